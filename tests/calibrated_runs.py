@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, Parameters
-from calib.errors import NotObservable
-from calib.model import predict
+from ftcalib import CalibrationDataset, CalibrationResult, Parameters
+from ftcalib.errors import NotObservable
+from ftcalib.model import predict
 from ftdrive.fleet.draws import drawn
 from ftdrive.fleet.resolve import solved, task_of
 from ftdrive.runs.run import RUN_FORMAT

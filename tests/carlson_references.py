@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from calib.model import Array, nearest_rotation
-from calib.published.carlson import ForceFit, _fit_vec, _least_singular_vector, _linear_equations, kron_identity
-from calib.published.carlson_known import _equations, _weight
+from ftcalib.model import Array, nearest_rotation
+from ftcalib.published.carlson import ForceFit, _fit_vec, _least_singular_vector, _linear_equations, kron_identity
+from ftcalib.published.carlson_known import _equations, _weight
 
 
 def nullspace_all_pairs(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:

@@ -3,7 +3,7 @@
 import threading
 
 from ftdrive.cell.emulated_clock import EmulatedClock
-from mocks.clock import CellClock
+from ftmocks.clock import CellClock
 
 
 class CellTime:

@@ -4,7 +4,7 @@ import heapq
 from collections.abc import Callable
 from itertools import count
 
-from drivers.clock import Clock, Waitable
+from ftdrivers.clock import Clock, Waitable
 
 
 class FakeClock(Clock):

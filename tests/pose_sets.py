@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.model import Array
-from calib.poses.information import Guess, prediction_weights, special, whitened_jacobian
+from ftcalib.model import Array
+from ftcalib.poses.information import Guess, prediction_weights, special, whitened_jacobian
 
 SUBSET_12 = (2, 4, 5, 7, 10, 12, 13, 15, 18, 20, 21, 23)
 """A-optimal for the forces; with torques 0.96 to 1 of `T12`, depending on the centre of mass."""

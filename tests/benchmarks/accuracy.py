@@ -23,16 +23,16 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, NotObservable, Parameters, read_csv, solve
-from calib.assessment.cross_validation import standardized
-from calib.assessment.observability import AMBIGUOUS_GAP, assess
-from calib.known import Known
-from calib.likelihood import fit as likelihood
-from calib.likelihood import rotation_minima
-from calib.likelihood.gain_and_cross_talk import predicted_covariance
-from calib.model import UP_IN_BASE, Array, predict
-from calib.published.methods import published
-from calib.published.yu import SPECIAL_R_flange_base, lrom, srom
+from ftcalib import CalibrationDataset, NotObservable, Parameters, read_csv, solve
+from ftcalib.assessment.cross_validation import standardized
+from ftcalib.assessment.observability import AMBIGUOUS_GAP, assess
+from ftcalib.known import Known
+from ftcalib.likelihood import fit as likelihood
+from ftcalib.likelihood import rotation_minima
+from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
+from ftcalib.model import UP_IN_BASE, Array, predict
+from ftcalib.published.methods import published
+from ftcalib.published.yu import SPECIAL_R_flange_base, lrom, srom
 from tests.benchmarks import carlson_figures, speed
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.scenarios import Rng, Truth

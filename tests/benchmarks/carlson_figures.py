@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.model import Array, nearest_rotation, skew
-from calib.published import carlson, carlson_known
+from ftcalib.model import Array, nearest_rotation, skew
+from ftcalib.published import carlson, carlson_known
 from tests import carlson_references
 
 FIG_1_SIGMA_N = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)

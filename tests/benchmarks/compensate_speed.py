@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from calib.model import predict
+from ftcalib.model import predict
 from ftdrive.live.samples import WrenchFrame
 from ftdrive.recording import Header, Recording, read_recording, write_recording
 from ftdrive.recording.compensation import NEEDED, compensated

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib import Parameters
-from calib.compensation import Compensator
-from calib.model import Array
+from ftcalib import Parameters
+from ftcalib.compensation import Compensator
+from ftcalib.model import Array
 
 Floats = NDArray[np.floating[Any]]
 

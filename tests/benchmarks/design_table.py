@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from calib.model import Array
-from calib.poses.information import (
+from ftcalib.model import Array
+from ftcalib.poses.information import (
     SUBSET_6,
     T12,
     Guess,
@@ -24,7 +24,7 @@ from calib.poses.information import (
     special,
     whitened_jacobian,
 )
-from calib.poses.selection import choose, cone_candidates, next_pose, order
+from ftcalib.poses.selection import choose, cone_candidates, next_pose, order
 from tests.pose_sets import AMBIGUOUS_6, SUBSET_8, SUBSET_12, efficiency, optimised
 
 GUESS = Guess(mass_kg=20 / 9.80665, sigma_force_N=0.2, sigma_torque_Nm=0.005)  # weight / sigma 100, lever 25 mm

@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
-from calib.errors import BadDataset
-from calib.known import Known
-from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array
+from ftcalib import CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
+from ftcalib.errors import BadDataset
+from ftcalib.known import Known
+from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array
 from ftdrive.checks.plausibility import judged
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.scenarios import Rng, Truth

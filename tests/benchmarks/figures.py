@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
-from calib.likelihood import fit as likelihood
+from ftcalib.likelihood import fit as likelihood
 from tests.benchmarks import accuracy, carlson_figures
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.accuracy import Lab

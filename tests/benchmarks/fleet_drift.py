@@ -15,8 +15,8 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.extras.drift_onset import drift_onset
-from calib.model import Array
+from ftcalib.extras.drift_onset import drift_onset
+from ftcalib.model import Array
 from ftdrive.fleet.observed import WINDOW
 
 YEAR = 365

@@ -23,19 +23,19 @@ from itertools import count
 from pathlib import Path
 from typing import cast
 
-from drivers.ati import codec as ati
-from drivers.ati import modbus
-from drivers.ati.netft import range_in
-from drivers.bota import codec as bota
-from drivers.errors import ProtocolError
-from drivers.registry import SENSORS, BadUrl, sensor_from_url
-from drivers.robotiq import codec as robotiq
-from drivers.robotous import codec as robotous
-from drivers.robotous.halves import Halves
-from drivers.transcript.recorder import FORMAT, BadTranscript, Transcript
-from drivers.ur import rtde
-from drivers.wires.crc import crc16_modbus, crc16_x25
 from ftdrive.checks.computer import SensorAddress
+from ftdrivers.ati import codec as ati
+from ftdrivers.ati import modbus
+from ftdrivers.ati.netft import range_in
+from ftdrivers.bota import codec as bota
+from ftdrivers.errors import ProtocolError
+from ftdrivers.registry import SENSORS, BadUrl, sensor_from_url
+from ftdrivers.robotiq import codec as robotiq
+from ftdrivers.robotous import codec as robotous
+from ftdrivers.robotous.halves import Halves
+from ftdrivers.transcript.recorder import FORMAT, BadTranscript, Transcript
+from ftdrivers.ur import rtde
+from ftdrivers.wires.crc import crc16_modbus, crc16_x25
 
 LONGEST = 400
 SLOWEST_S = 0.5

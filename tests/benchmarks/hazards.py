@@ -24,7 +24,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationResult
+from ftcalib import CalibrationResult
 from tests.benchmarks.hazard_rows import BEFOREHAND, FAULTS, UNSEEN, Beforehand, Fault, Json
 from tests.benchmarks.hazard_sessions import QUIET, Observed, begin, disturb, undisturbed
 

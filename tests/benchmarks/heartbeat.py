@@ -21,9 +21,9 @@ from contextlib import closing
 
 import numpy as np
 
-from drivers.clock import REAL
-from drivers.errors import DriverError
-from drivers.ur.timing import UrTiming
+from ftdrivers.clock import REAL
+from ftdrivers.errors import DriverError
+from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import Station
 from tests.wire.heartbeat_trial import KINDS, WITHIN_S, trial
 

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib import CalibrationResult
-from calib.model import Array
+from ftcalib import CalibrationResult
+from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import Station
 from ftdrive.live.samples import Stages, WrenchFrame

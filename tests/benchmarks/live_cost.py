@@ -13,12 +13,12 @@ import time
 
 import numpy as np
 
-from calib.model import gravity_wrench
-from drivers.interfaces import ArmStates, FtSamples
+from ftcalib.model import gravity_wrench
 from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.pairing import Pairing
 from ftdrive.live.processing import Processor
 from ftdrive.live.samples import Paired, Stages, WrenchFrame
+from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.unit.ftdrive.live.simulated import NOISE, P_FLANGE_SENSOR_M, T0_NS, Motion, calibrated, info, paired
 
 RATE_HZ = 7000.0

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from calib.model import Array
+from ftcalib.model import Array
 from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.noise import samples_in_reading
 from ftdrive.live.pairing import Pairing

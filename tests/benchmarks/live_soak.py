@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from drivers.interfaces import FtSamples
 from ftdrive.cell.emulated import Station
 from ftdrive.live.samples import Block, StreamEvent
 from ftdrive.live.stream import CompensatedStream
@@ -40,6 +39,7 @@ from ftdrive.servers.foxglove import FoxgloveServer
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live_screen import LiveApp
+from ftdrivers.interfaces import FtSamples
 from tests.benchmarks.on_terminal import on_terminal
 from tests.benchmarks.stream_latency import EVERY
 from tests.unit.ftdrive.live.simulated import calibrated_from

@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from drivers.ur.kinematics import MODELS, Array, forward
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
 from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrivers.ur.kinematics import MODELS, Array, forward
 from tests.benchmarks.planning import FIXED_POINTS_M
 
 coal: Any = importlib.import_module("coal")

@@ -1,7 +1,7 @@
 """Plant small errors in a copy of the project, one at a time, and print which of them the fast tests find.
 
-The tests of `ftdrive/session/x.py` are those of `tests/unit/ftdrive/session` or, where there is no such folder, of the
-next one up: first the files that import the module, then the rest.
+The tests of `ftdrive/ftdrive/session/x.py` are those of `tests/unit/ftdrive/session` or, where there is no such folder,
+of the next one up: first the files that import the module, then the rest.
 """
 
 import argparse
@@ -95,10 +95,11 @@ def mutants_of(path: Path) -> Iterator[Mutant]:
 
 def tests_of(path: Path) -> list[str]:
     """Test files of the folder that mirrors the module's, those that import it first."""
-    folder = PROJECT / "tests/unit" / path.parent
+    top, *package_path = path.parent.parts
+    folder = Path(PROJECT, "tests/unit", top, *package_path[1:])
     while not folder.is_dir():
         folder = folder.parent
-    package = re.escape(".".join(path.parent.parts))
+    package = re.escape(".".join(package_path))
     name = re.compile(rf"{package}\.{path.stem}\b|from {package} import .*\b{path.stem}\b")
     files = sorted(folder.rglob("test_*.py"), key=lambda file: (not name.search(file.read_text()), file))
     return [str(file.relative_to(PROJECT)) for file in files]
@@ -106,7 +107,10 @@ def tests_of(path: Path) -> list[str]:
 
 def outcome(root: Path, tests: list[str], limit_s: float) -> str:
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", *tests]
-    environment = {**os.environ, "PYTHONPATH": str(root)}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(str(root / top) for top in ("ftdrive", "calib", "drivers", "mocks")),
+    }
     quiet = subprocess.DEVNULL
     with subprocess.Popen(
         command, cwd=root, env=environment, stdout=quiet, stderr=quiet, start_new_session=True
@@ -120,7 +124,9 @@ def outcome(root: Path, tests: list[str], limit_s: float) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("paths", nargs="+", help="packages or modules: calib, ftdrive/session, drivers/clock.py")
+    parser.add_argument(
+        "paths", nargs="+", help="packages or modules: calib, ftdrive/ftdrive/session, drivers/ftdrivers/clock.py"
+    )
     parser.add_argument("--number", type=int, default=20, help="of mutants (default 20)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tests", nargs="+", help="tests to run for every mutant, instead of those of its folder")

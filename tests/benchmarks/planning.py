@@ -13,8 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from calib.poses.information import special
-from drivers.ur.kinematics import Array
+from ftcalib.poses.information import special
 from ftdrive.errors import PlanRefused
 from ftdrive.planning.approach import plan_approach
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
@@ -26,6 +25,7 @@ from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
 from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrivers.ur.kinematics import Array
 
 MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")
 TOOLS = {

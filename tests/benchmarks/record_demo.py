@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
-PICTURE = Path(__file__).parents[2] / "ftdrive/commands/pictures/demo.svg"
+PICTURE = Path(__file__).parents[2] / "docs/pictures/demo.svg"
 COLUMNS, ROWS = 80, 24
 ROW_PX = 24.4
 """Of rich's SVG, whose characters are 20 px high."""

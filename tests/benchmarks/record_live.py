@@ -20,7 +20,7 @@ from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live_screen import LiveApp
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream, Scenario
 
-FOLDER = Path(__file__).parents[2] / "ftdrive/terminal/pictures"
+FOLDER = Path(__file__).parents[2] / "docs/pictures"
 SIZE = (80, 24)
 BLOCKS = 1200
 CHECKS = (

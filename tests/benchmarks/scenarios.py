@@ -1,7 +1,7 @@
 """Simulated calibrations with known truth: pose sets, tools, readings, and the bound on any estimator.
 
-An implementation of the model of its own, so that a mistake in `calib.model` shows: here R is `s_eR`, flange to sensor,
-and A = `e_bR` is the transpose of a robot pose, as in Yu, Shi, Lou 2021, eqs 12-13. Derivatives are numeric.
+An implementation of the model of its own, so that a mistake in `ftcalib.model` shows: here R is `s_eR`, flange to
+sensor, and A = `e_bR` is the transpose of a robot pose, as in Yu, Shi, Lou 2021, eqs 12-13. Derivatives are numeric.
 """
 
 from dataclasses import astuple, dataclass
@@ -10,8 +10,8 @@ from itertools import permutations, product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import Parameters
-from calib.model import Array
+from ftcalib import Parameters
+from ftcalib.model import Array
 
 Rng = np.random.Generator
 

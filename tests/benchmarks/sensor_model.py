@@ -15,17 +15,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import Parameters, read_csv
-from calib.known import Constraints, Known
-from calib.likelihood import fit as likelihood
-from calib.likelihood.explanation import Explanation, with_all_minima
-from calib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, Response, predicted_covariance
-from calib.likelihood.session import Session, inverses
-from calib.likelihood.session_noise import centred
-from calib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, Kind, component
-from calib.model import STANDARD_GRAVITY_M_S2, Array, predict
-from calib.published.yu import lrom
-from calib.result import COMMON_GAIN
+from ftcalib import Parameters, read_csv
+from ftcalib.known import Constraints, Known
+from ftcalib.likelihood import fit as likelihood
+from ftcalib.likelihood.explanation import Explanation, with_all_minima
+from ftcalib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, Response, predicted_covariance
+from ftcalib.likelihood.session import Session, inverses
+from ftcalib.likelihood.session_noise import centred
+from ftcalib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, Kind, component
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, predict
+from ftcalib.published.yu import lrom
+from ftcalib.result import COMMON_GAIN
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.accuracy import Lab, Row, band, laboratory, most
 

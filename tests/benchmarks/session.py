@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.routine import Sampling
+from ftcalib.routine import Sampling
 from ftdrive.cell.emulated import Station
 from ftdrive.session.session import Options, calibrate
 from ftdrive.terminal.operators import PlainOperator

@@ -16,8 +16,8 @@ from rich.table import Table
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from calib.likelihood import rotation_minima
-from calib.model import Array
+from ftcalib.likelihood import rotation_minima
+from ftcalib.model import Array
 
 SETS = ("srom24", "haar24", "haar12", "haar6", "cone60", "cone40", "cone20", "ball60", "ball40", "ball20")
 TIES = ("3 poses", "4 half turns", "rim of a cone", "diagonal Q", "yaw only", "nearly yaw only", "ball0.5")

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, solve
-from calib.likelihood import fit as likelihood
+from ftcalib import CalibrationDataset, solve
+from ftcalib.likelihood import fit as likelihood
 from tests.benchmarks import scenarios as sim
 
 MANY = 1_000_000

@@ -31,11 +31,11 @@ import numpy as np
 import pytest
 import serial
 
-from drivers.ati import modbus
-from drivers.clock import REAL
-from drivers.errors import DriverError
-from drivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
-from drivers.ur.arm import UrArm
+from ftdrivers.ati import modbus
+from ftdrivers.clock import REAL
+from ftdrivers.errors import DriverError
+from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
+from ftdrivers.ur.arm import UrArm
 from tests.wire.conftest import Station
 from tests.wire.test_sensor_faults import (
     CYCLES,

@@ -22,9 +22,9 @@ from functools import partial
 from math import isnan, nan, radians
 from pathlib import Path
 
-from drivers.errors import ConnectError, DriverError
-from drivers.ur.arm import UrArm
-from drivers.ur.control_process import ControlProcess
+from ftdrivers.errors import ConnectError, DriverError
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control_process import ControlProcess
 from tests.wire.conftest import Station
 from tests.wire.moves import STEP_RAD, away, no_guard
 from tests.wire.test_ur_failures import APPLICATION, EVENTS, Once, nothing, on, wait_until_moving

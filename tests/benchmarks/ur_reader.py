@@ -17,8 +17,8 @@ from contextlib import closing
 
 import numpy as np
 
-from drivers.clock import REAL
-from drivers.ur.arm import UrArm
+from ftdrivers.clock import REAL
+from ftdrivers.ur.arm import UrArm
 from tests.wire.conftest import Station
 
 AGE_S, SHARE = 0.004, 0.06

@@ -20,15 +20,15 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, Parameters, solve
-from calib.data.dwell_mean import mean_and_covariance
-from calib.data.pooling import pooled_covariance
-from calib.extras.update import BLOCKS
-from calib.extras.verification import SINGLE, verify
-from calib.likelihood.gain_and_cross_talk import response_columns
-from calib.model import STANDARD_GRAVITY_M_S2, Array, predict
-from calib.poses.information import SUBSET_6, T12, special
-from calib.poses.verification import choose_verification_poses
+from ftcalib import CalibrationDataset, Parameters, solve
+from ftcalib.data.dwell_mean import mean_and_covariance
+from ftcalib.data.pooling import pooled_covariance
+from ftcalib.extras.update import BLOCKS
+from ftcalib.extras.verification import SINGLE, verify
+from ftcalib.likelihood.gain_and_cross_talk import response_columns
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, predict
+from ftcalib.poses.information import SUBSET_6, T12, special
+from ftcalib.poses.verification import choose_verification_poses
 from tests.benchmarks.accuracy import Lab, Row, band, laboratory
 from tests.benchmarks.scenarios import Rng, direction
 

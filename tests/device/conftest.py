@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
-from drivers.interfaces import ForceTorqueSensor
-from drivers.registry import sensor_from_url
+from ftdrivers.interfaces import ForceTorqueSensor
+from ftdrivers.registry import sensor_from_url
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -6,9 +6,9 @@ from math import radians
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceFault
-from drivers.interfaces import ForceTorqueSensor, RobotArm
-from drivers.registry import arm_class
+from ftdrivers.errors import DeviceFault
+from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
+from ftdrivers.registry import arm_class
 
 SPEED_RAD_S, ACCELERATION_RAD_S2 = radians(5), radians(20)
 TURN_RAD = radians(3)

@@ -2,10 +2,10 @@
 
 import pytest
 
-from drivers.interfaces import NOT_REPORTED, ForceTorqueSensor, FtSamples, Health
-from drivers.registry import sensor_from_url
 from ftdrive.checks import devices
 from ftdrive.checks.computer import SensorAddress
+from ftdrivers.interfaces import NOT_REPORTED, ForceTorqueSensor, FtSamples, Health
+from ftdrivers.registry import sensor_from_url
 
 DURATION_S = 10.0
 

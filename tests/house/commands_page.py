@@ -1,4 +1,4 @@
-"""Write `ftdrive/commands/README.md` from the commands: `uv run python tests/house/commands_page.py`."""
+"""Write `docs/ftdrive/commands.md` from the commands: `uv run python tests/house/commands_page.py`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,7 +7,7 @@ import click
 
 from ftdrive.cli import cli
 
-PAGE = Path(__file__).parents[2] / "ftdrive/commands/README.md"
+PAGE = Path(__file__).parents[2] / "docs/ftdrive/commands.md"
 
 _HEAD = """\
 # Commands

@@ -26,7 +26,7 @@ def station_of(program: int) -> int:
             arguments = (folder / "cmdline").read_bytes().split(b"\0")
         except OSError:
             continue  # ended meanwhile
-        if int(parent) == program and b"mocks" in arguments:
+        if int(parent) == program and b"ftmocks" in arguments:
             return int(folder.name)
     raise AssertionError("no station was started")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.routine import Sampling
+from ftcalib.routine import Sampling
 from ftdrive.cell.emulated import Station
 from ftdrive.errors import Declined
 from ftdrive.runs.outcome import Outcome

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.ur.timing import UrTiming
 from ftdrive.cell.emulated import Station
 from ftdrive.commands.emulated_run import rehearse
+from ftdrivers.ur.timing import UrTiming
 from tests.system.command_line import CommandLine, listen_for
 
 NAMED = {

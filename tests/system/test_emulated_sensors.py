@@ -8,13 +8,13 @@ import time
 import numpy as np
 import pytest
 
-from drivers.clock import REAL
-from drivers.errors import DeviceFault, ProtocolError
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.devices import build_sensor
 from ftdrive.cell.emulated import SENSORS, Station, sensor_reached
 from ftdrive.errors import ConfigError
-from mocks.sensors.catalogue import CHOICES
+from ftdrivers.clock import REAL
+from ftdrivers.errors import DeviceFault, ProtocolError
+from ftmocks.sensors.catalogue import CHOICES
 
 
 def test_the_application_knows_all_sensors_of_a_station() -> None:

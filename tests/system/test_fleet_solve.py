@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import Unreachable
 from ftdrive.fleet.resolve import solve_again, solved, solved_path, task_of
 from ftdrive.fleet.workers import WorkerDied, Workers, answers, cluster_workers, local_workers
+from ftdrivers.errors import Unreachable
 from tests.calibrated_runs import calibrated_run
 from tests.dask_cluster import dask_cluster, kill_busiest_worker
 from tests.system.command_line import CommandLine, end_of, wait_until

@@ -18,11 +18,11 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from drivers.errors import ConnectError
 from ftdrive.cell.config import load
 from ftdrive.cell.emulated import Station
 from ftdrive.cli import cli, exit_code
 from ftdrive.errors import ConfigError
+from ftdrivers.errors import ConnectError
 
 COLUMNS = 80
 TOOL = ["--height", "33", "--tool", "0:33:80", "--tool", "33:200:100:0:5"]

@@ -6,11 +6,11 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from calib.model import Array
-from drivers.errors import DeviceTimeout
+from ftcalib.model import Array
 from ftdrive.cell.emulated import Station
 from ftdrive.live.samples import Axes, Stages, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
+from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.live.simulated import calibrated_from
 
 OPTIONS = ("--time-scale", "1", "--sensor-origin", "0,0,0.03", "--inertia", "0,0,0,0,0,0")

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from calib import solve
-from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
-from drivers.errors import StreamBroken
-from drivers.interfaces import ArmState, ArmStatus, RobotArm
+from ftcalib import solve
+from ftcalib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from ftdrive.cell import emulated
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
@@ -25,6 +23,8 @@ from ftdrive.session.events import Estimated, Event, PoseTaken
 from ftdrive.session.hand_guided import Recorder, collect_manually
 from ftdrive.session.operator import Key, Question
 from ftdrive.terminal.report import errors_in_sigma
+from ftdrivers.errors import StreamBroken
+from ftdrivers.interfaces import ArmState, ArmStatus, RobotArm
 from tests.system.command_line import assert_found
 
 QUICK = (2, 4, 5, 7, 10, 12, 13, 15, 18, 20, 21, 23)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from calib import CalibrationResult
+from ftcalib import CalibrationResult
 from ftdrive.cell.emulated import Station
 from ftdrive.planning.plan import Plan
 from ftdrive.terminal.report import errors_in_sigma

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib import CalibrationResult
+from ftcalib import CalibrationResult
 from ftdrive.cell.emulated import Station
 from ftdrive.commands.emulated_run import rehearse
 from ftdrive.terminal.report import compensation_error

@@ -2,7 +2,7 @@
 
 import pytest
 
-from calib import CalibrationResult
+from ftcalib import CalibrationResult
 from ftdrive.cell.emulated import Station
 from ftdrive.terminal.report import errors_in_sigma
 from tests.system.command_line import CommandLine, assert_found

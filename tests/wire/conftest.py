@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.clock import Clock
-from drivers.registry import sensor_from_url
-from drivers.streaming.sensor import StreamingSensor
-from drivers.ur.arm import UrArm
-from drivers.ur.control import ControlPath
-from drivers.ur.opening import path_for
-from drivers.ur.timing import UrTiming
 from ftdrive.cell.emulated_clock import EmulatedClock
+from ftdrivers.clock import Clock
+from ftdrivers.registry import sensor_from_url
+from ftdrivers.streaming.sensor import StreamingSensor
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control import ControlPath
+from ftdrivers.ur.opening import path_for
+from ftdrivers.ur.timing import UrTiming
 from tests.cell_time import CellTime
 from tests.ur_rtde import require_ur_rtde
 from tests.wire.station_process import StationProcess
@@ -134,14 +134,14 @@ NOISE = np.array([0.03] * 3 + [0.001] * 3)
 PROGRAM = """
 import json, sys, threading, time
 import numpy as np
-from mocks.clock import CellClock
-from mocks.sensors.ati_can import AtiCanNode
-from mocks.sensors.ati_serial import AtiSerialBox
-from mocks.sensors.bota import BotaBox
-from mocks.wires.faults import Faults
-from mocks.sensors.netft import Calibration, NetFtBox
-from mocks.sensors.robotiq import RobotiqBox
-from mocks.sensors.robotous import Model, RobotousCanNode, RobotousSerialBox
+from ftmocks.clock import CellClock
+from ftmocks.sensors.ati_can import AtiCanNode
+from ftmocks.sensors.ati_serial import AtiSerialBox
+from ftmocks.sensors.bota import BotaBox
+from ftmocks.wires.faults import Faults
+from ftmocks.sensors.netft import Calibration, NetFtBox
+from ftmocks.sensors.robotiq import RobotiqBox
+from ftmocks.sensors.robotous import Model, RobotousCanNode, RobotousSerialBox
 
 wrench, noise = np.array(json.loads(sys.argv[1])), np.array(json.loads(sys.argv[2]))
 rng = np.random.default_rng(1)

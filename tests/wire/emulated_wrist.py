@@ -13,14 +13,14 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import TypeVar
 
-from mocks.arrays import Array
-from mocks.clock import CellClock
-from mocks.kinematics import MODELS, ZERO6
-from mocks.station import free_hosts
-from mocks.ur.robot import Robot, RobotSettings
-from mocks.ur.server import UrServer
-from mocks.wires.faults import Faults
-from mocks.world import Truth, World
+from ftmocks.arrays import Array
+from ftmocks.clock import CellClock
+from ftmocks.kinematics import MODELS, ZERO6
+from ftmocks.station import free_hosts
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.ur.server import UrServer
+from ftmocks.wires.faults import Faults
+from ftmocks.world import Truth, World
 
 T = TypeVar("T")
 

@@ -10,12 +10,12 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Final
 
-from drivers.clock import REAL, Clock
-from drivers.errors import DriverError
-from drivers.ur.arm import UrArm
-from drivers.ur.control_child import DECELERATION_RAD_S2
-from drivers.ur.timing import UrTiming
 from ftdrive.cell.emulated_clock import EmulatedClock
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import DriverError
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control_child import DECELERATION_RAD_S2
+from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import Station
 
 KINDS: Final = ("killed", "suspended", "network", "power")

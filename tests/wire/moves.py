@@ -1,6 +1,6 @@
 """Moves of the emulated arm, as the tests of `UrArm` use them."""
 
-from drivers.ur.arm import UrArm
+from ftdrivers.ur.arm import UrArm
 
 STEP_RAD = 1.2
 """1.3 s at the speed of these tests: long enough to be interrupted."""

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 
 
 class StationProcess:
-    """`python -m mocks station`, without a sensor unless the options say otherwise."""
+    """`python -m ftmocks station`, without a sensor unless the options say otherwise."""
 
     def __init__(self, *options: str) -> None:
         self._options = options if "--sensor" in options else ("--sensor", "none", *options)
@@ -33,7 +33,7 @@ class StationProcess:
         """Start it, on the address it had before."""
         host = ("--host", self.host) if self.host else ()
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "mocks", "station", *self._options, *host],
+            [sys.executable, "-m", "ftmocks", "station", *self._options, *host],
             cwd=ROOT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

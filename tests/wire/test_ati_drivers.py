@@ -9,9 +9,9 @@ from typing import Any, Protocol
 import numpy as np
 import pytest
 
-from drivers.clock import REAL, Clock
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.streaming.sensor import StreamingSensor
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.streaming.sensor import StreamingSensor
 
 WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])  # what the emulators of conftest.py measure
 

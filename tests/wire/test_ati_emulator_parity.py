@@ -9,9 +9,9 @@ import pytest
 import serial
 from numpy.typing import NDArray
 
-from mocks.sensors import ati_serial
-from mocks.sensors.ati_serial import AtiSerialBox
-from mocks.sensors.robotiq import RobotiqBox
+from ftmocks.sensors import ati_serial
+from ftmocks.sensors.ati_serial import AtiSerialBox
+from ftmocks.sensors.robotiq import RobotiqBox
 from tests.wire.waiting import LIMIT_S, drain, read_to, wait_until
 
 READ_STATUS = bytes.fromhex("0A 03 00 1D 00 01 15 77")

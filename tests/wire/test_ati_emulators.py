@@ -12,10 +12,10 @@ import serial
 from can.interfaces.slcan import slcanBus
 from numpy.typing import NDArray
 
-from mocks.sensors.ati_can import AtiCanNode
-from mocks.sensors.ati_gauges import REFERENCE
-from mocks.sensors.ati_serial import JAM_PAUSE_S, AtiSerialBox, calibration_block
-from mocks.wires.modbus import with_crc
+from ftmocks.sensors.ati_can import AtiCanNode
+from ftmocks.sensors.ati_gauges import REFERENCE
+from ftmocks.sensors.ati_serial import JAM_PAUSE_S, AtiSerialBox, calibration_block
+from ftmocks.wires.modbus import with_crc
 from tests.wire.waiting import LIMIT_S, drain, read_to, wait_until
 
 V1 = np.array([-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608])

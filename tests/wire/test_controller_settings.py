@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from mocks.ur import rtde
+from ftmocks.ur import rtde
 from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import StationProcess
 from tests.wire.waiting import wait_until

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from drivers.interfaces import ArmStates, FtSamples
-from drivers.registry import sensor_from_url
+from ftdrivers.interfaces import ArmStates, FtSamples
+from ftdrivers.registry import sensor_from_url
 from tests.wire.conftest import Station
 
 SECONDS = 2.0

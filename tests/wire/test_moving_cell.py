@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mocks.kinematics import MODELS, forward
-from mocks.sensors.netft import RECORD, NetFtBox
+from ftmocks.kinematics import MODELS, forward
+from ftmocks.sensors.netft import RECORD, NetFtBox
 from tests.wire.station_process import StationProcess
 from tests.wire.waiting import LIMIT_S
 

@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import ConnectError
-from drivers.probe import serial_line as module
-from drivers.probe.serial_line import probe
-from drivers.registry import sensor_from_url
-from mocks.sensors.ati_can import AtiCanNode
-from mocks.sensors.ati_serial import AtiSerialBox
-from mocks.sensors.bota import BotaBox
-from mocks.sensors.robotiq import RobotiqBox
-from mocks.sensors.robotous import RobotousSerialBox
+from ftdrivers.errors import ConnectError
+from ftdrivers.probe import serial_line as module
+from ftdrivers.probe.serial_line import probe
+from ftdrivers.registry import sensor_from_url
+from ftmocks.sensors.ati_can import AtiCanNode
+from ftmocks.sensors.ati_serial import AtiSerialBox
+from ftmocks.sensors.bota import BotaBox
+from ftmocks.sensors.robotiq import RobotiqBox
+from ftmocks.sensors.robotous import RobotousSerialBox
 
 
 def measure(n: int) -> Any:

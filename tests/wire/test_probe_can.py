@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import serial
 
-from drivers.errors import ConnectError, PortInUse
-from drivers.probe import can_bus as module
-from drivers.probe.can_bus import probe_can
-from drivers.registry import sensor_from_url
-from mocks.sensors.ati_can import AtiCanNode
-from mocks.sensors.robotous import RobotousCanNode
+from ftdrivers.errors import ConnectError, PortInUse
+from ftdrivers.probe import can_bus as module
+from ftdrivers.probe.can_bus import probe_can
+from ftdrivers.registry import sensor_from_url
+from ftmocks.sensors.ati_can import AtiCanNode
+from ftmocks.sensors.robotous import RobotousCanNode
 
 
 @pytest.fixture(autouse=True)

@@ -11,10 +11,10 @@ from typing import Any, Protocol
 import numpy as np
 import pytest
 
-from drivers.clock import Clock
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.registry import BadUrl, sensor_from_url
-from drivers.streaming.sensor import StreamingSensor
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.registry import BadUrl, sensor_from_url
+from ftdrivers.streaming.sensor import StreamingSensor
 
 WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])  # what the emulators of conftest.py measure, with
 NOISE = np.array([0.03] * 3 + [0.001] * 3)

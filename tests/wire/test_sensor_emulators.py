@@ -15,11 +15,11 @@ import pytest
 import serial
 from numpy.typing import NDArray
 
-from mocks.sensors.bota import BotaBox, crc16_x25
-from mocks.sensors.netft import RECORD, NetFtBox
-from mocks.sensors.robotiq import RobotiqBox
-from mocks.sensors.robotous import RobotousCanNode, RobotousSerialBox, packet
-from mocks.wires.modbus import crc16, with_crc
+from ftmocks.sensors.bota import BotaBox, crc16_x25
+from ftmocks.sensors.netft import RECORD, NetFtBox
+from ftmocks.sensors.robotiq import RobotiqBox
+from ftmocks.sensors.robotous import RobotousCanNode, RobotousSerialBox, packet
+from ftmocks.wires.modbus import crc16, with_crc
 from tests.wire.waiting import LIMIT_S, drain, read_to, wait_until
 
 UNPLUGGED = (serial.SerialException, can.CanError, OSError, termios.error)

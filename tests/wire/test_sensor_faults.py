@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.clock import REAL, Clock
-from drivers.errors import DeviceTimeout, DriverError, StreamBroken
-from drivers.follow import Unread
-from drivers.interfaces import Array, FtSamples
-from drivers.registry import sensor_from_url
-from drivers.streaming.sensor import StreamingSensor
 from ftdrive.cell.emulated_clock import EmulatedClock
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.follow import Unread
+from ftdrivers.interfaces import Array, FtSamples
+from ftdrivers.registry import sensor_from_url
+from ftdrivers.streaming.sensor import StreamingSensor
 
 pytestmark = pytest.mark.slow  # `test_sensor_drivers.py` has a share of it
 
@@ -35,14 +35,14 @@ UNIT = np.array([0.1] * 3 + [0.01] * 3)
 PROGRAM = """
 import json, sys, threading, time
 import numpy as np
-from mocks.clock import CellClock
-from mocks.sensors.ati_can import AtiCanNode
-from mocks.sensors.ati_serial import AtiSerialBox
-from mocks.sensors.bota import BotaBox
-from mocks.wires.faults import Faults
-from mocks.sensors.netft import NetFtBox
-from mocks.sensors.robotiq import RobotiqBox
-from mocks.sensors.robotous import RobotousCanNode, RobotousSerialBox
+from ftmocks.clock import CellClock
+from ftmocks.sensors.ati_can import AtiCanNode
+from ftmocks.sensors.ati_serial import AtiSerialBox
+from ftmocks.sensors.bota import BotaBox
+from ftmocks.wires.faults import Faults
+from ftmocks.sensors.netft import NetFtBox
+from ftmocks.sensors.robotiq import RobotiqBox
+from ftmocks.sensors.robotous import RobotousCanNode, RobotousSerialBox
 from tests.wire.emulated_wrist import EmulatedWrist
 
 class Counter:

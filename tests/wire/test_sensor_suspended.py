@@ -24,8 +24,8 @@ from ftdrive.cell.emulated import SENSORS, Station
 PROGRAM = """
 import json, sys, threading, time
 import numpy as np
-from drivers.errors import DriverError
-from drivers.registry import sensor_from_url
+from ftdrivers.errors import DriverError
+from ftdrivers.registry import sensor_from_url
 
 one_line = threading.Lock()
 

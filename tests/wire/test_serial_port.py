@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 import serial
 
-from drivers.errors import ConnectError, PortInUse
-from drivers.wires.serial_port import SerialPort
+from ftdrivers.errors import ConnectError, PortInUse
+from ftdrivers.wires.serial_port import SerialPort
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
 
@@ -217,7 +217,7 @@ def test_a_port_that_takes_no_flags_is_freed(far_side: FarSide, monkeypatch: pyt
     def refuse(_: object) -> bool:
         raise termios.error(5, "gone")
 
-    monkeypatch.setattr("drivers.wires.serial_port.ask_for_marks", refuse)
+    monkeypatch.setattr("ftdrivers.wires.serial_port.ask_for_marks", refuse)
     port = SerialPort("sensor", far_side.path, 1_250_000, even_parity=True)
     with pytest.raises(ConnectError, match="gone"):
         port.open()

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mocks.sensors.netft import RECORD, NetFtBox
+from ftmocks.sensors.netft import RECORD, NetFtBox
 from tests.wire.station_process import ROOT, StationProcess
 from tests.wire.waiting import LIMIT_S
 
@@ -262,7 +262,7 @@ def test_requests_to_begin_with() -> None:
     ],
 )
 def test_wrong_options_are_exit_code_2(options: list[str], why: str) -> None:
-    command = [sys.executable, "-m", "mocks", "station", *options]
+    command = [sys.executable, "-m", "ftmocks", "station", *options]
     ended = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=ROOT, check=False)
     assert (ended.returncode, ended.stdout) == (2, "")
     assert why in ended.stderr

@@ -19,21 +19,21 @@ import numpy as np
 import pytest
 import serial
 
-from drivers.clock import Clock
-from drivers.errors import ConnectError
-from drivers.interfaces import DeviceInfo, ForceTorqueSensor
-from drivers.registry import sensor_from_url
-from drivers.transcript.player import Player
-from drivers.transcript.recorder import BadTranscript, Passage, Transcript, Writer
-from drivers.transcript.taps import recording
-from drivers.wires.parity import Unmarker, ask_for_marks
-from drivers.wires.serial_port import SerialPort
-from mocks.sensors.ati_can import AtiCanNode
-from mocks.sensors.ati_serial import AtiSerialBox
-from mocks.sensors.bota import BotaBox
-from mocks.sensors.robotiq import RobotiqBox
-from mocks.sensors.robotous import RobotousSerialBox
-from mocks.wires.faults import Faults
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError
+from ftdrivers.interfaces import DeviceInfo, ForceTorqueSensor
+from ftdrivers.registry import sensor_from_url
+from ftdrivers.transcript.player import Player
+from ftdrivers.transcript.recorder import BadTranscript, Passage, Transcript, Writer
+from ftdrivers.transcript.taps import recording
+from ftdrivers.wires.parity import Unmarker, ask_for_marks
+from ftdrivers.wires.serial_port import SerialPort
+from ftmocks.sensors.ati_can import AtiCanNode
+from ftmocks.sensors.ati_serial import AtiSerialBox
+from ftmocks.sensors.bota import BotaBox
+from ftmocks.sensors.robotiq import RobotiqBox
+from ftmocks.sensors.robotous import RobotousSerialBox
+from ftmocks.wires.faults import Faults
 
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
 NOISE = np.array([0.03] * 3 + [0.001] * 3)

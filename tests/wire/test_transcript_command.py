@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from drivers.clock import REAL
-from drivers.errors import StreamBroken
-from drivers.interfaces import ForceTorqueSensor
-from drivers.registry import sensor_from_url
-from drivers.streaming.sensor import StreamingSensor
-from drivers.transcript.player import Player
-from drivers.transcript.recorder import BadTranscript, Writer
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
-from mocks.sensors.bota import BotaBox
+from ftdrivers.clock import REAL
+from ftdrivers.errors import StreamBroken
+from ftdrivers.interfaces import ForceTorqueSensor
+from ftdrivers.registry import sensor_from_url
+from ftdrivers.streaming.sensor import StreamingSensor
+from ftdrivers.transcript.player import Player
+from ftdrivers.transcript.recorder import BadTranscript, Writer
+from ftmocks.sensors.bota import BotaBox
 
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
 
@@ -134,8 +134,8 @@ def test_what_was_broken_off_too_early_says_so(recorded: list[str], tmp_path: Pa
 OWN_WIRE = """
 import time
 import numpy as np
-from drivers.interfaces import DeviceInfo, FtSamples
-from drivers.streaming import StreamingSensor
+from ftdrivers.interfaces import DeviceInfo, FtSamples
+from ftdrivers.streaming import StreamingSensor
 
 class Sensor(StreamingSensor):
     @classmethod

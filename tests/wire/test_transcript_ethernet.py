@@ -17,18 +17,18 @@ import pynetft
 import pytest
 from click.testing import CliRunner, Result
 
-from drivers.ati.netft import NetFtSensor
-from drivers.clock import Clock
-from drivers.errors import ConnectError, ProtocolError
-from drivers.interfaces import DeviceInfo, FtSamples
-from drivers.registry import sensor_from_url
-from drivers.transcript.player import Player
-from drivers.transcript.recorder import BadTranscript, Page, Passage, Transcript, Writer
-from drivers.transcript.relays import _DatagramRelay, _PageRelay
-from drivers.transcript.taps import recording
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
-from mocks.sensors.netft import NetFtBox
+from ftdrivers.ati.netft import NetFtSensor
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, ProtocolError
+from ftdrivers.interfaces import DeviceInfo, FtSamples
+from ftdrivers.registry import sensor_from_url
+from ftdrivers.transcript.player import Player
+from ftdrivers.transcript.recorder import BadTranscript, Page, Passage, Transcript, Writer
+from ftdrivers.transcript.relays import _DatagramRelay, _PageRelay
+from ftdrivers.transcript.taps import recording
+from ftmocks.sensors.netft import NetFtBox
 
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
 START, STOP = bytes.fromhex("1234 0002 0000 0000"), bytes.fromhex("1234 0000 0000 0000")

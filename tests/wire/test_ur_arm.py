@@ -19,12 +19,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.ur.arm import UrArm
-from drivers.ur.control import Control
-from drivers.ur.control_process import ControlProcess
-from drivers.ur.kinematics import MODELS, forward
-from drivers.ur.timing import UrTiming
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control import Control
+from ftdrivers.ur.control_process import ControlProcess
+from ftdrivers.ur.kinematics import MODELS, forward
+from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station, on_ur_rtde, one_path
 from tests.wire.moves import away, no_guard
 from tests.wire.waiting import wait_until
@@ -400,8 +400,8 @@ def test_a_powered_off_arm(station: Station, new_arm: NewArm) -> None:
 
 APPLICATION = """
 import sys
-from drivers.ur.arm import UrArm
-from drivers.ur.timing import UrTiming
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.timing import UrTiming
 from ftdrive.cell.emulated_clock import EmulatedClock
 print("main")
 clock = EmulatedClock(sys.argv[2])

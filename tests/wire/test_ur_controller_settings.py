@@ -5,10 +5,10 @@ from contextlib import closing
 
 import pytest
 
-from drivers.errors import DeviceFault
-from drivers.interfaces import ControllerSettings
-from drivers.ur.arm import UrArm
-from drivers.ur.control import ControlPath
+from ftdrivers.errors import DeviceFault
+from ftdrivers.interfaces import ControllerSettings
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control import ControlPath
 from tests.wire.conftest import Station
 
 COM_M = (0.0095, 0.0048, 0.0809)

@@ -20,10 +20,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ftdrive.cell.emulated_clock import EmulatedClock
-from mocks.clock import LEAD_NS
-from mocks.ur import rtde
-from mocks.ur.script import take_uploads
-from mocks.ur.variables import INPUTS, OUTPUTS
+from ftmocks.clock import LEAD_NS
+from ftmocks.ur import rtde
+from ftmocks.ur.script import take_uploads
+from ftmocks.ur.variables import INPUTS, OUTPUTS
 from tests.ur_rtde import require_ur_rtde
 from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import ROOT, StationProcess
@@ -443,7 +443,7 @@ def test_two_stations_live_side_by_side(station: StationProcess) -> None:
     with StationProcess() as other:
         assert other.host != station.host
     taken = subprocess.run(
-        [sys.executable, "-m", "mocks", "station", "--sensor", "none", "--host", station.host],
+        [sys.executable, "-m", "ftmocks", "station", "--sensor", "none", "--host", station.host],
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,

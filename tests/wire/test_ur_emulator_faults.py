@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from mocks.ur import rtde
+from ftmocks.ur import rtde
 from tests.ur_rtde import require_ur_rtde
 from tests.wire.station_process import StationProcess
 from tests.wire.waiting import LIMIT_S

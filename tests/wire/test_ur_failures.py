@@ -56,13 +56,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.clock import REAL
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
-from drivers.ur.arm import UrArm
-from drivers.ur.control import Control, ControlPath
-from drivers.ur.control_process import ControlProcess
-from drivers.ur.opening import Opening
-from drivers.ur.timing import STRICT, UrTiming
+from ftdrivers.clock import REAL
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control import Control, ControlPath
+from ftdrivers.ur.control_process import ControlProcess
+from ftdrivers.ur.opening import Opening
+from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station, on_ur_rtde, one_path
 from tests.wire.moves import STEP_RAD, away, no_guard
 
@@ -681,8 +681,8 @@ def test_a_silent_dashboard(station: Station) -> None:
 
 APPLICATION = """
 import sys
-from drivers.errors import DriverError
-from drivers.ur.arm import UrArm
+from ftdrivers.errors import DriverError
+from ftdrivers.ur.arm import UrArm
 arm = UrArm(sys.argv[1], speed_rad_s=float(sys.argv[2]), acceleration_rad_s2=3.0)
 arm.open(control=True)
 print(arm._control._process.pid, flush=True)
@@ -766,7 +766,7 @@ def test_both_processes_suspended(station: Station, application: Application) ->
 
 WATCHER = """
 import sys
-from drivers.ur.arm import UrArm
+from ftdrivers.ur.arm import UrArm
 arm = UrArm(sys.argv[1])
 arm.open()
 print("open", flush=True)

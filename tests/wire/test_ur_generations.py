@@ -8,10 +8,10 @@ from math import radians
 import numpy as np
 import pytest
 
-from drivers.errors import ConnectError, DeviceFault, ModelUnknown
-from drivers.interfaces import NOT_REPORTED
-from drivers.ur.arm import UrArm
-from drivers.ur.kinematics import MODELS, forward
+from ftdrivers.errors import ConnectError, DeviceFault, ModelUnknown
+from ftdrivers.interfaces import NOT_REPORTED
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.kinematics import MODELS, forward
 from tests.wire.conftest import TIME_SCALE, Station
 from tests.wire.moves import no_guard
 

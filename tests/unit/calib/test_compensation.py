@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
-from calib import Parameters
-from calib.compensation import CHUNK_ROWS, Compensator
-from calib.model import Array, predict
+from ftcalib import Parameters
+from ftcalib.compensation import CHUNK_ROWS, Compensator
+from ftcalib.model import Array, predict
 
 
 def random_parameters(rng: np.random.Generator) -> Parameters:

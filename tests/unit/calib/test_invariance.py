@@ -6,8 +6,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.model import Array, predict, skew
+from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.model import Array, predict, skew
 
 TRUTH = Parameters(
     Rotation.from_euler("zyx", [40, -8, 3], degrees=True).as_matrix(),

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from calib import PARAMETER_NAMES, Parameters
-from calib.model import Array, angle_between, gravity_wrench, jacobian, nearest_rotation, predict, rotation_of, skew
+from ftcalib import PARAMETER_NAMES, Parameters
+from ftcalib.model import Array, angle_between, gravity_wrench, jacobian, nearest_rotation, predict, rotation_of, skew
 
 SENSOR_Z_DOWN = Rotation.from_euler("x", 180, degrees=True).as_matrix()
 

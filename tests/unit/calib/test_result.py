@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import BadCalibration, CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.model import predict
+from ftcalib import BadCalibration, CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.model import predict
 
 RNG = np.random.default_rng(1)
 R = Rotation.random(10, rng=RNG).as_matrix()

@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.errors import TooFewSamples
-from calib.model import Array
-from calib.routine import PoseRecord, Sampling, TourPose, dataset_from, drift_check, take_pose
+from ftcalib.errors import TooFewSamples
+from ftcalib.model import Array
+from ftcalib.routine import PoseRecord, Sampling, TourPose, dataset_from, drift_check, take_pose
 
 
 @dataclass

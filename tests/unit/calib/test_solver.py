@@ -11,15 +11,15 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
-from calib.compare import compare
-from calib.errors import BadDataset
-from calib.known import Known
-from calib.likelihood.fit import fit
-from calib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, jacobian, predict
-from calib.published.methods import published
-from calib.published.yu import SPECIAL_R_flange_base
-from calib.result import Method
+from ftcalib import CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
+from ftcalib.compare import compare
+from ftcalib.errors import BadDataset
+from ftcalib.known import Known
+from ftcalib.likelihood.fit import fit
+from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, jacobian, predict
+from ftcalib.published.methods import published
+from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib.result import Method
 
 METHODS: tuple[Method, ...] = ("ml", "srom", "lrom")
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
@@ -38,7 +38,7 @@ TRUTH = Parameters(
 @pytest.fixture(autouse=True)
 def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     """The uncertainty of closed forms is simulated: a few runs are enough where it is not judged."""
-    monkeypatch.setattr("calib.solver.SIMULATIONS", 20)
+    monkeypatch.setattr("ftcalib.solver.SIMULATIONS", 20)
 
 
 def dataset(R_base_flange: Array, wrench: Array, cov: Array | None = None) -> CalibrationDataset:

@@ -168,7 +168,7 @@ class Table:
     ) -> SerialWire:
         wire = SerialWire(turns, streaming)
         self.monkeypatch.setattr("serial.Serial", wire)
-        self.monkeypatch.setattr("drivers.wires.serial_port.ask_for_marks", lambda _: marks)
+        self.monkeypatch.setattr("ftdrivers.wires.serial_port.ask_for_marks", lambda _: marks)
         return wire
 
     def can(self, turns: Iterable[tuple[str, Any]], streaming: Stream | None = None, *, echo: bool = False) -> CanWire:

@@ -1,6 +1,6 @@
 """A stream on a fake clock: the reader takes its turns in the test's thread whenever a caller waits."""
 
-from drivers.streaming.sensor import StreamingSensor
+from ftdrivers.streaming.sensor import StreamingSensor
 from tests.fake_clock import FakeClock
 
 TURN_S = 1e-4

@@ -7,12 +7,12 @@ from time import sleep  # by name: the controller in memory replaces that of the
 
 import pytest
 
-from drivers.clock import Follower
-from drivers.errors import ConnectError
-from drivers.interfaces import DeviceInfo, FtSamples
-from drivers.streaming.sensor import NOTHING, StreamingSensor
-from drivers.ur.reading import Reader
-from drivers.ur.timing import STRICT
+from ftdrivers.clock import Follower
+from ftdrivers.errors import ConnectError
+from ftdrivers.interfaces import DeviceInfo, FtSamples
+from ftdrivers.streaming.sensor import NOTHING, StreamingSensor
+from ftdrivers.ur.reading import Reader
+from ftdrivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import HOST, Controller, install
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers import errors
-from drivers.errors import DeviceTimeout, DriverError
+from ftdrivers import errors
+from ftdrivers.errors import DeviceTimeout, DriverError
 
 KINDS = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, DriverError)]
 

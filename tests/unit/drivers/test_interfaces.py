@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceFault, DeviceTimeout
-from drivers.interfaces import ArmStates, ControllerSettings
+from ftdrivers.errors import DeviceFault, DeviceTimeout
+from ftdrivers.interfaces import ArmStates, ControllerSettings
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import FakeArm
 

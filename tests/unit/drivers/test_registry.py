@@ -10,22 +10,22 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.ati.can import AtiCanSensor
-from drivers.ati.netft import NetFtSensor
-from drivers.ati.serial import AtiSerialSensor
-from drivers.bota.sensor import BotaSensor
-from drivers.interfaces import Fact
-from drivers.registry import BadUrl, arm_class, in_url, sensor_from_url, split_url
-from drivers.robotiq.sensor import RobotiqFt300
-from drivers.robotous.can import RobotousCan
-from drivers.robotous.serial import RobotousSerial
-from drivers.streaming.sensor import StreamingSensor
-from drivers.ur.arm import UrArm
-from drivers.ur.sensor import UrWristSensor
 from ftdrive.cell.config import FORMAT, CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.devices import build_arm
 from ftdrive.commands import doctor
 from ftdrive.errors import ConfigError
+from ftdrivers.ati.can import AtiCanSensor
+from ftdrivers.ati.netft import NetFtSensor
+from ftdrivers.ati.serial import AtiSerialSensor
+from ftdrivers.bota.sensor import BotaSensor
+from ftdrivers.interfaces import Fact
+from ftdrivers.registry import BadUrl, arm_class, in_url, sensor_from_url, split_url
+from ftdrivers.robotiq.sensor import RobotiqFt300
+from ftdrivers.robotous.can import RobotousCan
+from ftdrivers.robotous.serial import RobotousSerial
+from ftdrivers.streaming.sensor import StreamingSensor
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.sensor import UrWristSensor
 
 
 @given(st.text(min_size=1))
@@ -129,9 +129,9 @@ def test_mistakes_are_named(url: str, message: str) -> None:
 ACME = """
 import time
 import numpy as np
-from drivers.interfaces import ArmStatus, DeviceInfo, Finding, FtSamples
-from drivers.streaming import StreamingSensor
-from drivers.ur.arm import UrArm
+from ftdrivers.interfaces import ArmStatus, DeviceInfo, Finding, FtSamples
+from ftdrivers.streaming import StreamingSensor
+from ftdrivers.ur.arm import UrArm
 
 class Sensor(StreamingSensor):
     @classmethod

@@ -12,14 +12,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.assessment.observability import second_minimum
-from calib.likelihood.rotation_minima import Minimum
-from calib.model import Parameters
-from calib.routine import Sampling
-from drivers.clock import Clock
-from drivers.errors import DeviceFault, DriverError
-from drivers.follow import Follow
-from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
+from ftcalib.assessment.observability import second_minimum
+from ftcalib.likelihood.rotation_minima import Minimum
+from ftcalib.model import Parameters
+from ftcalib.routine import Sampling
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
 from ftdrive.planning.cell_plan import certifier_for, plan_for
@@ -40,6 +36,10 @@ from ftdrive.session.events import (
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.session import Options
 from ftdrive.session.watchdog import Watcher
+from ftdrivers.clock import Clock
+from ftdrivers.errors import DeviceFault, DriverError
+from ftdrivers.follow import Follow
+from ftdrivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
 from tests.fake_clock import FakeClock
 
 Array = NDArray[np.float64]
@@ -383,7 +383,7 @@ class Lab:
         monkeypatch.setattr(session, "build_arm", lambda _: self.arm)
         monkeypatch.setattr(session, "build_sensor", lambda _: self.sensor)
         monkeypatch.setattr(task, "plan_for", planned_once)
-        monkeypatch.setattr("calib.poses.information.second_minimum", second_minimum_once)
+        monkeypatch.setattr("ftcalib.poses.information.second_minimum", second_minimum_once)
         monkeypatch.setattr(session, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
         monkeypatch.setattr("os.fsync", lambda _: None)  # the disk may be slow

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.model import predict
-from calib.published.yu import SPECIAL_R_flange_base
-from drivers.interfaces import DeviceInfo, Fact
+from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.model import predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftdrive.live.samples import Block, Stages, StreamInfo, WrenchFrame
 from ftdrive.runs.verification import VerificationRecord
+from ftdrivers.interfaces import DeviceInfo, Fact
 
 TRUTH = Parameters(
     Rotation.from_rotvec([0.02, -0.01, 0.5]).as_matrix(),

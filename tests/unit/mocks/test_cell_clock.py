@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from ftdrive.cell.emulated_clock import EmulatedClock
-from mocks.clock import (
+from ftmocks.clock import (
     DEBT_NS,
     LEAD_NS,
     LOOK_S,

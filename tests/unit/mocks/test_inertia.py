@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mocks.inertia import drawn_gyration, inertia_tensor
-from mocks.kinematics import MODELS, JointState, Vector6, flange_motion, forward, jacobian, rotation, vector6
-from mocks.world import AHEAD_S, Truth, World
+from ftmocks.inertia import drawn_gyration, inertia_tensor
+from ftmocks.kinematics import MODELS, JointState, Vector6, flange_motion, forward, jacobian, rotation, vector6
+from ftmocks.world import AHEAD_S, Truth, World
 
 Array = NDArray[np.float64]
 

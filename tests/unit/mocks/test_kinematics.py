@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mocks.arrays import Array
-from mocks.kinematics import (
+from ftmocks.arrays import Array
+from ftmocks.kinematics import (
     MODELS,
     closed_form,
     forward,

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mocks.clock import LEAD_NS, CellClock
-from mocks.sensors.ati_can import AtiCanNode
-from mocks.sensors.ati_serial import AtiSerialBox
-from mocks.sensors.bota import BANNER, BotaBox
-from mocks.sensors.netft import RECORD, Command, NetFtBox
-from mocks.sensors.robotiq import FRAME_GAP_S, RobotiqBox
-from mocks.sensors.robotous import RobotousCanNode, RobotousSerialBox
-from mocks.wires.device import Pacer
-from mocks.wires.faults import Faults
-from mocks.wires.pty import PtyDevice
-from mocks.wires.slcan import CanFrame
+from ftmocks.clock import LEAD_NS, CellClock
+from ftmocks.sensors.ati_can import AtiCanNode
+from ftmocks.sensors.ati_serial import AtiSerialBox
+from ftmocks.sensors.bota import BANNER, BotaBox
+from ftmocks.sensors.netft import RECORD, Command, NetFtBox
+from ftmocks.sensors.robotiq import FRAME_GAP_S, RobotiqBox
+from ftmocks.sensors.robotous import RobotousCanNode, RobotousSerialBox
+from ftmocks.wires.device import Pacer
+from ftmocks.wires.faults import Faults
+from ftmocks.wires.pty import PtyDevice
+from ftmocks.wires.slcan import CanFrame
 from tests.unit.mocks.real_time import RealTime
 
 STEP_S = 0.001

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mocks.clock import CellClock
-from mocks.disturbances import Push
-from mocks.kinematics import MODELS, forward
-from mocks.recording import COLUMNS, RecordedArm, RecordedWorld, Recording
-from mocks.ur.robot import Robot, RobotSettings
-from mocks.ur.script import Upload
-from mocks.world import Truth
+from ftmocks.clock import CellClock
+from ftmocks.disturbances import Push
+from ftmocks.kinematics import MODELS, forward
+from ftmocks.recording import COLUMNS, RecordedArm, RecordedWorld, Recording
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.ur.script import Upload
+from ftmocks.world import Truth
 from tests.unit.mocks.real_time import RealTime
 
 DH = MODELS["UR5e"]

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mocks.clock import CellClock
-from mocks.disturbances import Cable, Drift, Push
-from mocks.kinematics import MODELS, Vector6, forward, inverse, matrix_of, vector6
-from mocks.world import Truth, World
+from ftmocks.clock import CellClock
+from ftmocks.disturbances import Cable, Drift, Push
+from ftmocks.kinematics import MODELS, Vector6, forward, inverse, matrix_of, vector6
+from ftmocks.world import Truth, World
 from tests.unit.mocks.real_time import RealTime
 
 DH = MODELS["UR5e"]

@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib.assessment.contradictions import contradictions
-from calib.known import Known
-from calib.model import STANDARD_GRAVITY_M_S2, Parameters
+from ftcalib.assessment.contradictions import contradictions
+from ftcalib.known import Known
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Parameters
 
 FOUND = Parameters(
     R_flange_sensor=np.eye(3),

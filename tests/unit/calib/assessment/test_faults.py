@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
-from calib.known import Known
-from calib.model import Array, predict
+from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, read_csv, solve
+from ftcalib.known import Known
+from ftcalib.model import Array, predict
 
 SIGMA = np.repeat([0.05, 0.00125], 3)
 SWAP = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])

@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, solve
-from calib.assessment.load_shift import lasting_change
-from calib.likelihood.gain_and_cross_talk import SIZE, response_columns
-from calib.model import Parameters, predict
-from calib.published.yu import SPECIAL_R_flange_base
+from ftcalib import CalibrationDataset, CalibrationResult, solve
+from ftcalib.assessment.load_shift import lasting_change
+from ftcalib.likelihood.gain_and_cross_talk import SIZE, response_columns
+from ftcalib.model import Parameters, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
 
 Array = NDArray[np.float64]
 

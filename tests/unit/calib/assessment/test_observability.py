@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from syrupy.assertion import SnapshotAssertion
 
-from calib import NotObservable, Parameters
-from calib.assessment.observability import (
+from ftcalib import NotObservable, Parameters
+from ftcalib.assessment.observability import (
     AMBIGUOUS_GAP,
     NOMINAL,
     assess,
@@ -18,8 +18,8 @@ from calib.assessment.observability import (
     second_minimum,
     wrong_basin_probability,
 )
-from calib.model import Array, predict
-from calib.published.yu import SPECIAL_R_flange_base
+from ftcalib.model import Array, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
 T12 = R24[np.array([1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22]) - 1]

@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from calib import CalibrationDataset, Parameters, solve
-from calib.assessment.cross_validation import IndependentFit, standardized
-from calib.assessment.faults import faults
-from calib.assessment.verdict import (
+from ftcalib import CalibrationDataset, Parameters, solve
+from ftcalib.assessment.cross_validation import IndependentFit, standardized
+from ftcalib.assessment.faults import faults
+from ftcalib.assessment.verdict import (
     Quality,
     _drift_reasons,
     expected_error,
@@ -20,11 +20,11 @@ from calib.assessment.verdict import (
     strong_correlations,
     successive_correlation,
 )
-from calib.data.dataset import read_csv
-from calib.likelihood.fit import DriftEstimate
-from calib.likelihood.gain_and_cross_talk import predicted_covariance
-from calib.model import Array, jacobian, predict
-from calib.published.yu import SPECIAL_R_flange_base
+from ftcalib.data.dataset import read_csv
+from ftcalib.likelihood.fit import DriftEstimate
+from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
+from ftcalib.model import Array, jacobian, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
 SIGMA = np.repeat([0.05, 0.05 * 0.025], 3)

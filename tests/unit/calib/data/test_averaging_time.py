@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from calib import BadDataset
-from calib.data.averaging_time import AveragingTime, allan_deviation, averaging_time
-from calib.model import Array
+from ftcalib import BadDataset
+from ftcalib.data.averaging_time import AveragingTime, allan_deviation, averaging_time
+from ftcalib.model import Array
 
 RATE_HZ = 200.0
 SIGMA = np.repeat([0.3, 0.01], 3)

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from syrupy.assertion import SnapshotAssertion
 
-from calib import BadDataset, CalibrationDataset, read_csv
-from calib.files import write_new
+from ftcalib import BadDataset, CalibrationDataset, read_csv
+from ftcalib.files import write_new
 
 RNG = np.random.default_rng(3)
 R = Rotation.random(4, rng=RNG).as_matrix()

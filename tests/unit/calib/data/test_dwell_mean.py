@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from calib import BadDataset, is_stationary, mean_and_covariance
-from calib.data.dwell_mean import is_quiet, noise_level, restless_channels
-from calib.model import Array
+from ftcalib import BadDataset, is_stationary, mean_and_covariance
+from ftcalib.data.dwell_mean import is_quiet, noise_level, restless_channels
+from ftcalib.model import Array
 
 
 def noise(rng: np.random.Generator, N: int, rho: Array) -> Array:

@@ -6,12 +6,12 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, Parameters, solve
-from calib.extras.bias_change import BiasChange, bias_change
-from calib.extras.expected_readings import Expected
-from calib.extras.update import Update
-from calib.extras.verification import verify
-from calib.model import Array, predict
+from ftcalib import CalibrationDataset, Parameters, solve
+from ftcalib.extras.bias_change import BiasChange, bias_change
+from ftcalib.extras.expected_readings import Expected
+from ftcalib.extras.update import Update
+from ftcalib.extras.verification import verify
+from ftcalib.model import Array, predict
 
 SIGMA = np.repeat([0.05, 0.002], 3) / np.sqrt(200)
 TRUTH = Parameters(

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from calib.extras.difference import difference
-from calib.model import Array, Parameters, rotation_of
+from ftcalib.extras.difference import difference
+from ftcalib.model import Array, Parameters, rotation_of
 
 TRUTH = Parameters(
     Rotation.from_euler("zx", [20, 3], degrees=True).as_matrix(),

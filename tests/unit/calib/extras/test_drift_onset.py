@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from calib.extras.drift_onset import FEWEST, LEAST_DAYS, DriftOnset, drift_onset
-from calib.model import Array
+from ftcalib.extras.drift_onset import FEWEST, LEAST_DAYS, DriftOnset, drift_onset
+from ftcalib.model import Array
 
 COMMON = np.full(6, 0.5)
 """Sigma of the calibration, in sigmas of a verification."""

@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import Parameters
-from calib.extras.inertia import Motion, inertial_wrench, motion_of_poses
-from calib.model import Array, predict
+from ftcalib import Parameters
+from ftcalib.extras.inertia import Motion, inertial_wrench, motion_of_poses
+from ftcalib.model import Array, predict
 
 G = 9.80665
 MASS_KG = 1.6

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from calib.extras.trend import trend
-from calib.model import Array
+from ftcalib.extras.trend import trend
+from ftcalib.model import Array
 
 A = np.array([[1.0, 0.3, 0.0], [0.3, 2.0, -0.4], [0.0, -0.4, 0.5]])
 

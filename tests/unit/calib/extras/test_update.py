@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, solve
-from calib.extras.tare import tare
-from calib.extras.update import BLOCKS, Update, reestimate, update_payload, updated
-from calib.likelihood.gain_and_cross_talk import Response, response_columns
-from calib.model import Array, jacobian, predict
+from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, solve
+from ftcalib.extras.tare import tare
+from ftcalib.extras.update import BLOCKS, Update, reestimate, update_payload, updated
+from ftcalib.likelihood.gain_and_cross_talk import Response, response_columns
+from ftcalib.model import Array, jacobian, predict
 
 NOISE = np.diag(np.repeat([0.05**2, (0.025 * 0.05) ** 2], 3))
 

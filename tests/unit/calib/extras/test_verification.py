@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import BadDataset, CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.extras.expected_readings import expected_with_inexact_orientations
-from calib.extras.update import updated
-from calib.extras.verification import Verification, verify
-from calib.likelihood.gain_and_cross_talk import response_columns
-from calib.model import Array, predict
-from calib.poses.information import SUBSET_6, special
-from calib.result import DriftResult
+from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.extras.expected_readings import expected_with_inexact_orientations
+from ftcalib.extras.update import updated
+from ftcalib.extras.verification import Verification, verify
+from ftcalib.likelihood.gain_and_cross_talk import response_columns
+from ftcalib.model import Array, predict
+from ftcalib.poses.information import SUBSET_6, special
+from ftcalib.result import DriftResult
 
 SIGMA = np.repeat([0.05, 0.002], 3) / np.sqrt(200)
 TRUTH = Parameters(

@@ -5,22 +5,22 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from calib import Parameters
-from calib.data.pooling import pooled_covariance
-from calib.known import Constraints, Known
-from calib.likelihood.descent import Descent
-from calib.likelihood.fit import Fit, fit
-from calib.likelihood.session import Drift
-from calib.likelihood.session_noise import CHUNK, Noise, inverse_blocks, summed_products
-from calib.likelihood.sufficient_statistics import (
+from ftcalib import Parameters
+from ftcalib.data.pooling import pooled_covariance
+from ftcalib.known import Constraints, Known
+from ftcalib.likelihood.descent import Descent
+from ftcalib.likelihood.fit import Fit, fit
+from ftcalib.likelihood.session import Drift
+from ftcalib.likelihood.session_noise import CHUNK, Noise, inverse_blocks, summed_products
+from ftcalib.likelihood.sufficient_statistics import (
     Statistics,
     coefficients,
     coefficients_derivative,
     features,
     wrench_gram,
 )
-from calib.likelihood.variance_components import squared_length
-from calib.model import Array, jacobian, predict
+from ftcalib.likelihood.variance_components import squared_length
+from ftcalib.model import Array, jacobian, predict
 
 WEIGHT_N = 20.0
 SIGMA = np.repeat([0.2, 0.2 * 0.025], 3)  # a hundredth of the weight

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.known import Constraints, Known
-from calib.likelihood.component_selection import with_walks_instead
-from calib.likelihood.fit import Fit, fit
-from calib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, LEVER_M, Response, response_columns
-from calib.likelihood.session import Session
-from calib.likelihood.variance_components import FORCE, RESPONSE, component, maximise
-from calib.model import Array, gravity_wrench, predict
+from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.known import Constraints, Known
+from ftcalib.likelihood.component_selection import with_walks_instead
+from ftcalib.likelihood.fit import Fit, fit
+from ftcalib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, LEVER_M, Response, response_columns
+from ftcalib.likelihood.session import Session
+from ftcalib.likelihood.variance_components import FORCE, RESPONSE, component, maximise
+from ftcalib.model import Array, gravity_wrench, predict
 
 SIGMA = np.repeat([0.05, 0.00125], 3)
 WHITE = np.diag(SIGMA**2)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from calib.likelihood import rotation_minima
+from ftcalib.likelihood import rotation_minima
 
 Array = NDArray[np.float64]
 

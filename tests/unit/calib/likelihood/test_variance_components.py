@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.likelihood.component_selection import _pruned, select, with_slopes_instead
-from calib.likelihood.session_noise import Noise, centred, walk_times
-from calib.likelihood.variance_components import (
+from ftcalib.likelihood.component_selection import _pruned, select, with_slopes_instead
+from ftcalib.likelihood.session_noise import Noise, centred, walk_times
+from ftcalib.likelihood.variance_components import (
     FORCE,
     ROTATION,
     TORQUE,
@@ -21,7 +21,7 @@ from calib.likelihood.variance_components import (
     point,
     score,
 )
-from calib.model import Array
+from ftcalib.model import Array
 
 N = 15
 

@@ -9,10 +9,10 @@ from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, solve
-from calib.errors import NotObservable
-from calib.model import Array, angle_between, jacobian, predict
-from calib.poses.information import (
+from ftcalib import CalibrationDataset, solve
+from ftcalib.errors import NotObservable
+from ftcalib.model import Array, angle_between, jacobian, predict
+from ftcalib.poses.information import (
     SUBSET_6,
     T12,
     Guess,
@@ -23,7 +23,7 @@ from calib.poses.information import (
     special,
     whitened_jacobian,
 )
-from calib.poses.selection import Criterion, choose, cone_candidates, next_pose, order
+from ftcalib.poses.selection import Criterion, choose, cone_candidates, next_pose, order
 from tests.pose_sets import AMBIGUOUS_6, SUBSET_8, SUBSET_12, efficiency, optimised
 
 ALL = special(range(1, 25))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.model import Array
-from calib.poses.information import special, whitened_jacobian
-from calib.poses.verification import TOOL, USUAL_CHANGE, choose_verification_poses
+from ftcalib.model import Array
+from ftcalib.poses.information import special, whitened_jacobian
+from ftcalib.poses.verification import TOOL, USUAL_CHANGE, choose_verification_poses
 
 DOWN = np.array([0.0, 0.0, -1.0])
 FITTED = special(range(1, 25))

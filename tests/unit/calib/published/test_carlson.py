@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib.errors import BadDataset, NotObservable
-from calib.model import Array, nearest_rotation
-from calib.published.carlson import ForceFit, eigen, iterative, nullspace, polynomial
-from calib.published.carlson_known import cayley, cayley_rotation, relaxation
+from ftcalib.errors import BadDataset, NotObservable
+from ftcalib.model import Array, nearest_rotation
+from ftcalib.published.carlson import ForceFit, eigen, iterative, nullspace, polynomial
+from ftcalib.published.carlson_known import cayley, cayley_rotation, relaxation
 from tests.carlson_references import nullspace_all_pairs, similarity
 
 Method = Callable[[Array, Array, Array, bool], ForceFit]

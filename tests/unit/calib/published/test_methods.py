@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import NotObservable, Parameters
-from calib.model import UP_IN_BASE, predict
-from calib.published.methods import PUBLISHED, published
-from calib.published.yu import SPECIAL_R_flange_base
+from ftcalib import NotObservable, Parameters
+from ftcalib.model import UP_IN_BASE, predict
+from ftcalib.published.methods import PUBLISHED, published
+from ftcalib.published.yu import SPECIAL_R_flange_base
 
 TRUTH = Parameters(
     Rotation.from_euler("zyx", [70, 15, 13], degrees=True).as_matrix(),

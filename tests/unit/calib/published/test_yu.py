@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import NotObservable, Parameters
-from calib.model import Array, predict
-from calib.published.yu import SPECIAL_R_flange_base, lrom, special_numbers, srom, srom_gravity_force, weight_and_tilt
+from ftcalib import NotObservable, Parameters
+from ftcalib.model import Array, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base, lrom, special_numbers, srom, srom_gravity_force, weight_and_tilt
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
 TRUTH = Parameters(

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from drivers.ati.calibration import NEWTON, NEWTON_METRE, Calibration, refuse_saturated
-from drivers.errors import DeviceFault, ProtocolError
+from ftdrivers.ati.calibration import NEWTON, NEWTON_METRE, Calibration, refuse_saturated
+from ftdrivers.errors import DeviceFault, ProtocolError
 
 MATRIX = np.array(
     [

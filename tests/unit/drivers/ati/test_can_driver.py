@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.ati.can import AtiCanSensor
-from drivers.clock import Clock
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
-from drivers.interfaces import Fact
+from ftdrivers.ati.can import AtiCanSensor
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.interfaces import Fact
 from tests.unit.drivers.dialogue import CanWire, Table
 from tests.unit.drivers.in_one_thread import InOneThread
 

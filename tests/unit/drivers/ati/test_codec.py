@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.ati import codec
-from drivers.errors import ProtocolError
-from drivers.wires.status_word import describe_status
+from ftdrivers.ati import codec
+from ftdrivers.errors import ProtocolError
+from ftdrivers.wires.status_word import describe_status
 
 i16 = st.integers(-32768, 32767)
 

@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.ati import modbus
-from drivers.errors import ProtocolError
-from drivers.wires.crc import crc16_modbus
-from drivers.wires.status_word import describe_status
+from ftdrivers.ati import modbus
+from ftdrivers.errors import ProtocolError
+from ftdrivers.wires.crc import crc16_modbus
+from ftdrivers.wires.status_word import describe_status
 
 V1 = bytes.fromhex("00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50")
 V2 = bytes.fromhex("00 DD 00 45 09 26 FC 62 FB C2 04 F2 62")

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 import pytest
 
-from drivers.ati.netft import (
+from ftdrivers.ati.netft import (
     AXIA_BITS,
     NET_FT_BITS,
     ONROBOT_BITS,
@@ -22,10 +22,10 @@ from drivers.ati.netft import (
     range_in,
     text_in,
 )
-from drivers.errors import ConnectError, DeviceFault, StreamBroken
-from drivers.interfaces import Fact, Health
-from drivers.registry import BadUrl, sensor_from_url
-from drivers.wires.status_word import describe_status
+from ftdrivers.errors import ConnectError, DeviceFault, StreamBroken
+from ftdrivers.interfaces import Fact, Health
+from ftdrivers.registry import BadUrl, sensor_from_url
+from ftdrivers.wires.status_word import describe_status
 from tests.cell_time import CellTime
 
 START, STOP = bytes.fromhex("1234 0002 0000 0000"), bytes.fromhex("1234 0000 0000 0000")
@@ -225,7 +225,7 @@ def test_nobody_there() -> None:
 
 def test_missing_library_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pynetft", None)
-    monkeypatch.delitem(sys.modules, "drivers.ati.netft")
+    monkeypatch.delitem(sys.modules, "ftdrivers.ati.netft")
     with pytest.raises(BadUrl, match=r"pip install 'ftdrive\[netft\]'"):
         sensor_from_url("ati-netft://192.168.1.1")
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.ati.serial import AtiSerialSensor
-from drivers.clock import Clock
-from drivers.errors import ConnectError, DeviceFault, DriverError, ProtocolError, StreamBroken
-from drivers.interfaces import Fact
+from ftdrivers.ati.serial import AtiSerialSensor
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, DeviceFault, DriverError, ProtocolError, StreamBroken
+from ftdrivers.interfaces import Fact
 from tests.unit.drivers.dialogue import Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread
 

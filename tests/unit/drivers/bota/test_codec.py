@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.bota import codec
-from drivers.errors import ProtocolError
-from drivers.wires.crc import crc16_x25
-from drivers.wires.status_word import describe_status
+from ftdrivers.bota import codec
+from ftdrivers.errors import ProtocolError
+from ftdrivers.wires.crc import crc16_x25
+from ftdrivers.wires.status_word import describe_status
 
 FRAME = bytes.fromhex("AA 0000 0000803F 000000C0 C3F51C41 CDCCCC3D CDCC4CBE 9A99993E 40420F00 0000CC41 3D0D")
 f32 = st.floats(width=32)

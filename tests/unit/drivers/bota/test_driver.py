@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.bota.sensor import BotaSensor
-from drivers.clock import Clock
-from drivers.errors import ConnectError, StreamBroken
-from drivers.wires.crc import crc16_x25
+from ftdrivers.bota.sensor import BotaSensor
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, StreamBroken
+from ftdrivers.wires.crc import crc16_x25
 from tests.unit.drivers.dialogue import Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread
 

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.clock import Clock
-from drivers.errors import ConnectError
-from drivers.interfaces import Fact
-from drivers.robotiq.sensor import RobotiqFt300
-from drivers.wires.crc import crc16_modbus
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError
+from ftdrivers.interfaces import Fact
+from ftdrivers.robotiq.sensor import RobotiqFt300
+from ftdrivers.wires.crc import crc16_modbus
 from tests.unit.drivers.dialogue import Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread
 

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolError
-from drivers.robotous import codec
-from drivers.robotous.codec import Command
-from drivers.robotous.serial import RobotousSerial
-from drivers.wires.framing import Deframer
+from ftdrivers.errors import ProtocolError
+from ftdrivers.robotous import codec
+from ftdrivers.robotous.codec import Command
+from ftdrivers.robotous.serial import RobotousSerial
+from ftdrivers.wires.framing import Deframer
 
 SAMPLE = bytes.fromhex("55 0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000 3F AA")
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout
-from drivers.interfaces import Fact
-from drivers.robotous.can import RobotousCan
-from drivers.robotous.sensor import RobotousSensor
-from drivers.robotous.serial import RobotousSerial
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout
+from ftdrivers.interfaces import Fact
+from ftdrivers.robotous.can import RobotousCan
+from ftdrivers.robotous.sensor import RobotousSensor
+from ftdrivers.robotous.serial import RobotousSerial
 from tests.unit.drivers.dialogue import CanWire, SerialWire, Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread
 

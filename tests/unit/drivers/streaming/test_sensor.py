@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.clock import REAL, Clock, Waitable
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, Frozen, ProtocolError, StreamBroken
-from drivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, FtSamples
-from drivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits
+from ftdrivers.clock import REAL, Clock, Waitable
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, Frozen, ProtocolError, StreamBroken
+from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, FtSamples
+from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.in_one_thread import InOneThread
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from drivers.ur.arm import UrArm
-from drivers.ur.control import ControlSetting
-from drivers.ur.timing import STRICT, UrTiming
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control import ControlSetting
+from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import HOST, Controller, MakeArm, install
 from tests.unit.drivers.ur.program_in_memory import Script, install_script

@@ -19,17 +19,17 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from drivers.errors import NoDashboard
-from drivers.ur import arm as arm_module
-from drivers.ur import control_child, opening, reading
-from drivers.ur.arm import UrArm
-from drivers.ur.control_process import ControlProcess
-from drivers.ur.kinematics import MODELS, Pose, forward
-from drivers.ur.reading import Reader
-from drivers.ur.rtde import Recipe
-from drivers.ur.sample import OUTPUTS
-from drivers.ur.services import Services, ServicesOf
-from drivers.ur.timing import STRICT, UrTiming
+from ftdrivers.errors import NoDashboard
+from ftdrivers.ur import arm as arm_module
+from ftdrivers.ur import control_child, opening, reading
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control_process import ControlProcess
+from ftdrivers.ur.kinematics import MODELS, Pose, forward
+from ftdrivers.ur.reading import Reader
+from ftdrivers.ur.rtde import Recipe
+from ftdrivers.ur.sample import OUTPUTS
+from ftdrivers.ur.services import Services, ServicesOf
+from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 
 CYCLE_S = 0.008

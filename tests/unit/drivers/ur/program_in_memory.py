@@ -1,4 +1,4 @@
-"""The control program on a controller in memory: what `drivers/ur/program.script` does, in Python, on a `FakeClock`.
+"""The control program on a controller in memory: what `drivers/ftdrivers/ur/program.script` does, on a `FakeClock`.
 
 The text itself runs on the emulated controller: tests/wire/test_ur_failures.py.
 """
@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.errors import StreamBroken
-from drivers.ur import opening, script_control
-from drivers.ur.control_program import OUTPUTS
-from drivers.ur.primary import Message
-from drivers.ur.script_control import ScriptControl
-from drivers.ur.timing import UrTiming
+from ftdrivers.errors import StreamBroken
+from ftdrivers.ur import opening, script_control
+from ftdrivers.ur.control_program import OUTPUTS
+from ftdrivers.ur.primary import Message
+from ftdrivers.ur.script_control import ScriptControl
+from ftdrivers.ur.timing import UrTiming
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, HOST, Controller
 
 COMMANDS = {1: "move", 2: "stop", 3: "limits", 4: "tcp_offset", 5: "set_payload", 6: "set_gravity", 7: "quit"}

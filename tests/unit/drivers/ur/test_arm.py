@@ -10,13 +10,13 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
-from drivers.interfaces import Guard
-from drivers.ur import arm as arm_module
-from drivers.ur import opening
-from drivers.ur.arm import UrArm
-from drivers.ur.control import Control, ControlSetting
-from drivers.ur.timing import STRICT, UrTiming
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from ftdrivers.interfaces import Guard
+from ftdrivers.ur import arm as arm_module
+from ftdrivers.ur import opening
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control import Control, ControlSetting
+from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import HOST, ControlInMemory, Controller, MakeArm, away, no_guard
 
@@ -111,7 +111,7 @@ def test_a_new_arm_talks_to_nobody_and_closes() -> None:
 
 
 def test_importing_the_driver_does_not_load_ur_rtde() -> None:
-    code = "import sys, drivers.ur.arm; sys.exit(any('rtde_' in n or n == 'dashboard_client' for n in sys.modules))"
+    code = "import sys, ftdrivers.ur.arm; sys.exit(any('rtde_' in n or n == 'dashboard_client' for n in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
-from drivers.interfaces import ArmStates
-from drivers.ur.kinematics import MODELS, forward
-from drivers.ur.reading import Reader
-from drivers.ur.sample import Sample
-from drivers.ur.timing import STRICT
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from ftdrivers.interfaces import ArmStates
+from ftdrivers.ur.kinematics import MODELS, forward
+from ftdrivers.ur.reading import Reader
+from ftdrivers.ur.sample import Sample
+from ftdrivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, ReaderInMemory, pose_from_ur
 

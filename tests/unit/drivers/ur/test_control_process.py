@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 
-from drivers.clock import REAL
-from drivers.errors import StreamBroken
-from drivers.ur import control_child
-from drivers.ur.control_process import ControlProcess
-from drivers.ur.timing import STRICT, UrTiming
+from ftdrivers.clock import REAL
+from ftdrivers.errors import StreamBroken
+from ftdrivers.ur import control_child
+from ftdrivers.ur.control_process import ControlProcess
+from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import Controller
 

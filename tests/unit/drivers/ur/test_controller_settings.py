@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.interfaces import ControllerSettings
-from drivers.ur import controller_settings
-from drivers.ur.arm import UrArm
-from drivers.ur.controller_settings import read_controller_settings
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.interfaces import ControllerSettings
+from ftdrivers.ur import controller_settings
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.controller_settings import read_controller_settings
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import HOST, Controller
 

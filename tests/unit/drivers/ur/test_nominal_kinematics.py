@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from drivers.ur.kinematics import MODELS, Pose, flange_poses, forward, model_named
+from ftdrivers.ur.kinematics import MODELS, Pose, flange_poses, forward, model_named
 from tests.unit.drivers.ur.controller_in_memory import pose_from_ur
 
 # The constant tour: (number of the orientation, psi, q5, q6) in degrees, psi = q2 + q3 + q4.

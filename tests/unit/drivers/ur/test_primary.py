@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.clock import REAL
-from drivers.errors import ConnectError, ProtocolError
-from drivers.ur import primary
-from drivers.ur.primary import Code, Failed, Message, Note, RobotType, Started, Stopped
+from ftdrivers.clock import REAL
+from ftdrivers.errors import ConnectError, ProtocolError
+from ftdrivers.ur import primary
+from ftdrivers.ur.primary import Code, Failed, Message, Note, RobotType, Started, Stopped
 
 
 def package(kind: int, payload: bytes) -> bytes:

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ConnectError, DeviceTimeout, ProtocolError, StreamBroken, Unreachable
-from drivers.ur import rtde
+from ftdrivers.errors import ConnectError, DeviceTimeout, ProtocolError, StreamBroken, Unreachable
+from ftdrivers.ur import rtde
 from tests.fake_clock import FakeClock
 
 # Real bytes of an e-Series controller answering, and of a client asking.

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from drivers.ur import control_program
-from drivers.ur.arm import UrArm
-from drivers.ur.control import ControlSetting
-from drivers.ur.control_child import DECELERATION_RAD_S2
-from drivers.ur.control_program import OUTPUTS, program_text
-from drivers.ur.primary import Code, Failed, Note, Stopped
-from drivers.ur.script_control import STOPS_ITSELF_S
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.ur import control_program
+from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control import ControlSetting
+from ftdrivers.ur.control_child import DECELERATION_RAD_S2
+from ftdrivers.ur.control_program import OUTPUTS, program_text
+from ftdrivers.ur.primary import Code, Failed, Note, Stopped
+from ftdrivers.ur.script_control import STOPS_ITSELF_S
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, MakeArm, away, no_guard
 from tests.unit.drivers.ur.program_in_memory import COMMANDS, Script, ScriptInMemory

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from drivers.clock import REAL
-from drivers.errors import NoDashboard
-from drivers.ur import dashboard
-from drivers.ur.services import Services, ServicesOf
+from ftdrivers.clock import REAL
+from ftdrivers.errors import NoDashboard
+from ftdrivers.ur import dashboard
+from ftdrivers.ur.services import Services, ServicesOf
 
 HOST = "127.0.0.1"
 V5, VX = (5, 15, 0, 1), (10, 14, 0, 1)

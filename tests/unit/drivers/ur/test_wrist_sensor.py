@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.clock import Clock
-from drivers.errors import ConnectError, StreamBroken
-from drivers.interfaces import Fact
-from drivers.registry import BadUrl, sensor_from_url
-from drivers.ur import sensor as sensor_module
-from drivers.ur.sensor import UrWristSensor
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, StreamBroken
+from ftdrivers.interfaces import Fact
+from ftdrivers.registry import BadUrl, sensor_from_url
+from ftdrivers.ur import sensor as sensor_module
+from ftdrivers.ur.sensor import UrWristSensor
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.in_one_thread import InOneThread
 

@@ -6,8 +6,8 @@ from contextlib import suppress
 
 import pytest
 
-from drivers.errors import StreamBroken
-from drivers.wires.can_bus import CanBus
+from ftdrivers.errors import StreamBroken
+from ftdrivers.wires.can_bus import CanBus
 
 ROOM = 65536
 """More than a pseudo-terminal holds."""

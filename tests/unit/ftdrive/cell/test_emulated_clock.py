@@ -1,4 +1,4 @@
-"""The clock of an emulated cell, as the program reads it; the station's side is `mocks.clock`, in this process."""
+"""The clock of an emulated cell, as the program reads it; the station's side is `ftmocks.clock`, in this process."""
 
 import os
 import threading
@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from drivers.errors import ConnectError
 from ftdrive.cell.emulated_clock import EmulatedClock
-from mocks.clock import LEAD_NS, CellClock
+from ftdrivers.errors import ConnectError
+from ftmocks.clock import LEAD_NS, CellClock
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.model import predict
-from calib.poses.information import special
+from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.model import predict
+from ftcalib.poses.information import special
 from ftdrive.cell.config import SensorConfig, ToolConfig
 from ftdrive.checks.controller_settings import LEAN_DEG, lean_in_words, mismatches, payload_in_words
 from ftdrive.planning.geometry.scene import Scene, lean_of

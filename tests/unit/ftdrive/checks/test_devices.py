@@ -10,8 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult
-from drivers.errors import (
+from ftcalib import CalibrationDataset, CalibrationResult
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
+from ftdrive.checks import devices as diagnosis
+from ftdrive.checks.check import Check
+from ftdrive.checks.computer import SensorAddress
+from ftdrivers.errors import (
     ConnectError,
     DeviceFault,
     DeviceTimeout,
@@ -22,11 +26,7 @@ from drivers.errors import (
     ProtocolError,
     StreamBroken,
 )
-from drivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
-from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
-from ftdrive.checks import devices as diagnosis
-from ftdrive.checks.check import Check
-from ftdrive.checks.computer import SensorAddress
+from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
 from tests.unit.ftdrive.fake_cell import Lab
 
 FACTS = {

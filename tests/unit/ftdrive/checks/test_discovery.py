@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from drivers.clock import REAL
-from drivers.errors import ConnectError
-from drivers.probe.serial_line import Answer
 from ftdrive.checks import computer, discovery
 from ftdrive.checks.discovery import ask, is_place, places, sensor_at
 from ftdrive.errors import ConfigError
+from ftdrivers.clock import REAL
+from ftdrivers.errors import ConnectError
+from ftdrivers.probe.serial_line import Answer
 
 FOUND = Answer("ati-can://can0?bitrate=500000", "ATI")
 REFUSED = Answer(None, "a Robotous was not asked")

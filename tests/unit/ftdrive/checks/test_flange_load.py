@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationResult, Parameters
+from ftcalib import CalibrationResult, Parameters
 from ftdrive.checks.flange_load import RATED_KG, flange_load, margin_in_words
 
 Array = NDArray[np.float64]
@@ -91,6 +91,6 @@ def test_the_margin_names_rated_payload_and_model() -> None:
 
 
 def test_every_model_that_can_be_driven_has_a_rated_payload() -> None:
-    from drivers.ur.kinematics import MODELS
+    from ftdrivers.ur.kinematics import MODELS
 
     assert set(RATED_KG) == set(MODELS)

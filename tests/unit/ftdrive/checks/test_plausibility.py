@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.model import predict
-from calib.poses.information import special
+from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.model import predict
+from ftcalib.poses.information import special
 from ftdrive.cell.config import SensorConfig
 from ftdrive.checks.plausibility import com_in_words, judged
 from ftdrive.runs.outcome import solve_records

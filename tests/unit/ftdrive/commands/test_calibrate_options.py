@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from calib.errors import BadDataset, CalibError
+from ftcalib.errors import BadDataset, CalibError
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.emulated import Station
 from ftdrive.cli import cli, exit_code

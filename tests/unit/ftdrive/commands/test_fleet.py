@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.cells import cell_len
 
-from calib import CalibrationResult
+from ftcalib import CalibrationResult
 from ftdrive import cli
 from ftdrive.runs.run import RUN_FORMAT
 from tests.unit.ftdrive.fleet.fleet_records import SIGMA

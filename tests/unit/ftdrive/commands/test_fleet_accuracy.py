@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from calib import CalibrationResult
+from ftcalib import CalibrationResult
 from ftdrive import __version__
 from ftdrive.store.store import Store
 from tests.calibrated_runs import calibrated_run, white_run

@@ -24,7 +24,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     """Run the command in an empty folder on a fake clock; return its exit code and what it prints for people."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.setattr("drivers.clock.REAL", FakeClock())
+    monkeypatch.setattr("ftdrivers.clock.REAL", FakeClock())
 
     def call(*arguments: str | Path) -> Ran:
         code = cli.run(["fleet", "serve", *map(str, arguments)])

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import ConnectError
 from ftdrive import cli
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import Declined
@@ -19,6 +18,7 @@ from ftdrive.runs.verified import AcceptanceLimits
 from ftdrive.session.operator import Question
 from ftdrive.store.records import StoredCell
 from ftdrive.store.store import Store
+from ftdrivers.errors import ConnectError
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result
 
 Ran = tuple[int, list[str], str]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib import CalibrationResult
+from ftcalib import CalibrationResult
 from ftdrive import cli
 from ftdrive.commands.common import index_run
 from ftdrive.runs.run import Run

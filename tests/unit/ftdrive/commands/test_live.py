@@ -12,14 +12,14 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from calib import CalibrationDataset, CalibrationResult, Known, Parameters, solve
-from calib.model import predict
-from calib.published.yu import SPECIAL_R_flange_base
-from drivers.errors import DeviceTimeout
+from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, solve
+from ftcalib.model import predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftdrive.commands import live
 from ftdrive.live.processing import Processor
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block, Stages, WrenchFrame
+from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.live.simulated import NOISE, calibrated, dwells, info, paired
 

@@ -13,11 +13,11 @@ import click
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceTimeout
 from ftdrive import cli
 from ftdrive.commands.record import Duration
 from ftdrive.live.samples import Block, StreamEvent
 from ftdrive.recording import Recorder, read_recording
+from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.recorded import UTC_OFFSET_NS, block, calibration, info
 
 END = KeyboardInterrupt()
@@ -272,7 +272,7 @@ def test_compensate_imports_no_driver_of_a_device(recorded: Path) -> None:
     code = (
         "import sys; from ftdrive.cli import run\n"
         f"assert run(['compensate', {str(recorded)!r}, '--json']) == 0\n"
-        "hardware = {'can', 'serial', 'rtde_receive', 'rtde_control', 'pynetft', 'drivers.ati', 'drivers.ur.arm'}\n"
+        "hardware = {'can', 'serial', 'rtde_receive', 'rtde_control', 'pynetft', 'ftdrivers.ati', 'ftdrivers.ur.arm'}\n"
         "assert not hardware & sys.modules.keys(), hardware & sys.modules.keys()\n"
     )
     outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

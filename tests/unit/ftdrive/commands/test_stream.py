@@ -8,11 +8,11 @@ from typing import Any, Self, cast
 import pytest
 from click.testing import CliRunner
 
-from drivers.errors import DeviceTimeout
 from ftdrive.cli import exit_code
 from ftdrive.commands import live_source, stream
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, StreamEvent, WrenchFrame
+from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.servers.fake_stream import FakeStream, block
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from calib.extras.bias_change import BiasChange
-from calib.extras.update import reestimate
-from calib.extras.verification import Verification
+from ftcalib.extras.bias_change import BiasChange
+from ftcalib.extras.update import reestimate
+from ftcalib.extras.verification import Verification
 from ftdrive.commands import verify as command
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run

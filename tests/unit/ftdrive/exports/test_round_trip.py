@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationResult, Parameters
-from calib.likelihood.gain_and_cross_talk import SIZE, Response
-from calib.model import Array
+from ftcalib import CalibrationResult, Parameters
+from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response
+from ftcalib.model import Array
 from ftdrive.errors import NotAccepted
 from ftdrive.exports.calibration.formats import FORMATS, Property
 from ftdrive.exports.calibration.registry import Export, export

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from calib.model import Array
+from ftcalib.model import Array
 from ftdrive.fleet.observed import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib import CalibrationResult, Parameters
+from ftcalib import CalibrationResult, Parameters
 from ftdrive.fleet.accuracy import BLOCK, Accuracy, accuracy_of, compared
 from ftdrive.fleet.draws import ACCEPTED, DRAW, NOT_OBSERVABLE, REJECTED, stated_sigma
 from ftdrive.fleet.workers import Answer, OtherVersion, Workers

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib import CalibrationDataset, CalibrationResult
-from calib.errors import BadCalibration
-from calib.likelihood.gain_and_cross_talk import response_columns
-from calib.likelihood.session_noise import Noise
-from calib.model import jacobian, predict
+from ftcalib import CalibrationDataset, CalibrationResult
+from ftcalib.errors import BadCalibration
+from ftcalib.likelihood.gain_and_cross_talk import response_columns
+from ftcalib.likelihood.session_noise import Noise
+from ftcalib.model import jacobian, predict
 from ftdrive.fleet.draws import ACCEPTED, DRAW, NOT_OBSERVABLE, REJECTED, drawn, solved_draws
 from ftdrive.fleet.resolve import solved, task_of
 from tests.calibrated_runs import calibrated_run, dataset, rewrite_dataset, white_run

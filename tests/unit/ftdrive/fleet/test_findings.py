@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.model import Array
+from ftcalib.model import Array
 from ftdrive.fleet.state import Finding
 from ftdrive.store.records import StoredResult
 from tests.unit.ftdrive.fleet.fleet_records import cell, check, daily, fleet, result

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib import CalibrationResult
+from ftcalib import CalibrationResult
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.resolve import (
     Comparison,

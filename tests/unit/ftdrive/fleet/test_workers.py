@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from calib.errors import BadDataset
+from ftcalib.errors import BadDataset
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.workers import SAME, Answer, WorkerDied, Workers, _require_same_versions, answers, cluster_workers
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.model import Array, predict
-from drivers.interfaces import ArmStates, DeviceInfo, FtSamples
+from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.model import Array, predict
 from ftdrive.live.samples import Paired, StreamInfo
+from ftdrivers.interfaces import ArmStates, DeviceInfo, FtSamples
 
 G = 9.80665
 NOISE = np.repeat([0.05, 0.002], 3)

@@ -6,11 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from calib.errors import BadDataset
-from calib.model import angle_between
-from drivers.interfaces import ArmStates, FtSamples
+from ftcalib.errors import BadDataset
+from ftcalib.model import angle_between
 from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.pairing import RATE_TOLERANCE, Pairing, PoseTrack, Timeline, pair_recording
+from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, T0_NS, Motion, calibrated
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from calib.model import Array, predict
+from ftcalib.model import Array, predict
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.processing import Processor, stages_in_words

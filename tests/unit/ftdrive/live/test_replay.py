@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.errors import BadDataset
+from ftcalib.errors import BadDataset
 from ftdrive.live.processing import Processor
 from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Stages, WrenchFrame

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib import CalibrationResult
-from drivers.errors import DeviceTimeout, DriverError
-from drivers.follow import Follow
-from drivers.interfaces import ArmStates, DeviceInfo, FtSamples, Health
+from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.errors import ConfigError
 from ftdrive.live import stream as module
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.live.stream import CompensatedStream, load_calibration, open_stream
+from ftdrivers.errors import DeviceTimeout, DriverError
+from ftdrivers.follow import Follow
+from ftdrivers.interfaces import ArmStates, DeviceInfo, FtSamples, Health
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import STATUS
 from tests.unit.ftdrive.live.simulated import DEVICE, NOISE, Motion, calibrated

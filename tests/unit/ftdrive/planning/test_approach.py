@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from drivers.ur.kinematics import Array
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.cell.rules import Rows
 from ftdrive.errors import ConfigError, PlanRefused
@@ -14,6 +13,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
+from ftdrivers.ur.kinematics import Array
 
 TOOL = (Cylinder(0, 0.2, 0.1),)
 CROWDED = Scene(

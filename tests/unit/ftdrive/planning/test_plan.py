@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.poses.information import special
-from drivers.ur.kinematics import Array
+from ftcalib.poses.information import special
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier, Margins
@@ -18,6 +17,7 @@ from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import NUMBERS, USUAL_POSTURE_RAD, guess_of, plan_tour
 from ftdrive.planning.search.tours import shortest_tour
+from ftdrivers.ur.kinematics import Array
 
 MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")
 TOOLS = (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from calib.poses.information import special
+from ftcalib.poses.information import special
 from ftdrive.errors import ConfigError
 from ftdrive.planning.approach import plan_approach
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder

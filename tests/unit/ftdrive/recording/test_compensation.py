@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import Parameters
-from calib.errors import BadDataset
-from calib.model import predict
-from drivers.interfaces import Array
+from ftcalib import Parameters
+from ftcalib.errors import BadDataset
+from ftcalib.model import predict
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
 from ftdrive.recording import Header, Recording, read_recording
 from ftdrive.recording.compensation import compensated, with_estimated_bias
 from ftdrive.recording.csv_pair import read_pair
 from ftdrive.recording.recording import rows_of
+from ftdrivers.interfaces import Array
 from tests.unit.ftdrive.recorded import NOISE, TRUTH, calibration, info
 
 RATE_HZ = 500.0

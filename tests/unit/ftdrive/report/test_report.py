@@ -16,11 +16,10 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, CalibrationResult, Parameters, solve
-from calib.errors import BadCalibration, BadDataset
-from calib.model import predict
-from calib.routine import PoseRecord, TourPose
-from drivers.interfaces import FtSamples
+from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.errors import BadCalibration, BadDataset
+from ftcalib.model import predict
+from ftcalib.routine import PoseRecord, TourPose
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError
 from ftdrive.report.comparison import compared
@@ -32,6 +31,7 @@ from ftdrive.report.sections import sections_of
 from ftdrive.report.subject import SolveOptions, Subject, read_subject
 from ftdrive.report.words import shown_poses
 from ftdrive.runs.run import Reading, Run
+from ftdrivers.interfaces import FtSamples
 
 TRUTH = Parameters(
     Rotation.from_rotvec([0.02, -0.01, 0.5]).as_matrix(),

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 
-from calib import CalibrationResult
+from ftcalib import CalibrationResult
 from ftdrive.cli import cli
 from ftdrive.report.origin_sections import provenance
 from ftdrive.report.page import page

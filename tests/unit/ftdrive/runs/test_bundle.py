@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from calib import CalibrationResult, Parameters
-from calib.errors import BadDataset
-from calib.model import predict
-from calib.poses.information import special
-from calib.routine import PoseRecord, TourPose
-from drivers.interfaces import FtSamples
+from ftcalib import CalibrationResult, Parameters
+from ftcalib.errors import BadDataset
+from ftcalib.model import predict
+from ftcalib.poses.information import special
+from ftcalib.routine import PoseRecord, TourPose
 from ftdrive.cli import cli
 from ftdrive.cli import run as run_command
 from ftdrive.errors import BadBundle
@@ -25,6 +24,7 @@ from ftdrive.runs import bundle
 from ftdrive.runs.bundle import unpacked, write_bundle
 from ftdrive.runs.outcome import solve_and_save
 from ftdrive.runs.run import Reading, Run
+from ftdrivers.interfaces import FtSamples
 
 TRUTH = Parameters(np.eye(3), np.array([0.0, 0, -12]), np.ones(3), np.array([0.0, 0, 0.06]), np.ones(3))
 SERIAL_PORT = "/dev/serial/by-id/usb-FTDI_USB-RS485_FT6ABC12-if00-port0"

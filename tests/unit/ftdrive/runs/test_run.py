@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.errors import BadDataset
-from calib.routine import PoseRecord, TourPose
-from drivers.interfaces import FtSamples
+from ftcalib.errors import BadDataset
+from ftcalib.routine import PoseRecord, TourPose
 from ftdrive.runs.run import Reading, Run
+from ftdrivers.interfaces import FtSamples
 
 CONFIG = {"robot": {"host": "10.0.0.2"}, "sensor": {"url": "ati-can://can0"}, "tool": {"mass_kg": None, "later": 1}}
 

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib import CalibrationDataset, CalibrationResult
-from calib.errors import BadCalibration
+from ftcalib import CalibrationDataset, CalibrationResult
+from ftcalib.errors import BadCalibration
 from ftdrive.runs.verification import (
     FORMAT,
     VerificationRecord,

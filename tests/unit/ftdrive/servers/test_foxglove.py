@@ -15,12 +15,12 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from drivers.interfaces import Array
 from ftdrive.errors import ConfigError
 from ftdrive.live import ros2
 from ftdrive.live.samples import Stages, StreamEvent, WrenchFrame
 from ftdrive.servers import foxglove
 from ftdrive.servers.foxglove import ARROWS, EVENTS, STATUS, TRANSFORMS, FoxgloveServer
+from ftdrivers.interfaces import Array
 from tests.unit.ftdrive.servers.fake_stream import INFO, UTC_OFFSET_NS, Client, FakeStream, block
 
 

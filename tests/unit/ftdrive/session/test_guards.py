@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.errors import DeviceFault, DeviceTimeout
-from drivers.interfaces import ArmState, ArmStatus
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene
@@ -28,6 +26,8 @@ from ftdrive.session.guards import (
     Tripped,
     arm_lost,
 )
+from ftdrivers.errors import DeviceFault, DeviceTimeout
+from ftdrivers.interfaces import ArmState, ArmStatus
 
 Array = NDArray[np.float64]
 

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import solve
-from calib.errors import TooFewSamples
-from calib.model import Array
-from calib.routine import PoseRecord, Sampling, dataset_from, drift_check
-from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
-from drivers.follow import Follow
-from drivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
+from ftcalib import solve
+from ftcalib.errors import TooFewSamples
+from ftcalib.model import Array
+from ftcalib.routine import PoseRecord, Sampling, dataset_from, drift_check
 from ftdrive.session.events import Compared, Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.hand_guided import Recorder, collect_manually
 from ftdrive.session.operator import Key, Question
+from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.follow import Follow
+from ftdrivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import STATUS
 

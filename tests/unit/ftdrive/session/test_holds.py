@@ -4,10 +4,10 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.errors import ConnectError, DeviceFault
 from ftdrive.errors import Declined
 from ftdrive.session.events import GuardTripped, Noted, State, StateChanged
 from ftdrive.session.operator import Key
+from ftdrivers.errors import ConnectError, DeviceFault
 from tests.unit.ftdrive.fake_cell import Lab
 
 QUESTIONS = ("Is the tool free", "Is the ball of", "Is the emergency stop in reach")

@@ -12,11 +12,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from calib import Parameters, solve
-from calib.model import predict
-from calib.poses.information import T12, Prediction, TOOL_DOWN_R_base_flange, special
-from calib.poses.selection import cone_candidates
-from calib.routine import PoseRecord, TourPose, dataset_from, drift_check
+from ftcalib import Parameters, solve
+from ftcalib.model import predict
+from ftcalib.poses.information import T12, Prediction, TOOL_DOWN_R_base_flange, special
+from ftcalib.poses.selection import cone_candidates
+from ftcalib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from ftdrive.planning.search.constant_tour import NUMBERS
 from ftdrive.runs.pose_hints import hints
 from ftdrive.session.events import Estimated
@@ -151,8 +151,8 @@ def test_one_figure_that_is_not_good_enough_decides_the_light(different: dict[st
 
 @pytest.mark.parametrize(("half_angle_deg", "light"), [(70, "green"), (37, "amber"), (15, "red")])
 def test_the_light_tells_wide_cones_from_narrow_ones(half_angle_deg: float, light: str) -> None:
-    from calib.poses.information import Guess
-    from calib.poses.selection import choose
+    from ftcalib.poses.information import Guess
+    from ftcalib.poses.selection import choose
 
     candidates = cone_candidates(np.radians(half_angle_deg), directions=60)
     event = run(records(candidates[choose(candidates, 24, Guess(1.1, 0.05, 0.00125))]))

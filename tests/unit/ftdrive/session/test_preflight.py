@@ -10,8 +10,6 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from drivers.errors import DeviceFault, StreamBroken
-from drivers.interfaces import ArmState
 from ftdrive.cell.config import ToolConfig, WorkcellConfig
 from ftdrive.checks import computer
 from ftdrive.checks.check import Check
@@ -20,6 +18,8 @@ from ftdrive.errors import NotAccepted
 from ftdrive.session import preflight, session
 from ftdrive.session.events import Checked, Noted
 from ftdrive.session.guards import Limits
+from ftdrivers.errors import DeviceFault, StreamBroken
+from ftdrivers.interfaces import ArmState
 from tests.unit.ftdrive.fake_cell import Lab
 
 

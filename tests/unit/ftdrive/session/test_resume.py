@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.routine import DriftCheck
-from drivers.errors import DeviceFault
-from drivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
+from ftcalib.routine import DriftCheck
 from ftdrive.cell.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.plan import Plan
@@ -31,6 +29,8 @@ from ftdrive.session.events import (
 from ftdrive.session.live_fit import faces
 from ftdrive.session.operator import Key
 from ftdrive.terminal.report import drift_in_words
+from ftdrivers.errors import DeviceFault
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
 from tests.unit.ftdrive.fake_cell import Lab
 
 

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib import CalibrationResult, Parameters
-from calib.errors import BadDataset
-from drivers.clock import Clock
-from drivers.errors import DeviceFault, DeviceTimeout
-from drivers.interfaces import ControllerSettings, DeviceInfo, Guard
+from ftcalib import CalibrationResult, Parameters
+from ftcalib.errors import BadDataset
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted
 from ftdrive.runs.push_receipt import Receipt
 from ftdrive.session.settings_push import Push, propose, restore, send
 from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
+from ftdrivers.clock import Clock
+from ftdrivers.errors import DeviceFault, DeviceTimeout
+from ftdrivers.interfaces import ControllerSettings, DeviceInfo, Guard
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import FakeArm, FakeSensor
 

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.routine import PoseRecord
-from drivers.errors import DeviceFault, DeviceTimeout, StreamBroken
-from drivers.interfaces import FtSamples
+from ftcalib.routine import PoseRecord
 from ftdrive.errors import Declined
 from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.geometry.certify import Certifier
@@ -29,6 +27,8 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key
+from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.interfaces import FtSamples
 from tests.unit.ftdrive.fake_cell import Lab
 
 Array = NDArray[np.float64]

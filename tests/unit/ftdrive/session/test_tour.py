@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.routine import Sampling
-from drivers.errors import DeviceFault
-from drivers.interfaces import NOT_REPORTED, DeviceInfo
+from ftcalib.routine import Sampling
 from ftdrive.cell.config import WorkcellConfig
 from ftdrive.errors import Declined, NotAccepted
 from ftdrive.planning.cell_plan import certifier_for
@@ -36,6 +34,8 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.operator import Key
 from ftdrive.terminal.session_text import in_words
+from ftdrivers.errors import DeviceFault
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from tests.unit.ftdrive.fake_cell import MODEL, Lab
 
 Array = NDArray[np.float64]

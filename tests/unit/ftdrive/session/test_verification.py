@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationResult
-from calib.errors import NotObservable
-from calib.model import Array
-from calib.routine import PoseRecord
-from drivers.interfaces import DeviceInfo
+from ftcalib import CalibrationResult
+from ftcalib.errors import NotObservable
+from ftcalib.model import Array
+from ftcalib.routine import PoseRecord
 from ftdrive.errors import ConfigError, Declined
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Reading, Run
@@ -25,6 +24,7 @@ from ftdrive.session.completed_plans import has_completed
 from ftdrive.session.events import Checked, Compared, Noted, PoseTaken, RunOpened, State
 from ftdrive.session.session import Options, take_poses
 from ftdrive.session.verification import Comparison, Verifying
+from ftdrivers.interfaces import DeviceInfo
 from tests.unit.ftdrive.fake_cell import Lab
 
 NO_LIMITS = AcceptanceLimits()

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.clock import REAL
-from drivers.errors import ConnectError, DeviceFault, DeviceTimeout
 from ftdrive.session.events import Event, GuardTripped, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.guards import Guard, Limits, Seen, SensorGuard, StallGuard, Tripped
 from ftdrive.session.watchdog import Watcher
+from ftdrivers.clock import REAL
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import FakeArm, FakeSensor, Lab, SteppedWatcher
 

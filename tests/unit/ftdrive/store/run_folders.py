@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from calib import CalibrationResult
-from calib.model import Array
+from ftcalib import CalibrationResult
+from ftcalib.model import Array
 from ftdrive.runs.run import RUN_FORMAT
 from tests.unit.ftdrive.live.simulated import calibrated
 

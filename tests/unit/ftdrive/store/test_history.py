@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.model import Array
+from ftcalib.model import Array
 from ftdrive.store.history import Drift, age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
 from tests.unit.ftdrive.live.simulated import calibrated

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.interfaces import NOT_REPORTED, DeviceInfo
 from ftdrive.errors import ConfigError
 from ftdrive.store.store import Store
 from ftdrive.store.tools import Tool, calibration_of_tool
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from tests.unit.ftdrive.store.run_folders import new_run, result, verified
 
 ARM, SENSOR = DeviceInfo("ARM", "arm-1", "1"), DeviceInfo("SENSOR", "ft-1", "1")

@@ -7,10 +7,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from calib import CalibrationResult, Parameters
-from calib.model import predict
-from drivers.errors import DeviceTimeout
-from drivers.interfaces import Array, DeviceInfo, Fact
+from ftcalib import CalibrationResult, Parameters
+from ftcalib.model import predict
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import (
     Block,
@@ -23,6 +21,8 @@ from ftdrive.live.samples import (
     WrenchFrame,
 )
 from ftdrive.runs.verification import VerificationRecord
+from ftdrivers.errors import DeviceTimeout
+from ftdrivers.interfaces import Array, DeviceInfo, Fact
 
 Scenario = Literal["still", "contact", "stale", "tare-refused"]
 

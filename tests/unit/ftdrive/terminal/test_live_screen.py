@@ -14,7 +14,6 @@ from rich.cells import cell_len
 from syrupy.assertion import SnapshotAssertion
 from textual.pilot import Pilot
 
-from drivers.errors import DeviceTimeout
 from ftdrive.checks.check import Check
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import STEP_S, ReplayedStream
@@ -24,6 +23,7 @@ from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.layout import frame
 from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live_screen import LiveApp, run_live
+from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import FREE, INFO, R_BASE_FLANGE, SIGMA, START_NS, FakeStream, Scenario
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset, Known, Parameters, solve
-from calib.compare import Compared, compare
-from calib.errors import NotObservable
-from calib.model import predict
-from calib.published.yu import SPECIAL_R_flange_base
-from calib.result import Method
+from ftcalib import CalibrationDataset, Known, Parameters, solve
+from ftcalib.compare import Compared, compare
+from ftcalib.errors import NotObservable
+from ftcalib.model import predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib.result import Method
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError
 from ftdrive.runs.pose_hints import hints

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mocks.sensors.ati_can import matrix_row_payloads, sg_payloads
-from mocks.sensors.ati_gauges import REFERENCE
-from mocks.wires.slcan import CanFrame, SlcanAdapter
+from ftmocks.sensors.ati_can import matrix_row_payloads, sg_payloads
+from ftmocks.sensors.ati_gauges import REFERENCE
+from ftmocks.wires.slcan import CanFrame, SlcanAdapter
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mocks.sensors.ati_gauges import REFERENCE, UNIT_N, UNIT_NM
+from ftmocks.sensors.ati_gauges import REFERENCE, UNIT_N, UNIT_NM
 
 V1_GAUGES = [100, -200, 300, -400, 500, -600]
 V1_WRENCH = [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608]

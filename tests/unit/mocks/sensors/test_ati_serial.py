@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from mocks.sensors.ati_gauges import REFERENCE
-from mocks.sensors.ati_serial import AtiSerialBox, calibration_block, stream_records
-from mocks.wires.modbus import crc16, with_crc
+from ftmocks.sensors.ati_gauges import REFERENCE
+from ftmocks.sensors.ati_serial import AtiSerialBox, calibration_block, stream_records
+from ftmocks.wires.modbus import crc16, with_crc
 
 V1 = [100, -200, 300, -400, 500, -600]
 V2 = [221, -926, 69, -1086, 2342, 1266]

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mocks.sensors.bota import BotaBox, crc16_x25, stream_frame
+from ftmocks.sensors.bota import BotaBox, crc16_x25, stream_frame
 
 WRENCH = [1, -2, 9.81, 0.1, -0.2, 0.3]
 FRAME = "AA 0000 0000803F 000000C0 C3F51C41 CDCCCC3D CDCC4CBE 9A99993E 40420F00 0000CC41 3D0D"

@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from mocks.sensors.netft import RECORD, Calibration, NetFtBox, rdt_records
+from ftmocks.sensors.netft import RECORD, Calibration, NetFtBox, rdt_records
 
 WRENCH = [1.5, -2.25, 10, 0.1, -0.05, 0.025]
 VECTOR = "00000001 000003E8 00000000 0016E360 FFDDAAF0 00989680 000186A0 FFFF3CB0 000061A8"

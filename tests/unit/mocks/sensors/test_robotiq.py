@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mocks.sensors.robotiq import RobotiqBox, raw_values, stream_frame
-from mocks.wires.modbus import crc16, reply, with_crc
+from ftmocks.sensors.robotiq import RobotiqBox, raw_values, stream_frame
+from ftmocks.wires.modbus import crc16, reply, with_crc
 
 WRENCH = np.array([12.34, -5.67, 100, 0.15, -0.025, 1])
 

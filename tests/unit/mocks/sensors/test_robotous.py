@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mocks.sensors.robotous import (
+from ftmocks.sensors.robotous import (
     Model,
     RobotousCanNode,
     RobotousSensor,

@@ -7,14 +7,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mocks.kinematics import MODELS, vector6
-from mocks.ur.dashboard import LOCAL_CONTROL, TOO_EARLY, answer
-from mocks.ur.events import Event
-from mocks.ur.modes import RobotMode, Runtime, SafetyMode
-from mocks.ur.robot import Robot, RobotSettings
-from mocks.ur.script import Upload
-from mocks.ur.variables import OUTPUTS, output_type
-from mocks.world import Truth, World
+from ftmocks.kinematics import MODELS, vector6
+from ftmocks.ur.dashboard import LOCAL_CONTROL, TOO_EARLY, answer
+from ftmocks.ur.events import Event
+from ftmocks.ur.modes import RobotMode, Runtime, SafetyMode
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.ur.script import Upload
+from ftmocks.ur.variables import OUTPUTS, output_type
+from ftmocks.world import Truth, World
 
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 GOAL = vector6([*HOME[:5], HOME[5] + 1.0])

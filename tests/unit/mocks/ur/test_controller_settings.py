@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mocks.kinematics import MODELS, Vector3, Vector6, forward, vector3, vector6
-from mocks.ur.robot import Robot, RobotSettings
-from mocks.ur.script import Upload
-from mocks.ur.variables import OUTPUTS
-from mocks.world import Truth, World
+from ftmocks.kinematics import MODELS, Vector3, Vector6, forward, vector3, vector6
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.ur.script import Upload
+from ftmocks.ur.variables import OUTPUTS
+from ftmocks.world import Truth, World
 
 DH = MODELS["UR5e"]
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))

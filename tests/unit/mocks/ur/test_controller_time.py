@@ -10,16 +10,16 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 
-from mocks.clock import DEBT_NS, LEAD_NS, CellClock
-from mocks.kinematics import MODELS, vector6
-from mocks.station import free_hosts
-from mocks.ur.clients import BACKLOG_LIMIT_S
-from mocks.ur.modes import Runtime
-from mocks.ur.robot import Robot, RobotSettings
-from mocks.ur.rtde_client import RtdeClient
-from mocks.ur.script import Upload
-from mocks.ur.server import UrServer
-from mocks.world import Truth, World
+from ftmocks.clock import DEBT_NS, LEAD_NS, CellClock
+from ftmocks.kinematics import MODELS, vector6
+from ftmocks.station import free_hosts
+from ftmocks.ur.clients import BACKLOG_LIMIT_S
+from ftmocks.ur.modes import Runtime
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.ur.rtde_client import RtdeClient
+from ftmocks.ur.script import Upload
+from ftmocks.ur.server import UrServer
+from ftmocks.world import Truth, World
 from tests.unit.mocks.real_time import RealTime
 
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))

@@ -6,13 +6,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mocks.arrays import Array
-from mocks.kinematics import MODELS, Vector6, forward, vector6
-from mocks.ur.hand import IN_A_PROGRAM, SPEED_RAD_S, guided_by_hand, orientations, pendant_program
-from mocks.ur.modes import Runtime
-from mocks.ur.robot import Robot, RobotSettings
-from mocks.ur.script import Upload
-from mocks.world import Truth, World
+from ftmocks.arrays import Array
+from ftmocks.kinematics import MODELS, Vector6, forward, vector6
+from ftmocks.ur.hand import IN_A_PROGRAM, SPEED_RAD_S, guided_by_hand, orientations, pendant_program
+from ftmocks.ur.modes import Runtime
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.ur.script import Upload
+from ftmocks.world import Truth, World
 
 UR5E = MODELS["UR5e"]
 HOME = vector6(np.radians([45, -100, 60, -50, 70, 0]))

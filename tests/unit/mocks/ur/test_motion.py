@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mocks.kinematics import MODELS, ZERO6, Vector6, forward, matrix_of, pose_of, rotvec, vector6
-from mocks.ur.motion import Arm, CannotFollow, JointMove, LineMove, MotionError, Trapezoid
+from ftmocks.kinematics import MODELS, ZERO6, Vector6, forward, matrix_of, pose_of, rotvec, vector6
+from ftmocks.ur.motion import Arm, CannotFollow, JointMove, LineMove, MotionError, Trapezoid
 
 DH = MODELS["UR5e"]
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))

@@ -2,13 +2,13 @@
 
 import pytest
 
-from mocks.kinematics import MODELS
-from mocks.ur import primary
-from mocks.ur.events import Event
-from mocks.ur.modes import RobotMode
-from mocks.ur.robot import Robot, RobotSettings
-from mocks.ur.script import Upload
-from mocks.world import Truth, World
+from ftmocks.kinematics import MODELS
+from ftmocks.ur import primary
+from ftmocks.ur.events import Event
+from ftmocks.ur.modes import RobotMode
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.ur.script import Upload
+from ftmocks.world import Truth, World
 from tests.unit.mocks.ur.primary_decoder import decoded, packages
 from tests.unit.mocks.ur.urscript_robot import HOME, new_robot, run, start
 

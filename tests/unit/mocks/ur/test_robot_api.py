@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from mocks.ur import api, http_wire
-from mocks.ur.modes import RobotMode, Runtime, SafetyMode
-from mocks.ur.robot import Robot
-from mocks.ur.variables import output_type
+from ftmocks.ur import api, http_wire
+from ftmocks.ur.modes import RobotMode, Runtime, SafetyMode
+from ftmocks.ur.robot import Robot
+from ftmocks.ur.variables import output_type
 from tests.unit.mocks.ur.urscript_robot import new_robot, run, start
 
 SLEEPING = "def f():\n  sleep(9)\nend\n"

@@ -6,11 +6,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mocks.kinematics import MODELS, forward, rotvec, vector6
-from mocks.ur.modes import Runtime
-from mocks.ur.robot import Robot, RobotSettings
-from mocks.ur.swing import Swing, SwingProgram
-from mocks.world import Truth, World
+from ftmocks.kinematics import MODELS, forward, rotvec, vector6
+from ftmocks.ur.modes import Runtime
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.ur.swing import Swing, SwingProgram
+from ftmocks.world import Truth, World
 
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 STEP_S = 0.004

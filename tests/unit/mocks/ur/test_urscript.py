@@ -4,11 +4,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mocks.ur.dashboard import answer
-from mocks.ur.script import Upload
-from mocks.ur.urscript.library import functions
-from mocks.ur.urscript.parser import parse
-from mocks.ur.urscript.syntax import UrscriptSyntaxError
+from ftmocks.ur.dashboard import answer
+from ftmocks.ur.script import Upload
+from ftmocks.ur.urscript.library import functions
+from ftmocks.ur.urscript.parser import parse
+from ftmocks.ur.urscript.syntax import UrscriptSyntaxError
 from tests.unit.mocks.ur.urscript_robot import HOME, end_of, failure, logged, new_robot, results, run, start
 
 BUILT_IN = functions((5, 15, 0))

@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mocks.ur.dashboard import answer
-from mocks.ur.modes import Runtime
-from mocks.ur.robot import Robot
+from ftmocks.ur.dashboard import answer
+from ftmocks.ur.modes import Runtime
+from ftmocks.ur.robot import Robot
 from tests.unit.mocks.ur.urscript_robot import HOME, end_of, failure, logged, new_robot, results, run, start
 
 TOUR = """

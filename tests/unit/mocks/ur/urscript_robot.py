@@ -4,12 +4,12 @@ from textwrap import indent
 
 import numpy as np
 
-from mocks.kinematics import MODELS, vector6
-from mocks.ur.events import Event
-from mocks.ur.modes import Runtime
-from mocks.ur.robot import Robot, RobotSettings
-from mocks.ur.script import take_uploads
-from mocks.world import Truth, World
+from ftmocks.kinematics import MODELS, vector6
+from ftmocks.ur.events import Event
+from ftmocks.ur.modes import Runtime
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.ur.script import take_uploads
+from ftmocks.world import Truth, World
 
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mocks.clock import CellClock
-from mocks.wires.faults import Faults, FaultyWire
-from mocks.wires.slcan import CanFrame
+from ftmocks.clock import CellClock
+from ftmocks.wires.faults import Faults, FaultyWire
+from ftmocks.wires.slcan import CanFrame
 from tests.unit.mocks.real_time import RealTime
 
 CLOCK = CellClock(RealTime())

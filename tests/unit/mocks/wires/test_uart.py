@@ -5,10 +5,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from mocks.clock import CellClock
-from mocks.sensors.ati_serial import RECORD_BYTES, AtiSerialBox
-from mocks.wires.faults import Faults, FaultyWire
-from mocks.wires.uart import WrongParity, marked
+from ftmocks.clock import CellClock
+from ftmocks.sensors.ati_serial import RECORD_BYTES, AtiSerialBox
+from ftmocks.wires.faults import Faults, FaultyWire
+from ftmocks.wires.uart import WrongParity, marked
 from tests.unit.mocks.real_time import RealTime
 
 CLOCK = CellClock(RealTime())
@@ -102,7 +102,7 @@ def test_a_full_terminal_drops_whole_records_and_breaks_no_mark(
     sent: list[list[tuple[int, bool]]] = []
     dropped = 0
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mocks.wires.pty.os.write", write)
+        patch.setattr("ftmocks.wires.pty.os.write", write)
         patch.setattr(box, "_client_wants_marks", lambda: True)
         for count, at, filler in bursts:
             data = b"".join(bytes([filler] * 12 + [len(sent) + i]) for i in range(count))

@@ -5,9 +5,9 @@ from math import cos, radians, sin
 
 import numpy as np
 
-from calib import CalibrationResult, Parameters
-from calib.likelihood.gain_and_cross_talk import SIZE, Response
-from calib.model import Array
+from ftcalib import CalibrationResult, Parameters
+from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response
+from ftcalib.model import Array
 from ftdrive.exports.calibration.settings import Settings
 
 G_M_S2 = 9.80665

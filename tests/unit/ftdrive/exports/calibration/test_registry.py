@@ -9,9 +9,9 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationResult
-from calib.compensation import Compensator
-from calib.model import Parameters
+from ftcalib import CalibrationResult
+from ftcalib.compensation import Compensator
+from ftcalib.model import Parameters
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.exports.calibration.difference import largest_difference
 from ftdrive.exports.calibration.formats import FORMATS

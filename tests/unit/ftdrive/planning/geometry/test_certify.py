@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from drivers.ur.kinematics import Array
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.scene import Box, Plane, Scene
 from ftdrive.planning.geometry.shapes import Bodies, height_above, separation, separation_from_box
 from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrivers.ur.kinematics import Array
 
 MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")
 TOOLS = (

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.ur.kinematics import MODELS, Array, forward
 from ftdrive.planning.geometry.kinematics import frames, inverse, wrist_inverse
+from ftdrivers.ur.kinematics import MODELS, Array, forward
 
 angles = st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6)
 

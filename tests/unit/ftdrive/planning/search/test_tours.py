@@ -5,8 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from calib.poses.information import T12, special
-from drivers.ur.kinematics import MODELS
+from ftcalib.poses.information import T12, special
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
@@ -17,6 +16,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
 from ftdrive.planning.search.constant_tour import DIFFERENT_SHAPES, NUMBERS, constant_tour
 from ftdrive.planning.search.nodes import WINDOW_RAD
+from ftdrivers.ur.kinematics import MODELS
 
 TOOL = (Cylinder(0, 0.2, 0.1),)
 LUMP = (*TOOL, Cylinder(0.05, 0.1, 0.03, 0.06, 0.0))

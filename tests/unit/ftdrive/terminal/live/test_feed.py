@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import DeviceTimeout
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, StreamEvent
 from ftdrive.terminal.live.feed import Feed
+from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from calib import CalibrationDataset
+from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
 from ftdrive.live.samples import Block, WrenchFrame
 from ftdrive.terminal.live.feed import Feed

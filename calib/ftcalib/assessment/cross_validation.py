@@ -1,0 +1,87 @@
+"""What can be assessed: a fit, or estimates of another method with leave-one-out cross-validation of its poses."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from ftcalib.likelihood.descent import column_scale
+from ftcalib.likelihood.fit import Fit
+from ftcalib.likelihood.session_noise import CHUNK, Noise, summed_products
+from ftcalib.likelihood.variance_components import left_out
+from ftcalib.model import Array, Parameters, jacobian, predict
+
+
+@dataclass(frozen=True, eq=False)
+class IndependentFit:
+    """A fit to poses with independent noise, for methods without cross-validation of their own."""
+
+    parameters: Parameters
+    covariance: Array
+    R_base_flange: Array
+    wrench: Array
+    wrench_cov: Array
+    """(n, 6, 6)"""
+    measured: bool
+    """Whether `wrench_cov` was measured, not estimated from the residuals."""
+    weights: Array
+    second_basin_chi2: float | None = None
+    components: Mapping[str, float] = field(default_factory=dict)
+    response: None = None
+    drift: None = None
+    gain_sigma: float = 0.0
+
+    @cached_property
+    def residuals(self) -> Array:
+        """(n, 6) measured minus predicted."""
+        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange))
+
+    @cached_property
+    def chi2(self) -> float:
+        """Of the used poses."""
+        r = self.residuals[..., None]
+        return float(self.weights @ np.sum(r * np.linalg.solve(self.wrench_cov, r), axis=(1, 2)))
+
+    @property
+    def measured_chi2(self) -> float:
+        """The same, if the noise was measured."""
+        return self.chi2 if self.measured else float("nan")
+
+    @property
+    def dof(self) -> int:
+        """Of chi2."""
+        return 6 * int(self.weights.sum()) - 15
+
+    @property
+    def left_out_residuals(self) -> Array:
+        """(n, 6) measured minus what all other poses predict."""
+        return self._left_out[0]
+
+    @property
+    def left_out_cov(self) -> Array:
+        """(n, 6, 6) covariance of these."""
+        return self._left_out[1]
+
+    @cached_property
+    def _left_out(self) -> tuple[Array, Array]:
+        """(I - H_kk)^-1 r_k without fitting again, exact for a linear model, and its covariance."""
+        J, noise = jacobian(self.parameters, self.R_base_flange), Noise(self.wrench_cov, kept=self.weights > 0)
+        WJ = noise.solve(J)
+        information = summed_products(J, WJ)
+        scale = column_scale(information)
+        C = np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)) / np.outer(scale, scale)
+        return left_out(noise, WJ, noise.solve(self.residuals[..., None])[..., 0], C)
+
+
+AssessedFit = Fit | IndependentFit
+"""Rejected poses count only in arrays with n rows."""
+
+
+def standardized(residuals: Array, covariance: Array) -> Array:
+    """Divide residuals (n, 6) by a root of their covariance (n, 6, 6): independent, of unit variance."""
+    unit = np.empty_like(residuals)
+    for first in range(0, len(residuals), CHUNK):
+        part = slice(first, first + CHUNK)
+        unit[part] = np.linalg.solve(np.linalg.cholesky(covariance[part]), residuals[part, :, None])[..., 0]
+    return unit

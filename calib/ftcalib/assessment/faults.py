@@ -1,0 +1,238 @@
+"""Mistakes in the data of a bad fit: orientations, pairs, axes, units. Named only if undoing one helps."""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from ftcalib.assessment.observability import RECOMMENDED_POSES
+from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
+from ftcalib.model import UP_IN_BASE, Array
+from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
+
+ROUNDING = 1e-9
+"""Of readings, relative to the largest: what is left at least."""
+COLLAPSE = 0.4
+"""Accept a hypothesis if it reduces the residual to this share."""
+NO_WORSE = 1.2
+"""The other residual may grow by this factor."""
+PLAUSIBLE_TILT_DEG = 60.0
+IMPLAUSIBLE = 1.0
+"""Penalty of a weight that does not pull downwards, in the logarithm of the residuals."""
+TIED = 1.3
+"""Residuals that differ by less than this factor are equal: the simpler explanation is taken."""
+OTHER_POSES, OF_A_WEIGHT = 0.2, 0.1
+"""Forces of a weight in other poses than given: large residuals, in shares of the weight, and little of them radial."""
+IN_BASE_RAD = np.deg2rad(10.0)
+"""A constant force that points down this exactly is a weight in base axes."""
+STEADY = 0.05
+"""A force that varies by less than this share of it is constant."""
+SAME_UNIT = 0.04
+"""A ratio this close to that of two units is one."""
+USUAL_COM_M = (0.02, 0.2)
+FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665, "mN": 1e-3, "kN": 1e3}
+TORQUE_UNITS_NM = {
+    "N·m": 1.0,
+    "N·mm": 1e-3,
+    "lbf·in": 0.11298483,
+    "lbf·ft": 1.3558179,
+    "kgf·cm": 0.0980665,
+    "kgf·m": 9.80665,
+    "kN·m": 1e3,
+}
+UNITS = (
+    *(("N", "N·mm"), ("N", "lbf·in"), ("lbf", "N·m"), ("kgf", "N·m"), ("mN", "N·m"), ("kN", "N·m")),
+    *(("lbf", "lbf·in"), ("lbf", "lbf·ft"), ("kgf", "kgf·cm"), ("kgf", "kgf·m"), ("mN", "N·mm"), ("kN", "kN·m")),
+)
+"""Units that are taken for N and N·m, the simplest mistake first."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rough:
+    """A plain fit: forces alone, then torques to them by linear least squares."""
+
+    R: Array
+    """(3, 3) flange to sensor."""
+    F_b: Array
+    weight_sensor_N: Array
+    """(n, 3)"""
+    force_rms_N: float
+    torque_rms_Nm: float
+
+    @classmethod
+    def of(cls, R_base_flange: Array, wrench: Array) -> Self:
+        """Fit."""
+        n, force_N, torque_Nm = len(wrench), wrench[:, :3], wrench[:, 3:]
+        best = minima(force_cost(R_base_flange, force_N, np.ones(n)))[0]
+        F_b, _ = given_rotation(best.R, R_base_flange, force_N, np.ones(n))
+        weight_sensor_N = (F_b @ R_base_flange) @ best.R.T
+        P, T0 = com_and_torque_bias(weight_sensor_N, torque_Nm)
+        force_rms_N = float(np.sqrt(max(best.cost, 0.0) / n)) + ROUNDING * float(np.abs(force_N).max())
+        return cls(best.R, F_b, weight_sensor_N, force_rms_N, _torque_rms(weight_sensor_N, torque_Nm, P, T0))
+
+    def tilt_deg(self, up_in_base: Array) -> float:
+        """Angle between the weight and where down should be."""
+        cosine = -float(self.F_b @ up_in_base) / float(np.linalg.norm(self.F_b) * np.linalg.norm(up_in_base) or 1.0)
+        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+    def score(self, up_in_base: Array) -> float:
+        """Logarithm of the residuals plus the penalty; lower is better."""
+        implausible = self.tilt_deg(up_in_base) > PLAUSIBLE_TILT_DEG
+        return float(np.log(self.force_rms_N * self.torque_rms_Nm)) + IMPLAUSIBLE * implausible
+
+
+def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
+    """Find the mistake that explains a bad fit: form of orientations, pairing of wrenches and poses, or axes.
+
+    Reversing all three axes of torque or of force only moves the centre of mass to the other side of the sensor.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+        In the order of the poses.
+    wrench : array, shape (n, 6)
+    up_in_base : array_like, shape (3,)
+        Where up should be.
+    """
+    if len(wrench) < RECOMMENDED_POSES + 1:
+        return []
+    if constant := constant_weight(wrench, up_in_base):
+        return constant
+    up = np.asarray(up_in_base, dtype=np.float64)
+    as_read = _Rough.of(R_base_flange, wrench)
+    found = []
+    for words, R, y in _readings(R_base_flange, wrench):
+        trial = _Rough.of(R, y)
+        if trial.force_rms_N < COLLAPSE * as_read.force_rms_N and (
+            trial.torque_rms_Nm < NO_WORSE * as_read.torque_rms_Nm
+        ):
+            found.append((trial.score(up), words, trial))
+    if found:
+        _, (what, advice), best = min(found, key=lambda each: each[0])
+        return [
+            f"{what}. Corrected, the force residual drops from {as_read.force_rms_N:.2g} to "
+            f"{best.force_rms_N:.2g} N: {advice}"
+        ]
+    return _axes(as_read, wrench[:, 3:], up)
+
+
+def other_poses(R_base_flange: Array, wrench: Array) -> list[str]:
+    """Recognise the wrenches of a weight in other poses than given: forces on a sphere, torques that belong to them.
+
+    A sphere does not depend on the orientations, so it also shows an order or a form of them that `faults` cannot undo.
+    """
+    if len(wrench) < RECOMMENDED_POSES + 1:
+        return []
+    as_read, force_N, torque_Nm = _Rough.of(R_base_flange, wrench), wrench[:, :3], wrench[:, 3:]
+    design = np.column_stack([2 * force_N, np.ones(len(force_N))])
+    solution = np.linalg.lstsq(design, np.sum(force_N**2, axis=1))[0]
+    center_N = solution[:3]
+    weight_N = float(np.sqrt(max(float(solution[3] + center_N @ center_N), 0.0)))
+    radial_N = np.linalg.norm(force_N - center_N, axis=1) - weight_N
+    radial_rms_N = float(np.sqrt(np.sum(radial_N**2) / (len(force_N) - len(solution))))
+    torque_rms_Nm = _torque_rms(force_N - center_N, torque_Nm, *com_and_torque_bias(force_N - center_N, torque_Nm))
+    elsewhere = as_read.force_rms_N > OTHER_POSES * weight_N and radial_rms_N < OF_A_WEIGHT * as_read.force_rms_N
+    if not elsewhere or torque_rms_Nm > COLLAPSE * as_read.torque_rms_Nm:
+        return []
+    return [
+        f"the forces are those of a weight of {weight_N:.3g} N to {radial_rms_N:.2g} N, but in these orientations only "
+        f"to {as_read.force_rms_N:.2g} N: the wrenches are paired with other poses, or the orientations have another "
+        "form (Euler angles, degrees, another order): check both"
+    ]
+
+
+def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
+    """Recognise a weight in base axes that was recorded without bias: the force is the same in all poses."""
+    mean, up = wrench[:, :3].mean(axis=0), np.asarray(up_in_base, dtype=np.float64)
+    size_N = float(np.linalg.norm(mean))
+    downwards = float(-mean @ up) > np.cos(IN_BASE_RAD) * size_N * float(np.linalg.norm(up))
+    if not downwards or float(wrench[:, :3].std(axis=0).max()) > STEADY * size_N:
+        return []
+    return [
+        f"the force is ({', '.join(f'{x:.2g}' for x in mean)}) N in all poses: the wrench looks given in base axes, "
+        "record it in the axes of the sensor"
+    ]
+
+
+def _readings(R: Array, wrench: Array) -> Iterator[tuple[tuple[str, str], Array, Array]]:
+    """Each mistake in words, with the data as they are without it."""
+    yield ("the orientations look inverted", "state that they map base to flange"), np.swapaxes(R, 1, 2), wrench
+    quaternions = Rotation.from_matrix(R).as_quat()
+    for shift, given, read in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
+        words = f"the quaternions look like ({given}) that were read as ({read})", f"read them as ({given})"
+        yield words, Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(), wrench
+    in_flange = np.concatenate([np.einsum("nji,nj->ni", R, part) for part in (wrench[:, :3], wrench[:, 3:])], axis=1)
+    yield ("the wrench looks given in base axes", "record it in the axes of the sensor"), R, in_flange
+    for place, own, other in (("before", slice(None, -1), slice(1, None)), ("after", slice(1, None), slice(None, -1))):
+        advice = "pair each wrench with the pose at which it was measured"
+        yield (f"each wrench looks like that of the pose {place} it", advice), R[own], wrench[other]
+
+
+def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[str]:
+    """Torque axes that disagree with the force axes."""
+    fits = []
+    for Q in SPECIAL_R_flange_base:
+        P, T0 = com_and_torque_bias(as_read.weight_sensor_N, torque_Nm @ Q.T)
+        rms = _torque_rms(as_read.weight_sensor_N, torque_Nm @ Q.T, P, T0)
+        outside = 1.0 if P @ as_read.R[:, 2] >= 0 else -1.0  # the tool hangs outside the flange
+        changed = int(np.count_nonzero(np.diag(outside * Q) != 1)) + int(np.count_nonzero(np.diag(Q) == 0))
+        fits.append((rms, changed, outside * Q))
+    least = min(fits, key=lambda fit: fit[0])[0]
+    rms, _, Q = min((fit for fit in fits if fit[0] <= TIED * least), key=lambda fit: fit[1])
+    if rms >= COLLAPSE * as_read.torque_rms_Nm:
+        return []
+    upwards, mirrored = bool(as_read.F_b @ up > 0), bool(np.linalg.det(Q) < 0)
+    if upwards and mirrored:  # a mirrored force reads like a weight that pulls upwards
+        undone = f"with force {axis_order(Q.T)}"
+    else:
+        other = f" (or force {axis_order(Q.T).removesuffix(' reversed')})" if not mirrored and not upwards else ""
+        undone = f"with torque {axis_order(Q)}{other}"
+    return [
+        f"force and torque axes disagree, {undone} the torque residual drops from {as_read.torque_rms_Nm:.2g} to "
+        f"{rms:.2g} N·m: check the wiring of the axes or the sensor's matrix"
+    ]
+
+
+def axis_order(Q: Array) -> str:
+    """Name the channels from which the axes of the wrench should be taken, given the signed permutation (3, 3)."""
+    if np.abs(np.diag(Q)).min() > 0.5:
+        return " and ".join("xyz"[k] for k in range(3) if Q[k, k] < 0) + " reversed"
+    channels = ", ".join(("-" if row[k] < 0 else "") + "xyz"[k] for row in Q for k in [int(np.abs(row).argmax())])
+    return f"x, y, z taken from ({channels})"
+
+
+def _torque_rms(weight_sensor_N: Array, torque_Nm: Array, P: Array, T0: Array) -> float:
+    e = torque_Nm - np.cross(P, weight_sensor_N) - T0
+    return float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) + ROUNDING * float(np.abs(torque_Nm).max())
+
+
+def units(com_m: float, forces: Collection[str] = tuple(FORCE_UNITS_N)) -> list[str]:
+    """Name the wrong units, with one of these units of force, that make a usual distance of the centre of mass."""
+    low, high = USUAL_COM_M
+    return [
+        " and ".join([f"forces in {force}"] * (force != "N") + [f"torques in {torque}"] * (torque != "N·m"))
+        for force, torque in UNITS
+        if force in forces and low <= com_m * TORQUE_UNITS_NM[torque] / FORCE_UNITS_N[force] <= high
+    ]
+
+
+def broken_channels(wrench: Array, R_base_flange: Array) -> list[str]:
+    """Find channels that do not move and rows that were copied."""
+    names = ("fx", "fy", "fz", "tx", "ty", "tz")
+    spread = np.ptp(wrench, axis=0)
+    group = np.repeat([spread[:3].max(), spread[3:].max()], 3)
+    stuck = [name for name, own, all_ in zip(names, spread, group, strict=True) if own == 0 < all_]
+    found = [f"{', '.join(stuck)} reads the same in all poses: the channel is stuck. Check it"] if stuck else []
+    if len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench):
+        return found
+    _, first, count = np.unique(wrench, axis=0, return_index=True, return_counts=True)
+    copied = [np.flatnonzero((wrench == wrench[row]).all(axis=1)) for row in np.sort(first[count > 1])]
+    for rows in copied:
+        same = bool(np.ptp(R_base_flange[rows], axis=0).max() == 0)
+        listed = ", ".join(str(row + 1) for row in rows)
+        what = "and orientations: keep one of the copies" if same else "in different orientations: repeat these poses"
+        found.append(f"poses {listed} have identical wrenches {what}")
+    return found

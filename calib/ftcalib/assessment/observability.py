@@ -1,0 +1,349 @@
+"""Observability of a set of poses: rank, parameters that cannot be separated, second solution, and poses to add.
+
+The Fisher information covers the neighbourhood of one solution only. So two further checks follow: whether a second
+solution elsewhere explains the data as well, and which motion removes the ambiguity.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib.errors import NotObservable
+from ftcalib.likelihood.rotation_minima import Minimum, force_cost, minima
+from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, gravity_wrench, jacobian
+
+LEAST_POSES = 4
+"""Three different orientations have 4 or 8 exact solutions, although their Fisher information has full rank."""
+RECOMMENDED_POSES = 6
+RANK_TOLERANCE = 1e-9
+POOR_CONDITION = 1e4
+WEAK_GAP = 0.02
+"""Eight poses distinguish the two solutions even if the tool weighs only ten times the noise."""
+AMBIGUOUS_GAP = 1e-6
+ACCEPTED_DELTA_CHI2 = 12.0
+"""In 7361 simulated calibrations, a second solution with chi2 larger by this was never the right one."""
+SAME_ORIENTATION_RAD = np.deg2rad(0.5)
+LEVER_M = 0.025
+"""Usual ratio of torque noise to force noise."""
+MOST_ADVISED = 5
+
+NOMINAL = Parameters(np.eye(3), -STANDARD_GRAVITY_M_S2 * UP_IN_BASE, np.zeros(3), np.array([0, 0, 0.08]), np.zeros(3))
+"""Tool before any data: 1 kg, 80 mm from a sensor on an upright robot. Rank and gap hardly depend on it."""
+
+_SAME_MINIMUM_RAD = np.deg2rad(1.0)
+_ALIGNED = np.cos(np.deg2rad(5.0))
+_NARROW_DEG = 30.0
+_THIN = 0.02
+"""Smaller spreads of unit vectors count as zero: about one degree."""
+_GROUPS = ("the mounting of the sensor", "gravity", "force bias", "centre of mass", "torque bias")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observability:
+    """Which parameters the poses determine."""
+
+    orientations: int
+    """Number of different orientations, counted up to 24."""
+    rank: int
+    """Number of determined combinations of the 15 parameters."""
+    condition: float
+    """Ratio of the extreme eigenvalues of the scaled Fisher information; infinite below rank 15."""
+    ambiguities: tuple[str, ...]
+    """Sentences: the reason, then the parameters that cannot be separated. Empty for a sound set."""
+    advice: tuple[str, ...]
+    """Poses to add, one phrase each, starting from the last pose of the set."""
+    advised_R_base_flange: Array
+    """(k, 3, 3) orientations of these poses; they make the set sound, if five poses suffice."""
+    second_gap: float
+    """Mean squared force residual of the best other solution, over weight squared: at best 8/9, 0 if ambiguous."""
+
+    @property
+    def sound(self) -> bool:
+        """True for four orientations, full rank, a fair condition, and a clearly worse second solution."""
+        enough = self.orientations >= LEAST_POSES and self.rank == 15
+        return enough and self.condition <= POOR_CONDITION and self.second_gap >= WEAK_GAP
+
+    def sentence(self) -> str:
+        """One sentence with the reason and the poses to add."""
+        if not self.ambiguities:
+            return f"the poses determine all parameters (condition {self.condition:.2g}, gap {self.second_gap:.2g})."
+        text = self.ambiguities[0] + (": " + ", and ".join(self.ambiguities[1:]) if self.ambiguities[1:] else "")
+        if len(self.advice) == 1:
+            text += f"; add a pose: from the last one, {self.advice[0]}"
+        elif self.advice:
+            text += f"; add {len(self.advice)} poses, each from the last one: {'; '.join(self.advice)}"
+        return text + "."
+
+
+def assess(
+    R_base_flange: Array, parameters: Parameters = NOMINAL, wrench_cov: Array | None = None, *, advise: bool = True
+) -> Observability:
+    """Assess which parameters a set of poses determines.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    parameters : Parameters
+        Estimated or, before any data, guessed.
+    wrench_cov : array, shape (n, 6, 6), optional
+        Noise of each pose; equal for all poses by default.
+    advise : bool
+        Whether to look for poses to add.
+    """
+    information = scaled_information(R_base_flange, parameters, wrench_cov)
+    eigenvalues, V = np.linalg.eigh(information)
+    free = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
+    rank = 15 - int(free.sum())
+    condition = float(eigenvalues[-1] / eigenvalues[0]) if rank == 15 else float("inf")
+    gap = second_minimum(R_base_flange, parameters)[0]
+    found = Observability(different_orientations(R_base_flange), rank, condition, (), (), np.zeros((0, 3, 3)), gap)
+    if found.sound:
+        return found
+    weak = V[:, free] if rank < 15 else V[:, :1]
+    ambiguities = _ambiguities(R_base_flange, parameters, information / eigenvalues[-1], weak, found)
+    words, poses = _advice(R_base_flange, parameters) if advise else ((), found.advised_R_base_flange)
+    return replace(found, ambiguities=ambiguities, advice=words, advised_R_base_flange=poses)
+
+
+def require_orientations(R_base_flange: Array, least: int = LEAST_POSES) -> None:
+    """Raise `NotObservable` for fewer than `least` different orientations.
+
+    Raises
+    ------
+    NotObservable
+        The message gives their number and the poses to add.
+    """
+    n, different = len(R_base_flange), different_orientations(R_base_flange)
+    if n < least:
+        raise NotObservable(
+            f"{n} {'pose is' if n == 1 else 'poses are'} too few, at least {least} are needed: add {least - n}, better "
+            f"{max(RECOMMENDED_POSES, least) - n}."
+        )
+    if different == 1:
+        raise NotObservable(f"all {n} poses have the same orientation: turn and tilt the tool between poses.")
+    if different < least:
+        raise NotObservable(
+            f"the {n} poses have only {different} different orientations, at least {least} are needed: "
+            "turn and tilt the tool to others."
+        )
+
+
+def require_observable(R_base_flange: Array, parameters: Parameters, wrench_cov: Array | None = None) -> None:
+    """Raise `NotObservable` for poses that do not determine the parameters.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    parameters : Parameters
+        Estimated, because observability depends on the direction of gravity.
+    wrench_cov : array, shape (n, 6, 6), optional
+
+    Raises
+    ------
+    NotObservable
+        The message names the reason and the poses to add.
+    """
+    require_orientations(R_base_flange)
+    found = assess(R_base_flange, parameters, wrench_cov, advise=False)
+    if found.rank < 15 or found.second_gap < AMBIGUOUS_GAP:
+        raise NotObservable(assess(R_base_flange, parameters, wrench_cov).sentence())
+
+
+def scaled_information(
+    R_base_flange: Array, parameters: Parameters = NOMINAL, wrench_cov: Array | None = None
+) -> Array:
+    """Fisher information (15, 15) in units of 1 rad, weight, weight, lever and weight times lever.
+
+    The lever is the distance of the centre of mass, 25 mm at least. By default the noise of the forces
+    is the weight and that of the torques 25 mm times it, so that the entries count poses.
+    """
+    weight_N = float(np.linalg.norm(parameters.gravity_force_base_N)) or 1.0
+    lever_m = max(float(np.linalg.norm(parameters.p_sensor_com_m)), LEVER_M)
+    J = jacobian(parameters, R_base_flange) * np.repeat([1, weight_N, weight_N, lever_m, weight_N * lever_m], 3)
+    if wrench_cov is None:
+        J /= np.repeat([weight_N, LEVER_M * weight_N], 3)[:, None]
+    else:
+        J = np.linalg.solve(np.linalg.cholesky(wrench_cov), J)
+    J = J.reshape(-1, 15)
+    return np.asarray(J.T @ J)
+
+
+def second_minimum(R_base_flange: Array, parameters: Parameters = NOMINAL) -> tuple[float, Minimum | None]:
+    """Mean squared force residual, over the squared weight, of the best solution with another mounting; also that one.
+
+    Without noise and from forces alone, because torques rarely decide. With white force noise sigma the wrong solution
+    of n poses is worse by n (weight / sigma)² times the gap. Infinite and None if there is no other minimum.
+    """
+    force_N = gravity_wrench(parameters, R_base_flange)[:, :3]
+    found = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
+    others = (m for m in found if angle_between(m.R.T, parameters.R_flange_sensor) > _SAME_MINIMUM_RAD)
+    if (other := next(others, None)) is None:
+        return float("inf"), None
+    weight_N2 = float(parameters.gravity_force_base_N @ parameters.gravity_force_base_N)
+    return max(0.0, other.cost / (len(R_base_flange) * weight_N2)), other
+
+
+def wrong_basin_probability(delta_chi2: float) -> float:
+    """Probability that the second-best solution is the right one if its chi2 is larger by `delta_chi2`.
+
+    Calibrated on 8954 simulated calibrations; from `ACCEPTED_DELTA_CHI2` on, the best one is accepted.
+    """
+    return float(1 / (1 + np.exp(delta_chi2 / 2)))
+
+
+def different_orientations(R_base_flange: Array) -> int:
+    """Count orientations that differ by more than half a degree; stops counting at 24."""
+    kept, rest = R_base_flange[:24], R_base_flange[24:]
+    pairs = np.triu_indices(len(kept), 1)
+    if np.any(angle_between(kept[pairs[0]], kept[pairs[1]]) <= SAME_ORIENTATION_RAD):
+        kept, rest = np.empty((0, 3, 3)), R_base_flange
+    elif len(kept) == 24:
+        return 24
+    for R in rest:
+        if np.all(angle_between(kept, R) > SAME_ORIENTATION_RAD):
+            kept = np.concatenate([kept, R[None]])
+            if len(kept) == 24:
+                break
+    return len(kept)
+
+
+def _ambiguities(
+    R_base_flange: Array, parameters: Parameters, information: Array, weak: Array, found: Observability
+) -> tuple[str, ...]:
+    """Sentences: the reason, then the parameters that cannot be separated."""
+    different = found.orientations
+    if different == 1:
+        return (
+            "there is only one orientation: weight, bias, centre of mass and mounting of the sensor cannot be "
+            "separated",
+        )
+    if different < LEAST_POSES:
+        return (
+            f"there are only {different} different orientations: several solutions explain them exactly, and bias, "
+            "weight and mounting of the sensor cannot be separated",
+        )
+    weight_N = float(np.linalg.norm(parameters.gravity_force_base_N))
+    gravity_flange = parameters.gravity_force_base_N @ R_base_flange / weight_N  # unit vectors
+    turns = Rotation.from_matrix(np.swapaxes(R_base_flange[:1], 1, 2) @ R_base_flange).as_rotvec()
+    _, spread, axes = np.linalg.svd(turns, full_matrices=False)
+    if spread[1] < _THIN * spread[0]:
+        steady = float(np.ptp(gravity_flange, axis=0).max()) < _THIN
+        return _one_axis(axes[0], R_base_flange[0], parameters, information, steady=steady)
+
+    _, spread, normals = np.linalg.svd(gravity_flange - gravity_flange.mean(axis=0))
+    thin = _THIN * np.sqrt(len(gravity_flange))
+    if spread[1] < thin and spread[0] > 2 * thin:
+        return (
+            "gravity acts along one line of the tool only: bias, weight and mounting of the sensor cannot be separated",
+        )
+    if spread[2] < min(thin, 0.05 * spread[1]):
+        normal = normals[2]
+        angle = np.rad2deg(np.arccos(np.clip(abs(float(gravity_flange.mean(axis=0) @ normal)), 0, 1)))
+        return (
+            f"all poses keep {_axis(normal)} at one angle to gravity, {angle:.0f}° from the vertical",
+            "reversed gravity with the sensor turned by 180° about that axis explains them as well",
+        )
+    mean = gravity_flange.mean(axis=0)
+    length = float(np.linalg.norm(mean))  # zero for balanced sets, which point everywhere
+    widest = np.rad2deg(np.arccos(np.clip((gravity_flange @ mean).min() / max(length, _THIN), -1, 1)))
+    if widest < _NARROW_DEG:
+        return (
+            f"gravity stays within {widest:.0f}° of one direction in the tool: mounting of the sensor, weight and bias "
+            "are hard to separate",
+        )
+    if found.rank == 15 and found.condition <= POOR_CONDITION:
+        return (
+            "a very different mounting of the sensor explains these poses almost as well if the tool is light "
+            f"(gap {found.second_gap:.2g}, {WEAK_GAP:g} is sound)",
+        )
+    share = (weak**2).sum(axis=1).reshape(5, 3).sum(axis=1) / weak.shape[1]
+    names = ", ".join(name for name, part in zip(_GROUPS, share, strict=True) if part > 0.05)
+    how = "cannot be separated" if found.rank < 15 else f"are hard to separate (condition {found.condition:.1g})"
+    return (f"{names} {how}",)
+
+
+def _one_axis(
+    axis_flange: Array, R_base_flange: Array, parameters: Parameters, information: Array, *, steady: bool
+) -> tuple[str, ...]:
+    """Turns about one axis only: name each change of the parameters that hardly changes a reading."""
+    R, P, b = parameters.R_flange_sensor.T, parameters.p_sensor_com_m, parameters.gravity_force_base_N
+    axis_base, axis_sensor = R_base_flange @ axis_flange, R @ axis_flange
+    weight_N, zero = float(np.linalg.norm(b)), np.zeros(3)
+    lever_m = max(float(np.linalg.norm(P)), LEVER_M)
+    scale = np.repeat([1, weight_N, weight_N, lever_m, weight_N * lever_m], 3)
+
+    def unseen(*change: Array) -> bool:
+        x = np.concatenate(change) / scale
+        return bool(x @ information @ x < x @ x / POOR_CONDITION)
+
+    inseparable = []
+    if steady:
+        reason = "the tool was turned about the vertical only, so its weight always has the same direction"
+        gravity_flange = b @ R_base_flange
+        force_N = R @ gravity_flange
+        delta = np.cross(gravity_flange, np.eye(3)[np.abs(gravity_flange).argmin()]) / weight_N
+        dF0 = R @ np.cross(gravity_flange, delta)
+        if unseen(delta, zero, dF0, zero, np.cross(P, dF0)):
+            inseparable.append("the sensor mounting cannot be separated from the force bias")
+        dP = lever_m * np.cross(force_N, np.eye(3)[np.abs(force_N).argmin()]) / weight_N
+        if unseen(zero, zero, zero, dP, np.cross(force_N, dP)):
+            inseparable.append("the centre of mass cannot be separated from the torque bias")
+    else:
+        last = abs(axis_flange[2]) > _ALIGNED
+        reason = "only the last joint was turned" if last else f"the tool was turned about {_axis(axis_flange)} only"
+        if unseen(-axis_flange, np.cross(axis_base, b), zero, zero, zero):
+            inseparable.append(
+                "the sensor angle about that axis cannot be separated from the direction of gravity about it"
+            )
+    if unseen(zero, axis_base, -axis_sensor, zero, -np.cross(P, axis_sensor)):
+        inseparable.append("the weight along the axis cannot be separated from the force bias along it")
+    return (reason, *inseparable)
+
+
+def _axis(axis_flange: Array) -> str:
+    k = int(np.abs(axis_flange).argmax())
+    if abs(axis_flange[k]) > _ALIGNED:
+        return ("the flange's x axis", "the flange's y axis", "the tool's own axis (flange z)")[k]
+    return f"the axis ({', '.join(f'{x:.2f}' for x in axis_flange)}) of the flange"
+
+
+def _motions() -> list[tuple[str, Array]]:
+    """Motions of the tool from the last pose, as phrases and rotations, simple ones first."""
+
+    def turn(axis: str, angle_deg: int) -> tuple[str, Array]:
+        words = "turn the last joint by" if axis == "z" else "tilt the tool about the flange's"
+        words += f" {angle_deg:+d}°" if axis == "z" else f" {axis} axis by {angle_deg:+d}°"
+        return words, Rotation.from_euler(axis, angle_deg, degrees=True).as_matrix()
+
+    spins = [turn("z", angle_deg) for angle_deg in (90, -90)]
+    tilts = [turn(axis, sign * angle_deg) for angle_deg in (45, 90) for axis in "xy" for sign in (1, -1)]
+    both = [(f"{words}, then {then}", R @ spin) for words, R in tilts for then, spin in spins]
+    return spins + tilts + both
+
+
+def _advice(R_base_flange: Array, parameters: Parameters) -> tuple[tuple[str, ...], Array]:
+    """Search for few and simple motions from the last pose that make the set sound.
+
+    Each step takes the first motion that does so, or else the most informative one.
+    """
+    poses, words, motions = R_base_flange, list[str](), _motions()
+    while len(words) < MOST_ADVISED:
+        trials = [np.concatenate([poses, [R_base_flange[-1] @ turn]]) for _, turn in motions]
+        enough = (k for k, trial in enumerate(trials) if assess(trial, parameters, advise=False).sound)
+        best = next(enough, None)
+        chosen = int(np.argmax([_worth(trial, parameters) for trial in trials])) if best is None else best
+        poses = trials[chosen]
+        words.append(motions[chosen][0])
+        if best is not None:
+            break
+    return tuple(words), poses[len(R_base_flange) :]
+
+
+def _worth(R_base_flange: Array, parameters: Parameters) -> float:
+    """Volume of the information, and distance of gravity directions from a plane, which has a second solution."""
+    information = scaled_information(R_base_flange, parameters)
+    gravity_flange = parameters.gravity_force_base_N @ R_base_flange
+    spread = np.linalg.svd(gravity_flange - gravity_flange.mean(axis=0), compute_uv=False)
+    spread = spread / float(np.linalg.norm(parameters.gravity_force_base_N))
+    return float(np.log(np.maximum(np.linalg.eigvalsh(information), 0) + 1e-3).sum() + 4 * np.log(spread + 1e-3).sum())

@@ -1,0 +1,145 @@
+"""Subtract weight and bias: one sample in about a microsecond, a recording at memory speed.
+
+For given parameters the expected wrench is affine in the nine entries of R_base_flange, so the contact wrench is
+
+    contact = wrench - matrix @ vec(R_base_flange) - offset        vec: row by row
+
+which is `wrench - predict(parameters, R_base_flange)` of `ftcalib.model` with everything constant computed once.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from ftcalib.likelihood.gain_and_cross_talk import Response
+from ftcalib.model import Parameters, skew
+
+Reals = NDArray[np.floating[Any]]
+
+
+CHUNK_ROWS = 8192
+"""Rows per matrix product: small enough that input and output stay in the cache."""
+
+
+class Compensator:
+    """The compensation of one calibration.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    dtype : float64 (default) or float32
+        Of the arithmetic and of the result. float32 halves the memory traffic and costs about 1e-7 of the wrench.
+    response : Response, optional
+        Gain and cross-talk of the sensor.
+
+    Attributes
+    ----------
+    matrix : array, shape (6, 9)
+        N and N·m per entry of R_base_flange.
+    offset : array, shape (6,)
+        The bias, N and N·m.
+
+    Notes
+    -----
+    Nothing is written after construction: threads may share an instance.
+    """
+
+    def __init__(
+        self, parameters: Parameters, dtype: DTypeLike = np.float64, *, response: Response | None = None
+    ) -> None:
+        self.dtype: np.dtype[Any] = np.dtype(dtype)
+        if self.dtype not in (np.float64, np.float32):
+            raise TypeError(f"dtype is {self.dtype}, expected float64 or float32")
+        by_force = np.einsum("i,jk->kij", parameters.gravity_force_base_N, parameters.R_flange_sensor).reshape(3, 9)
+        matrix = np.concatenate([by_force, skew(parameters.p_sensor_com_m) @ by_force])
+        if response is not None:
+            matrix += np.concatenate([response.force_gain, response.cross_talk_m]) @ by_force
+        offset = np.concatenate([parameters.force_bias_N, parameters.torque_bias_Nm])
+        self.matrix: Reals = matrix.astype(self.dtype)
+        self.offset: Reals = offset.astype(self.dtype)
+        self.matrix.setflags(write=False)
+        self.offset.setflags(write=False)
+        self._offsets: Reals = np.tile(self.offset, (CHUNK_ROWS, 1))  # subtracting one row from many is slow in numpy
+        # One sample is a single product with (wrench, vec(R_base_flange), 1).
+        self._product = np.concatenate([np.eye(6), -matrix, -offset[:, None]], axis=1).astype(self.dtype).dot
+        self._operand: Reals = np.zeros(16, self.dtype)
+        self._operand[15] = 1
+
+    def __call__(self, wrench: Reals, R_base_flange: Reals) -> Reals:
+        """Compensate one sample or many, with all checks; `sample` and `batch` are quicker.
+
+        Parameters
+        ----------
+        wrench : array, shape (6,) or (n, 6)
+            As measured, N and N·m, in the sensor frame.
+        R_base_flange : array, shape (3, 3) or (n, 3, 3)
+
+        Returns
+        -------
+        array, same shape as `wrench`
+            Contact wrench on the sensor, in the sensor frame, about the sensor origin.
+        """
+        wrench, R_base_flange = np.asarray(wrench), np.asarray(R_base_flange)
+        _check_shapes(wrench, R_base_flange)
+        return self.sample(wrench, R_base_flange) if wrench.ndim == 1 else self.batch(wrench, R_base_flange)
+
+    def sample(self, wrench: Reals, R_base_flange: Reals, out: Reals | None = None) -> Reals:
+        """Compensate one sample in a fast loop. numpy checks the shapes as far as the operations need them.
+
+        Parameters
+        ----------
+        wrench : array, shape (6,)
+            As measured, N and N·m, in the sensor frame. A NaN in any channel makes all six NaN.
+        R_base_flange : array, shape (3, 3)
+        out : array, shape (6,), optional
+            Buffer for the result, may be `wrench` itself; of the type of the compensator. Default: a new array.
+
+        Returns
+        -------
+        array, shape (6,)
+            Contact wrench on the sensor, in the sensor frame, about the sensor origin.
+        """
+        operand = self._operand.copy()
+        operand[:6] = wrench
+        operand[6:15] = R_base_flange.ravel()
+        return self._product(operand, out)
+
+    def batch(self, wrench: Reals, R_base_flange: Reals, out: Reals | None = None) -> Reals:
+        """Compensate a recording.
+
+        Parameters
+        ----------
+        wrench : array, shape (n, 6)
+            As measured, N and N·m, in the sensor frame.
+        R_base_flange : array, shape (n, 3, 3)
+            Arrays of another type than the compensator are converted first.
+        out : array, shape (n, 6), optional
+            Buffer for the result, may be `wrench` itself; of the type of the compensator. Default: a new array.
+
+        Returns
+        -------
+        array, shape (n, 6)
+            Contact wrenches on the sensor, in the sensor frame, about the sensor origin.
+        """
+        wrench, R_base_flange = np.asarray(wrench, self.dtype), np.asarray(R_base_flange, self.dtype)
+        _check_shapes(wrench, R_base_flange)
+        if wrench.ndim != 2:
+            raise ValueError(f"wrench has shape {wrench.shape}, expected (n, 6): use sample for one.")
+        if out is not None and (out.shape != wrench.shape or out.dtype != self.dtype):
+            raise ValueError(f"out is {out.dtype} {out.shape}, expected {self.dtype} {wrench.shape}")
+        contact = np.empty_like(wrench) if out is None else out
+        entries = R_base_flange.reshape(-1, 9)
+        for start in range(0, len(contact), CHUNK_ROWS):
+            rows = slice(start, start + CHUNK_ROWS)
+            np.subtract(wrench[rows], entries[rows] @ self.matrix.T, contact[rows])
+            contact[rows] -= self._offsets[: len(contact[rows])]
+        return contact
+
+
+def _check_shapes(wrench: Reals, R_base_flange: Reals) -> None:
+    if wrench.shape[-1:] != (6,) or wrench.ndim > 2 or R_base_flange.shape != (*wrench.shape[:-1], 3, 3):
+        raise ValueError(
+            f"wrench has shape {wrench.shape} and R_base_flange {R_base_flange.shape}: "
+            "expected (6,) with (3, 3), or (n, 6) with (n, 3, 3)"
+        )

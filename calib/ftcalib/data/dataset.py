@@ -1,0 +1,301 @@
+"""The dataset of a calibration: one orientation and one mean wrench per pose."""
+
+import csv
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ftcalib.data.dwell_mean import CHANNELS
+from ftcalib.errors import BadDataset
+from ftcalib.files import JSON, check_format, read_object, write_new
+from ftcalib.model import ROUNDING, Array, nearest_rotation, read_only
+
+FORMAT = "ftdrive.dataset/1"
+
+LARGEST = 1e9  # N, N·m or their squares: no sensor measures more, and powers of it must not overflow
+LEAST_VARIANCE = 1e-18  # N² or (N·m)²: sigma 1 nN; with much less, products of inverses lose all digits
+SIGMA_COLUMNS = tuple(f"sigma_{name}" for name in CHANNELS)
+MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
+VECTOR_COLUMNS = ("rx", "ry", "rz")
+LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationDataset:
+    """n poses, one row each. Arrays are read-only copies.
+
+    Orientations rounded to three or more decimals are projected onto SO(3).
+
+    Raises
+    ------
+    BadDataset
+        The message names the row, counted from 1, and the fault.
+    """
+
+    R_base_flange: Array
+    """(n, 3, 3) maps flange coordinates to base coordinates."""
+    wrench: Array
+    """(n, 6) mean wrench in N and N·m as measured, in the sensor frame: no bias, tare or compensation applied."""
+    wrench_cov: Array | None
+    """(n, 6, 6) covariance of the mean; None = unknown."""
+    n_samples: NDArray[np.int64]
+    """(n,) samples behind each mean; 0 = unknown."""
+    t_s: Array
+    """(n,) seconds since the first pose; NaN = unknown."""
+    meta: Mapping[str, JSON] = field(default_factory=dict)
+    """Further data, such as serial numbers, versions and events."""
+
+    def __post_init__(self) -> None:
+        n = len(np.atleast_1d(np.asarray(self.R_base_flange)))
+        if n == 0:
+            raise BadDataset("the dataset has no pose: record at least four.")
+        wrench = _measured("wrench", self.wrench, (n, 6))
+        R_base_flange = _rotations(_measured("R_base_flange", self.R_base_flange, (n, 3, 3)))
+        t_s = _shaped("t_s", self.t_s, (n,))
+        for i in np.flatnonzero(np.isinf(t_s)):
+            raise BadDataset(f"row {i + 1}: t_s is {t_s[i]}, expected seconds or NaN for unknown.")
+        n_samples = _shaped("n_samples", self.n_samples, (n,))
+        for i in np.flatnonzero(~((n_samples >= 0) & (n_samples == np.floor(n_samples)))):
+            raise BadDataset(f"row {i + 1}: n_samples is {n_samples[i]:g}, expected a whole number, 0 for unknown.")
+        n_samples = n_samples.astype(np.int64)
+        n_samples.setflags(write=False)
+        object.__setattr__(self, "R_base_flange", read_only(R_base_flange))
+        object.__setattr__(self, "wrench", read_only(wrench))
+        object.__setattr__(self, "t_s", read_only(t_s))
+        object.__setattr__(self, "n_samples", n_samples)
+        if self.wrench_cov is not None:
+            cov = _covariances(_measured("wrench_cov", self.wrench_cov, (n, 6, 6)))
+            object.__setattr__(self, "wrench_cov", read_only(cov))
+        try:
+            meta = json.loads(json.dumps(dict(self.meta), allow_nan=False))
+        except (TypeError, ValueError) as exc:
+            raise BadDataset(f"meta cannot be written as JSON ({exc}): use text, numbers, lists and mappings.") from exc
+        object.__setattr__(self, "meta", MappingProxyType(meta))
+
+    def __len__(self) -> int:
+        """Count the poses."""
+        return len(self.wrench)
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the content of a dataset file."""
+        return {
+            "format": FORMAT,
+            "R_base_flange": self.R_base_flange.tolist(),
+            "wrench": self.wrench.tolist(),
+            "wrench_cov": None if self.wrench_cov is None else self.wrench_cov.tolist(),
+            "n_samples": self.n_samples.tolist(),
+            "t_s": [None if np.isnan(t) else t for t in self.t_s.tolist()],
+            "meta": dict(self.meta),
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Build from the content of a dataset file; unknown fields are ignored. Raises `BadDataset`."""
+        check_format(document, FORMAT, BadDataset)
+        names = ("R_base_flange", "wrench", "wrench_cov", "n_samples", "t_s", "meta")
+        missing = [name for name in names if name not in document]
+        if missing:
+            raise BadDataset(f"the dataset lacks the field {', '.join(missing)}: the file is damaged.")
+        t_s, meta = document["t_s"], document["meta"]
+        if not isinstance(t_s, list) or not isinstance(meta, dict):
+            raise BadDataset("t_s must be a list and meta an object: the file is damaged.")
+        return cls(
+            **{name: document[name] for name in names[:4]},
+            t_s=np.array([np.nan if t is None else t for t in t_s], dtype=np.float64),
+            meta=meta,
+        )
+
+    def save(self, path: Path) -> None:
+        """Write a new file; raises `FileExistsError` if it exists."""
+        write_new(path, json.dumps(self.to_dict(), allow_nan=False) + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a dataset file. Raises `BadDataset` or `OSError`."""
+        try:
+            return cls.from_dict(read_object(path, BadDataset))
+        except BadDataset as exc:
+            raise BadDataset(f"{path.name}: {exc}") from exc
+
+    def sha256(self) -> str:
+        """Hash the content, independent of spacing and order of fields in the file.
+
+        It covers the meta data as JSON with sorted keys, then each array: name, shape, and numbers as little-endian
+        float64 row by row (an unknown covariance has no shape and no numbers).
+        """
+        digest = hashlib.sha256(json.dumps(dict(self.meta), allow_nan=False, sort_keys=True).encode())
+        for name in ("R_base_flange", "wrench", "wrench_cov", "n_samples", "t_s"):
+            array = getattr(self, name)
+            digest.update(f"{name} {None if array is None else array.shape}".encode())
+            digest.update(b"" if array is None else np.ascontiguousarray(array, dtype="<f8").tobytes())
+        return digest.hexdigest()
+
+
+def read_csv(
+    path: Path, orientation: Literal["R_base_flange", "R_flange_base"] = "R_base_flange"
+) -> CalibrationDataset:
+    """Read poses from a comma-separated table with one header row.
+
+    Columns: r11..r33 (rotation matrix, row by row) or rx, ry, rz (rotation vector in rad), fx, fy, fz (N), tx, ty, tz
+    (N·m), and optionally t (s) and sigma_fx .. sigma_tz, the standard error of each pose's mean. If both are
+    present, the matrix is used. Other columns are ignored.
+
+    Parameters
+    ----------
+    path : Path
+    orientation : {"R_base_flange", "R_flange_base"}
+        Whether the rotation maps flange to base coordinates, like a robot pose, or base to flange coordinates, like
+        e_bR in the papers.
+
+    Raises
+    ------
+    BadDataset
+        The message names the column or the row, counted from 1 below the header, and the reason.
+    """
+    if orientation not in ("R_base_flange", "R_flange_base"):
+        raise ValueError(f"orientation is '{orientation}', expected 'R_base_flange' or 'R_flange_base'")
+    try:
+        return _read_csv(path, orientation)
+    except BadDataset as exc:
+        raise BadDataset(f"{path.name}: {exc}") from exc
+
+
+def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
+    header, *rows = _table(path)
+    names = [name.strip() for name in header]
+    vector = any(c in names for c in VECTOR_COLUMNS) and not any(c in names for c in MATRIX_COLUMNS)
+    rotation_columns = VECTOR_COLUMNS if vector else MATRIX_COLUMNS
+    sigmas = SIGMA_COLUMNS if any(c in names for c in SIGMA_COLUMNS) else ()
+    wanted = [*rotation_columns, *CHANNELS, *sigmas, *(["t"] if "t" in names else [])]
+    missing = [name for name in wanted if name not in names]
+    if missing:
+        raise BadDataset(
+            f"missing column {', '.join(missing)}: the first row must name r11..r33 or rx, ry, rz, and fx, fy, fz, "
+            f"tx, ty, tz; it names {', '.join(names)}."
+        )
+    repeated = [name for name in wanted if names.count(name) > 1]
+    if repeated:
+        raise BadDataset(f"column {', '.join(repeated)} appears more than once: keep one.")
+    if not rows:
+        raise BadDataset("the table has a header but no row: add one row per pose.")
+
+    table = np.empty((len(rows), len(wanted)))
+    for i, row in enumerate(rows):
+        if len(row) != len(names):
+            raise BadDataset(f"row {i + 1} has {len(row)} values, the header {len(names)}.")
+        for j, name in enumerate(wanted):
+            text = row[names.index(name)].strip()
+            try:
+                table[i, j] = float(text)
+            except ValueError:
+                raise BadDataset(f"row {i + 1}: {name} is '{text}', not a number.") from None
+            if not np.isfinite(table[i, j]):
+                raise BadDataset(f"row {i + 1}: {name} is {text}, not a finite number.")
+
+    k = len(rotation_columns)
+    sigma = table[:, k + 6 : k + 12] if sigmas else None
+    if sigma is not None:
+        for i, j in np.argwhere(sigma <= 0):
+            raise BadDataset(f"row {i + 1}: {SIGMA_COLUMNS[j]} is {sigma[i, j]:g}, a standard error is above 0.")
+    if vector and (longest := float(np.linalg.norm(table[:, :k], axis=1).max())) > LONGEST_VECTOR_RAD:
+        raise BadDataset(
+            f"{path.name}: a rotation vector is {longest:.0f} rad long, more than 2π: rx, ry, rz look like degrees, "
+            "convert them to rad"
+        )
+    R = Rotation.from_rotvec(table[:, :k]).as_matrix() if vector else table[:, :k].reshape(-1, 3, 3)
+    return CalibrationDataset(
+        R_base_flange=np.swapaxes(R, 1, 2) if orientation == "R_flange_base" else R,
+        wrench=table[:, k : k + 6],
+        wrench_cov=None if sigma is None else sigma[:, :, None] ** 2 * np.eye(6),
+        n_samples=np.zeros(len(rows), np.int64),
+        t_s=table[:, -1] - table[0, -1] if "t" in names else np.full(len(rows), np.nan),
+        meta={"source": path.name, "orientation": orientation},
+    )
+
+
+def _table(path: Path) -> list[list[str]]:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
+    except (UnicodeDecodeError, csv.Error) as exc:
+        raise BadDataset(f"this is not a text table ({exc}): save it as UTF-8 CSV.") from exc
+    if not rows:
+        raise BadDataset("the file is empty: choose a table with poses.")
+    return rows
+
+
+def finite(name: str, value: object, shape: tuple[int, ...]) -> Array:
+    """Convert to an array of this shape, one row per pose; raises `BadDataset` naming the row that is not finite."""
+    array = _shaped(name, value, shape)
+    _reject(name, array, ~np.isfinite(array), "not a finite number.")
+    return array
+
+
+def _shaped(name: str, value: object, shape: tuple[int, ...]) -> Array:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as exc:
+        raise BadDataset(f"{name} is not an array of numbers ({exc}).") from exc
+    if array.shape != shape:
+        raise BadDataset(f"{name} has shape {array.shape}, expected {shape}: one row per pose.")
+    return array
+
+
+def _measured(name: str, value: object, shape: tuple[int, ...]) -> Array:
+    array = finite(name, value, shape)
+    _reject(name, array, np.abs(array) > LARGEST, f"more than any sensor measures ({LARGEST:g}): check the units.")
+    return array
+
+
+def _reject(name: str, array: Array, wrong: NDArray[np.bool_], why: str) -> None:
+    """Raise `BadDataset` for the first wrong entry."""
+    for row, *rest in np.argwhere(wrong):
+        entry = "".join(f"[{j}]" for j in rest)
+        raise BadDataset(f"row {row + 1}: {name}{entry} is {array[(row, *rest)]:.3g}, {why}")
+
+
+def _rotations(R: Array) -> Array:
+    error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+    for i in np.flatnonzero(error > ROUNDING):
+        raise BadDataset(
+            f"row {i + 1}: the orientation is not a rotation matrix, R^T R differs from the identity by {error[i]:.2g} "
+            f"(rounding explains {ROUNDING:g}): check the columns and their order."
+        )
+    for i in np.flatnonzero(np.linalg.det(R) < 0):
+        raise BadDataset(
+            f"row {i + 1}: the orientation is a reflection (determinant {np.linalg.det(R[i]):.3f}), not a rotation: "
+            "check the sign of one axis."
+        )
+    rounded = error > 1e-12  # exact ones stay unchanged, so that a loaded file has the hash of the saved one
+    R[rounded] = nearest_rotation(R[rounded])
+    return R
+
+
+def _covariances(cov: Array) -> Array:
+    for i, C in enumerate(cov):
+        problem = _covariance_problem(C)
+        if problem:
+            raise BadDataset(f"row {i + 1}: wrench_cov is not a covariance matrix, {problem}.")
+    return (cov + np.swapaxes(cov, 1, 2)) / 2
+
+
+def _covariance_problem(C: Array) -> str | None:
+    variance = np.diag(C)
+    if variance.min() < LEAST_VARIANCE:
+        return f"the variance of {CHANNELS[variance.argmin()]} is {variance.min():g}, less than that of any sensor"
+    correlation = C / np.outer(np.sqrt(variance), np.sqrt(variance))
+    asymmetry = np.abs(correlation - correlation.T).max()
+    if asymmetry > 1e-9:
+        return f"it is not symmetric (by {asymmetry:.2g} of a correlation)"
+    smallest = np.linalg.eigvalsh(correlation).min()
+    if smallest <= 1e-12:
+        return f"it is not positive definite (smallest eigenvalue of the correlation {smallest:.2g})"
+    return None

@@ -1,0 +1,214 @@
+"""How far readings of an unchanged cell may be from their prediction, under each explanation of the fit's residuals.
+
+What is estimated by a fit of few poses is uncertain, and so is what acts on its readings. Two explanations are kept:
+
+* The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
+* The measured noise, by a factor that only the residuals of the fit show, and inexact orientations, which a fit of few
+  poses does not separate from other noise, or not from none. Known is only the usual accuracy of arms.
+
+Under the second, with the ratio of both variances given, the squared distance of new readings from their prediction
+over the mean square of the fit's residuals has exactly an F distribution (predictive test of Chow, Econometrica 28,
+1960). Its probability is averaged over the ratios, each weighted by its restricted likelihood in the fit (posterior
+predictive probability), so an error that the fit cannot find widens the limit as much as the data allow.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import chdtrc as chi2_sf
+from scipy.special import fdtrc as f_sf
+
+from ftcalib.compensation import Compensator
+from ftcalib.data.dataset import CalibrationDataset
+from ftcalib.data.pooling import pooled_covariance
+from ftcalib.extras.update import Update
+from ftcalib.likelihood.descent import column_scale
+from ftcalib.likelihood.gain_and_cross_talk import Response, response_columns
+from ftcalib.model import BIASES, Array, Parameters, jacobian
+from ftcalib.result import CalibrationResult
+
+USUAL_ERRORS_RAD = np.deg2rad(np.geomspace(0.005, 0.5, 20))
+"""Errors of an arm's orientations over which the average is taken. Before the fit, each is as likely as any other."""
+MANY_POSES = 1000
+LEAST_FACTOR = 0.1
+"""Of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck."""
+
+_AXES = {name: [k] for k, name in enumerate(("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm"))}
+_CHANNELS = _AXES | {"force_N": [0, 1, 2], "torque_Nm": [3, 4, 5]}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """What unchanged readings scatter by, under one explanation."""
+
+    calibration: Update
+    """The calibration, with the drift of the bias since then in its covariance."""
+    noise: Array
+    """(6n, 6n) of the new readings: measured noise, errors of each pose, drift from the first to each."""
+    freedom: float
+    """Degrees of freedom from which the fit estimated this noise, or its factor; infinite if neither."""
+    factor: float = 1.0
+    """By which all variances are multiplied, noise and calibration; chi2 is without it."""
+    weight: float = 1.0
+    """Probability of the explanation, relative to the others of its kind."""
+
+    def distance(self, R_base_flange: Array, wrench: Array) -> tuple[Array, Array, float]:
+        """Return the residuals (n, 6), their sigma (n, 6), and chi2 of all of them together."""
+        p, response = self.calibration.parameters, self.calibration.response
+        residual = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)
+        S = self.noise + self.common(R_base_flange)
+        chi2 = float(residual.ravel() @ np.linalg.solve(S, residual.ravel()))
+        return residual, np.sqrt(self.factor * np.diag(S)).reshape(residual.shape), chi2
+
+    def common(self, R_base_flange: Array) -> Array:
+        """Return the covariance (6n, 6n) of the predictions: the uncertainty of the calibration, without `factor`."""
+        p, response = self.calibration.parameters, self.calibration.response
+        C = self.calibration.covariance if response is None else response.covariance
+        K = _columns(p, response, R_base_flange).reshape(6 * len(R_base_flange), -1)
+        return np.asarray(K @ C @ K.T)
+
+    def p_value(self, chi2: float, dof: int) -> float:
+        """Probability of a larger chi2."""
+        chi2 /= self.factor
+        return float(chi2_sf(dof, chi2) if np.isinf(self.freedom) else f_sf(dof, self.freedom, chi2 / dof))
+
+    def deviance(self, chi2: float, dof: int) -> float:
+        """-2 log likelihood: chi2, or that of Student's distribution if the noise was estimated."""
+        chi2 /= self.factor
+        return chi2 if np.isinf(self.freedom) else (self.freedom + dof) * float(np.log1p(chi2 / self.freedom))
+
+
+def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wrench_cov: Array) -> Expected:
+    """Add up what the fit found beyond the measured noise, as if the new poses continued the tour.
+
+    A random walk of variance q² a pose moves the bias by q² (N / 3 + 1) from its mean over the N poses of the tour to
+    the first new pose. A linear drift goes on for as long as the tour. If the fit found nothing, the measured noise has
+    the factor chi2 / dof of the fit.
+    """
+    n, later = len(wrench_cov), np.arange(len(wrench_cov), dtype=np.float64)
+    n_used = calibration.n_poses - len(calibration.rejected_poses)
+    measured = np.zeros((n, 6, n, 6))
+    measured[range(n), :, range(n)] = wrench_cov
+    parts, gap = [], np.zeros(6)
+    for name, sigma in _components(calibration).items():
+        kind, _, channels = name.partition("_")
+        part, since = np.zeros((n, 6, n, 6)), np.zeros(6)
+        c = _CHANNELS.get(channels, [])
+        freedom = len(c) * calibration.dof / 6
+        if kind == "walk":
+            part[:, c, :, c], since[c] = sigma**2 * np.minimum.outer(later, later), sigma**2 * (n_used / 3 + 1)
+            freedom = len(c) * (n_used - 1) / 2  # the other half is that of the white noise
+        elif kind == "slope":
+            part[:, c, :, c], since[c] = sigma**2 * np.outer(later, later) / n_used**2, sigma**2
+            freedom = len(c)
+        elif kind == "rotation":  # turns about gravity do not show
+            part[range(n), :, range(n)] = sigma**2 * _turns(calibration.parameters, R_base_flange)
+            freedom = max(2 * n_used - 6, 2)
+        elif kind == "white":  # with unmeasured noise all of it
+            known = np.zeros_like(wrench_cov) if calibration.noise_source == "measured" else wrench_cov
+            for k in c:
+                part[range(n), k, range(n), k] = np.maximum(sigma**2 - known[:, k, k], 0.0)
+        else:  # gain and cross-talk act through the response
+            continue
+        gap += since
+        part[:, range(6), :, range(6)] += since[:, None, None]
+        parts.append((part.reshape(6 * n, 6 * n), freedom))
+    total = measured.reshape(6 * n, 6 * n) + sum((part for part, _ in parts), np.zeros((6 * n, 6 * n)))
+    noise = total - np.kron(np.ones((n, n)), np.diag(gap))
+    if not (parts or calibration.components) and calibration.noise_source == "measured":
+        factor = max(calibration.chi2 / calibration.dof, LEAST_FACTOR)
+        return Expected(_drifted(calibration, gap), noise, calibration.dof, factor)
+    # Satterthwaite: the variances of independent estimates add up, each by its share of the noise
+    inverse = np.linalg.inv(total)
+    spread = sum((float(np.vdot(inverse, part)) / (6 * n)) ** 2 / freedom for part, freedom in parts)
+    return Expected(_drifted(calibration, gap), noise, 1 / spread if spread else np.inf)
+
+
+def expected_with_inexact_orientations(
+    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
+) -> list[Expected]:
+    """Explain the fit by scaled measured noise and inexact orientations, for each ratio of both; weights sum to 1.
+
+    Drift is not part of it. Gain and cross-talk have the variance that the fit found. Empty if the noise was not
+    measured, for parameters that were known or not estimated by maximum likelihood, and for so many poses that the fit
+    finds all that matters.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult
+    fitted : CalibrationDataset
+        Poses of the fit, with measured noise.
+    R_base_flange : array, shape (n, 3, 3)
+        New poses.
+    wrench_cov : array, shape (n, 6, 6)
+        Of the new readings.
+    """
+    p, response = calibration.parameters, calibration.response
+    kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
+    dof = 6 * int(kept.sum()) - 15
+    if fitted.wrench_cov is None or calibration.method != "ml" or calibration.dof != dof or len(kept) > MANY_POSES:
+        return []
+    R, D = fitted.R_base_flange[kept], pooled_covariance(fitted.wrench_cov, fitted.n_samples)[kept]
+    e = np.asarray(Compensator(p, response=response).batch(fitted.wrench[kept], R), dtype=np.float64)
+    turn, turn_new = _turns(p, R), _turns(p, R_base_flange)
+    # Found coefficients of gain and cross-talk count as measured: zero, with the variance that the fit found.
+    size = np.full(15, np.inf)
+    if response is not None:
+        size = np.append(
+            size, np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
+        )
+    seen = np.flatnonzero(size)
+    J, before = _columns(p, response, R)[..., seen], size[seen] ** -2
+    offset = np.zeros(15) if response is None else np.append(np.zeros(15), response.coefficients)
+    found, likelihood = [], []
+    for variance in USUAL_ERRORS_RAD**2:
+        V = D + variance * turn
+        W = np.linalg.inv(V)
+        WJ = W @ J
+        H = np.einsum("nij,nik->jk", J, WJ) + np.diag(before)
+        g = np.einsum("nij,ni->j", WJ, e) - before * offset[seen]
+        scale = np.outer(column_scale(H), column_scale(H))
+        C = np.zeros((len(size), len(size)))
+        C[np.ix_(seen, seen)] = np.linalg.inv(H / scale) / scale
+        rest = float(np.einsum("ni,nij,nj->", e, W, e) + before @ offset[seen] ** 2 - g @ C[np.ix_(seen, seen)] @ g)
+        logdet = float(np.linalg.slogdet(V)[1].sum() + np.linalg.slogdet(H)[1])
+        likelihood.append(-0.5 * (logdet + dof * np.log(rest)))
+        joint = None if response is None else replace(response, covariance=C)
+        noise = np.asarray(block_diag(*(wrench_cov + variance * turn_new)))
+        known = Update(p, C[:15, :15], 0.0, 0, response=joint)
+        found.append(Expected(known, noise, dof, max(rest / dof, LEAST_FACTOR)))
+    weights = np.exp(np.array(likelihood) - max(likelihood))
+    return [replace(one, weight=weight) for one, weight in zip(found, weights / weights.sum(), strict=True)]
+
+
+def _columns(p: Parameters, response: Response | None, R_base_flange: Array) -> Array:
+    """Give the derivative (n, 6, k) by the parameters, and by gain and cross-talk if there are any."""
+    J = jacobian(p, R_base_flange)
+    return J if response is None else np.concatenate([J, response_columns(p, R_base_flange)], axis=2)
+
+
+def _turns(p: Parameters, R_base_flange: Array) -> Array:
+    """Give the covariance (n, 6, 6) of the readings for one rad² of variance of each orientation."""
+    turn = jacobian(p, R_base_flange)[..., :3]
+    return np.asarray(turn @ np.swapaxes(turn, 1, 2))
+
+
+def _components(calibration: CalibrationResult) -> Mapping[str, float]:
+    """Components of the noise, and a linear drift that was part of the model."""
+    found = dict(calibration.components)
+    if calibration.drift is not None and not any(name.startswith(("walk", "slope")) for name in found):
+        found |= {f"slope_{name}": float(abs(calibration.drift.change[c[0]])) for name, c in _AXES.items()}
+    return found
+
+
+def _drifted(calibration: CalibrationResult, gap: Array) -> Update:
+    """Add variances (6,) of the bias to the covariance of a calibration."""
+    covariance, response = calibration.covariance.copy(), calibration.response
+    covariance[BIASES, BIASES] += gap
+    if response is not None:
+        joint = response.covariance.copy()
+        joint[BIASES, BIASES] += gap
+        response = replace(response, covariance=joint)
+    return Update(calibration.parameters, covariance, 0.0, 0, response=response)

@@ -1,0 +1,244 @@
+"""Verification: whether new poses agree with a calibration and, if not, what has changed since.
+
+All residuals are tested jointly. Their covariance holds the noise of the readings, the errors of each pose that the fit
+found (`components`), the drift of the bias since, and the uncertainty of the calibration, which all poses share:
+
+    S = noise + J C J' + drift,    chi2 = r' S^-1 r
+
+`ftcalib.extras.expected_readings` has its limit, which allows for noise that was estimated from the fit.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ftcalib.data.dataset import CalibrationDataset, finite
+from ftcalib.errors import BadDataset, NotObservable
+from ftcalib.extras.bias_change import BiasChange, bias_change
+from ftcalib.extras.expected_readings import Expected, expected_as_found, expected_with_inexact_orientations
+from ftcalib.extras.update import BLOCKS, Update, reestimate
+from ftcalib.files import JSON
+from ftcalib.model import BIASES, Array, read_only
+from ftcalib.result import CalibrationResult
+
+Change = Literal["bias", "payload", "centre of mass", "mounting", "base", "several"]
+
+SINGLE: Mapping[str, Change] = {
+    "bias": "bias",
+    "weight": "payload",
+    "payload": "payload",
+    "centre of mass": "centre of mass",
+    "mounting": "mounting",
+    "base": "base",
+}
+"""Kind of update that makes up for each change."""
+SEVERAL = ("bias and payload", "all")
+COST = 8.0
+"""Each parameter must lower chi2 by more than this: one in 200 does by chance."""
+UNEXPLAINED = 1e-3
+"""Probability of the remaining misfit below which a change does not explain the readings."""
+INDISTINCT = 9.2
+"""Two changes whose chi2 differ by less are not distinguished: odds of 100 to 1."""
+FEWEST = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verification:
+    """Result of a verification; arrays are read-only."""
+
+    residual: Array
+    """(n, 6) measured minus predicted, N and N·m, in the sensor frame."""
+    predicted_sigma: Array
+    """(n, 6) standard deviation of that: noise, drift and uncertainty of the calibration."""
+    chi2: float
+    """Of all residuals together."""
+    dof: int
+    p_value: float
+    """Probability of a larger chi2 if nothing has changed."""
+    passed: bool
+    change: Change | None
+    """What has changed; None if passed, or if no change explains the readings."""
+    reason: str
+    bias_change: BiasChange
+    """Change of the six biases, as if nothing else had changed."""
+    alternatives: tuple[Change, ...] = ()
+    """Other changes that explain the readings as well."""
+    update: Update | None = None
+    """The smallest update that makes up for the change; None if passed, or if none does."""
+
+    def __post_init__(self) -> None:
+        for name in ("residual", "predicted_sigma"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the content as JSON; `update` is its kind, chi2 and dof."""
+        update = self.update
+        return {
+            "passed": self.passed,
+            "change": self.change,
+            "alternatives": list(self.alternatives),
+            "reason": self.reason,
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "p_value": self.p_value,
+            "residual": self.residual.tolist(),
+            "predicted_sigma": self.predicted_sigma.tolist(),
+            "bias_change": self.bias_change.to_dict(),
+            "update": None if update is None else {"kind": update.kind, "chi2": update.chi2, "dof": update.dof},
+        }
+
+
+def verify(
+    calibration: CalibrationResult,
+    R_base_flange: Array,
+    wrench: Array,
+    wrench_cov: Array,
+    *,
+    fitted: CalibrationDataset | None = None,
+    false_alarms: float = 0.01,
+) -> Verification:
+    """Test whether new poses agree with a calibration; on an alarm, name the change and propose the smallest update.
+
+    An alarm is a p-value below `false_alarms` under each explanation of what acted on the fit.
+
+    Each change is a model that estimates some parameters again and keeps the others with their uncertainty. It explains
+    the readings unless its remaining misfit exceeds that of 999 in 1000 good fits. Of these changes, the one with the
+    lowest chi2 plus 8 a parameter is named. If there is none, bias and payload together are tried, then all.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult
+    R_base_flange : array, shape (n, 3, 3)
+        n >= 2 poses that were not used in the calibration, in the order of measuring. 6 separate all causes.
+    wrench : array, shape (n, 6)
+        Mean readings of the free tool as measured, N and N·m, in the sensor frame.
+    wrench_cov : array, shape (n, 6, 6)
+        Covariance of those means, pooled if they come from fewer than 100 samples (`ftcalib.data.pooling`).
+    fitted : CalibrationDataset, optional
+        The poses of the calibration. They show how uncertain the noise is that a fit of few poses found, see
+        `ftcalib.extras.expected_readings`.
+    false_alarms : float
+        Share of unchanged sensors that do not pass.
+
+    Raises
+    ------
+    BadDataset
+        Fewer than two poses, or shapes that do not fit each other.
+    """
+    n = len(wrench)
+    if n < FEWEST:
+        raise BadDataset(f"{n} {'pose is' if n == 1 else 'poses are'} too few for a verification: record 2 or more.")
+    R_base_flange, wrench = finite("R_base_flange", R_base_flange, (n, 3, 3)), finite("wrench", wrench, (n, 6))
+    wrench_cov = finite("wrench_cov", wrench_cov, (n, 6, 6))
+    if not 0 < false_alarms < 1:
+        raise ValueError(f"false_alarms is {false_alarms}, expected a share between 0 and 1")
+    if fitted is not None and len(fitted) != calibration.n_poses:
+        raise BadDataset(f"{len(fitted)} poses are not those of the calibration, which has {calibration.n_poses}.")
+    p_value, expected = _likeliest(calibration, fitted, R_base_flange, wrench, wrench_cov)
+    residual, sigma, chi2 = expected.distance(R_base_flange, wrench)
+    unchanged = Verification(
+        residual=residual,
+        predicted_sigma=sigma,
+        chi2=chi2,
+        dof=6 * n,
+        p_value=p_value,
+        passed=p_value >= false_alarms,
+        change=None,
+        reason=f"the {n} poses agree with the calibration (chi2 {chi2:.0f} for {6 * n} readings, p {p_value:.2g})",
+        bias_change=bias_change(expected, R_base_flange, wrench),
+    )
+    if unchanged.passed:
+        return unchanged
+    return _explained(unchanged, calibration, expected, R_base_flange, wrench)
+
+
+def _likeliest(
+    calibration: CalibrationResult,
+    fitted: CalibrationDataset | None,
+    R_base_flange: Array,
+    wrench: Array,
+    wrench_cov: Array,
+) -> tuple[float, Expected]:
+    """Return the larger p-value of both explanations of the fit, and that explanation, where it is likeliest."""
+    found = expected_as_found(calibration, R_base_flange, wrench_cov)
+    others = []
+    if fitted is not None:
+        others = expected_with_inexact_orientations(calibration, fitted, R_base_flange, wrench_cov)
+    p_found, *p_others = (
+        one.p_value(one.distance(R_base_flange, wrench)[2], 6 * len(wrench)) for one in (found, *others)
+    )
+    p_other = sum(one.weight * p for one, p in zip(others, p_others, strict=True))
+    if p_other <= p_found:
+        return p_found, found
+    return p_other, max(others, key=lambda one: one.weight)
+
+
+def _explained(
+    alarm: Verification, calibration: CalibrationResult, expected: Expected, R_base_flange: Array, wrench: Array
+) -> Verification:
+    """Name the change, with the update that makes up for it."""
+    misfit = f"chi2 {alarm.chi2:.0f} for {alarm.dof} readings"
+    found: dict[str, tuple[float, Update]] = {}
+    for kind in (*SINGLE, *SEVERAL):
+        try:
+            update = reestimate(expected.calibration, R_base_flange, wrench, expected.noise, kind)
+        except NotObservable:
+            continue
+        cost = expected.deviance(update.chi2, alarm.dof) + COST * (alarm.dof - update.dof)
+        if cost < expected.deviance(alarm.chi2, alarm.dof) and expected.p_value(update.chi2, update.dof) > UNEXPLAINED:
+            found[kind] = cost, update
+    single = sorted((kind for kind in found if kind in SINGLE), key=lambda kind: found[kind][0])
+    if single:
+        least, update = found[single[0]]
+        change = SINGLE[single[0]]
+        near = [kind for kind in single if found[kind][0] < least + INDISTINCT and not _nested(kind, single[0])]
+        others = tuple(dict.fromkeys(SINGLE[kind] for kind in near))
+        reason = f"{_in_words(calibration, update)} ({misfit}, {update.chi2:.0f} after the update)"
+        if others:
+            reason += (
+                f"; these poses do not distinguish it from a change of {' or '.join(others)}: verify with more poses"
+            )
+        return replace(alarm, change=change, alternatives=others, update=update, reason=reason)
+    for kind in SEVERAL:
+        if kind in found:
+            update = found[kind][1]
+            what = "bias and payload" if kind == "bias and payload" else "several quantities"
+            reason = f"{what} have changed: {_in_words(calibration, update)} ({misfit})"
+            return replace(alarm, change="several", update=update, reason=reason)
+    worst = int(np.argmax(np.linalg.norm(alarm.residual / alarm.predicted_sigma, axis=1)))
+    force_N, torque_Nm = (float(np.linalg.norm(alarm.residual[worst, c])) for c in (slice(3), slice(3, 6)))
+    return replace(
+        alarm,
+        reason=f"no change of bias, payload, mounting or base explains the readings ({misfit}; the farthest is pose "
+        f"{worst + 1} with {force_N:.2g} N and {torque_Nm:.2g} N·m): free tool and cables and verify again with 6 "
+        "poses or more, or calibrate again",
+    )
+
+
+def _nested(a: str, b: str) -> bool:
+    """Whether one kind of update estimates all that the other does."""
+    return set(BLOCKS[a]) <= set(BLOCKS[b]) or set(BLOCKS[b]) <= set(BLOCKS[a])
+
+
+def _in_words(calibration: CalibrationResult, update: Update) -> str:
+    """Describe how much has changed."""
+    old, new = calibration.parameters, update.parameters
+    error = old.difference(new)
+    words = []
+    before_N, after_N = (float(np.linalg.norm(p.gravity_force_base_N)) for p in (old, new))
+    if before_N != after_N and update.kind != "base":
+        words.append(f"the payload has changed by {1e3 * (after_N - before_N) / calibration.g_m_s2:+.0f} g")
+    if error[9:12].any():
+        words.append(f"the centre of mass has moved by {1e3 * np.linalg.norm(error[9:12]):.1f} mm")
+    if error[BIASES].any():
+        force_N, torque_Nm = np.linalg.norm(error[6:9]), np.linalg.norm(error[12:15])
+        words.append(f"the bias has changed by {force_N:.2g} N and {torque_Nm:.2g} N·m")
+    if error[:3].any():
+        words.append(f"the sensor has turned on the flange by {np.rad2deg(np.linalg.norm(error[:3])):.2g}°")
+    if update.kind in ("base", "all"):
+        across = float(np.linalg.norm(np.cross(old.gravity_force_base_N, new.gravity_force_base_N)))
+        along = float(old.gravity_force_base_N @ new.gravity_force_base_N)
+        words.append(f"gravity has turned in the base by {np.rad2deg(np.arctan2(across, along)):.2g}°")
+    return ", ".join(words)

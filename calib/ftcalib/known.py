@@ -1,0 +1,169 @@
+"""Values that are known before the calibration, exactly or within a tolerance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from ftcalib.model import Array, Parameters, is_rotation, read_only
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Constraints on the parameters. A tolerance is one standard deviation; 0 means exactly known.
+
+    Raises
+    ------
+    ValueError
+        An invalid rotation, a direction of length zero, a mass that is not positive, or a negative tolerance.
+    """
+
+    R_flange_sensor: ArrayLike | None = None
+    """(3, 3) mounting of the sensor; with `yaw_only` except for a turn about flange z, default the identity."""
+    R_tolerance_rad: float = 0.0
+    """Of each of the three angles; with `yaw_only` of the two tilts."""
+    yaw_only: bool = False
+    """The sensor is mounted flat: only its turn about the flange z axis is unknown."""
+    gravity_direction_base: ArrayLike | None = None
+    """(3,) down, of any length: (0, 0, -1) for a level robot."""
+    direction_tolerance_rad: float = 0.0
+    """Of each of the two tilt angles."""
+    mass_kg: float | None = None
+    """Of the load on the sensor."""
+    mass_tolerance_kg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.R_flange_sensor is not None or self.yaw_only:
+            R = read_only(np.eye(3) if self.R_flange_sensor is None else self.R_flange_sensor)
+            if not is_rotation(R):
+                raise ValueError(f"the known R_flange_sensor must be a rotation matrix, not {R.tolist()}")
+            object.__setattr__(self, "R_flange_sensor", R)
+        if self.gravity_direction_base is not None:
+            direction = np.asarray(self.gravity_direction_base, dtype=np.float64)
+            length = float(np.linalg.norm(direction))
+            if direction.shape != (3,) or not 0 < length < np.inf:
+                raise ValueError(f"gravity_direction_base must be three numbers, not all 0, got {direction.tolist()}")
+            object.__setattr__(self, "gravity_direction_base", read_only(direction / length))
+        if self.mass_kg is not None and not 0 < self.mass_kg < np.inf:
+            raise ValueError(f"mass_kg is {self.mass_kg}, expected a positive number")
+        for name in ("R_tolerance_rad", "direction_tolerance_rad", "mass_tolerance_kg"):
+            if not 0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"{name} is {getattr(self, name)}, expected 0 (exactly known) or more")
+
+
+class Constraints:
+    """A `Known` in the form of the solver: free directions, and pseudo-measurements in units of their tolerance."""
+
+    def __init__(self, known: Known, g_m_s2: float) -> None:
+        self.R = None if known.R_flange_sensor is None else np.asarray(known.R_flange_sensor)
+        self.yaw_only = known.yaw_only
+        self.direction = None if known.gravity_direction_base is None else np.asarray(known.gravity_direction_base)
+        self.weight_N = None if known.mass_kg is None else known.mass_kg * g_m_s2
+        self.R_tolerance = known.R_tolerance_rad
+        self.direction_tolerance = known.direction_tolerance_rad
+        self.weight_tolerance_N = known.mass_tolerance_kg * g_m_s2
+        self.any = not (self.R is None and self.direction is None and self.weight_N is None)
+        self._tilts = 2 if self.yaw_only else 3
+
+    def rotations(self, minima: list[Array], cost: Array) -> list[Array]:
+        """Choose starting rotations (3, 3) R_flange_sensor: the given minima, or those that respect the known mounting.
+
+        Parameters
+        ----------
+        minima : list of array, shape (3, 3)
+            R_flange_sensor of the unconstrained minima.
+        cost : array, shape (9, 9)
+            Force cost over vec(R_flange_sensor.T).
+        """
+        if self.R is None:
+            return minima
+        if not self.yaw_only:
+            return [self.R] if self.R_tolerance == 0 else [self.R, *minima]
+        angles = np.arange(24) * np.pi / 12  # the cost is a trigonometric polynomial of degree 2
+        turned = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix() @ self.R
+        r = np.swapaxes(turned, 1, 2).reshape(-1, 9)
+        value = np.einsum("ki,ij,kj->k", r, cost, r)
+        low = (value <= np.roll(value, 1)) & (value <= np.roll(value, -1))
+        return [*turned[low][np.argsort(value[low])][:4], *(minima if self.R_tolerance > 0 else [])]
+
+    def satisfied(self, p: Parameters) -> Parameters:
+        """Replace the exactly known direction and size of the gravity force."""
+        b = np.array(p.gravity_force_base_N)
+        if self.direction is not None and self.direction_tolerance == 0:
+            b = float(np.linalg.norm(b)) * self.direction
+        if self.weight_N is not None and self.weight_tolerance_N == 0:
+            b *= self.weight_N / max(float(np.linalg.norm(b)), 1e-300)
+        return Parameters(p.R_flange_sensor, b, p.force_bias_N, p.p_sensor_com_m, p.torque_bias_Nm)
+
+    def free(self, p: Parameters) -> Array:
+        """Orthonormal basis (15, m) of the directions that are not exactly known."""
+        keep = np.eye(15)
+        fixed = []
+        if self.R is not None and self.R_tolerance == 0:
+            fixed += [keep[k] for k in range(self._tilts)]
+        b_hat = unit_vector(p.gravity_force_base_N)
+        if self.direction is not None and self.direction_tolerance == 0:
+            fixed += [np.concatenate([np.zeros(3), t, np.zeros(9)]) for t in _across(b_hat)]
+        if self.weight_N is not None and self.weight_tolerance_N == 0:
+            fixed.append(np.concatenate([np.zeros(3), b_hat, np.zeros(9)]))
+        if not fixed:
+            return keep
+        Q, _ = np.linalg.qr(np.column_stack([np.array(fixed).T, keep]))
+        return np.asarray(Q[:, len(fixed) : 15])
+
+    @property
+    def dof(self) -> int:
+        """Residual degrees of freedom that exact constraints and pseudo-measurements add."""
+        rotation = 0 if self.R is None else self._tilts
+        return rotation + 2 * (self.direction is not None) + (self.weight_N is not None)
+
+    def measurements(self, p: Parameters) -> tuple[Array, Array]:
+        """Derivative (k, 15) and residual (k,), known minus estimated, of the values known within a tolerance."""
+        rows, residuals = [np.zeros((0, 15))], [np.zeros(0)]
+
+        def add(at: int, derivative: Array, residual: Array, tolerance: float) -> None:
+            row = np.zeros((len(residual), 15))
+            row[:, at : at + 3] = derivative / tolerance
+            rows.append(row)
+            residuals.append(residual / tolerance)
+
+        if self.R is not None and self.R_tolerance > 0:
+            turn = p.R_flange_sensor @ self.R.T
+            if self.yaw_only:
+                z = np.array([0.0, 0.0, 1.0])
+                add(0, np.eye(2, 3), turn_between(z, turn @ z)[:2], self.R_tolerance)
+            else:
+                add(0, np.eye(3), Rotation.from_matrix(turn).as_rotvec(), self.R_tolerance)
+        b = p.gravity_force_base_N
+        length = max(float(np.linalg.norm(b)), 1e-300)
+        if self.direction is not None and self.direction_tolerance > 0:
+            across = _across(self.direction)
+            off = across @ np.cross(turn_between(self.direction, b / length), self.direction)
+            add(3, across / length, -off, self.direction_tolerance)
+        if self.weight_N is not None and self.weight_tolerance_N > 0:
+            add(3, b[None] / length, np.array([self.weight_N - length]), self.weight_tolerance_N)
+        return np.concatenate(rows), np.concatenate(residuals)
+
+
+def turn_between(a: Array, b: Array) -> Array:
+    """Smallest rotation vector that takes unit vector a to b."""
+    axis = np.cross(a, b)
+    sine = float(np.linalg.norm(axis))
+    angle = np.arctan2(sine, a @ b)
+    if sine < 1e-12:
+        return np.asarray(axis if a @ b > 0 else np.pi * _across(a)[0])
+    return np.asarray(axis * (angle / sine))
+
+
+def unit_vector(v: Array) -> Array:
+    """Vector (3,) divided by its length; -z for a zero vector."""
+    length = float(np.linalg.norm(v))
+    return v / length if length > 0 else np.array([0.0, 0.0, -1.0])
+
+
+def _across(direction: Array) -> Array:
+    """Two unit vectors (2, 3) at right angles to a unit vector and to each other."""
+    first = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(direction, first)])

@@ -1,0 +1,138 @@
+"""Which components of the noise the data show: added, dropped and exchanged by restricted likelihood."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ftcalib.likelihood.variance_components import (
+    FORCE,
+    NEGLIGIBLE,
+    RESPONSE,
+    TORQUE,
+    Component,
+    Linearised,
+    Point,
+    component,
+    maximise,
+    point,
+    score,
+    units,
+)
+from ftcalib.model import Array
+
+SURE = 20.0  # a gain or loss that no other component can regain
+WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
+
+
+def select(
+    problem: Linearised,
+    components: Sequence[Component],
+    theta: Array,
+    candidates: Sequence[Component],
+    needed: int | None = None,
+) -> Point:
+    """Add the candidates that raise the likelihood, one by one, then drop those that others make needless.
+
+    Parameters
+    ----------
+    problem : Linearised
+    components : sequence of Component
+        To start from.
+    theta : array, shape (k,)
+        Their variances.
+    candidates : sequence of Component
+    needed : int, optional
+        How many of the components, the first, are part of the model; by default all.
+    """
+    needed = len(components) if needed is None else needed
+    best = _pruned(problem, maximise(problem, components, theta), needed)
+    waiting = [c for c in candidates if c not in best.components]
+    last = len(best.components)  # how many came in at once
+    while waiting:
+        gains, start = predicted_gains(problem, best, waiting)
+        k = int(np.argmax(gains))
+        if gains[k] < WORTH_A_TRY:
+            break
+        # What is as good as certain comes in together with others of its kind: each acts on its own channels.
+        together = [i for i, c in enumerate(waiting) if i == k or (c.kind == waiting[k].kind and gains[i] > SURE)]
+        trial = maximise(
+            problem, [*best.components, *(waiting[i] for i in together)], np.append(best.theta, start[together])
+        )
+        if trial.loglik > best.loglik + waiting[k].needed and not trial.too_large:
+            best, last = trial, len(together)
+        waiting = [c for i, c in enumerate(waiting) if i not in together]
+    return best if len(best.components) - needed <= last else _pruned(problem, best, needed)
+
+
+def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
+    """Try a walk, gain and cross-talk together in place of the white noise of a group.
+
+    One at a time they may bring less than white noise, which then takes their place.
+    """
+    for group in (FORCE, TORQUE):
+        walk = component("walk", group)
+        drifts = any(c.kind in ("walk", "slope") and c.share[group[0]] for c in best.components)
+        if walk not in candidates or drifts or len(best.components) == needed:
+            continue
+        rest = [k for k, c in enumerate(best.components) if k < needed or c.kind != "white" or not c.share[group[0]]]
+        kept = [best.components[k] for k in rest]
+        added = [walk, *(c for c in RESPONSE if c in candidates and c not in kept)]
+        start = np.append(best.theta[rest], units(problem, best, added))
+        trial = _pruned(problem, maximise(problem, [*kept, *added], start), needed)
+        if trial.worth > best.worth and not trial.too_large:
+            best = trial
+    return best
+
+
+def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
+    """Try a linear drift of the same groups in place of random walks; keep what is likelier."""
+    walks = [k for k, c in enumerate(best.components) if c.kind == "walk"]
+    if not walks:
+        return best
+    rest = [k for k in range(len(best.components)) if k not in walks]
+    groups = [g for g in (FORCE, TORQUE) if any(best.components[k].share[c] for k in walks for c in g)]
+    slopes = [component("slope", group) for group in groups]
+    start = [
+        len(problem.r) * max(best.theta[k] for k in walks if any(best.components[k].share[c] for c in g))
+        for g in groups
+    ]
+    components = [*(best.components[k] for k in rest), *slopes]
+    trial = maximise(problem, components, np.append(best.theta[rest], start))
+    return _pruned(problem, trial, needed) if trial.loglik > best.loglik else best
+
+
+def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
+    """Drop components that raise the likelihood too little, one at a time."""
+    k = needed
+    while k < len(best.components):
+        rest = [i for i in range(len(best.components)) if i != k]
+        components, theta = [best.components[i] for i in rest], best.theta[rest]
+        without = point(problem, components, theta)  # the others can regain a part of what is lost
+        if best.loglik - without.loglik < SURE:
+            without = maximise(problem, components, theta)
+        if without.worth > best.worth:
+            best, k = without, needed
+        else:
+            k += 1
+    return best
+
+
+def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
+    """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
+    start = units(problem, best, waiting)
+    components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * start])
+    at = point(problem, components, theta) if best.noise.walks else best
+    slope, information = score(problem, at, components, theta)
+    k = len(best.components)
+    curvature, slope_k = np.diag(information)[k:], slope[k:]
+    if k:
+        known = np.linalg.lstsq(information[:k, :k], np.column_stack([information[:k, k:], slope[:k]]))[0]
+        curvature = curvature - np.einsum("ki,ki->i", information[:k, k:], known[:, :-1])
+        slope_k = slope_k - information[:k, k:].T @ known[:, -1]
+    gains = np.where(slope_k > 0, slope_k**2 / (2 * np.maximum(curvature, 1e-300)), 0.0)
+    square = np.mean(problem.r[problem.kept] ** 2, axis=0)
+    for i, c in enumerate(waiting):
+        if c.kind == "white":
+            share = np.array(c.share)
+            start[i] = max(0.1 * start[i], float(square @ share) / share.sum() - start[i])
+    return gains, start

@@ -1,0 +1,254 @@
+"""What explains the data: which poses belong together, and which components of the noise act on them.
+
+The objective is the restricted likelihood at the best parameters, less what each component and each rejected pose must
+bring. Starting from all poses and from those that agree, parameters, variances, components and rejected poses are
+improved in turn until nothing changes.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.special import chdtr as chi2_cdf
+from scipy.special import chdtri as chi2_isf
+from scipy.special import fdtri as f_ppf
+
+from ftcalib.likelihood.component_selection import (
+    WORTH_A_TRY,
+    predicted_gains,
+    select,
+    with_slopes_instead,
+    with_walks_instead,
+)
+from ftcalib.likelihood.descent import Minimum
+from ftcalib.likelihood.outliers import (
+    FALSE_REJECTION,
+    FARTHEST,
+    FEWEST_TO_REJECT_FROM,
+    Kept,
+    agreeing_poses,
+    fewest_kept,
+)
+from ftcalib.likelihood.session import LEVER_M, Session, inverses, white
+from ftcalib.likelihood.session_noise import Noise
+from ftcalib.likelihood.variance_components import Component, Linearised, Point, maximise, noise_of, squared_length
+from ftcalib.model import Array, Parameters, predict
+
+MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or `drift` asks for it
+POSES_FOR_THE_SHAPE = 500  # fewer do not show that poses are bumped by the shape of the distribution
+SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked for
+LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
+ROUNDS = 20  # of the outer loop; it ends after a few
+SETTLED = 1e-4  # squared step, in standard deviations of the estimates
+MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Explanation:
+    """One way to explain the data: which poses belong together, and what acts on them."""
+
+    parameters: Parameters
+    kept: Kept
+    components: tuple[Component, ...] = ()
+    theta: Array = field(default_factory=lambda: np.zeros(0))
+    criterion: float = np.inf
+    """-2 log restricted likelihood, plus what each component and each rejected pose must bring."""
+    noticed: bool = False
+    """Whether bumped poses may be hidden in it."""
+    noise: Noise | None = None
+    """At the parameters."""
+
+    @property
+    def noise_moves(self) -> bool:
+        """Whether the noise depends on the parameters."""
+        return not {"rotation", "gain", "cross_talk"}.isdisjoint(c.kind for c in self.components)
+
+
+def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
+    """Find the likeliest explanation, its minima in ascending order, and chi2 without components on the same poses."""
+    weights = inverses(session.cov if session.measured else np.broadcast_to(white(1.0, LEVER_M), session.cov.shape))
+    minima = session.descent.minima(weights)
+    plain = Explanation(minima[0].parameters, session.everything)
+    if session.lacks_rank(minima[0]):
+        return plain, minima, minima[0].chi2
+    if session.is_exact(minima[0].parameters):
+        minima = session.descent.minima(inverses(session.cov))
+        return plain, minima, minima[0].chi2
+    if not session.measured:
+        session.cov = session.least_noise(minima[0].parameters)
+    if _is_quiet(session, minima[0]):
+        return plain, minima, minima[0].chi2
+    chosen = min(_explanations(session, minima, weights), key=lambda e: e.criterion)
+    static = minima if chosen.kept.all() else session.descent.minima(weights * chosen.kept[:, None, None])
+    for _ in range(len(static)):
+        found = with_all_minima(session, chosen, static)
+        if session.descent.same(found[0].parameters, chosen.parameters):
+            break
+        other = _explained(session, found[0].parameters, chosen.kept)
+        if other.criterion > chosen.criterion:
+            break
+        chosen = other
+    return chosen, found, static[0].chi2
+
+
+def _is_quiet(session: Session, best: Minimum) -> bool:
+    """Whether the measured noise explains everything, so that nothing more would be found."""
+    always, candidates = session.always(), session.candidates()
+    if not session.measured or always or session.drift == "linear":
+        return False
+    if best.chi2 > float(chi2_isf(session.dof(session.everything), SUSPICIOUS)):
+        return False
+    if session.n > MANY_POSES and session.drift == "none":
+        return True  # a pose that could do harm among so many would show in chi2
+    problem = session.linearised(best.parameters, session.everything)
+    at = maximise(problem, (), np.zeros(0))
+    if _stand_out(session, squared_length(*at.left_out())):
+        return False
+    return not candidates or bool(predicted_gains(problem, at, candidates)[0].max() < WORTH_A_TRY)
+
+
+def _explanations(session: Session, minima: list[Minimum], weights: Array) -> list[Explanation]:
+    """Explain the data with all poses; and, where these may hide bumped ones, with those that agree."""
+    p = minima[0].parameters
+    found = [_explained(session, p, session.everything)]
+    if found[0].noticed:
+        starts = [m.parameters for m in minima]
+        problem, always = session.linearised(p, session.everything), session.always()
+        at = maximise(problem, always, session.start(problem, always))
+        if not session.measured:
+            weights = np.asarray(at.noise.W, dtype=np.float64)
+        distances = squared_length(*at.left_out())
+        for scaled in (False, True):
+            robust = _agreeing(session, weights, starts, distances, scaled=scaled)
+            if robust is not None:
+                found.append(_explained(session, *robust))
+    return found
+
+
+def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
+    """Improve parameters, variances, components and rejected poses in turn, until nothing changes."""
+    always, candidates = session.always(), session.candidates()
+    problem = session.linearised(p, kept)
+    at = select(problem, always, session.start(problem, always), candidates, len(always))
+    best = Explanation(p, kept)
+    for _ in range(ROUNDS):
+        if session.drift == "auto":
+            at = with_walks_instead(problem, at, candidates, len(always))
+            at = with_slopes_instead(problem, at, len(always))
+        p, problem, at = _settled(session, p, kept, problem, at)
+        distances = squared_length(*at.left_out())
+        criterion = _criterion(session, at, distances)
+        if criterion < best.criterion - 1e-3:
+            if kept.all() and _are_gaussian(session, distances):
+                return Explanation(p, kept, at.components, at.theta, criterion, noise=at.noise)
+            noise_found = {c.kind for c in at.components[len(always) :]} - {"walk", "slope"}
+            noticed = session.n >= FEWEST_TO_REJECT_FROM and (bool(noise_found) or _stand_out(session, distances))
+            best = Explanation(p, kept, at.components, at.theta, criterion, noticed, at.noise)
+            kept = _membership(session, kept, distances, at)
+            if not (kept == best.kept).all():
+                problem = session.linearised(p, kept)
+                at = maximise(problem, at.components, at.theta)
+                continue
+        again = select(problem, at.components, at.theta, candidates, len(always))
+        if set(again.components) == set(at.components):
+            break
+        at = again
+    return best
+
+
+def _settled(
+    session: Session, p: Parameters, kept: Kept, problem: Linearised, at: Point
+) -> tuple[Parameters, Linearised, Point]:
+    """Go down with the noise as it is and estimate its variances again, until they agree."""
+    for _ in range(ROUNDS):
+        if float(at.step @ np.linalg.solve(at.C, at.step)) < SETTLED:
+            break
+        p = session.descent.down(session.statistics(at.noise, p), p).parameters
+        problem = session.linearised(p, kept)
+        at = maximise(problem, at.components, at.theta)
+    return p, problem, at
+
+
+def _membership(session: Session, kept: Kept, distances: Array, at: Point) -> Kept:
+    """Reject the poses that stand out, the worst first; take back those that do not any more."""
+    limit = _limit(session, at)
+    out = kept & (distances > max(limit, float(distances[kept].max()) / 4))
+    after = (kept & ~out) | (~kept & (distances < limit))
+    return after if after.sum() >= fewest_kept(session.n) else kept
+
+
+def _limit(session: Session, at: Point) -> float:
+    """Squared distance of a good pose that one in a thousand exceeds."""
+    estimated = any(c.kind == "white" for c in at.components)
+    return 6 * float(f_ppf(6, session.dof(at.noise.kept), 1 - FALSE_REJECTION)) if estimated else FARTHEST
+
+
+def _criterion(session: Session, at: Point, distances: Array) -> float:
+    """A rejected pose has noise of its own size. At the limit it costs what it would if it counted."""
+    value, rejected, limit = -2 * at.worth, ~at.noise.kept, _limit(session, at)
+    if rejected.any():
+        far = np.maximum(distances[rejected], limit)
+        value += float(np.linalg.slogdet(at.left_out()[1][rejected])[1].sum())
+        value += float(np.sum(limit + 6 * np.log(far / limit)))
+    return value
+
+
+def with_all_minima(session: Session, e: Explanation, others: list[Minimum]) -> list[Minimum]:
+    """Find the minima again, under the noise of the explanation."""
+    noise = noise_under(session, e, e.parameters)
+    statistics, logdet = session.statistics(noise, e.parameters), noise.logdet
+    ends = []
+    for start in (e.parameters, *(minimum.parameters for minimum in others)):
+        q = start
+        for _ in range(3 if e.noise_moves else 1):
+            if e.noise_moves:
+                noise = noise_under(session, e, q)
+                statistics = session.statistics(noise, q)
+            end = session.descent.down(statistics, q)
+            q = end.parameters
+        ends.append(replace(end, chi2=end.chi2 + noise.logdet - logdet))
+    return session.descent.distinct(ends)
+
+
+def noise_under(session: Session, e: Explanation, p: Parameters) -> Noise:
+    """Give the noise that an explanation has at parameters."""
+    if e.noise is not None and not e.noise_moves:
+        return e.noise
+    return noise_of(session.linearised(p, e.kept), e.components, e.theta)
+
+
+def _are_gaussian(session: Session, distances: Array) -> bool:
+    """Whether so many poses are distributed as the noise alone would have them (Kolmogorov and Smirnov)."""
+    if session.n < POSES_FOR_THE_SHAPE or _stand_out(session, distances):
+        return False
+    share = chi2_cdf(6, np.sort(distances))
+    apart = float(np.abs(share - (np.arange(session.n) + 0.5) / session.n).max())
+    return apart < float(np.sqrt(np.log(2 / SUSPICIOUS) / (2 * session.n)))
+
+
+def _stand_out(session: Session, distances: Array) -> bool:
+    """Whether poses stand out, or so many of them that none does."""
+    if session.n < FEWEST_TO_REJECT_FROM:
+        return False
+    tail = float(np.median(distances)) / MEDIAN_DISTANCE / (float(distances.mean()) / 6)
+    return bool(distances.max() > chi2_isf(6, 2 * SUSPICIOUS / session.n)) or tail < LIGHT_TAIL
+
+
+def _agreeing(
+    session: Session, weights: Array, starts: list[Parameters], distances: Array, *, scaled: bool
+) -> tuple[Parameters, Kept] | None:
+    """Find poses that agree within the noise, or within one that fits half of all poses."""
+    if not scaled:
+        return agreeing_poses(session.descent, weights, starts) if session.measured else None
+    scale = float(np.median(distances)) / MEDIAN_DISTANCE
+    found = None
+    for _ in range(4):
+        robust = agreeing_poses(session.descent, weights / scale, starts)
+        if robust is None:
+            break
+        found = robust
+        e = session.wrench - predict(robust[0], session.R)
+        d2 = np.einsum("ni,nij,nj->n", e, weights, e, optimize=True)
+        before, scale = scale, float(np.median(d2)) / MEDIAN_DISTANCE * session.n / (session.n - 2.5)
+        if scale > 0.7 * before:
+            break
+    return found

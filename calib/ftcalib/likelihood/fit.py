@@ -1,0 +1,267 @@
+"""Maximum likelihood: joint weighted least squares of forces and torques, under the noise the data show."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from ftcalib.errors import NotObservable
+from ftcalib.known import Constraints, Known
+from ftcalib.likelihood.descent import MAX_STEPS, Minimum, column_scale
+from ftcalib.likelihood.explanation import Explanation, explain, noise_under
+from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response, response_columns
+from ftcalib.likelihood.session import FEW_POSES_FOR_RESPONSE, Drift, Session
+from ftcalib.likelihood.session_noise import Noise, summed_products
+from ftcalib.likelihood.variance_components import (
+    POSES_THAT_SHOW_THE_NOISE,
+    RESPONSE,
+    Component,
+    estimates_of_unknown_variances,
+    left_out,
+    point,
+)
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriftEstimate:
+    """How the bias moved."""
+
+    change: Array
+    """(6,) bias at the last pose minus bias at the first, N and N·m."""
+    sigma: Array
+    """(6,) standard deviation of that."""
+    bias: Array
+    """(n, 6) bias of each pose minus the mean bias, in the order of the poses given."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Estimates and everything needed to judge them. Rejected poses count nowhere but in arrays with n rows."""
+
+    parameters: Parameters
+    """With drift the biases are the mean over the poses."""
+    information: Array
+    """(15, 15) Fisher information of the error coordinates `PARAMETER_NAMES`, priors included."""
+    free: Array
+    """(15, m) orthonormal basis of what is not exactly known: the identity without a `Known`."""
+    minima: tuple[Minimum, ...]
+    """By ascending chi2, R_flange_sensor at least 1° apart; the first is the answer."""
+    chi2: float
+    """Under the noise model: measured or estimated white noise plus `components`. About dof by construction."""
+    dof: int
+    measured_chi2: float
+    """The same poses, best fit without drift, weighted by the measured noise alone; NaN without it."""
+    weights: Array
+    """(n,) 1 = used, 0 = rejected because it does not fit the others."""
+    components: Mapping[str, float]
+    """Standard deviations of what was found, by name and unit: beyond the measured noise, or all of the noise
+    where it was not measured. A `walk` is per mean interval between poses, a `slope` per session."""
+    drift: DriftEstimate | None
+    noise: Noise
+    """Covariance of all wrenches under the noise model, poses in the order of `order`."""
+    order: NDArray[np.intp]
+    """(n,) row numbers by time."""
+    R_base_flange: Array
+    """(n, 3, 3)"""
+    wrench: Array
+    """(n, 6)"""
+    given_noise: Array
+    """(15, 15) covariance of the parameters if the noise model is taken as known."""
+    covariance: Array
+    """(15, 15) zero along what is exactly known; without meaning where the information lacks rank."""
+    response: Response | None
+    """Gain and cross-talk of the sensor, best linear prediction; None where none was found."""
+
+    @property
+    def wrench_cov(self) -> Array:
+        """(n, 6, 6) noise of each pose by itself, without drift."""
+        cov = np.empty_like(self.noise.D)
+        cov[self.order] = self.noise.D
+        return cov
+
+    @property
+    def second_basin_chi2(self) -> float | None:
+        """How much worse the second best minimum fits: it is right with the odds exp(-half of this). None: no other.
+
+        Where white noise was estimated from the same residuals a larger one makes up for part of the difference.
+        """
+        if len(self.minima) == 1:
+            return None
+        best, second = self.minima[0].chi2, self.minima[1].chi2
+        if any(name.startswith("white") for name in self.components):
+            return float(self.dof * np.log(second / best))
+        return second - best
+
+    @cached_property
+    def residuals(self) -> Array:
+        """(n, 6) measured minus predicted, gain and cross-talk included, drift not."""
+        added = 0.0 if self.response is None else self.response.wrench(self.parameters, self.R_base_flange)
+        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange) - added)
+
+    @cached_property
+    def _pass(self) -> tuple[Array, Array, Array]:
+        """One pass over the poses: left-out residuals, their covariance, and the normal equations (27, 27).
+
+        These are of the 15 parameters, the residual and the 11 numbers of gain and cross-talk.
+        """
+        e, S, G = np.empty((len(self.order), 6)), np.empty((len(self.order), 6, 6)), np.zeros((27, 27))
+        for part, noise in self.noise.parts():
+            rows = self.order[part]
+            R = self.R_base_flange[rows]
+            r = self.wrench[rows] - predict(self.parameters, R)
+            X = np.concatenate(
+                [jacobian(self.parameters, R), r[..., None], response_columns(self.parameters, R)], axis=2
+            )
+            WX = noise.solve(X)
+            G += summed_products(X, WX)
+            # With a prior the best parameters leave some of J' W r.
+            e[rows], S[rows] = left_out(noise, WX[..., :15], WX[..., 15], self.given_noise)
+        return e, S, G
+
+    @cached_property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the entries of the gain: as found, else what the data leave room for, by moments."""
+        if "gain" in self.components or len(self.weights) < FEW_POSES_FOR_RESPONSE:
+            return self.components.get("gain", 0.0)
+        G, own = self._pass[2], slice(16, 21)
+        Tu, M = G[own, 15], G[own, own] - G[own, :15] @ self.given_noise @ G[:15, own]
+        excess = float(Tu @ np.linalg.lstsq(M, Tu, rcond=1e-9)[0]) - len(M)
+        return float(np.sqrt(max(excess, 0.0) / np.trace(M)))
+
+    @property
+    def left_out_residuals(self) -> Array:
+        """(n, 6) measured minus what all other poses predict for this one, drift and correlation included."""
+        return self._pass[0]
+
+    @property
+    def left_out_cov(self) -> Array:
+        """(n, 6, 6) covariance of these: noise of the pose and uncertainty of its prediction."""
+        return self._pass[1]
+
+
+def fit(
+    R_base_flange: Array,
+    wrench: Array,
+    wrench_cov: Array | None = None,
+    *,
+    t_s: Array | None = None,
+    drift: Drift = "auto",
+    known: Known | None = None,
+    g_m_s2: float = STANDARD_GRAVITY_M_S2,
+) -> Fit:
+    """Fit all 15 parameters and, where the likelihood rises enough, components of the noise.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+        Rotations, not checked again.
+    wrench : array, shape (n, 6)
+        N and N·m, in the sensor frame.
+    wrench_cov : array, shape (n, 6, 6) or (6, 6), or None
+        Covariance of each pose's wrench, or of all of them. Without it one standard deviation for all forces and one
+        for all torques are estimated; from fewer than six poses a single one for both.
+    t_s : array, shape (n,), optional
+        When each pose was taken; without it, or with NaN in it, their order counts.
+    drift : {"auto", "none", "linear", "random-walk"}
+        How the bias may move: "auto": the restricted likelihood decides. The others: not at all, or always.
+    known : Known, optional
+    g_m_s2 : float
+        Only to turn a known mass into a weight.
+
+    Raises
+    ------
+    NotObservable
+        The lowest point reached is not a minimum. Poor information is not refused here: see `Fit.information`.
+    """
+    session = Session(R_base_flange, wrench, wrench_cov, t_s, drift, Constraints(known or Known(), g_m_s2))
+    return fit_of(session, *explain(session))
+
+
+def fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
+    """Put together what follows from an explanation; arguments as `explain` returns them."""
+    best = minima[0]
+    if not best.settled:
+        weight_N = np.linalg.norm(best.parameters.gravity_force_base_N)
+        raise NotObservable(
+            f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
+            "hang something heavier on the sensor, or add poses with other orientations."
+        )
+    plain = not e.components and e.kept.all() and session.drift != "linear"
+    noise = Noise(session.cov) if plain else noise_under(session, e, best.parameters)
+    weights = np.empty(session.n)
+    weights[session.order] = e.kept
+    drifts = session.drift == "linear" or any(c.kind in ("walk", "slope") for c in e.components)
+    found = dict(zip(e.components, e.theta, strict=True))
+    Z = session.constraints.free(best.parameters)
+    given_noise = covariance = np.asarray(Z @ _inverse(Z.T @ best.information @ Z) @ Z.T)
+    response = None
+    if found.keys() & set(RESPONSE) or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
+        problem = session.linearised(best.parameters, e.kept)
+        x, C = estimates_of_unknown_variances(problem, point(problem, e.components, e.theta))
+        Z = block_diag(Z, np.eye(SIZE))
+        covariance = (Z @ C @ Z.T)[:15, :15]
+        response = Response(x[-SIZE:], Z @ C @ Z.T) if x[-SIZE:].any() else None
+    return Fit(
+        parameters=best.parameters,
+        information=best.information,
+        free=session.constraints.free(best.parameters),
+        minima=tuple(minima),
+        chi2=best.chi2,
+        dof=session.dof(e.kept),
+        measured_chi2=static_chi2 if session.measured else float("nan"),
+        weights=weights,
+        components={c.name: _deviation(session, c, v) for c, v in found.items()},
+        drift=_drift(session, best, noise, given_noise, found) if drifts else None,
+        noise=noise,
+        order=session.order,
+        R_base_flange=session.given[0],
+        wrench=session.given[1],
+        given_noise=given_noise,
+        covariance=covariance,
+        response=response,
+    )
+
+
+def _deviation(session: Session, c: Component, variance: float) -> float:
+    """Standard deviation that the fit used: estimated white noise includes its lower bound."""
+    least = 0.0 if session.measured or c.kind != "white" else session.cov[0][np.argmax(c.share), np.argmax(c.share)]
+    return float(np.sqrt(variance + least))
+
+
+def _drift(session: Session, best: Minimum, noise: Noise, C: Array, found: Mapping[Component, float]) -> DriftEstimate:
+    """Best linear prediction of the bias at every pose, and the error of its change."""
+    J, r = jacobian(best.parameters, session.R), session.wrench - predict(best.parameters, session.R)
+    T = response_columns(best.parameters, session.R)
+    variance = np.repeat([found.get(c, 0.0) for c in RESPONSE], [5, 6])[:, None]
+
+    def not_drift(X: Array) -> Array:
+        """Multiply by the covariance of all but the drift."""
+        Y = noise.D @ X
+        return np.asarray(Y + T @ (variance * summed_products(T, X)) if variance.any() else Y)
+
+    sorted_bias = r - not_drift(noise.solve(r[..., None]))[..., 0]
+    if not noise.kept.all():
+        at, seen = session.time[noise.kept], sorted_bias[noise.kept]
+        sorted_bias = np.stack([np.interp(session.time, at, channel) for channel in seen.T], axis=1)
+    bias = np.empty((session.n, 6))
+    bias[session.order] = sorted_bias
+    ends = np.flatnonzero(noise.kept)[[0, -1]]
+    select_ends = np.zeros((session.n, 6, 6))
+    select_ends[ends] = [-np.eye(6), np.eye(6)]
+    Y = not_drift(select_ends)
+    WY = noise.solve(Y)
+    E = summed_products(select_ends, J) - summed_products(WY, J)
+    cov = summed_products(select_ends, Y) - summed_products(Y, WY) + E @ C @ E.T
+    change = sorted_bias[ends[1]] - sorted_bias[ends[0]]
+    return DriftEstimate(change, np.sqrt(np.maximum(np.diag(cov), 0.0)), bias)
+
+
+def _inverse(information: Array) -> Array:
+    scale = column_scale(information)
+    value, vector = np.linalg.eigh(information / np.outer(scale, scale))
+    value = np.maximum(value, 1e-14 * value[-1])
+    return np.asarray(vector / value @ vector.T / np.outer(scale, scale))

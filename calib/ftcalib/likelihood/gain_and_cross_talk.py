@@ -1,0 +1,128 @@
+"""How a sensor of inexact calibration responds: a gain of the force, and cross-talk from force to torque.
+
+    force_N = (1 + force_gain) u + force_bias_N        torque_Nm = p x u + cross_talk_m u + torque_bias_Nm
+
+with u the weight in the sensor frame. Both matrices are symmetric, and the gain has no trace: together with mounting,
+weight and centre of mass they describe every linear response to one payload. A gain common to all axes cannot be
+separated from the weight.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ftcalib.files import JSON
+from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, read_only
+
+LEVER_M = 0.05
+"""Cross-talk counts relative to a force at this lever."""
+
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+def _symmetric(i: int, j: int) -> Array:
+    matrix = np.zeros((3, 3))
+    matrix[i, j] = matrix[j, i] = 1.0
+    return matrix
+
+
+_MIXED = [_symmetric(i, j) for i, j in _PAIRS]
+GAIN = np.array([np.diag([1.0, -1, 0]) / np.sqrt(2), np.diag([1.0, 1, -2]) / np.sqrt(6), *_MIXED])
+"""(5, 3, 3) basis of the gain: equal and independent coefficients make the entries so."""
+CROSS_TALK_M = LEVER_M * np.array([*(_symmetric(i, i) for i in range(3)), *_MIXED])
+"""(6, 3, 3) basis of the cross-talk, m."""
+SIZE = len(GAIN) + len(CROSS_TALK_M)
+
+
+def response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
+    """Give the derivative (..., 6, 11) of the wrench by the coefficients of gain and cross-talk."""
+    u = gravity_wrench(parameters, R_base_flange)[..., :3]
+    T = np.zeros((*u.shape[:-1], 6, SIZE))
+    T[..., :3, :5] = np.einsum("kij,...j->...ik", GAIN, u)
+    T[..., 3:, 5:] = np.einsum("kij,...j->...ik", CROSS_TALK_M, u)
+    return T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Response:
+    """Gain and cross-talk as estimated; what was not looked for, or not found, is zero. Arrays are read-only."""
+
+    coefficients: Array
+    """(11,) of the bases `GAIN` and `CROSS_TALK_M`."""
+    covariance: Array
+    """(26, 26) of the 15 error coordinates of the parameters and of the coefficients."""
+
+    def __post_init__(self) -> None:
+        for name, shape in (("coefficients", (SIZE,)), ("covariance", (15 + SIZE, 15 + SIZE))):
+            value = read_only(getattr(self, name))
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"the response's {name} must be {shape} finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+
+    @property
+    def force_gain(self) -> Array:
+        """(3, 3) symmetric, without trace: read minus true force, over the true force."""
+        return np.asarray(np.tensordot(self.coefficients[:5], GAIN, 1))
+
+    @property
+    def cross_talk_m(self) -> Array:
+        """(3, 3) symmetric: torque read for a force, N·m/N."""
+        return np.asarray(np.tensordot(self.coefficients[5:], CROSS_TALK_M, 1))
+
+    @property
+    def sigma(self) -> dict[str, Array]:
+        """One standard deviation (3, 3) of each entry of both matrices, by their names."""
+        C = self.covariance[15:, 15:]
+        return {
+            "force_gain": np.sqrt(np.einsum("kij,kl,lij->ij", GAIN, C[:5, :5], GAIN)),
+            "cross_talk_m": np.sqrt(np.einsum("kij,kl,lij->ij", CROSS_TALK_M, C[5:, 5:], CROSS_TALK_M)),
+        }
+
+    def wrench(self, parameters: Parameters, R_base_flange: Array) -> Array:
+        """Give what gain and cross-talk add (..., 6) to the wrench of the weight."""
+        return np.asarray(response_columns(parameters, R_base_flange) @ self.coefficients)
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Give what a calibration file holds of it; reading takes `coefficients` and `covariance`."""
+        return {
+            "force_gain": self.force_gain.tolist(),
+            "cross_talk_m": self.cross_talk_m.tolist(),
+            "sigma": {name: value.tolist() for name, value in self.sigma.items()},
+            "coefficients": self.coefficients.tolist(),
+            "covariance": self.covariance.tolist(),
+        }
+
+    def in_words(self) -> str:
+        """Say along which axes the sensor reads high or low, and how much force leaks into torque."""
+        gain, cross_talk, sigma = self.force_gain, self.cross_talk_m, self.sigma
+        found = [
+            f"reads {100 * abs(gain[k, k]):.1f} % {'high' if gain[k, k] > 0 else 'low'} along {axis}"
+            for k, axis in enumerate("xyz")
+            if abs(gain[k, k]) > 3 * sigma["force_gain"][k, k] > 0
+        ]
+        found += [
+            f"mixes force {'xyz'[i]} with {'xyz'[j]} by {100 * abs(gain[i, j]):.1f} %"
+            for i, j in _PAIRS
+            if abs(gain[i, j]) > 3 * sigma["force_gain"][i, j] > 0
+        ]
+        if (np.abs(cross_talk) > 3 * sigma["cross_talk_m"]).any():
+            found.append(f"reads up to {1e3 * np.abs(cross_talk).max():.2g} mN·m of torque for 1 N of force")
+        return "the sensor " + (", ".join(found) if found else "has a small error of gain or cross-talk")
+
+
+def predicted_covariance(
+    parameters: Parameters, covariance: Array, response: Response | None, R_base_flange: Array
+) -> Array:
+    """Covariance (..., 6, 6) of the predicted wrench that the uncertainty of all estimates causes.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    covariance : array, shape (15, 15)
+    response : Response or None
+    R_base_flange : array, shape (..., 3, 3)
+    """
+    J = jacobian(parameters, R_base_flange)
+    if response is not None:
+        J, covariance = np.concatenate([J, response_columns(parameters, R_base_flange)], axis=-1), response.covariance
+    return np.asarray(J @ covariance @ np.swapaxes(J, -1, -2))

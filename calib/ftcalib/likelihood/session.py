@@ -1,0 +1,145 @@
+"""The data of one session: poses in the order of time, what is known before, and what may act on the poses."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from ftcalib.known import Constraints
+from ftcalib.likelihood.descent import Descent, Minimum, column_scale
+from ftcalib.likelihood.gain_and_cross_talk import response_columns
+from ftcalib.likelihood.outliers import Kept
+from ftcalib.likelihood.session_noise import Noise, pose_times
+from ftcalib.likelihood.sufficient_statistics import Statistics, coefficients, features
+from ftcalib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, Component, Linearised, component
+from ftcalib.model import Array, Parameters, jacobian, predict
+
+Drift = Literal["auto", "none", "linear", "random-walk"]
+
+RANK_TOLERANCE = 1e-9
+LEVER_M = 0.025  # usual ratio of torque noise to force noise
+FEW_POSES = 6  # fewer cannot separate force noise from torque noise: the usual ratio is taken
+FEW_POSES_FOR_RESPONSE = 7  # fewer cannot separate gain and cross-talk from noise
+FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot separate drift from unknown noise
+POSES_FOR_EACH_AXIS = 50  # fewer cannot separate the drifts of the axes of a group
+FLOOR = 1e-3  # of the residuals: the least white noise where it was not measured
+
+
+class Session:
+    """Arguments as in `ftcalib.likelihood.fit.fit`."""
+
+    def __init__(
+        self,
+        R_base_flange: Array,
+        wrench: Array,
+        wrench_cov: Array | None,
+        t_s: Array | None,
+        drift: Drift,
+        constraints: Constraints,
+    ) -> None:
+        self.n = len(wrench)
+        self.given = R_base_flange, wrench
+        self.drift, self.constraints = drift, constraints
+        self.measured = wrench_cov is not None
+        time = np.arange(self.n, dtype=np.float64) if t_s is None else pose_times(t_s)
+        self.order = np.argsort(time, kind="stable")
+        self.time = time[self.order]
+        ordered = bool((self.order[1:] > self.order[:-1]).all())
+        self.R, self.wrench = (x if ordered else x[self.order] for x in self.given)
+        cov = white(*self._least()) if wrench_cov is None else np.asarray(wrench_cov, dtype=np.float64)
+        common = cov.ndim == 2
+        self.cov = np.broadcast_to(cov, (self.n, 6, 6)) if common else cov if ordered else cov[self.order]
+        self.descent = Descent(self.R, self.wrench, constraints)
+        self.everything = np.ones(self.n, bool)
+
+    def dof(self, kept: Kept) -> int:
+        """Of chi2, from the poses that count."""
+        return 6 * int(kept.sum()) - 15 + self.constraints.dof - (6 if self.drift == "linear" else 0)
+
+    def lacks_rank(self, minimum: Minimum) -> bool:
+        """Whether the poses leave a combination of parameters open."""
+        Z = self.constraints.free(minimum.parameters)
+        H = Z.T @ minimum.information @ Z
+        scale = column_scale(H)
+        eigenvalues = np.linalg.eigvalsh(H / np.outer(scale, scale))
+        return bool(eigenvalues[0] < RANK_TOLERANCE * eigenvalues[-1]) or self.dof(np.ones(self.n, bool)) <= 0
+
+    def _least(self) -> tuple[float, float]:
+        """Noise of data that have none: their rounding."""
+        least_N = 1e-12 * float(np.abs(self.wrench[:, :3]).max())
+        return least_N, LEVER_M * least_N
+
+    def is_exact(self, p: Parameters) -> bool:
+        """Whether the parameters fit data of unknown noise to rounding."""
+        if self.measured:
+            return False
+        residuals = self.wrench - predict(p, self.R)
+        return float(np.abs(residuals[:, :3]).max()) < 100 * self._least()[0]
+
+    def least_noise(self, p: Parameters) -> Array:
+        """Give a small share of the residuals, so that a random walk never explains them all."""
+        e = self.wrench - predict(p, self.R)
+        force_N, torque_Nm = (FLOOR * float(np.sqrt(np.mean(e[:, c] ** 2))) for c in (slice(0, 3), slice(3, 6)))
+        least_N, least_Nm = self._least()
+        return np.broadcast_to(white(max(force_N, least_N), max(torque_Nm, least_Nm)), self.cov.shape)
+
+    def start(self, problem: Linearised, components: Sequence[Component]) -> Array:
+        """Give variances to start from: the mean square residual of the group, or its noise where that is more."""
+        if not components:
+            return np.zeros(0)
+        noise = np.diagonal(problem.D, axis1=1, axis2=2)
+        size = np.maximum(problem.r**2, noise)[problem.kept]
+        scale = [np.mean(size[:, np.array(c.share) > 0]) for c in components]
+        return np.array([s / (10 * self.n if c.kind == "walk" else 1) for c, s in zip(components, scale, strict=True)])
+
+    def statistics(self, noise: Noise, p: Parameters) -> Statistics:
+        """Sum up under any noise, around parameters."""
+        return Statistics.of_noise(features(self.R), self.wrench, noise, coefficients(p))
+
+    def linearised(self, p: Parameters, kept: Kept) -> Linearised:
+        """Linearise at parameters."""
+        J = jacobian(p, self.R)
+        turn = J[..., :3]
+        r = self.wrench - predict(p, self.R)
+        H, g = np.zeros((15, 15)), np.zeros(15)
+        if self.constraints.any:
+            A, residual = self.constraints.measurements(p)
+            Z = self.constraints.free(p)
+            J, H, g = J @ Z, Z.T @ A.T @ A @ Z, Z.T @ A.T @ residual
+        slope = np.full(6, np.inf) if self.drift == "linear" else None
+        return Linearised(J, r, (H, g), turn, self.cov, self.time, kept, slope, response_columns(p, self.R))
+
+    def _groups(self) -> list[range]:
+        return [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]
+
+    def always(self) -> list[Component]:
+        """Components that are part of the model."""
+        always = []
+        if not self.measured and self.n < FEW_POSES:
+            always = [Component("white_force_N", "white", (1.0, 1.0, 1.0, *[LEVER_M**2] * 3))]
+        elif not self.measured:
+            always = [component("white", FORCE), component("white", TORQUE)]
+        if self.drift == "random-walk":
+            always += [component("walk", group) for group in (FORCE, TORQUE)]
+        return always
+
+    def candidates(self) -> list[Component]:
+        """Components that the data may show."""
+        found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE else []
+        if self.n >= (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
+            white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
+            walks = [component("walk", group) for group in self._groups()] if self.drift == "auto" else []
+            found += [*white, ROTATION, *walks]
+        return found
+
+
+def white(sigma_N: float, sigma_Nm: float) -> Array:
+    """Give the covariance (6, 6) of white noise."""
+    return np.diag(np.repeat([sigma_N**2, sigma_Nm**2], 3))
+
+
+def inverses(cov: Array) -> Array:
+    """Invert (n, 6, 6) matrices, once when they are all the same."""
+    if cov.strides[0] == 0:
+        return np.broadcast_to(np.linalg.inv(cov[:1]), cov.shape)
+    return np.asarray(np.linalg.inv(cov))

@@ -1,0 +1,226 @@
+"""The noise of a whole session: every pose its own, and a bias that drifts from pose to pose.
+
+    V = blockdiag(D_i) + S (K (x) I6) S + slopes + effects,    S = diag(walk)
+
+K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias: the
+pseudo-inverse of the path's stiffness matrix. This matrix is tridiagonal.
+Woodbury's identity makes every operation O(n).
+"""
+
+from collections.abc import Iterator
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+
+from ftcalib.model import Array
+
+CHUNK = 4096
+"""Rows per matrix product, so that a chunk stays in the cache."""
+SHORTEST_STEP = 1e-3  # in mean intervals: two poses at the same time have nearly the same bias
+FAINT = 1e-9  # weight of a rejected pose: too little to count, enough for the others to predict it
+
+
+class Noise:
+    """Covariance of all wrenches, and its inverse applied.
+
+    Parameters
+    ----------
+    D : array, shape (n, 6, 6)
+        Independent noise of each pose.
+    time : array, shape (n,), or None
+        Ascending, in mean intervals between poses. Not needed without drift.
+    walk : array, shape (6,), or None
+        Standard deviation of the change of each channel's bias over one unit of time.
+    slope : array, shape (6,), or None
+        Standard deviation of each channel's linear change over the session; infinite = unknown.
+    effects : tuple of array, shapes (n, 6, k) and (k,), or None
+        What acts on all poses at once, and the variances with which it does.
+    kept : bool array, shape (n,), or None
+        The poses that count. The others are as good as deleted: a walk sees a longer interval.
+    """
+
+    def __init__(
+        self,
+        D: Array,
+        time: Array | None = None,
+        walk: Array | None = None,
+        slope: Array | None = None,
+        effects: tuple[Array, Array] | None = None,
+        kept: NDArray[np.bool_] | None = None,
+    ) -> None:
+        self.D = D
+        self.n = len(D)
+        self.kept = np.ones(self.n, bool) if kept is None else kept
+        self._logdet = 0.0
+        self._low_rank: list[tuple[Array, Array]] = []
+        self._walking = np.zeros(0, np.intp)
+        if time is not None and walk is not None and walk.any():
+            self._walking = np.flatnonzero(walk)
+            self._s = walk[self._walking]
+            self._add_walk(steps(time)[1:])
+        if time is not None and slope is not None and slope.any():
+            sloping = np.flatnonzero(slope)
+            self._add_effects(centred(time)[:, None, None] * np.eye(6)[:, sloping], slope[sloping] ** 2)
+        if effects is not None:
+            self._add_effects(*effects)
+
+    @cached_property
+    def W(self) -> Array:
+        """(n, 6, 6) inverse noise of each pose by itself."""
+        if self.D.strides[0] == 0:
+            W = np.broadcast_to(np.linalg.inv(self.D[:1]), self.D.shape)
+        else:
+            W = np.linalg.inv(self.D)
+        return np.asarray(W if self.kept.all() else W * np.where(self.kept, 1.0, FAINT)[:, None, None])
+
+    def parts(self) -> Iterator[tuple[slice, "Noise"]]:
+        """Split into poses that are independent of those of other parts, few enough for the caches."""
+        if not self.independent or self.n <= CHUNK:
+            yield slice(None), self
+            return
+        for first in range(0, self.n, CHUNK):
+            part = slice(first, first + CHUNK)
+            yield part, Noise(self.D[part], kept=self.kept[part])
+
+    def _add_walk(self, dt: Array) -> None:
+        """Factorise M = K^+ + S W S, unknowns ordered by pose, then channel; then keep the mean of the walk at zero."""
+        n, k, s = self.n, self._walking.size, self._s
+        stiffness = 1 / dt
+        blocks = s[:, None] * self.W[:, self._walking[:, None], self._walking] * s
+        blocks[:-1, range(k), range(k)] += stiffness[:, None]
+        blocks[1:, range(k), range(k)] += stiffness[:, None]
+        banded = np.zeros((k + 1, n, k))
+        for a in range(k):
+            for b in range(a, k):
+                banded[k - (b - a), :, b] = blocks[:, a, b]
+        banded[0, 1:] = -stiffness[:, None]
+        self._blocks, self._stiffness = blocks, stiffness
+        self._cholesky = cholesky_banded(banded.reshape(k + 1, -1), check_finite=False)
+        ones = np.zeros((n, k, k))
+        ones[:, range(k), range(k)] = 1.0
+        M_ones = self._solve_walk(ones)
+        mean = M_ones.sum(axis=0)
+        Q = self.W[:, :, self._walking] @ (s[:, None] * M_ones)
+        self._low_rank.append((Q, np.linalg.inv(mean)))
+        self._logdet += 2 * float(np.log(self._cholesky[-1]).sum()) + float(np.linalg.slogdet(mean)[1])
+        self._logdet += k * (float(np.log(dt).sum()) - 2 * float(np.log(n)))
+
+    def _add_effects(self, T: Array, variance: Array) -> None:
+        Q = self.solve(T)
+        core = np.diag(1 / variance) + summed_products(T, Q)
+        self._low_rank.append((Q, -np.asarray(np.linalg.inv(core), dtype=np.float64)))
+        self._logdet += float(np.linalg.slogdet(core)[1]) + float(np.log(variance[np.isfinite(variance)]).sum())
+
+    def _solve_walk(self, X: Array) -> Array:
+        """Give M^-1 X for X (n, k, m)."""
+        Z = cho_solve_banded((self._cholesky, False), X.reshape(-1, X.shape[2]), check_finite=False)
+        return np.asarray(Z.reshape(X.shape))
+
+    def solve(self, X: Array) -> Array:
+        """Give V^-1 X for X (n, 6, m)."""
+        Y = np.asarray(self.W @ X)
+        if self._walking.size:
+            s = self._s[:, None]
+            Y -= self.W[:, :, self._walking] @ (s * self._solve_walk(s * Y[:, self._walking]))
+        for Q, core in self._low_rank:
+            Y += Q @ (core @ summed_products(Q, X))
+        return Y
+
+    @cached_property
+    def logdet(self) -> float:
+        """Logarithm of the determinant of V; with slopes of infinite variance what depends on the rest of it."""
+        common = self.D.strides[0] == 0
+        each = np.broadcast_to(np.linalg.slogdet(self.D[:1] if common else self.D)[1], self.n)
+        return self._logdet + float(each[self.kept].sum())
+
+    @cached_property
+    def blocks(self) -> Array:
+        """(n, 6, 6) the diagonal blocks of V^-1."""
+        W = self.W
+        if self._walking.size:
+            WS = self.W[:, :, self._walking] * self._s
+            above = -self._stiffness[:, None, None] * np.eye(self._walking.size)
+            W = W - WS @ inverse_blocks(self._blocks, above)[0] @ _transposed(WS)
+        for Q, core in self._low_rank:
+            W = W + Q @ core @ _transposed(Q)
+        return np.asarray(W, dtype=np.float64)
+
+    @property
+    def independent(self) -> bool:
+        """Whether the poses have nothing in common."""
+        return not self._low_rank
+
+    @property
+    def walks(self) -> bool:
+        """Whether the bias of some channel walks."""
+        return self._walking.size > 0
+
+    def walk_trace(self, time: Array, channels: NDArray[np.intp], low_rank: tuple[Array, Array]) -> float:
+        """Give tr(K (V^-1 + Q core Q')) for walks of these channels, where none walks yet."""
+        trace = float(np.cumsum(steps(time)) @ self.W[:, channels, channels].sum(axis=1))
+        for Q, core in (*self._low_rank, low_rank):
+            F = _following(Q[:, channels])
+            trace += float(np.vdot(core, summed_products(steps(time)[:, None, None] * F, F)))
+        return trace
+
+
+def inverse_blocks(diagonal: Array, above: Array) -> tuple[Array, Array]:
+    """Invert a symmetric block-tridiagonal matrix as far as its own blocks: diagonal (n, k, k), above it (n-1, k, k).
+
+    Every second block is eliminated at once, and the rest is inverted in the same way (cyclic reduction).
+    """
+    if len(diagonal) == 1:
+        return np.asarray(np.linalg.inv(diagonal)), above
+    inverse, beside = np.empty_like(diagonal), np.empty_like(above)
+    before, after, own = above[::2], above[1::2], np.linalg.inv(diagonal[1::2])
+    k = len(after)  # the last of the eliminated blocks may have none after it
+    left, right = own @ _transposed(before), own[:k] @ after
+    rest = diagonal[::2].copy()
+    rest[: len(own)] -= before @ left
+    rest[1:] -= _transposed(after) @ right
+    kept, between = inverse_blocks(rest, -before[:k] @ right)
+    beside[::2] = -kept[: len(own)] @ _transposed(left)
+    beside[::2][:k] -= between @ _transposed(right)
+    beside[1::2] = -left[:k] @ between - right @ kept[1:]
+    inverse[::2] = kept
+    inverse[1::2] = own - _transposed(beside[::2]) @ _transposed(left)
+    inverse[1::2][:k] -= beside[1::2] @ _transposed(right)
+    return inverse, beside
+
+
+def _transposed(X: Array) -> Array:
+    return np.swapaxes(X, -1, -2)
+
+
+def summed_products(X: Array, Y: Array) -> Array:
+    """Sum of X_i' Y_i over the poses, shape (k, l), for X (n, m, k) and Y (n, m, l)."""
+    return np.asarray(X.reshape(-1, X.shape[-1]).T @ Y.reshape(-1, Y.shape[-1]))
+
+
+def pose_times(t_s: Array) -> Array:
+    """Return times (n,) in mean intervals between poses, from 0; the poses counted if t_s lacks a time."""
+    n = len(t_s)
+    if np.isnan(t_s).any() or np.ptp(t_s) == 0:
+        return np.arange(n, dtype=np.float64)
+    return np.asarray((t_s - t_s.min()) * (n - 1) / np.ptp(t_s))
+
+
+def steps(time: Array) -> Array:
+    """Intervals (n,) before each pose; the first is one unit, which the mean bias takes up."""
+    return np.maximum(np.diff(time, prepend=time[0] - 1.0), SHORTEST_STEP)
+
+
+def walk_times(time: Array, X: Array) -> Array:
+    """Multiply X (n, k) by the covariance of a random walk of unit variance per unit time."""
+    return np.asarray(np.cumsum(steps(time)[:, None] * _following(X), axis=0))
+
+
+def _following(X: Array) -> Array:
+    return np.asarray(np.cumsum(X[::-1], axis=0)[::-1])
+
+
+def centred(time: Array) -> Array:
+    """Shift and scale time to mean zero and unit length."""
+    return np.asarray((time - time.mean()) / max(np.ptp(time), 1e-300))

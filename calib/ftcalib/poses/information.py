@@ -1,0 +1,246 @@
+"""Predicted information of a set of poses before any measurement, and pose sets that are known to be good.
+
+The Fisher information of the model depends on the orientations, a guess of the tool and the noise, not on readings.
+Pose sets hardly depend on the guess; predictions in newtons and radians do. `ftcalib.poses.selection` selects poses
+from those that an arm can reach.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftcalib.assessment.observability import second_minimum
+from ftcalib.likelihood.rotation_minima import given_rotation
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
+from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
+
+OBSERVABLE = 1e-9
+"""Smaller eigenvalues of the scaled information, as a share of the largest, count as zero."""
+
+TOOL_DOWN_R_base_flange = np.diag([1.0, -1.0, -1.0])
+
+T12 = (1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22)
+"""Numbers of the tetrahedral subgroup of the paper's 24 orientations: per pose as good as all 24, for every tool."""
+SUBSET_6 = (9, 10, 16, 19, 21, 22)
+"""Nearly the best six of the 24 that have one solution, second-basin gap 0.28."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Guess:
+    """Expected tool, noise and base. Angles and offsets as in a calibration file."""
+
+    mass_kg: float
+    """Of the load on the measuring side."""
+    sigma_force_N: float
+    """Standard deviation of one axis in the mean of one pose."""
+    sigma_torque_Nm: float
+    p_sensor_com_m: ArrayLike = (0.0, 0.0, 0.08)
+    R_flange_sensor: ArrayLike = field(default_factory=lambda: np.eye(3))
+    tilt_alpha_rad: float = 0.0
+    tilt_beta_rad: float = 0.0
+    walk_force_N: float = 0.0
+    """Standard deviation of the random walk of each axis of the force bias from pose to pose."""
+    walk_torque_Nm: float = 0.0
+    g_m_s2: float = STANDARD_GRAVITY_M_S2
+
+    def __post_init__(self) -> None:
+        for name in ("mass_kg", "sigma_force_N", "sigma_torque_Nm", "g_m_s2"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ValueError(f"{name} is {value}, expected a positive number")
+        for name in ("walk_force_N", "walk_torque_Nm"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise ValueError(f"{name} is {value}, expected zero or more")
+
+    @property
+    def weight_N(self) -> float:
+        """Mass times gravity."""
+        return self.mass_kg * self.g_m_s2
+
+    @property
+    def parameters(self) -> Parameters:
+        """The guess as parameters, without bias, because information does not depend on bias."""
+        alpha, beta = self.tilt_alpha_rad, self.tilt_beta_rad
+        down = -np.array([np.cos(alpha) * np.sin(beta), -np.sin(alpha), np.cos(alpha) * np.cos(beta)])
+        R_flange_sensor = np.asarray(self.R_flange_sensor, dtype=np.float64)
+        p_sensor_com_m = np.asarray(self.p_sensor_com_m, dtype=np.float64)
+        return Parameters(R_flange_sensor, self.weight_N * down, np.zeros(3), p_sensor_com_m, np.zeros(3))
+
+    @property
+    def scale(self) -> Array:
+        """(15,) units that make the error coordinates comparable: 1 rad, weight, weight, lever, weight times lever.
+
+        The lever is |P|, or the ratio of torque to force noise if that is longer.
+        """
+        lever_m = max(float(np.linalg.norm(self.p_sensor_com_m)), self.sigma_torque_Nm / self.sigma_force_N)
+        return np.repeat([1.0, self.weight_N, self.weight_N, lever_m, self.weight_N * lever_m], 3)
+
+    @property
+    def wrench_sigma(self) -> Array:
+        """(6,) standard deviations, N and N·m."""
+        return np.repeat([self.sigma_force_N, self.sigma_torque_Nm], 3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Expected accuracy of a calibration from given poses, from noise alone."""
+
+    n_poses: int
+    sigma: Mapping[str, Array | float]
+    """Standard deviations, named as in `CalibrationResult.sigma`; infinite if not determined by the poses."""
+    force_rms_N: float
+    """Error of the compensation (norm), root mean square over all orientations."""
+    torque_rms_Nm: float
+    cond9: float
+    """Condition of the nine force parameters' equations: 1.22 at best, above 4 fair, above 8 poor."""
+    cond_u1: float
+    """Condition of gravity directions beside a constant, which LROM needs: 1.7 at best, above 8 fair, above 25 poor."""
+    second_basin_gap: float
+    """See `second_basin`."""
+
+
+def special(numbers: Sequence[int]) -> Array:
+    """Return the orientations R_base_flange (n, 3, 3) with these numbers, 1 to 24, of the paper (Yu, eq. 14)."""
+    return np.swapaxes(SPECIAL_R_flange_base[np.asarray(numbers) - 1], 1, 2)
+
+
+def whitened_jacobian(R_base_flange: Array, guess: Guess) -> Array:
+    """Jacobian (n, 6, 15) in noise standard deviations per unit of `Guess.scale`: its square is the information."""
+    return np.asarray(jacobian(guess.parameters, R_base_flange) * guess.scale / guess.wrench_sigma[:, None])
+
+
+def information(J: Array, guess: Guess) -> Array:
+    """Fisher information (15, 15) of a whitened Jacobian (n, 6, 15) whose rows are in the order of measuring.
+
+    With a random walk of the bias, the bias parameters are those at the last pose.
+    """
+    n = len(J)
+    before_last = np.arange(n)[::-1]
+    halves = []
+    walks = guess.walk_force_N / guess.sigma_force_N, guess.walk_torque_Nm / guess.sigma_torque_Nm
+    for walk, rows in zip(walks, (J[:, :3], J[:, 3:]), strict=True):
+        flat = rows.reshape(n, 3 * J.shape[2])
+        if walk:
+            noise = np.eye(n) + walk**2 * np.minimum.outer(before_last, before_last)
+            flat = np.linalg.solve(np.linalg.cholesky(noise), flat)
+        halves.append(flat.reshape(-1, J.shape[2]))
+    stacked = np.concatenate(halves)
+    return np.asarray(stacked.T @ stacked)
+
+
+def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
+    """Predict the uncertainty of a calibration from its poses (Cramér-Rao bound of the joint model).
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+        In the order of measuring, which matters if the guess has a random walk of the bias.
+    guess : Guess
+
+    Returns
+    -------
+    Prediction
+    """
+    R_base_flange = np.asarray(R_base_flange, dtype=np.float64)
+    variance = _Variance(information(whitened_jacobian(R_base_flange, guess), guess), guess.scale)
+
+    std = np.sqrt(variance(np.eye(15)))
+    weight, alpha, beta = np.sqrt(variance(_weight_and_tilt_rows(guess))).tolist()
+    everywhere = jacobian(guess.parameters, special(range(1, 25)))
+    force, torque = (variance(everywhere[:, k].reshape(-1, 15)).sum() / 24 for k in (slice(3), slice(3, 6)))
+    u = predict(guess.parameters, R_base_flange)[:, :3] / guess.weight_N
+    return Prediction(
+        n_poses=len(R_base_flange),
+        sigma={
+            "R_flange_sensor": read_only(std[0:3]),
+            "gravity_force_base_N": read_only(std[3:6]),
+            "force_bias_N": read_only(std[6:9]),
+            "p_sensor_com_m": read_only(std[9:12]),
+            "torque_bias_Nm": read_only(std[12:15]),
+            "weight_N": weight,
+            "mass_kg": weight / guess.g_m_s2,
+            "tilt_alpha_rad": min(alpha, float(np.pi)),
+            "tilt_beta_rad": min(beta, float(np.pi)),
+        },
+        force_rms_N=float(np.sqrt(force)),
+        torque_rms_Nm=float(np.sqrt(torque)),
+        cond9=_condition(force_rows(R_base_flange, guess).reshape(-1, 9)),
+        cond_u1=_condition(np.column_stack([u, np.ones(len(u))])),
+        second_basin_gap=second_basin(R_base_flange, guess)[0],
+    )
+
+
+def prediction_weights(R_base_flange: Array, guess: Guess) -> tuple[Array, Array]:
+    """Matrices (15, 15) whose scalar product with a covariance is the mean square error over these orientations.
+
+    In the units of `Guess.scale`; of force, in sigma_force_N², and of torque, in sigma_torque_Nm².
+    """
+    J = whitened_jacobian(R_base_flange, guess)
+    force, torque = (np.einsum("nki,nkj->ij", rows, rows) / len(J) for rows in (J[:, :3], J[:, 3:]))
+    return force, torque
+
+
+def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters | None]:
+    """Compute the separation of the true mounting from the best other one by the forces; also that solution or None.
+
+    The gap is the lowest residual sum of squares of a second minimum over the rotations, fitted to exact forces of the
+    guessed tool and divided by n weight². It is 8/9 for the special 24, weak below 0.05, and 0 if exactly
+    ambiguous (all tool axes at one angle to the vertical, or too few poses). The chi2 of the
+    second solution is larger by gap n (weight / sigma_force_N)².
+    """
+    if len(R_base_flange) < 3:
+        return 0.0, None  # the solutions form a continuum
+    gap, other = second_minimum(R_base_flange, guess.parameters)
+    if other is None:
+        return gap, None
+    wrench, R = predict(guess.parameters, R_base_flange), other.R
+    gravity_N, bias_N = given_rotation(R, R_base_flange, wrench[:, :3], np.ones(len(wrench)))
+    com_m, torque_bias_Nm = com_and_torque_bias(gravity_N @ R_base_flange @ R.T, wrench[:, 3:])
+    return gap, Parameters(R.T, gravity_N, bias_N, com_m, torque_bias_Nm)
+
+
+def force_rows(R_base_flange: Array, guess: Guess) -> Array:
+    """Force equations (n, 3, 9) of rotation, weight and bias per weight: [-R [g]x, R A, 1]."""
+    return np.asarray((jacobian(guess.parameters, R_base_flange) * guess.scale / guess.weight_N)[:, :3, :9])
+
+
+class _Variance:
+    """Variances of linear functions of the error coordinates; infinite if undetermined."""
+
+    def __init__(self, information: Array, scale: Array) -> None:
+        eigenvalues, V = np.linalg.eigh(information)
+        observable = eigenvalues > OBSERVABLE * eigenvalues[-1]
+        self._scale = scale
+        self._root = V[:, observable] / np.sqrt(eigenvalues[observable])
+        self._null = V[:, ~observable]
+
+    def __call__(self, rows: Array) -> Array:
+        """(k,) variances of rows (k, 15) times the error."""
+        scaled = rows * self._scale
+        blind = ((scaled @ self._null) ** 2).sum(axis=1) > OBSERVABLE * (scaled**2).sum(axis=1)
+        return np.where(blind, np.inf, ((scaled @ self._root) ** 2).sum(axis=1))
+
+
+def _weight_and_tilt_rows(guess: Guess) -> Array:
+    """Derivatives (3, 15) of weight, alpha and beta by the error coordinates."""
+    F_b = guess.parameters.gravity_force_base_N
+    turn = skew(F_b / guess.weight_N**2)  # of a small rotation of F_b: cross(F_b, dF_b) / weight²
+    alpha, beta = guess.tilt_alpha_rad, guess.tilt_beta_rad
+    axis_of_alpha = np.array([np.cos(beta), 0.0, -np.sin(beta)])
+    rows = np.zeros((3, 15))
+    rows[0, 3:6] = F_b / guess.weight_N
+    rows[1, 3:6] = axis_of_alpha @ turn
+    rows[2, 3:6] = np.array([0.0, 1.0, 0.0]) @ turn / max(np.cos(alpha) ** 2, OBSERVABLE)
+    return rows
+
+
+def _condition(M: Array) -> float:
+    """Condition number; infinite if a column is not determined."""
+    singular = np.linalg.svd(M, compute_uv=False)
+    columns = M.shape[1]
+    if len(singular) < columns or singular[-1] <= OBSERVABLE * singular[0]:
+        return float("inf")
+    return float(singular[0] / singular[-1])

@@ -1,0 +1,369 @@
+"""Carlson's methods for an unknown gravity vector, from forces alone.
+
+F. Bagge Carlson, "On the Calibration of Force/Torque Sensors in Robotics", 2019, section 3. Section 2, gravity known,
+is in `ftcalib.published.carlson_known`.
+
+The paper's letters: `A_i = R_TF^RB = R_base_flange[i].T`, `X = R_TF^S = R_flange_sensor`, `g = gravity_force_base_N`
+(the mass is inside), so that at every pose `X f_i = A_i g` (eq. 13), stacked `F vec(X) = D g` (eq. 17). vec stacks
+columns: `vec(X) = R_flange_sensor.T.ravel()`. Without noise all methods find the same solution. With noise they do so
+(section 4.2) only when the forces point equally in all directions: prefer `polynomial`, which is least squares.
+
+The paper has no sensor bias. Every method has two forms:
+
+* `bias=False` is the paper's model. A bias then causes an unreported error: with 20 N of weight, 24 random poses and
+  0.05 N of noise, a bias of 0, 0.1, 1, 5 and 20 N makes the rotation wrong by 0.07, 0.10, 0.75, 3.7 and 10 to 20 deg
+  (rms) and the gravity force by 0.1, 0.14, 1.0, 5 and 21 %, much the same for all methods.
+* `bias=True` estimates the bias too: `X f_i = A_i g + h` with `h = X f_0`. Subtracting the mean over the poses
+  eliminates h exactly, so each method runs on `f_i - mean f` and `A_i - mean A`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ftcalib.errors import BadDataset, NotObservable
+from ftcalib.likelihood import rotation_minima
+from ftcalib.model import Array, nearest_rotation, skew
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForceFit:
+    """Result of a method that uses forces only: mounting of the sensor, weight and force bias."""
+
+    R_flange_sensor: Array
+    """(3, 3) maps sensor to flange coordinates."""
+    gravity_force_base_N: Array
+    """(3,) weight of the load on the sensor, in base axes."""
+    force_bias_N: Array
+    """(3,) in sensor axes; zero in the form without bias."""
+    converged: bool = True
+    """False if an iteration stopped before convergence; closed forms always converge."""
+    certificate_gap: float | None = None
+    """From `ftcalib.likelihood.rotation_minima.certificate`, which proves global optimality: complete below 1e-8."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForceEquations:
+    """The equations `X f_i = A_i g` of all poses, minus their mean in the form with bias."""
+
+    A: Array
+    """(n, 3, 3) base to flange; in the form with bias minus `A_mean`."""
+    f: Array
+    """(n, 3) N in sensor axes; in the form with bias minus `f_mean`."""
+    A_mean: Array
+    """(3, 3), zero in the form without bias."""
+    f_mean: Array
+    """(3,) N, zero in the form without bias."""
+
+    @property
+    def D(self) -> Array:
+        """(3n, 3), eq. 17."""
+        return self.A.reshape(-1, 3)
+
+    @property
+    def F(self) -> Array:
+        """(3n, 9) rows `f_i^T (x) I`, eq. 17."""
+        return kron_identity(self.f)
+
+    def gravity(self, R_flange_sensor: Array) -> Array:
+        """(3,) N: the least-squares gravity force of a rotation (eq. 20)."""
+        return np.asarray(np.linalg.lstsq(self.D, (self.f @ R_flange_sensor.T).ravel())[0], dtype=np.float64)
+
+    def fit(
+        self, R_flange_sensor: Array, gravity_N: Array, *, converged: bool = True, certificate_gap: float | None = None
+    ) -> ForceFit:
+        """Add the bias that follows from the means."""
+        bias_N = self.f_mean - R_flange_sensor.T @ self.A_mean @ gravity_N
+        return ForceFit(R_flange_sensor, gravity_N, bias_N, converged, certificate_gap)
+
+
+def force_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str, min_poses: int) -> ForceEquations:
+    """Check the input of a method and form its equations.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    force_N : array, shape (n, 3)
+        Sensor axes.
+    bias : bool
+        Whether to estimate the force bias, which needs one more pose.
+    method : str
+        Name for the error message.
+    min_poses : int
+        Poses the method needs without bias.
+
+    Raises
+    ------
+    NotObservable
+        Too few poses.
+    BadDataset
+        A pose or force is not finite.
+    ValueError
+        The shapes do not fit.
+    """
+    n = len(force_N)
+    if R_base_flange.shape != (n, 3, 3) or force_N.shape != (n, 3):
+        raise ValueError(f"expected shapes (n, 3, 3) and (n, 3), got {R_base_flange.shape} and {force_N.shape}")
+    finite = np.isfinite(force_N).all(axis=1) & np.isfinite(R_base_flange).all(axis=(1, 2))
+    if not finite.all():
+        raise BadDataset(f"the force or orientation in row {np.argmin(finite)} is not finite: leave that pose out")
+    needed = min_poses + bias
+    if n < needed:
+        form = "with a force bias" if bias else "without bias"
+        raise NotObservable(f"{method} {form} needs {needed} poses or more, got {n}: record {needed - n} more")
+    A = R_base_flange.transpose(0, 2, 1)
+    if not bias:
+        return ForceEquations(A, force_N, np.zeros((3, 3)), np.zeros(3))
+    A_mean, f_mean = A.mean(axis=0), force_N.mean(axis=0)
+    return ForceEquations(A - A_mean, force_N - f_mean, A_mean, f_mean)
+
+
+def eigen(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
+    """Unknown gravity by eigendecomposition (theorem 1).
+
+    vec(X) is the eigenvector of `K = F^+ D D^+ F` with the largest eigenvalue, which is 1 without noise. That is the
+    smallest principal angle between the ranges of F and D, the form computed here. It minimises `|F r - D g| / |F r|`.
+    The noise in the denominator makes it inconsistent if the forces do not point equally in all directions: with 8
+    orientations within 40 deg, each 2000 times at a signal-to-noise ratio of 10, R remains wrong by 3.5 deg where
+    `nullspace` has 0.3 deg. (With the bias as columns `[D, I]` instead of centring, a bias as large as the weight is
+    in that denominator too, and R remains wrong by 30 deg.)
+
+    Corrections: the eigenvector is that of the largest eigenvalue (appendix B takes the first, which Julia from 1.2 on
+    sorts to be the least), with length sqrt(3) and positive determinant. That the eigenvalue 1 is single does not
+    follow from full rank of F and D, as the theorem claims (all poses turned about one axis), so it is checked.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    force_N : array, shape (n, 3)
+        Sensor axes.
+    bias : bool
+        Whether to estimate the force bias, or to assume zero like the paper (see the module).
+
+    Raises
+    ------
+    NotObservable
+        Fewer than 4 poses (5 with bias), or poses that leave a family of solutions.
+    """
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the eigendecomposition")
+    Q_F, R_F = np.linalg.qr(eq.F)
+    Q_D = np.linalg.qr(eq.D)[0]
+    principal = np.linalg.svd(Q_F.T @ Q_D)[0][:, 0]
+    return _fit_vec(eq, np.linalg.solve(R_F, principal))
+
+
+def nullspace(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
+    """Unknown gravity by the nullspace method (section 3.2) in O(n).
+
+    The sum of squares over all pairwise differences is exactly n times `|(I - D D^+) F r|^2`, so the least singular
+    vector of `(I - D D^+) F` is the published solution (eqs. 22-26) without its n^2 blocks. With bias it is the LROM of
+    Yu et al. Consistent for isotropic noise.
+
+    Parameters
+    ----------
+    R_base_flange, force_N, bias
+        As in `eigen`.
+
+    Raises
+    ------
+    NotObservable
+        As in `eigen`.
+    """
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the nullspace method")
+    return _fit_vec(eq, _least_singular_vector(eq.D, eq.F))
+
+
+def iterative(
+    R_base_flange: Array,
+    force_N: Array,
+    *,
+    bias: bool,
+    gravity_start_base: Array | None = None,
+    max_iterations: int = 20_000,
+) -> ForceFit:
+    """Unknown gravity by iterative linear least squares (section 3.4, algorithm 1).
+
+    Alternates between the rotation of a given gravity, projected onto SO(3), and the gravity of a given rotation. The
+    error shrinks in each step by the second eigenvalue of K: 0.04 for 100 random orientations, but without bias 0.78,
+    0.90 and 0.98 for orientations within 60, 40 and 20 deg (about 0.5 with bias, thanks to the centring). So it runs
+    until the rotation converges, instead of 6 times as in appendix B.
+
+    Corrections: a matrix with negative determinant is negated before the projection. As printed, the
+    limit is the truth in only 39 % (start at R = I) or 52 % (random gravity) of cases with 100 random orientations;
+    with the negation, in all. With few poses there are still false fixed points: from a random gravity, without
+    noise, 37, 12, 3 and 0.3 % of cases with 5, 8, 12 and 24 random poses (and bias) end there. From the gravity of
+    theorem 1, the default, 1 % with 5 poses and none with more. (A start at zero, which the paper recommends, is the
+    start R = I by accident of the singular value decomposition.)
+
+    Parameters
+    ----------
+    R_base_flange, force_N, bias
+        As in `eigen`.
+    gravity_start_base : array, shape (3,), optional
+        A direction, of any length and sign. The default is the gravity of theorem 1.
+    max_iterations : int
+        If they do not suffice, the fit has `converged=False`.
+
+    Raises
+    ------
+    NotObservable
+        As in `eigen`.
+    """
+    eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the iterative method")
+    rotation_of_gravity = np.linalg.lstsq(eq.F, eq.D)[0]
+    gravity_of_rotation = np.linalg.lstsq(eq.D, eq.F)[0]
+    if gravity_start_base is None:
+        eigenvalues, vectors = np.linalg.eig(gravity_of_rotation @ rotation_of_gravity)
+        gravity = vectors[:, np.argmax(eigenvalues.real)].real
+    else:
+        gravity = np.array(gravity_start_base, dtype=np.float64)
+    X = np.zeros((3, 3))
+    converged = False
+    for _ in range(max_iterations):
+        previous, X = X, _rotation_of_vec(rotation_of_gravity @ gravity)
+        gravity = gravity_of_rotation @ X.T.ravel()
+        converged = bool(np.linalg.norm(X - previous) <= 1e-13)
+        if converged:
+            break
+    _require_single_null_vector(eq, gravity)
+    return eq.fit(X, gravity, converged=converged)
+
+
+def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
+    """Unknown gravity by polynomial optimisation (section 3.3, eq. 27), to certified global optimality.
+
+    Gravity and bias are linear given the rotation, so eq. 27 is the minimum of a quadratic form in vec(X) over SO(3):
+    the least-squares solution, which for isotropic noise is the most likely one. The paper follows 2^18 homotopy
+    paths in 10 minutes; the form has only 40 complex critical rotations, and `ftcalib.likelihood.rotation_minima` finds
+    all its minima in milliseconds and bounds how far the best is from the global one. (The residual in eq. 27 must be
+    `R_TF^S f - A g` for the paper's count of paths.)
+
+    Parameters
+    ----------
+    R_base_flange, force_N, bias
+        As in `eigen`.
+
+    Raises
+    ------
+    NotObservable
+        Fewer than 3 poses (4 with bias), poses that leave a family of solutions, or a second rotation that explains
+        the forces nearly as well (costs less than 12 noise variances apart, estimated from the residuals).
+    """
+    eq = force_equations(R_base_flange, force_N, bias=bias, method="polynomial optimisation", min_poses=3)
+    _require_turns_and_weight(eq)
+    Q = rotation_minima.force_cost(R_base_flange, force_N, np.ones(len(force_N)), with_bias=bias)
+    best, *others = rotation_minima.minima(Q)
+    X = best.R.T
+    gravity = eq.gravity(X)
+    _require_locally_unique(eq, gravity)
+    degrees_of_freedom = 3 * len(force_N) - (9 if bias else 6)
+    indistinguishable = max(12 * best.cost / degrees_of_freedom, 1e-12 * float(np.sum(eq.f**2)))
+    if others and others[0].cost - best.cost <= indistinguishable:
+        apart = np.degrees(np.arccos(np.clip((np.trace(best.R.T @ others[0].R) - 1) / 2, -1, 1)))
+        raise NotObservable(
+            f"two sensor orientations {apart:.0f} deg apart explain the forces about equally well: add poses, at least "
+            "one with another angle between tool axis and gravity"
+        )
+    return eq.fit(X, gravity, certificate_gap=rotation_minima.certificate(Q, best.R))
+
+
+def kron_identity(f: Array) -> Array:
+    """(3n, 9) stack of `f_i^T (x) I` for (n, 3) vectors: times vec(X) it gives the stack of `X f_i`."""
+    return np.asarray(np.einsum("nj,ik->nijk", f, np.eye(3)).reshape(-1, 9))
+
+
+def _linear_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str) -> ForceEquations:
+    """Form the equations of a method that is linear in all nine entries of the rotation, if the poses suffice."""
+    eq = force_equations(R_base_flange, force_N, bias=bias, method=method, min_poses=4)
+    _require_turns_and_weight(eq)
+    _require_varied_forces(eq.f, 0)
+    return eq
+
+
+def _rotation_of_vec(r: Array) -> Array:
+    """Rotation closest to the matrix with columns in r (9,), times a factor of either sign (theorem 1, eqs. 28-29)."""
+    X = r.reshape(3, 3).T
+    return nearest_rotation(X if np.linalg.det(X) > 0 else -X)
+
+
+def _fit_vec(eq: ForceEquations, r: Array) -> ForceFit:
+    X = _rotation_of_vec(r)
+    gravity = eq.gravity(X)
+    _require_single_null_vector(eq, gravity)
+    return eq.fit(X, gravity)
+
+
+def _complement(eliminated: Array, kept: Array) -> Array:
+    """Few rows with the Gram matrix of `kept` minus its projection on the columns of `eliminated`."""
+    k = eliminated.shape[1]
+    return np.linalg.qr(np.hstack([eliminated, kept])).R[k:, k:]
+
+
+def _least_singular_vector(eliminated: Array, kept: Array) -> Array:
+    return np.asarray(np.linalg.svd(_complement(eliminated, kept))[2][-1])
+
+
+# --- observability ---
+# The checks use the forces `A_i g` of the fitted gravity, because noise lifts the singular values of measured forces
+# above any bound, and degenerate pose sets would pass. One kind still passes: if all poses tilt the tool equally, noise
+# in the fitted direction hides it. Only a comparison with the second solution, as in `polynomial`, detects that.
+
+
+def spanned_dimensions(rows: Array, size: float) -> int:
+    """Number of dimensions spanned by the rows; `size` is their norm before a mean was subtracted, for rounding."""
+    singular = np.linalg.svd(rows, compute_uv=False)
+    return int(np.sum(singular > max(3e-5 * singular[0], 1e-9 * size)))
+
+
+def require_weight(eq: ForceEquations) -> None:
+    """Reject forces that are zero or, with a bias, constant.
+
+    Raises
+    ------
+    NotObservable
+    """
+    if not spanned_dimensions(eq.f, float(np.linalg.norm(eq.f + eq.f_mean))):
+        raise NotObservable("the forces show no weight: attach a tool or a mass to the sensor")
+
+
+def _require_turns_and_weight(eq: ForceEquations) -> None:
+    if spanned_dimensions(eq.D, len(eq.A) ** 0.5) < 3:
+        raise NotObservable(
+            "all poses turn about one base axis, and a weight along it resembles a bias: add poses turned about "
+            "another axis"
+        )
+    require_weight(eq)
+
+
+def _require_varied_forces(f: Array, size: float) -> None:
+    spanned = spanned_dimensions(f, size)
+    if spanned < 3:
+        raise NotObservable(
+            f"the weight changes the force along only {spanned} of 3 sensor axes: add poses with another angle between "
+            "tool axis and gravity"
+        )
+
+
+def _require_single_null_vector(eq: ForceEquations, gravity: Array) -> None:
+    """The equations relaxed to any matrix X must have one solution."""
+    f = eq.A @ gravity
+    size = len(f) ** 0.5 * float(np.linalg.norm(gravity))
+    _require_varied_forces(f, size)
+    missing = 8 - spanned_dimensions(_complement(eq.D, kron_identity(f)), size)
+    if missing > 0:
+        raise NotObservable(
+            f"the poses leave {missing} unknowns of the linear equations undetermined: add poses turned about "
+            "other axes"
+        )
+
+
+def _require_locally_unique(eq: ForceEquations, gravity: Array) -> None:
+    """The Jacobian in rotation (of 1 rad) and gravity (of its own size) must have full rank."""
+    weight = float(np.linalg.norm(gravity))
+    J = np.concatenate([skew(eq.A @ gravity), weight * eq.A], axis=2).reshape(-1, 6)
+    missing = 6 - spanned_dimensions(J, len(eq.A) ** 0.5 * weight)
+    if missing > 0:
+        raise NotObservable(
+            f"the poses leave {missing} of 6 unknowns of rotation and weight undetermined: "
+            "add poses turned about another axis"
+        )

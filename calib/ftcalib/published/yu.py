@@ -1,0 +1,306 @@
+"""The closed-form methods of Yu, Shi, Lou 2021: SROM (24 special orientations) and LROM (any orientations).
+
+Source: "Bias Estimation and Gravity Compensation for Wrist-Mounted Force/Torque Sensor", eqs 14-48. In this module
+A (n, 3, 3) is the paper's e_bR, base to flange, which is `R_base_flange` transposed, and the estimated R is s_eR,
+flange to sensor. Docstrings name the misprints of the paper.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftcalib.errors import NotObservable
+from ftcalib.model import Array, Parameters, nearest_rotation
+
+Indices = NDArray[np.intp]
+
+_ROWS = (
+    "+x +y +z", "+x -y -z", "+x -z +y", "+x +z -y", "-x +y -z", "-x -y +z",
+    "-x +z +y", "-x -z -y", "+y +x -z", "-y +x +z", "+z +x +y", "-z +x -y",
+    "+y -x +z", "-y -x -z", "-z -x +y", "+z -x -y", "+y +z +x", "-y -z +x",
+    "-z +y +x", "+z -y +x", "+y -z -x", "-y +z -x", "+z +y -x", "-z -y -x",
+)  # fmt: skip
+
+
+def _special_orientations() -> Array:
+    axes = dict(zip("xyz", np.eye(3), strict=True))
+    return np.array([[float(row[0] + "1") * axes[row[1]] for row in rows.split()] for rows in _ROWS])
+
+
+SPECIAL_R_flange_base = _special_orientations()
+"""(24, 3, 3) the paper's e_bR_1 … e_bR_24 (Fig. 3, Table of special orientations): the rotation group of the cube."""
+
+TOLERANCE_RAD = np.deg2rad(0.1)
+"""Largest deviation of an orientation from one of the 24."""
+
+# Numbers of the orientations whose forces are added and subtracted: p_kj for k, j = 1, 2, 3 (eqs 17-23).
+_SUMS = (
+    (((1, 2, 3, 4), (5, 6, 7, 8)), ((9, 10, 11, 12), (13, 14, 15, 16)), ((17, 18, 19, 20), (21, 22, 23, 24))),
+    (((9, 13, 17, 21), (10, 14, 18, 22)), ((1, 5, 19, 23), (2, 6, 20, 24)), ((3, 7, 11, 15), (4, 8, 12, 16))),
+    (((11, 16, 20, 23), (12, 15, 19, 24)), ((4, 7, 17, 22), (3, 8, 18, 21)), ((1, 6, 10, 13), (2, 5, 9, 14))),
+)
+
+
+def srom(R_base_flange: Array, wrench: Array) -> Parameters:
+    """Calibrate from the 24 special orientations, in any order, possibly all turned by one common rotation.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (24, 3, 3)
+        Y @ SPECIAL_R_flange_base[i].T for one rotation Y of the base, each within 0.1°.
+    wrench : array, shape (24, 6)
+        N and N·m, in the sensor frame.
+
+    Raises
+    ------
+    NotObservable
+        Orientations are missing or repeated; the message gives their numbers.
+    """
+    return srom_numbered(R_base_flange, wrench, *special_numbers(R_base_flange))
+
+
+def srom_numbered(R_base_flange: Array, wrench: Array, number: Indices, Y: Array) -> Parameters:
+    """`srom` with the result of `special_numbers`."""
+    force_N = np.empty((24, 3))
+    force_N[number] = wrench[:, :3]
+    # With A_i = R_i Y.T the published formulas see the gravity force in the turned base, Y.T F_b.
+    return _remaining_steps(R_base_flange, wrench, Y @ srom_gravity_force(force_N))
+
+
+def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
+    """Calibrate from at least five orientations.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    wrench : array, shape (n, 6)
+        N and N·m, in the sensor frame.
+
+    Raises
+    ------
+    NotObservable
+        Fewer than five poses, or poses for which the linear equations have several solutions.
+    """
+    A = np.swapaxes(R_base_flange, 1, 2)
+    return _remaining_steps(R_base_flange, wrench, lrom_gravity_force(A, wrench[:, :3]))
+
+
+def _remaining_steps(R_base_flange: Array, wrench: Array, gravity_force_base_N: Array) -> Parameters:
+    A, force_N, torque_Nm = np.swapaxes(R_base_flange, 1, 2), wrench[:, :3], wrench[:, 3:]
+    R, force_bias_N = rotation_and_force_bias(A, force_N, gravity_force_base_N)
+    p_sensor_com_m, torque_bias_Nm = com_and_torque_bias(force_N - force_bias_N, torque_Nm)
+    return Parameters(R.T, gravity_force_base_N, force_bias_N, p_sensor_com_m, torque_bias_Nm)
+
+
+def special_numbers(R_base_flange: Array) -> tuple[Indices, Array]:
+    """Recognise the 24 special orientations.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+
+    Returns
+    -------
+    number : int array, shape (24,)
+        Row i is orientation number[i] + 1 of the paper.
+    Y : array, shape (3, 3)
+        R_base_flange[i] = Y @ SPECIAL_R_flange_base[number[i]].T; the identity where that fits, else the smallest
+        rotation that does.
+
+    Raises
+    ------
+    NotObservable
+        An orientation is missing, repeated or more than 0.1° off; the message gives the numbers.
+    """
+    best = _Match(R_base_flange, np.eye(3))
+    if not best.complete:
+        turned = [_Match(R_base_flange, _common_rotation(R_base_flange, seed)) for seed in R_base_flange[:24]]
+        best = max([best, *turned], key=lambda match: match.found)
+    if not best.complete:
+        raise NotObservable(best.refusal())
+    return best.number, best.Y
+
+
+class _Match:
+    """The special orientation nearest to each pose, when the base is turned by Y."""
+
+    def __init__(self, R_base_flange: Array, Y: Array) -> None:
+        trace = np.einsum("nij,kji->nk", Y.T @ R_base_flange, SPECIAL_R_flange_base)
+        self.Y = Y
+        self.number: Indices = trace.argmax(axis=1)
+        self.angle_rad = np.arccos(np.clip((trace.max(axis=1) - 1) / 2, -1, 1))
+        self.times_seen = np.bincount(self.number[self.angle_rad <= TOLERANCE_RAD], minlength=24)
+        self.found = int(np.count_nonzero(self.times_seen))
+        self.complete = len(R_base_flange) == self.found == 24
+
+    def refusal(self) -> str:
+        if not self.found:
+            return "SROM needs its 24 orientations, and no pose has one of them: use LROM or ML."
+        problems = []
+        if self.found < 24:
+            problems.append(f"missing {_listed(np.flatnonzero(self.times_seen == 0))}")
+        if self.times_seen.max() > 1:
+            problems.append(f"repeated {_listed(np.flatnonzero(self.times_seen > 1))}")
+        strays = np.flatnonzero(self.angle_rad > TOLERANCE_RAD)
+        if strays.size:
+            worst = strays[self.angle_rad[strays].argmax()]
+            problems.append(
+                f"row {_listed(strays)} not among them (row {worst + 1} is {np.rad2deg(self.angle_rad[worst]):.2f}° "
+                f"from orientation {self.number[worst] + 1}, 0.1° is allowed)"
+            )
+        return f"SROM needs its 24 orientations once each: {'; '.join(problems)}. Use LROM or ML instead."
+
+
+def _common_rotation(R_base_flange: Array, seed: Array) -> Array:
+    """Estimate Y from all poses in the group of `seed`, and return the smallest of its 24 equivalents."""
+    match = _Match(R_base_flange, seed)
+    near = match.angle_rad < 3 * TOLERANCE_RAD
+    pairs = R_base_flange[near], SPECIAL_R_flange_base[match.number[near]]
+    equivalents = nearest_rotation(np.einsum("nij,njk->ik", *pairs)) @ SPECIAL_R_flange_base
+    rounded = equivalents.round(4)  # so that a tie, as at 45°, has the same result in every order of rows
+    smallest = min(range(24), key=lambda i: (-np.trace(rounded[i]), *rounded[i].ravel()))
+    return np.asarray(equivalents[smallest])
+
+
+def _listed(indices: Indices) -> str:
+    return ", ".join(str(i + 1) for i in indices.tolist())
+
+
+def srom_gravity_force(force_N: Array) -> Array:
+    """Gravity force in base from the 24 forces, in the paper's order: eqs 14-23.
+
+    Parameters
+    ----------
+    force_N : array, shape (24, 3)
+        In the sensor frame.
+
+    Returns
+    -------
+    array, shape (3,)
+    """
+    F_b = np.empty(3)
+    for k, sums in enumerate(_SUMS):
+        p = [
+            (force_N[np.array(plus) - 1].sum(axis=0) - force_N[np.array(minus) - 1].sum(axis=0)) / 8
+            for plus, minus in sums
+        ]
+        F_b[k] = np.cbrt(np.linalg.det(np.column_stack(p)))  # [p_k1 p_k2 p_k3] = f_bk R and det R = 1
+    return F_b
+
+
+def lrom_gravity_force(A: Array, force_N: Array) -> Array:
+    """Gravity force in base from any orientations: eqs 24-34.
+
+    The sign rule of eq 34 contradicts itself (its alpha is not that of eqs 46-48). det R > 0 replaces it and needs no
+    knowledge of the mounting of the robot.
+
+    Parameters
+    ----------
+    A : array, shape (n, 3, 3)
+        e_bR.
+    force_N : array, shape (n, 3)
+        In the sensor frame.
+
+    Returns
+    -------
+    array, shape (3,)
+
+    Raises
+    ------
+    NotObservable
+        Fewer than five poses, or poses for which the linear equations have several solutions.
+    """
+    if len(A) < 5:
+        raise NotObservable(f"LROM needs at least 5 poses, there are {len(A)}: record more, or use ML, which needs 4.")
+    H, x6_of_x9 = reduced_equations(A, force_N)
+    _, singular, Vt = np.linalg.svd(H)
+    if singular[7] <= 1e-9 * singular[0]:
+        raise NotObservable("LROM has several solutions for these poses: tilt the tool in more directions, or use ML.")
+    x9 = np.sqrt(3) * Vt[8]
+    if np.linalg.det(x9.reshape(3, 3)) < 0:
+        x9 = -x9
+    return np.asarray((x6_of_x9 @ x9)[:3])
+
+
+def reduced_equations(A: Array, force_N: Array) -> tuple[Array, Array]:
+    """Eliminate F_b and R^T F0 from the equations R^T F_i - A_i F_b - R^T F0 = 0: eqs 24-32.
+
+    Parameters
+    ----------
+    A : array, shape (n, 3, 3)
+    force_N : array, shape (n, 3)
+
+    Returns
+    -------
+    H : array, shape (m, 9), m = min(3n, 9)
+        |H x9| is the smallest possible residual for x9, the rows of R^T one after the other.
+    x6_of_x9 : array, shape (6, 9)
+        (F_b, R^T F0) = x6_of_x9 @ x9.
+    """
+    n = len(A)
+    A9 = np.einsum("kl,ni->nkli", np.eye(3), force_N).reshape(3 * n, 9)
+    A6 = np.concatenate([-A, np.broadcast_to(-np.eye(3), A.shape)], axis=2).reshape(3 * n, 6)
+    x6_of_x9 = -np.linalg.lstsq(A6, A9)[0]
+    H = np.asarray(np.linalg.qr(A9 + A6 @ x6_of_x9, mode="r"))  # the same norm in at most nine rows
+    return H, x6_of_x9
+
+
+def rotation_and_force_bias(A: Array, force_N: Array, F_b: Array) -> tuple[Array, Array]:
+    """Rotation s_eR and force bias for a known gravity force (Wahba's problem): eqs 36-42 and 39.
+
+    Parameters
+    ----------
+    A : array, shape (n, 3, 3)
+    force_N : array, shape (n, 3)
+    F_b : array, shape (3,)
+
+    Returns
+    -------
+    R : array, shape (3, 3)
+        Flange to sensor.
+    force_bias_N : array, shape (3,)
+    """
+    gravity_flange_N = A @ F_b
+    D = (force_N - force_N.mean(axis=0)).T @ (gravity_flange_N - gravity_flange_N.mean(axis=0))
+    R = nearest_rotation(D)
+    return R, force_N.mean(axis=0) - R @ gravity_flange_N.mean(axis=0)
+
+
+def com_and_torque_bias(weight_N: Array, torque_Nm: Array) -> tuple[Array, Array]:
+    """Centre of mass and torque bias by linear least squares: eqs 43-45.
+
+    The paper's regressor is the measured force without bias, whose noise makes P too short by
+    sigma^2 / (sigma^2 + mg^2 / 3).
+
+    Parameters
+    ----------
+    weight_N : array, shape (n, 3)
+        Measured force minus force bias, in the sensor frame.
+    torque_Nm : array, shape (n, 3)
+
+    Returns
+    -------
+    p_sensor_com_m, torque_bias_Nm : array, shape (3,)
+    """
+    C = np.zeros((len(weight_N), 3, 6))
+    fx, fy, fz = weight_N.T
+    C[:, 0, 1], C[:, 0, 2], C[:, 1, 2] = fz, -fy, fx  # P x F = -[F]x P
+    C[:, 1, 0], C[:, 2, 0], C[:, 2, 1] = -fz, fy, -fx
+    C[:, :, 3:] = np.eye(3)
+    solution = np.asarray(np.linalg.lstsq(C.reshape(-1, 6), torque_Nm.ravel())[0], dtype=np.float64)
+    return solution[:3], solution[3:]
+
+
+def weight_and_tilt(F_b: Array) -> tuple[float, float, float]:
+    """Weight (N) and the tilt angles alpha, beta (rad) of the base: eqs 46-48.
+
+    Two misprints of eq 48 are corrected: the weight is the norm of F_b, not its square, and the angles are those that
+    reproduce F_b = -weight [cos(alpha) sin(beta), -sin(alpha), cos(alpha) cos(beta)], with alpha in [-pi/2, pi/2]. An
+    upright base has (0, 0), one under the ceiling (0, pi). Where gravity runs along base y, beta is free and set to 0.
+
+    Parameters
+    ----------
+    F_b : array, shape (3,)
+    """
+    x, y, z = F_b.tolist()
+    beta = np.arctan2(0.0 - x, 0.0 - z) if x or z else 0.0  # not -x: a negative zero would turn pi to -pi
+    return float(np.linalg.norm(F_b)), float(np.arctan2(y, np.hypot(x, z))), float(beta)

@@ -1,0 +1,414 @@
+"""The result of a calibration: estimates, their uncertainty, provenance and verdict."""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal, Self
+
+import numpy as np
+from scipy.special import expit
+
+from ftcalib.assessment.verdict import SURE, Verdict, expected_error
+from ftcalib.compensation import Compensator
+from ftcalib.errors import BadCalibration
+from ftcalib.files import JSON, check_format, read_object, write_new
+from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
+from ftcalib.model import PARAMETER_NAMES, Array, Parameters, is_rotation, read_only
+from ftcalib.published.yu import weight_and_tilt
+
+FORMAT = "ftdrive.calibration/1"
+
+COMMON_GAIN = float(np.sqrt(5 / 3 / 3))
+"""Sigma of the mean of three gains over that of one; five numbers determine that one, so 5/3 as in Student's t."""
+
+LATER = (
+    "p_value",
+    "measured_sigma",
+    "weights",
+    "components",
+    "drift",
+    "response",
+    "gain_sigma",
+    "second_basin_chi2",
+    "quality",
+)
+"""Fields that the first files of this format lack."""
+
+Method = Literal[
+    "ml",
+    "srom",
+    "lrom",
+    "carlson-relaxation",
+    "carlson-cayley",
+    "carlson-eigen",
+    "carlson-nullspace",
+    "carlson-iterative",
+    "carlson-polynomial",
+    "known-rotation",
+    "yaw-only",
+]
+NoiseSource = Literal["measured", "residuals"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriftResult:
+    """Change of the bias during the tour; arrays are read-only."""
+
+    change: Array
+    """(6,) bias at the last pose minus bias at the first, N and N·m."""
+    sigma: Array
+    """(6,) one standard deviation of that."""
+
+    def __post_init__(self) -> None:
+        for name in ("change", "sigma"):
+            value = read_only(getattr(self, name))
+            if value.shape != (6,) or not np.isfinite(value).all():
+                raise ValueError(f"the drift's {name} must be six finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """Estimates with their covariance; arrays are read-only. Frames and signs are those of calib/README.md."""
+
+    parameters: Parameters
+    covariance: Array
+    """(15, 15) of the error coordinates `PARAMETER_NAMES`, from the noise and the `components`."""
+    residuals: Array
+    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame: `response` included, drift not."""
+    chi2: float
+    """Weighted sum of squared residuals of the used poses, with the measured noise alone, without drift or
+    `components`. If the noise was not measured, with the noise estimated from the residuals."""
+    dof: int
+    noise_source: NoiseSource
+    """Source of the noise: the spread within each pose, or the residuals of the fit."""
+    g_m_s2: float
+    method: Method
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    """Reasons for a verdict below good, then notes."""
+    provenance: Mapping[str, JSON] = field(default_factory=dict)
+    p_value: float | None = None
+    """Probability of a larger chi2 if there is only the measured noise; None if the noise was not measured."""
+    measured_sigma: Array | None = None
+    """(6,) measured standard deviation of a pose's mean, root mean square over the poses, N and N·m; None = unknown."""
+    weights: Array | None = None
+    """(n,) 1 = used, 0 = rejected because it does not fit the others. None = all are used."""
+    components: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations of the variance components, by name and unit: beyond the measured noise, or all of the noise
+    if it was not measured. `walk_…` is the random walk of the bias per mean interval between poses, `slope_…` its
+    linear change over the session, `rotation_rad` the error of each pose's orientation per axis, `gain` and
+    `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm."""
+    drift: DriftResult | None = None
+    """None: no drift was found, or `drift="none"`."""
+    response: Response | None = None
+    """Gain and cross-talk of the sensor; None: none were found, or the method does not estimate them."""
+    gain_sigma: float = 0.0
+    """Standard deviation of the gain entries that the data do not exclude."""
+    second_basin_chi2: float | None = None
+    """Increase of chi2 at the second best solution, under the noise model; None: there is no other."""
+    quality: Mapping[str, JSON] = field(default_factory=dict)
+    """Statistics behind the verdict: `loo_force_rms_N` and `loo_torque_rms_Nm` (each pose predicted from all others),
+    `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
+    `correlations` (pairs of parameters above 0.9)."""
+
+    def __post_init__(self) -> None:
+        for each in fields(Parameters):
+            if not np.isfinite(value := getattr(self.parameters, each.name)).all():
+                raise ValueError(f"{each.name} must be finite, not {value.tolist()}")
+        if not is_rotation(self.R_flange_sensor):
+            raise ValueError(f"R_flange_sensor must be a rotation matrix, not {self.R_flange_sensor.tolist()}")
+        n = len(self.residuals)
+        for name, shape in (("covariance", (15, 15)), ("residuals", (n, 6))):
+            value = read_only(getattr(self, name))
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"{name} must be {shape} finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+        for name, length in (("measured_sigma", 6), ("weights", n)):
+            if getattr(self, name) is not None:
+                value = read_only(getattr(self, name))
+                if value.shape != (length,) or not np.isfinite(value).all():
+                    raise ValueError(f"{name} must be {length} finite numbers, got shape {value.shape}")
+                object.__setattr__(self, name, value)
+        if isinstance(self.drift, Mapping):
+            object.__setattr__(self, "drift", DriftResult(self.drift["change"], self.drift["sigma"]))
+        if isinstance(self.response, Mapping):
+            given = self.response
+            object.__setattr__(self, "response", Response(given["coefficients"], given["covariance"]))
+        object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
+        object.__setattr__(self, "reasons", tuple(self.reasons))
+        for name in ("provenance", "quality"):
+            try:
+                value = json.loads(json.dumps(dict(getattr(self, name)), allow_nan=False))
+            except (TypeError, ValueError) as exc:
+                raise ValueError(f"{name} cannot be written as JSON ({exc})") from exc
+            object.__setattr__(self, name, MappingProxyType(value))
+
+    @property
+    def id(self) -> str:
+        """Name of the result: 12 hex digits of the SHA-256 of all that `compensate` and its uncertainty depend on.
+
+        Two files with the same id compensate alike, whatever their provenance.
+        """
+        numbers = [getattr(self.parameters, each.name).tolist() for each in fields(Parameters)]
+        numbers += [self.covariance.tolist(), self.gain_sigma, self.g_m_s2]
+        if self.response is not None:
+            numbers.append(self.response.to_dict())
+        return hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:12]
+
+    @property
+    def n_poses(self) -> int:
+        """Number of poses, rejected ones included."""
+        return len(self.residuals)
+
+    @property
+    def noise_factor(self) -> float:
+        """Ratio of the residuals to the measured noise: about 1 for a good fit."""
+        return float(np.sqrt(self.chi2 / self.dof))
+
+    @property
+    def rejected_poses(self) -> tuple[int, ...]:
+        """Rows, counted from 1, that were rejected."""
+        return () if self.weights is None else tuple(int(i) + 1 for i in np.flatnonzero(self.weights == 0))
+
+    @property
+    def p_wrong(self) -> float:
+        """Probability that the second best solution is the true one: 1 / (1 + exp(second_basin_chi2 / 2))."""
+        return 0.0 if self.second_basin_chi2 is None else float(expit(-self.second_basin_chi2 / 2))
+
+    @property
+    def R_flange_sensor(self) -> Array:
+        """(3, 3) maps sensor coordinates to flange coordinates."""
+        return self.parameters.R_flange_sensor
+
+    @property
+    def gravity_force_base_N(self) -> Array:
+        """(3,) weight of the load on the sensor, in base."""
+        return self.parameters.gravity_force_base_N
+
+    @property
+    def force_bias_N(self) -> Array:
+        """(3,) in the sensor frame."""
+        return self.parameters.force_bias_N
+
+    @property
+    def torque_bias_Nm(self) -> Array:
+        """(3,) in the sensor frame, about its origin."""
+        return self.parameters.torque_bias_Nm
+
+    @property
+    def p_sensor_com_m(self) -> Array:
+        """(3,) centre of mass in the sensor frame."""
+        return self.parameters.p_sensor_com_m
+
+    @property
+    def weight_N(self) -> float:
+        """Weight of the load on the sensor."""
+        return weight_and_tilt(self.gravity_force_base_N)[0]
+
+    @property
+    def mass_kg(self) -> float:
+        """Weight divided by `g_m_s2`."""
+        return self.weight_N / self.g_m_s2
+
+    @property
+    def tilt_alpha_rad(self) -> float:
+        """First tilt angle of the base, see `ftcalib.published.yu.weight_and_tilt`."""
+        return weight_and_tilt(self.gravity_force_base_N)[1]
+
+    @property
+    def tilt_beta_rad(self) -> float:
+        """Second tilt angle of the base."""
+        return weight_and_tilt(self.gravity_force_base_N)[2]
+
+    @property
+    def sigma(self) -> Mapping[str, Array | float]:
+        """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes.
+
+        Those of weight and mass include the gain common to all axes, which no orientation reveals.
+        """
+        std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, self.covariance[3:6, 3:6])
+        if weight > 1e-9 * self.weight_N:  # not exactly known
+            weight = float(np.hypot(weight, COMMON_GAIN * self.gain_sigma * self.weight_N))
+        return {
+            "R_flange_sensor": std[0:3],
+            "gravity_force_base_N": std[3:6],
+            "force_bias_N": std[6:9],
+            "p_sensor_com_m": std[9:12],
+            "torque_bias_Nm": std[12:15],
+            "weight_N": weight,
+            "mass_kg": weight / self.g_m_s2,
+            "tilt_alpha_rad": alpha,
+            "tilt_beta_rad": beta,
+        }
+
+    def compensate(self, wrench: Array, R_base_flange: Array, *, response: bool = True) -> Array:
+        """Subtract weight and bias to give the contact wrench.
+
+        Parameters
+        ----------
+        wrench : array, shape (6,) or (n, 6)
+            As measured, N and N·m, in the sensor frame.
+        R_base_flange : array, shape (3, 3) or (n, 3, 3)
+        response : bool
+            Whether to apply gain and cross-talk of the sensor to the weight. False gives the result of a program that
+            knows only mounting, weight, centre of mass and bias.
+
+        Returns
+        -------
+        array, same shape as `wrench`
+            Contact wrench on the sensor, in the sensor frame, about the sensor origin.
+        """
+        compensator = self.compensator if response else Compensator(self.parameters)
+        return np.asarray(compensator(wrench, R_base_flange), dtype=np.float64)
+
+    @cached_property
+    def compensator(self) -> Compensator:
+        """The fast form of `compensate`: one sample, into a buffer, or a recording."""
+        return Compensator(self.parameters, response=self.response)
+
+    def wrench_covariance(self, R_base_flange: Array) -> Array:
+        """Covariance of the predicted wrench due to the uncertainty of the estimates.
+
+        Parameters
+        ----------
+        R_base_flange : array, shape (..., 3, 3)
+
+        Returns
+        -------
+        array, shape (..., 6, 6)
+        """
+        R = np.asarray(R_base_flange, dtype=np.float64)
+        return predicted_covariance(self.parameters, self.covariance, self.response, R)
+
+    def predicted_error(self) -> tuple[float, float]:
+        """Expected root mean square error of `compensate` over all orientations, N and N·m, from noise alone."""
+        return expected_error(self.parameters, self.covariance, self.response)
+
+    @property
+    def noise_explains(self) -> bool:
+        """Whether the residuals agree with the noise model; True for files of the first version, which lack it."""
+        return not self.quality or (self.p_value is not None and self.p_value >= SURE)
+
+    def likely_error(self) -> Array:
+        """Root mean square error (2,) of compensating a free tool over all orientations, N and N·m.
+
+        It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the larger of that and
+        of the error in predicting each pose from all others.
+        """
+        predicted = np.array(self.predicted_error())
+        if self.noise_explains:
+            return predicted
+        left_out = [self.quality["loo_force_rms_N"], self.quality["loo_torque_rms_Nm"]]
+        return np.asarray(np.maximum(predicted, np.array(left_out, dtype=np.float64)))
+
+    def residual_summary(self) -> dict[str, float]:
+        """Root mean square and largest norm of the force and torque residuals over the poses."""
+        force, torque = np.linalg.norm(self.residuals[:, :3], axis=1), np.linalg.norm(self.residuals[:, 3:], axis=1)
+        return {
+            "force_rms_N": float(np.sqrt(np.mean(force**2))),
+            "force_max_N": float(force.max()),
+            "torque_rms_Nm": float(np.sqrt(np.mean(torque**2))),
+            "torque_max_Nm": float(torque.max()),
+        }
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the content of a calibration file."""
+        force_N, torque_Nm = self.predicted_error()
+        return {
+            "format": FORMAT,
+            "schema_version": 1,
+            "id": self.id,
+            "method": self.method,
+            "verdict": self.verdict,
+            "reasons": list(self.reasons),
+            "n_poses": self.n_poses,
+            "mass_kg": self.mass_kg,
+            "weight_N": self.weight_N,
+            "gravity_force_base_N": self.gravity_force_base_N.tolist(),
+            "R_flange_sensor": self.R_flange_sensor.tolist(),
+            "force_bias_N": self.force_bias_N.tolist(),
+            "torque_bias_Nm": self.torque_bias_Nm.tolist(),
+            "p_sensor_com_m": self.p_sensor_com_m.tolist(),
+            "tilt_alpha_rad": self.tilt_alpha_rad,
+            "tilt_beta_rad": self.tilt_beta_rad,
+            "sigma": {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in self.sigma.items()},
+            "residual": self.residual_summary(),
+            "predicted_error": {"force_rms_N": force_N, "torque_rms_Nm": torque_Nm},
+            "chi2": self.chi2,
+            "dof": self.dof,
+            "p_value": self.p_value,
+            "noise_factor": self.noise_factor,
+            "noise_source": self.noise_source,
+            "measured_sigma": None if self.measured_sigma is None else self.measured_sigma.tolist(),
+            "components": dict(self.components),
+            "drift": None
+            if self.drift is None
+            else {"change": self.drift.change.tolist(), "sigma": self.drift.sigma.tolist()},
+            "response": None if self.response is None else self.response.to_dict(),
+            "gain_sigma": self.gain_sigma,
+            "weights": None if self.weights is None else self.weights.tolist(),
+            "rejected_poses": list(self.rejected_poses),
+            "second_basin_chi2": self.second_basin_chi2,
+            "p_wrong": self.p_wrong,
+            "quality": dict(self.quality),
+            "g_m_s2": self.g_m_s2,
+            "parameter_names": list(PARAMETER_NAMES),
+            "covariance": self.covariance.tolist(),
+            "residuals": self.residuals.tolist(),
+            "provenance": dict(self.provenance),
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Build from the content of a calibration file; unknown fields are ignored. Raises `BadCalibration`."""
+        check_format(document, FORMAT, BadCalibration)
+        try:
+            return cls(
+                parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
+                **{
+                    field.name: document[field.name]
+                    for field in fields(cls)
+                    if field.name != "parameters" and not (field.name in LATER and field.name not in document)
+                },
+            )
+        except KeyError as exc:
+            raise BadCalibration(f"the calibration lacks the field {exc.args[0]}: the file is damaged.") from exc
+        except (TypeError, ValueError) as exc:
+            raise BadCalibration(f"the calibration cannot be read ({exc}): the file is damaged.") from exc
+
+    def save(self, path: Path) -> None:
+        """Write a new file; raises `FileExistsError` if it exists."""
+        write_new(path, json.dumps(self.to_dict(), allow_nan=False, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a calibration file. Raises `BadCalibration` or `OSError`."""
+        try:
+            return cls.from_dict(read_object(path, BadCalibration))
+        except BadCalibration as exc:
+            raise BadCalibration(f"{path.name}: {exc}") from exc
+
+
+def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:
+    """Propagate the covariance of the gravity force to weight (N), alpha and beta (rad).
+
+    Sigma of an angle is limited to pi, where the linear formula loses its meaning.
+    """
+    weight, _, _ = weight_and_tilt(F_b)
+    if weight == 0.0:
+        return float(np.sqrt(np.trace(cov))), float(np.pi), float(np.pi)
+    x, y, z = F_b.tolist()
+    h = float(np.hypot(x, z))
+    out = np.array([x, 0.0, z]) / h if h > 0 else np.array([1.0, 0.0, 0.0])  # away from the base y axis
+    gradients = np.array([F_b / weight, (h * np.array([0.0, 1.0, 0.0]) - y * out) / weight**2])
+    variance = np.einsum("ki,ij,kj->k", gradients, cov, gradients)
+    weight_sigma, alpha = np.sqrt(np.maximum(variance, 0.0)).tolist()  # below 0 only by rounding, if exactly known
+    along_beta = np.array([z, 0.0, -x])
+    beta = float(np.sqrt(max(along_beta @ cov @ along_beta, 0.0))) / h**2 if h > 0 else float("inf")
+    return weight_sigma, min(alpha, float(np.pi)), min(beta, float(np.pi))

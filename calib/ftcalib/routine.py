@@ -1,0 +1,208 @@
+"""The calibration routine at one pose (wait until still, average, repeat if necessary) and the dataset of a tour.
+
+It reaches devices only through `ftcalib.ports` and prints nothing, so that a cell or a recording can drive it. Its
+decisions depend only on the readings of arm and sensor.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from ftcalib.data.dataset import CalibrationDataset
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_quiet, is_stationary, mean_and_covariance
+from ftcalib.errors import CalibError, TooFewSamples
+from ftcalib.model import Array
+from ftcalib.ports import Arm, ArmReading, Sensor, WrenchSamples
+
+Stage = Literal["settle", "sample"]
+
+MOVED_RAD = float(np.radians(0.05))
+"""Largest turn of the flange during a dwell: a tenth of the noise of a good sensor at 1 kg."""
+
+LONGER = (1, 2, 4)
+"""Factors on the averaging time, tried in turn until there are enough samples: polled sensors may be slow."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TourPose:
+    """One stop of a tour."""
+
+    number: int
+    """Of the orientation: 1 to 24 as in Yu et al., Fig. 3; above 100 for all others."""
+    q_rad: Array
+    """(6,) joint angles."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sampling:
+    """Time limits and repetitions at each pose."""
+
+    average_s: float = 2.0
+    still_timeout_s: float = 10.0
+    attempts: int = 2
+    """Dwells at a pose, at most: a dwell with motion or drift is repeated, and the last one is kept as noisy."""
+    noise_record_s: float = 12.0
+    """Length of the record before a tour from which the averaging time is chosen; 0 uses `average_s`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseRecord:
+    """Raw readings of arm and sensor at one pose."""
+
+    stop: int
+    """Position in the tour, from 1; the return to the first pose is last."""
+    pose: TourPose
+    before: ArmReading
+    after: ArmReading
+    samples: WrenchSamples
+    steady: bool
+    """Neither flange nor mean wrench changed during the dwell."""
+    clock_offset_ns: int = 0
+    """From the host clock to the clock of the run, which may span a restart of the computer."""
+    mean: PoseMean = field(init=False)
+    """Mean wrench and the covariance of the mean."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mean", mean_and_covariance(self.samples.wrench))
+
+    @property
+    def t_mid_ns(self) -> int:
+        """Time in the middle of the samples, on the clock of the run."""
+        return (int(self.samples.t_host_ns[0]) + int(self.samples.t_host_ns[-1])) // 2 + self.clock_offset_ns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriftCheck:
+    """Change from the first pose to its repetition at the end of the tour."""
+
+    change: Array
+    """(6,) N and N·m."""
+    sigma: Array
+    """(6,) standard deviation of the change expected from the noise alone."""
+    elapsed_s: float
+    """Negative if the first pose was retaken after the return."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as JSON takes them."""
+        return {"change": self.change.tolist(), "sigma": self.sigma.tolist(), "elapsed_s": self.elapsed_s}
+
+
+def take_pose(
+    arm: Arm,
+    sensor: Sensor,
+    stop: int,
+    pose: TourPose,
+    sampling: Sampling,
+    *,
+    guard: Callable[[], None] | None = None,
+    on_stage: Callable[[Stage], None] = lambda _: None,
+    quiet_std: Array | None = None,
+) -> PoseRecord:
+    """Wait until the arm is still, and average; repeat if arm or wrench changed during the dwell.
+
+    Parameters
+    ----------
+    stop : int
+        Place in the tour.
+    pose : TourPose
+        Pose of the arm.
+    guard : callable
+        Called between readings of the arm; raises to abort. Default: the check of the sensor.
+    on_stage : callable
+        Called at the start of each stage.
+    quiet_std : array, shape (6,), optional
+        Standard deviation of the samples of an arm at rest. A dwell with more than twice that is not steady.
+
+    Raises
+    ------
+    TooFewSamples
+        The sensor is too slow for the averaging time.
+    Exception
+        Whatever the arm, the sensor or the guard raises.
+    """
+    guard = guard or sensor.check
+    for _ in range(sampling.attempts):
+        on_stage("settle")
+        arm.wait_until_still(timeout_s=sampling.still_timeout_s, guard=guard)
+        on_stage("sample")
+        before = arm.state()
+        samples = collect_enough(sensor, sampling.average_s)
+        after = arm.state()
+        guard()
+        steady = turned_rad(before, after) < MOVED_RAD
+        if steady:
+            wrench = samples.wrench
+            steady = is_stationary(wrench) if quiet_std is None else is_quiet(wrench, quiet_std)
+        if steady:
+            break
+    return PoseRecord(stop, pose, before, after, samples, steady)
+
+
+def collect_enough(sensor: Sensor, average_s: float) -> WrenchSamples:
+    """Collect for `average_s` seconds; if that gives too few samples, repeat for longer.
+
+    Raises
+    ------
+    TooFewSamples
+        The longest time gave too few samples.
+    """
+    for times in LONGER:
+        samples = sensor.collect(times * average_s)
+        if len(samples.wrench) >= LEAST_SAMPLES:
+            break
+    require_enough(samples, times * average_s)
+    return samples
+
+
+def require_enough(samples: WrenchSamples, average_s: float) -> None:
+    """Raise `TooFewSamples` if there are too few samples to average."""
+    if len(samples.wrench) < LEAST_SAMPLES:
+        raise TooFewSamples(
+            f"the sensor sent {len(samples.wrench)} samples in {average_s} s, at least {LEAST_SAMPLES} are needed: "
+            "check its rate, or average longer"
+        )
+
+
+def turned_rad(before: ArmReading, after: ArmReading) -> float:
+    """Angle between the flange orientations of two readings."""
+    change = before.R_base_flange.T @ after.R_base_flange
+    sine = np.linalg.norm([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]]) / 2
+    return float(np.arctan2(sine, (np.trace(change) - 1) / 2))
+
+
+def is_return(record: PoseRecord, records: Sequence[PoseRecord]) -> bool:
+    """Check whether a record is the return to the first pose of its tour."""
+    return record.stop != records[0].stop and record.pose.number == records[0].pose.number
+
+
+def dataset_from(records: Sequence[PoseRecord], meta: Mapping[str, Any]) -> CalibrationDataset:
+    """Turn the records of a complete or aborted tour into a dataset.
+
+    The return to the first pose is left out, because `drift_check` uses it.
+    """
+    if not records:
+        raise CalibError("the run contains no pose: record poses first")
+    kept = [record for record in records if not is_return(record, records)]
+    t_ns = np.array([record.t_mid_ns for record in kept])
+    return CalibrationDataset(
+        R_base_flange=np.stack([record.before.R_base_flange for record in kept]),
+        wrench=np.stack([record.mean.mean for record in kept]),
+        wrench_cov=np.stack([record.mean.covariance for record in kept]),
+        n_samples=np.array([len(record.samples.t_host_ns) for record in kept]),
+        t_s=(t_ns - t_ns[0]) * 1e-9,
+        meta=meta,
+    )
+
+
+def drift_check(records: Sequence[PoseRecord]) -> DriftCheck | None:
+    """Compare the first pose with its repetition at the end; None if the tour was aborted before."""
+    if len(records) < 2 or not is_return(records[-1], records):
+        return None
+    first, last = records[0], records[-1]
+    return DriftCheck(
+        change=last.mean.mean - first.mean.mean,
+        sigma=np.sqrt(np.diag(first.mean.covariance) + np.diag(last.mean.covariance)),
+        elapsed_s=(last.t_mid_ns - first.t_mid_ns) * 1e-9,
+    )

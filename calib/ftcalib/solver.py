@@ -1,0 +1,241 @@
+"""Solve a dataset for a calibration."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftcalib.assessment.contradictions import contradictions, other_unit
+from ftcalib.assessment.cross_validation import AssessedFit, IndependentFit
+from ftcalib.assessment.faults import faults, other_poses
+from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
+from ftcalib.assessment.verdict import SIGNIFICANT_SIGMAS, judge
+from ftcalib.data.dataset import CalibrationDataset
+from ftcalib.data.pooling import pooled_covariance
+from ftcalib.errors import NotObservable
+from ftcalib.known import Known
+from ftcalib.likelihood.descent import column_scale
+from ftcalib.likelihood.fit import Fit, fit
+from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
+from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, predict
+from ftcalib.published.methods import PUBLISHED, Estimator, published
+from ftcalib.result import CalibrationResult, DriftResult, Method
+
+SIMULATIONS = 400
+UNRESOLVED_N = 1e-12
+"""No sensor resolves smaller differences of force."""
+
+_NEED_GRAVITY = ("carlson-relaxation", "carlson-cayley")
+"""Published methods that need the direction of gravity, or the weight."""
+
+
+def solve(
+    dataset: CalibrationDataset,
+    method: Method = "ml",
+    *,
+    drift: Drift = "auto",
+    known: Known | None = None,
+    g_m_s2: float = STANDARD_GRAVITY_M_S2,
+    up_in_base: ArrayLike = UP_IN_BASE,
+    payload_kg: float | None = None,
+    provenance: Mapping[str, Any] | None = None,
+) -> CalibrationResult:
+    """Calibrate from a dataset.
+
+    Parameters
+    ----------
+    dataset : CalibrationDataset
+    method : Method
+        "ml": maximum likelihood, from 4 poses on; "known-rotation", "yaw-only": the same for a sensor whose mounting is
+        known (`known`, default: axes of sensor and flange agree), or known except for its turn about flange z.
+        Or, for comparison, one of `ftcalib.published.methods.PUBLISHED`.
+    drift : {"auto", "none", "linear", "random-walk"}
+        Model of the bias during the tour: chosen from the data, constant, or as given. Poses without time count as
+        equally spaced in their order.
+    known : Known, optional
+        Known mounting, direction of gravity and mass. Of the published methods, only those that need gravity use it.
+    g_m_s2 : float
+        Gravity; mass is weight divided by it.
+    up_in_base : array_like, shape (3,)
+        Expected up direction in base: +z for a robot on a table. For the verdict, and for the published methods that
+        need gravity.
+    payload_kg : float, optional
+        Set in the controller, without the sensor if its mass is known. For the verdict: forces in lbf or kgf make a
+        load that is lighter than the payload by such a factor.
+    provenance : mapping, optional
+        Stored with the result, beside the hash of the dataset. Must be valid JSON.
+
+    Raises
+    ------
+    NotObservable
+        The poses do not determine the parameters; the message names what is missing and what to add.
+    """
+    for name, value, choices in (("method", method, get_args(Method)), ("drift", drift, get_args(Drift))):
+        if value not in choices:
+            raise ValueError(f"{name} is '{value}', expected one of {', '.join(choices)}")
+    if not (np.isfinite(g_m_s2) and g_m_s2 > 0):
+        raise ValueError(f"g_m_s2 is {g_m_s2}, expected about 9.8")
+    if method in PUBLISHED and method not in _NEED_GRAVITY and known is not None:
+        raise ValueError(f"{method} cannot use known values: use 'ml'")
+    known = _constrained(method, known)
+    require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
+    if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNRESOLVED_N:
+        raise NotObservable("the force is the same in all poses: check that the sensor works and carries a load.")
+
+    estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, up_in_base) if method in PUBLISHED else None
+    wrench_cov = dataset.wrench_cov
+    if wrench_cov is not None:
+        wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
+
+    def contradicted(unconstrained: Fit | None) -> list[str]:
+        if known is None or unconstrained is None:
+            return []
+        found = unconstrained.parameters, unconstrained.covariance
+        return contradictions(known, *found, g_m_s2, SIGNIFICANT_SIGMAS, up_in_base)
+
+    # Published methods use this fit too: for observability, and for the noise if it was not measured.
+    try:
+        best = fit(
+            dataset.R_base_flange,
+            dataset.wrench,
+            wrench_cov,
+            t_s=dataset.t_s,
+            drift=drift,
+            known=None if estimator else known,
+            g_m_s2=g_m_s2,
+        )
+        _require_determined(dataset.R_base_flange, best, known)
+    except NotObservable as exc:
+        poses = dataset.R_base_flange, dataset.wrench
+        named = faults(*poses, up_in_base) or other_poses(*poses)
+        if not named and known is not None:  # wrong ones can leave no weight, and so no centre of mass
+            named = contradicted(_unconstrained(dataset, wrench_cov, drift))
+        if named:
+            raise NotObservable(f"{named[0]}.") from exc
+        raise
+    assessed: AssessedFit = best
+    if estimator:
+        parameters = estimator(dataset.wrench)
+        noise = wrench_cov
+        if noise is None:  # take the residuals of the method as its noise
+            residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
+            square = (residuals**2).reshape(-1, 2, 3).mean(axis=(0, 2)) * 6 * len(dataset) / best.dof
+            noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))
+        assessed = IndependentFit(
+            parameters,
+            _simulated_covariance(estimator, parameters, dataset.R_base_flange, noise),
+            dataset.R_base_flange,
+            dataset.wrench,
+            noise,
+            wrench_cov is not None,
+            np.ones(len(dataset)),
+            best.second_basin_chi2,
+        )
+    measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
+    unconstrained = best if estimator else None if known is None else _unconstrained(dataset, wrench_cov, drift)
+    quality = judge(
+        assessed,
+        t_s=dataset.t_s,
+        measured_sigma=measured_sigma,
+        up_in_base=up_in_base,
+        unconstrained=unconstrained,
+        contradicted=contradicted(unconstrained),
+        other_unit=[] if payload_kg is None else other_unit(assessed.parameters, payload_kg, g_m_s2),
+    )
+    chi2 = assessed.chi2 if wrench_cov is None else assessed.measured_chi2
+    drifted = best.drift if estimator is None else None
+    return CalibrationResult(
+        parameters=assessed.parameters,
+        covariance=assessed.covariance,
+        residuals=assessed.residuals,
+        chi2=chi2,
+        dof=assessed.dof,
+        noise_source="residuals" if wrench_cov is None else "measured",
+        g_m_s2=g_m_s2,
+        method=method,
+        verdict=quality.verdict,
+        reasons=quality.reasons,
+        provenance={**(provenance or {}), "dataset_sha256": dataset.sha256()},
+        p_value=quality.chi2_p,
+        measured_sigma=measured_sigma,
+        weights=assessed.weights,
+        components=assessed.components,
+        drift=None if drifted is None else DriftResult(drifted.change, drifted.sigma),
+        response=assessed.response,
+        gain_sigma=assessed.gain_sigma,
+        second_basin_chi2=best.second_basin_chi2,
+        quality={
+            "loo_force_rms_N": quality.loo_force_rms_N,
+            "loo_torque_rms_Nm": quality.loo_torque_rms_Nm,
+            "worst_pose": quality.worst_pose + 1,
+            "residual_sigma": quality.residual_sigma.tolist(),
+            "lag1": quality.lag1,
+            "correlations": [list(pair) for pair in quality.correlations],
+        },
+    )
+
+
+def _constrained(method: Method, known: Known | None) -> Known | None:
+    if method == "known-rotation" and (known is None or known.R_flange_sensor is None):
+        return replace(known or Known(), R_flange_sensor=np.eye(3))
+    if method == "yaw-only":
+        return replace(known or Known(), yaw_only=True)
+    return known
+
+
+def _unconstrained(dataset: CalibrationDataset, wrench_cov: Array | None, drift: Drift) -> Fit | None:
+    """Fit without known values; None if the poses do not determine all parameters."""
+    try:
+        require_orientations(dataset.R_base_flange, 4)
+        found = fit(dataset.R_base_flange, dataset.wrench, wrench_cov, t_s=dataset.t_s, drift=drift)
+        _require_determined(dataset.R_base_flange, found, None)
+    except NotObservable:
+        return None
+    return found
+
+
+def estimator_of(
+    method: Method, R_base_flange: Array, known: Known | None, g_m_s2: float, up_in_base: ArrayLike
+) -> Estimator:
+    """Prepare a published method, with gravity from `known` if the method needs it. Raises `NotObservable`."""
+    level = -np.asarray(up_in_base, dtype=np.float64)
+    direction = level if known is None or known.gravity_direction_base is None else known.gravity_direction_base
+    weight_N = None if known is None or known.mass_kg is None else known.mass_kg * g_m_s2
+    return published(method, R_base_flange, gravity_direction_base=np.asarray(direction), weight_N=weight_N)
+
+
+def _require_determined(R_base_flange: Array, best: Fit, known: Known | None) -> None:
+    """Raise `NotObservable` for undetermined parameters, with advice if the poses alone are the reason."""
+    Z = best.free
+    information = Z.T @ best.information @ Z
+    scale = column_scale(information)
+    eigenvalues, V = np.linalg.eigh(information / np.outer(scale, scale))
+    free = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
+    ambiguous = best.second_basin_chi2 is not None and best.second_basin_chi2 < ACCEPTED_DELTA_CHI2
+    if known is None and (free.any() or ambiguous):
+        require_observable(R_base_flange, best.parameters, best.wrench_cov)
+    if free.any():
+        share = ((Z @ V[:, free]) ** 2).sum(axis=1).reshape(5, 3).sum(axis=1) / free.sum()
+        names = [PARAMETER_NAMES[3 * k].partition(".")[0] for k in np.flatnonzero(share > 0.05)]
+        raise NotObservable(
+            f"the poses do not determine {free.sum()} of {len(free)} combinations of {', '.join(names)}: add poses "
+            "that tilt the tool about two different horizontal axes, and turn it about its own."
+        )
+
+
+def _simulated_covariance(estimator: Estimator, truth: Parameters, R_base_flange: Array, wrench_cov: Array) -> Array:
+    """Mean square error of a closed form around its own estimate, from repetitions with simulated noise.
+
+    Linear propagation fails, because SROM's cube roots have no derivative if a component of the gravity force is zero.
+    The seed is fixed, so that the same data give the same numbers.
+    """
+    rng = np.random.default_rng(20210)
+    L = np.linalg.cholesky(wrench_cov)
+    exact = predict(truth, R_base_flange)
+    errors = [
+        truth.difference(estimator(exact + (L @ rng.standard_normal((*exact.shape, 1)))[..., 0]))
+        for _ in range(SIMULATIONS)
+    ]
+    return np.asarray(np.mean([np.outer(error, error) for error in errors], axis=0))

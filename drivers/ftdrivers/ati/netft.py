@@ -1,0 +1,355 @@
+"""ATI Net F/T, Ethernet Axia and OnRobot HEX force/torque sensors over Ethernet (RDT), through pynetft.
+
+Ref: ATI, "Net F/T User Manual" 9620-05-Net FT, and "Ethernet Axia" 9610-05-Ethernet Axia: RDT, netftapi2.xml and
+netftcalapi.xml, as in public drivers; OptoForce, "Ethernet Converter" manual, version 2.0.
+Checked on hardware: no. Verified against: tests/unit/drivers/test_netft.py and the emulator (tests/wire).
+
+pynetft reads the scale, drains the socket and reports why a stream has ended. Its bias command is never used here.
+"""
+
+import http.client
+import logging
+import math
+import re
+from collections.abc import Mapping
+from contextlib import closing
+from dataclasses import replace
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+import pynetft
+
+from ftdrivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM, units
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import UNUSABLE, ConnectError, DeviceFault, ProtocolError, StreamBroken
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples, Health
+from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits, scale_facts
+from ftdrivers.wires.status_word import describe_status
+
+if TYPE_CHECKING:
+    from ftdrivers.registry import Options
+
+log = logging.getLogger(__name__)
+
+_SILENCE_S = 0.3
+"""A longer silence ends the stream: a sensor set to less than 10 Hz is too slow for this driver."""
+_STARTS = 5
+"""The request to start is a datagram, which can be lost."""
+_HTTP_S = 1.0
+_NEVER_S = 3600.0
+_WAIT_S, _BATCH_S = 0.05, 0.002
+"""In real time, for the first sample and then for those after it."""
+_QUEUE = 16_384
+"""More than 2 s at 7 kHz. A full queue drops the oldest sample, whose number is then missing."""
+_ONROBOT_COUNTS = (10_000, 100_000)
+"""Per N and per N·m, fixed by the manual: an OnRobot converter does not report them."""
+
+MONITOR_LATCHED = 0x80010000
+"""A monitored threshold was crossed earlier; the data is valid."""
+
+NET_FT_BITS: Mapping[int, str] = MappingProxyType(
+    {
+        1: "HTTP",
+        2: "temperature",
+        3: "reference voltage",
+        4: "no data from the transducer",
+        5: "supply too low",
+        6: "supply too high",
+        7: "artificial analog ground",
+        8: "excitation current low",
+        9: "excitation current high",
+        10: "analog watchdog",
+        11: "flash",
+        12: "EEPROM",
+        13: "stack",
+        14: "watchdog",
+        16: "monitor condition latched",
+        17: "transducer saturated or A/D error",
+        18: "DeviceNet",
+        19: "EtherNet/IP",
+        20: "RDT",
+        21: "CAN",
+        22: "network",
+        23: "configuration does not fit the calibration",
+        24: "settings invalid",
+        25: "halted by a configuration error",
+        26: "program memory",
+        27: "link to the transducer",
+        28: "analog board",
+        29: "digital board",
+        30: "CPU or RAM",
+        31: "any error",
+    }
+)
+AXIA_BITS: Mapping[int, str] = MappingProxyType(
+    {
+        0: "temperature",
+        1: "supply voltage",
+        2: "broken gauge",
+        3: "busy",
+        5: "hardware",
+        16: "monitor condition latched",
+        26: "gauge near its limit",
+        27: "gauge out of range",
+        28: "simulated error",
+        29: "calibration checksum",
+        30: "force or torque out of range",
+        31: "any error",
+    }
+)
+ONROBOT_BITS: Mapping[int, str] = MappingProxyType(
+    {
+        3: "several sensors failed",
+        4: "overload Fx",
+        5: "overload Fy",
+        6: "overload Fz",
+        7: "overload Tx",
+        8: "overload Ty",
+        9: "overload Tz",
+        10: "sensor not detected",
+        11: "sensor failure",
+        12: "sensor temperature",
+        13: "converter failure",
+        14: "converter communication",
+        15: "converter error",
+    }
+)
+
+
+def text_in(page: bytes, element: str) -> str:
+    """Find the text of an element in a page of a sensor; empty where it is missing."""
+    match = re.search(rf"<{element}>\s*([\x20-\x3b\x3d-\x7e]{{1,64}}?)\s*</{element}>".encode(), page)
+    return match[1].decode("ascii") if match else ""
+
+
+def numbers_in(page: bytes, element: str) -> list[float]:
+    """Find the positive numbers of an element, such as ``130;130;400;10;10;10``; empty where it holds other text."""
+    try:
+        numbers = [float(number) for number in text_in(page, element).split(";")]
+    except ValueError:
+        return []
+    return numbers if all(math.isfinite(number) and number > 0 for number in numbers) else []
+
+
+def range_in(page: bytes) -> tuple[float, ...] | None:
+    """Find the maximum ratings (6,) in N and N·m in ``netftcalapi.xml``."""
+    rating, codes = numbers_in(page, "calmr"), numbers_in(page, "calfu") + numbers_in(page, "caltu")
+    if len(rating) != 6 or len(codes) != 2:
+        return None
+    try:
+        unit_N, unit_Nm = units((int(codes[0]), int(codes[1])))
+    except ProtocolError:
+        return None
+    return (*(unit_N * force for force in rating[:3]), *(unit_Nm * torque for torque in rating[3:]))
+
+
+class NetFtSensor(StreamingSensor):
+    """A sensor with ATI's RDT protocol.
+
+    `counts` are the six values as sent, `seq` is the RDT sequence number, `t_device_s` is NaN: records carry no time.
+    Nominal rate and range are known where the pages of the sensor contain them. Every status but a latched monitor
+    condition is a `DeviceFault`.
+
+    Parameters
+    ----------
+    host : str
+        Address of the sensor; ATI's factory setting is 192.168.1.1.
+    onrobot : bool
+        An OnRobot HEX or OptoForce converter, with the scale and status bits of its manual.
+    rdt_port, http_port : int
+        Ports of RDT (UDP) and of the configuration pages.
+    sign : int
+        -1 for a sensor that reports the reaction.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        *,
+        onrobot: bool = False,
+        rdt_port: int = 49152,
+        http_port: int = 80,
+        sign: int = 1,
+        clock: Clock = REAL,
+    ) -> None:
+        name = f"{'OnRobot' if onrobot else 'ATI'} Ethernet sensor at {host}"
+        # UDP reports no broken cable: a silence ends the stream, before the stream is stale
+        super().__init__(name, sign=sign, clock=clock, limits=StreamLimits(stale_s=_SILENCE_S + 0.15))
+        self._http_s = clock.patience_s(_HTTP_S)
+        self._host = host
+        self._onrobot = onrobot
+        self._rdt_port = rdt_port
+        self._http_port = http_port
+        self._client: pynetft.Client | None = None
+
+    @classmethod
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+        """Build from ``ati-netft://192.168.1.1?onrobot=0&rdt_port=49152&http_port=80``."""
+        return cls(
+            address,
+            onrobot=bool(options.integer("onrobot", 0, 0, 1)),
+            rdt_port=options.integer("rdt_port", 49152, 1, 65535),
+            http_port=options.integer("http_port", 80, 1, 65535),
+            sign=sign,
+            clock=clock,
+        )
+
+    def _connect(self) -> DeviceInfo:
+        # an OnRobot converter serves no pages
+        page = b"" if self._onrobot else self._read_page("/netftapi2.xml")
+        self._nominal_Hz, *_ = numbers_in(page, "comm?rdtrate") or [math.nan]  # both spellings exist
+        index = text_in(page, "cfgcalsel")
+        rating = range_in(self._read_page(f"/netftcalapi.xml?index={index}")) if index.isdecimal() else None
+        override = None
+        if self._onrobot:
+            override = pynetft.Calibration(*_ONROBOT_COUNTS, pynetft.ForceUnit.NEWTON, pynetft.TorqueUnit.NEWTON_METER)
+        config = pynetft.Config(
+            sensor_host=self._host,
+            rdt_port=self._rdt_port,
+            http_port=self._http_port,
+            receive_timeout=_NEVER_S,  # in real time; silence is judged here
+            configuration_connect_timeout=self._http_s,
+            configuration_timeout=self._http_s,
+            deliver_samples_with_error_status=True,  # so that the fault can be named
+            # A doubled or late datagram ends a stream that fails at once. So it may recover, but not before we noticed.
+            recovery_policy=pynetft.RecoveryPolicy.RECONNECT,
+            reconnect_initial_delay=_NEVER_S,
+            reconnect_max_delay=_NEVER_S,
+            calibration_override=override,
+        )
+        self._warned = False
+        self._newest_number: int | None = None
+        try:
+            self._client = pynetft.Client(config, queue_size=_QUEUE)
+        except pynetft.NetFTError as exc:
+            raise self._unread(exc) from exc
+        configuration = self._start(self._client)
+        scale = configuration.calibration
+        if scale.force_unit.value not in FORCE_UNITS_N or scale.torque_unit.value not in TORQUE_UNITS_NM:
+            raise ConnectError(
+                f"{self.name}: the sensor measures in {scale.force_unit.value} and {scale.torque_unit.value}",
+                "choose N and Nm on its configuration page",
+            )
+        counts_per_N = scale.counts_per_force_unit / FORCE_UNITS_N[scale.force_unit.value]
+        counts_per_Nm = scale.counts_per_torque_unit / TORQUE_UNITS_NM[scale.torque_unit.value]
+        self._counts_per_unit = np.repeat([counts_per_N, counts_per_Nm], 3)
+        model = "OnRobot HEX (Ethernet)" if self._onrobot else configuration.product_name or "ATI Net F/T"
+        facts = scale_facts(counts_per_N, counts_per_Nm, "documented" if self._onrobot else "device")
+        if rating:
+            facts["range"] = Fact(rating, "device")
+        return DeviceInfo(
+            model=model, serial=text_in(page, "cfgcalsn") or NOT_REPORTED, firmware=NOT_REPORTED, facts=facts
+        )
+
+    def _read_block(self) -> FtSamples:
+        samples = self._fetch()
+        t_host_ns = self._clock.now_ns()
+        if not samples:
+            return NOTHING
+        self._arrived_ns = t_host_ns
+        numbers = [sample.rdt_sequence for sample in samples]
+        before = numbers[0] - 1 if self._newest_number is None else self._newest_number
+        self._lost += max(0, numbers[-1] - before - len(numbers))
+        self._newest_number = numbers[-1]
+        status = np.array([sample.status for sample in samples], np.uint32)
+        self._judge(int(np.bitwise_or.reduce(status)))
+        counts = np.array([sample.raw_wrench for sample in samples], np.int32)
+        return FtSamples.of(t_host_ns, numbers, counts / self._counts_per_unit, counts=counts, status=status)
+
+    def _disconnect(self) -> None:
+        with self._news:
+            client, self._client = self._client, None
+            if client is None:
+                return
+            counted = client.health()
+            self._earlier_malformed += counted.malformed_count
+            self._duplicated += counted.duplicate_count
+            self._out_of_order += counted.out_of_order_count
+        client.stop()
+
+    def health(self) -> Health:
+        """Return the counters since `open`, including datagrams that pynetft has dropped."""
+        with self._news:
+            health, client = super().health(), self._client
+            if client is None:
+                return health
+            counted = client.health()
+        return replace(
+            health,
+            malformed=health.malformed + counted.malformed_count,
+            duplicated=health.duplicated + counted.duplicate_count,
+            out_of_order=health.out_of_order + counted.out_of_order_count,
+        )
+
+    def _start(self, client: pynetft.Client) -> pynetft.SensorConfiguration:
+        """Request the stream until it starts; return the configuration that the sensor reports."""
+        for _ in range(_STARTS):
+            try:
+                client.start()
+            except pynetft.NetFTError as exc:
+                raise self._unread(exc) from exc
+            looks = self._clock.looks(_SILENCE_S)
+            arrived = any(client.wait_for_first_sample(min(left_s, self._clock.poll_s)) for left_s in looks)
+            self._arrived_ns = self._clock.now_ns()
+            health = client.health()
+            if health.sensor_configuration is None:
+                raise ConnectError(f"{self.name}: the sensor reports no scale", "open it again")
+            is_axia = "Axia" in health.sensor_configuration.product_name
+            self._bits = ONROBOT_BITS if self._onrobot else AXIA_BITS if is_axia else NET_FT_BITS
+            self._judge(health.last_status)
+            if arrived:
+                return health.sensor_configuration
+            client.stop()
+        raise ConnectError(
+            f"{self.name}: no sample after {_STARTS} requests",
+            "check supply and cable, and enable RDT on its communications page",
+        )
+
+    def _fetch(self) -> list[pynetft.Sample]:
+        """Return all samples that have arrived; wait 50 ms for the first and 2 ms for more."""
+        client = self._client
+        if client is None:
+            raise StreamBroken(f"{self.name}: closed")
+        samples: list[pynetft.Sample] = []
+        try:
+            samples.append(next(client.samples(timeout=_WAIT_S)))
+            self._clock.sleep(_BATCH_S)
+            for sample in client.samples(timeout=0.0):
+                samples.append(sample)
+        except TimeoutError:
+            pass
+        except StopIteration:
+            raise StreamBroken(f"{self.name}: closed") from None
+        if not samples:
+            health, silent_s = client.health(), (self._clock.now_ns() - self._arrived_ns) / 1e9
+            has_failed = health.state is not pynetft.ClientState.STREAMING
+            if has_failed:
+                self._judge(health.last_status)
+            if has_failed or silent_s > _SILENCE_S:
+                why = health.last_error if has_failed else f"nothing arrived for {silent_s:.2f} s"
+                raise StreamBroken(
+                    f"{self.name}: the stream has ended ({why})", "check cable and supply, then open it again"
+                )
+        return samples
+
+    def _judge(self, status: int) -> None:
+        """Raise on a fault, log a latched monitor condition once."""
+        if status not in {0, MONITOR_LATCHED}:
+            raise DeviceFault(f"{self.name}: status {describe_status(status, self._bits, 32)}", UNUSABLE)
+        if status and not self._warned:
+            log.warning("%s: status %s; measuring continues", self.name, describe_status(status, self._bits, 32))
+            self._warned = True
+
+    def _read_page(self, path: str) -> bytes:
+        """Read a page that pynetft does not: serial number of the calibration in use, rate, range."""
+        try:
+            page = http.client.HTTPConnection(self._host, self._http_port, timeout=self._http_s)
+            with self._clock.away(), closing(page) as connection:
+                connection.request("GET", path)
+                return connection.getresponse().read(65536)
+        except (OSError, ValueError, http.client.HTTPException) as exc:
+            raise self._unread(exc) from exc
+
+    def _unread(self, exc: Exception) -> ConnectError:
+        return ConnectError(f"{self.name}: its configuration cannot be read ({exc})", "check address, cable and supply")

@@ -1,0 +1,233 @@
+"""ATI Digital F/T and NETCANOEM force/torque sensors over RS-485.
+
+Ref: ATI "Digital F/T" Modbus interface (sections 8.1, 8.3, 8.4 of 9620-05-Digital FT, as cited by public drivers).
+Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_modbus.py and the emulator (tests/wire).
+
+Modbus RTU for set-up, then a bare stream of 13-byte records at 7 kHz. Only a jamming sequence stops the stream, which
+outlives the program that started it. Gauge gains and offsets are volatile, so every start writes them.
+"""
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from ftdrivers.ati import modbus
+from ftdrivers.ati.calibration import Calibration, refuse_saturated, units
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
+from ftdrivers.streaming.sensor import StreamingSensor, scale_facts
+from ftdrivers.wires.modbus import ask
+from ftdrivers.wires.serial_port import SerialPort
+from ftdrivers.wires.status_word import describe_status
+
+if TYPE_CHECKING:
+    from ftdrivers.registry import Options
+
+log = logging.getLogger(__name__)
+
+_BAUD = 1_250_000
+_READ_S = 0.02
+"""The longest wait of one read, and the silence that proves that a stream has stopped."""
+_REPLY_S = 0.1
+_SILENCE_S = 0.2
+_BATCH_BYTES = 28 * modbus.RECORD_SIZE
+"""The least that one read waits for, 4 ms of stream: few wake-ups, and far less than a port buffers."""
+_MAX_RESTARTS = 3
+
+
+class AtiSerialSensor(StreamingSensor):
+    """An ATI Digital F/T (or the RS-485 port of a NETCANOEM) on a serial port, 7 kHz.
+
+    Records carry no time and no number. `t_host_ns` is the receipt of their batch of at least 28, `t_device_s` is NaN.
+    `seq` counts records, including damaged ones (wrong sum, or a byte with wrong parity) and an estimate from the clock
+    for those lost in a restart. `counts` are the six gauges. `status` is the status word as last read. A record has
+    only an error bit; when it is set, the driver stops the stream and reads the word again. If the word explains the
+    bit and is not critical, measuring continues.
+
+    Parameters
+    ----------
+    port : str
+        The serial port; ``/dev/serial/by-id/…`` survives replugging.
+    calibration : int
+        Stored calibration to use, 1 to 16.
+    sign : int
+        -1 for a sensor mounted or wired to report the reaction.
+    """
+
+    def __init__(self, port: str, *, calibration: int = 1, sign: int = 1, clock: Clock = REAL) -> None:
+        super().__init__(f"ATI serial sensor on {port}", sign=sign, clock=clock)
+        self._calibration_index = calibration
+        self._port = SerialPort(self.name, port, _BAUD, even_parity=True, read_s=_READ_S, clock=clock)
+        self._buffer = bytearray()
+        self._damaged: list[int] = []
+        """Places in the buffer of bytes with wrong parity."""
+        self._seq = self._status = self._restarts = 0
+        self._slipped = False
+        self._last_good_ns: int | None = None
+        """Until a restarted stream delivers: when the old one last delivered."""
+
+    @classmethod
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+        """Build from ``ati-serial:///dev/serial/by-id/…?calibration=1``."""
+        return cls(address, calibration=options.integer("calibration", 1, 1, 16), sign=sign, clock=clock)
+
+    def _connect(self) -> DeviceInfo:
+        self._seq = self._restarts = self._status = 0
+        self._slipped, self._last_good_ns = False, None
+        self._nominal_Hz = modbus.NOMINAL_RATE_Hz
+        self._port.open()
+        self._judge_status(self._stop_stream())
+        stored = b"".join(
+            self._ask(modbus.read_registers(register, count))
+            for register, count in modbus.calibration_reads(self._calibration_index)
+        )
+        try:
+            block = modbus.decode_calibration_block(stored)
+            self._calibration = Calibration.from_vendor(block.matrix, block.counts_per_unit, block.unit_codes)
+        except ProtocolError as exc:
+            raise ProtocolError(
+                f"{self.name}: calibration slot {self._calibration_index}: {exc.found}",
+                "choose another slot, calibration=1 to 16 in its address",
+            ) from exc
+        self._ask(modbus.UNLOCK)
+        try:
+            self._ask(modbus.write_registers(modbus.GAINS, block.gains))
+            self._ask(modbus.write_registers(modbus.OFFSETS, block.offsets))
+        finally:
+            self._ask(modbus.LOCK)
+        self._start_stream()
+        facts = scale_facts(self._calibration.counts_per_N, self._calibration.counts_per_Nm, "device")
+        rating = np.array(block.max_rating) * np.repeat(units(block.unit_codes), 3)
+        if np.isfinite(rating).all() and (rating > 0).all():
+            facts["range"] = Fact(tuple(rating.tolist()), "device")
+        return DeviceInfo(
+            model=f"ATI Digital F/T {block.part_number}".strip(),
+            serial=block.serial,
+            firmware=NOT_REPORTED,
+            facts=facts,
+        )
+
+    def _read_block(self) -> FtSamples:
+        if self._slipped:
+            self._restart()
+        data, damaged = self._port.read_marked(_BATCH_BYTES)
+        t_host_ns = self._clock.now_ns()
+        self._damaged += [len(self._buffer) + place for place in damaged]
+        self._buffer += data
+        whole = len(self._buffer) // modbus.RECORD_SIZE * modbus.RECORD_SIZE
+        records = modbus.decode_records(bytes(self._buffer[:whole]), self._damaged)
+        keep, settled, slipped = modbus.keep_records(records.intact)
+        keep &= records.parity[:settled]
+        used = settled * modbus.RECORD_SIZE
+        del self._buffer[:used]
+        self._damaged = [place - used for place in self._damaged if place >= used]
+        flagged = keep & records.error[:settled]
+        suspect = bool(flagged.any()) and not self._status & modbus.ANY_ERROR
+        if suspect:
+            keep &= ~flagged
+        elif keep.any() and not flagged.any():
+            self._status &= ~modbus.ANY_ERROR  # an error is over: the next one is new
+        gauges = records.gauges[:settled][keep]
+        seq = self._seq + 1 + np.flatnonzero(keep)
+        if self._last_good_ns is not None and len(gauges):
+            missed = max(0, round((t_host_ns - self._last_good_ns) * 1e-9 * modbus.NOMINAL_RATE_Hz) - settled)
+            seq += missed
+            self._seq += missed
+            self._lost += missed
+            self._last_good_ns = None
+        if len(gauges) and not suspect:
+            self._restarts = 0
+        # the records behind a slip were sent and are lost
+        done = len(records.intact) if slipped else settled
+        self._seq += done
+        self._malformed += done - len(gauges)
+        self._lost += done - len(gauges)
+        if slipped:
+            self._slipped = True
+            self._last_good_ns = self._last_good_ns or t_host_ns
+        if suspect:
+            self._look_at_status(t_host_ns)
+        refuse_saturated(self.name, gauges)
+        wrench = self._calibration.wrench(gauges)
+        return FtSamples.of(t_host_ns, seq, wrench, counts=gauges, status=self._status)
+
+    def _discard_backlog(self) -> None:
+        """Treat an overflow of the port as a slip, because the start of a record is unknown."""
+        self._buffer.clear()
+        self._slipped = True
+        self._last_good_ns = self._last_good_ns or self._newest_ns
+
+    def _look_at_status(self, t_host_ns: int) -> None:
+        """Stop and read the status, because the sum does not cover the error bit of a record."""
+        self._judge_status(self._stop_stream())
+        if not self._status & modbus.ANY_ERROR:
+            text = describe_status(self._status, modbus.STATUS_BITS)
+            self._restarts += 1
+            if self._restarts > _MAX_RESTARTS:
+                raise ProtocolError(
+                    f"{self.name}: records have the error bit set, but the status is {text}, {self._restarts} times in "
+                    "a row",
+                    "check parity and wiring, power it off and on",
+                )
+            log.warning(
+                "%s: a record with its error bit set, but the status is %s; measuring continues", self.name, text
+            )
+        self._start_stream()
+        self._slipped = False
+        self._last_good_ns = self._last_good_ns or t_host_ns
+
+    def _disconnect(self) -> None:
+        if not self._port.is_open:
+            return
+        try:
+            self._jam()
+        finally:
+            self._port.close()
+
+    def _stop_stream(self) -> int:
+        """Stop the stream, prove it by reading the status word, and return the word."""
+        self._jam()
+        try:
+            return int.from_bytes(self._ask(modbus.read_registers(modbus.STATUS, 1), self._jam), "big")
+        except (DeviceTimeout, ProtocolError) as exc:
+            raise DeviceTimeout(exc.found, f"{exc.fix}, check termination and address") from exc
+
+    def _start_stream(self) -> None:
+        self._ask(modbus.START, self._jam)  # it may stream already, with only the reply lost
+        self._buffer.clear()
+        self._damaged.clear()
+
+    def _restart(self) -> None:
+        self._restarts += 1
+        if self._restarts > _MAX_RESTARTS:
+            raise ProtocolError(
+                f"{self.name}: no intact record after {_MAX_RESTARTS} restarts of the stream", "check parity and wiring"
+            )
+        log.warning("%s: the stream has slipped; restarting it", self.name)
+        self._judge_status(self._stop_stream())
+        self._start_stream()
+        self._slipped = False
+
+    def _jam(self) -> None:
+        """Stop any stream and wait until the line is silent."""
+        self._port.write(modbus.JAM, discard=True)
+        self._port.drain(_READ_S, _SILENCE_S)
+
+    def _ask(self, request: bytes, before_again: Callable[[], object] | None = None) -> bytes:
+        """Exchange with retries; by default a late reply is read between them."""
+        again = before_again or (lambda: self._port.read(_BATCH_BYTES))
+        return ask(self._port, self.name, request, modbus.check_reply, self._clock, _REPLY_S, again)
+
+    def _judge_status(self, status: int) -> None:
+        """Raise when the data is unusable; log other status bits once."""
+        new, self._status = status & ~self._status, status
+        text = describe_status(status, modbus.STATUS_BITS)
+        if status & modbus.CRITICAL:
+            raise DeviceFault(f"{self.name}: status {text}", UNUSABLE)
+        if self._seq and new & modbus.WATCHDOG_RESET:
+            raise StreamBroken(f"{self.name}: the sensor has reset itself and lost its gains", "open it again")
+        if new:
+            log.warning("%s: status %s; measuring continues", self.name, text)

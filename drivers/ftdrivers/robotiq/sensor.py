@@ -1,0 +1,109 @@
+"""Robotiq FT 300 and FT 300-S force/torque sensor on a serial port.
+
+Ref: Robotiq, "FT 300 Force Torque Sensor" instruction manual, control over Modbus RTU and data stream.
+Checked on hardware: no. Verified against: tests/unit/drivers/robotiq/test_codec.py and the emulator (tests/wire).
+
+Modbus RTU for set-up, then a bare stream at 100 Hz, which may run directly after boot. Only 50 bytes of 0xFF stop it.
+The sensor has no zero command: other programs zero on the host.
+"""
+
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import DeviceFault
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
+from ftdrivers.robotiq import codec
+from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
+from ftdrivers.wires.modbus import ask
+from ftdrivers.wires.serial_port import SerialPort
+
+if TYPE_CHECKING:
+    from ftdrivers.registry import Options
+
+_BAUD = 19_200
+_REPLY_S = 0.2
+_SILENCE_S, _STOP_S = 0.05, 1.0
+"""The silence that proves that a stream has stopped, and the longest wait for it."""
+_LATENT_RATE_Hz = (55.0, 70.0)
+"""Around 62.5 Hz, one delivery in each 16 ms of an FTDI adapter's latency timer."""
+
+
+class RobotiqFt300(StreamingSensor):
+    """A Robotiq FT 300 or FT 300-S, 100 Hz.
+
+    `counts` are the six raw values (0.01 N and 0.001 N·m), `t_device_s` is NaN, `status` is 0, as the sensor reports
+    neither. A value at the end of its 16 bits is a `DeviceFault`. Frames carry no number: `seq` counts arrived frames,
+    including damaged ones, so a wholly lost frame shows only in the rate.
+
+    Parameters
+    ----------
+    port : str
+        The serial port; ``/dev/serial/by-id/…`` survives replugging.
+    sign : int
+        -1 for a sensor mounted or wired to report the reaction.
+    """
+
+    def __init__(self, port: str, *, sign: int = 1, clock: Clock = REAL) -> None:
+        super().__init__(f"Robotiq FT 300 on {port}", sign=sign, clock=clock)
+        self._port = SerialPort(self.name, port, _BAUD, clock=clock)
+
+    @classmethod
+    def from_url(cls, address: str, _options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+        """Build from ``robotiq-ft300:///dev/serial/by-id/…``."""
+        return cls(address, sign=sign, clock=clock)
+
+    def _connect(self) -> DeviceInfo:
+        self._port.open()
+        self._stop_stream()
+        serial = codec.decode_serial(self._ask(codec.read_registers(codec.SERIAL, 4)))
+        try:
+            firmware = codec.decode_firmware(self._ask(codec.read_registers(codec.FIRMWARE, 3)))
+        except codec.Refused:
+            firmware = NOT_REPORTED
+        self._ask(codec.write_register(codec.STREAM, codec.START_STREAM))
+        self._frames = codec.deframer()
+        self._nominal_Hz = codec.NOMINAL_RATE_Hz
+        return DeviceInfo(
+            model="Robotiq FT 300",
+            serial=serial,
+            firmware=firmware,
+            facts=scale_facts(100, 1000, "documented") | {"range": Fact(codec.RANGE, "documented")},
+        )
+
+    def _read_block(self) -> FtSamples:
+        frames = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))
+        t_host_ns = self._clock.now_ns()
+        self._lost = self._malformed = self._frames.damaged
+        if not frames:
+            return NOTHING
+        counts = np.array([codec.decode_frame(frame) for _, frame in frames], np.int32)
+        if (np.abs(counts + 0.5) > 32767).any():
+            raise DeviceFault(f"{self.name}: a value is at the end of its range", "take the load off, check the cable")
+        numbers = [number for number, _ in frames]
+        return FtSamples.of(t_host_ns, numbers, counts / codec.COUNTS_PER_UNIT, counts=counts)
+
+    def _disconnect(self) -> None:
+        if not self._port.is_open:
+            return
+        try:
+            self._port.write(codec.STOP)
+        finally:
+            self._port.close()
+
+    def _stop_stream(self) -> None:
+        self._port.write(codec.STOP)
+        self._port.drain(_SILENCE_S, _STOP_S)
+
+    def _ask(self, request: bytes) -> tuple[int, ...]:
+        """Exchange with retries, each after another stop, because an earlier stream may still run."""
+        return ask(self._port, self.name, request, codec.check_reply, self._clock, _REPLY_S, self._stop_stream)
+
+    def _rate_fix(self, rate_Hz: float) -> str:
+        if not _LATENT_RATE_Hz[0] < rate_Hz < _LATENT_RATE_Hz[1]:
+            return super()._rate_fix(rate_Hz)
+        return (
+            "reduce the 16 ms latency of the USB adapter: "
+            "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer (with the name of your port)"
+        )

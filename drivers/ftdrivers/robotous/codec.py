@@ -1,0 +1,142 @@
+"""Robotous RFT: commands, replies and samples, the same on both wires, as pure functions on bytes.
+
+A command is a field of 8 bytes, a reply or sample one of 16; byte 0 is the command. CAN carries bare fields, the UART
+puts each into a frame. All multi-byte numbers are big-endian.
+
+Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7, communication protocol.
+Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py.
+
+A decoder returns a value or raises `ProtocolError`, never anything else.
+"""
+
+import re
+import struct
+from collections.abc import Mapping
+from enum import IntEnum
+from types import MappingProxyType
+from typing import NamedTuple
+
+from ftdrivers.errors import ProtocolError
+from ftdrivers.wires.framing import Deframer
+
+COMMAND_SIZE, REPLY_SIZE = 8, 16
+START_OF_FRAME, END_OF_FRAME = 0x55, 0xAA
+FRAME_SIZE = REPLY_SIZE + 3
+"""Of a frame from the sensor."""
+
+AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
+
+RATE_CODES: Mapping[int, int] = MappingProxyType({10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8})
+"""Code of each output rate in Hz. A new sensor reports code 0, which is 200 Hz."""
+
+COUNTS_PER_N = 50
+_COUNTS_PER_NM: Mapping[str, int] = MappingProxyType(
+    {"40": 2000, "44": 2000, "60": 2000, "64": 2000, "76": 2000, "80": 1000, "82": 1000}
+)
+_FAILURES = {1: "not supported", 2: "value out of range", 3: "failed to set"}
+
+
+class Command(IntEnum):
+    """The commands of this driver, which never sends the bias command, 0x11."""
+
+    MODEL = 0x01
+    SERIAL = 0x02
+    FIRMWARE = 0x03
+    ONE_SAMPLE = 0x0A
+    START = 0x0B
+    STOP = 0x0C
+    SET_RATE = 0x0F
+    GET_RATE = 0x10
+
+
+class Field(NamedTuple):
+    """A received field of 16 bytes; `number` counts damaged ones too."""
+
+    number: int
+    t_host_ns: int
+    data: bytes
+
+
+class Sample(NamedTuple):
+    """One sample: six counts Fx..Tz, and the overload bits, 5 for Fx down to 0 for Tz."""
+
+    counts: tuple[int, ...]
+    overload: int
+
+
+def encode(command: Command, *parameters: int) -> bytes:
+    """Build a command field (8 bytes)."""
+    return bytes([command, *parameters]).ljust(COMMAND_SIZE, b"\0")
+
+
+def encode_frame(field: bytes) -> bytes:
+    """Put a field into a UART frame: start, field, sum of the field, end. Nothing is escaped."""
+    return bytes([START_OF_FRAME, *field, sum(field) & 0xFF, END_OF_FRAME])
+
+
+def is_frame(data: bytes) -> bool:
+    """Return whether bytes are a whole frame of the sensor: length, both marks and the sum."""
+    return len(data) == FRAME_SIZE and data == encode_frame(data[1:-2])
+
+
+def deframer() -> Deframer:
+    """Build a finder of frames in a stream of bytes."""
+    return Deframer(bytes([START_OF_FRAME]), FRAME_SIZE, is_frame)
+
+
+def decode_text(field: bytes) -> str:
+    """Decode a reply to `MODEL`, `SERIAL` or `FIRMWARE`: 15 ASCII characters, padded."""
+    _expect_size(field)
+    text = field[1:].split(b"\0")[0].strip()
+    if not text or not all(0x20 <= byte < 0x7F for byte in text):
+        raise ProtocolError(
+            f"the reply to command 0x{field[0]:02X} is not text: {field.hex(' ')}", "power it off and on"
+        )
+    return text.decode("ascii")
+
+
+def decode_rate(field: bytes) -> int:
+    """Decode the reply to `GET_RATE`: output rate in Hz."""
+    _expect_size(field)
+    for rate_Hz, code in RATE_CODES.items():
+        if field[1] in {code, 0} and (field[1] or rate_Hz == 200):
+            return rate_Hz
+    raise ProtocolError(f"the sensor reports output rate code {field[1]}, known are 0 to 8", "power it off and on")
+
+
+def check_set(field: bytes) -> None:
+    """Check the reply to a setting; a refusal is a `ProtocolError` with its reason."""
+    _expect_size(field)
+    if field[1] != 1:
+        reason = _FAILURES.get(field[2], "unknown reason")
+        fix = "leave rate out of its address, or power it off and on"
+        raise ProtocolError(f"the sensor refused command 0x{field[0]:02X}: {field[2]} ({reason})", fix)
+
+
+def decode_sample(field: bytes) -> Sample:
+    """Decode a sample, sent once for `ONE_SAMPLE` or continually after `START`."""
+    _expect_size(field)
+    if field[0] not in {Command.ONE_SAMPLE, Command.START}:
+        raise ProtocolError(f"a field of command 0x{field[0]:02X} is not a sample: {field.hex(' ')}")
+    *counts, overload = struct.unpack_from(">6hB", field, 1)
+    return Sample(tuple(counts), overload)
+
+
+def overloaded_axes(overload: int) -> list[str]:
+    """Return the axes whose overload bit is set."""
+    return [axis for bit, axis in zip(range(5, -1, -1), AXES, strict=True) if overload >> bit & 1]
+
+
+def counts_per_unit(model: str) -> tuple[int, int]:
+    """Return counts per N and per N·m of a model such as ``RFT60-HA01``."""
+    match = re.match(r"RFT-?(\d\d)", model)
+    if match is None or match[1] not in _COUNTS_PER_NM:
+        known = ", ".join(f"RFT{number}" for number in _COUNTS_PER_NM)
+        fix = "add its scale, from its manual, to drivers/ftdrivers/robotous/codec.py"
+        raise ProtocolError(f"the scale of model '{model}' is unknown, known are those of {known}", fix)
+    return COUNTS_PER_N, _COUNTS_PER_NM[match[1]]
+
+
+def _expect_size(field: bytes) -> None:
+    if len(field) != REPLY_SIZE:
+        raise ProtocolError(f"expected a field of {REPLY_SIZE} bytes, got {len(field)} ({field.hex(' ')})")

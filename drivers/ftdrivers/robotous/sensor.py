@@ -1,0 +1,134 @@
+"""Robotous RFT force/torque sensor, on either wire.
+
+Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7.
+Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py and the emulator (tests/wire).
+
+A streaming sensor accepts only stop and bias, so a reply to any other command proves that it has stopped. This driver
+never sends the bias command.
+"""
+
+from abc import abstractmethod
+
+import numpy as np
+
+from ftdrivers.clock import Clock
+from ftdrivers.errors import DeviceFault, DeviceTimeout
+from ftdrivers.interfaces import DeviceInfo, FtSamples
+from ftdrivers.robotous import codec
+from ftdrivers.robotous.codec import Command, Field
+from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
+
+_REPLY_S = 0.15
+_ATTEMPTS = 3
+
+
+class RobotousSensor(StreamingSensor):
+    """A Robotous RFT; a subclass sends and receives its fields on one wire.
+
+    `counts` are the six raw values, `t_device_s` is NaN, `status` holds the overload bits (5 for Fx down to 0 for Tz);
+    any of them set is a `DeviceFault`. Samples carry no number. On a UART `seq` counts arrived frames, including
+    damaged ones, so a wholly lost sample shows only in the rate. On CAN the clock shows what is missing.
+
+    Parameters
+    ----------
+    name : str
+        The device as the user knows it.
+    fastest_Hz : int
+        The highest output rate of the wire.
+    rate_Hz : int, optional
+        10, 20, 50, 100, 200, 333, 500 or 1000, which a UART carries at 921600 baud only. Without it, the rate that is
+        set in the sensor.
+    sign : int
+        -1 for a sensor mounted or wired to report the reaction.
+    """
+
+    def __init__(self, name: str, fastest_Hz: int, *, rate_Hz: int | None, sign: int, clock: Clock) -> None:
+        super().__init__(name, sign=sign, clock=clock)
+        if rate_Hz is not None and rate_Hz not in codec.RATE_CODES:
+            raise ValueError(f"rate is {rate_Hz} Hz; choose one of {', '.join(map(str, codec.RATE_CODES))}")
+        if rate_Hz is not None and rate_Hz > fastest_Hz:
+            raise ValueError(f"rate is {rate_Hz} Hz; choose at most {fastest_Hz} Hz, or a higher baud rate")
+        self._rate_Hz = rate_Hz
+
+    @abstractmethod
+    def _open(self) -> None: ...
+
+    @abstractmethod
+    def _close(self) -> None: ...
+
+    @abstractmethod
+    def _send(self, field: bytes) -> None:
+        """Send a command field (8 bytes)."""
+
+    @abstractmethod
+    def _receive(self) -> list[Field]:
+        """Return the fields that arrive within about 0.05 s."""
+
+    @abstractmethod
+    def _damaged(self) -> int:
+        """Return how many fields were damaged or incomplete."""
+
+    def _start_stream(self, _rate_Hz: int) -> None:
+        self._send(codec.encode(Command.START))
+
+    def _connect(self) -> DeviceInfo:
+        self._open()
+        model = codec.decode_text(self._ask(Command.MODEL))
+        force, torque = codec.counts_per_unit(model)
+        self._unit_per_count = 1 / np.array([force] * 3 + [torque] * 3)
+        serial = codec.decode_text(self._ask(Command.SERIAL))
+        firmware = codec.decode_text(self._ask(Command.FIRMWARE))
+        rate_Hz = codec.decode_rate(self._ask(Command.GET_RATE))
+        if self._rate_Hz is not None and rate_Hz != self._rate_Hz:
+            codec.check_set(self._ask(Command.SET_RATE, codec.RATE_CODES[self._rate_Hz]))
+            rate_Hz = self._rate_Hz
+        self._start_stream(rate_Hz)
+        self._damaged_before = self._damaged()
+        self._nominal_Hz = rate_Hz
+        return DeviceInfo(
+            model=f"Robotous {model}",
+            serial=serial,
+            firmware=firmware,
+            facts=scale_facts(force, torque, "documented"),
+        )
+
+    def _read_block(self) -> FtSamples:
+        received = self._receive()
+        self._lost = self._malformed = self._damaged() - self._damaged_before
+        fields = [field for field in received if field.data[0] == Command.START]  # a late reply is no sample
+        if not fields:
+            return NOTHING
+        samples = [codec.decode_sample(field.data) for field in fields]
+        overload = np.array([sample.overload for sample in samples], np.uint32)
+        if axes := codec.overloaded_axes(int(np.bitwise_or.reduce(overload))):
+            raise DeviceFault(
+                f"{self.name}: overload of {', '.join(axes)}", "take the load off, then check the zero of the sensor"
+            )
+        counts = np.array([sample.counts for sample in samples], np.int32)
+        return FtSamples.of(
+            [field.t_host_ns for field in fields],
+            [field.number for field in fields],
+            counts * self._unit_per_count,
+            counts=counts,
+            status=overload,
+        )
+
+    def _disconnect(self) -> None:
+        try:
+            self._send(codec.encode(Command.STOP))
+        finally:
+            self._close()
+
+    def _ask(self, command: Command, *parameters: int) -> bytes:
+        """Stop any stream, send a command and return the field that replies to it."""
+        for _ in range(_ATTEMPTS):
+            self._send(codec.encode(Command.STOP))
+            self._send(codec.encode(command, *parameters))
+            for _ in self._clock.looks(_REPLY_S):
+                for field in self._receive():
+                    if field.data[0] == command:
+                        return field.data
+        raise DeviceTimeout(
+            f"{self.name}: no reply to {command.name} after {_ATTEMPTS} attempts of {_REPLY_S} s",
+            "check supply, wiring, bit rate and, on CAN, that the sensor has the factory's identifiers",
+        )

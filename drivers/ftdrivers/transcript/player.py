@@ -1,0 +1,263 @@
+"""The far side of a recorded wire: it plays a transcript to the unmodified driver."""
+
+import contextlib
+import os
+import select
+import socket
+import threading
+import tty
+from collections.abc import Callable
+from socketserver import BaseRequestHandler
+from typing import Any, Final
+
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.transcript.ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
+from ftdrivers.transcript.recorder import Page, Passage, Transcript, asked_for
+from ftdrivers.wires.parity import leave_marks_to_far_side, marks_asked_for
+
+_EARLY_S: Final = 0.05
+"""A driver may send a request this much earlier than recorded; earlier data of the device is then sent at once."""
+
+
+class Player:
+    """Replays a recorded device to one driver that opens it once, on a pseudo-terminal or on ports of this computer.
+
+    Replies have the recorded delays, and unsolicited data the recorded timing. A request that is not in the rest of the
+    recording is a divergence: silence follows. Pages may be requested at any time; repeated requests for one page get
+    the recorded replies in order.
+    """
+
+    def __init__(self, transcript: Transcript, clock: Clock = REAL) -> None:
+        self._clock = clock
+        self._passages = transcript.passages
+        self._datagrams = transcript.datagrams
+        self._far = _Ethernet(transcript.pages, self._diverge, clock) if transcript.datagrams else _Terminal(transcript)
+        self._next = 0
+        self._t_ns = transcript.opened_ns  # of the recording, at `_t`
+        self._t = 0.0
+        self._asked = bytearray()
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.divergence: str | None = None
+        """The request of the driver that is not in the recording."""
+
+    @property
+    def left_s(self) -> float:
+        """How much of the recording is left, in its own time."""
+        left = self._passages[self._next :]
+        return (left[-1].t_ns - left[0].t_ns) / 1e9 if left else 0.0
+
+    def __enter__(self) -> str:
+        """Open the far side and return the argument of `Transcript.url_at`, such as the path of a pseudo-terminal."""
+        place = self._far.open()
+        self._thread = threading.Thread(target=self._serve, name=f"player on {place}", daemon=True)
+        self._thread.start()
+        return place
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+            self._far.close()
+
+    def _serve(self) -> None:
+        if not self._far.wait_for_driver(self._ended):
+            return
+        with self._clock.keeping_up():
+            self._t = self._clock.now_s()
+            while not self._ended.is_set():
+                self._clock.now_ns()  # an emulated cell waits for this thread
+                wait_s = min(self._clock.poll_s, max(0.0, self._play()))
+                readable, _, _ = select.select([self._far], [], [], wait_s)
+                if readable:
+                    data = self._far.read()
+                    if data is None:
+                        return
+                    self._asked += data
+                    self._listen()
+
+    def _play(self) -> float:
+        """Send the data that is due; return the seconds until more may be."""
+        if self._far.is_full:
+            self._far.send(b"")
+        for _ in range(AT_ONCE):
+            if self._next == len(self._passages) or self.divergence or self._passages[self._next].sent:
+                return 0.001 if self._far.is_full else LOOK_S
+            passage = self._passages[self._next]
+            wait_s = self._due_in_s(passage)
+            if wait_s > 0:
+                return wait_s
+            self._far.send(passage.data)
+            self._next += 1
+        return 0.001
+
+    def _due_in_s(self, passage: Passage) -> float:
+        return self._t + (passage.t_ns - self._t_ns) / 1e9 - self._clock.now_s()
+
+    def _listen(self) -> None:
+        """Compare what the driver writes with the next request of the recording."""
+        while self._asked and not self.divergence:
+            first = self._request_from(self._next)
+            if first is None:  # the driver is closing, or the recording was broken off
+                self._asked.clear()
+                return
+            expected = self._passages[first].data
+            if not self._datagrams and len(expected) > len(self._asked) and expected.startswith(self._asked):
+                return
+            found: int | None = first
+            while found is not None and not self._is_asked(self._passages[found].data):
+                found = self._request_from(found + 1)
+            if found is None:
+                self._diverge(f"the driver sent {self._asked.hex(' ')}, the recording has {expected.hex(' ')}")
+                return
+            if found == first and not self._datagrams:  # earlier datagrams belong to a closed socket
+                for passage in self._passages[self._next : found]:
+                    if self._due_in_s(passage) < _EARLY_S:
+                        self._far.send(passage.data)
+            request = self._passages[found]
+            del self._asked[: len(request.data)]
+            self._next = found + 1
+            self._t, self._t_ns = self._clock.now_s(), request.t_ns
+
+    def _is_asked(self, request: bytes) -> bool:
+        return self._asked == request if self._datagrams else self._asked.startswith(request)
+
+    def _request_from(self, start: int) -> int | None:
+        return next((i for i in range(start, len(self._passages)) if self._passages[i].sent), None)
+
+    def _diverge(self, what: str) -> None:
+        self.divergence = self.divergence or what
+
+
+class _Terminal:
+    """A pseudo-terminal; for CAN frames an slcan adapter on it, which accepts every command and does nothing."""
+
+    def __init__(self, transcript: Transcript) -> None:
+        self._parity_marks = transcript.parity_marks
+        self._frames = transcript.frames
+        self._line = b""
+        self._unsent = b""
+        self._master = -1
+
+    def open(self) -> str:
+        self._master, slave = os.openpty()
+        path = os.ttyname(slave)
+        tty.setraw(slave)
+        os.close(slave)  # so that the master shows when a driver opens and closes
+        os.set_blocking(self._master, False)
+        return path
+
+    def close(self) -> None:
+        os.close(self._master)
+
+    def wait_for_driver(self, ended: threading.Event) -> bool:
+        """Wait until the driver has opened the port; return False when `ended` comes first."""
+        poll = select.poll()
+        poll.register(self._master, 0)
+        while poll.poll(0):  # "hung up" until a driver has opened the other end
+            if ended.wait(0.005):
+                return False
+        if self._parity_marks:  # nothing is sent before the driver is ready for them
+            while not marks_asked_for(self._master):
+                if ended.wait(0.001):
+                    return False
+            leave_marks_to_far_side(self._master)
+        return True
+
+    def fileno(self) -> int:
+        return self._master
+
+    def read(self) -> bytes | None:
+        """Return what the driver has sent; None when it has closed the port."""
+        try:
+            data = os.read(self._master, 4096)
+        except OSError:
+            return None  # the driver has closed the port
+        return self._frames_of(data) if self._frames else data
+
+    def _frames_of(self, data: bytes) -> bytes:
+        """Leave out commands to the adapter, because the recording was made with another one."""
+        *lines, self._line = (self._line + data).split(b"\r")
+        return b"".join(line + b"\r" for line in lines if line[:1] in {b"t", b"T", b"r", b"R"})
+
+    def send(self, data: bytes) -> None:
+        """Send as much as the driver accepts; the next call sends the rest first."""
+        data = self._unsent + data
+        try:
+            written = os.write(self._master, data)
+        except BlockingIOError:
+            written = 0
+        self._unsent = data[written:]
+
+    @property
+    def is_full(self) -> bool:
+        return bool(self._unsent)
+
+
+class _Ethernet:
+    """A UDP port, and a second port with pages over HTTP."""
+
+    is_full = False
+
+    def __init__(self, pages: tuple[Page, ...], diverge: Callable[[str], None], clock: Clock) -> None:
+        self._pages = pages
+        self._clock = clock
+        self._diverge = diverge
+        self._driver: Any = None
+        self._opened = contextlib.ExitStack()
+
+    def open(self) -> str:
+        self._socket = self._opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        self._socket.bind((LOOPBACK, 0))
+        answers = self._opened.enter_context(_PageAnswers(self._pages, self._diverge, self._clock))
+        return f"{LOOPBACK}?rdt_port={self._socket.getsockname()[1]}&http_port={answers.port}"
+
+    def close(self) -> None:
+        self._opened.close()
+
+    def wait_for_driver(self, _: threading.Event) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def read(self) -> bytes | None:
+        data, self._driver = self._socket.recvfrom(65536)
+        return data
+
+    def send(self, data: bytes) -> None:
+        if self._driver is not None:
+            self._socket.sendto(data, self._driver)
+
+
+class _PageAnswers(PageServer):
+    """Replies with the recorded bytes after the recorded time."""
+
+    def __init__(self, pages: tuple[Page, ...], diverge: Callable[[str], None], clock: Clock) -> None:
+        super().__init__("player of pages", _PageAnswer)
+        self._diverge = diverge
+        self._clock = clock
+        self._left: dict[bytes, list[Page]] = {}
+        for page in pages:
+            self._left.setdefault(asked_for(page.request), []).append(page)
+
+    def answer(self, request: bytes) -> bytes:
+        asked = asked_for(request)
+        left = self._left.get(asked)
+        if not left:
+            self._diverge(f"the driver requested {asked.decode(errors='replace')}, which is not in the recording")
+            return b""
+        page = left.pop(0) if len(left) > 1 else left[0]
+        self._clock.wait(self.ended, page.took_s)
+        return page.reply
+
+
+class _PageAnswer(BaseRequestHandler):
+    server: _PageAnswers
+
+    def handle(self) -> None:
+        driver: socket.socket = self.request
+        driver.settimeout(HTTP_S)
+        with contextlib.suppress(OSError):  # a driver that has disconnected needs no reply
+            driver.sendall(self.server.answer(driver.recv(65536)))

@@ -1,0 +1,267 @@
+"""A file with the bytes on the wire of a sensor: `taps.py` records it, `player.py` plays it.
+
+A transcript (``ftdrive.transcript/1``) is JSON lines. The first holds sensor, time and versions. The others have the
+time of the driver's clock as `t_ns`:
+
+{"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits", "parity_marks"}   a serial port
+{"t_ns", "event": "open", "port", "frames": true}                                                 a CAN interface
+{"t_ns", "event": "open", "port", "datagrams": true}                                              UDP
+{"t_ns", "event": "unreachable", "error"}   why a datagram was lost, which the driver does not notice
+{"t_ns", "event": "page", "request", "reply", "took_s", "error"}   one HTTP request and its reply, with headers, in hex
+{"t_ns", "dir": "tx", "hex"}    one write of the driver
+{"t_ns", "dir": "rx", "hex"}    one datagram, or what the driver read within 2 ms, stamped with its first byte
+{"t_ns", "event": "end", "error"}   the error at the end; without one, what the driver decoded: "identity", "samples",
+                                    "mean_force_N", "mean_torque_Nm" and more
+
+Where `parity_marks` is true, received bytes contain the marks of `drivers/ftdrivers/wires/parity.py`; older transcripts
+lack the field and the marks. An slcan adapter is recorded as a serial port. The frames of other CAN interfaces are written
+as lines of slcan, and an emulated slcan adapter plays them. Commands of python-can to that adapter are not compared.
+"""
+
+import json
+import math
+import os
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any, Final, Self
+from urllib.parse import parse_qsl, urlencode
+
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.registry import split_url
+
+FORMAT: Final = "ftdrive.transcript/1"
+
+_TOGETHER_NS: Final = 2_000_000
+INTERRUPTED: Final = "interrupted"
+"""The error of a recording that the user has interrupted."""
+_LONGEST_PAGE_S: Final = 60.0
+"""Longer than any driver waits for a page."""
+
+
+class BadTranscript(Exception):
+    """The file is not a transcript, or is damaged."""
+
+
+class Writer:
+    """Writes a transcript to `path` with the suffix ``.partial``; `end` renames it.
+
+    Parameters
+    ----------
+    path : Path
+        Must not exist.
+    header : mapping
+        Content of the first line.
+    clock : Clock
+        The driver's.
+
+    Raises
+    ------
+    OSError
+        The file or its ``.partial`` exists already, or cannot be written.
+    """
+
+    def __init__(self, path: Path, header: Mapping[str, Any], clock: Clock = REAL) -> None:
+        self.has_port = False
+        """Whether any port was opened; without one there is nothing to play."""
+        self.clock = clock
+        self._path = path
+        self._partial = path.parent / (path.name + ".partial")
+        for existing in (path, self._partial):
+            if existing.exists():
+                raise FileExistsError(f"{existing} exists already and is not overwritten; give another name")
+        self._lock = threading.Lock()
+        self._received = bytearray()
+        self._received_ns = 0
+        try:
+            self._file: IO[str] | None = self._partial.open("x", encoding="utf-8")
+        except OSError as error:
+            fix = "choose a folder that exists and is writable"
+            raise OSError(f"{path} cannot be written ({error.strerror}); {fix}") from error
+        self._line({"format": FORMAT, **header})
+
+    def event(self, name: str, **content: Any) -> None:
+        """Record an event."""
+        self.has_port |= name == "open"
+        self._entry(event=name, **content)
+
+    def sent(self, data: bytes) -> None:
+        """Record one write of the driver."""
+        self._entry(dir="tx", hex=data.hex())
+
+    def received(self, data: bytes) -> None:
+        """Record what the driver has read; reads within 2 ms become one line."""
+        if not data:
+            return
+        now_ns = self.clock.now_ns()
+        with self._lock:
+            if self._received and now_ns - self._received_ns > _TOGETHER_NS:
+                self._flush_received()
+            if not self._received:
+                self._received_ns = now_ns
+            self._received += data
+
+    def received_datagram(self, data: bytes) -> None:
+        """Record one datagram to the driver as one line."""
+        self._entry(dir="rx", hex=data.hex())
+
+    def end(self, **content: Any) -> None:
+        """Write the last line and rename the file."""
+        self.event("end", **content)
+        with self._lock:
+            file, self._file = self._file, None
+        if file is None:
+            return
+        with file:
+            file.flush()
+            os.fsync(file.fileno())
+        if self._path.exists():
+            raise FileExistsError(f"{self._path} was created meanwhile; find the transcript in {self._partial}")
+        self._partial.rename(self._path)
+
+    def discard(self) -> None:
+        """Delete the file."""
+        with self._lock:
+            file, self._file = self._file, None
+        if file is not None:
+            file.close()
+            self._partial.unlink()
+
+    def _entry(self, **content: Any) -> None:
+        with self._lock:
+            self._flush_received()
+            self._line({"t_ns": self.clock.now_ns(), **content})
+
+    def _flush_received(self) -> None:
+        if self._received:
+            self._line({"t_ns": self._received_ns, "dir": "rx", "hex": self._received.hex()})
+            self._received.clear()
+
+    def _line(self, content: Mapping[str, Any]) -> None:
+        if self._file is not None:
+            self._file.write(json.dumps(content, ensure_ascii=False) + "\n")
+
+
+@dataclass(frozen=True, slots=True)
+class Passage:
+    """Bytes in one direction."""
+
+    t_ns: int
+    sent: bool
+    """Whether the driver sent them."""
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """An HTTP request and its reply, as they were on the wire."""
+
+    request: bytes
+    reply: bytes
+    """Empty where none arrived."""
+    took_s: float
+
+
+def asked_for(request: bytes) -> bytes:
+    """Return method and path of an HTTP request, because the rest differs between clients."""
+    return b" ".join(request.split(b"\r\n", 1)[0].split(b" ")[:2])
+
+
+@dataclass(frozen=True, slots=True)
+class Transcript:
+    """A transcript read from a file."""
+
+    header: Mapping[str, Any]
+    opened_ns: int
+    """When the driver opened its port."""
+    passages: tuple[Passage, ...]
+    end: Mapping[str, Any]
+    """What the driver decoded; empty if the recording was interrupted."""
+    parity_marks: bool = False
+    """Whether received bytes contain marks of wrong parity."""
+    frames: bool = False
+    """Whether the passages are frames of a CAN interface, as lines of slcan."""
+    datagrams: bool = False
+    """Whether each passage is a datagram."""
+    pages: tuple[Page, ...] = ()
+
+    @property
+    def is_broken_off(self) -> bool:
+        """Whether the recording was interrupted, or its end is missing."""
+        return bool(self.end.get("error", INTERRUPTED) == INTERRUPTED)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file. Raises `BadTranscript`, or `OSError` when it cannot be read."""
+        header: Mapping[str, Any] = {}
+        opened_ns: int | None = None
+        parity_marks = frames = datagrams = False
+        passages: list[Passage] = []
+        pages: list[Page] = []
+        end: Mapping[str, Any] = {}
+        number = 0
+        try:
+            with path.open(encoding="utf-8") as file:
+                for number, text in enumerate(file, start=1):
+                    line = json.loads(text)
+                    if number == 1:
+                        header = _checked_header(path, line)
+                    elif "dir" in line:
+                        passages.append(Passage(_time_ns(line), line["dir"] == "tx", bytes.fromhex(line["hex"])))
+                    elif line.get("event") == "open" and opened_ns is None:
+                        opened_ns, parity_marks = _time_ns(line), line.get("parity_marks") is True
+                        frames, datagrams = line.get("frames") is True, line.get("datagrams") is True
+                    elif line.get("event") == "page":
+                        pages.append(_checked_page(line))
+                    elif line.get("event") == "end":
+                        end = _checked_end(line)
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+            raise BadTranscript(
+                f"{path}, line {number}: not a line of a transcript ({error}); record it again"
+            ) from error
+        if not header:
+            raise BadTranscript(f"{path} is empty; record it again")
+        if opened_ns is None:
+            raise BadTranscript(f"{path}: nothing to play, the driver opened no port: {end.get('error')}")
+        return cls(header, opened_ns, tuple(passages), end, parity_marks, frames, datagrams, tuple(pages))
+
+    def url_at(self, port: str) -> str:
+        """Return the sensor's address with the port and the options of a player in place of the device."""
+        parts = split_url(str(self.header["url"]))
+        place, _, own = port.partition("?")
+        options = dict(parse_qsl(parts.query)) | dict(parse_qsl(own)) | ({"interface": "slcan"} if self.frames else {})
+        return f"{parts.scheme}://{place}" + (f"?{urlencode(options)}" if options else "")
+
+
+def _checked_header(path: Path, line: Any) -> Mapping[str, Any]:
+    found = line.get("format") if isinstance(line, dict) else None
+    if found != FORMAT:
+        raise BadTranscript(f"{path}: the format in the first line is {found!r}; give a file with {FORMAT}")
+    if not isinstance(line.get("url"), str) or not isinstance(line.get("duration_s"), int | float):
+        raise BadTranscript(f"{path}: url or duration_s is missing in the first line; record it again")
+    split_url(line["url"])
+    if not 0 < float(line["duration_s"]) < math.inf:
+        raise ValueError(f"duration_s is {line['duration_s']}")
+    return dict(line)
+
+
+def _checked_end(line: Mapping[str, Any]) -> Mapping[str, Any]:
+    if "identity" in line:
+        _ = line["identity"]["model"], line["identity"]["serial"], line["samples"]
+        for x, y, z in (line["mean_force_N"], line["mean_torque_Nm"]):
+            if not all(map(math.isfinite, (x, y, z))):
+                raise ValueError(f"a mean of {x}, {y}, {z}")
+    return line
+
+
+def _checked_page(line: Mapping[str, Any]) -> Page:
+    page = Page(bytes.fromhex(line["request"]), bytes.fromhex(line["reply"]), float(line["took_s"]))
+    if not 0 <= page.took_s <= _LONGEST_PAGE_S:
+        raise ValueError(f"took_s is {page.took_s}")
+    return page
+
+
+def _time_ns(line: Mapping[str, Any]) -> int:
+    float(line["t_ns"])  # beyond its range times cannot be distinguished
+    return int(line["t_ns"])

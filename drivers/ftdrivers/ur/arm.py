@@ -1,0 +1,584 @@
+"""A Universal Robots arm.
+
+`reading.py` reads it, a control path (`control.py`) moves it. The dashboard server or the Robot API can stop the arm
+without either.
+
+Ref: `is_steady` in the URScript manual.
+Checked on hardware: no.
+"""
+
+import logging
+import math
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
+from math import radians
+from typing import Final, Literal
+
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
+from ftdrivers.follow import Follow
+from ftdrivers.interfaces import (
+    ArmState,
+    ArmStates,
+    ArmStatus,
+    ControllerSettings,
+    DeviceInfo,
+    Fact,
+    Finding,
+    Guard,
+    RobotArm,
+)
+from ftdrivers.ur.control import CONTROL_SETTINGS, Control, ControlSetting
+from ftdrivers.ur.control_child import DECELERATION_RAD_S2
+from ftdrivers.ur.controller_settings import checked_gravity, checked_payload, read_controller_settings
+from ftdrivers.ur.kinematics import MODELS, model_named
+from ftdrivers.ur.opening import SIMULATORS, Opening, path_for
+from ftdrivers.ur.own_program import OwnProgram
+from ftdrivers.ur.reading import Reader
+from ftdrivers.ur.robot_api import PORT as API_PORT
+from ftdrivers.ur.sample import PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Sample
+from ftdrivers.ur.timing import UrTiming
+
+log = logging.getLogger(__name__)
+
+_ARRIVED_RAD: Final = 1e-3
+_STANDING_RAD_S: Final = 1e-6
+"""Speed of the set-point, which is exactly zero at rest."""
+_STILL_RAD_S: Final = 0.002
+
+
+class UrArm(RobotArm):
+    """A Universal Robots arm: CB3 generation, e-Series, or PolyScope X.
+
+    Parameters
+    ----------
+    host
+        Address of the controller.
+    model
+        Such as "UR5e", to compare poses with nominal kinematics; None takes the model that the controller reports.
+    speed_rad_s, acceleration_rad_s2
+        Defaults of the leading joint in `move_to`. The speed slider of the pendant scales them down further.
+    control
+        The control path: "ur-rtde", "script", or "auto", which takes ur_rtde where it is installed and the controller
+        has a dashboard server.
+    api_port
+        Of the Robot API of PolyScope X.
+    clock
+        Measures and waits; an emulated cell has its own.
+    timing
+        Every time limit; by default those of the cell that `clock` times.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        *,
+        model: str | None = None,
+        speed_rad_s: float = radians(30),
+        acceleration_rad_s2: float = radians(40),
+        control: ControlSetting = "auto",
+        api_port: int = API_PORT,
+        clock: Clock = REAL,
+        timing: UrTiming | None = None,
+    ) -> None:
+        _check_speed(speed_rad_s, acceleration_rad_s2)
+        if control not in CONTROL_SETTINGS:
+            raise ValueError(f"control is {control!r}; choose one of {', '.join(CONTROL_SETTINGS)}.")
+        if model is not None and model_named(model, 0) is None:
+            raise ValueError(f"model {model!r} is unknown; choose one of {', '.join(MODELS)}.")
+        self._host = host
+        self._model = None if model is None else model_named(model, 0)
+        self._speed_rad_s = float(speed_rad_s)
+        self._acceleration_rad_s2 = float(acceleration_rad_s2)
+        self._clock = clock
+        self._timing = timing or UrTiming.of(clock)
+        self._moves_at_rad_s = self._speed_rad_s
+        self._setting = control
+        self._api_port = api_port
+        self._reader: Reader | None = None
+        self._control: Control | None = None
+        self._program = OwnProgram(self._timing)
+        self._goal: list[float] | None = None
+        self._stop_requested = threading.Event()
+
+    # ------------------------------------------------------------------ opening and closing
+
+    def open(self, *, control: bool = False) -> None:
+        """Connect, read-only unless `control` is requested; reopen lost connections.
+
+        Reading disturbs nothing and needs no remote control. Taking control starts a program on the controller, which
+        zeroes the sensor in an e-Series wrist. It never stops another program that plays or is paused, except one that
+        this object has started before. After a safety stop the operator has to clear it first; the interrupted move is
+        gone. Takes 5 s at most. Raises `ConnectError`, and then the arm is closed.
+        """
+        try:
+            self._drop_what_is_lost(control)
+            self._connect(control)
+        except (StreamBroken, DeviceTimeout, DeviceFault, ProtocolError) as error:
+            self.close()
+            raise ConnectError(f"cannot open the arm at {self._host}: {error.found}", error.fix) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _drop_what_is_lost(self, control: bool) -> None:
+        if self._reader is None:
+            return
+        try:
+            look = self._reader.look()
+        except DriverError as error:
+            log.info("%s is reopened: %s", self._host, error)
+            self.close()
+            return
+        if look.program_state == PROGRAM_STOPPED:
+            self._program.is_stopped()
+        if not control or self._control is None:
+            return
+        plays = self._control.alive and not look.program_fault()
+        if plays and (look.safety_fault() or self._is_ours(self._control, timeout_s=self._timing.ours_again_s)):
+            return
+        self._control.kill()
+        self._control = None
+
+    def _connect(self, control: bool) -> None:
+        if self._reader is None:
+            self._reader = self._new_reader()
+        if control and self._control is None:
+            self._control = self._opening(self._reader).open()
+        if self._reader.look().robot_mode == ROBOT_RUNNING and (self._reader.reports_tcp or self._control is not None):
+            self.state()  # checks the model
+
+    def _new_reader(self, **rate: float) -> Reader:
+        return Reader(self._host, self._model, clock=self._clock, timing=self._timing, api_port=self._api_port, **rate)
+
+    def _opening(self, reader: Reader) -> Opening:
+        return Opening(self._host, self._setting, reader, self._program, self._clock, self._timing)
+
+    def close(self) -> None:
+        """Stop the arm and its control script, then disconnect. Idempotent; takes 1.5 s at most."""
+        control, self._control = self._control, None
+        reader, self._reader = self._reader, None
+        self._goal = None
+        if control is not None:
+            self._end_program(control, reader)
+        if self._program.left_behind:
+            self._program.stop()
+        if reader is not None:
+            reader.close()
+
+    def _end_program(self, control: Control, reader: Reader | None) -> None:
+        """End our program through its control path, if that can be confirmed to work."""
+        try:
+            look = None if reader is None else reader.look(limit_s=self._timing.glance_s)
+            if control.has_ended:
+                self._program.is_gone()
+            if look and control.alive and look.program_state == PROGRAM_PLAYING and not look.safety_fault():
+                if self._is_ours(control, timeout_s=self._timing.ours_closing_s):
+                    if control.quit(timeout_s=self._timing.quit_s):
+                        self._program.is_gone()
+                elif not self._program.left_behind:
+                    log.warning("%s runs another program; it is not stopped", self._host)
+        except DriverError as error:
+            log.info("%s: %s", self._host, error)
+        finally:
+            control.kill()
+
+    def identify(self) -> DeviceInfo:
+        """Return model, serial number and PolyScope version, as read when the arm was opened, and the control path."""
+        reader = self._reading()
+        path, why = path_for(self._setting, reader.version)
+        source: Literal["configured", "assumed"] = "assumed" if self._setting == "auto" else "configured"
+        return replace(reader.info, facts={"control": Fact(f"{path}: {why}", source)})
+
+    def state(self) -> ArmState:
+        """Read a new, consistent state; the pose is that of the mechanical flange, whatever TCP is active.
+
+        Raises `DeviceTimeout` when the controller's clock stands still for 0.2 s, `StreamBroken` when the connection is
+        lost, `DeviceFault` when the joints are not measured (no power) or the pose does not fit the model, and
+        `ConnectError` when the controller is too old to report its TCP and the arm was opened without control.
+        """
+        reader = self._reading()
+        if not reader.reports_tcp and self._control is None:
+            raise ConnectError(
+                f"the controller {self._host} is too old to report its active TCP, so the flange pose is unknown",
+                "update it, or open the arm with control, as a calibration does",
+            )
+        return reader.state(lambda: self._in_control().call("tcp_offset"))
+
+    def follow(self) -> AbstractContextManager[Follow[ArmStates]]:
+        """Read every sample from now on, 500 a second (CB3: 125), as flange poses; see `RobotArm`.
+
+        Before the first call, the arm is read 125 times a second, which is enough for a session and costs a quarter.
+        That call replaces the reader; a `state` or `status` that waits in another thread then raises `StreamBroken`.
+        Samples that are late are included: compare `t_device_s`. Samples without power over the joints are left out;
+        a read that finds no others raises `DeviceFault`. A controller that is too old to report its TCP is polled.
+        """
+        reader = self._reading()
+        if not reader.reports_tcp:
+            return super().follow()
+        if not reader.reads_all:
+            quick = self._new_reader(rate_Hz=math.inf)
+            self._reader = quick
+            reader.close()
+            reader = quick
+        return reader.follow()
+
+    def status(self) -> ArmStatus:
+        """Return the controller's modes and settings, updated with every sample; see `RobotArm`."""
+        return self._reading().status()
+
+    def controller_settings(self) -> ControllerSettings:
+        """Read payload, inertia and gravity over a connection of their own, which takes some milliseconds.
+
+        Payload from PolyScope 5.6 and 3.11 on, inertia from 5.11 and 3.15 on, gravity only on recent versions.
+        """
+        self._reading()
+        return read_controller_settings(self._host, timeout_s=self._timing.connect_s, clock=self._clock)
+
+    def in_remote_control(self) -> bool | None:
+        """Ask the dashboard server or the Robot API, which takes some milliseconds. Raises `NoDashboard`.
+
+        None before PolyScope 5.6 and on PolyScope X before 10.12, which do not report it, and at the addresses of
+        URSim, which does not need it.
+        """
+        reader = self._reading()
+        if reader.version[:2] < (5, 6) or self._host in SIMULATORS:
+            return None
+        return reader.services.ask(lambda services: services.in_remote_control(), timeout_s=self._timing.connect_s)
+
+    def reported_program(self) -> str | None:
+        """Ask the controller for the program's state and name; None where it does not answer.
+
+        A program that a client has sent may be reported with the name of the loaded one: not checked on hardware.
+        """
+        return self._reading().reported_program()
+
+    def diagnose(self) -> list[Finding]:
+        """Check what control needs: a control path, the version, free RTDE registers, an open port for programs."""
+        return self._opening(self._reading()).diagnose()
+
+    # ------------------------------------------------------------------ moving
+
+    def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
+        """Ask the controller whether it would accept these joint angles (6,). Needs control.
+
+        The controller knows its own limits and planes, not the obstacles around it. Raises `DeviceFault` or
+        `StreamBroken` when it cannot be asked.
+        """
+        q = _joints(q_rad)
+        control = self._in_control()
+        try:
+            return bool(control.call("within_safety_limits", q, look_out=self._look_out))
+        except DriverError as error:
+            if fault := self._fault():
+                raise fault from error
+            raise
+
+    def set_payload(
+        self, mass_kg: float, p_flange_com_m: Sequence[float], inertia_kg_m2: Sequence[float] = (0.0,) * 6
+    ) -> None:
+        """Set the payload; see `RobotArm`. The controller also zeroes the sensor in an e-Series wrist.
+
+        The change is instantaneous, so the arm may make a small jump. Raises `DeviceFault` or `StreamBroken` when it
+        cannot be confirmed, and `ValueError` for values that no payload has. PolyScope before 5.10 takes no inertia.
+        """
+        mass, com, inertia = checked_payload(mass_kg, p_flange_com_m, inertia_kg_m2)
+        version = self._reading().version[:2]
+        takes_inertia = version >= (5, 10)
+        if any(inertia) and not takes_inertia:
+            raise DeviceFault(
+                "PolyScope {}.{} takes no inertia of the payload from a program".format(*version),
+                "set the payload at the pendant",
+            )
+        self._set("payload", mass, com, inertia if takes_inertia else None)
+
+    def set_gravity(self, up_base_m_s2: Sequence[float]) -> None:
+        """Set the direction of gravity; see `RobotArm`. Errors as `set_payload`."""
+        self._set("gravity", checked_gravity(up_base_m_s2))
+
+    def _set(self, what: str, *values: object) -> None:
+        """Have our program set what a controller assumes; another program is left as it is."""
+        control = self._in_control()
+        self._look_out()
+        self._check_ours(control)
+        try:
+            taken = control.call(f"set_{what}", *values, look_out=self._look_out)
+        except DriverError as error:
+            if fault := self._fault():
+                raise fault from error
+            raise
+        if not taken:
+            raise self._fault() or DeviceFault(
+                f"the controller did not confirm the {what} that was sent", "read the pendant's log"
+            )
+
+    def move_to(
+        self,
+        q_rad: Sequence[float],
+        *,
+        timeout_s: float,
+        guard: Guard,
+        speed_rad_s: float | None = None,
+        acceleration_rad_s2: float | None = None,
+    ) -> None:
+        """Move all joints to `q_rad` (6,) and return when they have arrived; see `RobotArm` for the speed.
+
+        `guard` is called about 100 times a second. Whatever ends the wait early stops the arm first and is raised then:
+        `DeviceFault` (protective, emergency or safeguard stop, program ended, not arrived), `StreamBroken`,
+        `DeviceTimeout` (silent controller, or `timeout_s` is over), an exception of the guard, KeyboardInterrupt.
+        A safety stop is never reset. The program is ended, so that the rest of the move cannot be resumed.
+        """
+        q = _joints(q_rad)
+        speed = self._speed_rad_s if speed_rad_s is None else float(speed_rad_s)
+        acceleration = self._acceleration_rad_s2 if acceleration_rad_s2 is None else float(acceleration_rad_s2)
+        _check_speed(speed, acceleration)
+        control = self._in_control()
+        self._stop_requested.clear()
+        self._goal = None
+        with self._stopping_on_error():
+            self._look_out()
+        self._check_ours(control)  # another program is not stopped
+        guard()
+        self._moves_at_rad_s = speed
+        with self._stopping_on_error():
+            with self._reporting_stop():
+                if not control.call("move", q, speed, acceleration, look_out=self._look_out):
+                    raise self._fault() or DeviceFault(
+                        f"the controller rejected the move to {_degrees(q)}", "read the pendant's log"
+                    )
+            checked_s = self._clock.now_s()
+            for look in self._watch(
+                timeout_s, guard, f"the move to {_degrees(q)} has not ended", self._look_out_moving
+            ):
+                with self._reporting_stop():
+                    if self._has_ended(control):
+                        self._check_arrival(look, q)
+                        self._goal = q
+                        return
+                    if self._clock.now_s() - checked_s > self._timing.ours_every_s:
+                        self._check_ours(control)
+                        checked_s = self._clock.now_s()
+
+    def _has_ended(self, control: Control) -> bool:
+        if self._stop_requested.is_set():
+            raise _stopped()
+        ended, unwatched = control.call("progress", timeout_s=self._timing.progress_s, look_out=self._look_out)
+        if unwatched:
+            raise DeviceTimeout(
+                f"this program did not watch the move for {self._timing.unwatched_s} s, so its control path "
+                "stopped the arm",
+                "keep the computer awake and give it less to do, then move again",
+            )
+        return bool(ended)
+
+    def _check_arrival(self, look: Sample, q: list[float]) -> None:
+        # The control process may report the end before the last set-points arrive over RTDE.
+        deadline_s = self._clock.now_s() + self._timing.reason_s
+        while not _near(look.target_q_rad, q):
+            if self._clock.now_s() > deadline_s:
+                raise self._fault() or DeviceFault(
+                    f"the move ended at {_degrees(look.target_q_rad)} instead of {_degrees(q)}",
+                    "read the reason at the pendant",
+                )
+            look = self._reading().look()
+
+    def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
+        """Return when the joints have been at rest long enough for the structure to stop ringing.
+
+        For 0.3 s without a break, the arm is at the target of `move_to`, its target velocity is zero and every measured
+        joint speed is below 0.002 rad/s. (The controller's own `is_steady` waits for 0.5 s of zero target velocity; the
+        mean force over 1 s does not show the difference.) Errors as in `move_to`; without control, safety stops are not
+        errors.
+        """
+        still_since_s: float | None = None
+        with self._stopping_on_error():
+            for look in self._watch(timeout_s, guard, "the arm has not come to rest", self._look_out):
+                still = (
+                    max(map(abs, look.target_qd_rad_s)) <= _STANDING_RAD_S
+                    and max(map(abs, look.qd_rad_s)) < _STILL_RAD_S
+                    and (self._goal is None or _near(look.target_q_rad, self._goal))
+                )
+                if not still:
+                    still_since_s = None
+                elif still_since_s is None:
+                    still_since_s = look.t_device_s
+                elif look.t_device_s - still_since_s >= self._timing.still_s:
+                    return
+
+    def stop(self) -> None:
+        """Stop the arm and end `move_to` with `DeviceFault`. From any thread, at any time; needs control."""
+        if self._control is not None:
+            self._stop_requested.set()
+            self._halt()
+
+    def _watch(self, timeout_s: float, guard: Guard, what: str, look_out: Callable[[], Sample]) -> Iterator[Sample]:
+        """Yield each new sample until the time is over; raise any fault of the arm."""
+        deadline_s = self._clock.now_s() + timeout_s
+        while True:
+            look = look_out()
+            guard()
+            yield look
+            if self._clock.now_s() > deadline_s:
+                raise DeviceTimeout(
+                    f"{what} within {timeout_s:.1f} s; set-points are at {_degrees(look.target_q_rad)}",
+                    "check the speed slider, and whether something else moves the arm",
+                )
+
+    @contextmanager
+    def _reporting_stop(self) -> Iterator[None]:
+        """Report any failure after `stop` in another thread as that stop."""
+        try:
+            yield
+        except DriverError as error:
+            if self._stop_requested.is_set():
+                raise _stopped() from error
+            raise
+
+    def _look_out(self) -> Sample:
+        """Return a new sample; raise any fault of the arm, its program or the connections."""
+        try:
+            look = self._reading().look()
+        except (DeviceTimeout, StreamBroken) as error:
+            if self._control is None:
+                raise
+            raise self._control.explained(error) from error
+        if self._control is not None:
+            if fault := self._fault(look):
+                raise fault
+            self._in_control()
+        return look
+
+    def _look_out_moving(self) -> Sample:
+        with self._reporting_stop():
+            return self._look_out()
+
+    def _fault(self, look: Sample | None = None) -> DriverError | None:
+        """Return why the arm does not move, if the controller reports a reason."""
+        reader = self._reading()
+        look = look or reader.look()
+        deadline_s = self._clock.now_s() + self._timing.reason_s
+        while not look.safety_fault() and look.program_fault() and self._clock.now_s() < deadline_s:
+            look = reader.look()
+        fault = look.safety_fault() or look.program_fault()
+        if fault is None:
+            return None
+        if self._control is not None and not look.safety_fault() and (reason := self._control.end_reason()):
+            return reason
+        return DeviceFault(f"the arm at {self._host} stopped: {fault.found}", f"{fault.fix}, then open the arm again")
+
+    @contextmanager
+    def _stopping_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self._halt()
+            raise
+
+    def _halt(self) -> None:
+        """Stop the arm with `stopJ`, or else by ending its program; never raises."""
+        control = self._control
+        if control is None:
+            return
+        stopped = False
+        try:
+            stopped = self._stop_softly(control)
+        finally:  # also after a second Ctrl-C
+            if not stopped:
+                control.kill()  # on a lost link ur_rtde would restart the program repeatedly
+                if control.has_ended:
+                    self._program.is_gone()
+                else:
+                    self._program.stop(silent=self._reader is not None and self._reader.silent)
+
+    def _stop_softly(self, control: Control) -> bool:
+        try:
+            if self._reading().silent:
+                return False
+            glance_s = self._timing.glance_s
+            look = self._reading().look(limit_s=glance_s)
+            if not control.alive or look.safety_fault() or look.program_fault():
+                return False
+            limit_s = self._timing.braking_s + self._moves_at_rad_s / DECELERATION_RAD_S2
+            control.call("stop", timeout_s=limit_s, look_out=self._look_out)
+            for _ in range(10):  # ur_rtde does not report success
+                if max(map(abs, self._reading().look(limit_s=glance_s).target_qd_rad_s)) <= _STANDING_RAD_S:
+                    return True
+        except DriverError as error:
+            log.info("%s: stopJ failed: %s", self._host, error)
+        return False
+
+    def _check_ours(self, control: Control) -> None:
+        """Raise `DeviceFault` when another program runs, whose registers mean nothing to us."""
+        if not self._is_ours(control, timeout_s=self._timing.ours_s, look_out=self._look_out):
+            raise (
+                control.end_reason()
+                or self._fault()
+                or DeviceFault(
+                    f"the control program on {self._host} does not answer: another program may be running, or "
+                    "controller or computer are overloaded",
+                    "check the program at the pendant, then open the arm again",
+                )
+            )
+
+    def _is_ours(self, control: Control, *, timeout_s: float, look_out: Callable[[], object] = lambda: None) -> bool:
+        try:
+            control.call("tcp_offset", timeout_s=timeout_s, look_out=look_out)
+        except DeviceTimeout as error:
+            if control.alive:
+                raise  # of `look_out`: the controller sends nothing, whatever program it runs
+            log.info("%s: the control program does not answer: %s", self._host, error)
+            self._program.is_gone()  # another program has probably replaced it
+            return False
+        except DriverError as error:
+            log.info("%s: the control program cannot be asked: %s", self._host, error)
+            return False
+        return True
+
+    def _in_control(self) -> Control:
+        if self._control is None:
+            raise ConnectError(f"the arm at {self._host} was opened for reading only", "open it with control")
+        if not self._control.alive:
+            raise self._control.end_reason() or StreamBroken(
+                f"the control of {self._host} has ended", "check the robot, then open the arm again"
+            )
+        return self._control
+
+    def _reading(self) -> Reader:
+        reader = self._reader  # once: another thread may close the arm meanwhile
+        if reader is None:
+            raise ConnectError(f"the arm at {self._host} is not open", "open it first")
+        return reader
+
+
+def _stopped() -> DeviceFault:
+    return DeviceFault("a stop was requested before the arm arrived")
+
+
+def _check_speed(speed_rad_s: float, acceleration_rad_s2: float) -> None:
+    if not radians(0.5) <= speed_rad_s <= radians(180):
+        raise ValueError(f"speed_rad_s is {speed_rad_s}; choose 0.0087 to 3.14 (0.5 to 180 degrees per second).")
+    if not radians(1) <= acceleration_rad_s2 <= radians(300):
+        raise ValueError(
+            f"acceleration_rad_s2 is {acceleration_rad_s2}; choose 0.0175 to 5.24 (1 to 300 degrees per second "
+            "squared)."
+        )
+
+
+def _joints(q_rad: Sequence[float]) -> list[float]:
+    """Check joint angles, because ur_rtde checks neither their number nor their values."""
+    q = [float(angle) for angle in q_rad]
+    if len(q) != 6 or not all(math.isfinite(angle) for angle in q):
+        raise ValueError(f"q_rad is {q}; give six finite angles in radians.")
+    if max(map(abs, q)) > 2 * math.pi + 1e-9:
+        raise ValueError(f"q_rad is {_degrees(q)}, every joint ends at 360 degrees; give radians.")
+    return q
+
+
+def _near(a_rad: Sequence[float], b_rad: Sequence[float]) -> bool:
+    return max(abs(a - b) for a, b in zip(a_rad, b_rad, strict=True)) < _ARRIVED_RAD
+
+
+def _degrees(q_rad: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{math.degrees(angle):.1f}" for angle in q_rad) + ") degrees"

@@ -1,0 +1,211 @@
+"""Taking control of an arm: which control path, what it needs, and the program's start."""
+
+import logging
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Final
+
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.interfaces import Finding
+from ftdrivers.ur import control_process, control_program, primary
+from ftdrivers.ur.control import Control, ControlPath, ControlSetting, ProgramRefused
+from ftdrivers.ur.control_process import ControlProcess
+from ftdrivers.ur.own_program import OwnProgram
+from ftdrivers.ur.primary import find_program_port
+from ftdrivers.ur.reading import Reader
+from ftdrivers.ur.rtde import registers_in_use, registers_taken
+from ftdrivers.ur.sample import PROGRAM_STOPPED
+from ftdrivers.ur.script_control import ScriptControl
+from ftdrivers.ur.services import POLYSCOPE_X, Services
+from ftdrivers.ur.timing import UrTiming
+
+log = logging.getLogger(__name__)
+
+SIMULATORS: Final = ("localhost", "127.0.0.1", "192.168.56.101")
+"""Addresses of URSim, at which ur_rtde does not require remote control."""
+_LEAST: Final[dict[ControlPath, dict[int, int]]] = {"ur-rtde": {3: 4, 5: 4}, "script": {3: 9, 5: 3, POLYSCOPE_X: 11}}
+"""Minor version by major: of the control script of ur_rtde; of the registers 24 to 47, and of the Robot API."""
+_LOCAL: Final = (
+    "press Local, Remote Control at the top right of the pendant (enable it first under Settings, System, Remote "
+    "Control)"
+)
+_LOCAL_X: Final = "set Control mode to Remote in the Safety overview of the pendant"
+
+
+def path_for(setting: ControlSetting, version: tuple[int, ...]) -> tuple[ControlPath, str]:
+    """Return the control path, and in words why it is taken."""
+    if setting != "auto":
+        return setting, "as configured"
+    if version[0] >= POLYSCOPE_X:
+        return "script", "PolyScope X has no dashboard server, which ur_rtde needs"
+    if find_spec("rtde_control") is None:
+        return "script", "ur_rtde is not installed"
+    return "ur-rtde", "ur_rtde is installed"
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """Opens the control of one arm, which `reader` reads."""
+
+    host: str
+    setting: ControlSetting
+    reader: Reader
+    program: OwnProgram
+    clock: Clock
+    timing: UrTiming
+
+    @property
+    def path(self) -> ControlPath:
+        """The control path of this arm."""
+        return path_for(self.setting, self.reader.version)[0]
+
+    def open(self) -> Control:
+        """Start our program; another one is never stopped, except one that the same object has started before.
+
+        Raises `ConnectError`, also when a safety stop prevents it, and what the reader raises.
+        """
+        self._look_out()
+        path, why = path_for(self.setting, self.reader.version)
+        log.info("%s is controlled through %s: %s", self.host, path, why)
+        self.require_path()
+        self.require_version()
+        self.require_port()
+        self.require_registers()
+        self.program.cancel_stop()  # an attempt in the background would stop the new program
+        self.reader.services.ask(self._prepare, timeout_s=self.timing.connect_s)
+        self._require_no_program()
+        control = self._start(path)
+        self.program.is_sent(self.reader.services, stops_itself=control.stops_itself)
+        try:
+            control.wait_until_ready(self._look_out)
+        except ProgramRefused:
+            control.kill()
+            self.program.is_gone()
+            self._look_out()  # a control path seldom knows the reason
+            raise
+        except (StreamBroken, DeviceTimeout) as error:
+            control.kill()
+            self._look_out()
+            raise _refusal(self.host, path, error) from error
+        except BaseException:
+            control.kill()
+            raise
+        self.program.has_started()
+        return control
+
+    def diagnose(self) -> list[Finding]:
+        """Check what control needs; change nothing."""
+
+        def finding(name: str, require: Callable[[], None], found: str) -> Finding:
+            try:
+                require()
+            except DriverError as error:
+                return Finding(name, False, error.found, error.fix)
+            return Finding(name, True, found)
+
+        path, why = path_for(self.setting, self.reader.version)
+        stops = (
+            "; its program stops the arm within 0.3 s when computer or network fail"
+            if path == "script"
+            else "; if computer and network fail, the arm ends its present move"
+        )
+        version = "PolyScope {}.{} can be controlled".format(*self.reader.version)
+        free = "the RTDE registers are free: no other client controls the arm"
+        is_open = f"port {self._port}, which takes programs, is open"
+        return [
+            finding("control", self.require_path, f"control path {path}: {why}{stops}"),
+            finding("version", self.require_version, version),
+            finding("registers", self.require_registers, free),
+            finding("programs", self.require_port, is_open),
+        ]
+
+    def require_path(self) -> None:
+        """Raise `ConnectError` where ur_rtde is configured and cannot be used."""
+        if self.path != "ur-rtde":
+            return
+        if self.reader.version[0] >= POLYSCOPE_X:
+            raise ConnectError(
+                f"{self.host} runs PolyScope X, which has no dashboard server, and ur_rtde needs one",
+                "take the control path script or auto",
+            )
+        if find_spec("rtde_control") is None:
+            raise ConnectError(
+                f"ur_rtde is not installed for Python {platform.python_version()} on {platform.system()} "
+                f"{platform.machine()}",
+                "take the control path script or auto, or CPython 3.11 or 3.12 on 64-bit x86 Linux, for which ur_rtde "
+                "has wheels",
+            )
+
+    def require_version(self) -> None:
+        """Raise `ConnectError` for a PolyScope that can be read but not controlled."""
+        major, minor = self.reader.version[:2]
+        least = _LEAST[self.path].get(major, 0)
+        if minor < least:
+            raise ConnectError(
+                f"{self.host} runs PolyScope {major}.{minor}, which cannot be controlled through {self.path}",
+                f"update it to {major}.{least} or later",
+            )
+
+    def require_port(self) -> None:
+        """Raise `ConnectError` when the port that takes programs is closed."""
+        find_program_port(self.host, self._port, timeout_s=self.timing.connect_s)
+
+    def require_registers(self) -> None:
+        """Raise `ConnectError` when another client keeps the registers, before any of its programs is stopped."""
+        inputs = control_process.INPUTS if self.path == "ur-rtde" else tuple(control_program.INPUTS)
+        deadline_s = self.clock.now_s() + self.timing.release_s
+        while taken := registers_in_use(self.host, inputs, timeout_s=self.timing.connect_s, clock=self.clock):
+            if self.clock.now_s() > deadline_s:
+                raise registers_taken(self.host, taken)
+            self.clock.sleep(0.05)
+
+    @property
+    def _port(self) -> int:
+        return control_process.PROGRAM_PORT if self.path == "ur-rtde" else primary.PORT
+
+    def _start(self, path: ControlPath) -> Control:
+        if path == "script":
+            return ScriptControl(self.host, self.reader.version, clock=self.clock, timing=self.timing)
+        return ControlProcess(self.host, clock=self.clock, timing=self.timing)
+
+    def _look_out(self) -> None:
+        if fault := self.reader.look().safety_fault():
+            raise ConnectError(f"the arm at {self.host} cannot move: {fault.found}", fault.fix)
+
+    def _prepare(self, services: Services) -> None:
+        """Check that the controller accepts programs, and end one that we have left there."""
+        version = self.reader.version
+        asks = version[:2] >= (5, 6) and self.host not in SIMULATORS
+        if asks and services.in_remote_control() is False:
+            fix = _LOCAL_X if version[0] >= POLYSCOPE_X else _LOCAL
+            raise ConnectError(f"{self.host} is not in remote control", fix)
+        if self.program.left_behind and self.reader.look().program_state != PROGRAM_STOPPED:
+            log.warning("%s still runs our earlier control program; stopping it", self.host)
+            services.stop()
+
+    def _require_no_program(self) -> None:
+        """Raise `ConnectError` when a program stays on the controller: ours would replace it."""
+        deadline_s = self.clock.now_s() + self.timing.release_s
+        while self.reader.look().program_state != PROGRAM_STOPPED:
+            if self.clock.now_s() > deadline_s:
+                program = self.reader.reported_program()
+                raise ConnectError(
+                    f"another program is on {self.host}{f' ({program})' if program else ''} and is not stopped "
+                    "automatically",
+                    "stop it at the pendant, then start again",
+                )
+
+
+def _refusal(host: str, path: ControlPath, error: DriverError) -> ConnectError:
+    """Convert why a control path did not start to an error with a fix."""
+    if "already in use" in error.found:
+        return registers_taken(host, ())
+    if "remote control" in error.found:
+        return ConnectError(f"{host} is not in remote control", _LOCAL)
+    return ConnectError(
+        f"{path} cannot control {host}: {error.found}",
+        "check at the pendant that no dialog is open and that no other program starts automatically",
+    )

@@ -1,0 +1,242 @@
+"""The primary interface: takes programs, and reports how they start, end and fail.
+
+A connection that was opened in local control is read-only. The controller ignores a program on it and reports error
+code 210; a connection that was open before the pendant was switched to local control is closed.
+
+Ref: Universal Robots, "Primary and Secondary Interfaces" and "Client Interfaces" (messages, sub-packages);
+`robot_message/*.cpp`, `robot_state/configuration_data.cpp` and `datatypes.h` of Universal Robots' client library; issue
+459 of Universal_Robots_ROS_Driver about read-only connections.
+Checked on hardware: no.
+"""
+
+import logging
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, ProtocolError
+
+log = logging.getLogger(__name__)
+
+PORT: Final = 30001
+
+_HEADER: Final = struct.Struct(">iB")  # size of the whole package, type
+_ROBOT_STATE, _ROBOT_MESSAGE = 16, 20
+_MESSAGE: Final = struct.Struct(">QbB")  # time stamp, source, type
+_TEXT, _ERROR_CODE, _KEY, _EXCEPTION = 0, 6, 7, 10
+_KEY_HEAD: Final = struct.Struct(">iiB")  # code, argument, length of the title
+_EXCEPTION_HEAD: Final = struct.Struct(">ii")  # line, column
+_CODE_HEAD: Final = struct.Struct(">iiiBI")  # code, argument, level, type of the data (4 bytes in old documents), data
+_READ_ONLY_CODE: Final = 210
+_CONFIGURATION: Final = 6
+_ROBOT_TYPE: Final = struct.Struct(">432xi")
+"""In the configuration data, behind limits, defaults and lengths of the arm."""
+_ROBOT_TYPES: Final = MappingProxyType(
+    {1: "UR5", 2: "UR10", 3: "UR3", 4: "UR16", 5: "UR18", 6: "UR8long", 7: "UR20", 8: "UR30", 9: "UR15"}
+)
+_LARGEST: Final = 1 << 20
+_RECEIVE_BYTES: Final = 65536
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """A program has started."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Stopped:
+    """A program has ended."""
+
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """A program does not compile, or has ended with a runtime error."""
+
+    line: int
+    column: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """An error code, such as C210A0."""
+
+    code: int
+    argument: int
+    text: str
+
+    @property
+    def is_read_only(self) -> bool:
+        """Whether it says that this connection cannot send programs."""
+        return self.code == _READ_ONLY_CODE
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A text of a program."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class RobotType:
+    """The model without its generation; None for a number that is not known here."""
+
+    model: str | None
+
+
+Message = Started | Stopped | Failed | Code | Note | RobotType
+
+
+def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
+    """Remove the first package from `buffer` as (type, payload); None while it is incomplete.
+
+    Raises `ProtocolError` when the buffer cannot begin with a package.
+    """
+    if len(buffer) < _HEADER.size:
+        return None
+    size, kind = _HEADER.unpack_from(buffer)
+    if not _HEADER.size <= size <= _LARGEST:
+        raise ProtocolError(f"primary package of {size} bytes", "check that this is the primary interface of a robot")
+    if len(buffer) < size:
+        return None
+    payload = bytes(buffer[_HEADER.size : size])
+    del buffer[:size]
+    return kind, payload
+
+
+def decode(kind: int, payload: bytes) -> Iterator[Message]:
+    """Yield what a package reports, as far as it is of use here; what is cut short or unknown is left out."""
+    with suppress(struct.error):
+        if kind == _ROBOT_STATE:
+            yield from _decode_state(payload)
+        elif kind == _ROBOT_MESSAGE:
+            _, _, message = _MESSAGE.unpack_from(payload)
+            yield from _decode_message(message, payload[_MESSAGE.size :])
+
+
+def _decode_state(payload: bytes) -> Iterator[Message]:
+    rest = bytearray(payload)
+    with suppress(ProtocolError):
+        while (part := take_package(rest)) is not None:
+            kind, content = part
+            if kind == _CONFIGURATION:
+                yield RobotType(_ROBOT_TYPES.get(_ROBOT_TYPE.unpack_from(content)[0]))
+
+
+def _decode_message(kind: int, content: bytes) -> Iterator[Message]:
+    if kind == _TEXT:
+        yield Note(_text(content))
+    elif kind == _EXCEPTION:
+        line, column = _EXCEPTION_HEAD.unpack_from(content)
+        yield Failed(line, column, _text(content[_EXCEPTION_HEAD.size :]))
+    elif kind == _ERROR_CODE:
+        code, argument, *_ = _CODE_HEAD.unpack_from(content)
+        yield Code(code, argument, _text(content[_CODE_HEAD.size :]))
+    elif kind == _KEY:
+        *_, length = _KEY_HEAD.unpack_from(content)
+        title = _text(content[_KEY_HEAD.size : _KEY_HEAD.size + length])
+        text = _text(content[_KEY_HEAD.size + length :])
+        if title == "PROGRAM_XXX_STARTED":
+            yield Started(text)
+        elif title == "PROGRAM_XXX_STOPPED":
+            yield Stopped(text)
+
+
+def _text(data: bytes) -> str:
+    return data.strip(b"\0").decode("utf-8", "replace")
+
+
+class Primary:
+    """One connection. Raises `ConnectError` when the controller cannot be reached.
+
+    Parameters
+    ----------
+    host
+        Address of the controller.
+    timeout_s
+        To connect, and for each sending.
+    """
+
+    def __init__(self, host: str, *, timeout_s: float) -> None:
+        self.closed = False
+        """Whether the controller has closed the connection, as it does when the pendant is switched to local."""
+        try:
+            self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
+        except OSError as error:
+            raise unreachable(host, PORT, error) from error
+        self._timeout_s = timeout_s
+        self._buffer = bytearray()
+
+    def send(self, program: str) -> None:
+        """Send a program, which replaces the one that runs. Raises `OSError` on a lost connection."""
+        self._socket.settimeout(self._timeout_s)
+        self._socket.sendall(program.encode("ascii") + b"\n")
+
+    def read(self, timeout_s: float = 0.0) -> list[Message]:
+        """Return what has arrived, or arrives within `timeout_s`; nothing from a connection that has ended."""
+        messages: list[Message] = []
+        try:
+            self._socket.settimeout(timeout_s)
+            while received := self._socket.recv(_RECEIVE_BYTES):
+                self._buffer += received
+                if len(received) < _RECEIVE_BYTES:
+                    break
+            self.closed = self.closed or not received
+            while (package := take_package(self._buffer)) is not None:
+                messages += decode(*package)
+        except (BlockingIOError, TimeoutError):
+            pass
+        except (OSError, ProtocolError) as error:
+            log.info("primary interface: %s", error)
+            self.closed = True
+        return messages
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+
+def read_model(host: str, *, timeout_s: float, clock: Clock) -> str | None:
+    """Return the model that the controller reports, without its generation; None where it reports none."""
+    try:
+        primary = Primary(host, timeout_s=timeout_s)
+    except ConnectError as error:
+        log.info("%s", error)
+        return None
+    try:
+        for left_s in clock.looks(timeout_s):
+            for message in primary.read(max(min(left_s, clock.poll_s), 1e-3)):
+                if isinstance(message, RobotType):
+                    return message.model
+            if primary.closed:
+                break
+    finally:
+        primary.close()
+    return None
+
+
+def find_program_port(host: str, port: int, *, timeout_s: float) -> None:
+    """Check that the controller accepts programs on a port, without sending one. Raises `ConnectError`."""
+    try:
+        socket.create_connection((host, port), timeout=timeout_s).close()
+    except OSError as error:
+        raise unreachable(host, port, error) from error
+
+
+def unreachable(host: str, port: int, error: OSError) -> ConnectError:
+    """Return the error for a port that takes programs."""
+    name = "primary" if port == PORT else "real-time"
+    return ConnectError(
+        f"{host}:{port}, which accepts programs, cannot be reached ({error})",
+        f"enable the {name} client interface under Settings, Security, Services, and check the firewall",
+    )

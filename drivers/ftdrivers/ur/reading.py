@@ -1,0 +1,345 @@
+"""The reader of a Universal Robots arm: new samples, and a flange pose that does not depend on the TCP setting.
+
+One RTDE subscription carries everything. After a suspension of this process or a stall of the network, samples arrive
+that are seconds old, and their time stamps advance like new ones. So the controller's clock is compared with ours, and
+a late sample is never used for a state or a status, which are updated 125 times a second: a move and its guards need no
+more. Followers get every sample, 500 a second of an e-Series arm. The TCP offset of the same sample is
+removed from its pose, and the flange pose is compared with nominal forward kinematics.
+
+Checked on hardware: no.
+"""
+
+import copy
+import logging
+import math
+import struct
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from math import radians
+from typing import Final
+
+import numpy as np
+
+from ftdrivers.clock import Clock, Follower
+from ftdrivers.errors import (
+    ConnectError,
+    DeviceFault,
+    DeviceTimeout,
+    DriverError,
+    ModelUnknown,
+    NoDashboard,
+    StreamBroken,
+)
+from ftdrivers.follow import Follow, Unread
+from ftdrivers.interfaces import NOT_REPORTED, ArmState, ArmStates, ArmStatus, Array, DeviceInfo
+from ftdrivers.ur.kinematics import MODELS, Pose, flange_poses, forward, model_named
+from ftdrivers.ur.primary import read_model
+from ftdrivers.ur.robot_api import PORT as API_PORT
+from ftdrivers.ur.rtde import Subscription
+from ftdrivers.ur.sample import MEASURING, OPTIONAL, OUTPUTS, Sample
+from ftdrivers.ur.services import Services, ServicesOf
+from ftdrivers.ur.timing import Lateness, Patience, UrTiming
+
+log = logging.getLogger(__name__)
+
+STATES_HZ: Final = 125.0
+"""Rate of states and status: the full rate of the CB3 generation, a quarter of that of the e-Series."""
+_MOST_UNREAD: Final = 1_000_000
+"""Samples that may wait for one follower: 33 minutes at 500 Hz."""
+Received = tuple[int, list[bytes]]
+"""Samples of one read, and their `t_host_ns`."""
+_PAUSE_S: Final = 0.1
+"""A reader that has had no turn for so long was suspended, or starved."""
+_TIMESTAMP: Final = struct.Struct(">xd")
+"""The first output, after the number of the recipe."""
+_MODEL_POSITION_M: Final = 0.005
+_MODEL_ANGLE_RAD: Final = radians(0.5)
+
+
+class Reader:
+    """The reading side of one arm; connected while it exists.
+
+    Raises `ConnectError` when the arm cannot be reached, or is not the `model` (a key of `MODELS`) it should be.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        model: str | None,
+        *,
+        clock: Clock,
+        timing: UrTiming,
+        rate_Hz: float = STATES_HZ,
+        api_port: int = API_PORT,
+    ) -> None:
+        self._host = host
+        self._clock = clock
+        self._timing = timing
+        self._changed = threading.Condition()
+        self._live: tuple[int, bytes] | None = None
+        """The newest sample for a state or a status, and its `t_host_ns`."""
+        self._since_live = 0
+        """Samples after it."""
+        self._turn_s = self._read_s = self._live_s = clock.awake_s()
+        """When a read last returned, when with a sample, and when with `_live`."""
+        self._t_device_s = math.nan
+        self._lateness, self._late_s = Lateness(), 0.0
+        self._followers: list[Unread[Received]] = []
+        self._failure: DriverError | None = None
+        self.silent = False
+        """Whether no sample has arrived since `DeviceTimeout` was raised."""
+        self._stream = Subscription(host, OUTPUTS, rate_Hz, timeout_s=timing.connect_s, clock=clock)
+        self.version = self._stream.version
+        """Of the controller: major, minor, bugfix, build."""
+        self.services = ServicesOf(host, self.version, clock, api_port)
+        missing = set(self._stream.missing)
+        self.reports_tcp = "tcp_offset" not in missing
+        """Whether the controller reports its TCP offset over RTDE; old ones do not."""
+        self._thread = Follower(clock, self._run, "ur-reader")
+        try:
+            self._thread.start()
+            self.info = self._identify(model, missing - OPTIONAL)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def reads_all(self) -> bool:
+        """Whether it reads at the full rate of the controller."""
+        return self._stream.is_full_rate
+
+    def close(self) -> None:
+        """Close the connection. Idempotent."""
+        self._end(StreamBroken(f"the arm at {self._host} was closed", "open it again"))
+        self._stream.close()
+        self._thread.join(timeout=1.0)
+
+    def look(self, *, limit_s: float | None = None) -> Sample:
+        """Wait for a sample taken after this call.
+
+        Raises `StreamBroken` when the connection is lost and `DeviceTimeout` when no sample arrives for `limit_s`
+        (default `stale_s` of the timing).
+        """
+        before = self._live
+        return self._wait(lambda: self._live is not before, self._timing.stale_s if limit_s is None else limit_s)
+
+    def status(self) -> ArmStatus:
+        """Return the controller's modes and settings, of one sample at most `status_s` old. Raises as `look`."""
+        oldest_s = self._clock.awake_s() - self._timing.status_s
+        return self._wait(lambda: self._live_s >= oldest_s, self._timing.stale_s).status()
+
+    def state(self, ask_tcp: Callable[[], Sequence[float]]) -> ArmState:
+        """Read a state; `ask_tcp` asks for the TCP offset (6,) if samples lack it. Errors as `UrArm.state`."""
+        sample, tcp_offset = self._look_with_tcp(ask_tcp)
+        self._check_measures(sample)
+        flange = sample.flange(tcp_offset)
+        self._check_model(sample.q_rad, flange)
+        return ArmState(
+            t_host_ns=sample.t_host_ns,
+            t_device_s=sample.t_device_s,
+            q_rad=np.array(sample.q_rad),
+            qd_rad_s=np.array(sample.qd_rad_s),
+            R_base_flange=flange.R,
+            p_base_flange_m=flange.p_m,
+        )
+
+    @contextmanager
+    def follow(self) -> Iterator[Follow[ArmStates]]:
+        """Read every sample from now on, late ones too. The controller has to report its TCP."""
+        unread: Unread[Received] = Unread(self._host, _MOST_UNREAD)
+        with self._changed:
+            self._raise_failure()
+            self._followers.append(unread)
+        try:
+            yield Follow(partial(self._read_on, unread))
+        finally:
+            with self._changed:
+                self._followers.remove(unread)
+
+    def _read_on(self, unread: Unread[Received], timeout_s: float) -> ArmStates:
+        """Return what a follower has not read."""
+        with self._changed:
+            for left_s in self._clock.looks(timeout_s):
+                if received := unread.take():
+                    break
+                self._raise_failure()
+                age_s = self._clock.awake_s() - self._read_s
+                if age_s > self._timing.stale_s:
+                    raise self._silence(age_s)
+                self._clock.wait(self._changed, min(left_s, self._timing.stale_s - age_s + 1e-3))
+            else:
+                received = unread.take()
+        return self._states(received)
+
+    def _states(self, received: list[Received]) -> ArmStates:
+        """Convert samples to flange poses; those without power over the joints are left out."""
+        outputs = self._stream.decode([sample for _, samples in received for sample in samples])
+        t_host_ns = [t_ns for t_ns, samples in received for _ in samples]
+        R_base_flange, p_base_flange_m = flange_poses(outputs["actual_TCP_pose"], outputs["tcp_offset"])
+        states = ArmStates(
+            t_host_ns=np.array(t_host_ns, np.int64),
+            t_device_s=outputs["timestamp"],
+            q_rad=outputs["actual_q"],
+            qd_rad_s=outputs["actual_qd"],
+            R_base_flange=R_base_flange,
+            p_base_flange_m=p_base_flange_m,
+        )
+        if not received:
+            return states
+        measured = (outputs["robot_mode"] >= MEASURING[0]) & (outputs["robot_mode"] <= MEASURING[1])
+        if not measured.any():
+            self._check_measures(Sample.of(t_host_ns[-1], outputs))
+        if not measured.all():
+            states = states.rows(measured)
+        self._check_model(states.q_rad[-1], Pose(states.R_base_flange[-1], states.p_base_flange_m[-1]))
+        return states
+
+    def _check_measures(self, sample: Sample) -> None:
+        if not sample.measures and (fault := sample.safety_fault()):
+            raise DeviceFault(f"{self._host} does not measure its joints: {fault.found}", fault.fix)
+
+    def _look_with_tcp(self, ask_tcp: Callable[[], Sequence[float]]) -> tuple[Sample, Sequence[float]]:
+        for _ in range(5):
+            before = None if self.reports_tcp else tuple(ask_tcp())
+            sample = self.look()
+            if sample.tcp_offset is not None:
+                return sample, sample.tcp_offset
+            if before is not None and before == tuple(ask_tcp()):  # so it was active when the sample was taken
+                return sample, before
+        raise DeviceFault(f"the TCP of {self._host} changes repeatedly", "stop the program or client that sets it")
+
+    def _check_model(self, q_rad: Sequence[float] | Array, flange: Pose) -> None:
+        nominal = forward(MODELS[self.info.model], q_rad)
+        distance_m = float(np.linalg.norm(flange.p_m - nominal.p_m))
+        angle_rad = flange.angle_to_rad(nominal)
+        if distance_m > _MODEL_POSITION_M or angle_rad > _MODEL_ANGLE_RAD:
+            raise DeviceFault(
+                f"the flange is {1e3 * distance_m:.1f} mm and {math.degrees(angle_rad):.2f} degrees from the nominal "
+                f"pose of a {self.info.model}: the arm at {self._host} is another model, or its TCP is changing",
+                "check model and TCP, then read again",
+            )
+
+    def reported_program(self) -> str | None:
+        """Ask the controller for the program's state and name; None where it does not answer."""
+        try:
+            return self.services.ask(lambda services: services.program(), timeout_s=self._timing.connect_s)
+        except DriverError as error:
+            log.info("%s does not report its program: %s", self._host, error)
+            return None
+
+    def _identify(self, model: str | None, lacking: set[str]) -> DeviceInfo:
+        if lacking:
+            raise ConnectError(
+                f"{self._host} does not report {', '.join(sorted(lacking))} over RTDE", "update its PolyScope"
+            )
+
+        def ask(services: Services) -> tuple[str | None, str | None, str | None]:
+            return services.model(), services.serial(), services.polyscope()
+
+        try:
+            reported, serial, polyscope = self.services.ask(ask, timeout_s=self._timing.connect_s)
+        except NoDashboard as error:
+            if not self.services.has_api:
+                raise
+            log.info("%s", error)  # the Robot API is younger than PolyScope X, and reading does not need it
+            reported = serial = polyscope = None
+        if reported is None and self.services.has_api:
+            reported = read_model(self._host, timeout_s=self._timing.connect_s, clock=self._clock)
+        known = None if reported is None else model_named(reported, self.version[0])
+        if model is None and known is None:
+            found = f"reports the unknown model {reported!r}"
+            if reported is None:
+                found = "does not report its model, as CB3 before 3.12 and e-Series before 5.6"
+            raise ModelUnknown(f"{self._host} {found}", "set the model of the arm")
+        if model is not None and known is not None and MODELS[known] != MODELS[model]:
+            raise ConnectError(f"{self._host} is a {known}, not a {model}", "check the address and the model")
+        return DeviceInfo(
+            model=model or known or NOT_REPORTED,
+            serial=serial or NOT_REPORTED,
+            firmware=polyscope or ".".join(map(str, self.version[:3])),
+        )
+
+    # ------------------------------------------------------------------ following the stream
+
+    def _wait(self, is_new: Callable[[], bool], limit_s: float) -> Sample:
+        patience = Patience(self._clock, limit_s)
+        with self._changed:
+            while True:
+                self._raise_failure()
+                if self._live is not None and is_new():
+                    t_host_ns, sample = self._live
+                    return Sample.of(t_host_ns, self._stream.decode([sample]))
+                if patience.is_over:
+                    self.silent = True
+                    raise self._silence(limit_s)
+                patience.wait(self._changed)
+
+    def _raise_failure(self) -> None:
+        if self._failure:
+            raise copy.copy(self._failure) from self._failure
+
+    def _silence(self, silent_s: float) -> DeviceTimeout:
+        if self._clock.awake_s() - self._turn_s > _PAUSE_S:
+            return DeviceTimeout(
+                f"no sample of {self._host} was read for {silent_s:.2f} s, because this program or computer was "
+                "suspended or too busy",
+                "try again with less load, and press the emergency stop if the arm moves",
+            )
+        if self._late_s > self._timing.late_s and self._clock.awake_s() - self._read_s < silent_s:
+            return DeviceTimeout(
+                f"samples of {self._host} arrive {self._late_s:.2f} s late by the controller's clock",
+                "check the network and the load of the controller, and press the emergency stop if the arm moves",
+            )
+        at = "" if math.isnan(self._t_device_s) else f" at {self._t_device_s:.3f} s"
+        return DeviceTimeout(
+            f"the clock of {self._host} has stood still{at} for {silent_s:.2f} s",
+            "check the robot and the network, and press the emergency stop if the arm moves",
+        )
+
+    def _run(self) -> None:
+        while self._follow():
+            pass
+
+    def _follow(self) -> bool:
+        """Read what has arrived; return whether to continue. An error is raised at the next look."""
+        try:
+            samples = self._stream.read(self._clock.poll_s)
+        except TimeoutError:
+            self._clock.now_ns()  # an emulated cell waits for this thread
+            self._turn_s = self._clock.awake_s()
+            return True
+        except (OSError, StreamBroken) as error:
+            failure: DriverError = StreamBroken(
+                f"the RTDE connection to {self._host} was lost ({error})",
+                "check the robot and the cable, then open the arm again",
+            )
+        except DriverError as error:
+            failure = error
+        else:
+            self._turn_s = self._read_s = self._clock.awake_s()
+            t_host_ns = self._clock.now_ns()
+            before_s = self._t_device_s
+            (self._t_device_s,) = _TIMESTAMP.unpack_from(samples[-1])
+            self._late_s = self._lateness.late_s(self._t_device_s, self._read_s)
+            with self._changed:
+                self.silent = False
+                for unread in self._followers:
+                    unread.put((t_host_ns, samples), len(samples))
+                self._since_live += len(samples)
+                due = self._since_live >= self._stream.rate_Hz / STATES_HZ
+                advances = self._t_device_s != before_s  # a repeated sample is not a new one
+                if due and advances and self._late_s <= self._timing.late_s:
+                    self._live, self._live_s, self._since_live = (t_host_ns, samples[-1]), self._read_s, 0
+                if self._followers or not self._since_live:
+                    self._changed.notify_all()
+            return True
+        self._end(failure)
+        return False
+
+    def _end(self, failure: DriverError) -> None:
+        """Let every later call raise this failure; the first one counts."""
+        with self._changed:
+            self._failure = self._failure or failure
+            self._changed.notify_all()

@@ -1,0 +1,171 @@
+"""A CAN bus on any adapter of python-can; it raises our errors."""
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterable
+from typing import Any
+
+import can
+import serial
+from can.interfaces.slcan import slcanBus
+
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import ConnectError, StreamBroken
+from ftdrivers.wires.serial_port import LINK_ERRORS, refusal
+
+BUS_ERRORS = (can.CanError, ValueError, *LINK_ERRORS)
+_SEND_S, _LOOK_S = 0.1, 0.05
+_DISCARD_S = 0.1
+
+
+class CanBus:
+    """The connection to one device on a CAN bus with 11-bit identifiers.
+
+    Parameters
+    ----------
+    owner : str
+        Name of the device; begins every error message.
+    channel, interface : str
+        As python-can names them: ``can0`` and ``socketcan``, or a serial port and ``slcan``.
+    bitrate : int
+        Bit/s; not used on socketcan, where ``ip link`` sets it.
+    identifiers : iterable of int
+        Identifiers that the device sends; others are ignored. An empty one accepts all.
+    clock : Clock
+        Measures the waits.
+    """
+
+    def __init__(
+        self,
+        owner: str,
+        channel: str,
+        interface: str,
+        bitrate: int,
+        identifiers: Iterable[int] = (),
+        clock: Clock = REAL,
+    ) -> None:
+        self._owner = owner
+        self._channel = channel
+        self._interface = interface
+        self._bitrate = bitrate
+        self._identifiers = frozenset(identifiers)
+        self._clock = clock
+        self._bus: can.BusABC | None = None
+        self._lock: int | None = None
+        """File descriptor that locks the serial port of an slcan adapter."""
+        self.malformed = 0
+        """Lines of an slcan adapter that are not frames."""
+
+    def open(self) -> None:
+        """Join the bus. Raises `ConnectError`."""
+        self.malformed = 0
+        filters: list[can.typechecking.CanFilter] = [
+            {"can_id": identifier, "can_mask": 0x7FF, "extended": False} for identifier in self._identifiers
+        ]
+        options: dict[str, Any] = {}
+        tty = self._channel
+        if self._interface == "slcan":
+            # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
+            tty = tty.split("@", maxsplit=1)[0]
+            with contextlib.suppress(OSError):  # the link to an adapter may vanish meanwhile
+                tty = os.path.realpath(tty)
+            if not os.access(tty, os.R_OK | os.W_OK):
+                raise ConnectError(
+                    f"{self._owner}: {self._channel} does not exist, or may not be read and written",
+                    "plug the adapter in, and join the group of its port",
+                )
+            if tty.startswith("/dev/pts/"):
+                options["sleep_after_open"] = 0.0
+        try:
+            if self._interface == "slcan":
+                self._take(tty)
+            self._bus = can.Bus(
+                self._channel,
+                interface=self._interface,
+                bitrate=self._bitrate,
+                can_filters=filters,
+                ignore_config=True,
+                **options,
+            )
+        except Exception as exc:  # an adapter whose library is missing may raise anything
+            self.close()
+            fix = "plug the adapter in, and install what python-can needs for it"
+            if "/" in self._channel and self._interface == "socketcan":
+                fix = "add interface=slcan to the address of an adapter on a serial port"
+            elif self._interface == "socketcan":
+                up = f"sudo ip link set {self._channel} up type can bitrate {self._bitrate}"
+                fix = f"plug the adapter in, then run {up}"
+            raise refusal(self._owner, tty, exc, f"the bus does not open ({exc})", fix) from exc
+
+    def _take(self, tty: str) -> None:
+        """Lock a serial port before python-can opens it, because python-can itself does not."""
+        self._lock = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def close(self) -> None:
+        """Leave the bus. Idempotent."""
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            with contextlib.suppress(*BUS_ERRORS):
+                bus.shutdown()
+            # the slcan bus does not close its port when its last command to the adapter fails
+            if port := getattr(bus, "serialPortOrig", None):
+                with contextlib.suppress(*LINK_ERRORS):
+                    port.close()
+        lock, self._lock = self._lock, None
+        if lock is not None:
+            with contextlib.suppress(OSError):
+                os.close(lock)
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Send one data frame; it is lost when a busy adapter does not accept it in time. Raises `StreamBroken`."""
+        if self._bus is None:
+            raise StreamBroken(f"{self._owner}: the bus is closed", "open it first")
+        timeout_s = self._clock.patience_s(_SEND_S)
+        try:
+            self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=timeout_s)
+        except BUS_ERRORS as exc:
+            if not isinstance(exc.__cause__, serial.SerialTimeoutException):  # a stalled computer causes it too
+                raise self._broken(exc) from exc
+
+    def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
+        """Wait for the next data frame of the device as (identifier, data). Raises `StreamBroken`.
+
+        It also blocks in an emulated cell, where shorter waits would delay the polls.
+        """
+        for left_s in self._clock.looks(timeout_s):
+            if frame := self.look(left_s):
+                return frame
+        return None
+
+    def look(self, wait_s: float) -> tuple[int, bytes] | None:
+        """Return the next data frame; wait for it in real time, at most 0.05 s. Raises `StreamBroken`."""
+        if self._bus is None:
+            raise StreamBroken(f"{self._owner}: the bus is closed", "open it first")
+        while True:
+            try:
+                message = self._bus.recv(timeout=min(wait_s, _LOOK_S))
+            except (ValueError, LookupError):
+                self.malformed += 1
+                return None
+            except (can.CanError, *LINK_ERRORS) as exc:
+                raise self._broken(exc) from exc
+            if message is None:
+                return None
+            strange = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
+            if not strange and (not self._identifiers or message.arbitration_id in self._identifiers):
+                return message.arbitration_id, bytes(message.data)
+
+    def discard(self) -> None:
+        """Drop the frames that have arrived. Raises `StreamBroken`."""
+        if isinstance(self._bus, slcanBus):
+            with contextlib.suppress(*BUS_ERRORS):  # `send` will raise
+                self._bus.flush()  # its `recv` would wait 1 ms before it returns nothing
+            return
+        for _ in self._clock.looks(_DISCARD_S):
+            if self.look(0.0) is None:
+                return
+
+    def _broken(self, exc: Exception) -> StreamBroken:
+        return StreamBroken(f"{self._owner}: the CAN interface is gone ({exc})", "plug it in and open it again")

@@ -1,0 +1,436 @@
+# ruff: noqa: RUF009 - `entry` returns a new field for each key
+"""The configuration of one cell: its keys with their rules, and the source of each value.
+
+The first of these that sets a value counts: an option of the command; the environment, where FTDRIVE_ROBOT_HOST is the
+key `host` of `[robot]`; the project's file, `ftdrive.toml` in the working directory, or `--config`; the user's file,
+`$XDG_CONFIG_HOME/ftdrive/ftdrive.toml`; the default. Values that must be measured have no default. The averaging time
+is chosen from a record of the sensor at rest, unless `average_s` is set and `noise_record_s` is not.
+"""
+
+import json
+import os
+import re
+import tomllib
+from collections.abc import Iterable, Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from ftcalib.routine import Sampling
+from ftdrive.cell import rules
+from ftdrive.cell.rules import Rows, Rule, entry, rule_of
+from ftdrive.errors import ConfigError
+from ftdrivers.clock import REAL, Clock
+
+FORMAT = "ftdrive.config/1"
+FILE = "ftdrive.toml"
+PREFIX = "FTDRIVE_"
+CLOCK = "FTDRIVE_CLOCK"
+
+USUAL_KG = 1.0
+"""Expected mass of a tool whose mass is not configured."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotConfig:
+    """The arm."""
+
+    host: str = entry("name or IPv4 address of the controller", option="--robot", reject=rules.reject_host)
+    model: str | None = entry(
+        'such as "ur5e"; compared with the controller where it reports one',
+        None,
+        option="--model",
+        reject=rules.reject_model,
+    )
+    speed_deg_s: float = entry(
+        "of the fastest joint; the first run of a plan is slower", 60.0, "deg/s", (0.5, 60), option="--speed"
+    )
+    acceleration_deg_s2: float = entry("of the fastest joint", 80.0, "deg/s²", (1, 300))
+    tip_speed_mm_s: float = entry(
+        "of the tool's farthest point; 250 is the reduced speed of ISO 10218-1", 250.0, "mm/s", (1, 250)
+    )
+    driver: str = entry("ur, or the entry point of an arm of another package", "ur", reject=rules.reject_empty)
+    control: str = entry(
+        "auto, ur-rtde or script: what moves the arm; auto takes ur-rtde where it is installed and the controller has "
+        "what it needs; script stops the arm within 0.3 s when this computer or the network fails",
+        "auto",
+        reject=rules.reject_control,
+    )
+    api_port: int = entry("of the Robot API of PolyScope X", 80, between=(1, 65535))
+    serial: str | None = entry("serial number; if set, nothing moves on another arm", None, reject=rules.reject_empty)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorConfig:
+    """The force/torque sensor."""
+
+    url: str = entry("such as ati-can://can0?bitrate=250000", option="--sensor", reject=rules.reject_empty)
+    sign: int = entry(
+        "1, or -1 for a sensor that reports the reaction; `ftdrive doctor --push` finds it", 1, reject=rules.reject_sign
+    )
+    height_mm: float | None = entry(
+        "of the sensor's origin above the flange face; gravity cannot identify it",
+        None,
+        "mm",
+        (0, 500),
+        option="--height",
+        reject=rules.reject_height,
+    )
+    mass_kg: float | None = entry(
+        "of sensor and adapter, from scale or datasheet; the sensor cannot weigh itself",
+        None,
+        "kg",
+        (0, 20),
+        option="--sensor-mass",
+    )
+    delay_ms: float | None = entry(
+        "delay of the wrench after the pose; estimated from motion if it is not set", None, "ms", (-100, 100)
+    )
+    mount: str | None = entry(
+        "label of the mounting, such as adapter-a; a calibration is valid for one label: change it when the sensor is "
+        "mounted again",
+        None,
+        reject=rules.reject_empty,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ToolConfig:
+    """Everything mounted on the flange, the sensor included. What is not described here may collide."""
+
+    name: str = entry(
+        "of the tool; `live --tool NAME` takes its newest calibration",
+        "tool",
+        option="--tool-name",
+        reject=rules.reject_empty,
+    )
+    cylinders_mm: Rows = entry(
+        "[from, to, diameter] along the flange z axis from the flange face; [from, to, diameter, x, y] puts the axis "
+        "aside; measure cables, cameras and screws too",
+        (),
+        "mm",
+        option="--tool",
+        reject=rules.reject_cylinders,
+    )
+    mass_kg: float | None = entry(
+        "of what hangs on the sensor, about; compared with the controller's payload and the sensor's range; until six "
+        "poses are taken, a larger change of the wrench counts as contact",
+        None,
+        "kg",
+        (0.001, 100),
+        option="--tool-mass",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class WorkcellConfig:
+    """Base and surroundings, in base axes, mm from the centre of the base. PLACEHOLDERS until measured."""
+
+    mounting: str = entry(
+        "floor, wall, ceiling, or degrees the base leans towards its -x; 90 is wall",
+        "floor",
+        option="--mounting",
+        reject=rules.reject_mounting,
+    )
+    planes_mm: Rows = entry(
+        "[nx, ny, nz, place]: the arm stays where normal times point is place or more; [-1, 0, 0, -800] is a wall 800 "
+        "mm away towards +x; the plane under the base is always there",
+        (),
+        "mm",
+        option="--plane",
+        reject=rules.reject_planes,
+    )
+    boxes_mm: Rows = entry(
+        "[x, y, z, x, y, z], two opposite corners of a block", (), "mm", option="--box", reject=rules.reject_boxes
+    )
+    measured: bool = entry("set it to true when tool, planes and boxes are measured; nothing moves before", False)
+
+
+_ROUTINE = {item.name: item.default for item in fields(Sampling)}
+
+
+@dataclass(frozen=True, slots=True)
+class SamplingConfig(Sampling):
+    """How long each pose is averaged."""
+
+    average_s: float = entry(
+        "at each pose; if set alone, no noise record is taken", _ROUTINE["average_s"], "s", (0.05, 600)
+    )
+    still_timeout_s: float = entry("until the arm rests at a pose", _ROUTINE["still_timeout_s"], "s", (1, 600))
+    attempts: int = entry(
+        "averages of a pose that moves or drifts; the last is kept as noisy", _ROUTINE["attempts"], between=(1, 100)
+    )
+    noise_record_s: float = entry(
+        "record of the sensor at rest before the tour, which chooses the averaging time; 0 for none",
+        _ROUTINE["noise_record_s"],
+        "s",
+        (0, 600),
+        reject=rules.reject_record,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SiteConfig:
+    """The place of the cell."""
+
+    g_m_s2: float = entry("local gravity; it scales the mass and nothing else", 9.80665, "m/s²", (9.7, 9.9))
+
+
+@dataclass(frozen=True, slots=True)
+class StoreConfig:
+    """The store of results and verifications, an index of run folders."""
+
+    url: str | None = entry(
+        "of the database, such as sqlite:////data/store.sqlite; a file in the user's data folder if it is not set",
+        None,
+        reject=rules.reject_store,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class CellConfig:
+    """Everything that is configured."""
+
+    robot: RobotConfig
+    sensor: SensorConfig
+    tool: ToolConfig = field(default_factory=ToolConfig)
+    workcell: WorkcellConfig = field(default_factory=WorkcellConfig)
+    sampling: Sampling = field(default_factory=SamplingConfig)
+    site: SiteConfig = field(default_factory=SiteConfig)
+    store: StoreConfig = field(default_factory=StoreConfig)
+    clock: Clock = field(default=REAL, compare=False, repr=False)
+    """Times everything in the cell; an emulated cell has its own. It is in no file."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the sections as files have them; a password in the store's address is left out."""
+        found = {name: asdict(getattr(self, name)) for name in SECTIONS}
+        if self.store.url is not None:
+            found["store"]["url"] = without_password(self.store.url)
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One value of the configuration."""
+
+    value: Any
+    """None where it is not set and has no default."""
+    origin: str
+    """The option, variable or file that sets it; "default" or "not set"."""
+
+
+def without_password(text: str) -> str:
+    """Return an address, or a word of a command line, without the password in it."""
+    return re.sub(r"(://[^:/@]*):.*@", r"\1@", text)
+
+
+Flag = tuple[str, Any]
+"""An option of a command, and its value; None where it was not given."""
+
+SECTIONS: Mapping[str, Any] = {
+    "robot": RobotConfig,
+    "sensor": SensorConfig,
+    "tool": ToolConfig,
+    "workcell": WorkcellConfig,
+    "sampling": SamplingConfig,
+    "site": SiteConfig,
+    "store": StoreConfig,
+}
+_KEYS = {f"{name}.{item.name}": item for name, kind in SECTIONS.items() for item in fields(kind)}
+
+RULES: Mapping[str, Rule] = {key: rule_of(item) for key, item in _KEYS.items()}
+
+
+def clock_in_force() -> Clock:
+    """Return the clock of the emulated cell whose page FTDRIVE_CLOCK names, else the computer's.
+
+    An emulated cell of another process looks like a real one, but only its own clock waits for a busy computer.
+    """
+    if page := os.environ.get(CLOCK):
+        from ftdrive.cell.emulated_clock import EmulatedClock
+
+        return EmulatedClock(page)
+    return REAL
+
+
+def load(config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, devices: bool = True) -> CellConfig:
+    """Read a cell from all sources.
+
+    Parameters
+    ----------
+    config : Path, optional
+        Read in place of the project's file.
+    flags : mapping
+        Options of the command by key, such as ``{"robot.host": ("--robot", "10.0.0.2")}``.
+    devices : bool
+        Whether arm and sensor are needed; if not, their addresses may be empty.
+
+    Raises
+    ------
+    ConfigError
+        With source, section, key, value and what to do.
+    """
+    return cell_of(settings(config, flags), devices=devices)
+
+
+def settings(
+    config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, cell: CellConfig | None = None
+) -> dict[str, Setting]:
+    """Return every key, such as "robot.host", with its value and origin; errors as `load`.
+
+    Parameters
+    ----------
+    config, flags
+        As in `load`.
+    cell : CellConfig, optional
+        An emulated one, which replaces all files and variables.
+    """
+    found: dict[str, Setting] = {}
+    if cell is not None:
+        found = _from_cell(cell)
+    else:
+        for path in (user_file(), config or Path(FILE)):
+            if path == config or path.is_file():
+                found |= _from_file(path)
+        found |= _from_environment()
+    for key, (option, value) in (flags or {}).items():
+        if value is not None:
+            found[key] = Setting(checked(option, key, value), option)
+    if "sampling.average_s" in found:  # a set averaging time is not chosen again
+        found.setdefault("sampling.noise_record_s", Setting(0.0, found["sampling.average_s"].origin))
+    defaults = {key: None if item.default is MISSING else item.default for key, item in _KEYS.items()}
+    unset = {key: Setting(value, "not set" if value is None else "default") for key, value in defaults.items()}
+    return unset | found
+
+
+def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfig:
+    """Turn settings into a cell; raises `ConfigError` when a device is needed and not named."""
+    missing = [key for key in ("robot.host", "sensor.url") if values[key].value is None]
+    if missing and devices:
+        section, key = missing[0].split(".")
+        raise ConfigError(
+            f"[{section}] {key} is not set: write it into {FILE} (`ftdrive init` asks for it), set "
+            f"{variable(missing[0])} or give {RULES[missing[0]].option}; --simulate takes an emulated cell"
+        )
+    found = {key: setting.value for key, setting in values.items()} | dict.fromkeys(missing, "")
+    return CellConfig(
+        **{
+            name: kind(**{item.name: found[f"{name}.{item.name}"] for item in fields(kind)})
+            for name, kind in SECTIONS.items()
+        },
+        clock=clock_in_force(),
+    )
+
+
+def variable(key: str) -> str:
+    """Return the environment variable of a key."""
+    return PREFIX + key.replace(".", "_").upper()
+
+
+def as_toml(value: Any) -> str:
+    """Return a value as a file has it."""
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return json.dumps(value)
+
+
+def user_file() -> Path:
+    """Return the file for all projects of a user; it need not exist."""
+    home = os.environ.get("XDG_CONFIG_HOME", "")
+    folder = Path(home) if Path(home).is_absolute() else Path("~/.config").expanduser()
+    return folder / "ftdrive" / FILE
+
+
+def _from_cell(cell: CellConfig) -> dict[str, Setting]:
+    values = {key: getattr(getattr(cell, section), name) for key in _KEYS for section, name in [key.split(".")]}
+    return {key: Setting(value, "emulated cell") for key, value in values.items() if value is not None}
+
+
+def _from_file(path: Path) -> dict[str, Setting]:
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not a TOML file: {error}; correct it") from error
+    if (found := document.pop("format", None)) != FORMAT:
+        instead = "" if found is None else f", found {found!r}"
+        raise ConfigError(f'{path}: the first line must be format = "{FORMAT}"{instead}')
+    if unknown := sorted(document.keys() - SECTIONS.keys()):
+        raise ConfigError(f"{path}: unknown section [{unknown[0]}]: {_known(unknown[0], 'sections', SECTIONS)}")
+    values: dict[str, Setting] = {}
+    for section, content in document.items():
+        if not isinstance(content, dict):
+            raise ConfigError(
+                f"{path}: {section} = {content!r} is not a section: write [{section}] alone on a line, its keys below"
+            )
+        for key, value in content.items():
+            if f"{section}.{key}" not in _KEYS:
+                raise ConfigError(f"{path}: [{section}] has no key '{key}': {_known(key, 'keys', _names(section))}")
+            values[f"{section}.{key}"] = Setting(checked(str(path), f"{section}.{key}", value), str(path))
+    return values
+
+
+def _from_environment() -> dict[str, Setting]:
+    values: dict[str, Setting] = {}
+    names = {variable(key): key for key in _KEYS}
+    for name, text in os.environ.items():
+        if name in names:
+            values[names[name]] = Setting(checked(name, names[name], _parsed(name, names[name], text)), name)
+            continue
+        for section in SECTIONS:
+            if name.startswith(start := variable(section) + "_"):
+                known = _known(name.removeprefix(start).lower(), "keys", _names(section))
+                raise ConfigError(f"{name} is set, but [{section}] has no such key: {known}; unset it")
+    return values
+
+
+def _parsed(name: str, key: str, text: str) -> Any:
+    """Read a text as it is, and everything else as a file has it."""
+    if not text:
+        raise ConfigError(f"{name} is empty: give [{key.replace('.', '] ')} a value, or unset it")
+    if _KEYS[key].type in {str, str | None}:
+        return text
+    try:
+        document = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        document = {}
+    return document["value"] if document.keys() == {"value"} else text
+
+
+def _names(section: str) -> list[str]:
+    return [item.name for item in fields(SECTIONS[section])]
+
+
+def _known(unknown: str, kind: str, names: Iterable[str]) -> str:
+    """Return what may have been meant, and all names."""
+    near = get_close_matches(unknown, names, 1)
+    return f"{f'did you mean {near[0]}? ' if near else ''}the {kind} are {', '.join(names)}"
+
+
+def recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return the cell that a run has recorded; raises `ConfigError` for a value of a wrong type.
+
+    Keys that this version does not know are left out. Ranges are not checked: another version may have had others.
+    """
+    return {
+        section: {
+            item.name: rules.typed(f"[{section}] {item.name} = {values[item.name]!r}", item, values[item.name])
+            for item in fields(SECTIONS[section])
+            if item.name in values
+        }
+        for section, values in config.items()
+        if section in SECTIONS
+    }
+
+
+def recorded_cell(config: Mapping[str, Mapping[str, Any]]) -> CellConfig:
+    """Return the cell of a run from what `recorded` returns."""
+    return CellConfig(**{name: kind(**config.get(name, {})) for name, kind in SECTIONS.items()}, clock=clock_in_force())
+
+
+def checked(place: str, key: str, value: Any) -> Any:
+    """Return the value of a key such as "robot.host" as its section takes it, or raise `ConfigError`."""
+    where = f"{place}: [{key.replace('.', '] ')} = {value!r}"
+    if key == "workcell.mounting" and rules.is_number(value):  # degrees
+        value = str(value)
+    return rules.ruled(where, _KEYS[key], value)

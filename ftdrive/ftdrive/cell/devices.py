@@ -1,0 +1,44 @@
+"""The only place where configuration becomes drivers."""
+
+from collections.abc import Callable
+from math import radians
+from typing import cast
+
+from ftcalib.ports import Arm, Sensor
+from ftdrive.cell.config import CellConfig
+from ftdrive.cell.emulated import sensor_reached
+from ftdrive.errors import ConfigError
+from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
+from ftdrivers.registry import arm_class, sensor_from_url
+
+
+def build_arm(cell: CellConfig) -> RobotArm:
+    """Build the arm's driver, not yet open; it moves at the speed of the cell unless a move names its own."""
+    try:
+        build = cast("Callable[..., RobotArm]", arm_class(cell.robot.driver))
+    except ValueError as error:
+        raise ConfigError(f"[robot] driver: {error}") from error
+    # Only an emulated arm takes a clock: an arm of another package may not know it.
+    emulated = {"clock": cell.clock} if cell.clock.emulated else {}
+    ur = {"control": cell.robot.control, "api_port": cell.robot.api_port} if cell.robot.driver == "ur" else {}
+    arm = build(
+        cell.robot.host,
+        model=cell.robot.model,
+        speed_rad_s=radians(cell.robot.speed_deg_s),
+        acceleration_rad_s2=radians(cell.robot.acceleration_deg_s2),
+        **ur,
+        **emulated,
+    )
+    _fits: Arm = arm  # checked statically: what the routine asks for is what the driver gives
+    return arm
+
+
+def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
+    """Build the sensor's driver, not yet open."""
+    url, clock = sensor_reached(cell.sensor.url, cell.clock)
+    try:
+        sensor = sensor_from_url(url, sign=cell.sensor.sign, clock=clock)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    _fits: Sensor = sensor
+    return sensor

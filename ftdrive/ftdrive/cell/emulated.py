@@ -1,0 +1,190 @@
+"""An emulated cell as a child process; the real drivers reach it over real wires."""
+
+import atexit
+import json
+import platform
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any, Self
+
+from ftcalib.routine import Sampling
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.errors import ConfigError
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import ConnectError
+
+TIME_SCALE = 20
+"""The emulated arm moves this many times faster; nothing else differs from a real cell."""
+
+SENSORS = {
+    "can": "ATI sensor on CAN",
+    "serial": "ATI sensor on RS-485",
+    "robotous-can": "Robotous sensor on CAN",
+    "robotous-serial": "Robotous sensor on a serial port",
+    "robotiq": "Robotiq sensor",
+    "bota": "Bota sensor",
+    "netft": "ATI Net F/T",
+    "ur-ft": "sensor of its own",
+}
+"""Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm."""
+EMULATED = "emulated://"
+MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
+    "manual": ({"do": "hand-guide"}, "its arm is guided by hand from orientation to orientation"),
+    "listen": ({"do": "pendant-program"}, "a program is started on its pendant, which turns the wrist"),
+}
+"""How the emulated arm moves in modes in which the session does not move it: the request to the cell, and words."""
+
+TOOL_MM = (0.0, 200.0, 100.0)
+
+
+class Station:
+    """One `mocks` process, ended by leaving its `with` block or by the end of ours.
+
+    Its `with` block raises `ConfigError` on another system than Linux.
+
+    Parameters
+    ----------
+    sensor : one of `SENSORS`, "both" (can and serial) or "none"
+    options : sequence of str
+        More options of `python -m ftmocks station`.
+    control_path : str
+        As `control` of `[robot]`.
+    """
+
+    def __init__(self, sensor: str = "can", options: Sequence[str] = (), *, control_path: str = "auto") -> None:
+        self.sensor = sensor
+        self.options = tuple(options)
+        self.control_path = control_path
+        self.endpoints: Mapping[str, Any] = {}
+        self.clock: Clock = REAL
+        """The cell's own, once it has started."""
+        self._process: subprocess.Popen[str] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        made_by: Mapping[str, Any] | None,
+        sensor: str | None = None,
+        options: Sequence[str] = (),
+        *,
+        control_path: str | None = None,
+    ) -> Self:
+        """Describe the station that a run or a calibration names as its `station`, or the usual one; not started.
+
+        An address emulated://NAME in `sensor` replaces its sensor, and `control_path` its control path; `options` come
+        after its own.
+        """
+        made_by = made_by or {}
+        name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
+        path = control_path or made_by.get("control_path", "auto")
+        return cls(name, (*made_by.get("options", ()), *options), control_path=path)
+
+    def __enter__(self) -> Self:
+        if sys.platform != "linux":
+            raise ConfigError(
+                f"an emulated cell needs Linux, and this is {platform.system()}: use recorded data, without --simulate"
+            )
+        from ftdrive.cell.emulated_clock import EmulatedClock
+
+        command = [sys.executable, "-P", "-m", "ftmocks", "station", "--sensor", self.sensor]
+        command += ["--time-scale", str(TIME_SCALE), *self.options]
+        # A session of its own: Ctrl-C in the terminal is for us, not for the emulated cell.
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+        )
+        self.endpoints = self._answer()
+        self.clock = EmulatedClock(self.endpoints["clock"])
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is None:
+            return
+        process, self._process = self._process, None
+        try:
+            process.communicate(timeout=3)  # closes its stdin, which ends it
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+
+    @property
+    def truth(self) -> Mapping[str, Any]:
+        """The values that a perfect calibration of this cell finds."""
+        truth: Mapping[str, Any] = self.endpoints["truth"]
+        return truth
+
+    @property
+    def pid(self) -> int:
+        """Process number while the station lives."""
+        return self._process.pid if self._process else 0
+
+    def control(self, **request: Any) -> Mapping[str, Any]:
+        """Send one request, such as `do="unplug", device="sensor"`, and return the answer."""
+        if self._process and self._process.stdin:
+            self._process.stdin.write(json.dumps(request) + "\n")
+            self._process.stdin.flush()
+        return self._answer()
+
+    def _answer(self) -> Mapping[str, Any]:
+        line = self._process.stdout.readline() if self._process and self._process.stdout else ""
+        if not line:
+            raise ConnectError("the emulated cell has ended: read its message above")
+        answer: Mapping[str, Any] = json.loads(line)
+        return answer
+
+    @property
+    def mounting(self) -> str:
+        """As set by its options."""
+        return self.options[self.options.index("--mount") + 1] if "--mount" in self.options else "floor"
+
+    @property
+    def cell(self) -> CellConfig:
+        """Configuration that reaches this station as it would reach a real cell."""
+        arm = self.endpoints["arm"]
+        url = next(iter(self.endpoints["sensors"].values()))["url"]
+        truth = self.truth
+        return CellConfig(
+            robot=RobotConfig(
+                arm["host"],
+                arm["model"],
+                speed_deg_s=60.0,
+                acceleration_deg_s2=80.0,
+                control=self.control_path,
+                api_port=arm.get("api_port", 80),
+            ),
+            sensor=SensorConfig(url, height_mm=1e3 * truth["p_flange_sensor_m"][2], mass_kg=truth["sensor_mass_kg"]),
+            tool=ToolConfig("emulated", (TOOL_MM,)),
+            workcell=WorkcellConfig(self.mounting, measured=True),
+            sampling=Sampling(average_s=0.4, noise_record_s=0.0),
+            clock=self.clock,
+        )
+
+
+def sensor_reached(url: str, clock: Clock = REAL) -> tuple[str, Clock]:
+    """Return address and clock for a driver: for emulated://NAME those of a sensor, which is started once.
+
+    Its orientation is constant; emulated:// alone is an ATI sensor on CAN. Any other address keeps the given clock.
+    Raises `ConfigError` for an unknown name.
+    """
+    if not url.startswith(EMULATED):
+        return url, clock
+    cell = _emulated_alone(sensor_name(url))
+    return cell.sensor.url, cell.clock
+
+
+def sensor_name(url: str | None) -> str:
+    """Return the name in emulated://NAME, by default the first one. Raises `ConfigError`."""
+    name = (url or EMULATED).removeprefix(EMULATED) or next(iter(SENSORS))
+    if name not in SENSORS:
+        known = ", ".join(EMULATED + name for name in SENSORS)
+        raise ConfigError(f"{url} is not an emulated sensor: leave --sensor out, or give one of {known}")
+    return name
+
+
+@cache
+def _emulated_alone(name: str) -> CellConfig:
+    """Start a sensor without an arm for the life of this process."""
+    station = Station(name, ["--time-scale", "1"])
+    atexit.register(station.__exit__)
+    return station.__enter__().cell

@@ -1,0 +1,263 @@
+"""Checks of this computer: disk, permissions, serial ports, CAN interfaces; and of the described tool and workcell.
+
+Each finding names the exact command or action that fixes it. Nothing here opens a device. The places where Linux keeps
+its facts (/sys, /dev) are parameters. On a computer without them a check is skipped, which is never a failure.
+"""
+
+import json
+import os
+import shutil
+import stat
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import Any
+from urllib.parse import parse_qsl, urlencode
+
+from ftdrive.cell.config import CellConfig
+from ftdrive.checks.check import Check, State
+from ftdrive.errors import ConfigError
+from ftdrivers.registry import BadUrl, in_url, split_url
+
+SYS = Path("/sys")
+DEV = Path("/dev")
+
+_CAN_INTERFACE = "280"
+"""ARPHRD_CAN, in /sys/class/net/*/type."""
+_ON_SERIAL = ("ati-serial", "bota", "robotiq-ft300", "robotous-serial")
+_ON_ETHERNET = ("ati-netft", "ur-ft")
+_LEAST_BYTES, _FEW_BYTES = 200_000_000, 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class SensorAddress:
+    """A sensor's address in parts: protocol, port or host, options."""
+
+    scheme: str
+    address: str
+    options: Mapping[str, str]
+
+    @classmethod
+    def of(cls, url: str) -> "SensorAddress":
+        """Split a sensor's address. Raises `ConfigError` where it is not one."""
+        try:
+            parts = split_url(url)
+        except BadUrl as error:
+            raise ConfigError(str(error)) from error
+        return cls(parts.scheme, parts.address, dict(parse_qsl(parts.query)))
+
+    @property
+    def serial_port(self) -> Path | None:
+        """Its serial port, also that of an slcan adapter."""
+        if self.scheme.endswith("-can") and self.options.get("interface") == "slcan":
+            return Path(self.address.split("@")[0])
+        return Path(self.address) if self.scheme in _ON_SERIAL or self.address.startswith("/") else None
+
+    @property
+    def can_interface(self) -> str | None:
+        """Its CAN interface of the kernel."""
+        on_socketcan = self.scheme.endswith("-can") and self.options.get("interface", "socketcan") == "socketcan"
+        return self.address if on_socketcan else None
+
+    @property
+    def host(self) -> str | None:
+        """The host that sends its samples over Ethernet."""
+        return self.address.partition("/")[0] if self.scheme in _ON_ETHERNET else None
+
+    @property
+    def place(self) -> str | None:
+        """The argument with which `ftdrive devices --probe` looks for it; None where that is not possible."""
+        if not self.scheme.endswith("-can"):
+            return None if self.serial_port is None else str(self.serial_port)
+        base = {key: self.options[key] for key in ("base",) if key in self.options}
+        if self.options.get("interface") == "slcan":
+            return f"slcan://{in_url(self.address)}?{urlencode({'bitrate': self.bitrate} | base)}"
+        return f"socketcan://{self.address}?{urlencode(base)}" if self.can_interface and base else self.can_interface
+
+    @property
+    def bitrate(self) -> int:
+        """Required bit rate of its bus, bit/s."""
+        if self.scheme == "robotous-can":
+            return 1_000_000
+        return int(self.options.get("bitrate", "250000"), 0)
+
+
+def check_disk(folder: Path) -> Check:
+    """Check that runs can be written into a folder, which need not exist yet, and that there is room for them."""
+    name, there = "disk.runs", folder.absolute()
+    while not there.exists():
+        there = there.parent
+    try:
+        with TemporaryFile(dir=there) as file:
+            file.write(b"ftdrive")
+            file.flush()
+        free = shutil.disk_usage(there).free
+    except OSError as error:
+        return Check(name, "failed", f"{there} cannot be written to ({error})", "give another folder with --runs DIR")
+    state: State = "failed" if free < _LEAST_BYTES else "warning" if free < _FEW_BYTES else "ok"
+    fix = None if state == "ok" else "make room, or give --runs DIR on another disk"
+    return Check(name, state, f"{free / 1e9:.1f} GB free in {there}", fix)
+
+
+def check_workcell(cell: CellConfig, model: str | None) -> Check:
+    """Check that tool and surroundings are described, possible for this arm, and measured."""
+    from ftdrive.planning.cell_plan import require_possible
+
+    name = "workcell.measured"
+    if not cell.tool.cylinders_mm:
+        fix = "describe what is mounted: [tool] cylinders_mm in ftdrive.toml, or --tool of calibrate"
+        return Check(name, "warning", "no tool is described", fix)
+    try:
+        require_possible(cell, model)
+    except ConfigError as error:
+        found, _, fix = str(error).rpartition(": ")
+        return Check(name, "failed", found, fix)
+    if not cell.workcell.measured:
+        fix = "measure tool, planes and boxes, then set measured = true in [workcell] of ftdrive.toml"
+        return Check(name, "failed", "tool and surroundings are placeholders", fix)
+    rows = (cell.tool.cylinders_mm, "cylinder"), (cell.workcell.planes_mm, "plane"), (cell.workcell.boxes_mm, "box")
+    cylinders, planes, boxes = (_counted(len(row), one) for row, one in rows)
+    return Check(name, "ok", f"tool of {cylinders}, {planes}, {boxes}, measured")
+
+
+def _counted(count: int, one: str) -> str:
+    return f"{count} {one if count == 1 else 'boxes' if one == 'box' else one + 's'}"
+
+
+def check_permissions(address: SensorAddress, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:
+    """Check that this user may use the sensor's port, and that the port is set up for it."""
+    if (port := address.serial_port) is not None:
+        return check_serial_port(port, sys=sys, dev=dev)
+    if (interface := address.can_interface) is not None:
+        return [check_can_interface(interface, address.bitrate, can_details(interface), sys=sys)]
+    found = f"not applicable: {address.scheme} at {address.address} uses no serial port and no CAN interface of Linux"
+    return [Check("permissions.port", "skipped", found)]
+
+
+def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:
+    """Check a serial port: present, permitted, with a name that survives replugging, and fast."""
+    if not dev.is_dir():
+        return [Check("permissions.port", "skipped", f"not applicable: {port} has no file on this system")]
+    if not port.exists():
+        fix = "plug it in; ftdrive devices lists the ports"
+        return [Check("permissions.port", "failed", f"{port} does not exist", fix)]
+    real = Path(os.path.realpath(port))
+    checks = [_check_access(port)]
+    name = name_by_id(port, dev=dev)
+    if name is None:
+        checks.append(Check("permissions.by-id", "skipped", "not applicable: the port has no name by id"))
+    elif port.parent == name.parent:
+        checks.append(Check("permissions.by-id", "ok", "the name survives replugging"))
+    else:
+        found = f"{port} may be another device after replugging"
+        checks.append(Check("permissions.by-id", "warning", found, f"write {name} in the sensor's address"))
+    timer = sys / "bus" / "usb-serial" / "devices" / real.name / "latency_timer"
+    if not timer.exists():
+        checks.append(Check("permissions.latency_timer", "skipped", "not applicable: the port has no latency timer"))
+        return checks
+    latency_ms = timer.read_text(encoding="ascii").strip()
+    found = f"the adapter delays data by up to {latency_ms} ms"
+    state: State = "ok" if latency_ms == "1" else "warning"
+    command = None if state == "ok" else latency_command(real.name)
+    return [*checks, Check("permissions.latency_timer", state, found, command)]
+
+
+def name_by_id(port: Path, *, dev: Path = DEV) -> Path | None:
+    """Return the name of a serial port that survives replugging; None where it has none."""
+    by_id, real = dev / "serial" / "by-id", os.path.realpath(port)
+    links = sorted(by_id.iterdir()) if by_id.is_dir() else []
+    return next((link for link in links if os.path.realpath(link) == real), None)
+
+
+def latency_command(tty: str) -> str:
+    """Return the command that sets a USB serial adapter's delay to 1 ms until it is unplugged."""
+    return f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{tty}/latency_timer"
+
+
+def _check_access(port: Path) -> Check:
+    if os.access(port, os.R_OK | os.W_OK):
+        return Check("permissions.port", "ok", f"{port} is readable and writable")
+    info = port.stat()
+    try:
+        import grp
+
+        group = grp.getgrgid(info.st_gid).gr_name
+    except (ImportError, KeyError):
+        group = "dialout"
+    if info.st_mode & stat.S_IRGRP and info.st_mode & stat.S_IWGRP and group != "root":
+        fix = f"sudo usermod -aG {group} $USER    (then log out and in again)"
+    else:
+        install = _udev_command(Path(os.path.realpath(port)).name)
+        fix = f"{install}    (then log out and in again; until the next plugging: sudo chmod a+rw {port})"
+    return Check("permissions.port", "failed", f"{port} is not readable and writable", fix)
+
+
+def _udev_command(tty: str) -> str:
+    """Return the command that gives ports of this kind to the group dialout and adds the user to it."""
+    rule = f'SUBSYSTEM=="tty", KERNEL=="{tty.rstrip("0123456789")}[0-9]*", GROUP="dialout", MODE="0660"'
+    return (
+        f"echo '{rule}' | sudo tee /etc/udev/rules.d/60-ftdrive.rules && sudo udevadm control --reload && "
+        "sudo udevadm trigger --subsystem-match=tty && sudo usermod -aG dialout $USER"
+    )
+
+
+def can_interfaces(sys: Path = SYS) -> list[str]:
+    """Return the names of the kernel's CAN interfaces."""
+    found = sorted((sys / "class" / "net").glob("*/type"))
+    return [path.parent.name for path in found if path.read_text(encoding="ascii").strip() == _CAN_INTERFACE]
+
+
+def can_details(interface: str) -> Mapping[str, Any]:
+    """Read kind, state and bitrate of a CAN interface with `ip`; empty where `ip` does not report them."""
+    if (ip := shutil.which("ip", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")) is None:
+        return {}
+    command = [ip, "-details", "-json", "link", "show", interface]
+    try:
+        outcome = subprocess.run(command, capture_output=True, text=True, timeout=5, check=False)
+        links = json.loads(outcome.stdout or "[]")
+    except (OSError, ValueError, subprocess.TimeoutExpired):
+        return {}
+    info = (links[0] if links else {}).get("linkinfo", {})
+    data = info.get("info_data", {})
+    bitrate = data.get("bittiming", {}).get("bitrate")
+    details = {"kind": info.get("info_kind"), "state": data.get("state"), "bitrate": bitrate}
+    return {key: value for key, value in details.items() if value is not None}
+
+
+def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any], *, sys: Path = SYS) -> Check:
+    """Check an interface of the kernel: present, up, not bus-off, and at the sensor's bitrate.
+
+    Parameters
+    ----------
+    details : mapping
+        As `can_details` gives them.
+    """
+    name = "permissions.can"
+    up = f"sudo ip link set {interface} up type can bitrate {bitrate}"
+    if "/" in interface or interface.startswith("tty"):
+        port = interface if "/" in interface else f"/dev/{interface}"
+        fix = f"for a sensor on a serial port give {port}, for a bus behind an adapter slcan://{port}?bitrate={bitrate}"
+        return Check(name, "failed", f"{interface} is not a CAN interface", fix)
+    folder = sys / "class" / "net" / interface
+    if not folder.exists():
+        fix = f"plug the adapter in (ftdrive devices lists the interfaces), then {up}"
+        return Check(name, "failed", f"there is no CAN interface {interface}", fix)
+    if (folder / "type").read_text(encoding="ascii").strip() != _CAN_INTERFACE:
+        return Check(name, "failed", f"{interface} is not a CAN interface", "ftdrive devices lists them")
+    flags = int((folder / "flags").read_text(encoding="ascii"), 16)
+    if not flags & 1:
+        return Check(name, "failed", f"{interface} is down", up)
+    if details.get("state") == "BUS-OFF":
+        fix = f"check wiring, termination and bitrate, then sudo ip link set {interface} type can restart"
+        return Check(name, "failed", f"{interface} has switched itself off (bus-off)", fix)
+    found = details.get("bitrate")
+    if found is not None and found != bitrate:
+        fix = f"sudo ip link set {interface} down && {up}"
+        return Check(name, "failed", f"{interface} is at {found} bit/s, the sensor at {bitrate}", fix)
+    state = details.get("state", details.get("kind", "state unknown"))
+    rate = "bitrate unknown" if found is None else f"{found} bit/s"
+    if state in {"ERROR-WARNING", "ERROR-PASSIVE"}:
+        return Check(name, "warning", f"{interface} is up, {rate}, {state}", "check wiring and termination of the bus")
+    return Check(name, "ok", f"{interface} is up, {rate}, {state}")

@@ -1,0 +1,124 @@
+"""Discovery of robots and sensors at an address, port or bus. They are read, never changed or moved."""
+
+from contextlib import closing
+from pathlib import Path
+
+from serial.tools import list_ports
+
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.cell.devices import build_arm, build_sensor
+from ftdrive.checks.check import Check
+from ftdrive.checks.computer import (
+    can_details,
+    can_interfaces,
+    check_can_interface,
+    check_serial_port,
+    name_by_id,
+)
+from ftdrive.checks.devices import who
+from ftdrive.errors import ConfigError
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import ConnectError
+from ftdrivers.probe.can_bus import probe_can
+from ftdrivers.probe.serial_line import Answer, probe
+from ftdrivers.registry import Options, split_url
+
+_LOOK_S = 0.5
+_CAN = ("socketcan", "slcan")
+_SLCAN = "slcan:///dev/ttyACM0?bitrate=250000"
+
+
+def identify_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[str, str]:
+    """Return the model of the arm at an address, and in words what it reports; raises `DriverError`."""
+    with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
+        arm.open()
+        info, remote = arm.identify(), arm.in_remote_control()
+    switch = "" if remote is None else f", remote control {'ON' if remote else 'OFF'}"
+    return info.model, who(info) + switch
+
+
+def identify_sensor(url: str, clock: Clock = REAL) -> str:
+    """Return in words which sensor is at an address, and its rate; raises `DriverError` or `ConfigError`."""
+    with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url), clock=clock)) as sensor:
+        info = sensor.identify()
+        rate_Hz = len(sensor.collect(_LOOK_S).t_host_ns) / _LOOK_S
+    return f"{who(info)}, {rate_Hz:.0f} Hz"
+
+
+def is_place(text: str) -> bool:
+    """Return whether this names a port or bus to probe, not the address of a sensor."""
+    return "://" not in text or text.startswith(tuple(f"{interface}://" for interface in _CAN))
+
+
+def sensor_at(place: str, clock: Clock = REAL) -> str:
+    """Probe a port or bus and return the address of its sensor; raises `ConfigError` unless exactly one answers."""
+    answers = ask(place, clock)
+    urls = [answer.url for answer in answers if answer.url]
+    if len(urls) == 1:
+        return urls[0]
+    if urls:
+        raise ConfigError(f"{len(urls)} sensors answer on {place}: choose one, {' or '.join(urls)}")
+    why = "; ".join(answer.what for answer in answers)
+    usual = "check its power and bit rate, or give its address (drivers/README lists the forms)"
+    raise ConfigError(f"no known sensor answers on {place}: {why or usual}")
+
+
+def ask(place: str, clock: Clock = REAL) -> list[Answer]:
+    """Probe a port or bus for known sensors, which are only read.
+
+    Parameters
+    ----------
+    place : str
+        A serial port; a CAN interface of the kernel, ``can0`` or ``socketcan://can0?base=0x7F``; or a CAN adapter on a
+        serial port with the bit rate of its bus, ``slcan:///dev/ttyACM0?bitrate=250000``.
+    clock : Clock
+        That of the devices, where they are emulated.
+
+    Raises
+    ------
+    ConfigError
+        The place has another form.
+    ConnectError
+        It does not exist, is not up, or not permitted.
+    """
+    if "://" in place:
+        return _ask_can(place, clock)
+    if "/" in place or place.upper().startswith("COM"):
+        _must_pass(check_serial_port(Path(place)))
+        answer = probe(place, clock)
+        return [] if answer is None else [answer]
+    return _ask_can(f"socketcan://{place}", clock)
+
+
+def _ask_can(url: str, clock: Clock) -> list[Answer]:
+    try:
+        parts = split_url(url)
+        interface, channel, options = parts.scheme, parts.address, Options(url, parts.query)
+        if interface not in _CAN or not channel:
+            raise ConfigError(f"{url} cannot be probed: give a serial port, can0, or {_SLCAN}")
+        bitrate = options.integer("bitrate", 0, 0, 1_000_000) or None
+        base = options.integer("base", 0x20, 0, 0x7F)
+        options.reject_others()
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    if interface == "socketcan":
+        details = can_details(channel)
+        bitrate = bitrate or details.get("bitrate")
+        _must_pass([check_can_interface(channel, bitrate or 250_000, details)])
+    elif bitrate is None:
+        raise ConfigError(f"{url} has no bit rate: add it, as in {_SLCAN}; a wrong one disturbs the bus")
+    else:
+        _must_pass(check_serial_port(Path(channel.split("@")[0])))
+    return probe_can(channel, interface=interface, bitrate=bitrate, base=base, clock=clock)
+
+
+def _must_pass(checks: list[Check]) -> None:
+    for check in checks:
+        if check.state == "failed":
+            raise ConnectError(check.found, check.fix or "")
+
+
+def places() -> list[str]:
+    """Return the ports and buses that can be probed: CAN interfaces of the kernel, and serial ports on USB by id."""
+    ports = sorted(port.device for port in list_ports.comports() if port.vid is not None)
+    return can_interfaces() + [str(name_by_id(Path(port)) or port) for port in ports]

@@ -1,0 +1,168 @@
+"""The command line: one group, lazy commands, and the one place where an exception becomes an exit code."""
+
+import importlib
+import logging
+import platform
+import signal
+import sys
+from collections.abc import Sequence
+from errno import ENOSPC
+from io import StringIO
+
+import click
+
+from ftdrive import __version__, _siblings
+
+# A command, its module, its line in the help. The module is imported only when the command is called: help is fast.
+_COMMANDS = {
+    "demo": ("ftdrive.commands.demo", "Calibrate an emulated cell: no hardware, 25 s."),
+    "init": ("ftdrive.commands.init", "Ask about the cell, probe it, write ftdrive.toml. Moves nothing."),
+    "config": ("ftdrive.commands.config", "Show the configuration and the source of each value."),
+    "plan": ("ftdrive.commands.plan", "Plan a tour proven clear of collisions. Needs no robot."),
+    "calibrate": ("ftdrive.commands.calibrate", "Drive the tour, average the sensor at each pose, solve."),
+    "verify": ("ftdrive.commands.verify", "Compare fresh poses with a calibration's prediction."),
+    "doctor": ("ftdrive.commands.doctor", "Check robot, sensor and computer. Moves nothing."),
+    "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
+    "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
+    "report": ("ftdrive.commands.report", "Report a calibration in one file: verdict, reasons, figures."),
+    "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
+    "push": ("ftdrive.commands.push", "Set payload or gravity in the controller as calibrated."),
+    "record": ("ftdrive.commands.record", "Record raw and compensated wrench with pose and events."),
+    "history": ("ftdrive.commands.history", "List results and verifications, with their trends."),
+    "fleet": ("ftdrive.commands.fleet", "Watch many cells: what is due, what drifts, solve all again."),
+    "diff": ("ftdrive.commands.diff", "Compare two calibrations, in sigmas."),
+    "convert": ("ftdrive.commands.convert", "Convert a recording between MCAP, CSV and Parquet."),
+    "compensate": ("ftdrive.commands.compensate", "Compensate a recording. Needs no device."),
+    "stream": ("ftdrive.commands.stream", "Serve the wrench to Foxglove, Lichtblick and PlotJuggler."),
+    "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
+    "bundle": ("ftdrive.commands.bundle", "Write a run into one file for a bug report, without addresses."),
+    "export": ("ftdrive.commands.export", "Write a plan or a calibration for another program."),
+    "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),
+}
+
+_EPILOG = """\
+Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
+5 device fault, 6 file cannot be read or written, 7 check or acceptance failed, 8 recording has gaps,
+130 interrupted (data kept)."""
+
+
+class _LazyGroup(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        command: click.Command = getattr(importlib.import_module(_COMMANDS[cmd_name][0]), cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, line) for name, (_, line) in _COMMANDS.items()])
+
+
+@click.group(cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option("-v", "--verbose", count=True, help="Print details on stderr; -vv also prints debug messages.")
+@click.option("-q", "--quiet", is_flag=True, help="Print only errors and, before a question, the text it refers to.")
+@click.version_option(__version__, prog_name="ftdrive")
+def cli(verbose: int, quiet: bool) -> None:
+    """Calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force.
+
+    New here? `ftdrive demo` needs no hardware.
+    """
+    level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
+    logger = logging.StreamHandler() if quiet else _TalkHandler()
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[logger])
+    if quiet or verbose:
+        from ftdrive.terminal.console import talk
+
+        talk.quiet, talk.verbose = quiet, bool(verbose)
+
+
+class _TalkHandler(logging.Handler):
+    """Prints log records on stderr, above a live screen if there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        from ftdrive.terminal.console import talk
+
+        talk.print(self.format(record))
+
+
+def exit_code(error: BaseException) -> int | None:
+    """Return the exit code of an error that a user can fix; None for a defect of ftdrive."""
+    if _not_on_this_system(error):
+        return 2
+    from ftcalib.errors import BadCalibration, BadDataset, CalibError, TooFewSamples
+    from ftdrive.errors import (
+        BadBundle,
+        BadPlan,
+        BadRecording,
+        BadStore,
+        ConfigError,
+        NotAccepted,
+        RecordingHasGaps,
+    )
+    from ftdrivers.errors import ConnectError, DeviceFault, DriverError
+    from ftdrivers.transcript.recorder import BadTranscript
+
+    codes: list[tuple[int, tuple[type[BaseException], ...]]] = [
+        (2, (ConfigError,)),
+        (3, (ConnectError,)),
+        (5, (DeviceFault,)),
+        (4, (DriverError, TooFewSamples)),
+        (6, (BadDataset, BadCalibration, BadTranscript, BadPlan, BadRecording, BadStore, BadBundle)),
+        (7, (CalibError, NotAccepted)),
+        (8, (RecordingHasGaps,)),
+        (6, (OSError,)),
+    ]
+    return next((code for code, kinds in codes if isinstance(error, kinds)), None)
+
+
+def _not_on_this_system(error: BaseException) -> bool:
+    """Whether a module of the standard library is missing, as `termios` is on Windows."""
+    return isinstance(error, ModuleNotFoundError) and error.name in sys.stdlib_module_names
+
+
+def in_a_sentence(error: BaseException) -> str:
+    """Return the message of an error; for an error of the system also its file and what to check."""
+    if isinstance(error, ModuleNotFoundError):
+        return f"Python on {platform.system()} has no module {error.name}, which this needs: use Linux"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}: check this path, and who may read and write there"
+    if isinstance(error, OSError) and error.errno == ENOSPC:
+        return f"{error.strerror}: make room where the output goes"
+    return str(error)
+
+
+def main() -> int:
+    """Run the command line; return the exit code."""
+    # Ctrl-C, `kill` and a terminal that closes all end a command the same way: the arm is stopped first. Set even where
+    # they are inherited as ignored, as in a job in the background.
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.default_int_handler)
+    return run(sys.argv[1:])
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run one command line without the program's name; errors are printed, the exit code is returned."""
+    try:
+        _siblings.check()
+        return int(cli.main(list(arguments), prog_name="ftdrive", standalone_mode=False) or 0)
+    except click.ClickException as error:
+        from ftdrive.terminal.console import in_whole_words
+
+        error.show(message := StringIO())
+        click.echo(in_whole_words(message.getvalue(), sys.stderr), err=True, nl=False)
+        return error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted", err=True)
+        return 130
+    except Exception as error:
+        code = exit_code(error)
+        if code is None:
+            raise
+        from ftdrive.terminal.console import in_whole_words
+
+        click.echo(in_whole_words(f"error: {in_a_sentence(error)}", sys.stderr), err=True)
+        return code

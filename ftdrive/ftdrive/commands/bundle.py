@@ -1,0 +1,62 @@
+"""`ftdrive bundle`: a run in one file for a bug report, without addresses and names."""
+
+from contextlib import nullcontext
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from ftcalib.files import require_new
+from ftdrive.commands.common import (
+    EMULATED_SENSOR,
+    FILE,
+    FOLDER,
+    JSON,
+    NewFile,
+    check_simulate,
+    simulate,
+    write_json,
+)
+from ftdrive.commands.emulated_run import rehearsed_run
+from ftdrive.errors import ConfigError
+from ftdrive.runs.bundle import write_bundle
+from ftdrive.terminal.console import hanging, talk
+
+
+@click.command()
+@click.argument("run", metavar="RUN", required=False, type=FOLDER)
+@click.option("-o", "--output", type=NewFile(), help="New file.  [default: RUN's name and .zip, in this folder]")
+@click.option("--transcript", "transcripts", multiple=True, type=FILE, help="Of the sensor's wire; may be repeated.")
+@simulate("Bundle a short run of an emulated cell.")
+@EMULATED_SENSOR
+@JSON
+def bundle(
+    run: Path | None,
+    output: Path | None,
+    transcripts: tuple[Path, ...],
+    simulate: bool,
+    sensor: str | None,
+    as_json: bool,
+) -> None:
+    """Write RUN into one zip file, which `ftdrive replay` and `ftdrive solve` read like the run.
+
+    It has configuration, versions, events, samples, results and checks of this computer. IP and MAC addresses, host and
+    user names and home directories are redacted; serial numbers stay. Look through it before you publish it.
+    """
+    check_simulate(simulate, real={"RUN": run}, emulated={"--sensor": sensor})
+    if run is None and not simulate:
+        raise ConfigError("no run: give its folder, or --simulate")
+    with nullcontext(run) if run is not None else rehearsed_run(sensor) as folder:
+        path = output or Path(f"{folder.resolve().name}.zip")
+        try:
+            require_new(path)
+        except OSError as error:
+            raise ConfigError(f"{error} with --output") from error
+        bundled = write_bundle(folder, path, transcripts)
+    if as_json:
+        write_json({"schema_version": 1, "file": str(path), **asdict(bundled)})
+    counted = ", ".join(f"{count} {kind}" for kind, count in bundled.redacted.items()) or "nothing found"
+    talk.print(hanging(" redacted: ", counted))
+    if bundled.left_out:
+        talk.print(hanging(" left out: ", f"{', '.join(bundled.left_out)} (neither text nor a pose)"))
+    talk.print(f" Saved {path}")

@@ -1,0 +1,257 @@
+"""What several commands share: options, JSON on stdout."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from os import fsdecode
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args
+
+import click
+
+from ftdrivers.ur.control import CONTROL_SETTINGS
+
+if TYPE_CHECKING:
+    from ftcalib import CalibrationResult
+    from ftdrive.cell.config import CellConfig
+    from ftdrive.live.samples import Axes, WrenchFrame
+    from ftdrive.store.store import Store
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+MODEL = click.option(
+    "--model", help="Model of the arm, for controllers that do not report it (CB3 before 3.12, e-Series before 5.6)."
+)
+
+
+CONTROL = click.option(
+    "--control",
+    type=click.Choice(CONTROL_SETTINGS),
+    help="What moves the arm.  [default: [robot] control, else auto]",
+)
+
+
+def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F]:
+    """Make the option --runs."""
+    folder = click.Path(file_okay=False, path_type=Path)
+    return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
+
+
+YES = click.option(
+    "--yes",
+    is_flag=True,
+    help="Answer the safety questions automatically; never a first run, nor a move of the whole arm.",
+)
+CONFIG = click.option("--config", type=FILE, help="TOML file that describes the cell, instead of ./ftdrive.toml.")
+
+
+def CELL(command: F) -> F:
+    """Add the options --config, --robot and --sensor, which `read_cell` takes."""
+    sensor_help = "Address, such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0."
+    command = click.option("--sensor", metavar="URL", help=sensor_help)(command)
+    return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
+
+
+CALIBRATION = click.option(
+    "--calibration",
+    "path",
+    metavar="PATH",
+    type=click.Path(exists=True, path_type=Path),
+    help="A calibration.json or its run folder. With --simulate the default is a new one.",
+)
+
+
+def CALIBRATION_OR_TOOL(command: F) -> F:
+    """Add the options --calibration, --tool and --force, which `open_source` takes."""
+    tool = click.option("--tool", metavar="NAME", help="Newest accepted calibration of this tool on this cell.")
+    force = click.option("--force", is_flag=True, help="Apply a calibration of another arm, sensor or mount.")
+    return CALIBRATION(tool(force(command)))
+
+
+class Number(click.FloatRange):
+    """A finite number within a range; `click` alone accepts nan."""
+
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number."""
+        from math import isfinite
+
+        number: float = super().convert(value, param, ctx)
+        if not isfinite(number):
+            self.fail(f"'{value}' is not a number.", param, ctx)
+        return number
+
+
+class NewFile(click.Path):
+    """A file that a command creates. It is rejected before any work if it exists or its folder does not."""
+
+    def __init__(self) -> None:
+        super().__init__(dir_okay=False, path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path; raises `ConfigError`."""
+        from ftcalib.files import require_new
+        from ftdrive.errors import ConfigError
+
+        path = Path(fsdecode(super().convert(value, param, ctx)))
+        try:
+            require_new(path)
+        except OSError as error:
+            raise ConfigError(f"{max(param.opts, key=len) if param else '--output'}: {error}") from error
+        return path
+
+
+def simulate(words: str = "Use an emulated cell; --sensor emulated://NAME chooses its sensor.") -> Callable[[F], F]:
+    """Make the option --simulate, which every command accepts."""
+    return click.option("--simulate", is_flag=True, help=words)
+
+
+EMULATED_SENSOR = click.option("--sensor", metavar="emulated://NAME", help="With --simulate: the emulated sensor.")
+
+
+def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated: Mapping[str, object] = {}) -> None:
+    """Raise `ConfigError` for an option that would be ignored.
+
+    Parameters
+    ----------
+    real, emulated : mapping
+        Values by option that require a real cell, and that require --simulate. None, False and empty mean not given.
+    """
+    from ftdrive.errors import ConfigError
+
+    if given := [option for option, value in (real if simulate else emulated).items() if value]:
+        fix = "leave one of the two out" if simulate else "add --simulate, or leave it out"
+        raise ConfigError(f"{given[0]} {'does not go with' if simulate else 'goes only with'} --simulate: {fix}")
+
+
+def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
+    """Read the numbers in the value of an option; raises `ConfigError` unless their count is one of `counts`."""
+    from math import isfinite
+
+    from ftdrive.errors import ConfigError
+
+    try:
+        values = [float(part) for part in text.split(separator)]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not all(map(isfinite, values)):
+        wanted = " or ".join(map(str, counts))
+        raise ConfigError(f"{option} is '{text}': give {wanted} numbers separated by '{separator}'")
+    return values
+
+
+def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[float]] | None:
+    """Read a repeatable option, numbers separated by colons; None if it was not given."""
+    return [numbers(option, text, ":", counts) for text in texts] or None
+
+
+def FRAME(command: F) -> F:
+    """Add the options --axes and --about, which `read_frame` takes."""
+    about = click.option(
+        "--about",
+        default="sensor",
+        show_default=True,
+        metavar="POINT",
+        help="Reference point of the torque: sensor, flange, tcp, or x,y,z in m from the flange along its axes.",
+    )
+    axes = click.Choice(["sensor", "flange", "base", "tcp"])
+    return click.option("--axes", type=axes, default="sensor", show_default=True, help="Axes of the wrench.")(
+        about(command)
+    )
+
+
+def read_frame(axes: "Axes", about: str) -> "WrenchFrame":
+    """Return axes and reference point from the options; raises `ConfigError`."""
+    from ftdrive.live.samples import Point, WrenchFrame
+
+    if about in get_args(Point):
+        return WrenchFrame(axes, cast("Point", about))
+    x, y, z = numbers("--about", about, ",", [3])
+    return WrenchFrame(axes, (x, y, z))
+
+
+def host_and_port(option: str, text: str, example: str, *, lowest: int = 1) -> tuple[str, int]:
+    """Read HOST:PORT, with brackets round an IPv6 address; raises `ConfigError`."""
+    from ftdrive.errors import ConfigError
+
+    host, _, port = text.rpartition(":")
+    if not host or not (port.isascii() and port.isdecimal()) or not lowest <= int(port) < 65536:
+        raise ConfigError(f"{option} is '{text}': give HOST:PORT, such as {example}")
+    return host.strip("[]"), int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer reaches an address."""
+    import ipaddress
+
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def write_json(value: Mapping[str, Any]) -> None:
+    """Write one JSON object to stdout, on one line."""
+    click.echo(json.dumps(value))
+
+
+def index_run(folder: Path, cell: "CellConfig | None" = None) -> None:
+    """Add a run to the store, and the runs beside it that it lacks; if that fails, print one sentence.
+
+    The run folder is complete without the store, and the next call adds it. Without a real cell the store is that of
+    environment and files.
+    """
+    from ftdrive.errors import BadStore, ConfigError
+    from ftdrive.store.store import Store
+    from ftdrive.terminal.console import talk
+
+    try:
+        Store(store_url() if cell is None else cell.store.url).index(folder.resolve().parent)
+    except (BadStore, ConfigError, OSError) as error:
+        talk.print(f" The run is saved but not in the history yet, because {error}.")
+
+
+def upgrade_store(store: "Store") -> None:
+    """Migrate the tables of an older version, and print it."""
+    from ftdrive.terminal.console import talk
+
+    if (version := store.upgrade()) is not None:
+        talk.print(f"The store {store.name} is upgraded from version {version}.")
+
+
+STORE = click.option("--store", "url", metavar="URL", help="Database to use, instead of [store] url.")
+
+
+def open_store(url: str | None) -> "Store":
+    """Return the store of the option --store, else that of environment and files."""
+    from ftdrive.store.store import Store
+
+    return Store(url or store_url())
+
+
+def store_url(config: Path | None = None) -> str | None:
+    """Return [store] url from environment and files; None is the user's store."""
+    from ftdrive.cell.config import settings
+
+    url: str | None = settings(config)["store.url"].value
+    return url
+
+
+def read_cell(config: Path | None, robot: str | None, sensor: str | None, *, model: str | None = None) -> "CellConfig":
+    """Read the cell from options, environment and files, in this order of precedence."""
+    from ftdrive.cell.config import load
+
+    flags = {"robot.host": ("--robot", robot), "robot.model": ("--model", model), "sensor.url": ("--sensor", sensor)}
+    return load(config, flags)
+
+
+def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:
+    """Raise `NotAccepted` for a rejected result; its message mentions the missing file if one was requested."""
+    from ftdrive.errors import NotAccepted
+
+    if result.verdict == "rejected":
+        unsaved = " and was not saved" if to_be_saved else ""
+        raise NotAccepted(f"the result is rejected{unsaved}: {'; '.join(result.reasons)}")

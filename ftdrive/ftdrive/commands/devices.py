@@ -1,0 +1,118 @@
+"""`ftdrive devices`: the ports and buses of this computer, and on request the known sensors on them."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.text import Text
+from serial.tools import list_ports
+from serial.tools.list_ports_common import ListPortInfo
+
+from ftdrive.cell.config import clock_in_force
+from ftdrive.cell.emulated import Station
+from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
+from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
+from ftdrive.errors import ConfigError
+from ftdrive.terminal.console import hanging
+from ftdrivers.clock import Clock
+from ftdrivers.errors import DriverError
+
+_PLACES = """\b
+A PLACE is
+  /dev/ttyUSB0                         a serial port
+  can0                                 a CAN interface that is up, at its rate
+  slcan:///dev/ttyACM0?bitrate=250000  a CAN adapter on a serial port"""
+
+
+@click.command(epilog=_PLACES)
+@click.option("--probe", "places", multiple=True, metavar="PLACE", help="Look for known sensors there. Repeatable.")
+@simulate("Show and probe the two ports of an emulated cell instead.")
+@JSON
+def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
+    """List serial ports by id and CAN interfaces; with --probe, the known sensors that answer there.
+
+    Nothing is opened and no byte is sent, except at each PLACE: the command listens there, and then sends read requests
+    in the protocols of the known sensors. Do not probe a serial port with another device on it.
+
+    Only CAN adapters of the kernel (can0) and slcan can be probed. ATI sensors are expected at base identifier 0x20
+    (another: socketcan://can0?base=0x7F), Robotous sensors at 1 Mbit/s. If another device uses the identifiers of a
+    sensor, nothing is sent and the output reports it. A wrong bit rate disturbs a bus in use.
+    """
+    check_simulate(simulate, real={"--probe": places})
+    failures: list[Exception] = []
+    found = (
+        _emulated(failures)
+        if simulate
+        else {
+            "serial": [_serial_port(port) for port in sorted(list_ports.comports())],
+            "can": [{"interface": name, **can_details(name)} for name in can_interfaces()],
+        }
+    )
+    if places:
+        clock = clock_in_force()
+        found["answers"] = [answer for place in places for answer in _answers(place, clock, failures)]
+    if as_json:
+        write_json({"schema_version": 1, **found})
+    else:
+        _print(found)
+    if failures:
+        raise failures[0]
+
+
+def _serial_port(port: ListPortInfo) -> dict[str, Any]:
+    name = name_by_id(Path(port.device))
+    checks = check_serial_port(name or Path(port.device))
+    return {
+        "port": port.device,
+        "by_id": None if name is None else str(name),
+        "description": None if port.description == "n/a" else port.description,
+        "usb": None if port.vid is None else f"{port.vid:04x}:{port.pid:04x}",
+        "serial_number": port.serial_number,
+        "findings": [{"found": one.found, "fix": one.fix} for one in checks if one.state in {"warning", "failed"}],
+    }
+
+
+def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[str, Any]]:
+    """Probe one place. An error is an answer too, so that other places are probed, and is added to `failures`."""
+    from ftdrive.checks.discovery import ask
+
+    nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
+    try:
+        answers = [nothing | {"url": answer.url, "what": answer.what} for answer in ask(place, clock)]
+    except (ConfigError, DriverError, OSError) as error:
+        failures.append(error)
+        return [nothing | {"what": "could not be probed", "error": str(error)}]
+    return answers or [nothing]
+
+
+def _emulated(failures: list[Exception]) -> dict[str, Any]:
+    with Station("both") as station:
+        serial, can = station.endpoints["sensors"]["serial"], station.endpoints["sensors"]["can"]
+        places = (serial["port"], f"slcan://{can['channel']}?bitrate={can['bitrate']}")
+        return {
+            "serial": [_serial_port(ListPortInfo(path)) for path in (serial["port"], can["channel"])],
+            "can": [],
+            "answers": [answer for place in places for answer in _answers(place, station.clock, failures)],
+        }
+
+
+def _print(found: dict[str, Any]) -> None:
+    data = Console(highlight=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+    for port in found["serial"]:
+        words = [port["by_id"] or port["port"], port["description"], port["usb"]]
+        data.print(hanging(" serial  ", "   ".join(word for word in words if word), data))
+        for finding in port["findings"]:
+            data.print(hanging(Text.assemble(" " * 9, ("!", "yellow"), " "), finding["found"], data))
+            data.print(hanging(f"{'':11}fix: ", finding["fix"] or "-", data))
+    for interface in found["can"]:
+        words = [str(value) for value in interface.values()]
+        data.print(hanging(" can     ", "   ".join(words), data))
+    for kind, name in (("serial", "serial ports"), ("can", "CAN interfaces of the kernel")):
+        if not found[kind]:
+            data.print(f" no {name}")
+    for answer in found.get("answers", ()):
+        what = answer["what"] if answer["error"] is None else f"{answer['what']}: {answer['error']}"
+        words = [answer["port"], what, answer["url"]]
+        data.print(hanging(" probed  ", "   ".join(word for word in words if word), data))

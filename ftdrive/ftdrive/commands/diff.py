@@ -1,0 +1,143 @@
+"""`ftdrive diff`: the difference of two calibrations, in sigmas."""
+
+from dataclasses import dataclass
+from math import degrees
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ftdrive.commands.common import JSON, store_url, write_json
+
+if TYPE_CHECKING:
+    from ftcalib.extras.difference import ChiSquare, Difference, Estimated
+
+_SIGNIFICANT = 0.01
+_ROWS = (
+    ("R_flange_sensor", "mounting", "°", degrees(1.0)),
+    ("gravity_force_base_N", "weight, base axes", "N", 1.0),
+    ("force_bias_N", "force bias", "N", 1.0),
+    ("p_sensor_com_m", "centre of mass", "mm", 1e3),
+    ("torque_bias_Nm", "torque bias", "N·m", 1.0),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Side:
+    """One of the two calibrations."""
+
+    calibrated: "Estimated"
+    id: str
+    path: str
+    created_utc: str | None
+    mass_kg: float
+    mass_sigma_kg: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields as JSON, without the calibration itself."""
+        names = ("id", "path", "created_utc", "mass_kg", "mass_sigma_kg")
+        return {name: getattr(self, name) for name in names}
+
+
+@click.command()
+@click.argument("first", metavar="A")
+@click.argument("second", metavar="B")
+@JSON
+def diff(first: str, second: str, as_json: bool) -> None:
+    """Compare two calibrations: each a file, a run folder, or an id of `ftdrive history` (its first digits suffice).
+
+    The differences B minus A are given in sigmas of both together, and tested jointly with both covariances. A rotation
+    is compared as one rotation about the flange axes. The exit code is 0 whatever the difference is.
+    """
+    from ftcalib.extras.difference import difference
+
+    a, b = _side(first), _side(second)
+    found = difference(a.calibrated, b.calibrated)
+    mass_sigma_kg = (a.mass_sigma_kg**2 + b.mass_sigma_kg**2) ** 0.5
+    if as_json:
+        write_json(
+            {
+                "schema_version": 1,
+                "a": a.to_dict(),
+                "b": b.to_dict(),
+                "mass_kg": {"change": b.mass_kg - a.mass_kg, "sigma": mass_sigma_kg},
+                "parameters": [_parameter(found, i) for i in range(15)],
+                "groups": {name: _as_json(test) for name, test in found.groups.items()},
+                "joint": _as_json(found.joint),
+                "significant": found.joint.p_value < _SIGNIFICANT,
+            }
+        )
+        return
+    for name, side in (("A", a), ("B", b)):
+        click.echo(f"{name}  {side.id[:6]}  {(side.created_utc or 'unknown time')[:16].replace('T', ' ')}  {side.path}")
+    click.echo(f"{'B minus A':22}{'change':>12}{'± 1 sigma':>12}{'in sigmas':>11}")
+    click.echo(_line("mass, kg", b.mass_kg - a.mass_kg, mass_sigma_kg))
+    for i, (_, label, unit, scale) in enumerate(_ROWS):
+        for k, axis in enumerate("xyz"):
+            row = 3 * i + k
+            click.echo(_line(f"{label} {axis}, {unit}", scale * found.change[row], scale * found.sigma[row]))
+    click.echo(_in_words(found))
+
+
+def _side(text: str) -> Side:
+    """Find a calibration by path or id; raises `ConfigError`."""
+    from ftdrive.errors import ConfigError
+    from ftdrive.live.stream import load_calibration
+    from ftdrive.store.records import mass_sigma_kg
+    from ftdrive.store.store import Store
+
+    if (path := Path(text)).exists():
+        result = load_calibration(path)
+        sigma_kg = mass_sigma_kg(result.parameters, result.covariance, result.g_m_s2)
+        created = result.provenance.get("created_utc")
+        return Side(result, result.id, text, created if isinstance(created, str) else None, result.mass_kg, sigma_kg)
+    if len(text) < 4 or not set(text) <= set("0123456789abcdef"):
+        raise ConfigError(f"'{text}' is neither a file nor an id: give a path, or 4 digits or more of an id")
+    store = Store(store_url())
+    found = store.find(text)
+    if not found:
+        raise ConfigError(f"the store {store.name} has no result {text}…: `ftdrive history` lists them")
+    if len(found) > 1:
+        ids = ", ".join(one.id for one in found)
+        raise ConfigError(f"{text} is the beginning of {ids}: give more digits")
+    one = found[0]
+    return Side(one, one.id, one.path, one.created_utc, one.mass_kg, one.mass_sigma_kg)
+
+
+def _line(label: str, change: float, sigma: float) -> str:
+    if change == 0:
+        return f"{label:22}{'same':>12}"
+    spread, ratio = (f"{sigma:12.5f}", f"{change / sigma:+11.1f}") if sigma > 0 else (f"{'known':>12}", "")
+    return f"{label:22}{change:+12.5f}{spread}{ratio}"
+
+
+def _in_words(found: "Difference") -> str:
+    joint = found.joint
+    if joint.dof == 0:
+        return "The calibrations are the same."
+    test = f"chi2 {joint.chi2:.1f} for {joint.dof} degrees of freedom, p = {joint.p_value:.2g}"
+    if joint.p_value >= _SIGNIFICANT:
+        return f"They agree within their uncertainty ({test})."
+    changed = [label for name, label, *_ in _ROWS if found.groups[name].p_value < _SIGNIFICANT / len(_ROWS)]
+    return f"They differ significantly ({test}): {', '.join(changed) or 'several parameters together'}."
+
+
+def _parameter(found: "Difference", i: int) -> dict[str, Any]:
+    from math import isfinite
+
+    from ftcalib.model import PARAMETER_NAMES
+
+    ratio = float(found.in_sigmas[i])
+    return {
+        "name": PARAMETER_NAMES[i],
+        "change": float(found.change[i]),
+        "sigma": float(found.sigma[i]),
+        "in_sigmas": ratio if isfinite(ratio) else None,
+    }
+
+
+def _as_json(test: "ChiSquare") -> dict[str, Any]:
+    from math import isfinite
+
+    chi2 = test.chi2 if isfinite(test.chi2) else None
+    return {"chi2": chi2, "dof": test.dof, "p_value": test.p_value}

@@ -1,0 +1,245 @@
+"""`ftdrive doctor`: is the cell connected, quiet and permitted? Nothing moves."""
+
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+from rich.console import Console
+from rich.text import Text
+
+from ftcalib import CalibrationResult
+from ftdrive.cell.config import USUAL_KG, CellConfig
+from ftdrive.cell.devices import build_arm, build_sensor
+from ftdrive.cell.emulated import Station, sensor_name, sensor_reached
+from ftdrive.checks import computer, devices
+from ftdrive.checks.check import Check, verdict
+from ftdrive.checks.computer import SensorAddress
+from ftdrive.commands.common import (
+    CELL,
+    FILE,
+    JSON,
+    MODEL,
+    Number,
+    check_simulate,
+    read_cell,
+    runs,
+    simulate,
+    write_json,
+)
+from ftdrive.errors import NotAccepted
+from ftdrive.session.guards import Limits
+from ftdrive.terminal.console import hanging, talk
+from ftdrivers.clock import Clock
+from ftdrivers.errors import DriverError
+from ftdrivers.interfaces import ArmStatus, Array, ForceTorqueSensor, RobotArm
+
+Blame = Callable[[str, DriverError], Check]
+"""From the name of a check and the error of a sensor's driver."""
+
+_CLOCK_S = 1.0
+_LOOK_S = 2.0
+_PUSH_S = 3.0
+_PUSH_WINDOW_S = 0.2
+_SIMULATED_PUSH_N, _SIMULATED_PUSH_S = 15.0, 0.6
+_MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
+
+
+@click.command()
+@CELL
+@MODEL
+@simulate()
+@click.option("--calibration", "path", type=FILE, help="Is it of these devices?")
+@click.option(
+    "--mass-kg", type=Number(0, min_open=True), help="Expected, of the tool.  [default: [tool] mass_kg, else 1]"
+)
+@click.option("--push", is_flag=True, help="Find the sign of the sensor: you push the tool along +X of the base.")
+@runs("Folder of the runs, whose disk is checked.")
+@JSON
+def doctor(
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    model: str | None,
+    simulate: bool,
+    path: Path | None,
+    mass_kg: float | None,
+    push: bool,
+    runs: Path,
+    as_json: bool,
+) -> None:
+    """Check robot, sensor, noise, clocks, disk and permissions; print a fix for each finding.
+
+    Runs every check except the controller's safety limits, which can only be queried with control. The arm is only
+    read, nothing moves, no program is touched. Exit code 7 if a check fails.
+    """
+    check_simulate(simulate, real={"--config": config, "--robot": robot, "--model": model})
+    calibration = None if path is None else CalibrationResult.load(path)
+    pushed: dict[str, Any] | None = None
+    with ExitStack() as stack:
+        station = stack.enter_context(Station(sensor_name(sensor), ["--time-scale", "1"])) if simulate else None
+        cell = read_cell(config, robot, sensor, model=model) if station is None else station.cell
+        address = SensorAddress.of(sensor_reached(cell.sensor.url)[0])
+        device = build_sensor(cell)
+
+        found, arm = _examine_robot(cell, stack)
+        permissions = computer.check_permissions(address)
+        blame = partial(devices.check_sensor_error, address=address, permissions=permissions)
+        mass_kg = mass_kg or cell.tool.mass_kg or USUAL_KG
+        of_sensor, alive = _examine_sensor(device, address, cell, mass_kg, blame, stack)
+        model = cell.robot.model if arm is None else arm.identify().model
+        found += [*of_sensor, computer.check_workcell(cell, model), computer.check_disk(runs), *permissions]
+        if calibration is not None:
+            connected = {"sensor": device.identify()} if alive else {}
+            if arm is not None:
+                connected["arm"] = arm.identify()
+            found.append(devices.check_calibration(calibration, connected, cell.sensor.mount))
+        if push:
+            R_flange_sensor = None if calibration is None else calibration.R_flange_sensor
+            if station is not None and calibration is None:
+                R_flange_sensor = np.array(station.truth["R_flange_sensor"])
+            check, pushed = _examine_push(
+                device if alive else None, arm, R_flange_sensor, cell.sensor.sign, station, blame
+            )
+            found.append(check)
+    failed = [check.name for check in found if check.state == "failed"]
+    if as_json:
+        answer = {"schema_version": 1, "checks": [asdict(check) for check in found], "verdict": verdict(found)}
+        write_json({**answer, "push": pushed} if push else answer)
+    else:
+        _print(found)
+    if failed:
+        raise NotAccepted(f"{len(failed)} of {len(found)} checks failed: {', '.join(failed)}")
+
+
+def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], RobotArm | None]:
+    """Return the checks of the arm, and the arm where it could be opened."""
+    host, arm = cell.robot.host, build_arm(cell)
+    stack.callback(arm.close)
+    try:
+        arm.open()
+        info, status = arm.identify(), arm.status()
+    except DriverError as error:
+        return [devices.check_unreachable(error, host)], None
+    return [
+        Check("robot.reachable", "ok", f"{host} answers"),
+        devices.check_arm(info, cell.robot),
+        devices.check_remote(arm),
+        *map(devices.check_finding, arm.diagnose()),
+        devices.check_safety(status),
+        devices.check_program(status),
+        devices.check_speed(status),
+        devices.check_payload(status, cell.tool, cell.sensor.mass_kg),
+        *_check_poses(arm, status, cell.clock),
+        _check_clock(arm, cell.clock),
+    ], arm
+
+
+def _check_poses(arm: RobotArm, status: ArmStatus, clock: Clock) -> list[Check]:
+    name = "robot.flange"
+    if status.tcp_offset is None:
+        found = "the controller does not report its TCP offset: only a calibration, which takes control, can read poses"
+        return [Check(name, "skipped", found)]
+    try:
+        p_mm = 1e3 * arm.state().p_base_flange_m
+    except DriverError as error:
+        return [Check(name, "failed", error.found, error.fix or "check the robot and the network")]
+    where = ", ".join(f"{value:.0f}" for value in p_mm)
+    limits = Limits.emulated() if clock.emulated else Limits()
+    return [
+        Check(name, "ok", f"TCP offset read; flange at ({where}) mm in base"),
+        devices.check_link(arm, clock, usual_s=limits.link_usual_s, gap_s=limits.link_gap_s),
+    ]
+
+
+def _check_clock(arm: RobotArm, clock: Clock) -> Check:
+    host_ns: list[int] = []
+    device_s: list[float] = []
+    try:
+        with clock.keeping_up():
+            while not host_ns or host_ns[-1] - host_ns[0] < _CLOCK_S * 1e9:
+                clock.sleep(0.02)
+                status = arm.status()
+                host_ns.append(status.t_host_ns)
+                device_s.append(status.t_device_s)
+    except DriverError as error:
+        return Check("clock.pace", "failed", error.found, error.fix or "check the robot and the network")
+    return devices.check_clock(host_ns, device_s)
+
+
+def _examine_sensor(
+    device: ForceTorqueSensor, address: SensorAddress, cell: CellConfig, mass_kg: float, blame: Blame, stack: ExitStack
+) -> tuple[list[Check], bool]:
+    """Return the checks of the sensor, and whether it streams."""
+    found: list[Check] = []
+    name = "sensor.identity"
+    try:
+        stack.enter_context(device)
+        info = device.identify()
+        found += devices.check_identity(info)
+        name = "sensor.stream"
+        samples = device.collect(_LOOK_S)
+        health = device.health()
+    except DriverError as error:
+        return [*found, blame(name, error)], False
+    limits = info.facts.get("range")
+    return [
+        *found,
+        devices.check_load(None if limits is None else limits.value, cell),
+        *devices.check_stream(samples, health, address, _LOOK_S),
+        *devices.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg),
+    ], True
+
+
+def _examine_push(
+    device: ForceTorqueSensor | None,
+    arm: RobotArm | None,
+    R_flange_sensor: Array | None,
+    sign: int,
+    station: Station | None,
+    blame: Blame,
+) -> tuple[Check, dict[str, Any] | None]:
+    if device is None:
+        return Check("push.sign", "skipped", "the sensor does not measure"), None
+    try:
+        R_base_flange = None if arm is None else arm.state().R_base_flange
+    except DriverError:
+        R_base_flange = None  # robot.flange reports it
+    try:
+        before = device.collect(1.0).wrench[:, :3].mean(axis=0)
+        with ExitStack() as stack:
+            if station is None:
+                words = f"Push the tool along +X of the base, about 20 N; press Enter and hold for {_PUSH_S:.0f} s"
+                click.echo(words, err=True)
+                if not sys.stdin.readline():
+                    return Check("push.sign", "skipped", "no push: the standard input is closed"), None
+            elif R_base_flange is not None and R_flange_sensor is not None:
+                force = (R_base_flange @ R_flange_sensor).T @ [_SIMULATED_PUSH_N, 0.0, 0.0]
+                station.control(do="push", wrench=[*force.tolist(), 0.0, 0.0, 0.0])
+                stack.callback(station.control, do="push", wrench=[0.0] * 6)
+            windows = round((_PUSH_S if station is None else _SIMULATED_PUSH_S) / _PUSH_WINDOW_S)
+            pieces = (device.collect(_PUSH_WINDOW_S).wrench[:, :3] for _ in range(windows))
+            changes = [force_N.mean(axis=0) - before for force_N in pieces]
+    except DriverError as error:
+        return blame("push.sign", error), None
+    largest = max(changes, key=lambda change: float(np.linalg.norm(change)))
+    return devices.check_push(largest, R_base_flange, R_flange_sensor, sign)
+
+
+def _print(found: list[Check]) -> None:
+    data = Console(highlight=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+    subject = ""
+    for check in found:
+        first, _, _ = check.name.partition(".")
+        head = Text.assemble(f" {'' if first == subject else first:<12}", _MARK[check.state], " ")
+        data.print(hanging(head, check.found, data))
+        if check.fix is not None and check.state in {"warning", "failed"}:
+            data.print(hanging(f"{'':15}fix: ", check.fix, data))
+        subject = first
+    words = {"ok": " All checks passed.", "warning": " Usable; see the lines with !", "failed": " Not ready."}
+    talk.print(words[verdict(found)])

@@ -1,0 +1,129 @@
+"""`ftdrive history`: results and verifications of the store, with trends and warnings."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, upgrade_store, write_json
+
+if TYPE_CHECKING:
+    from ftdrive.store.records import StoredResult, StoredVerification
+
+
+@click.command()
+@click.argument("folders", metavar="[RUNS]...", nargs=-1, type=FOLDER)
+@click.option("--tool", metavar="NAME", help="Only results of this tool.")
+@click.option("--index", metavar="FOLDER", multiple=True, type=FOLDER, help="First add the runs in FOLDER. Repeatable.")
+@click.option("--rebuild", is_flag=True, help="First read all runs again, and forget those that were deleted.")
+@STORE
+@JSON
+def history(
+    folders: Sequence[Path], tool: str | None, index: Sequence[Path], rebuild: bool, url: str | None, as_json: bool
+) -> None:
+    """List results with their date and last verification, and the trends of bias and payload.
+
+    They come from the store, where `calibrate` and `verify` add theirs, or from the run folders in RUNS. A trend is
+    significant if the uncertainty of the results explains it in less than one case of 100, and so does their scatter.
+
+    --index and --rebuild also upgrade a store of an older version.
+    """
+    from ftdrive.errors import ConfigError
+    from ftdrive.store.history import drifts, warnings
+    from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
+    from ftdrive.terminal.console import hanging, talk
+
+    left_out: tuple[str, ...] = ()
+    name = None
+    if folders:
+        if option := "--index" if index else "--rebuild" if rebuild else "--store" if url else "":
+            raise ConfigError(f"RUNS and {option} exclude one another: leave one out")
+        records, left_out = read_records(record_paths(folders))
+        results = [one for one in records if isinstance(one, StoredResult) and tool in {None, one.tool}]
+        results.sort(key=lambda one: (one.created_utc or "", one.id))
+        checks = [one for one in records if isinstance(one, StoredVerification)]
+        checks.sort(key=lambda one: one.created_utc or "")
+    else:
+        store = open_store(url)
+        name = store.name
+        if index or rebuild:
+            upgrade_store(store)
+            left_out = (store.rebuild(*index) if rebuild else store.index(*index)).unreadable
+        results, checks = store.results(tool), store.verifications()
+    for words in left_out:
+        talk.print(hanging(" left out: ", words))
+    now = datetime.now(UTC)
+    found, advice = drifts(results), list(warnings(results, checks, now))
+    last = {check.calibration_id: check for check in checks}
+    if as_json:
+        rows = [_as_json(one, last.get(one.id), now) for one in results]
+        trends = [one.to_dict() for one in found]
+        write_json({"schema_version": 1, "store": name, "results": rows, "trends": trends, "warnings": advice})
+        return
+    if not results:
+        talk.print("No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder.")
+        return
+    _print_table([_row(one, last.get(one.id), now) for one in results])
+    for drift in found:
+        click.echo(f"trend: {drift}")
+    for words in advice:
+        talk.print(hanging(" ! ", words), style="yellow")
+
+
+_TITLES = ("id", "date", "tool", "verdict", "kg", "force bias, N", "verified", "°C", "parent")
+_OPTIONAL = {"°C", "parent"}
+"""Shown if a result has one."""
+
+
+def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime) -> tuple[str, ...]:
+    from ftdrive.store.history import age_days
+
+    verified = "-"
+    if check is not None:
+        since = age_days(check.created_utc, now)
+        verified = f"{'passed' if check.passed else 'FAILED'}{'' if since is None else f' {since:.0f} d'}"
+        verified += f", {check.change}" if check.change else ""
+    return (
+        one.id[:6],
+        "-" if one.created_utc is None else one.created_utc[:10],
+        one.tool or "-",
+        one.verdict,
+        f"{one.mass_kg:.4f}",
+        " ".join(f"{value:.2f}" for value in one.parameters.force_bias_N),
+        verified,
+        "" if one.temperature_C is None else f"{one.temperature_C:.0f}",
+        f"{one.parent[:6]} ({one.update})" if one.parent else "",
+    )
+
+
+def _print_table(rows: Sequence[Sequence[str]]) -> None:
+    """Print the columns that every table has, and those that a result has."""
+    from ftdrive.terminal.table import print_table
+
+    shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
+    print_table(
+        [_TITLES[n] for n in shown], [[row[n] for n in shown] for row in rows], folding={"tool", "verified", "parent"}
+    )
+
+
+def _as_json(one: "StoredResult", check: "StoredVerification | None", now: datetime) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    import numpy as np
+
+    from ftcalib.model import BIASES
+    from ftdrive.store.history import age_days
+
+    kept = {name: value for name, value in asdict(one).items() if name != "numbers"}
+    bias = {name: one.numbers[name] for name in ("force_bias_N", "torque_bias_Nm", "p_sensor_com_m")}
+    sigma = np.sqrt(np.diag(one.covariance))[BIASES].tolist()
+    return {
+        **kept,
+        "age_days": age_days(one.created_utc, now),
+        "mass_sigma_kg": one.mass_sigma_kg,
+        **bias,
+        "bias_sigma": {"force_N": sigma[:3], "torque_Nm": sigma[3:]},
+        "last_verification": None if check is None else asdict(check),
+    }

@@ -1,0 +1,107 @@
+"""`ftdrive push`: payload and gravity of a calibration to the controller."""
+
+import json
+import shlex
+import sys
+from contextlib import ExitStack, closing
+from dataclasses import asdict
+from pathlib import Path
+
+import click
+
+from ftcalib import CalibrationResult
+from ftdrive.cell.config import CellConfig
+from ftdrive.cell.devices import build_arm, build_sensor
+from ftdrive.cell.emulated import Station
+from ftdrive.commands.common import CELL, JSON, check_simulate, read_cell, simulate, write_json
+from ftdrive.commands.emulated_run import rehearsed_run
+from ftdrive.errors import ConfigError, Declined
+from ftdrive.live.stream import load_calibration
+from ftdrive.runs.push_receipt import Receipt
+from ftdrive.session.operator import Operator, Question
+from ftdrive.session.settings_push import EFFECTS, WORDS, propose, restore, send
+from ftdrive.terminal.console import in_whole_words, talk
+from ftdrive.terminal.operators import JsonOperator, PlainOperator
+from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
+
+_PATH = click.Path(exists=True, path_type=Path)
+
+
+@click.command()
+@click.argument("source", metavar="[RESULT|RUN]", required=False, type=_PATH)
+@CELL
+@click.option("--payload", is_flag=True, help="Push mass and centre of mass; the default without --gravity.")
+@click.option("--gravity", is_flag=True, help="Push the direction of gravity in the base.")
+@click.option("--restore", "receipt", metavar="RECEIPT|RUN", type=_PATH, help="Send the values before a push back.")
+@click.option("--dry-run", is_flag=True, help="Compare only; nothing is sent.")
+@simulate("Push to an emulated cell, without a typed word; it is calibrated first if no result is given.")
+@JSON
+def push(
+    source: Path | None,
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    payload: bool,
+    gravity: bool,
+    receipt: Path | None,
+    dry_run: bool,
+    simulate: bool,
+    as_json: bool,
+) -> None:
+    """Set payload or gravity in the controller as calibrated, after a typed word, and read it back.
+
+    The payload is everything below the flange: the identified tool, sensor and adapter. The old values are kept in a
+    receipt, push.json in the run, for --restore. The arm must be free and still, in remote control, without a program.
+    A program made at the pendant sets the values of its installation again when it starts.
+    """
+    check_simulate(simulate, real={"--config": config, "--robot": robot})
+    if receipt is not None and (source or payload or gravity):
+        raise ConfigError("--restore takes everything from the receipt: leave RESULT, --payload and --gravity out")
+    if not (source or receipt or simulate):
+        raise ConfigError("nothing to push: give a calibration.json or a run folder, --restore or --simulate")
+    operator: Operator = JsonOperator() if as_json else PlainOperator()
+    with ExitStack() as stack:
+        path = source or receipt or stack.enter_context(rehearsed_run(sensor))
+        folder = path if path.is_dir() else path.parent
+        of = load_calibration(path) if receipt is None else Receipt.load(path)
+        cell = _emulated_cell(of, sensor, stack) if simulate else read_cell(config, robot, sensor)
+        arm = stack.enter_context(closing(build_arm(cell)))
+        arm.open()
+        if isinstance(of, Receipt):
+            proposal = restore(cell, arm, of)
+        else:
+            device = stack.enter_context(build_sensor(cell))
+            proposal = propose(cell, arm, device, of, payload=payload or not gravity, gravity=gravity, name=str(path))
+        sends = bool(proposal.settings) and not dry_run
+        asks = sends and not simulate
+        if as_json and (asks or not sends):
+            values = {"old": asdict(proposal.old), "new": asdict(proposal.new)}
+            write_json({"schema_version": 1, "event": "proposal", **proposal.reason, **values})
+        elif not as_json and (asks or not talk.quiet):
+            click.echo(in_whole_words("\n".join(proposal_in_lines(proposal)), sys.stderr), err=True)
+        if not sends:
+            talk.print("Dry run: nothing was sent." if dry_run else "The controller agrees: nothing was sent.")
+            return
+
+        def ask(name: str) -> None:
+            if not simulate:
+                operator.ask(Question(EFFECTS[name], (WORDS[name],)))
+
+        try:
+            saved, read_back = send(arm, proposal, folder, ask)
+        except Declined as error:
+            talk.print(str(error))
+            raise click.Abort from error
+        if as_json:
+            write_json({"schema_version": 1, **json.loads(saved.read_text(encoding="utf-8")), "file": str(saved)})
+            return
+    talk.print(f" ✔ Read back: {settings_in_words(read_back)}")
+    talk.print(" Programs made at the pendant set the values of their installation: enter them there too.")
+    if saved.exists():  # not of a temporary run
+        talk.print(f" Receipt {saved}; undo: ftdrive push --restore {shlex.quote(str(saved))}")
+
+
+def _emulated_cell(of: CalibrationResult | Receipt, sensor: str | None, stack: ExitStack) -> CellConfig:
+    """Start the emulated cell of a calibration, or any."""
+    made_by = of.provenance.get("station") if isinstance(of, CalibrationResult) else None
+    return stack.enter_context(Station.of(made_by, sensor)).cell

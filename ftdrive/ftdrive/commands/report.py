@@ -1,0 +1,129 @@
+"""`ftdrive report`: one file that says whether a calibration is good, and why."""
+
+import shlex
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import get_args
+
+import click
+from click.core import ParameterSource
+
+from ftcalib.files import require_new, write_new
+from ftcalib.likelihood.session import Drift
+from ftcalib.result import Method
+from ftdrive.commands.common import (
+    EMULATED_SENSOR,
+    JSON,
+    NewFile,
+    check_simulate,
+    simulate,
+    store_url,
+    write_json,
+)
+from ftdrive.commands.emulated_run import rehearsed_run
+from ftdrive.commands.solve import known_values
+from ftdrive.commands.solve import solve as solve_command
+from ftdrive.errors import ConfigError
+from ftdrive.report.facts import facts_of
+from ftdrive.report.report import Format
+from ftdrive.report.report import report as written
+from ftdrive.report.subject import SolveOptions, read_subject
+from ftdrive.report.trust import trust
+from ftdrive.runs.bundle import unpacked
+from ftdrive.runs.source import Orientation
+from ftdrive.terminal.console import hanging, talk
+
+_SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg")
+DEFAULT = Path("report.html")
+
+
+@click.command(params=[one for one in solve_command.params if one.name in _SHARED])
+@click.option(
+    "--method",
+    metavar="METHOD",
+    type=click.Choice(get_args(Method)),
+    default="ml",
+    show_default=True,
+    help="As of `ftdrive solve`; the report compares the others with it.",
+)
+@click.argument("source", required=False, type=click.Path(exists=True, path_type=Path))
+@click.option("-o", "--output", type=NewFile(), help=f"New file. [default: {DEFAULT}; stdout for md and json]")
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["html", "md", "json"]),
+    default="html",
+    show_default=True,
+    help="A page (needs ftdrive[report]), Markdown, or the facts as JSON.",
+)
+@click.option(
+    "--parent",
+    metavar="RESULT",
+    type=click.Path(exists=True, path_type=Path),
+    help="Compare with this calibration.json or run folder. Default: the parent that the result names.",
+)
+@simulate("Report a short run of an emulated cell.")
+@EMULATED_SENSOR
+@JSON
+def report(
+    source: Path | None,
+    output: Path | None,
+    form: Format,
+    parent: Path | None,
+    method: Method,
+    orientation: Orientation,
+    drift: Drift,
+    mass_kg: float | None,
+    level_deg: float | None,
+    mounting_deg: str | None,
+    simulate: bool,
+    sensor: str | None,
+    as_json: bool,
+) -> None:
+    """Report SOURCE: a calibration.json, a run folder, a dataset.json or a CSV file, as `ftdrive solve` takes them.
+
+    The report has verdict, reasons, next step, uncertainty, cross-validation, residuals, drift, noise, coverage,
+    settings and provenance. An unsolved source is solved with the options of `ftdrive solve`. Rejected results are
+    reported too, with exit code 0.
+    """
+    check_simulate(simulate, real={"SOURCE": source}, emulated={"--sensor": sensor})
+    if source is None and not simulate:
+        raise ConfigError("nothing to report: give a calibration.json, a run folder or a CSV file, or --simulate")
+    if output is None and form == "html":
+        try:
+            require_new(output := DEFAULT)
+        except OSError as error:
+            raise ConfigError(f"{error} with --output") from error
+    options = SolveOptions(
+        method, orientation, drift, known_values(mass_kg, level_deg, mounting_deg), _typed(click.get_current_context())
+    )
+    with unpacked(source) if source is not None else rehearsed_run(sensor) as found:
+        subject = read_subject(found, options, parent)
+        known = trust(subject.result, found, store_url, datetime.now(UTC))
+        subject = replace(subject, trust=known)
+        if known["store_error"]:
+            talk.print(hanging(" ! ", f"a later verification may be missing, because {known['store_error']}"))
+        if source is not None and found != source:  # unpacked
+            reproduce = subject.reproduce.replace(str(found), shlex.quote(str(source)))
+            subject = replace(subject, source=source, reproduce=reproduce)
+        facts = facts_of(subject)
+    text = written(facts, form)
+    if output is not None:
+        write_new(output, text)
+        talk.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}"))
+        talk.print(f" Saved {output}")
+    if as_json:
+        write_json({**facts, "file": None if output is None else str(output)})
+    elif output is None:
+        click.echo(text, nl=False)
+
+
+def _typed(context: click.Context) -> tuple[str, ...]:
+    """Return the options of solve that were given, as words for a shell."""
+    return tuple(
+        word
+        for one in context.command.params
+        if one.name in ("method", *_SHARED) and context.get_parameter_source(one.name) is not ParameterSource.DEFAULT
+        for word in (one.opts[0], shlex.quote(str(context.params[one.name])))
+    )

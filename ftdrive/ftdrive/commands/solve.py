@@ -1,0 +1,189 @@
+"""`ftdrive solve`: a calibration from data on disk, without a device."""
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import click
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationDataset, CalibrationResult, Known
+from ftcalib import solve as solve_dataset
+from ftcalib.compare import compare
+from ftcalib.errors import CalibError
+from ftcalib.likelihood.session import Drift
+from ftcalib.model import UP_IN_BASE
+from ftcalib.result import Method
+from ftcalib.routine import drift_check
+from ftdrive.checks.plausibility import judged
+from ftdrive.cli import exit_code
+from ftdrive.commands.common import (
+    EMULATED_SENSOR,
+    JSON,
+    NewFile,
+    Number,
+    check_simulate,
+    index_run,
+    numbers,
+    simulate,
+    stop_unless_accepted,
+    write_json,
+)
+from ftdrive.commands.emulated_run import rehearsed_run
+from ftdrive.errors import BadBundle, ConfigError, NotAccepted
+from ftdrive.runs.bundle import unpacked
+from ftdrive.runs.pose_hints import hints
+from ftdrive.runs.source import Orientation, read_source
+from ftdrive.terminal.console import talk
+from ftdrive.terminal.report import print_comparison, print_result
+
+_METHODS = (
+    *("ml", "srom", "lrom", "carlson-relaxation", "carlson-cayley", "carlson-eigen", "carlson-nullspace"),
+    *("carlson-iterative", "carlson-polynomial", "known-rotation", "yaw-only", "all"),
+)
+_NAMES = "\b\nMETHOD is one of\n" + fill(
+    ", ".join(_METHODS), 76, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
+)
+
+
+@click.command(epilog=_NAMES)
+@click.argument("sources", metavar="DATASET...", nargs=-1, type=click.Path(exists=True, path_type=Path))
+@click.option(
+    "--method",
+    metavar="METHOD",
+    type=click.Choice(_METHODS),
+    default="ml",
+    show_default=True,
+    help="One of those below; all prints them side by side.",
+)
+@click.option(
+    "--orientation",
+    type=click.Choice(["R_base_flange", "R_flange_base"]),
+    default="R_base_flange",
+    show_default=True,
+    help="Rotation in a CSV: flange to base coordinates, or the inverse (as in the papers).",
+)
+@click.option(
+    "--drift",
+    type=click.Choice(["auto", "none", "linear", "random-walk"]),
+    default="auto",
+    show_default=True,
+    help="Model of the bias drift; rows without times count as equally spaced.",
+)
+@click.option("--mass-kg", metavar="KG", type=Number(0, min_open=True), help="Known mass below the sensor.")
+@click.option("--level-deg", metavar="DEG", type=Number(0, 180), help="The base is level within DEG (one sigma).")
+@click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange.")
+@click.option("--output", "-o", type=NewFile(), help="Save the calibration as a new file.")
+@click.option("--force", is_flag=True, help="Save a rejected result too; it stays marked as rejected.")
+@simulate("Solve a short run of an emulated cell.")
+@EMULATED_SENSOR
+@JSON
+def solve(
+    sources: Sequence[Path],
+    method: str,
+    orientation: Orientation,
+    drift: Drift,
+    mass_kg: float | None,
+    level_deg: float | None,
+    mounting_deg: str | None,
+    output: Path | None,
+    force: bool,
+    simulate: bool,
+    sensor: str | None,
+    as_json: bool,
+) -> None:
+    """Solve each DATASET: a run folder, the file of `ftdrive bundle`, a dataset.json, or a CSV file.
+
+    A CSV has a header with r11..r33 (or the rotation vector rx,ry,rz), fx,fy,fz,tx,ty,tz in N and N·m, and optionally
+    t in seconds and sigma_fx..sigma_tz, the standard error of each pose's mean. With --json, one object a line.
+    """
+    check_simulate(simulate, real={"DATASET": sources}, emulated={"--sensor": sensor})
+    if not (sources or simulate):
+        raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
+    if output is not None and (len(sources) > 1 or method == "all"):
+        raise ConfigError("--output takes one result: give one dataset and one method")
+    options = {"drift": drift, "known": known_values(mass_kg, level_deg, mounting_deg)}
+    with rehearsed_run(sensor) if simulate else nullcontext() as run:
+        _solve_each(sources if run is None else [run], method, orientation, options, output, force, as_json)
+    if output is not None and sources and sources[0].is_dir():
+        index_run(sources[0])  # the result, if it was saved in the run
+
+
+def _solve_each(
+    sources: Sequence[Path],
+    method: str,
+    orientation: Orientation,
+    options: dict[str, Any],
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    first_failure: CalibError | NotAccepted | BadBundle | None = None
+    for source in sources:
+        try:
+            with unpacked(source) as place:
+                data = read_source(place, orientation, options["known"])
+                circumstances = dict(data.circumstances)
+                payload_kg = circumstances.pop("payload_kg", None)
+                here = {**options, **circumstances}
+                if method == "all":
+                    _show_all(source, data.dataset, here, as_json)
+                    continue
+                result = _solve(data.dataset, method, {**here, "payload_kg": payload_kg, "provenance": data.provenance})
+                if as_json:
+                    found = list(hints(result, data.records)) if data.records else []
+                    write_json({"source": str(source), "hints": found, **result.to_dict()})
+                else:
+                    print_result(result, drift=drift_check(data.records), records=data.records)
+                if not force:
+                    stop_unless_accepted(result, to_be_saved=output is not None)
+                if output is not None:
+                    result.save(output)
+                    talk.print(f" Saved {output}")
+        except (CalibError, NotAccepted, BadBundle) as error:
+            if len(sources) == 1:
+                raise
+            first_failure = first_failure or error
+            if as_json and not isinstance(error, NotAccepted):
+                write_json({"schema_version": 1, "source": str(source), "error": str(error)})
+            click.echo(f"error: {source}: {error}", err=True)
+    if first_failure is not None:
+        raise SystemExit(exit_code(first_failure))
+
+
+def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) -> CalibrationResult:
+    chosen: Method = method
+    try:
+        return judged(solve_dataset(dataset, chosen, **options))
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _show_all(source: Path, dataset: CalibrationDataset, options: dict[str, Any], as_json: bool) -> None:
+    compared = compare(dataset, **options)
+    if as_json:
+        write_json({"schema_version": 1, "source": str(source), "methods": [one.to_dict() for one in compared]})
+    else:
+        print_comparison(compared)
+
+
+def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: str | None) -> Known | None:
+    """Return the known values of the options in degrees; None without any. Raises `ConfigError`."""
+    if mass_kg is None and level_deg is None and mounting_deg is None:
+        return None
+    R_flange_sensor = None
+    if mounting_deg is not None:
+        rotation_vector = numbers("--mounting-deg", mounting_deg, ",", (3,))
+        R_flange_sensor = Rotation.from_rotvec(rotation_vector, degrees=True).as_matrix()
+    try:
+        return Known(
+            R_flange_sensor=R_flange_sensor,
+            gravity_direction_base=None if level_deg is None else -UP_IN_BASE,
+            direction_tolerance_rad=0.0 if level_deg is None else float(np.radians(level_deg)),
+            mass_kg=mass_kg,
+        )
+    except ValueError as error:
+        raise ConfigError(str(error)) from error

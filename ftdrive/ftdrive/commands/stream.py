@@ -1,0 +1,128 @@
+"""`ftdrive stream`: the compensated wrench for Foxglove, Lichtblick and PlotJuggler."""
+
+import socket
+from collections.abc import Sequence
+from contextlib import ExitStack, closing
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ftdrive.commands.common import (
+    CALIBRATION_OR_TOOL,
+    CELL,
+    FRAME,
+    check_simulate,
+    host_and_port,
+    is_loopback,
+    read_frame,
+    simulate,
+)
+from ftdrive.commands.live_source import open_source
+from ftdrive.live.processing import ProcessedStream
+from ftdrive.live.samples import Axes
+from ftdrive.live.stream import CompensatedStream
+from ftdrive.servers.udp import UdpSender
+from ftdrive.terminal.console import talk
+from ftdrivers.errors import DriverError
+
+if TYPE_CHECKING:
+    from ftdrive.servers.foxglove import FoxgloveServer
+
+RECOVER_S = 10.0
+"""So long a device may be silent: the viewers stay connected. Then the command ends."""
+
+
+@click.command()
+@CALIBRATION_OR_TOOL
+@CELL
+@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@FRAME
+@click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve at. Another one is unprotected.")
+@click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Port; 0 is a free one.")
+@click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
+def stream(
+    path: Path | None,
+    tool: str | None,
+    force: bool,
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    simulate: bool,
+    axes: Axes,
+    about: str,
+    host: str,
+    port: int,
+    udp: str | None,
+) -> None:
+    """Serve the raw and the compensated wrench to viewers.
+
+    Foxglove, Lichtblick and PlotJuggler from 3.16 connect to one WebSocket server. They receive every sample of the
+    sensor, poses, joint angles, frames, arrows and events, and can tare and change frame and stages. The arm is only
+    read, never moved. Ctrl-C ends.
+    """
+    from ftdrive.servers.foxglove import FoxgloveServer
+
+    check_simulate(simulate, real={"--config": config, "--robot": robot})
+    frame = read_frame(axes, about)
+    udp_address = None if udp is None else host_and_port("--udp", udp, "127.0.0.1:9870")
+    with ExitStack() as stack:
+        source, _ = open_source(
+            path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
+        )
+        server = stack.enter_context(closing(FoxgloveServer(source, host, port)))
+        sinks: list[FoxgloveServer | UdpSender] = [server]
+        if udp_address is not None:
+            sinks.append(stack.enter_context(closing(UdpSender(source.info, *udp_address))))
+        _introduce(source, server, host, udp_address)
+        serve(source, sinks)
+
+
+def serve(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
+    """Send blocks and events until Ctrl-C is pressed, or a device is silent for `RECOVER_S`."""
+    silent_since_s: float | None = None
+    try:
+        while True:
+            try:
+                block = source.read()
+            except DriverError as error:
+                now_s = source.clock.now_s()
+                if silent_since_s is None:
+                    silent_since_s = now_s
+                    talk.print(f"{error}. Viewers stay connected for {RECOVER_S:g} s.")
+                elif now_s - silent_since_s > RECOVER_S:
+                    raise
+            else:
+                if silent_since_s is not None:
+                    silent_since_s = None
+                    talk.print("Samples arrive again.")
+                for sink in sinks:
+                    sink.write(block)
+            _send_events(source, sinks)
+    finally:
+        _send_events(source, sinks)
+
+
+def _send_events(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
+    for event in source.take_events():
+        for sink in sinks:
+            sink.event(event)
+
+
+def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp: tuple[str, int] | None) -> None:
+    """Print what is served, and how to open it."""
+    name = socket.gethostname() if host in ("0.0.0.0", "::") else host
+    url = f"ws://{f'[{name}]' if ':' in name else name}:{server.port}"
+    talk.print(f"Serving the wrench in {source.frame}; {source.info.calibration_name}.")
+    talk.print(f"  Foxglove, Lichtblick:  Open connection > Foxglove WebSocket > {url}")
+    talk.print(f"  PlotJuggler from 3.16: Streaming > Foxglove Bridge > {url}")
+    if udp is not None:
+        talk.print(f"  PlotJuggler before:    Streaming > UDP Server > port {udp[1]}, JSON, use the timestamp")
+    if is_loopback(host):
+        talk.print(f"  In a browser:          {server.app_url}")
+    else:
+        talk.print(
+            f"Unprotected: any computer that reaches port {server.port} can read the stream, tare it and change its "
+            "frame and stages. There is no password and no encryption."
+        )
+    talk.print("Ctrl-C ends.")

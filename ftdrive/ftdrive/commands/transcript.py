@@ -1,0 +1,200 @@
+"""`ftdrive transcript`: record the bytes on a sensor's wire, and play them to the driver."""
+
+import math
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import click
+import numpy as np
+
+from ftdrive.cell.config import clock_in_force
+from ftdrive.cell.emulated import EMULATED, sensor_name, sensor_reached
+from ftdrive.checks.computer import SensorAddress
+from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
+from ftdrive.errors import ConfigError
+from ftdrive.runs.run import versions
+from ftdrive.terminal.console import talk
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, DeviceTimeout, ProtocolError
+from ftdrivers.interfaces import ForceTorqueSensor
+from ftdrivers.registry import BadUrl, sensor_from_url
+from ftdrivers.transcript.player import Player
+from ftdrivers.transcript.recorder import INTERRUPTED, BadTranscript, Transcript, Writer
+from ftdrivers.transcript.taps import recording
+
+_PIECE_S = 60.0
+"""A `collect` holds a million samples: 143 s of an ATI sensor on a serial port."""
+_TAIL_S = 0.3
+"""Recorded beyond the duration, so that a replay which begins a little later still has enough."""
+
+
+@click.group()
+def transcript() -> None:
+    """Record the bytes on a sensor's wire, or play them to the driver: a bug report becomes a test.
+
+    For sensors on a serial port or a CAN bus, and Net F/T. The arm's own sensor is not recorded.
+    """
+
+
+@transcript.command()
+@click.option("--sensor", metavar="URL", help="Such as ati-serial:///dev/serial/by-id/NAME.")
+@simulate("An emulated sensor, on RS-485 from ATI unless --sensor emulated://NAME names another.")
+@click.option("-o", "--output", "path", required=True, type=NewFile(), help="A new file.")
+@click.option("--duration", "duration_s", type=Number(0.1, 600), default=5.0, show_default=True, help="Seconds.")
+@JSON
+def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as_json: bool) -> None:
+    """Record all bytes between the driver and its sensor, from opening to closing.
+
+    Only the driver's own requests are sent. If the sensor fails, the transcript of the failure is kept.
+    """
+    if simulate:
+        sensor = _emulated(sensor)
+    if sensor is None:
+        raise ConfigError("no sensor is given: add --sensor URL or --simulate")
+    url, seen = _record(sensor, path, duration_s)
+    if as_json:
+        write_json({"schema_version": 1, "file": str(path), "url": url, "recorded": seen})
+    else:
+        talk.print(_words(seen))
+
+
+def _emulated(sensor: str | None) -> str:
+    return EMULATED + sensor_name(sensor or f"{EMULATED}serial")
+
+
+def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) -> tuple[str, dict[str, Any]]:
+    """Record; return the address of the driver, and what it received. A file that is `kept` is named on the screen."""
+    if sensor.startswith("ur-ft:") or sensor == f"{EMULATED}ur-ft":  # rejected before an emulated one starts
+        raise ConfigError(
+            f"{sensor} is read over RTDE, which is not recorded: capture TCP port 30004 of the arm with Wireshark"
+        )
+    url, clock = sensor_reached(sensor, clock_in_force())
+    address = SensorAddress.of(url)
+    if address.serial_port is None and address.scheme != "ati-netft" and not address.scheme.endswith("-can"):
+        raise ConfigError(
+            f"{sensor} is neither on a serial port or a CAN bus nor an ati-netft: only these can be recorded; capture "
+            "others with Wireshark"
+        )
+    device = _sensor(url, clock)
+    header = {
+        "url": url,
+        "duration_s": duration_s,
+        "utc": datetime.now(UTC).isoformat(),
+        "t_ns": clock.now_ns(),  # of the same moment as `utc`: the anchor of all lines
+        "versions": versions(),
+    }
+    writer = Writer(path, header, clock)
+    seen: dict[str, Any] = {"error": INTERRUPTED}
+    try:
+        with recording(writer), device:
+            whole = _watch(device, duration_s)
+            device.collect(_TAIL_S)
+        seen = whole
+    except Exception as error:
+        seen = {"error": f"{type(error).__name__}: {error}"}
+        raise
+    finally:
+        if not writer.has_port and seen["error"] in {None, INTERRUPTED}:  # a port that does not open is worth a report
+            writer.discard()
+        else:
+            writer.end(**seen)
+            if kept:
+                talk.print(f" Saved {path}")
+    if not writer.has_port:
+        raise ConfigError(
+            f"the driver of {sensor} uses neither pyserial nor python-can nor pynetft: only these can be recorded"
+        )
+    return url, seen
+
+
+@transcript.command()
+@click.argument("file", required=False, type=FILE)
+@simulate("Record a second of an emulated sensor first, and play that.")
+@EMULATED_SENSOR
+@JSON
+def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
+    """Play the transcript FILE to the unmodified driver, and print what the driver measures this time.
+
+    A recording that was interrupted is played to its end.
+    """
+    check_simulate(simulate, real={"FILE": file}, emulated={"--sensor": sensor})
+    clock = clock_in_force()
+    if simulate:
+        _, clock = sensor_reached(_emulated(sensor))
+        with TemporaryDirectory(prefix="ftdrive-") as folder:
+            path = Path(folder) / "sensor.jsonl"
+            _record(_emulated(sensor), path, 1.0, kept=False)
+            loaded = Transcript.load(path)
+    elif file is not None:
+        loaded = Transcript.load(file)
+    else:
+        raise ConfigError("no transcript is given: add its FILE, or --simulate")
+    player = Player(loaded, clock)
+    with player as port:
+        device = _sensor(loaded.url_at(port), clock)
+        duration_s = float(loaded.header["duration_s"])
+        try:
+            with device:
+                if loaded.is_broken_off:
+                    duration_s = min(duration_s, player.left_s - _TAIL_S)
+                played = _watch(device, duration_s)
+        except Exception as error:
+            if player.divergence:
+                raise ProtocolError(f"{error}; the transcript does not answer: {player.divergence}") from error
+            silent = isinstance(error, ConnectError | DeviceTimeout)
+            if silent and loaded.is_broken_off and player.left_s < _TAIL_S:
+                raise BadTranscript(
+                    f"the recording was broken off before there was anything to measure ({error}): record it again"
+                ) from error
+            raise
+    recorded = {key: value for key, value in loaded.end.items() if key not in {"event", "t_ns"}}
+    if as_json:
+        write_json({"schema_version": 1, "url": loaded.header["url"], "recorded": recorded, "played": played})
+    else:
+        talk.print(f" recorded  {_words(recorded)}")
+        talk.print(f" played    {_words(played)}")
+    if duration_s < loaded.header["duration_s"]:
+        whole_s = loaded.header["duration_s"]
+        talk.print(f" The recording was broken off: {duration_s:.3g} s of {whole_s:g} s were played.")
+
+
+def _sensor(url: str, clock: Clock) -> ForceTorqueSensor:
+    try:
+        return sensor_from_url(url, clock=clock)
+    except BadUrl as error:
+        raise ConfigError(str(error)) from error
+
+
+def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:
+    """Collect from an open sensor, in pieces because a `collect` is bounded; with the sensor's own sign."""
+    pieces = math.ceil(duration_s / _PIECE_S)
+    samples, total = 0, np.zeros(6)
+    for _ in range(pieces):
+        wrench = device.collect(duration_s / pieces).wrench
+        samples, total = samples + len(wrench), total + wrench.sum(axis=0)
+    if not samples:
+        raise DeviceTimeout(f"no sample came in {duration_s:g} s: record for longer, with --duration")
+    force_N, torque_Nm = np.split(total / samples, 2)
+    return {
+        "error": None,
+        "identity": asdict(device.identify()),
+        "duration_s": duration_s,
+        "samples": samples,
+        "lost": device.health().lost,
+        "mean_force_N": force_N.tolist(),
+        "mean_torque_Nm": torque_Nm.tolist(),
+    }
+
+
+def _words(seen: dict[str, Any]) -> str:
+    if "identity" not in seen:
+        return str(seen.get("error", "broken off"))
+    force, torque = (
+        ", ".join(f"{value:.{digits}f}" for value in seen[key])
+        for key, digits in (("mean_force_N", 3), ("mean_torque_Nm", 4))
+    )
+    who = seen["identity"]
+    return f"{who['model']}, serial {who['serial']}: {seen['samples']} samples, mean ({force}) N, ({torque}) N·m"

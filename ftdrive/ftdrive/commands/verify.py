@@ -1,0 +1,281 @@
+"""`ftdrive verify`: fresh poses against the prediction of a calibration."""
+
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from ftdrive.commands.common import (
+    CALIBRATION,
+    CELL,
+    FOLDER,
+    YES,
+    Number,
+    check_simulate,
+    index_run,
+    read_cell,
+    runs,
+    simulate,
+    stop_unless_accepted,
+    write_json,
+)
+from ftdrive.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ftcalib import CalibrationResult
+    from ftdrive.cell.config import CellConfig
+    from ftdrive.cell.emulated import Station
+    from ftdrive.runs.run import Run
+    from ftdrive.runs.verified import AcceptanceLimits, Verified
+    from ftdrive.session.session import Options
+
+Answer = Literal["ask", "no", "yes"]
+
+
+@click.command()
+@CALIBRATION
+@CELL
+@simulate(
+    "Use the emulated cell of the calibration, or calibrate one first; --sensor emulated://NAME chooses its sensor."
+)
+@click.option("--quick", is_flag=True, help="2 poses instead of 6, at the plan's speeds after one complete slow run.")
+@click.option("--poses", type=click.IntRange(2, 24), help="Number of poses.")
+@click.option("--max-force", "force_N", type=Number(0, min_open=True), metavar="N", help="Largest difference, N.")
+@click.option(
+    "--max-torque", "torque_Nm", type=Number(0, min_open=True), metavar="N·m", help="Largest difference, N·m."
+)
+@click.option("--manual", is_flag=True, help="No motion commands: you move the arm.")
+@click.option(
+    "--update",
+    type=click.Choice(["ask", "no", "yes"]),
+    default="ask",
+    show_default=True,
+    help="If something has changed: whether to save the smallest sufficient update as a new calibration.",
+)
+@click.option("--resume", type=FOLDER, help="Continue an interrupted verification in its mode.")
+@YES
+@runs()
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line: events, questions, the result.")
+def verify(
+    path: Path | None,
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    simulate: bool,
+    quick: bool,
+    poses: int | None,
+    force_N: float | None,
+    torque_Nm: float | None,
+    manual: bool,
+    update: Answer,
+    resume: Path | None,
+    yes: bool,
+    runs: Path,
+    as_json: bool,
+) -> None:
+    """Compare fresh poses, far from those of the calibration, with its prediction.
+
+    The session is that of `calibrate`: a certified plan, checks, safety questions, guards. Without --max-force and
+    --max-torque, 1 % of unchanged cells fail. If it fails, it names what has changed, offers the smallest sufficient
+    update, and ends with exit code 7.
+    """
+    from ftdrive.errors import Declined, NotAccepted
+    from ftdrive.runs.verified import AcceptanceLimits
+    from ftdrive.session.session import Options
+    from ftdrive.terminal.console import talk
+
+    check_simulate(simulate, real={"--config": config, "--robot": robot})
+    wanted = _wanted(path, quick, poses, AcceptanceLimits(force_N, torque_Nm), resume)
+    options = Options(
+        runs,
+        "verify",
+        poses=wanted.poses,
+        mode="manual" if manual else "auto",
+        fast=wanted.quick,
+        resume=resume,
+        real=not simulate,
+        yes=yes,
+    )
+    with ExitStack() as stack:
+        station, path = None, wanted.path
+        if simulate:
+            station, path = _emulated(stack, path, sensor, runs)
+        elif path is None:
+            raise ConfigError("no calibration: give --calibration PATH, or --simulate")
+        cell = read_cell(config, robot, sensor) if station is None else station.cell
+        try:
+            verified = verify_cell(cell, path, wanted, options, station, update=update, as_json=as_json)
+        except Declined as error:
+            talk.print(str(error))
+            raise click.Abort from error
+    if not verified.passed:
+        raise NotAccepted(f"the verification failed: {failure_in_words(verified)}")
+
+
+def verify_cell(
+    cell: "CellConfig",
+    path: Path,
+    wanted: "Wanted",
+    options: "Options",
+    station: "Station | None" = None,
+    *,
+    update: Answer = "ask",
+    as_json: bool = False,
+) -> "Verified":
+    """Guide the operator through the poses, compare them with a calibration, report, and add the run to the store.
+
+    Parameters
+    ----------
+    cell : CellConfig
+    path : Path
+        The calibration file or its run folder.
+    wanted : Wanted
+    options : Options
+        Of the session.
+    station : Station, optional
+        The emulated cell that `cell` describes.
+    update : "ask", "no" or "yes"
+        Whether to save the smallest sufficient update.
+    as_json : bool
+        Print events, questions and the outcome as JSON.
+
+    Raises
+    ------
+    Declined
+        The operator ended the session.
+    NotAccepted, PlanRefused, ConfigError, DriverError, OSError
+        As `ftdrive.session.session.take_poses`.
+    """
+    from ftdrive.runs.verified import verify_run
+
+    if wanted.quick:  # 12 s of noise would take longer than the poses
+        cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
+    run, calibration, path = _take_poses(cell, station, path, wanted, options, as_json=as_json)
+    verified = verify_run(run, calibration, path, wanted.limits)
+    _report(verified, update, as_json=as_json)
+    index_run(run.folder, cell if station is None else None)
+    return verified
+
+
+def failure_in_words(verified: "Verified") -> str:
+    """Return why a verification failed."""
+    return "; ".join(verified.exceeded if verified.limits.given else (verified.verification.reason,))
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What is verified, and how; the run keeps it, so that --resume continues alike."""
+
+    path: Path | None
+    poses: int
+    quick: bool
+    limits: "AcceptanceLimits"
+
+
+def _wanted(
+    path: Path | None, quick: bool, poses: int | None, limits: "AcceptanceLimits", resume: Path | None
+) -> Wanted:
+    from ftdrive.runs.run import Run
+    from ftdrive.runs.verified import AcceptanceLimits
+    from ftdrive.session.verification import POSES, QUICK_POSES
+
+    if quick and poses is not None:
+        raise ConfigError("--quick and --poses exclude one another: leave one of them out")
+    if resume is None:
+        return Wanted(path, poses or (QUICK_POSES if quick else POSES), quick, limits)
+    given = {"--calibration": path, "--quick": quick, "--poses": poses, "--max-force or --max-torque": limits.given}
+    if wrong := [option for option, value in given.items() if value]:
+        raise ConfigError(f"--resume continues with the options of its run: leave out {' and '.join(wrong)}")
+    run = Run(resume)
+    if run.command != "verify":
+        raise ConfigError(f"{resume} is not a verification: continue it with {run.resume_command}")
+    begun = run.header()["verification"]
+    return Wanted(Path(begun["path"]), begun["poses"], begun["quick"], AcceptanceLimits(**begun["limits"]))
+
+
+def _take_poses(
+    cell: "CellConfig",
+    station: "Station | None",
+    path: Path,
+    wanted: Wanted,
+    options: "Options",
+    *,
+    as_json: bool,
+) -> tuple["Run", "CalibrationResult", Path]:
+    """Guide the operator through the poses; return the run, and the calibration with its file."""
+    from ftdrive.cell.emulated import MOVED_BY
+    from ftdrive.commands.emulated_run import described
+    from ftdrive.live.stream import load_calibration
+    from ftdrive.runs.run import Run
+    from ftdrive.session.session import take_poses, with_recorded_mode
+    from ftdrive.session.verification import Verifying
+    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.screen import open_operator
+
+    calibration = load_calibration(path)
+    path = Run(path).calibration_path if path.is_dir() else path
+    about = {**asdict(wanted), "id": calibration.id, "path": str(path.absolute())}
+    description = {"verification": about}
+    if station is not None:
+        description |= described(station)
+        if mover := MOVED_BY.get(with_recorded_mode(options).mode):
+            request, words = mover
+            station.control(**request)
+            talk.print(f"The cell is emulated: {words}.")
+    task = Verifying(calibration, path, wanted.poses, options.runs)
+    with open_operator(as_json=as_json, command=task.command) as operator:
+        run = take_poses(cell, operator, replace(options, description=description), task)
+    if run is None:
+        raise RuntimeError("a verification is never a dry run")
+    return run, calibration, path
+
+
+def _report(verified: "Verified", update: Answer, *, as_json: bool) -> None:
+    """Print the outcome; save the update if it is wanted."""
+    from ftdrive.runs.verified import save_update
+    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.verification_text import print_verification
+
+    if not as_json:
+        print_verification(verified)
+    saved = save_update(verified) if _wants_update(verified, update, as_json=as_json) else None
+    if as_json:
+        write_json({**verified.to_dict(), "file": str(verified.path), "saved": None if saved is None else str(saved)})
+    elif saved is not None:
+        talk.print(f" Saved {saved}: {verified.update_name} updated, parent {verified.calibration.id[:6]}")
+
+
+def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Path) -> tuple["Station", Path]:
+    """Start the cell of a calibration, or calibrate a new one; return it with the path of its calibration."""
+    from ftdrive.cell.emulated import Station
+    from ftdrive.commands.emulated_run import rehearse
+    from ftdrive.live.stream import load_calibration
+
+    made_by = None if path is None else load_calibration(path).provenance.get("station")
+    station = stack.enter_context(Station.of(made_by, sensor))
+    if path is None:
+        outcome = rehearse(station, runs, "simulated", poses=6)
+        stop_unless_accepted(outcome.result, to_be_saved=True)
+        path = outcome.run.calibration_path
+    return station, path
+
+
+def _wants_update(verified: "Verified", update: Answer, *, as_json: bool) -> bool:
+    """Whether to save the update; without an answer, no."""
+    from ftdrive.errors import Declined
+    from ftdrive.session.operator import Question
+    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.operators import JsonOperator, PlainOperator
+
+    if verified.passed or verified.update is None or update == "no":
+        return False
+    if update == "yes":
+        return True
+    operator = JsonOperator() if as_json else PlainOperator(quiet=talk.quiet)
+    text = f"An update of the {verified.update_name} is sufficient. Save it as a new calibration?"
+    try:
+        return operator.ask(Question(text)) == "yes"
+    except Declined:
+        return False

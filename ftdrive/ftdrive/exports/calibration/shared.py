@@ -1,0 +1,55 @@
+"""Values that several targets need, in the frames that the settings name."""
+
+import warnings
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult
+from ftcalib.model import Array
+from ftdrive.exports.calibration.settings import Settings
+from ftdrive.exports.calibration.text import numbers
+
+
+def gravity_m_s2(calibration: CalibrationResult) -> Array:
+    """Return gravity (3,) in axes of the controller's base, pointing down, m/s²; along -z if nothing hangs."""
+    if calibration.mass_kg == 0.0:
+        return np.array([0.0, 0.0, -calibration.g_m_s2])
+    return calibration.gravity_force_base_N / calibration.mass_kg
+
+
+def gravity_in_frame_m_s2(calibration: CalibrationResult, settings: Settings) -> Array:
+    """Return gravity (3,) in axes of the frame `settings.base_frame`, m/s²."""
+    return settings.R_frame_base @ gravity_m_s2(calibration)
+
+
+def R_frame_sensor(calibration: CalibrationResult, settings: Settings) -> Array:
+    """Return the orientation (3, 3) of the sensor in the frame `settings.flange_frame`."""
+    return settings.R_frame_flange @ calibration.R_flange_sensor
+
+
+def rpy_rad(R: Array) -> list[float]:
+    """Return a rotation as URDF has it: roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # at a pitch of 90 degrees roll is set to zero
+        return numbers(Rotation.from_matrix(R).as_euler("xyz"))
+
+
+def quaternion_xyzw(R: Array) -> list[float]:
+    """Return a rotation as a quaternion, scalar last and not negative."""
+    return numbers(Rotation.from_matrix(R).as_quat(canonical=True))
+
+
+def world_note(settings: Settings) -> str:
+    """Say in which axes gravity is, for simulations."""
+    return f"Gravity is in axes of {settings.base_frame}, {settings.base_axes}: turn it if those of the world differ."
+
+
+def frame_note(calibration: CalibrationResult, settings: Settings) -> str:
+    """Say how the robot model must turn the sensor frame, for targets that look it up there."""
+    rpy = ", ".join(f"{angle:.6g}" for angle in rpy_rad(R_frame_sensor(calibration, settings)))
+    return (
+        f"The robot model must turn {settings.sensor_frame} against {settings.flange_frame} by roll, pitch, yaw = "
+        f"({rpy}) rad: the formats urdf and static-transform write it. {settings.base_frame} must have the axes of "
+        f"{settings.base_axes}."
+    )

@@ -1,0 +1,152 @@
+"""Compensate many recordings, each in a call of its own.
+
+FOLDER/<name of the recording>   the result, in the format of the recording
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory, gettempdir
+from typing import Any
+
+from ftcalib import CalibrationResult
+from ftcalib.files import write_new
+from ftdrive import __version__
+from ftdrive.errors import BadRecording, ConfigError
+from ftdrive.fleet.workers import OtherVersion, Workers, answers, in_words, require_version
+from ftdrive.live.samples import WrenchFrame
+from ftdrive.live.stream import load_calibration
+from ftdrive.recording.compensation import compensated, read_with_calibration
+from ftdrive.recording.files import ENDINGS, format_of
+from ftdrive.recording.recording import frame_of
+
+
+def recordings_of(paths: Iterable[Path]) -> list[Path]:
+    """Return the recordings among these paths, and those directly in these folders, each once and by name.
+
+    Raises
+    ------
+    ConfigError
+        A file has another ending or is incomplete, a folder contains no recording, or a package is missing.
+    """
+    found = set[Path]()
+    for path in paths:
+        if path.suffix == ".partial":
+            raise ConfigError(f"{path} is incomplete: save it with `ftdrive convert`, and name the new file")
+        files = [one for one in path.iterdir() if one.suffix in ENDINGS and one.is_file()] if path.is_dir() else [path]
+        if not files:
+            raise ConfigError(f"{path} contains no .mcap, .csv or .parquet file: name a folder of recordings")
+        for one in files:
+            format_of(one)
+            found.add(one.parent.resolve() / one.name)
+    return sorted(found)
+
+
+def require_own_results(recordings: Iterable[Path], folder: Path) -> None:
+    """Raise `ConfigError` if two results would have the same path, or a result that of its recording."""
+    seen = dict[str, Path]()
+    for one in recordings:
+        if (other := seen.setdefault(one.name, one)) is not one:
+            raise ConfigError(f"{other} and {one} have the same name: compensate them into two folders")
+        if one.parent == folder.resolve():
+            raise ConfigError(f"the result of {one} would have the path of the recording: choose another folder")
+
+
+def task_of(calibration: Path | None, frame: WrenchFrame, bias: str) -> bytes:
+    """Return what `compensated_file` needs beside the recording, as JSON.
+
+    Parameters
+    ----------
+    calibration : Path, optional
+        A calibration.json or its run folder; without it each recording uses its own.
+    frame : WrenchFrame
+        Of the results.
+    bias : str
+        "keep", or "estimate" from each recording.
+
+    Raises
+    ------
+    BadCalibration, OSError
+        The calibration cannot be read.
+    """
+    document = None if calibration is None else load_calibration(calibration).to_dict()
+    given = {"calibration": document, "calibration_name": str(calibration), "bias": bias, **frame.to_dict()}
+    return json.dumps({"version": __version__, **given}).encode()
+
+
+def compensated_file(recording: bytes, name: str, task: bytes) -> bytes:
+    """Return the file of the result and a line of JSON: a pure function of its arguments and the installed versions.
+
+    The line has what `ftdrive.recording.compensation.compensated` returns, and `cut` of the recording.
+
+    Raises
+    ------
+    OtherVersion
+        The task was made by another version.
+    BadRecording, ConfigError, CalibError
+        The recording cannot be compensated in this way.
+    OSError
+        The temporary folder of the worker cannot be written.
+    """
+    given: dict[str, Any] = json.loads(task)
+    require_version(given["version"])
+    try:
+        with TemporaryDirectory(prefix="ftdrive-compensate-") as folder:
+            source, output = Path(folder) / name, Path(folder) / f"result{Path(name).suffix}"
+            source.write_bytes(recording)
+            try:
+                numbers = _compensated(source, output, given)
+            except (BadRecording, ConfigError) as error:  # the temporary folder means nothing to a user
+                raise type(error)(str(error).removeprefix(f"{source}: ").replace(str(source), name)) from error
+            with output.open("ab") as file:
+                file.write(b"\n" + json.dumps(numbers).encode())
+            return output.read_bytes()
+    except OSError as error:
+        raise OSError(f"{gettempdir()} on the worker: {error}: make room there, or set TMPDIR") from error
+
+
+def _compensated(source: Path, output: Path, given: dict[str, Any]) -> dict[str, Any]:
+    document = given["calibration"]
+    calibration = None if document is None else CalibrationResult.from_dict(document)
+    recording = read_with_calibration(source, calibration, given["calibration_name"])
+    numbers = compensated(recording, frame_of(given), output, estimate_bias=given["bias"] == "estimate")
+    return {**numbers, "cut": recording.cut}
+
+
+def compensate_all(
+    recordings: Sequence[Path], folder: Path, task: bytes, workers: Workers
+) -> Iterator[tuple[Path, dict[str, Any] | str]]:
+    """Compensate recordings into a folder; yield each as it comes with its numbers, or why it failed.
+
+    A file is written whole or not at all, so everything that was yielded remains when the caller stops. Two recordings
+    for each worker are in memory at a time.
+
+    Raises
+    ------
+    OtherVersion
+        A worker has another version.
+    """
+
+    def arguments(recording: Path) -> tuple[bytes, str, bytes]:
+        return recording.read_bytes(), recording.name, task
+
+    alone = replace(workers, group=1)  # a recording is large
+    for recording, answer in answers(compensated_file, arguments, recordings, alone):
+        if isinstance(answer, OtherVersion):
+            raise answer
+        if isinstance(answer, BaseException):
+            yield recording, in_words(answer)
+        else:
+            yield recording, _saved(folder / recording.name, answer)
+
+
+def _saved(path: Path, answer: bytes) -> dict[str, Any] | str:
+    """Write a result; return its numbers, or why it cannot be written."""
+    content, _, line = answer.rpartition(b"\n")
+    try:
+        write_new(path, content)
+    except OSError as error:
+        return in_words(error)
+    numbers: dict[str, Any] = json.loads(line)
+    return numbers

@@ -1,0 +1,197 @@
+"""What several results show together: wrong payloads, moved bases, late verifications."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Final
+
+import numpy as np
+from scipy.special import chdtrc as chi2_sf
+
+from ftcalib.model import Array, skew
+from ftdrive.fleet.observed import Observed, when
+from ftdrive.fleet.state import CellState, Finding
+from ftdrive.fleet.temperature import temperature_findings
+from ftdrive.fleet.words import listed
+from ftdrive.store.records import StoredResult
+
+SIGMAS: Final = 4.0
+ALIKE_M, WRONG_M = 0.003, 0.005
+"""Centres of mass of one tool are alike within the first, that of a payload is wrong from the second on; or 4 sigma,
+if that is more."""
+ALIKE_SHARE, WRONG_SHARE, WRONG_KG = 0.03, 0.1, 0.1
+"""Likewise masses. A mass is wrong by the larger of share and kg."""
+MOST_SENSOR_KG: Final = 1.0
+"""Of sensor and adapter, which a payload includes and the identified mass does not."""
+TILTED_RAD: Final = np.deg2rad(0.1)
+TILT_FLOOR_RAD: Final = np.deg2rad(0.02)
+"""Added to the sigma of a tilt: postures of an arm bend it differently."""
+SURE: Final = 1e-4
+"""Largest p-value of a turned base: one in 50 fleets of 200 cells shows one by chance."""
+LATE: Final = timedelta(days=1)
+"""A verification that is due today is not late yet."""
+
+
+def findings(observed: Observed, states: Sequence[CellState]) -> tuple[Finding, ...]:
+    """Return all findings."""
+    newest = [(cell.name, one) for cell in observed.cells for one in observed.newest(cell)]
+    return (
+        *_overdue(states, observed),
+        *_bases(observed),
+        *_payloads(newest),
+        *temperature_findings(observed),
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------ schedule
+
+
+def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[Finding]:
+    late = [(one.due, one.cell) for one in states if one.due is not None and one.due + LATE < observed.now]
+    if late:
+        due, worst = min(late)
+        cells = tuple(sorted({cell for _, cell in late}))
+        days = (observed.now - due).days
+        what = f"The verification of {worst} is late by {days} d"
+        if len(cells) > 1:
+            what = f"The verifications of {listed(cells)} are late, that of {worst} by {days} d"
+        yield Finding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
+
+
+# ---------------------------------------------------------------------------------------------------------------- base
+
+
+def _bases(observed: Observed) -> Iterator[Finding]:
+    """Yield the cells whose base has turned between the newest calibration and the one before.
+
+    An update that copies the direction of gravity shows nothing.
+    """
+    for name, results in observed.results.items():
+        seen = list[StoredResult]()
+        for one in reversed(results):
+            if not seen or _turned(one, seen[0])[0] > 1e-9:
+                seen.append(one)
+            if len(seen) == 2:
+                angle, p_value = _turned(*reversed(seen))
+                if angle > TILTED_RAD and p_value < SURE:
+                    yield Finding(
+                        "base",
+                        (name,),
+                        f"{name}: gravity has turned by {np.rad2deg(angle):.2f}° in the base between the calibrations "
+                        f"of {when(one):%Y-%m-%d} and {when(seen[0]):%Y-%m-%d}: check the bolts and the frame under "
+                        "the base, then calibrate its other tools again",
+                    )
+                break
+
+
+def _turned(before: StoredResult, after: StoredResult) -> tuple[float, float]:
+    """Return the angle in rad between two directions of gravity, and its p-value if the base has not moved."""
+    forces = [one.numbers["gravity_force_base_N"] for one in (before, after)]
+    weights = [float(np.linalg.norm(force)) for force in forces]
+    if not min(weights) > 0:
+        return 0.0, 1.0
+    old, new = (np.array(force) / weight for force, weight in zip(forces, weights, strict=True))
+    angle = float(np.arctan2(np.linalg.norm(np.cross(old, new)), old @ new))
+    if angle <= TILTED_RAD:
+        return angle, 1.0
+    across = np.linalg.svd(skew(old))[0][:, :2]  # (3, 2)
+    covariance = TILT_FLOOR_RAD**2 * np.eye(2)
+    for one, weight in zip((before, after), weights, strict=True):
+        covariance += across.T @ one.covariance[3:6, 3:6] @ across / weight**2
+    change = across.T @ (new - old)
+    return angle, float(chi2_sf(2, change @ np.linalg.solve(covariance, change)))
+
+
+# ------------------------------------------------------------------------------------------------------------- payload
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Load:
+    """A tool as one cell has identified it, and as its controller has it."""
+
+    cell: str
+    mass_kg: float
+    mass_sigma_kg: float
+    off_axis_m: Array
+    """(2,) identified centre of mass of the tool, flange axes."""
+    off_axis_sigma_m: Array
+    payload_kg: float
+    configured_off_axis_m: Array | None
+    """(2,) the centre that the payload amounts to, if sensor and adapter are centred on the axis of the flange."""
+
+
+def _payloads(newest: Sequence[tuple[str, StoredResult]]) -> Iterator[Finding]:
+    """Yield the tools that several cells identify alike, and whose controllers have another mass or centre."""
+    tools = dict[str, list[_Load]]()
+    for cell, one in newest:
+        if one.tool is not None and one.payload_kg is not None and one.mass_kg > 0:
+            tools.setdefault(one.tool, []).append(_load(cell, one, one.payload_kg))
+    for tool, loads in tools.items():
+        if len(loads) > 1:
+            yield from _centre(tool, loads)
+            yield from _mass(tool, loads)
+
+
+def _load(cell: str, one: StoredResult, payload_kg: float) -> _Load:
+    """Sensor and adapter drop out of the moment about the axis, whatever their mass and height."""
+    R, covariance = np.array(one.numbers["R_flange_sensor"]), one.covariance
+    arm_m = R @ np.array(one.numbers["p_sensor_com_m"])
+    J = np.concatenate([-skew(arm_m), R], axis=1)  # by the rotation about the flange axes, and by the centre
+    rows = np.r_[0:3, 9:12]
+    sigma = np.sqrt(np.diag(J @ covariance[np.ix_(rows, rows)] @ J.T))
+    com = one.payload_com_m
+    configured = None if com is None else np.array(com[:2]) * payload_kg / one.mass_kg
+    return _Load(cell, one.mass_kg, one.mass_sigma_kg, arm_m[:2], sigma[:2], payload_kg, configured)
+
+
+def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
+    centre = np.median([one.off_axis_m for one in loads], axis=0)
+    alike = [one for one in loads if (abs(one.off_axis_m - centre) <= _either(ALIKE_M, one.off_axis_sigma_m)).all()]
+    wrong = [
+        one
+        for one in alike
+        if one.configured_off_axis_m is not None
+        and (abs(one.configured_off_axis_m - one.off_axis_m) > _either(WRONG_M, one.off_axis_sigma_m)).any()
+    ]
+    yield from _wrong_payloads(
+        wrong,
+        lambda first, cells: (
+            f"The tool {tool} has its centre of mass {_mm(centre)} mm off the flange axis in {cells} alike. "
+            f"The payloads of their controllers amount to others, such as {_mm(first.configured_off_axis_m)} mm"
+        ),
+    )
+
+
+def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
+    mass_kg = float(np.median([one.mass_kg for one in loads]))
+    wrong = []
+    for one in loads:
+        margin_kg = max(WRONG_KG, WRONG_SHARE * one.mass_kg, SIGMAS * one.mass_sigma_kg)
+        above_kg = one.payload_kg - one.mass_kg
+        alike = abs(one.mass_kg - mass_kg) <= max(ALIKE_SHARE * mass_kg, SIGMAS * one.mass_sigma_kg)
+        if alike and not -margin_kg <= above_kg <= MOST_SENSOR_KG + margin_kg:
+            wrong.append(one)
+    yield from _wrong_payloads(
+        wrong,
+        lambda first, cells: (
+            f"The tool {tool} weighs {mass_kg:.2f} kg without sensor and adapter in {cells} alike. "
+            f"The payloads of their controllers do not agree, such as {first.payload_kg:.2f} kg"
+        ),
+    )
+
+
+def _wrong_payloads(wrong: Iterable[_Load], words: Callable[[_Load, str], str]) -> Iterator[Finding]:
+    """Yield a finding of several loads; `words` takes the first of them and the names of all cells."""
+    loads = sorted(wrong, key=lambda one: one.cell)
+    if len(loads) > 1:
+        cells, first = tuple(one.cell for one in loads), loads[0]
+        fix = "set them with `ftdrive push`"
+        yield Finding("payload", cells, f"{words(first, listed(cells))} in {first.cell}: {fix}")
+
+
+def _either(least: float, sigma: Array) -> Array:
+    return np.maximum(least, SIGMAS * sigma)
+
+
+def _mm(point_m: Array | None) -> str:
+    return "-" if point_m is None else "(" + ", ".join(f"{1e3 * value + 0.0:.0f}" for value in point_m) + ")"

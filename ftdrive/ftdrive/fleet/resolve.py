@@ -1,0 +1,166 @@
+"""Solve runs again with this version, and compare each result with the run's own calibration.
+
+solved-<version>.json   ftdrive.calibration/1, in the run folder: the result of that version. It never replaces the
+                        calibration of the run.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ftcalib import CalibrationDataset, CalibrationResult, solve
+from ftcalib.errors import BadDataset, CalibError
+from ftcalib.extras.difference import difference
+from ftcalib.files import read_object, write_new
+from ftcalib.model import PARAMETER_NAMES
+from ftdrive import __version__
+from ftdrive.checks.plausibility import judged
+from ftdrive.fleet.workers import OtherVersion, Workers, answers, in_words, require_version
+from ftdrive.runs.outcome import circumstances_of
+from ftdrive.runs.run import Run
+
+CHANGED_SIGMAS: Final = 3.0
+
+
+def solved_path(folder: Path) -> Path:
+    """Return where the result of this version is kept in a run folder."""
+    return folder / f"solved-{__version__}.json"
+
+
+def run_folders(folders: Iterable[Path]) -> list[Path]:
+    """Return the runs among these folders, and those directly in them, each once and by name."""
+    found = {run.parent for one in folders for name in ("run.json", "*/run.json") for run in one.resolve().glob(name)}
+    return sorted(found)
+
+
+def is_calibration(folder: Path, since: datetime | None) -> bool:
+    """Return whether a run is a calibration since that time; True for a damaged one too, so that it is reported."""
+    try:
+        header = read_object(folder / "run.json", BadDataset)
+        recent = since is None or datetime.fromisoformat(header["created_utc"]) >= since
+    except (BadDataset, OSError, KeyError, TypeError, ValueError):
+        return True
+    return recent and header.get("command") != "verify"
+
+
+def task_of(folder: Path) -> tuple[bytes, bytes]:
+    """Return the newest dataset of a run as its file has it, and what else `solved` needs, as JSON.
+
+    Raises
+    ------
+    BadDataset, BadCalibration, OSError
+        A file of the run is damaged or missing.
+    """
+    run = Run(folder)
+    circumstances, origin = circumstances_of(run)
+    own = CalibrationResult.load(run.calibration_path).provenance if run.calibration_path.is_file() else run.header()
+    given = {
+        "version": __version__,
+        "circumstances": {**circumstances, "up_in_base": circumstances["up_in_base"].tolist()},
+        "provenance": {"created_utc": own.get("created_utc"), **origin},
+    }
+    return run.dataset_path.read_bytes(), json.dumps(given).encode()
+
+
+def solver(task: bytes) -> Callable[[CalibrationDataset], CalibrationResult]:
+    """Return what solves a dataset in the circumstances of a task.
+
+    Raises
+    ------
+    OtherVersion
+        The task was made by another version.
+    """
+    given: dict[str, Any] = json.loads(task)
+    require_version(given["version"])
+    versions = {"ftdrive": __version__, **{name: version(name) for name in ("numpy", "scipy")}}
+    provenance = {**given["provenance"], "versions": versions}
+    return lambda dataset: judged(solve(dataset, **given["circumstances"], provenance=provenance))
+
+
+def solved(dataset: bytes, task: bytes) -> bytes:
+    """Return the calibration file of a task: a pure function of its bytes and of the installed versions.
+
+    Raises
+    ------
+    OtherVersion
+        The task was made by another version.
+    CalibError
+    """
+    solve_as_the_run = solver(task)
+    try:
+        document = json.loads(dataset)
+    except ValueError as error:
+        raise BadDataset(f"the dataset is not valid JSON ({error}): the file is damaged") from error
+    result = solve_as_the_run(CalibrationDataset.from_dict(document))
+    return (json.dumps(result.to_dict(), allow_nan=False, indent=1) + "\n").encode()
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The result of this version beside the calibration of the run."""
+
+    verdict_before: str | None
+    """None: the run has no calibration of these poses, because it was rejected or not observable."""
+    verdict: str
+    reason: str
+    """First reason of the new verdict; empty for a good one."""
+    parameter: str
+    """The one of `ftcalib.model.PARAMETER_NAMES` that changed most."""
+    sigmas: float
+    """Its change in sigmas of both results; infinite for a value that both take as known."""
+
+    @property
+    def has_changed(self) -> bool:
+        """Whether a parameter changed by more than `CHANGED_SIGMAS`."""
+        return abs(self.sigmas) > CHANGED_SIGMAS
+
+    @property
+    def has_other_verdict(self) -> bool:
+        """Whether the verdict differs; no calibration counts as rejected."""
+        return self.verdict != (self.verdict_before or "rejected")
+
+
+def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Path, Comparison | str]]:
+    """Solve runs and write their results as they come; yield each folder with the comparison, or why it failed.
+
+    A run that has the result of this version is only compared, and comes first. A file is written whole or not at all,
+    so everything that was yielded remains when the caller stops.
+
+    Raises
+    ------
+    OtherVersion
+        A worker has another version.
+    """
+    rest = list[Path]()
+    for folder in folders:
+        if solved_path(folder).exists():
+            yield folder, _compared(folder)
+        else:
+            rest.append(folder)
+    for folder, answer in answers(solved, task_of, rest, workers):
+        if isinstance(answer, OtherVersion):
+            raise answer
+        yield folder, in_words(answer) if isinstance(answer, BaseException) else _compared(folder, answer)
+
+
+def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
+    """Write the result if it is new; compare it with the newest calibration of the run, if the poses are the same."""
+    try:
+        if document is not None:
+            write_new(solved_path(folder), document)
+        new, path = CalibrationResult.load(solved_path(folder)), Run(folder).calibration_path
+        old = CalibrationResult.load(path) if path.is_file() else None
+    except (CalibError, OSError) as error:
+        return in_words(error)
+    reason = "" if new.verdict == "good" else next(iter(new.reasons), "")
+    if old is None or old.provenance.get("dataset_sha256") != new.provenance["dataset_sha256"]:
+        return Comparison(None, new.verdict, reason, PARAMETER_NAMES[0], 0.0)
+    change = difference(old, new).in_sigmas
+    most = int(np.argmax(np.abs(change)))
+    return Comparison(old.verdict, new.verdict, reason, PARAMETER_NAMES[most], float(change[most]))

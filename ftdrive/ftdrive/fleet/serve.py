@@ -1,0 +1,93 @@
+"""The server of a fleet: reads its state again and again, and passes it to metrics and messages."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from threading import Event
+from typing import Final, Protocol
+
+from ftdrive.errors import BadStore
+from ftdrive.fleet.state import Fleet
+from ftdrive.runs.verification import age_in_words
+from ftdrivers.clock import Clock
+
+EVERY_S: Final = 60.0
+"""Time between two reads of the store."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """The state of a fleet as it was read last."""
+
+    fleet: Fleet
+    read: datetime
+    """When it was read from the store, UTC."""
+    now: datetime
+    """When it is passed on, UTC; later than `read` while the store cannot be read."""
+    store_up: bool = True
+
+
+class Sink(Protocol):
+    """Where readings go."""
+
+    def update(self, reading: Reading) -> None:
+        """Take the newest reading; returns at once. Raises `ConfigError` if the sink can never work."""
+
+
+def utc_now() -> datetime:
+    """Return the time of this computer, UTC."""
+    return datetime.now(UTC)
+
+
+def serve(
+    fleet_at: Callable[[datetime], Fleet],
+    sinks: Sequence[Sink],
+    clock: Clock,
+    wake: Event,
+    *,
+    say: Callable[[str], None],
+    every_s: float = EVERY_S,
+    now: Callable[[], datetime] = utc_now,
+) -> None:
+    """Read the state and pass it on until an exception ends it, such as `KeyboardInterrupt`.
+
+    A store that cannot be read later than at the start ends nothing: the last state stays, with its age.
+
+    Parameters
+    ----------
+    fleet_at : callable
+        Reads the state at a time, UTC.
+    sinks : sequence of Sink
+    clock : Clock
+        Times the period.
+    wake : Event
+        A sink sets it to be updated at once.
+    say : callable
+        Takes a sentence for the operator.
+    every_s : float
+        Period, s.
+
+    Raises
+    ------
+    BadStore
+        The store cannot be read at the start.
+    ConfigError
+        A sink can never work.
+    """
+    time = now()
+    reading = Reading(fleet_at(time), time, time)
+    while True:
+        for sink in sinks:
+            sink.update(reading)
+        clock.wait(wake, every_s)
+        wake.clear()
+        was_up, time = reading.store_up, now()
+        try:
+            reading = Reading(fleet_at(time), time, time)
+        except BadStore as error:
+            reading = replace(reading, now=time, store_up=False)
+            if was_up:
+                say(f"{error}. The last state is served meanwhile. It is {age_in_words(time - reading.read)} old.")
+        else:
+            if not was_up:
+                say("The store can be read again.")

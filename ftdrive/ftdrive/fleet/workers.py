@@ -1,0 +1,226 @@
+"""Processes of this computer, or the workers of a Dask cluster: both take calls and give futures."""
+
+import logging
+import re
+import signal
+from collections.abc import Callable, Generator, Hashable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from typing import Any, Final, TypeVar
+
+from ftcalib.errors import CalibError
+from ftdrive import __version__
+from ftdrive.errors import BadRecording, ConfigError
+from ftdrivers.errors import StreamBroken, Unreachable
+
+CONNECT_S: Final = 10.0
+"""For a scheduler to answer, and for its first worker."""
+SAME: Final = ("ftdrive", "numpy", "scipy")
+"""Packages whose versions a cluster must share, because the last digits depend on them."""
+
+_ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
+"""More threads than cores are slow, and their number can change the last digits."""
+_LOGS: Final = ("distributed", "distributed.client", "tornado.application")
+_SHORT_LOG: Final = {"distributed.admin.low-level-log-length": 10}
+"""Messages that a client keeps for developers of Dask: 1000 by default, with their datasets 130 MB."""
+_LARGE_CALLS: Final = {"distributed.admin.large-graph-warning-threshold": "1TB"}
+"""A recording of 40 s at 1 kHz exceeds the default, and its warning means nothing to a user."""
+_NO_ENGINE: Final = "the workers need {}: pip install 'ftdrive[fleet]'"
+
+_DIED: Final = "each worker that was given it died: `ftdrive solve` or `ftdrive compensate` may show the cause"
+
+GROUP: Final = 8
+"""Calls that a Dask worker gets at once: a message costs 15 ms of computing time, a solve 65 ms."""
+
+Item = TypeVar("Item", bound=Hashable)
+Answer = bytes | BaseException
+"""What a call returned or raised."""
+
+
+class WorkerDied(Exception):
+    """Each worker that was given this call ended without an answer."""
+
+
+class OtherVersion(ConfigError):
+    """A worker has another version of ftdrive than the computer that calls it."""
+
+
+def require_version(version: str) -> None:
+    """Raise `OtherVersion`, in a worker, unless it has this version of ftdrive."""
+    if version != __version__:
+        raise OtherVersion(
+            f"a worker has ftdrive {__version__}, but this computer has ftdrive {version}: install the same version on "
+            "both"
+        )
+
+
+def in_words(error: BaseException) -> str:
+    """Return why a call failed."""
+    expected = isinstance(error, CalibError | BadRecording | ConfigError | WorkerDied | OSError)
+    return str(error) if expected else f"unexpected {type(error).__name__}: {error}"
+
+
+@dataclass(frozen=True, slots=True)
+class Workers:
+    """Where calls run at once."""
+
+    count: int
+    submit: Callable[..., "Future[list[Answer]]"]
+    """Takes a function and its arguments."""
+    death: type[Exception]
+    """Of a future whose worker ended without an answer."""
+    group: int = 1
+    """Calls that a worker gets at once."""
+
+
+@contextmanager
+def local_workers(count: int | None = None) -> Iterator[Workers]:
+    """Start processes, by default one for each core that this program may use; they end with the context, at once."""
+    try:
+        from joblib.externals.loky import cpu_count, get_reusable_executor
+    except ModuleNotFoundError as error:
+        raise ConfigError(_NO_ENGINE.format(error.name)) from None
+    count = count or cpu_count()
+    executor = partial(  # gives a working one also after a worker was killed
+        get_reusable_executor,
+        max_workers=count,
+        timeout=None,
+        initializer=signal.signal,  # Ctrl-C reaches every process of a terminal, but only the parent must act on it
+        initargs=(signal.SIGINT, signal.SIG_IGN),
+        env=_ONE_THREAD,
+    )
+    try:
+        yield Workers(count, lambda *call: executor().submit(*call), BrokenExecutor)
+    finally:
+        executor().shutdown(kill_workers=True)
+
+
+@contextmanager
+def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Workers]:
+    """Connect to a Dask cluster.
+
+    Parameters
+    ----------
+    address : str
+        Of its scheduler: dask://HOST:PORT.
+
+    Raises
+    ------
+    ConfigError
+        The address has another form, or a worker has another version of ftdrive, numpy or scipy.
+    Unreachable
+        No scheduler answers there, or it has no worker.
+    StreamBroken
+        The scheduler was lost while calls were running.
+    """
+    found = re.fullmatch(r"dask://([^/:@]+|\[[0-9a-fA-F:]+\]):(\d{1,5})/?", address)
+    if found is None:
+        raise ConfigError(f"--cluster is '{address}': give the address of a Dask scheduler, such as dask://host:8786")
+    try:
+        import distributed
+        from dask import config
+    except ModuleNotFoundError as error:
+        raise ConfigError(_NO_ENGINE.format(error.name)) from None
+    for name in _LOGS:
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # a lost cluster is one sentence, not several tracebacks
+    dask: Any = distributed  # most of it has no types
+    try:
+        with config.set(_SHORT_LOG):
+            client = dask.Client(f"tcp://{found[1]}:{found[2]}", timeout=timeout_s, set_as_default=False)
+    except (OSError, ValueError, MemoryError) as error:  # the answer of another server may look like a huge length
+        raise Unreachable(
+            f"no Dask scheduler answers at {address} ({error})", "start it, or correct --cluster"
+        ) from error
+    with config.set(_LARGE_CALLS), client:
+        try:
+            client.wait_for_workers(1, timeout=timeout_s)
+        except TimeoutError as error:
+            raise Unreachable(
+                f"the cluster {address} has no worker",
+                f"start one: dask worker tcp://{found[1]}:{found[2]} --nthreads 1",
+            ) from error
+        _require_same_versions(client.get_versions(packages=list(SAME)), address)
+        try:
+            submit = client.get_executor(pure=False).submit
+            yield Workers(sum(client.ncores().values()), submit, dask.KilledWorker, GROUP)
+        except CancelledError as error:
+            raise StreamBroken(f"the cluster {address} was lost", "start it, and repeat the command") from error
+
+
+def _require_same_versions(found: Any, address: str) -> None:
+    """Raise `ConfigError` for a worker of another version; `found` is as `distributed.Client.get_versions` has it."""
+    ours = found["client"]["packages"]
+    for worker, theirs in found["workers"].items():
+        for name in SAME:
+            if (other := theirs["packages"].get(name)) != ours[name]:
+                raise ConfigError(
+                    f"the worker {worker} of the cluster {address} has {name} {other or '(none)'}, this computer has "
+                    f"{ours[name]}: install {name} {ours[name]} there"
+                )
+
+
+def answers(
+    function: Callable[..., bytes], arguments: Callable[[Item], Iterable[Any]], items: Iterable[Item], workers: Workers
+) -> Iterator[tuple[Item, Answer]]:
+    """Call a function for each item, and yield item and answer as they come.
+
+    A call whose worker died is repeated: first among the others, because most workers are killed from outside, then
+    alone, so that the third death has one cause.
+
+    Parameters
+    ----------
+    arguments : callable
+        Makes the arguments of an item when it is its turn, so that few are in memory.
+    """
+    left: Iterable[Item] = items
+    for at_once, group in ((2 * workers.count, workers.group), (2 * workers.count, 1), (1, 1)):
+        left = yield from _round(function, arguments, left, workers, at_once, group)
+    for item in left:
+        yield item, WorkerDied(_DIED)
+
+
+def _round(
+    function: Callable[..., bytes],
+    arguments: Callable[[Item], Iterable[Any]],
+    items: Iterable[Item],
+    workers: Workers,
+    at_once: int,
+    group: int,
+) -> Generator[tuple[Item, Answer], None, list[Item]]:
+    """Call each item once, some groups at a time; return those whose worker died."""
+    waiting, running, died = iter(items), dict["Future[list[Answer]]", list[Item]](), list[Item]()
+    while True:
+        while len(running) < at_once and (new := list(islice(waiting, group))):
+            calls = dict[Item, Iterable[Any]]()
+            for item in new:
+                try:
+                    calls[item] = arguments(item)
+                except (CalibError, OSError) as error:
+                    yield item, error
+            try:
+                running[workers.submit(_each, function, list(calls.values()))] = list(calls)
+            except workers.death:
+                died += calls
+        if not running:
+            return died
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            called, raised = running.pop(future), future.exception()
+            if isinstance(raised, workers.death):
+                died += called
+            else:
+                yield from zip(called, future.result() if raised is None else [raised] * len(called), strict=True)
+
+
+def _each(function: Callable[..., bytes], calls: Sequence[Iterable[Any]]) -> list[Answer]:
+    """Call a function with each of several arguments, in a worker."""
+    return [_answer(function, call) for call in calls]
+
+
+def _answer(function: Callable[..., bytes], call: Iterable[Any]) -> Answer:
+    try:
+        return function(*call)
+    except Exception as error:
+        return error

@@ -1,0 +1,72 @@
+"""A wrench in other axes and about another point."""
+
+import numpy as np
+
+from ftcalib.model import skew
+from ftdrive.errors import ConfigError
+from ftdrive.live.samples import StreamInfo, WrenchFrame
+from ftdrivers.interfaces import Array
+
+
+class FrameTransform:
+    """Maps wrenches from sensor axes, about the sensor origin, to a frame.
+
+    f' = R f and t' = R (t + p x f), with R the axes and p the sensor origin seen from the new point.
+
+    Parameters
+    ----------
+    frame : WrenchFrame
+    info : StreamInfo
+        Its points of the flange.
+
+    Raises
+    ------
+    ConfigError
+        The frame needs a point that is not configured.
+    """
+
+    def __init__(self, frame: WrenchFrame, info: StreamInfo) -> None:
+        R_flange_sensor = info.calibration.R_flange_sensor
+        lever_m = R_flange_sensor.T @ _sensor_from(frame, info)
+        if frame.axes == "tcp":
+            _require_tcp(info)
+        # base axes: to flange axes here, the rest differs from sample to sample
+        R_axes_flange = {"sensor": R_flange_sensor.T, "tcp": info.R_flange_tcp.T}.get(frame.axes, np.eye(3))
+        R = R_axes_flange @ R_flange_sensor
+        self._matrix = np.block([[R, np.zeros((3, 3))], [R @ skew(lever_m), R]])
+        self._is_identity = frame.axes == "sensor" and frame.about == "sensor"
+        self._turns = frame.axes == "base"
+
+    def __call__(self, wrench: Array, R_base_flange: Array) -> Array:
+        """Return wrenches (n, 6) in the frame; `R_base_flange` is (n, 3, 3)."""
+        if self._is_identity:
+            return wrench
+        wrench = wrench @ self._matrix.T
+        if not self._turns:
+            return wrench
+        return (wrench.reshape(-1, 2, 3) @ np.swapaxes(R_base_flange, 1, 2)).reshape(-1, 6)
+
+    def matrix(self, R_base_flange: Array) -> Array:
+        """Return the matrix (6, 6) of the transform at one orientation (3, 3)."""
+        return np.kron(np.eye(2), R_base_flange) @ self._matrix if self._turns else self._matrix
+
+
+def _sensor_from(frame: WrenchFrame, info: StreamInfo) -> Array:
+    """Position of the sensor origin from the frame's point, in flange axes."""
+    if frame.about == "sensor":
+        return np.zeros(3)
+    if not np.isfinite(info.p_flange_sensor_m).all():
+        raise ConfigError(
+            f"a torque {str(frame).partition(', ')[2]} needs the position of the sensor: set [sensor] height_mm, the "
+            "height of its origin above the flange face, or choose --about sensor"
+        )
+    if frame.about == "tcp":
+        _require_tcp(info)
+    points = {"flange": np.zeros(3), "tcp": info.p_flange_tcp_m}
+    point_m = points[frame.about] if isinstance(frame.about, str) else np.array(frame.about)
+    return np.asarray(info.p_flange_sensor_m - point_m)
+
+
+def _require_tcp(info: StreamInfo) -> None:
+    if not np.isfinite(info.p_flange_tcp_m).all():
+        raise ConfigError("the controller does not report its active TCP: choose another frame than tcp")

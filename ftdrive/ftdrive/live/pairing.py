@@ -1,0 +1,353 @@
+"""Wrench and pose on one time axis: times of measurement, the delay between the two links, the pose at each wrench.
+
+A sample is received some time after it was measured, and never before. `Timeline` therefore lays a straight line under
+the times of receipt over the device's own count; the device's clock may drift slowly. What the line cannot show is the
+shortest delay of each link. Only the difference between the two links matters, and `DelayEstimator` finds it from
+motion.
+"""
+
+import math
+from collections import deque
+from itertools import pairwise
+
+import numpy as np
+
+from ftcalib.errors import BadDataset
+from ftdrive.live.delay import DelayEstimator
+from ftdrive.live.quaternions import matrices, quaternions
+from ftdrive.live.samples import Ns, Paired
+from ftdrivers.interfaces import ArmStates, Array, FtSamples
+
+_BUCKET_S, _BUCKETS = 0.25, 40
+_LEAST_SCATTER_NS = 1e4
+CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
+"""Of a device's clock, and of the nominal rate of a sensor without one."""
+_IMPLAUSIBLE = 4.0
+_SLEW = 0.05
+"""Times never jump and never run backwards: they approach a better estimate at this fraction of the time passing."""
+_FAR_NS, _FASTEST_SLEW = 2e8, 0.9
+"""They approach one that is farther away faster."""
+_SCALED_S, _SCALED = 0.2, 0.05
+"""A clock is no clock of seconds if it differs by so much over this time."""
+_PASSES = 4
+"""A recording is paired so often until its delay has converged."""
+_STEP_BUCKETS, _STEP_NS = 8, 5e6
+"""If so many buckets in a row are later than this, and alike, the line before them is no longer true."""
+_MOST_AHEAD_NS = 10_000_000
+"""A pose is extrapolated at most so far: one interval of a CB3 controller, with some delay."""
+_LOST_S = 1.0
+"""A device whose count is so far from the line has restarted."""
+
+
+class Timeline:
+    """Time of measurement of every sample of one device: the supporting line below its times of receipt.
+
+    Each quarter of a second contributes its least delayed sample. Of the last ten seconds' samples, the edge of the
+    lower convex hull at their middle is the line: the clock skew estimator of Moon, Skelly, Towsley, INFOCOM 1999.
+
+    Parameters
+    ----------
+    period_s : float
+        Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number.
+    tolerance : float
+        Relative error of that duration, one standard deviation. It counts as long as the times of receipt scatter too
+        much to show the rate, as on a computer that is too busy.
+    """
+
+    def __init__(self, period_s: float = 1.0, tolerance: float = CLOCK_TOLERANCE) -> None:
+        self.shift_s = 0.0
+        """Subtracted from every time; a change is followed slowly."""
+        self._nominal_ns = period_s * 1e9
+        self._tolerance = tolerance
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the line, after an interruption: a device may not have counted meanwhile."""
+        self._points: deque[tuple[float, float]] = deque(maxlen=_BUCKETS)
+        self._origin: tuple[float, int] | None = None
+        self._slope, self._offset = self._nominal_ns, 0.0
+        self._last: tuple[float, float] | None = None
+
+    def stamp(self, count: Array, t_host_ns: Ns) -> Ns:
+        """Return the times of measurement (n,) of samples with these counts (n,) and times of receipt (n,)."""
+        if self._origin is None:
+            self._origin = float(count[0]), int(t_host_ns[0])
+        x, y = count - self._origin[0], (t_host_ns - self._origin[1]).astype(np.float64)
+        behind_ns = y - self._slope * x
+        k = int(np.argmin(behind_ns))
+        if self._last is not None and (
+            x[0] < self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9  # the device has restarted
+        ):
+            self.restart()
+            return self.stamp(count, t_host_ns)
+        self._note(float(x[k]), float(y[k]))
+        end = self._slope * x[-1] + self._offset - self.shift_s * 1e9
+        if self._last is None:
+            times = self._slope * (x - x[-1]) + end
+        else:
+            x_0, y_0 = self._last
+            if x[-1] <= x_0:  # the device's clock has coarse steps
+                return np.full(len(x), self._origin[1] + round(y_0), np.int64)
+            due = self._slope * (x[-1] - x_0)
+            slew = min(max(_SLEW, abs(end - y_0 - due) / _FAR_NS), _FASTEST_SLEW)
+            end = min(max(end, y_0 + (1 - slew) * due), y_0 + (1 + slew) * due)
+            times = y_0 + (x - x_0) * ((end - y_0) / (x[-1] - x_0))
+        self._last = float(x[-1]), float(end)
+        return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
+
+    def _note(self, x: float, y: float) -> None:
+        """Keep the least delayed sample of each bucket, and fit the line."""
+        width = _BUCKET_S * 1e9 / self._slope
+        if not self._points or x // width > self._points[-1][0] // width:
+            self._points.append((x, y))
+            late = list(self._points)[-_STEP_BUCKETS - 1 : -1]
+            by_ns = [b - self._slope * a - self._offset for a, b in late]
+            if len(late) == _STEP_BUCKETS and min(by_ns) > max(_STEP_NS, 0.7 * max(by_ns)):
+                self._points = deque([*late, (x, y)], maxlen=_BUCKETS)  # samples were lost that nothing has counted
+        elif y - self._slope * x < self._points[-1][1] - self._slope * self._points[-1][0]:
+            self._points[-1] = x, y
+        elif len(self._points) > 1:
+            return
+        hull: list[tuple[float, float]] = []
+        for point in self._points:
+            while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
+                hull.pop()
+            hull.append(point)
+        if len(hull) > 1:
+            middle = sum(a for a, _ in self._points) / len(self._points)
+            (x_0, y_0), (x_1, y_1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
+            slope = (y_1 - y_0) / (x_1 - x_0)
+            above_ns = sum(b - y_0 - slope * (a - x_0) for a, b in self._points) / len(self._points)
+            error = (above_ns + _LEAST_SCATTER_NS) / ((hull[-1][0] - hull[0][0]) * self._nominal_ns)
+            weight = 1 / (1 + (error / self._tolerance) ** 2)
+            if abs(slope / self._nominal_ns - 1) > _IMPLAUSIBLE * self._tolerance:
+                weight = 0.0  # no drift of a clock, but a growing delay
+            self._slope = weight * slope + (1 - weight) * self._nominal_ns
+        self._offset = min(b - self._slope * a for a, b in self._points)
+
+
+def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+
+
+class PoseTrack:
+    """Poses of the flange over time, interpolated to any time between the first and the last.
+
+    Positions and joint angles are interpolated linearly, orientations by slerp: constant angular velocity.
+
+    Parameters
+    ----------
+    keep_s : float
+        Older poses are dropped.
+    """
+
+    def __init__(self, keep_s: float = math.inf) -> None:
+        self._keep_s = keep_s
+        self._t_ns = np.empty(0, np.int64)
+        self._room = np.empty(0, np.int64), np.empty((0, 14))
+        """Both, with room for more."""
+        self._columns = np.empty((0, 14))  # unit quaternion x y z w, position, joint angles, half the angle to the next
+
+    @property
+    def span_ns(self) -> tuple[int, int] | None:
+        """First and last time; None while there is no pose."""
+        return (int(self._t_ns[0]), int(self._t_ns[-1])) if len(self._t_ns) else None
+
+    @property
+    def ahead_ns(self) -> int:
+        """How long after the last pose the next one is due; so long, the motion is taken to continue."""
+        return min(int(self._t_ns[-1] - self._t_ns[-2]), _MOST_AHEAD_NS) if len(self._t_ns) > 1 else 0
+
+    def add(self, t_host_ns: Ns, q_rad: Array, R_base_flange: Array, p_base_flange_m: Array) -> None:
+        """Append n poses; one that is not later than the pose before it is dropped."""
+        newest = self._t_ns[-1] if len(self._t_ns) else np.iinfo(np.int64).min
+        later = t_host_ns > np.maximum.accumulate(np.concatenate([[newest], t_host_ns[:-1]]))
+        if not later.any():
+            return
+        new = np.zeros((int(later.sum()), 14))
+        new[:, :4] = quaternions(R_base_flange[later])
+        new[:, 4:7], new[:, 7:13] = p_base_flange_m[later], q_rad[later]
+        start, end = max(0, len(self._t_ns) - 1), len(self._t_ns) + len(new)
+        if end > len(self._room[0]):
+            self._make_room(end)
+        t_ns, columns = self._room[0][:end], self._room[1][:end]
+        t_ns[end - len(new) :], columns[end - len(new) :] = t_host_ns[later], new
+        quat = columns[start:, :4]
+        # q and -q are one orientation: take the one on the side of its predecessor
+        side = np.where((quat[1:] * quat[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        quat[1:] *= np.cumprod(side)[:, None]
+        chord = np.sqrt(np.square(quat[1:] - quat[:-1]).sum(axis=1))
+        columns[start:-1, 13] = np.maximum(2 * np.arcsin(np.minimum(chord / 2, 1.0)), 1e-9)
+        keep = 0
+        if math.isfinite(self._keep_s):
+            keep = int(np.searchsorted(t_ns, t_ns[-1] - round(self._keep_s * 1e9)))
+        self._room = self._room[0][keep:], self._room[1][keep:]
+        self._t_ns, self._columns = t_ns[keep:], columns[keep:]
+
+    def _make_room(self, rows: int) -> None:
+        """Move the poses to the beginning of arrays with room for as many again."""
+        t_ns, columns = np.empty(2 * rows, np.int64), np.empty((2 * rows, 14))
+        t_ns[: len(self._t_ns)], columns[: len(self._t_ns)] = self._t_ns, self._columns
+        self._room = t_ns, columns
+
+    def at(self, t_ns: Ns) -> tuple[Array, Array, Array]:
+        """Return joint angles (n, 6), R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) at times (n,).
+
+        Times are inside `span_ns`, or after it by `ahead_ns` at most: the velocity between the last two poses lasts.
+        """
+        if len(self._t_ns) == 1:
+            i = np.zeros(len(t_ns), np.intp)
+            before = after = self._columns[i]
+            f = np.zeros((len(t_ns), 1))
+        else:
+            i = np.clip(np.searchsorted(self._t_ns, t_ns, "right") - 1, 0, len(self._t_ns) - 2)
+            before, after = self._columns[i], self._columns[i + 1]
+            f = ((t_ns - self._t_ns[i]) / (self._t_ns[i + 1] - self._t_ns[i]))[:, None]
+        linear = before[:, 4:13] + f * (after[:, 4:13] - before[:, 4:13])
+        angle = np.maximum(before[:, 13:], 1e-9)
+        quat = (np.sin((1 - f) * angle) * before[:, :4] + np.sin(f * angle) * after[:, :4]) / np.sin(angle)
+        return linear[:, 3:], matrices(quat), linear[:, :3]
+
+
+class Pairing:
+    """Puts the samples of both links on one time axis and finds the pose of each wrench.
+
+    Parameters
+    ----------
+    sensor_rate_Hz : float
+        Nominal, for a sensor without a clock of its own; NaN where it is polled, which is not at a fixed rate.
+    delay : DelayEstimator or float
+        Finds the delay of the wrench after the pose, or is that delay in s.
+    """
+
+    def __init__(self, sensor_rate_Hz: float, delay: DelayEstimator | float) -> None:
+        self._estimator = delay if isinstance(delay, DelayEstimator) else None
+        self._rate_Hz = sensor_rate_Hz
+        self._sensor: Timeline | None = None
+        self._arm: Timeline | None = None
+        self._poses = PoseTrack(keep_s=2.0)
+        self._waiting: list[tuple[FtSamples, Ns]] = []
+        self._delay_s = 0.0 if isinstance(delay, DelayEstimator) else delay
+
+    @property
+    def delay_s(self) -> float:
+        """Of the wrench after the pose."""
+        return self._estimator.delay_s if self._estimator else self._delay_s
+
+    @property
+    def delay_sigma_s(self) -> float:
+        """One standard deviation; 0 if the delay is configured."""
+        return self._estimator.sigma_s if self._estimator else 0.0
+
+    def use(self, estimator: DelayEstimator) -> None:
+        """Estimate with another calibration from now on, and keep the delay; a configured delay stays."""
+        if self._estimator is not None:
+            estimator.delay_s, estimator.sigma_s = self._estimator.delay_s, self._estimator.sigma_s
+            self._estimator = estimator
+
+    @property
+    def waits_for_pose(self) -> bool:
+        """Whether there are samples without a pose, which are too new to extrapolate it."""
+        return bool(self._waiting)
+
+    def add_states(self, states: ArmStates) -> None:
+        """Add what the arm has sent."""
+        if not len(states.t_host_ns):
+            return
+        t_ns = states.t_host_ns
+        if np.isfinite(states.t_device_s).all():
+            if self._arm is None:
+                self._arm = _clock_of(states)
+            t_ns = self._arm.stamp(states.t_device_s, t_ns)
+        self._poses.add(t_ns, states.q_rad, states.R_base_flange, states.p_base_flange_m)
+
+    def add_samples(self, samples: FtSamples) -> None:
+        """Add what the sensor has sent."""
+        if not len(samples):
+            return
+        has_clock, counts = bool(np.isfinite(samples.t_device_s).all()), math.isfinite(self._rate_Hz)
+        if has_clock:
+            count = samples.t_device_s
+        elif counts:
+            count = samples.seq.astype(np.float64)
+        else:  # polled: each time of receipt is its own
+            count = np.asarray(samples.t_host_ns * 1e-9)
+        if self._sensor is None:
+            self._sensor = Timeline(1 / self._rate_Hz, RATE_TOLERANCE) if counts and not has_clock else Timeline()
+        self._sensor.shift_s = self.delay_s
+        self._waiting.append((samples, self._sensor.stamp(count, samples.t_host_ns)))
+
+    def take(self) -> Paired | None:
+        """Return the samples whose pose is known by now; None if there is none.
+
+        Samples before the first pose are dropped.
+        """
+        if not self._waiting or (span_ns := self._poses.span_ns) is None:
+            return None
+        samples = FtSamples.concatenate([block for block, _ in self._waiting])
+        t_ns = np.concatenate([times for _, times in self._waiting])
+        first, end = np.searchsorted(t_ns, [span_ns[0], span_ns[1] + self._poses.ahead_ns + 1]).tolist()
+        self._waiting = [(samples.rows(slice(end, None)), t_ns[end:])] if end < len(t_ns) else []
+        if first >= end:
+            return None
+        paired = paired_with(self._poses, t_ns[first:end], samples.rows(slice(first, end)))
+        if self._estimator:
+            self._estimator.add(paired)
+        return paired
+
+    def forget(self) -> None:
+        """Drop what waits, after an interruption of either link."""
+        self._waiting = []
+        self._poses = PoseTrack(keep_s=2.0)
+        for line in (self._sensor, self._arm):
+            if line is not None:
+                line.restart()
+
+
+def _clock_of(states: ArmStates) -> Timeline:
+    """Return the timeline of a controller from its first states; an emulated one may run many times faster."""
+    host_s = float(states.t_host_ns[-1] - states.t_host_ns[0]) * 1e-9
+    device_s = float(states.t_device_s[-1] - states.t_device_s[0])
+    if host_s < _SCALED_S or abs(host_s / device_s - 1) < _SCALED:
+        return Timeline()
+    return Timeline(host_s / device_s, _SCALED)
+
+
+def paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:
+    """Give each sample the pose at its time, which must be inside the track."""
+    return Paired(t_ns, samples.t_device_s, samples.seq, samples.status, samples.wrench, *poses.at(t_ns))
+
+
+def pair_recording(samples: FtSamples, states: ArmStates, delay: DelayEstimator | float) -> Paired:
+    """Pair a recording whose times are those of measurement; both are sorted by time.
+
+    Parameters
+    ----------
+    samples, states
+        Samples before the first and after the last state are dropped.
+    delay : DelayEstimator or float
+        An estimator with a window as long as the recording, which then has the result; or the delay of the wrench after
+        the pose in s.
+
+    Raises
+    ------
+    BadDataset
+        The two do not overlap.
+    """
+    poses = PoseTrack()
+    poses.add(states.t_host_ns, states.q_rad, states.R_base_flange, states.p_base_flange_m)
+
+    def paired(delay_s: float) -> Paired:
+        t_ns = samples.t_host_ns - round(delay_s * 1e9)
+        span_ns = poses.span_ns or (0, -1)
+        inside = slice(*np.searchsorted(t_ns, [span_ns[0], span_ns[1] + 1]).tolist())
+        if not len(t_ns[inside]):
+            raise BadDataset("wrench and pose have no time in common: give files of the same recording and one clock")
+        return paired_with(poses, t_ns[inside], samples.rows(inside))
+
+    if not isinstance(delay, DelayEstimator):
+        return paired(delay)
+    for _ in range(_PASSES):
+        delay.restart()
+        delay.add(paired(delay.delay_s))
+    return paired(delay.delay_s)

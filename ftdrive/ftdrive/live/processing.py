@@ -1,0 +1,464 @@
+"""From paired samples to a block: stages, frame, uncertainty, contact, tare, drift."""
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Mapping
+from threading import RLock
+
+import numpy as np
+
+from ftcalib.compensation import Compensator
+from ftcalib.extras.inertia import REACH_S, inertial_wrench, motion_of_poses
+from ftcalib.extras.update import Calibrated
+from ftcalib.files import JSON
+from ftdrive.errors import ConfigError
+from ftdrive.live.contact import Contact, ContactTest, ContactTracker
+from ftdrive.live.drift import DriftFilter
+from ftdrive.live.filters import LOWPASS_ORDER, NOTCH_Q, Filter, deadband
+from ftdrive.live.frames import FrameTransform
+from ftdrive.live.noise import READING_S, NoiseEstimator
+from ftdrive.live.samples import (
+    Block,
+    EventKind,
+    LinkStatus,
+    Paired,
+    Stages,
+    StreamEvent,
+    StreamInfo,
+    StreamStatus,
+    WrenchFrame,
+)
+from ftdrive.live.tare import TARE_S, try_tare
+from ftdrivers.clock import Clock
+from ftdrivers.interfaces import Array
+
+SENSOR_FRAME = WrenchFrame()
+STANDARD = Stages()
+FALSE_ALARM_RATE = 1e-3
+_CHUNK_ROWS = 8192
+"""More rows are processed in pieces that stay in the cache."""
+_KNOT_S = 0.002
+"""Poses of this spacing give the acceleration."""
+_DRIFT_SIGMAS = 5.0
+
+
+class Processor:
+    """Compensates paired samples, one block after the other; a whole recording may be one block.
+
+    Parameters
+    ----------
+    info : StreamInfo
+    frame : WrenchFrame
+    stages : Stages
+    false_alarm_rate : float
+        Share of independent readings of a free tool that count as contact. See `ftdrive.live.contact`.
+    inertia_com_kg_m2 : array, shape (3, 3), optional
+        Inertia of the load about its centre of mass, in sensor axes; without it the load counts as a point.
+
+    Raises
+    ------
+    ConfigError
+        Frame or stages need something that is not configured.
+    """
+
+    def __init__(
+        self,
+        info: StreamInfo,
+        frame: WrenchFrame = SENSOR_FRAME,
+        stages: Stages = STANDARD,
+        *,
+        false_alarm_rate: float = FALSE_ALARM_RATE,
+        inertia_com_kg_m2: Array | None = None,
+    ) -> None:
+        self.info = info
+        self._lock = RLock()  # frame, stages and tare may come from another thread
+        calibration = info.calibration
+        self._compensator: Compensator = calibration.compensator
+        self._inertia = inertia_com_kg_m2
+        self._tares: list[tuple[Calibrated, int]] = [(calibration, 0)]
+        likely_error = calibration.likely_error()
+        self._usual_error_N = float(likely_error[0])
+        beyond = np.repeat((likely_error**2 - np.square(calibration.predicted_error())) / 3, 3)
+        self._noise = NoiseEstimator(info.sensor_rate_Hz)
+        self._noise_is_learnt = False
+        self._test = ContactTest(info.sensor_rate_Hz, false_alarm_rate, beyond)
+        self._tracker = ContactTracker()
+        self._drift = DriftFilter()
+        self._drift_warned = False
+        self._recent: deque[Paired] = deque()
+        self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
+        knot_s = self._stride / info.sensor_rate_Hz
+        self._reach = max(2, round(max(REACH_S, 2 / info.arm_rate_Hz) / knot_s))
+        self._buffer: Paired | None = None
+        self._done = 0
+        """Rows of the buffer that are processed; they remain as neighbours for the acceleration."""
+        self._newest_ns = 0
+        self._newest_seq: int | None = None
+        self._events: list[StreamEvent] = []
+        self._frame, self._transform = frame, FrameTransform(frame, info)
+        self._stages, self._filter = stages, self._filter_of(stages)
+
+    # ------------------------------------------------------------------------------------------------ what is settable
+
+    @property
+    def frame(self) -> WrenchFrame:
+        """Axes and reference point of the wrench; setting them is an event. Raises `ConfigError`."""
+        return self._frame
+
+    @frame.setter
+    def frame(self, frame: WrenchFrame) -> None:
+        if frame == self._frame:
+            return
+        transform = FrameTransform(frame, self.info)
+        with self._lock:
+            self._report_contacts(self._tracker.end())
+            self._frame, self._transform = frame, transform
+            self.note("frame", str(frame), frame.to_dict())
+
+    @property
+    def stages(self) -> Stages:
+        """What is done to the raw wrench; setting it is an event. Raises `ConfigError`."""
+        return self._stages
+
+    @stages.setter
+    def stages(self, stages: Stages) -> None:
+        if stages == self._stages:
+            return
+        new = self._filter_of(stages)
+        with self._lock:
+            self._filter, self._stages = new, stages
+            self.note("stages", stages_in_words(stages), {})
+
+    def _filter_of(self, stages: Stages) -> Filter:
+        if stages.inertia and not np.isfinite(self.info.p_flange_sensor_m).all():
+            raise ConfigError(
+                "the inertia stage needs the position of the sensor: set [sensor] height_mm, the height of its origin "
+                "above the flange face"
+            )
+        return Filter(stages, self.info.sensor_rate_Hz)
+
+    # ------------------------------------------------------------------------------------------------------ processing
+
+    def process(self, paired: Paired, *, last: bool = False) -> Block:
+        """Process the next samples.
+
+        With the inertia stage the last milliseconds wait for the poses after them, unless these samples are the `last`;
+        a block may then be empty.
+        """
+        with self._lock:
+            if not len(paired):
+                return self._processed(paired, None)
+            if len(paired) <= 2 * _CHUNK_ROWS:
+                return self._process(paired, last)
+            chunks = [paired.rows(slice(i, i + _CHUNK_ROWS)) for i in range(0, len(paired), _CHUNK_ROWS)]
+            if self._noise.noise is None:
+                self.learn_noise(paired)
+            return Block.concatenate([self._process(chunk, last and chunk is chunks[-1]) for chunk in chunks])
+
+    def _process(self, paired: Paired, last: bool) -> Block:
+        self._note_gaps(paired)
+        self._recent.append(paired)
+        since_ns = int(paired.t_host_ns[-1]) - round(TARE_S * 1e9)
+        while self._recent[0].t_host_ns[-1] < since_ns:
+            self._recent.popleft()
+        self._newest_ns = int(paired.t_host_ns[-1])
+        buffer = paired if self._buffer is None else Paired.concatenate([self._buffer, paired])
+        end, inertial = len(buffer), None
+        neighbours = self._reach * self._stride
+        if self._stages.inertia:
+            inertial, ready = self._inertial(buffer)
+            end = end if last else max(ready, self._done)
+            inertial = inertial[self._done : end]
+        rows = buffer.rows(slice(self._done, end))
+        keep = max(0, end - neighbours - self._stride) // self._stride * self._stride  # knots stay where they are
+        self._buffer, self._done = buffer.rows(slice(keep, None)), end - keep
+        block = self._processed(rows, inertial)
+        if last:
+            self._report_contacts(self._tracker.end())
+        return block
+
+    def learn_noise(self, paired: Paired) -> None:
+        """Learn the noise from all of a recording, before it is processed and instead of during that."""
+        with self._lock:
+            self._noise_is_learnt = True
+            for i in range(0, len(paired), _CHUNK_ROWS):
+                rows = paired.rows(slice(i, i + _CHUNK_ROWS))
+                self._noise.add(self._free(rows)[0], rows.R_base_flange, rows.p_base_flange_m)
+
+    def _free(self, rows: Paired) -> tuple[Array, Array, Array]:
+        """Return the residual of a free tool at rest, (n, 6), its weight (n, 6) and the bias (6,)."""
+        gravity = rows.R_base_flange.reshape(-1, 9) @ self._compensator.matrix.T
+        bias = self._compensator.offset if self.tare_wrench is None else self._compensator.offset + self.tare_wrench
+        return rows.raw - gravity - bias, gravity, np.asarray(bias)
+
+    def _inertial(self, buffer: Paired) -> tuple[Array, int]:
+        """Return the inertial wrench of all rows, and the number of those with neighbours on both sides."""
+        knots = np.arange(0, len(buffer), self._stride)
+        t_s = (buffer.t_host_ns - buffer.t_host_ns[0]) * 1e-9
+        knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]  # a coarse clock repeats times
+        if len(knots) < 2 * self._reach + 2:
+            return np.zeros((len(buffer), 6)), 0
+        parameters = self.info.calibration.parameters
+        motion = motion_of_poses(
+            t_s[knots],
+            buffer.R_base_flange[knots],
+            np.nan_to_num(buffer.p_base_flange_m[knots]),  # an unknown position does not move
+            R_flange_sensor=parameters.R_flange_sensor,
+            p_flange_sensor_m=self.info.p_flange_sensor_m,
+            reach=self._reach,
+        )
+        mass_kg = self.info.calibration.mass_kg
+        at_knots = inertial_wrench(mass_kg, parameters.p_sensor_com_m, motion, self._inertia)
+        wrench = np.stack([np.interp(t_s, motion.t_s, column) for column in at_knots.T], axis=1)
+        return wrench, int(knots[-1 - self._reach]) + 1
+
+    def _processed(self, rows: Paired, inertial: Array | None) -> Block:
+        stages, n = self._stages, len(rows)
+        residual, gravity, bias = self._free(rows)  # chi2 is that of a free tool, whatever is switched off
+        if inertial is not None:
+            residual -= inertial
+        if n and not self._noise_is_learnt:
+            self._noise.add(residual, rows.R_base_flange, rows.p_base_flange_m)
+        current = self._tares[-1][0]
+        uncertain = (current.parameters, current.covariance, current.response)
+        self._test.expect(self._noise.noise, uncertain)
+        if n:
+            readings, chi2 = self._test.judge(residual, rows.R_base_flange)
+        else:
+            readings, chi2 = np.empty((0, 6)), np.empty(0)
+        in_contact = chi2 > self._test.limit
+        wrench = residual
+        if not stages.gravity:
+            wrench = wrench + gravity
+        if not stages.bias:
+            wrench = wrench + bias
+        wrench = self._transform(self._filter(wrench), rows.R_base_flange)
+        wrench = deadband(wrench, stages.deadband_N, stages.deadband_Nm)
+        if self._tracker.open is not None or in_contact.any():
+            readings = self._transform(readings, rows.R_base_flange)
+            self._report_contacts(self._tracker.follow(rows.t_host_ns, in_contact, readings))
+        self._follow_drift(rows, residual)
+        return Block(
+            rows.t_host_ns,
+            rows.t_device_s,
+            rows.seq,
+            rows.status,
+            rows.raw,
+            wrench,
+            chi2,
+            in_contact,
+            rows.q_rad,
+            rows.R_base_flange,
+            rows.p_base_flange_m,
+            self.sigma(rows.R_base_flange[-1]) if n else np.full(6, np.nan),
+            self._frame,
+            stages,
+        )
+
+    def sigma(self, R_base_flange: Array, mean_s: float = 0.0) -> Array:
+        """Standard deviation (6,) of the newest sample in the frame, or of the mean over `mean_s`.
+
+        NaN until it is known. `R_base_flange` (3, 3) is that of the sample.
+        """
+        noise = self._noise.noise
+        if noise is None:
+            return np.full(6, np.nan)
+        if mean_s > 0:
+            covariance = noise.reading * min(READING_S / mean_s, 1.0)
+        else:
+            covariance = noise.sample * self._filter.power_gain
+        if self._stages.gravity or self._stages.bias:
+            covariance = covariance + self._test.uncertainty
+        T = self._transform.matrix(R_base_flange)
+        return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", T, covariance, T)))
+
+    def restart(self, *, elsewhere: bool = False) -> None:
+        """Forget the samples before an interruption; noise, tares and drift remain.
+
+        With `elsewhere` the next sample is at another place of a recording, and none were lost.
+        """
+        with self._lock:
+            self._report_contacts(self._tracker.end())
+            self._test.restart()
+            self._filter = self._filter_of(self._stages)
+            self._recent.clear()
+            self._buffer, self._done = None, 0
+            if elsewhere:
+                self._newest_seq = None
+
+    @property
+    def contact_limit(self) -> float:
+        """Of `Block.chi2`."""
+        return self._test.limit
+
+    def status(self, sensor: LinkStatus, arm: LinkStatus, delay: tuple[float, float]) -> StreamStatus:
+        """Return the state of a stream with these links and this delay and its sigma, s."""
+        drift_N_h, drift_sigma_N_h = self._drift.force_rate_N_h
+        tare_wrench = self.tare_wrench
+        return StreamStatus(
+            sensor=sensor,
+            arm=arm,
+            delay_s=delay[0],
+            delay_sigma_s=delay[1],
+            tare=tare_wrench,
+            tare_t_host_ns=None if tare_wrench is None else self._tares[-1][1],
+            drift_N_h=drift_N_h,
+            drift_sigma_N_h=drift_sigma_N_h,
+            contact_limit=self._test.limit,
+            false_alarm_rate=self._test.false_alarm_rate,
+        )
+
+    # ---------------------------------------------------------------------------------------------------------- events
+
+    def take_events(self) -> list[StreamEvent]:
+        """Return the events since the last call."""
+        events, self._events = self._events, []
+        return events
+
+    def note(self, kind: EventKind, text: str, values: Mapping[str, JSON], t_ns: int | None = None) -> StreamEvent:
+        """Add an event, by default at the time of the newest sample."""
+        event = StreamEvent(self._newest_ns if t_ns is None else t_ns, kind, text, values)
+        self._events.append(event)
+        return event
+
+    def _note_gaps(self, paired: Paired) -> None:
+        before = int(paired.seq[0]) - 1 if self._newest_seq is None else self._newest_seq
+        self._newest_seq = int(paired.seq[-1])
+        if self._newest_seq - before == len(paired):
+            return
+        missing = np.diff(paired.seq, prepend=before) - 1
+        for i in np.flatnonzero(missing > 0):
+            lost = int(missing[i])
+            text = f"{lost} sample{'s' if lost > 1 else ''} lost before sample {int(paired.seq[i])}"
+            self.note("gap", text, {"lost": lost, "seq": int(paired.seq[i])}, int(paired.t_host_ns[i]))
+
+    def _report_contacts(self, contacts: list[Contact]) -> None:
+        for contact in contacts:
+            values: dict[str, JSON] = {
+                "duration_s": contact.duration_s,
+                "peak_N": contact.peak_N,
+                "peak_wrench": contact.peak.tolist(),
+                "direction": contact.direction.tolist(),
+                "line_point_m": contact.line_m.tolist(),
+                "line_distance_m": float(np.linalg.norm(contact.line_m)),
+                **self._frame.to_dict(),
+            }
+            words = f"contact {contact.peak_N:.1f} N, {contact.duration_s:.1f} s"
+            self.note("contact", words, values, contact.begin_ns)
+
+    # ---------------------------------------------------------------------------------------------------- bias, noise
+
+    @property
+    def tare_wrench(self) -> Array | None:
+        """(6,) change of the bias by tares, N and N·m, sensor axes; None without a tare."""
+        if len(self._tares) == 1:
+            return None
+        new, old = self._tares[-1][0].parameters, self.info.calibration.parameters
+        return np.concatenate([new.force_bias_N - old.force_bias_N, new.torque_bias_Nm - old.torque_bias_Nm])
+
+    def tare(self) -> StreamEvent:
+        """Set the bias so that the free tool reads zero in the last half second, or refuse; see `try_tare`."""
+        with self._lock:
+            if not self._recent:
+                return self.note("tare-refused", "tare refused: no sample has arrived yet; tare again", {})
+            rows = Paired.concatenate(list(self._recent))
+            rows = rows.rows(rows.t_host_ns >= self._newest_ns - round(TARE_S * 1e9))
+            update, text, values = try_tare(rows, self._tares[-1][0])
+            if update is None:
+                return self.note("tare-refused", text, values)
+            self._set_tare([*self._tares, (update, self._newest_ns)])
+            return self.note("tare", text, values)
+
+    def undo_tare(self) -> StreamEvent:
+        """Take the last tare back."""
+        with self._lock:
+            if len(self._tares) == 1:
+                return self.note("tare-refused", "there is no tare to undo", {})
+            self._set_tare(self._tares[:-1])
+            left = self.tare_wrench
+            return self.note("tare-undone", "tare undone", {"tare": None if left is None else left.tolist()})
+
+    def _set_tare(self, tares: list[tuple[Calibrated, int]]) -> None:
+        before, self._tares = self.tare_wrench, tares
+        now = np.zeros(6) if self.tare_wrench is None else self.tare_wrench
+        self._drift.shift(now - (np.zeros(6) if before is None else before))
+        self._test.restart()
+        self._filter = self._filter_of(self._stages)
+
+    def _follow_drift(self, rows: Paired, residual: Array) -> None:
+        noise = self._noise.noise
+        if noise is None or not self._drift.follow(
+            rows.t_host_ns, residual, rows.R_base_flange, noise, np.diag(self._test.uncertainty)
+        ):
+            return
+        rate, sigma = self._drift.force_rate_N_h
+        worth = max(self._usual_error_N, _DRIFT_SIGMAS * sigma)
+        if rate > worth and not self._drift_warned:
+            text = f"the bias drifts by {rate:.2g} ± {sigma:.1g} N/h (1 sigma); tare when the tool is free"
+            self.note("drift", text, {"drift_N_h": rate, "sigma_N_h": sigma})
+        self._drift_warned = rate > (0.5 if self._drift_warned else 1.0) * worth
+
+
+class ProcessedStream(ABC):
+    """What a live and a replayed stream share: everything that the processing shows and lets set."""
+
+    info: StreamInfo
+    clock: Clock
+    _processor: Processor
+
+    @property
+    def frame(self) -> WrenchFrame:
+        """Axes and reference point of the wrench. Setting raises `ConfigError` if it needs what is not configured."""
+        return self._processor.frame
+
+    @frame.setter
+    def frame(self, frame: WrenchFrame) -> None:
+        self._processor.frame = frame
+
+    @property
+    def stages(self) -> Stages:
+        """What is done to the raw wrench. Setting raises `ConfigError` for an impossible filter."""
+        return self._processor.stages
+
+    @stages.setter
+    def stages(self, stages: Stages) -> None:
+        self._processor.stages = stages
+
+    def take_events(self) -> list[StreamEvent]:
+        """Return the events since the last call."""
+        return self._processor.take_events()
+
+    def tare(self) -> StreamEvent:
+        """Change the bias so that the free tool reads zero; the event says how much, or why it was refused."""
+        return self._processor.tare()
+
+    def undo_tare(self) -> StreamEvent:
+        """Take the last tare back."""
+        return self._processor.undo_tare()
+
+    def mark(self, text: str) -> StreamEvent:
+        """Add a mark to the events."""
+        return self._processor.note("mark", text, {})
+
+    @abstractmethod
+    def status(self) -> StreamStatus:
+        """Return rates, losses, ages, delay, tare and drift."""
+
+    def sigma_of_mean(self, R_base_flange: Array, duration_s: float) -> Array:
+        """Standard deviation (6,) of the mean of the wrench over `duration_s`, `READING_S` or longer, in the frame.
+
+        NaN until the noise is known. `R_base_flange` is (3, 3).
+        """
+        return self._processor.sigma(R_base_flange, duration_s)
+
+
+def stages_in_words(stages: Stages) -> str:
+    """Return the stages that are on, in their order."""
+    words = ["raw"] + [name for name in ("bias", "gravity", "inertia") if getattr(stages, name)]
+    if stages.notch_Hz is not None:
+        words.append(f"notch {stages.notch_Hz:g} Hz (Q {NOTCH_Q:g})")
+    if stages.lowpass_Hz is not None:
+        words.append(f"low-pass {stages.lowpass_Hz:g} Hz (Butterworth, order {LOWPASS_ORDER})")
+    if stages.deadband_N or stages.deadband_Nm:
+        words.append(f"deadband {stages.deadband_N:g} N, {stages.deadband_Nm:g} N·m")
+    return ", ".join(words)

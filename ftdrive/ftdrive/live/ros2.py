@@ -1,0 +1,144 @@
+"""Samples as ROS 2 messages: CDR bytes, `ros2msg` schemas and topics, shared by recordings and servers.
+
+CDR: 4 bytes that say "little endian", then the fields, each aligned to its size counted from there. All but the stamp
+and the numbers is the same in every message of a block, so that a block is packed as one array of records.
+"""
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftdrive.live.quaternions import quaternions
+from ftdrive.live.samples import WrenchFrame
+from ftdrivers.interfaces import Array
+
+RAW, COMPENSATED, POSE, JOINTS = "/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states"
+
+ENCODING = b"\0\1\0\0"
+"""The first bytes of a message: CDR, little endian."""
+
+JOINT_NAMES = (
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
+
+_HEADER = """std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id"""
+_TIME = """builtin_interfaces/Time
+int32 sec
+uint32 nanosec"""
+_VECTOR = """geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z"""
+_WRENCH = """geometry_msgs/Wrench
+Vector3 force
+Vector3 torque"""
+_POSE = """geometry_msgs/Pose
+Point position
+Quaternion orientation"""
+_POINT = """geometry_msgs/Point
+float64 x
+float64 y
+float64 z"""
+_QUATERNION = """geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w"""
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """A message type and its definition in the encoding `ros2msg`."""
+
+    name: str
+    text: str
+
+
+def _schema(name: str, fields: str, *used: str) -> Schema:
+    return Schema(name, f"\n{'=' * 80}\nMSG: ".join((fields, *used, _HEADER, _TIME)))
+
+
+_WRENCH_STAMPED = _schema("geometry_msgs/msg/WrenchStamped", "std_msgs/Header header\nWrench wrench", _WRENCH, _VECTOR)
+
+SCHEMAS = {
+    RAW: _WRENCH_STAMPED,
+    COMPENSATED: _WRENCH_STAMPED,
+    POSE: _schema("geometry_msgs/msg/PoseStamped", "std_msgs/Header header\nPose pose", _POSE, _POINT, _QUATERNION),
+    JOINTS: _schema(
+        "sensor_msgs/msg/JointState",
+        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort",
+    ),
+}
+"""The schema of each topic."""
+
+
+def frame_id(frame: WrenchFrame) -> str:
+    """Return a name of axes and point: `sensor`, `base_at_tcp` or `base_at_0_0_0.15_m` (a point from the flange)."""
+    if frame.axes == frame.about:
+        return frame.axes
+    if isinstance(frame.about, str):
+        return f"{frame.axes}_at_{frame.about}"
+    return f"{frame.axes}_at_{'_'.join(f'{x:g}' for x in frame.about)}_m"
+
+
+def pack_wrenches(t_utc_ns: NDArray[np.int64], wrench: Array, frame: str) -> list[bytes]:
+    """Pack (n, 6) wrenches, N and N·m, as WrenchStamped."""
+    return _pack(t_utc_ns, _strings(frame), wrench)
+
+
+def pack_poses(t_utc_ns: NDArray[np.int64], R_base_flange: Array, p_base_flange_m: Array) -> list[bytes]:
+    """Pack poses (n, 3, 3) and (n, 3) of the flange in base as PoseStamped."""
+    return pack_pose_numbers(t_utc_ns, np.concatenate([p_base_flange_m, quaternions(R_base_flange)], axis=1))
+
+
+def pack_pose_numbers(t_utc_ns: NDArray[np.int64], pose: Array) -> list[bytes]:
+    """Pack (n, 7) poses, position in m and quaternion x, y, z, w, as PoseStamped."""
+    return _pack(t_utc_ns, _strings("base"), pose)
+
+
+def pack_joints(t_utc_ns: NDArray[np.int64], q_rad: Array) -> list[bytes]:
+    """Pack (n, 6) joint angles as JointState without velocity and effort."""
+    names = _strings("", len(JOINT_NAMES), *JOINT_NAMES, q_rad.shape[1])
+    return _pack(t_utc_ns, names, q_rad, struct.pack("<II", 0, 0))
+
+
+def _strings(*fields: str | int) -> bytes:
+    """Pack strings and counts (uint32), each aligned to 4 bytes; what follows is aligned to 8."""
+    packed = b""
+    for item in fields:
+        packed += bytes(-len(packed) % 4)
+        if isinstance(item, int):
+            packed += struct.pack("<I", item)
+        else:
+            packed += struct.pack("<I", len(item.encode()) + 1) + item.encode() + b"\0"
+    return packed + bytes(-len(packed) % 8)
+
+
+def _pack(t_utc_ns: NDArray[np.int64], same: bytes, numbers: Array, end: bytes = b"") -> list[bytes]:
+    n, width = numbers.shape
+    layout = [
+        ("encoding", "V4"),
+        ("sec", "<i4"),
+        ("nanosec", "<u4"),
+        ("same", f"V{len(same)}"),
+        ("numbers", "<f8", (width,)),
+        ("end", f"V{len(end)}"),
+    ]
+    records = np.zeros(n, layout)
+    records["encoding"] = np.void(ENCODING)
+    records["sec"], records["nanosec"] = np.divmod(t_utc_ns, 1_000_000_000)
+    records["same"] = np.void(same)
+    records["numbers"] = numbers
+    if end:
+        records["end"] = np.void(end)
+    packed: list[bytes] = records.view(f"V{records.itemsize}").tolist()
+    return packed

@@ -1,0 +1,278 @@
+"""The values of a compensated stream: blocks of samples, the frame they are given in, the stages applied, events."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftcalib import CalibrationResult
+from ftcalib.files import JSON
+from ftdrive.runs.verification import VerificationRecord
+from ftdrivers.interfaces import Array, DeviceInfo
+
+Axes = Literal["sensor", "flange", "base", "tcp"]
+Point = Literal["sensor", "flange", "tcp"]
+Ns = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class WrenchFrame:
+    """Axes and reference point of a wrench, which belong together: a torque without its point means nothing."""
+
+    axes: Axes = "sensor"
+    about: Point | tuple[float, float, float] = "sensor"
+    """The origin of a frame, or a point in flange axes from the flange, m."""
+
+    def __str__(self) -> str:
+        if isinstance(self.about, str):
+            point = "the flange" if self.about == "flange" else f"the {self.about} origin"
+        else:
+            point = "({:g}, {:g}, {:g}) mm from the flange".format(*(1e3 * x for x in self.about))
+        return f"{self.axes} axes, about {point}"
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the fields as JSON; a point is a list."""
+        return {"axes": self.axes, "about": self.about if isinstance(self.about, str) else list(self.about)}
+
+
+@dataclass(frozen=True, slots=True)
+class Stages:
+    """What is done to the raw wrench, in this order. Raw samples are always kept beside the result."""
+
+    bias: bool = True
+    gravity: bool = True
+    inertia: bool = False
+    """Subtract the inertial wrench of the identified load."""
+    notch_Hz: float | None = None
+    lowpass_Hz: float | None = None
+    deadband_N: float = 0.0
+    deadband_Nm: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Paired:
+    """n consecutive samples of the sensor, each with the pose at its time; the fields are those of `Block`."""
+
+    t_host_ns: Ns
+    """(n,) time of the measurement on the clock of the cell."""
+    t_device_s: Array
+    """(n,) NaN where the sensor has no clock."""
+    seq: Ns
+    """(n,)"""
+    status: NDArray[np.uint32]
+    """(n,)"""
+    raw: Array
+    """(n, 6) as measured, N and N·m, sensor axes, about the sensor origin."""
+    q_rad: Array
+    """(n, 6) NaN where unknown."""
+    R_base_flange: Array
+    """(n, 3, 3)"""
+    p_base_flange_m: Array
+    """(n, 3) NaN where unknown."""
+
+    def __len__(self) -> int:
+        """Count the samples."""
+        return len(self.t_host_ns)
+
+    def rows(self, which: slice | NDArray[np.bool_]) -> Self:
+        """Select samples."""
+        return type(self)(*(getattr(self, column.name)[which] for column in fields(self)))
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Self]) -> Self:
+        """Join blocks in the order given."""
+        if len(blocks) == 1:
+            return blocks[0]
+        return cls(*(np.concatenate([getattr(block, column.name) for block in blocks]) for column in fields(cls)))
+
+
+_ALIKE = ("sigma", "frame", "stages")
+"""Fields of a block that its samples share."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """n consecutive samples of the sensor, each with the pose at its time."""
+
+    t_host_ns: NDArray[np.int64]
+    """(n,) time of the measurement on the clock of the cell: smoothed, and free of the delay between the links."""
+    t_device_s: Array
+    """(n,) the sensor's own clock; NaN where it has none."""
+    seq: NDArray[np.int64]
+    """(n,) the sensor's sample numbers; a missing one is a lost sample."""
+    status: NDArray[np.uint32]
+    """(n,) the sensor's status word."""
+    raw: Array
+    """(n, 6) as measured, N and N·m, sensor axes, about the sensor origin."""
+    wrench: Array
+    """(n, 6) after `stages`, N and N·m, in `frame`."""
+    chi2: Array
+    """(n,) squared Mahalanobis distance from a free tool, 6 degrees of freedom, before filter and deadband."""
+    in_contact: NDArray[np.bool_]
+    """(n,)"""
+    q_rad: Array
+    """(n, 6) joint angles, interpolated."""
+    R_base_flange: Array
+    """(n, 3, 3) interpolated."""
+    p_base_flange_m: Array
+    """(n, 3) interpolated."""
+    sigma: Array
+    """(6,) standard deviation of one sample of `wrench`: noise and calibration, N and N·m, in `frame`."""
+    frame: WrenchFrame
+    stages: Stages
+
+    def __len__(self) -> int:
+        """Count the samples."""
+        return len(self.t_host_ns)
+
+    def rows(self, which: slice | NDArray[np.bool_]) -> Self:
+        """Select samples."""
+        return type(self)(
+            **{
+                item.name: getattr(self, item.name) if item.name in _ALIKE else getattr(self, item.name)[which]
+                for item in fields(self)
+            }
+        )
+
+    @classmethod
+    def concatenate(cls, blocks: Sequence[Self]) -> Self:
+        """Join blocks of one frame and stages in the order given; sigma is that of the last."""
+        columns: dict[str, Any] = {
+            item.name: getattr(blocks[-1], item.name)
+            if item.name in _ALIKE
+            else np.concatenate([getattr(block, item.name) for block in blocks])
+            for item in fields(cls)
+        }
+        return cls(**columns)
+
+    def __iter__(self) -> Iterator["Sample"]:
+        force_sigma, torque_sigma = self.sigma[:3], self.sigma[3:]
+        for i, t_ns in enumerate(self.t_host_ns.tolist()):
+            yield Sample(
+                t_s=t_ns * 1e-9,
+                force_N=self.wrench[i, :3],
+                torque_Nm=self.wrench[i, 3:],
+                force_sigma_N=force_sigma,
+                torque_sigma_Nm=torque_sigma,
+                raw=self.raw[i],
+                in_contact=bool(self.in_contact[i]),
+                frame=self.frame,
+            )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """One compensated sample."""
+
+    t_s: float
+    """On the clock of the cell."""
+    force_N: Array
+    torque_Nm: Array
+    force_sigma_N: Array
+    torque_sigma_Nm: Array
+    raw: Array
+    """(6,) as measured, sensor axes, about the sensor origin."""
+    in_contact: bool
+    frame: WrenchFrame
+
+
+def mean_rate_Hz(t_ns: NDArray[np.int64]) -> float:
+    """Return the mean rate of samples at these times (n,), n >= 2."""
+    return (len(t_ns) - 1) / max(float(t_ns[-1] - t_ns[0]) * 1e-9, 1e-9)
+
+
+def sensor_origin_m(height_mm: float | None) -> Array:
+    """Return `p_flange_sensor_m` (3,) of a sensor whose origin is so high above the flange face; NaN where unknown."""
+    return np.full(3, np.nan) if height_mm is None else np.array([0.0, 0.0, height_mm / 1e3])
+
+
+EventKind = Literal[
+    "contact",
+    "tare",
+    "tare-refused",
+    "tare-undone",
+    "stages",
+    "frame",
+    "drift",
+    "gap",
+    "delay",
+    "stale",
+    "recovered",
+    "tool",
+    "mark",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class StreamEvent:
+    """Something that happened at one moment of a stream."""
+
+    t_host_ns: int
+    kind: EventKind
+    text: str
+    """One sentence for people."""
+    values: Mapping[str, JSON] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StreamInfo:
+    """What does not change while a stream runs with one calibration; every file and every client gets it."""
+
+    calibration: CalibrationResult
+    calibration_name: str
+    """The file it was read from."""
+    arm: DeviceInfo
+    sensor: DeviceInfo
+    tool: str
+    utc_offset_ns: int
+    """UTC minus the clock of the cell: `t_host_ns + utc_offset_ns` is nanoseconds since 1970."""
+    sensor_rate_Hz: float
+    arm_rate_Hz: float
+    p_flange_sensor_m: Array
+    """(3,) origin of the sensor, configured: gravity cannot identify it."""
+    R_flange_tcp: Array
+    """(3, 3)"""
+    p_flange_tcp_m: Array
+    """(3,)"""
+    versions: Mapping[str, str]
+    verification: VerificationRecord | None = None
+    """The last one of the calibration, when the stream was opened."""
+    calibration_state: str = ""
+    """Id, verdict, age and last verification of the calibration, when the stream was opened; for people."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStatus:
+    """One device of the stream."""
+
+    rate_Hz: float
+    """Over the last second."""
+    nominal_rate_Hz: float
+    lost: int
+    age_s: float
+    """Since its newest sample."""
+    error: str = ""
+    """Why it is silent or has failed; empty while it delivers."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StreamStatus:
+    """The state of a stream beside its samples."""
+
+    sensor: LinkStatus
+    arm: LinkStatus
+    delay_s: float
+    """Of the wrench after the pose."""
+    delay_sigma_s: float
+    """0 if the delay is configured."""
+    tare: Array | None
+    """(6,) what was subtracted from the bias, N and N·m, sensor axes; None without a tare."""
+    tare_t_host_ns: int | None
+    drift_N_h: float
+    """Drift of the force bias while nothing touches the tool."""
+    drift_sigma_N_h: float
+    contact_limit: float
+    """Of `chi2`."""
+    false_alarm_rate: float

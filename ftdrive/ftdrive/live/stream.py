@@ -1,0 +1,417 @@
+"""The compensated stream: arm, sensor and calibration in, samples out. It knows no screen and no file."""
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import NoReturn, Self
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult
+from ftdrive.cell.config import CellConfig, load
+from ftdrive.cell.devices import build_arm, build_sensor
+from ftdrive.checks.devices import belonging
+from ftdrive.errors import ConfigError
+from ftdrive.live.delay import DelayEstimator
+from ftdrive.live.pairing import Pairing
+from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME, STANDARD, ProcessedStream, Processor
+from ftdrive.live.samples import (
+    Block,
+    LinkStatus,
+    Sample,
+    Stages,
+    StreamEvent,
+    StreamInfo,
+    StreamStatus,
+    WrenchFrame,
+    mean_rate_Hz,
+    sensor_origin_m,
+)
+from ftdrive.runs.run import Run, versions
+from ftdrive.runs.verification import VerificationRecord, calibration_in_words, last_verification
+from ftdrivers.clock import Clock
+from ftdrivers.errors import DeviceTimeout, DriverError
+from ftdrivers.follow import Follow
+from ftdrivers.interfaces import ArmStates, ArmStatus, DeviceInfo, FtSamples
+
+STALE_S = 0.3
+"""Without a new sample of either device for so long, `CompensatedStream.read` raises."""
+
+_BLOCK_S = 0.003
+"""A block has the samples of so long, because it costs about the same with one sample as with many."""
+_RETRY_S = 0.2
+"""Between two attempts to reconnect."""
+_RATE_S = 0.5
+"""At the beginning both rates are measured."""
+_RATE_WINDOW_NS = 1_000_000_000
+
+
+class CompensatedStream(ProcessedStream):
+    """Paired and compensated samples of a cell, as long as `with` lasts. The arm is only read.
+
+    Samples come from `read` or by iteration, without gaps: a lost sample is a gap in `Block.seq` and an event. After
+    `read` has raised an error of a device, the next `read` reconnects and goes on.
+
+    Parameters
+    ----------
+    cell : CellConfig
+    calibration : CalibrationResult or str
+        Of these devices, or the name of a tool: its newest accepted calibration is looked up on entry.
+    name : str
+        Of the calibration, such as its path.
+    force : bool
+        Warn instead of raising an error if the calibration is of another arm, sensor or mount.
+    frame : WrenchFrame
+        Axes and reference point; may be set at any time.
+    stages : Stages
+        May be set at any time.
+    false_alarm_rate : float
+        Share of readings of a free tool that count as contact.
+
+    Raises
+    ------
+    ConfigError
+        On entry: the calibration is of another arm, sensor or mount, the tool has none, or the frame needs what is
+        not configured.
+    ConnectError
+        On entry: a device does not answer.
+    """
+
+    def __init__(
+        self,
+        cell: CellConfig,
+        calibration: CalibrationResult | str,
+        *,
+        name: str = "",
+        force: bool = False,
+        frame: WrenchFrame = SENSOR_FRAME,
+        stages: Stages = STANDARD,
+        false_alarm_rate: float = FALSE_ALARM_RATE,
+    ) -> None:
+        self._cell = cell
+        self.clock: Clock = cell.clock
+        self._wanted = calibration
+        self._name = name
+        self._force = force
+        self._begin = frame, stages, false_alarm_rate
+        self._stack = ExitStack()
+        self._follows: ExitStack | None = None
+        self._failure: tuple[str, DriverError] | None = None
+        """The device that has failed, "sensor" or "arm", and why."""
+        self._silent_since_ns: int | None = None
+        self._arrivals: deque[tuple[int, int]] = deque()
+        self._arm_lost = 0
+        self._arm_newest: tuple[int, float] | None = None
+        self._next_ns = 0
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            self._sensor = stack.enter_context(build_sensor(self._cell))
+            self._arm = stack.enter_context(closing(build_arm(self._cell)))
+            self._arm.open()
+            arm, sensor = self._arm.identify(), self._sensor.identify()
+            self._calibration, self._name, self.warnings = self._chosen(arm, sensor)
+            """What is doubtful about the calibration, and what could not be checked."""
+            stack.callback(self._unfollow)
+            self._follow()
+            samples, states = self._first_samples()
+            nominal_Hz = self._sensor.health().nominal_rate_Hz
+            sensor_rate_Hz = nominal_Hz if np.isfinite(nominal_Hz) else mean_rate_Hz(samples.t_host_ns)
+            arm_rate_Hz = mean_rate_Hz(states.t_host_ns)
+            self._block_rows = int(_BLOCK_S * sensor_rate_Hz)
+            self._arm_step_s = float(np.median(np.diff(states.t_device_s)))
+            status = self._arm.status()
+            self.payload_kg = status.payload_kg
+            """As configured in the controller; None where it is not reported."""
+            self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, status)
+            frame, stages, false_alarm_rate = self._begin
+            self._processor = Processor(self.info, frame, stages, false_alarm_rate=false_alarm_rate)
+            delay_ms = self._cell.sensor.delay_ms
+            delay = (
+                DelayEstimator(self._calibration, self.info.p_flange_sensor_m) if delay_ms is None else delay_ms / 1e3
+            )
+            self._pairing = Pairing(nominal_Hz, delay)
+            self._pairing.add_states(states)
+            self._pairing.add_samples(samples)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _chosen(self, arm: DeviceInfo, sensor: DeviceInfo) -> tuple[CalibrationResult, str, tuple[str, ...]]:
+        """Return the calibration, its name and warnings; it belongs to the devices and their mounting."""
+        calibration, name, warnings = self._wanted, self._name, tuple[str, ...]()
+        mount = self._cell.sensor.mount
+        if isinstance(calibration, str):
+            from ftdrive.store.tools import calibration_of_tool
+
+            url = self._cell.store.url
+            tool = calibration_of_tool(calibration, arm, sensor, mount, url=url, force=self._force)
+            calibration, name, warnings = tool.calibration, str(tool.path), tool.warnings
+        belongs = belonging(calibration, {"arm": arm, "sensor": sensor}, mount)
+        if belongs.others and not self._force:
+            raise ConfigError(f"{belongs.others[0]}: calibrate this cell, or apply it all the same with --force")
+        return calibration, name, (*warnings, *belongs.others, *belongs.unknown)
+
+    def _described(
+        self, arm: DeviceInfo, sensor: DeviceInfo, sensor_rate_Hz: float, arm_rate_Hz: float, status: ArmStatus
+    ) -> StreamInfo:
+        tcp = np.full(6, np.nan) if status.tcp_offset is None else np.array(status.tcp_offset)
+        verification, state = self._trusted()
+        return StreamInfo(
+            calibration=self._calibration,
+            calibration_name=self._name,
+            arm=arm,
+            sensor=sensor,
+            tool=self._wanted if isinstance(self._wanted, str) else self._cell.tool.name,
+            utc_offset_ns=time.time_ns() - self.clock.now_ns(),  # the anchor of all times in files
+            sensor_rate_Hz=sensor_rate_Hz,
+            arm_rate_Hz=arm_rate_Hz,
+            p_flange_sensor_m=sensor_origin_m(self._cell.sensor.height_mm),
+            R_flange_tcp=np.eye(3) if status.tcp_offset is None else Rotation.from_rotvec(tcp[3:]).as_matrix(),
+            p_flange_tcp_m=tcp[:3],
+            versions=versions(),
+            verification=verification,
+            calibration_state=state,
+        )
+
+    def _trusted(self) -> tuple[VerificationRecord | None, str]:
+        """Return the last verification of the calibration, and what is said of its age and of that."""
+        path = Path(self._name)
+        verification = last_verification(path) if path.name and path.exists() else None
+        return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC))
+
+    def use_tool(self, name: str) -> StreamEvent:
+        """Continue with the newest accepted calibration of another tool, after a change of tools.
+
+        The devices stay open. Noise, contact, tares and drift begin again; the delay is kept. Call it between two
+        reads, and open new recorders and servers: each keeps the calibration with which it was opened.
+
+        Raises
+        ------
+        ConfigError
+            There is no such calibration. The stream continues with the one it has.
+        """
+        before, self._wanted = self._wanted, name
+        try:
+            self._calibration, self._name, self.warnings = self._chosen(self.info.arm, self.info.sensor)
+        except ConfigError:
+            self._wanted = before
+            raise
+        verification, state = self._trusted()
+        old, self.info = (
+            self._processor,
+            replace(
+                self.info,
+                calibration=self._calibration,
+                calibration_name=self._name,
+                tool=name,
+                verification=verification,
+                calibration_state=state,
+            ),
+        )
+        self._processor = Processor(self.info, old.frame, old.stages, false_alarm_rate=self._begin[2])
+        for event in old.take_events():
+            self._processor.note(event.kind, event.text, event.values, event.t_host_ns)
+        self._pairing.use(DelayEstimator(self._calibration, self.info.p_flange_sensor_m))
+        values = {"tool": name, "calibration": self._calibration.id}
+        return self._processor.note("tool", f"tool {name}, calibration {self._name}", values, self.clock.now_ns())
+
+    # -------------------------------------------------------------------------------------------------------- reading
+
+    def read(self, timeout_s: float = STALE_S) -> Block:
+        """Return every sample since the last read whose pose is known, at least one.
+
+        Raises
+        ------
+        DeviceTimeout
+            A device is silent, or no sample came within `timeout_s`.
+        StreamBroken, DeviceFault, ConnectError
+            A device has failed. The next call reconnects.
+        """
+        if self._failure is not None:
+            self._reopen(*self._failure)
+        for left_s in self.clock.looks(timeout_s):
+            if (block := self._next_block(left_s)) is not None:
+                self._report_recovery()
+                return block
+        role = "arm" if self._pairing.waits_for_pose else "sensor"
+        self._fail(role, DeviceTimeout(f"the {role} sent nothing new for {timeout_s:g} s", "check cable and supply"))
+
+    def _next_block(self, wait_s: float) -> Block | None:
+        waits_for_pose = self._pairing.waits_for_pose
+        role = "sensor"
+        try:
+            samples = self._sensor_follow.read(0.0) if waits_for_pose else self._read_sensor(wait_s)
+            role = "arm"
+            states = self._arm_follow.read(wait_s if waits_for_pose else 0.0)
+        except DriverError as error:
+            self._fail(role, error)
+        self._count(states)
+        self._pairing.add_states(states)
+        self._pairing.add_samples(samples)
+        paired = self._pairing.take()
+        if paired is None:
+            return None
+        block = self._processor.process(paired)
+        return block if len(block) else None
+
+    def _read_sensor(self, wait_s: float) -> FtSamples:
+        """Wait for the first samples, then for those of one block; the last of them have just arrived."""
+        blocks = [self._sensor_follow.read(wait_s)]
+        rows = len(blocks[0])
+        while 0 < rows < self._block_rows and len(more := self._sensor_follow.read(_BLOCK_S)):
+            blocks.append(more)
+            rows += len(more)
+        return FtSamples.concatenate(blocks)
+
+    def __iter__(self) -> Iterator[Sample]:
+        while True:
+            yield from self.read()
+
+    # ---------------------------------------------------------------------------------------------------- interruption
+
+    def _follow(self) -> None:
+        with ExitStack() as stack:
+            self._sensor_follow: Follow[FtSamples] = stack.enter_context(self._sensor.follow())
+            self._arm_follow: Follow[ArmStates] = stack.enter_context(self._arm.follow())
+            self._follows = stack.pop_all()
+
+    def _unfollow(self) -> None:
+        follows, self._follows = self._follows, None
+        if follows is not None:
+            follows.close()
+
+    def _first_samples(self) -> tuple[FtSamples, ArmStates]:
+        """Read both devices until their rates are known."""
+        samples, states = [], []
+        for left_s in self.clock.looks(_RATE_S):
+            samples.append(self._sensor_follow.read(min(left_s, 0.01)))
+            states.append(self._arm_follow.read(0.0))
+        found = FtSamples.concatenate(samples), ArmStates.concatenate(states)
+        for device, rows in (("sensor", found[0]), ("arm", found[1])):
+            if len(rows) < 2:
+                raise DeviceTimeout(f"the {device} sent {len(rows)} samples in {_RATE_S:g} s", "check cable and supply")
+        return found
+
+    def _fail(self, role: str, error: DriverError) -> NoReturn:
+        if self._silent_since_ns is None:
+            self._silent_since_ns = self.clock.now_ns()
+            self._processor.note("stale", f"{role}: {error}", {"device": role}, self._silent_since_ns)
+        self._failure = role, error
+        raise error
+
+    def _reopen(self, role: str, failure: DriverError) -> None:
+        """Open what has ended again; raises the failure that remains."""
+        self.clock.sleep((self._next_ns - self.clock.now_ns()) * 1e-9)
+        self._next_ns = self.clock.now_ns() + round(_RETRY_S * 1e9)
+        self._unfollow()
+        try:
+            self._sensor.open()
+            self._arm.open()
+            self._sensor.check()
+            self._follow()
+        except DriverError as error:
+            self._failure = role, error
+            raise
+        if (arm := self._arm.identify()) != self.info.arm or self._sensor.identify() != self.info.sensor:
+            raise ConfigError(f"another device answers ({arm.model} {arm.serial}): start again") from failure
+        self._pairing.forget()
+        self._processor.restart()
+        self._failure = None
+        self._arm_newest = None
+
+    def _report_recovery(self) -> None:
+        if self._silent_since_ns is not None:
+            silent_s = (self.clock.now_ns() - self._silent_since_ns) * 1e-9
+            self._silent_since_ns = None
+            text = f"samples arrive again after {silent_s:.1f} s"
+            self._processor.note("recovered", text, {"silent_s": silent_s}, self.clock.now_ns())
+
+    def status(self) -> StreamStatus:
+        """Return rates, losses, ages, delay, tare and drift."""
+        health = self._sensor.health()
+        texts = {} if self._failure is None else {self._failure[0]: str(self._failure[1])}
+        now_ns = self.clock.now_ns()
+        newest_ns = self._arm_newest[0] if self._arm_newest else 0
+        sensor = LinkStatus(
+            health.rate_Hz, self.info.sensor_rate_Hz, health.lost, health.age_s, texts.get("sensor", "")
+        )
+        recent = sum(n for t_ns, n in self._arrivals if t_ns > now_ns - _RATE_WINDOW_NS)
+        age_s = (now_ns - newest_ns) * 1e-9
+        arm = LinkStatus(float(recent), self.info.arm_rate_Hz, self._arm_lost, age_s, texts.get("arm", ""))
+        return self._processor.status(sensor, arm, (self._pairing.delay_s, self._pairing.delay_sigma_s))
+
+    def _count(self, states: ArmStates) -> None:
+        """Count the states of the last second, and those that are missing by the controller's clock."""
+        if not len(states):
+            return
+        t_ns = int(states.t_host_ns[-1])
+        self._arrivals.append((t_ns, len(states)))
+        while self._arrivals[0][0] < t_ns - _RATE_WINDOW_NS:
+            self._arrivals.popleft()
+        if self._arm_newest is not None and np.isfinite(states.t_device_s).all():
+            steps = np.diff(states.t_device_s, prepend=self._arm_newest[1]) / self._arm_step_s
+            self._arm_lost += int(np.maximum(np.rint(steps) - 1, 0).sum())
+        self._arm_newest = t_ns, float(states.t_device_s[-1])
+
+
+def open_stream(
+    config: Path | CellConfig | None = None,
+    calibration: Path | str | CalibrationResult | None = None,
+    *,
+    tool: str | None = None,
+    frame: WrenchFrame = SENSOR_FRAME,
+    stages: Stages = STANDARD,
+    force: bool = False,
+) -> CompensatedStream:
+    """Return the stream of a cell, for use with `with`.
+
+    Parameters
+    ----------
+    config : Path or CellConfig, optional
+        A configuration file instead of ./ftdrive.toml, or the cell itself.
+    calibration : Path, str or CalibrationResult
+        A calibration.json or its run folder.
+    tool : str
+        Instead of `calibration`: the newest accepted one of this tool on the devices and mount of the cell, from the
+        store and from the run folders in ./runs. `CompensatedStream.use_tool` switches to another one.
+    frame : WrenchFrame
+    stages : Stages
+    force : bool
+        Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`.
+
+    Raises
+    ------
+    ConfigError
+        The configuration cannot be used, or there is not one of calibration and tool.
+    BadCalibration, OSError
+        The calibration cannot be read.
+
+    Examples
+    --------
+    >>> with open_stream(calibration="runs/tool") as stream:  # doctest: +SKIP
+    ...     for sample in stream:
+    ...         print(sample.t_s, sample.force_N, sample.torque_Nm, sample.frame)
+    """
+    if (calibration is None) == (tool is None):
+        found = "no calibration" if tool is None else "both a calibration and a tool"
+        raise ConfigError(f"{found}: give the path of a calibration.json or of its run folder, or the name of a tool")
+    cell = config if isinstance(config, CellConfig) else load(config)
+    if tool is not None:
+        return CompensatedStream(cell, tool, frame=frame, stages=stages, force=force)
+    if isinstance(calibration, CalibrationResult):
+        return CompensatedStream(cell, calibration, frame=frame, stages=stages, force=force)
+    path = Path(str(calibration))
+    return CompensatedStream(cell, load_calibration(path), name=str(path), frame=frame, stages=stages, force=force)
+
+
+def load_calibration(path: Path) -> CalibrationResult:
+    """Read a calibration.json, or the newest one of a run folder. Raises `BadCalibration` or `OSError`."""
+    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path)

@@ -1,0 +1,186 @@
+"""The approach from the present posture to the first pose: a straight joint move if it is clear, else via-poses.
+
+Via-poses come from a roadmap with lazy proofs (Bohlin and Kavraki, Path planning using lazy PRM, ICRA 2000). The
+shortest path through free poses is searched first, then its moves are certified, and moves that are not clear are
+removed from the roadmap. The result is deterministic.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.csgraph import dijkstra
+
+from ftdrive.errors import PlanRefused
+from ftdrive.planning.geometry.certify import Certificate, Certifier
+from ftdrive.planning.geometry.kinematics import checked_joints
+from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
+from ftdrive.planning.search.nodes import ELBOW_RAD
+from ftdrivers.ur.kinematics import Array
+
+NEAR_RAD = float(np.radians(30))
+"""If no approach is proven, the operator jogs every joint to within this angle of the first pose."""
+ROOM_RAD = np.radians([120.0, 90.0, 100.0, 120.0, 120.0, 0.0])
+"""Via-poses may lie this far beyond the range between start and end. Joint 6 needs no detour."""
+AT_RAD = 1e-3
+"""An arm within this angle of the first pose needs no approach."""
+STILL_RAD = float(np.radians(0.5))
+"""A joint that turns less does not count as moving: no part of any arm moves by 20 mm."""
+NODES = 240
+NEIGHBOURS = 16
+ROUNDS = 80
+"""Maximum number of proof rounds, about a second; then the search gives up."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Approach:
+    """k consecutive moves that end at the first pose; k is 0 if the arm is there already."""
+
+    way_rad: Array
+    """(k + 1, 6) from the present posture to the first pose; (0, 6) without a move."""
+    speed_rad_s: Array
+    """(k,) of the leading joint of each move."""
+    certified: bool
+    """Every move is proven clear. Always so when made by `plan_approach`."""
+    clearance_m: float
+    """Lower bound of the distance to anything, over all moves."""
+    limited_by: str
+    """The two bodies that come closest to their margin."""
+
+    @property
+    def q_rad(self) -> Array:
+        """(k, 6) where each move ends."""
+        return self.way_rad[1:]
+
+
+def arm_moves(way_rad: ArrayLike) -> bool:
+    """Return whether base, shoulder or elbow turn along a path (n, 6)."""
+    path = np.asarray(way_rad)
+    return len(path) > 0 and bool(np.ptp(path[:, :3], axis=0).max() >= STILL_RAD)
+
+
+def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, speeds: Speeds) -> Approach:
+    """Plan the approach to the first pose of a tour.
+
+    Parameters
+    ----------
+    q_now : array_like, shape (6,)
+        Present joint angles as reported, within one turn of zero, so that no move crosses a joint limit.
+    q_first : array_like, shape (6,)
+        First pose of the tour.
+
+    Raises
+    ------
+    PlanRefused
+        No approach was proven clear; the message says where to jog the arm.
+    """
+    if np.abs(np.subtract(q_now, q_first)).max() < AT_RAD:
+        return Approach(np.zeros((0, 6)), np.zeros(0), certified=True, clearance_m=np.inf, limited_by="")
+    now, first = checked_joints(q_now), checked_joints(q_first)
+    direct = certifier.certify(now, first, tight=False).clear[0]
+    whole = np.vstack([now, first if direct else _around(certifier, now, first, speeds)])
+    certificate = certifier.certify(whole[:-1], whole[1:])
+    nearest = int(np.argmin(certificate.clearance_m))
+    return Approach(
+        whole,
+        speed_of_leading_joint(certifier.arm, whole[:-1], whole[1:], speeds),
+        bool(certificate.clear.all()),
+        float(certificate.clearance_m[nearest]),
+        certificate.limited_by[nearest],
+    )
+
+
+def _around(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> Array:
+    """Via-poses and the first pose (k, 6). Raises `PlanRefused` if there is no proven path."""
+    here = certifier.certify(now, now)
+    if not here.clear[0]:
+        raise PlanRefused(_too_near(certifier, here) + _where_to_jog(first))
+    if not certifier.free(first)[0]:
+        raise PlanRefused("the first pose of the plan is not clear in this cell: make a new plan with `ftdrive plan`")
+    path = _through_roadmap(certifier, now, first, speeds)
+    if path is None:
+        raise PlanRefused(
+            "no approach from the present posture to the first pose is proven clear: " + _where_to_jog(first)
+        )
+    return path
+
+
+def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> Array | None:
+    """Via-poses and the first pose (k, 6); None if no path was proven."""
+    nodes = _nodes(certifier, now, first)
+    turn = np.abs(nodes[:, None] - nodes)
+    cost = move_duration_s(turn.max(axis=2), speeds.joint_rad_s, speeds.joint_rad_s2) + 0.05 * turn.sum(axis=2)
+    near = np.argsort(cost, axis=1, kind="stable")[:, 1 : NEIGHBOURS + 1]
+    possible = np.zeros(cost.shape, dtype=np.bool_)
+    possible[np.arange(len(nodes))[:, None], near] = True
+    possible[:2] = True  # both ends see every node
+    possible |= possible.T
+    possible[0, 1] = possible[1, 0] = False
+    np.fill_diagonal(possible, val=False)
+    proven = np.zeros_like(possible)
+    for _ in range(ROUNDS):
+        # Two shortest-path trees give the best path through every node, so that a whole batch is certified at once.
+        distance, before = dijkstra(
+            np.where(possible, cost, 0.0), directed=False, indices=[0, 1], return_predecessors=True
+        )
+        if not np.isfinite(distance[0, 1]):
+            return None
+        path = _walk(before[0], 1)[::-1]
+        if all(proven[i, j] for i, j in pairwise(path)):
+            return nodes[path[1:]]
+        through = np.argsort(distance.sum(axis=0), kind="stable")[:6]
+        moves = {
+            (min(i, j), max(i, j))
+            for node in through
+            for way in (_walk(before[0], int(node)), _walk(before[1], int(node)))
+            for i, j in pairwise(way)
+            if not proven[i, j]
+        }
+        start, end = np.array(sorted(moves)).T
+        clear = certifier.certify(nodes[start], nodes[end], tight=False).clear
+        for i, j, is_clear in zip(start, end, clear, strict=True):
+            possible[i, j] = possible[j, i] = is_clear
+            proven[i, j] = proven[j, i] = is_clear
+    return None
+
+
+def _nodes(certifier: Certifier, now: Array, first: Array) -> Array:
+    """Both ends, the corners of the box between them, and random poses in a larger box; all free."""
+    corner = (np.arange(1, 63)[:, None] >> np.arange(6)) % 2 == 1
+    limit = np.full(6, 2 * np.pi)
+    limit[2] = max(ELBOW_RAD, abs(now[2]), abs(first[2]))
+    low = np.maximum(np.minimum(now, first) - ROOM_RAD, -limit)
+    high = np.minimum(np.maximum(now, first) + ROOM_RAD, limit)
+    spread = np.random.default_rng(0).uniform(low, high, (3 * NODES, 6))
+    via = np.unique(np.vstack([np.where(corner, now, first), spread]), axis=0)
+    # Where some joints of both ends are equal, corners coincide with each other or with an end.
+    via = via[(via != now).any(axis=1) & (via != first).any(axis=1)]
+    away = np.maximum(np.abs(via - now), np.abs(via - first)).max(axis=1)
+    via = via[np.argsort(away, kind="stable")]
+    return np.vstack([now, first, via[certifier.free(via)][:NODES]])
+
+
+def _walk(before: NDArray[np.int32], node: int) -> list[int]:
+    """Nodes from one back to the root of its tree; only the node itself if it is not reached."""
+    way = [node]
+    while before[way[-1]] >= 0:
+        way.append(int(before[way[-1]]))
+    return way
+
+
+def _too_near(certifier: Certifier, here: Certificate) -> str:
+    found, margins = here.limited_by[0], certifier.margins
+    within = here.self_clearance_m[0] - margins.self_m < here.scene_clearance_m[0] - margins.scene_m
+    distance, margin = (
+        (here.self_clearance_m[0], margins.self_m) if within else (here.scene_clearance_m[0], margins.scene_m)
+    )
+    return (
+        f"at its present posture the arm is {1e3 * max(distance, 0.0):.0f} mm from contact ({found}), "
+        f"less than the margin of {1e3 * margin:.0f} mm: "
+    )
+
+
+def _where_to_jog(first: Array) -> str:
+    angles = ", ".join(f"{angle:.0f}" for angle in np.degrees(first))
+    return f"jog the arm to within {np.degrees(NEAR_RAD):.0f} degrees of joints {angles}, then start again"

@@ -1,0 +1,298 @@
+"""The shapes of arm and tool, where they are at given joint angles, and how far a turn of a joint can move them.
+
+Radii and hub widths were measured from the convex hulls of the collision meshes in the ROS 2 description of the arms,
+version 2.4.5. Those of UR3e, UR5e, UR10e and UR16e were then fitted to meshes with all lids and edges: none stands out
+by more than 1 mm (tests/benchmarks/mesh_check.py). Those of UR20 and UR30 were widened alike, their lids scaled from
+the UR5e by the length of wrist 2. Models without measured shapes are refused.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ftdrive.errors import ConfigError
+from ftdrive.planning.geometry.kinematics import Frames, frames
+from ftdrive.planning.geometry.shapes import Bodies
+from ftdrivers.ur.kinematics import MODELS, Array, Geometry, model_named
+
+HUB_ROUNDING_M = 0.020
+"""Of the edges of the housings at the joints. On the constant tour a UR3e then comes within 22 mm of itself; the convex
+hulls of its meshes stay 27 mm apart."""
+
+FOREARM_END_ROUNDING_M = 0.010
+"""The same where the forearm carries the wrist."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """Sizes of one arm, metres. Ranges are along the lift axis, from the shoulder's centre."""
+
+    upper_arm_offset_m: float
+    forearm_offset_m: float
+    base_radius_m: float
+    shoulder_radius_m: float
+    upper_arm_radius_m: float
+    elbow_radius_m: float
+    forearm_radius_m: float
+    forearm_end_radius_m: float
+    wrist_radius_m: float
+    upper_arm_hub_m: tuple[float, float]
+    elbow_hub_m: tuple[float, float]
+    forearm_hub_m: tuple[float, float]
+    forearm_end_hub_m: tuple[float, float]
+    wrist_lid_m: float
+    """From the centres of joints 5 and 6 back to the lids of wrists 1 and 2."""
+
+
+_UR5E = Shape(
+    0.138, 0.007, 0.081, 0.088, 0.062, 0.062, 0.050, 0.042, 0.048, (0.065, 0.217), (0.053, 0.217), (-0.035, 0.068),
+    (-0.052, 0.063), 0.057,
+)  # fmt: skip
+_UR10E = Shape(
+    0.1762, 0.0393, 0.101, 0.111, 0.077, 0.071, 0.059, 0.048, 0.057, (0.084, 0.275), (0.084, 0.256), (-0.005, 0.112),
+    (-0.022, 0.109), 0.060,
+)  # fmt: skip
+_UR20 = Shape(
+    0.260, 0.043, 0.125, 0.150, 0.095, 0.097, 0.075, 0.070, 0.065, (0.117, 0.358), (0.134, 0.346), (-0.036, 0.154),
+    (-0.033, 0.143), 0.091,
+)  # fmt: skip
+SHAPES = {
+    "UR3e": Shape(
+        0.120, 0.027, 0.069, 0.073, 0.048, 0.048, 0.040, 0.035, 0.040, (0.054, 0.187), (0.062, 0.180), (0.004, 0.070),
+        (-0.020, 0.080), 0.048,
+    ),
+    "UR5e": _UR5E,
+    "UR7e": _UR5E,
+    "UR10e": _UR10E,
+    "UR12e": _UR10E,
+    "UR16e": Shape(
+        0.176, 0.040, 0.101, 0.111, 0.077, 0.071, 0.059, 0.048, 0.057, (0.084, 0.275), (0.084, 0.256), (-0.005, 0.113),
+        (-0.021, 0.110), 0.060,
+    ),
+    "UR20": _UR20,
+    "UR30": _UR20,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder:
+    """A part of what is mounted on the flange: sensor, adapter, gripper, or a lump at its side. Metres, flange axes."""
+
+    from_m: float
+    """Along the flange z axis, 0 at the flange face."""
+    to_m: float
+    diameter_m: float
+    x_m: float = 0.0
+    """Of its axis, which is parallel to the flange z axis."""
+    y_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.from_m < self.to_m <= 2:
+            raise ConfigError(
+                f"a cylinder of the tool goes from {self.from_m * 1e3:g} to {self.to_m * 1e3:g} mm from the flange: "
+                "give 0 or more first, then something larger, at most 2000"
+            )
+        if not 0 < self.diameter_m <= 1:
+            raise ConfigError(f"a cylinder of the tool is {self.diameter_m * 1e3:g} mm thick: give 1 to 1000")
+        if not self.offset_m <= 1:
+            raise ConfigError(f"a cylinder of the tool is {self.offset_m * 1e3:g} mm off its axis: give at most 1000")
+
+    @property
+    def offset_m(self) -> float:
+        """Distance of its axis from that of joint 6."""
+        return float(np.hypot(self.x_m, self.y_m))
+
+    @property
+    def reach_m(self) -> float:
+        """Largest distance of a point of it from the axis of joint 6."""
+        return self.offset_m + self.diameter_m / 2
+
+
+_ARM = (
+    ("base", 0),
+    ("shoulder", 1),
+    ("upper arm", 2),
+    ("upper arm", 2),
+    ("elbow", 2),
+    *[("upper arm", 2)] * 4,
+    ("forearm", 3),
+    ("forearm", 3),
+    ("forearm", 3),
+    *[("forearm", 3)] * 2,
+    ("wrist 1", 4),
+    ("wrist 1", 4),
+    ("wrist 2", 5),
+    ("wrist 2", 5),
+    ("wrist 3", 6),
+)
+"""Name of each body of the arm, and how many joints move it."""
+_UPPER_ARM, _ELBOW_SIDE, _FOREARM = [*range(2, 9)], 9, [*range(10, 14)]
+_WRIST_1, _WRIST_2_ALONG_6, _WRIST_3, _TOOL = (14, 15), 17, 18, 19
+
+_Part = tuple[Array, Array, float, float]
+"""Ends (n, 3) of the axis of a body, its radius and its rounding."""
+_Housing = tuple[Array, tuple[float, float], float, float]
+"""Of a joint: its centre (n, 3), from where to where along the lift axis, its radius and its rounding."""
+
+
+class ArmModel:
+    """One arm with its tool."""
+
+    def __init__(self, model: str, tool: Sequence[Cylinder]) -> None:
+        name = model_named(model, controller_major=0)
+        if name is None:
+            raise ConfigError(
+                f"'{model}' is not a model of Universal Robots known here: use one of {', '.join(MODELS)}"
+            )
+        if name not in SHAPES:
+            raise ConfigError(
+                f"the shape of the {name} has not been measured, so no collision can be excluded: plans exist for "
+                f"{', '.join(SHAPES)}"
+            )
+        if not tool:
+            raise ConfigError("the tool is empty: describe at least the sensor as a cylinder, from:to:diameter in mm")
+        self.name = name
+        self.geometry: Geometry = MODELS[name]
+        self.shape = SHAPES[name]
+        self.tool = tuple(tool)
+        self.names = tuple(name for name, _ in _ARM) + tuple(f"tool {i + 1}" for i in range(len(tool)))
+        self.moved_by = np.array([joints for _, joints in _ARM] + [6] * len(tool))
+        self.pairs = _pairs(len(tool))
+        self.travel_m = self._travel()
+
+    def frames(self, q_rad: ArrayLike) -> Frames:
+        """Where the joints are, for joint vectors (n, 6)."""
+        return frames(self.geometry, q_rad)
+
+    def bodies(self, q_rad: ArrayLike) -> Bodies:
+        """Bodies (n, k) at joint vectors (n, 6), in the order of `names`."""
+        at, g, s = self.frames(q_rad), self.geometry, self.shape
+        axis_6 = at.R_base_flange[:, :, 2]
+        half_way = (at.wrist_m + at.wrist_2_m) / 2
+        wrist_3 = at.flange_m - g.d6_m / 2 * axis_6
+        lid = s.wrist_lid_m - HUB_ROUNDING_M
+        shoulder_side = at.shoulder_m, s.upper_arm_hub_m, s.upper_arm_radius_m, HUB_ROUNDING_M
+        elbow = at.elbow_m, s.elbow_hub_m, s.elbow_radius_m, HUB_ROUNDING_M
+        elbow_side = at.elbow_m, s.forearm_hub_m, s.elbow_radius_m, HUB_ROUNDING_M
+        wrist_side = at.forearm_end_m, s.forearm_end_hub_m, s.forearm_end_radius_m, FOREARM_END_ROUNDING_M
+        shoulder_end = at.shoulder_m + s.upper_arm_hub_m[0] * at.lift
+        forearm_end = at.forearm_end_m + s.forearm_end_hub_m[1] * at.lift
+        upper_arm, forearm = s.upper_arm_offset_m * at.lift, s.forearm_offset_m * at.lift
+        wrist_hub = s.wrist_radius_m - HUB_ROUNDING_M, HUB_ROUNDING_M
+        parts = [
+            (np.zeros_like(at.lift), at.shoulder_m, 0.0, s.base_radius_m),
+            (at.shoulder_m, shoulder_end, 0.0, s.shoulder_radius_m),
+            _hub(at.lift, shoulder_side),
+            (at.shoulder_m + upper_arm, at.elbow_m + upper_arm, 0.0, s.upper_arm_radius_m),
+            _hub(at.lift, elbow),
+            *_edges(at.lift, 0, shoulder_side, elbow),
+            *_edges(at.lift, 1, shoulder_side, elbow),
+            _hub(at.lift, elbow_side),
+            (at.elbow_m + forearm, at.forearm_end_m + forearm, 0.0, s.forearm_radius_m),
+            _hub(at.lift, wrist_side),
+            *_edges(at.lift, 1, elbow_side, wrist_side),
+            (forearm_end, at.wrist_m, 0.0, s.wrist_radius_m),
+            (at.wrist_m - lid * at.axis_5, half_way, *wrist_hub),
+            (half_way, at.wrist_2_m, 0.0, s.wrist_radius_m),
+            (at.wrist_2_m - lid * axis_6, wrist_3, *wrist_hub),
+            (wrist_3, at.flange_m, s.wrist_radius_m, 0.0),
+        ]
+        for part in self.tool:
+            foot = at.flange_m + at.R_base_flange[:, :, :2] @ np.array([part.x_m, part.y_m])
+            parts.append((foot + part.from_m * axis_6, foot + part.to_m * axis_6, part.diameter_m / 2, 0.0))
+        starts, ends, radius, rounding = zip(*parts, strict=True)
+        start, end = np.stack(starts, axis=1), np.stack(ends, axis=1)
+        length = np.linalg.norm(end - start, axis=2)
+        axis = (end - start) / np.maximum(length, 1e-12)[:, :, None]
+        half_length = length.max(axis=0, initial=0.0) / 2  # the same in every posture
+        return Bodies((start + end) / 2, axis, half_length, np.array(radius), np.array(rounding))
+
+    @property
+    def ball_m(self) -> float:
+        """Radius about the wrist centre of a ball that holds all that the last three joints move, and 15 mm more."""
+        g, r = self.geometry, self.shape.wrist_radius_m
+        parts = [(r, g.d6_m), *((part.reach_m, g.d6_m + part.to_m) for part in self.tool)]
+        return max(float(np.hypot(g.d5_m + reach, height)) for reach, height in parts) + 0.015
+
+    def describe(self) -> dict[str, Any]:
+        """Everything a plan relies on, for its hash."""
+        return {"model": self.name, "geometry": asdict(self.geometry), "shape": asdict(self.shape)}
+
+    def _travel(self) -> Array:
+        """Bound (k, 6): how far a turn of joint j by one radian can move a point of body i, metres.
+
+        Largest distance of a point of the body from the joint's axis, over all postures. Of a body that is round about
+        the axis of joint 6, that joint moves nothing.
+        """
+        g, s = self.geometry, self.shape
+        # Reach of each body beyond the wrist centre: from axis 4, from axis 5, from axis 6, and along the lift axis.
+        # Rounding is left out: where a body's core stays, so does all of it.
+        r, lid = s.wrist_radius_m, s.wrist_lid_m - HUB_ROUNDING_M
+        hub, back_4, back_5 = r - HUB_ROUNDING_M, max(lid, g.d5_m / 2), max(lid, g.d6_m / 2)
+        wrist: list[tuple[float, float, float]] = [
+            (0.0, 0.0, 0.0),
+            (float(np.hypot(back_4, hub)), hub, 0.0),
+            (g.d5_m, 0.0, 0.0),
+            (float(np.hypot(g.d5_m + hub, back_5)), float(np.hypot(back_5, hub)), 0.0),
+            (float(np.hypot(g.d5_m + r, g.d6_m)), float(np.hypot(g.d6_m, r)), 0.0),
+        ]
+        for part in self.tool:
+            height, reach = g.d6_m + part.to_m, part.reach_m
+            turned = reach if part.offset_m > 0 else 0.0
+            wrist.append((float(np.hypot(g.d5_m + reach, height)), float(np.hypot(height, reach)), turned))
+        upper, fore = -g.a2_m, -g.a3_m
+        rows = np.zeros((len(_ARM) + len(self.tool), 6))
+        hubs = s.upper_arm_hub_m, s.elbow_hub_m, s.forearm_hub_m, s.forearm_end_hub_m
+        sideways = max(abs(end) for hub in hubs for end in hub)
+        radius = max(s.upper_arm_radius_m, s.elbow_radius_m, s.forearm_radius_m)
+        rows[1, 0] = sideways
+        rows[_UPPER_ARM, :2] = np.hypot(sideways, upper + radius), upper + radius
+        rows[_UPPER_ARM[0], :2] = np.hypot(sideways, radius), radius
+        rows[_FOREARM, :3] = np.hypot(sideways, upper + fore + radius), upper + fore + radius, fore + radius
+        rows[_ELBOW_SIDE, :3] = np.hypot(sideways, upper + radius), upper + radius, radius
+        for row, (from_4, from_5, from_6) in zip(rows[_WRIST_1[0] :], wrist, strict=True):
+            from_2 = upper + fore + from_4
+            row[:] = np.hypot(from_2, g.d4_m + from_5 + radius), from_2, fore + from_4, from_4, from_5, from_6
+        return rows
+
+
+def _hub(lift: Array, housing: _Housing) -> _Part:
+    centre, (low, high), radius, rounding = housing
+    return centre + (low + rounding) * lift, centre + (high - rounding) * lift, radius - rounding, rounding
+
+
+def _edges(lift: Array, end: int, *housings: _Housing) -> list[_Part]:
+    """Two bars from housing to housing, along the edges of their hull at its low (0) or high (1) end of the lift axis.
+
+    The arm is hollow there, between its tube and the housings; nothing should be planned to go in.
+    """
+    (first, *_), (second, *_) = housings
+    side = np.cross(lift, second - first)
+    side /= np.linalg.norm(side, axis=1)[:, None]
+    inwards = HUB_ROUNDING_M if end == 0 else -HUB_ROUNDING_M
+    bars = []
+    for sign in (-1, 1):
+        start, stop = (
+            centre + (range_m[end] + inwards) * lift + sign * (radius - HUB_ROUNDING_M) * side
+            for centre, range_m, radius, _ in housings
+        )
+        bars.append((start, stop, 0.0, HUB_ROUNDING_M))
+    return bars
+
+
+def _pairs(n_tool: int) -> NDArray[np.intp]:
+    """Pairs (p, 2) of bodies that can touch. Neighbours on a joint, and what the arm's build keeps apart, are left out.
+
+    Upper arm and forearm turn past each other in parallel planes, and so do forearm and the part of wrist 2 along axis
+    5. Wrists 1 and 3 are held apart by wrist 2.
+    """
+    tool = range(_TOOL, _TOOL + n_tool)
+    beyond_forearm = (*range(_WRIST_1[0], _TOOL), *tool)
+    pairs = [(low, high) for low in (0, 1) for high in (*_FOREARM, *beyond_forearm)]
+    pairs += [(low, high) for low in _UPPER_ARM for high in beyond_forearm]
+    pairs += [(low, high) for low in (_ELBOW_SIDE, *_FOREARM) for high in (_WRIST_2_ALONG_6, _WRIST_3, *tool)]
+    pairs += [(low, high) for low in _WRIST_1 for high in tool]
+    return np.array(pairs)

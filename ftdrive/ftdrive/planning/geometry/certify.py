@@ -1,0 +1,172 @@
+"""Proof that straight joint moves are clear along their whole length, not only at samples.
+
+In a straight joint move, the distance of two bodies changes by at most the sum of |turn| times the longest lever over
+the joints between them. An interval is clear if its midpoint is farther from contact than half of that change. Other
+intervals are halved. Only pairs that are still undecided are examined again.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ftdrive.planning.geometry.arm_model import ArmModel
+from ftdrive.planning.geometry.scene import Scene
+from ftdrive.planning.geometry.shapes import Bodies, height_above, separation, separation_from_box
+from ftdrivers.ur.kinematics import Array
+
+FIRST_STEP_RAD = np.radians(15)
+LAST_STEP_RAD = np.radians(0.4)
+TIGHTNESS = 0.1
+"""The reported clearance is at most this fraction, or 2 mm, below the true minimum of the move."""
+
+
+@dataclass(frozen=True, slots=True)
+class Margins:
+    """Distances to keep, metres."""
+
+    self_m: float = 0.020
+    """Between parts of arm and tool: more than the error of their shapes."""
+    scene_m: float = 0.030
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Certificate:
+    """The result of the proof for m moves."""
+
+    clear: NDArray[np.bool_]
+    """(m,) The whole move keeps the margins."""
+    self_clearance_m: Array
+    """(m,) Lower bound of the distance between parts of arm and tool; an upper bound if the move is not clear."""
+    scene_clearance_m: Array
+    """(m,) The same to planes and boxes; infinite if there are none."""
+    limited_by: tuple[str, ...]
+    """(m,) The pair that comes closest to its margin."""
+
+    @property
+    def clearance_m(self) -> Array:
+        """(m,) The smaller of both clearances."""
+        return np.minimum(self.self_clearance_m, self.scene_clearance_m)
+
+
+class Certifier:
+    """Proves moves of one arm with its tool in one scene."""
+
+    def __init__(self, arm: ArmModel, scene: Scene, margins: Margins | None = None) -> None:
+        self.arm, self.scene, self.margins = arm, scene, margins or Margins()
+        self._pairs = arm.pairs
+        moving = np.flatnonzero(arm.moved_by > 0)
+        obstacles = len(scene.planes) + len(scene.boxes)
+        self._of_scene = np.array([(body, k) for k in range(obstacles) for body in moving], dtype=np.intp).reshape(
+            -1, 2
+        )
+        joint = np.arange(6)
+        low, high = arm.moved_by[self._pairs].T
+        between = (joint >= low[:, None]) & (joint < high[:, None])
+        # (p, 6) metres of approach a radian of each joint can bring; pairs of the scene after those of the arm.
+        self._lever_m = np.vstack([arm.travel_m[self._pairs[:, 1]] * between, arm.travel_m[self._of_scene[:, 0]]])
+        self._margin_m = np.repeat([self.margins.self_m, self.margins.scene_m], [len(self._pairs), len(self._of_scene)])
+        self._names = [f"{arm.names[i]} - {arm.names[j]}" for i, j in self._pairs]
+        things = [f"plane {i + 1}" for i in range(len(scene.planes))] + [
+            f"box {i + 1}" for i in range(len(scene.boxes))
+        ]
+        self._names += [f"{arm.names[i]} - {things[k]}" for i, k in self._of_scene]
+
+    def free(self, q_rad: ArrayLike) -> NDArray[np.bool_]:
+        """Return (n,) whether the margins are kept at joint vectors (n, 6)."""
+        q = np.asarray(q_rad, dtype=np.float64).reshape(-1, 6)
+        row, pair = (index.ravel() for index in np.indices((len(q), len(self._margin_m))))
+        needed = self._margin_m[pair]
+        touching = row[self._distance(q, row, pair, needed) <= needed]
+        return ~np.isin(np.arange(len(q)), touching)
+
+    def clear_around(self, q_rad: Array) -> bool:
+        """Return whether all moves of a closed tour through joint vectors (n, 6) are proven clear."""
+        return bool(self.certify(q_rad, np.roll(q_rad, -1, axis=0), tight=False).clear.all())
+
+    def certify(self, start_rad: ArrayLike, end_rad: ArrayLike, *, tight: bool = True) -> Certificate:
+        """Certify straight joint moves.
+
+        Parameters
+        ----------
+        start_rad, end_rad : array_like, shape (m, 6)
+        tight : bool
+            If true, refine the reported clearances; else stop as soon as the margins are proven.
+        """
+        start = np.asarray(start_rad, dtype=np.float64).reshape(-1, 6)
+        turn = np.asarray(end_rad, dtype=np.float64).reshape(-1, 6) - start
+        m, n_pairs, n_self = len(start), len(self._margin_m), len(self._pairs)
+        approach_m = np.abs(turn) @ self._lever_m.T  # (m, p) over the whole move
+        leading = np.abs(turn).max(axis=1)
+        proven = np.full((m, 2), np.inf)  # smallest lower bound of what is settled, by kind
+        nearest = np.full((m, 2), np.inf)  # smallest distance met, by kind
+        least_excess, limited_by = np.full(m, np.inf), np.zeros(m, dtype=np.intp)
+        clear = np.ones(m, dtype=np.bool_)
+
+        parts = np.maximum(1, np.ceil(leading / FIRST_STEP_RAD)).astype(int)
+        move = np.repeat(np.arange(m), parts)
+        middle = (np.arange(len(move)) - np.repeat(np.cumsum(parts) - parts, parts) + 0.5) / parts[move]
+        half = 0.5 / parts[move]
+        interval, pair = (index.ravel() for index in np.indices((len(move), n_pairs)))
+        while len(interval):
+            kind = (pair >= n_self).astype(int)
+            own = move[interval]
+            slack = approach_m[own, pair] * half[interval]
+            enough = np.full(len(pair), np.inf) if tight else self._margin_m[pair] + slack
+            distance = self._distance(start[move] + middle[:, None] * turn[move], interval, pair, enough)
+            np.minimum.at(nearest, (own, kind), distance)
+            excess = distance - self._margin_m[pair]
+            order = np.argsort(-excess, kind="stable")
+            closer = excess[order] < least_excess[own[order]]
+            limited_by[own[order[closer]]] = pair[order[closer]]  # the last assignment is the closest
+            np.minimum.at(least_excess, own, excess)
+            bound = distance - slack
+            settled = bound > self._margin_m[pair]
+            if tight:
+                allowed = np.maximum(0.002, TIGHTNESS * nearest[own, kind])
+                settled &= bound >= nearest[own, kind] - allowed
+            last = half[interval] * leading[own] < LAST_STEP_RAD / 2
+            clear[own[(excess <= 0) | (last & (bound <= self._margin_m[pair]))]] = False
+            settled |= last
+            np.minimum.at(proven, (own[settled], kind[settled]), bound[settled])
+            open_ = ~settled & clear[own]
+            # Halve the intervals that still hold an open pair.
+            kept, position = np.unique(interval[open_], return_inverse=True)
+            pair = np.concatenate([pair[open_]] * 2)
+            interval = np.concatenate([position, position + len(kept)])
+            move, middle, half = (np.concatenate([a[kept]] * 2) for a in (move, middle, half))
+            half = half / 2
+            middle = middle + np.repeat([-1.0, 1.0], len(kept)) * half
+        stated = np.where(clear[:, None], proven, nearest)
+        return Certificate(clear, stated[:, 0], stated[:, 1], tuple(self._names[i] for i in limited_by))
+
+    def _distance(self, q_rad: Array, row: NDArray[np.intp], pair: NDArray[np.intp], enough_m: Array) -> Array:
+        """Lower bounds of distances (k,) of some pairs at some joint vectors."""
+        bodies = self.arm.bodies(q_rad)
+        n = len(self._pairs)
+        distance = np.empty(len(pair))
+        own = pair < n
+        first, second = self._pairs[pair[own]].T
+        at = row[own]
+        gap = bodies.centre_m[at, first] - bodies.centre_m[at, second]
+        reach = bodies.reach_m
+        apart = np.sqrt((gap * gap).sum(axis=1)) - reach[first] - reach[second]
+        near = apart < enough_m[own]
+        apart[near] = separation(bodies[at[near], first[near]], bodies[at[near], second[near]], enough_m[own][near])
+        distance[own] = apart
+        body, thing = self._of_scene[pair[~own] - n].T
+        distance[~own] = self._to_scene(bodies, row[~own], body, thing)
+        return distance
+
+    def _to_scene(
+        self, bodies: Bodies, row: NDArray[np.intp], body: NDArray[np.intp], thing: NDArray[np.intp]
+    ) -> Array:
+        distance = np.empty(len(row))
+        for k, plane in enumerate(self.scene.planes):
+            at = thing == k
+            distance[at] = height_above(bodies[row[at], body[at]], np.array(plane.normal), plane.offset_m)
+        for k, box in enumerate(self.scene.boxes):
+            at = thing == len(self.scene.planes) + k
+            corners = np.array(box.low_m), np.array(box.high_m)
+            distance[at] = separation_from_box(bodies[row[at], body[at]], *corners)
+        return distance

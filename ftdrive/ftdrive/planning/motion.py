@@ -1,0 +1,80 @@
+"""How fast a joint move may be, and how long it takes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ftdrive.planning.geometry.arm_model import ArmModel
+from ftdrivers.ur.kinematics import Array
+
+SAMPLE_RAD = np.radians(0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Speeds:
+    """Limits of every move: for the joint that turns farthest, and for the tips of the tool."""
+
+    joint_rad_s: float = float(np.radians(60))
+    joint_rad_s2: float = float(np.radians(80))
+    tip_m_s: float | None = 0.25
+    """None for no limit."""
+
+    @classmethod
+    def first_run(cls) -> "Speeds":
+        """Return the slow limits for a plan that has not run in its workcell yet."""
+        return cls(float(np.radians(30)), float(np.radians(40)))
+
+
+def slower(one: Speeds, other: Speeds) -> Speeds:
+    """Return the smaller of each limit."""
+    return Speeds(
+        min(one.joint_rad_s, other.joint_rad_s),
+        min(one.joint_rad_s2, other.joint_rad_s2),
+        min(one.tip_m_s or np.inf, other.tip_m_s or np.inf),
+    )
+
+
+def move_duration_s(turn_rad: Array, speed_rad_s: Array | float, acceleration_rad_s2: float) -> Array:
+    """Duration of moves by the angle of their leading joint, with speed ramped up and down."""
+    ramp = np.square(speed_rad_s) / acceleration_rad_s2
+    whole = turn_rad / speed_rad_s + np.asarray(speed_rad_s) / acceleration_rad_s2
+    return np.asarray(np.where(turn_rad > ramp, whole, 2 * np.sqrt(turn_rad / acceleration_rad_s2)))
+
+
+def speed_of_leading_joint(arm: ArmModel, start_rad: Array, end_rad: Array, speeds: Speeds) -> Array:
+    """Speed (m,) for straight joint moves (m, 6) at which no tip of the tool exceeds the limit."""
+    turn = end_rad - start_rad
+    leading = np.abs(turn).max(axis=1)
+    speed = np.full(len(turn), speeds.joint_rad_s)
+    if speeds.tip_m_s is None:
+        return speed
+    for i in np.flatnonzero(leading > 0):
+        share = np.linspace(0, 1, int(np.ceil(leading[i] / SAMPLE_RAD)) + 1)
+        points = tips(arm, start_rad[i] + share[:, None] * turn[i])
+        path_m = np.linalg.norm(np.diff(points, axis=0), axis=2).max() * (len(share) - 1)
+        speed[i] = min(speeds.joint_rad_s, speeds.tip_m_s * leading[i] / path_m) if path_m > 0 else speeds.joint_rad_s
+    return speed
+
+
+def durations_s(arm: ArmModel, q_rad: Array, speeds: Speeds) -> Array:
+    """Duration (n, n) of straight moves between joint vectors (n, 6), to compare tours.
+
+    Tips are evaluated only at both ends and the middle of a move: their true speed may be a little higher.
+    """
+    turn = np.abs(q_rad[:, None] - q_rad).max(axis=2)
+    speed = np.full(turn.shape, speeds.joint_rad_s)
+    if speeds.tip_m_s is not None:
+        at = tips(arm, q_rad)
+        i, j = np.triu_indices(len(q_rad), 1)
+        middle = tips(arm, (q_rad[i] + q_rad[j]) / 2)
+        halves = [np.linalg.norm(middle - at[end], axis=2).max(axis=1) for end in (i, j)]
+        path_m = np.maximum(2 * np.maximum(*halves), 1e-9)
+        speed[i, j] = speed[j, i] = np.minimum(speeds.joint_rad_s, speeds.tip_m_s * turn[i, j] / path_m)
+    return move_duration_s(turn, np.maximum(speed, 1e-9), speeds.joint_rad_s2)
+
+
+def tips(arm: ArmModel, q_rad: Array) -> Array:
+    """Centres (n, k, 3) in base of the far ends of the tool's cylinders."""
+    at = arm.frames(q_rad)
+    local = np.array([[part.x_m, part.y_m, part.to_m] for part in arm.tool])
+    return np.asarray(at.flange_m[:, None] + local @ np.swapaxes(at.R_base_flange, 1, 2))

@@ -1,0 +1,258 @@
+"""A plan: joint targets, speeds, clearances, predicted accuracy, and the cell that it was made for."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ftcalib.files import check_format, read_object, write_new
+from ftcalib.poses.information import Guess, Prediction, predicted_sigma, special
+from ftdrive.errors import BadPlan, PlanRefused
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
+from ftdrivers.ur.kinematics import Array
+
+PLAN_FORMAT = "ftdrive.plan/1"
+BALL_SAMPLES = 181
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One pose, and the move from it to the next one; the last move leads back to the first pose."""
+
+    number: int
+    """Number of the orientation in the paper, 1 to 24; from 101 on for chosen poses."""
+    q_rad: tuple[float, ...]
+    R_base_flange: tuple[tuple[float, ...], ...]
+    turn_rad: float
+    """Turn of the leading joint in the move."""
+    speed_rad_s: float
+    """Speed of the leading joint."""
+    duration_s: float
+    certified: bool
+    clearance_m: float
+    limited_by: str
+    """The two bodies that come closest to their margin."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A closed tour of poses; `to_dict` defines the file."""
+
+    kind: str
+    """constant, wrist, posture, box, cone, reachable or verification."""
+    why: tuple[str, ...]
+    """What was tried, and the loss of accuracy of this choice."""
+    made_for: Mapping[str, str]
+    """SHA-256 of model, tool, scene (with the margins)."""
+    steps: tuple[Step, ...]
+    acceleration_rad_s2: float
+    ball_m: float
+    """Radius of a ball that contains wrist and tool during the whole tour."""
+    ball_centre_m: tuple[float, ...]
+    """(3,) in base; where the axes of joints 4 and 5 cross, if base, shoulder and elbow rest."""
+    predicted: Mapping[str, Any]
+    description: Mapping[str, Any]
+    """Model, tool, scene and speeds; `measured` says whether the operator has measured tool and scene, see `marked`."""
+
+    @property
+    def certified(self) -> bool:
+        """Whether every move, the last one back included, is proven clear."""
+        return all(step.certified for step in self.steps)
+
+    @property
+    def arm_rests(self) -> bool:
+        """Whether base, shoulder and elbow stay at rest during the whole tour."""
+        return len({step.q_rad[:3] for step in self.steps}) == 1
+
+    @property
+    def measured(self) -> bool:
+        """Whether the operator has configured tool and scene as measured; else they may be placeholders."""
+        return self.description.get("measured") is True
+
+    def marked(self, *, measured: bool) -> "Plan":
+        """Record in the description, and so in the file and its hash, whether tool and scene were measured."""
+        return replace(self, description={**self.description, "measured": measured})
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the file."""
+        return str(self.to_dict()["sha256"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the contents of the file; its hash over everything else reveals later changes."""
+        document: dict[str, Any] = {
+            "format": PLAN_FORMAT,
+            "kind": self.kind,
+            "why": list(self.why),
+            "poses": len(self.steps),
+            "certified": self.certified,
+            "uncertified_segments": sum(not step.certified for step in self.steps),
+            "max_move_deg": float(np.degrees(max(step.turn_rad for step in self.steps))),
+            "motion_time_s": float(sum(step.duration_s for step in self.steps)),
+            "min_clearance_mm": 1e3 * min(step.clearance_m for step in self.steps),
+            "ball_m": self.ball_m,
+            "ball_centre_m": list(self.ball_centre_m),
+            "predicted_sigma": dict(self.predicted),
+            "acceleration_rad_s2": self.acceleration_rad_s2,
+            "made_for": dict(self.made_for),
+            "description": dict(self.description),
+            "steps": [asdict(step) for step in self.steps],
+        }
+        document = json.loads(json.dumps(document))  # tuples become lists, as they come back from a file
+        return document | {"sha256": digest(document)}
+
+    def save(self, path: Path) -> None:
+        """Write a new file."""
+        write_new(path, json.dumps(self.to_dict(), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> "Plan":
+        """Read a file; raises `BadPlan` if it is not a plan, `PlanRefused` if it was changed."""
+        try:
+            document = read_object(path, BadPlan)
+            check_format(document, PLAN_FORMAT, BadPlan)
+        except BadPlan as error:
+            raise BadPlan(f"{path}: {error}") from error
+        document.pop("schema_version", None)  # that of `ftdrive plan --json`, which is a plan too
+        found = document.pop("sha256", None)
+        if found != digest(document):
+            raise PlanRefused(f"{path} was changed after it was made: make a new plan with `ftdrive plan`")
+        steps = tuple(
+            Step(**{**step, "q_rad": tuple(step["q_rad"]), "R_base_flange": tuple(map(tuple, step["R_base_flange"]))})
+            for step in document["steps"]
+        )
+        return cls(
+            document["kind"],
+            tuple(document["why"]),
+            document["made_for"],
+            steps,
+            document["acceleration_rad_s2"],
+            document["ball_m"],
+            tuple(document["ball_centre_m"]),
+            document["predicted_sigma"],
+            document["description"],
+        )
+
+    def require(self, certifier: Certifier) -> None:
+        """Raise `PlanRefused` unless the plan was made for this model, tool and scene, and is still proven clear."""
+        now = fingerprints(certifier)
+        changed = [name for name in now if self.made_for.get(name) != now[name]]
+        if changed:
+            raise PlanRefused(f"the plan was made for another {' and another '.join(changed)}: make a new one")
+        q = np.array([step.q_rad for step in self.steps])
+        if not certifier.clear_around(q):
+            raise PlanRefused("a move of the plan cannot be proven clear: make a new plan")
+
+
+def make_plan(
+    kind: str,
+    why: Sequence[str],
+    certifier: Certifier,
+    numbers: Sequence[int],
+    q_rad: Array,
+    speeds: Speeds,
+    guess: Guess,
+) -> Plan:
+    """Certify a closed tour and predict its accuracy for the guessed tool and noise.
+
+    Parameters
+    ----------
+    why : sequence of str
+        Sentences; the predicted error is appended.
+    numbers : sequence of int
+        Numbers of the orientations.
+    q_rad : array, shape (n, 6)
+        In the order of travel.
+    """
+    arm, following = certifier.arm, np.roll(q_rad, -1, axis=0)
+    certificate = certifier.certify(q_rad, following)
+    R = arm.frames(q_rad).R_base_flange
+    turn = np.abs(following - q_rad).max(axis=1)
+    speed = speed_of_leading_joint(arm, q_rad, following, speeds)
+    duration = move_duration_s(turn, speed, speeds.joint_rad_s2)
+    prediction = predicted_sigma(R, guess)
+    all_24 = predicted_sigma(special(range(1, 25)), guess).force_rms_N
+    words = f"Predicted error of force compensation: {prediction.force_rms_N:.3f} N"
+    if set(numbers) != set(range(1, 25)):
+        words += f", {prediction.force_rms_N / all_24:.2f} times that of all 24 poses"
+    ball_centre_m, ball_m = _ball(certifier, q_rad, following)
+    steps = tuple(
+        Step(
+            int(numbers[i]),
+            tuple(q_rad[i].tolist()),
+            tuple(tuple(row) for row in R[i].tolist()),
+            float(turn[i]),
+            float(speed[i]),
+            float(duration[i]),
+            bool(certificate.clear[i]),
+            float(certificate.clearance_m[i]),
+            certificate.limited_by[i],
+        )
+        for i in range(len(q_rad))
+    )
+    return Plan(
+        kind,
+        (*why, f"{words}."),
+        fingerprints(certifier),
+        steps,
+        speeds.joint_rad_s2,
+        ball_m,
+        tuple(ball_centre_m.tolist()),
+        _as_json(prediction),
+        {
+            "model": arm.name,
+            "tool": [asdict(part) for part in arm.tool],
+            "scene": certifier.scene.describe(),
+            "margins": asdict(certifier.margins),
+            "speeds": asdict(speeds),
+            "guess": {
+                "mass_kg": guess.mass_kg,
+                "sigma_force_N": guess.sigma_force_N,
+                "sigma_torque_Nm": guess.sigma_torque_Nm,
+            },
+        },
+    )
+
+
+def _ball(certifier: Certifier, start_rad: Array, end_rad: Array) -> tuple[Array, float]:
+    """Centre (3,) and radius of a ball that contains wrist and tool during all moves."""
+    share = np.linspace(0, 1, BALL_SAMPLES)[:, None, None]
+    wrist_m = certifier.arm.frames(((1 - share) * start_rad + share * end_rad).reshape(-1, 6)).wrist_m
+    centre_m = (wrist_m.min(axis=0) + wrist_m.max(axis=0)) / 2
+    # Between two samples the wrist centre can be farther out by no more than half a step of its path.
+    step_m = np.linalg.norm(np.diff(wrist_m.reshape(BALL_SAMPLES, -1, 3), axis=0), axis=2).max()
+    away_m = np.linalg.norm(wrist_m - centre_m, axis=1).max() + step_m / 2
+    return centre_m, certifier.arm.ball_m + float(away_m)
+
+
+def fingerprints(certifier: Certifier) -> dict[str, str]:
+    """SHA-256 of everything that a proof of clearance depends on."""
+    return {
+        "model": digest(certifier.arm.describe()),
+        "tool": digest([asdict(part) for part in certifier.arm.tool]),
+        "scene": digest([certifier.scene.describe(), asdict(certifier.margins)]),
+    }
+
+
+def digest(value: Any) -> str:
+    """SHA-256 of a value's JSON with sorted keys."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
+
+
+def _as_json(prediction: Prediction) -> dict[str, Any]:
+    """Sigma of each estimate; null if the poses do not determine it."""
+    values: dict[str, Any] = {name: np.asarray(sigma).tolist() for name, sigma in prediction.sigma.items()}
+    for name in ("force_rms_N", "torque_rms_Nm", "cond9", "cond_u1", "second_basin_gap"):
+        values[name] = getattr(prediction, name)
+
+    def finite(value: Any) -> Any:
+        if isinstance(value, list):
+            return [finite(one) for one in value]
+        return value if np.isfinite(value) else None
+
+    return {name: finite(value) for name, value in values.items()}

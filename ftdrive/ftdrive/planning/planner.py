@@ -1,0 +1,298 @@
+"""Chooses a plan and states the reason: the constant tour if it fits, else the next best kind.
+
+All 24 orientations are preferred because they are the most informative. Tours that keep base, shoulder and elbow at
+rest come first. If some orientations are out of reach, the most informative reachable poses replace them.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from ftcalib.poses.information import SUBSET_6, T12, Guess, special
+from ftcalib.poses.verification import FEWEST
+from ftdrive.cell.config import USUAL_KG
+from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.kinematics import checked_joints
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.plan import Plan, make_plan
+from ftdrive.planning.search import constant_tour
+from ftdrive.planning.search.chosen import Chosen, chosen_tour, verification_tour
+from ftdrive.planning.search.nodes import WRIST_6_RAD, box_nodes, wrist_nodes
+from ftdrive.planning.search.postures import with_room
+from ftdrive.planning.search.tours import clear_tour
+from ftdrivers.ur.kinematics import Array
+
+USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
+"""All models have room for the constant tour here with usual tools; the wrist is at its first pose."""
+NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
+BOX_HALF_SIZE_M = 0.1
+FEWEST_CHOSEN = 6
+
+Found = tuple[Sequence[int], Array]
+"""Numbers of the orientations and joint vectors (n, 6), in the order of travel."""
+Attempt = tuple[str, Sequence[str], Found | None]
+"""Kind of a tour, the reason for it, and the tour where there is one."""
+
+
+def guess_of(certifier: Certifier, mass_kg: float | None = None) -> Guess:
+    """Return a prior: this tool mass, centre of mass at half the tool length, usual noise, gravity as mounted."""
+    length_m = max(part.to_m for part in certifier.arm.tool)
+    return Guess(mass_kg or USUAL_KG, 0.05, 0.003, (0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
+
+
+def plan_tour(
+    certifier: Certifier, q_rad: ArrayLike = USUAL_POSTURE_RAD, poses: int = 24, *, speeds: Speeds, guess: Guess
+) -> Plan:
+    """Plan a tour of the special orientations if one exists, else of the most informative reachable poses.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        Present joint angles.
+    poses : {24, 12, 6}
+    guess : Guess
+        Of the tool and the noise.
+
+    Returns
+    -------
+    Plan
+        Of kind "constant", "wrist", "posture", "box" or "reachable", in this order of preference.
+
+    Raises
+    ------
+    PlanRefused
+        No tour has only moves that are proven clear.
+    """
+    q_now = checked_joints(q_rad)
+    _numbers(poses)
+    refusal = (
+        f"{_reason(poses)}. Another posture, a box for the flange, and other poses were tried: no tour of them is "
+        "proven clear and informative enough to estimate everything. Describe the tool more closely, or clear the "
+        "surroundings"
+    )
+    return _first_found(_attempts(certifier, q_now, poses, speeds, guess), refusal, certifier, speeds, guess)
+
+
+def _attempts(certifier: Certifier, q_now: Array, poses: int, speeds: Speeds, guess: Guess) -> Iterator[Attempt]:
+    """Try each kind of tour, the preferred ones first."""
+    numbers, reason = NUMBERS[poses], _reason(poses)
+    if poses == 24:
+        why = "The constant tour is proven clear at the present posture; base, shoulder and elbow stay at rest."
+        yield "constant", [why], _constant(certifier, q_now)
+    why = f"{reason}: the wrist visits them in the fastest order that is clear, base, shoulder and elbow at rest."
+    yield "wrist", [why], _wrist(certifier, q_now, numbers, speeds)
+    for tour in _clear_tours(certifier, q_now):
+        elsewhere: Found | None = constant_tour.NUMBERS, tour
+        if poses != 24 or not _winds_little(tour, q_now):
+            elsewhere = _wrist(certifier, np.append(tour[0, :5], q_now[5]), numbers, speeds)
+        why = f"{reason}, and the wrist alone has no clear tour there."
+        yield "posture", [why, _elsewhere_words(tour[0])], elsewhere
+    nowhere = f"{reason}, and the wrist alone has no clear tour at any posture of joints 1 to 3 that was tried."
+    for centre_m in _box_centres(certifier, q_now):
+        found = _box(certifier, q_now, numbers, centre_m, BOX_HALF_SIZE_M, speeds)
+        yield "box", [nowhere, _box_words(centre_m, BOX_HALF_SIZE_M)], found
+    if (chosen := chosen_tour(certifier, q_now, poses, np.pi, speeds, guess)) is not None:
+        why = "Some orientations are out of reach: these are the most informative reachable poses."
+        yield "reachable", [why, nowhere, *_chosen_words(chosen)], (chosen.numbers, chosen.q_rad)
+
+
+def _reason(poses: int) -> str:
+    """Return why the plan is not the constant tour."""
+    if poses == 24:
+        return "The constant tour cannot be proven clear at the present posture"
+    return f"{poses} of the 24 orientations were requested"
+
+
+def _first_found(attempts: Iterable[Attempt], refusal: str, certifier: Certifier, speeds: Speeds, guess: Guess) -> Plan:
+    for kind, why, found in attempts:
+        if found is not None:
+            return make_plan(kind, why, certifier, *found, speeds, guess)
+    raise PlanRefused(refusal)
+
+
+def plan_cone(
+    certifier: Certifier,
+    q_rad: ArrayLike = USUAL_POSTURE_RAD,
+    poses: int = 24,
+    *,
+    half_angle_rad: float,
+    speeds: Speeds,
+    guess: Guess,
+) -> Plan:
+    """Plan a tour of chosen poses that keeps the tool axis in a cone about straight down.
+
+    Parameters
+    ----------
+    q_rad, guess
+        As of `plan_tour`.
+    poses : int
+        6 or more.
+    half_angle_rad : float
+        Between the tool axis (flange z) and straight down.
+    """
+    q_now = checked_joints(q_rad)
+    if not (0 < half_angle_rad <= np.pi and poses >= FEWEST_CHOSEN):
+        raise ConfigError(
+            f"a cone of {np.degrees(half_angle_rad):g} degrees with {poses} poses cannot be planned: give above 0 to "
+            f"180 degrees, and {FEWEST_CHOSEN} poses or more"
+        )
+    cone = f"within {np.degrees(half_angle_rad):.0f} degrees of straight down"
+    attempts = list[Attempt]()
+    if (chosen := chosen_tour(certifier, q_now, poses, half_angle_rad, speeds, guess)) is not None:
+        why = [f"The tool axis stays {cone}.", *_chosen_words(chosen)]
+        attempts = [("cone", why, (chosen.numbers, chosen.q_rad))]
+    refusal = (
+        f"no tour of {poses} poses with the tool {cone} is reachable, proven clear and informative enough to estimate "
+        "everything: widen the cone, or jog the arm to another posture"
+    )
+    return _first_found(attempts, refusal, certifier, speeds, guess)
+
+
+def plan_box(
+    certifier: Certifier,
+    q_rad: ArrayLike = USUAL_POSTURE_RAD,
+    poses: int = 24,
+    *,
+    half_size_m: float = BOX_HALF_SIZE_M,
+    centre_m: ArrayLike | None = None,
+    speeds: Speeds,
+    guess: Guess,
+) -> Plan:
+    """Plan a tour of the special orientations with the flange free in a box. Base, shoulder and elbow move too.
+
+    Parameters
+    ----------
+    q_rad, poses, guess
+        As of `plan_tour`.
+    half_size_m : float
+        Half the length of the edges of the box, which are along the base axes.
+    centre_m : array_like, shape (3,), optional
+        Centre of the box, in base; default: the present flange position.
+    """
+    q_now = checked_joints(q_rad)
+    if not 0 <= half_size_m <= 1:
+        raise ConfigError(f"the box is {1e3 * half_size_m:g} mm to each side: give 0 to 1000")
+    centre = certifier.arm.frames(q_now).flange_m[0] if centre_m is None else np.asarray(centre_m, dtype=np.float64)
+    found = _box(certifier, q_now, _numbers(poses), centre, half_size_m, speeds)
+    refusal = (
+        f"with the flange within {1e3 * half_size_m:.0f} mm of {_point(centre)} not all {poses} orientations are in "
+        "reach, or no tour of them is proven clear: give a larger box, or another centre"
+    )
+    return _first_found([("box", [_box_words(centre, half_size_m)], found)], refusal, certifier, speeds, guess)
+
+
+def plan_verification(
+    certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, *, speeds: Speeds, guess: Guess
+) -> Plan:
+    """Plan a tour of poses that are far from those of a calibration.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        Present joint angles.
+    poses : int
+        2 or more.
+    R_fitted : array, shape (k, 3, 3)
+        Orientations R_base_flange of the calibration.
+    guess : Guess
+        As of `plan_tour`.
+
+    Raises
+    ------
+    PlanRefused
+        Too few poses are reachable by moves that are proven clear.
+    """
+    q_now = checked_joints(q_rad)
+    if poses < FEWEST:
+        raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST} or more")
+    found = verification_tour(certifier, q_now, poses, R_fitted, speeds)
+    if found is None:
+        raise PlanRefused(
+            f"no tour of {poses} fresh poses is reachable and proven clear: jog the arm to another posture, or clear "
+            "the surroundings"
+        )
+    nearest = -int(np.abs(found[1] - q_now).max(axis=1).argmin())  # a closed tour may begin anywhere
+    numbers, q = np.roll(found[0], nearest), np.roll(found[1], nearest, axis=0)
+    why = [f"{poses} poses that were not used in the calibration, far from its {len(R_fitted)} poses."]
+    why += [] if np.array_equal(q[0, :3], q_now[:3]) else [_elsewhere_words(q[0])]
+    plan = make_plan("verification", why, certifier, numbers.tolist(), q, speeds, guess)
+    return replace(plan, why=tuple(why))  # without the accuracy of a calibration from these poses
+
+
+def _numbers(poses: int) -> tuple[int, ...]:
+    if poses not in NUMBERS:
+        raise ConfigError(f"a plan of {poses} poses does not exist: choose {', '.join(map(str, NUMBERS))}")
+    return NUMBERS[poses]
+
+
+def _constant(certifier: Certifier, q_rad: Array) -> Found | None:
+    q = constant_tour.constant_tour(q_rad)
+    return (constant_tour.NUMBERS, q) if _winds_little(q, q_rad) and certifier.clear_around(q) else None
+
+
+def _winds_little(q_rad: Array, q_now: Array) -> bool:
+    """Return whether joint 6 stays in its window around its present angle."""
+    return bool(np.abs(q_rad[:, 5] - q_now[5]).max() <= WRIST_6_RAD + 1e-9)
+
+
+def _wrist(certifier: Certifier, q_rad: Array, numbers: Sequence[int], speeds: Speeds) -> Found | None:
+    q, group = wrist_nodes(certifier, q_rad, _at_pan(q_rad, numbers))
+    if len(np.unique(group)) < len(numbers):
+        return None
+    order = clear_tour(certifier, q, group, speeds)
+    return None if order is None else ([numbers[g] for g in group[order]], q[order])
+
+
+def _clear_tours(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
+    """Constant tours (24, 6) in other postures of joints 1 to 3."""
+    return (tour for tour in with_room(certifier, q_rad) if certifier.clear_around(tour))
+
+
+def _box(
+    certifier: Certifier, q_rad: Array, numbers: Sequence[int], centre_m: Array, half_size_m: float, speeds: Speeds
+) -> Found | None:
+    q, group = box_nodes(certifier, q_rad, _at_pan(q_rad, numbers), centre_m, half_size_m)
+    if len(np.unique(group)) < len(numbers):
+        return None
+    # Preferred: what moves base, shoulder and elbow least.
+    away = np.abs(q - q_rad)
+    calm = np.argsort(away[:, :3].max(axis=1) + 0.01 * away.sum(axis=1), kind="stable")
+    order = clear_tour(certifier, q[calm], group[calm], speeds)
+    return None if order is None else ([numbers[g] for g in group[calm][order]], q[calm][order])
+
+
+def _box_centres(certifier: Certifier, q_rad: Array) -> Array:
+    """Flange positions (2, 3): the present one, and that of the usual posture at this pan angle."""
+    usual = np.array([q_rad[0], *USUAL_POSTURE_RAD[1:]])
+    return certifier.arm.frames([q_rad, usual]).flange_m
+
+
+def _at_pan(q_rad: Array, numbers: Sequence[int]) -> Array:
+    """Orientations (n, 3, 3) as the constant tour would visit them: turned about base z with joint 1."""
+    return np.asarray(Rotation.from_euler("z", q_rad[0] - np.pi / 4).as_matrix() @ special(numbers))
+
+
+def _chosen_words(chosen: Chosen) -> list[str]:
+    lost = chosen.force_rms_N / chosen.ideal_force_rms_N
+    words = [f"Their predicted error is {lost:.2f} times that of the best poses without limits of reach."]
+    return [*words, _elsewhere_words(chosen.q_rad[0])] if chosen.elsewhere else words
+
+
+def _elsewhere_words(q_rad: Array) -> str:
+    first = np.degrees(q_rad[:3]).round().astype(int).tolist()
+    return f"A tour exists with joints 1 to 3 at {first} degrees; the approach to them is not part of the plan."
+
+
+def _box_words(centre_m: Array, half_size_m: float) -> str:
+    return (
+        f"The flange stays within {1e3 * half_size_m:.0f} mm of {_point(centre_m)}: base, shoulder and elbow move too, "
+        "and the whole arm needs clear space."
+    )
+
+
+def _point(centre_m: Array) -> str:
+    return "(" + ", ".join(f"{value:.2f}" for value in centre_m) + ") m in base"

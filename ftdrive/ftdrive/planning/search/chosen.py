@@ -1,0 +1,187 @@
+"""A tour of chosen poses that the wrist reaches: the most informative ones, or those far from a calibration's.
+
+Informative poses follow the design of `ftcalib.poses.selection`, which keeps the second solution away and the gravity
+directions out of one plane.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftcalib.poses.information import Guess, predicted_sigma
+from ftcalib.poses.selection import choose, cone_candidates
+from ftcalib.poses.verification import choose_verification_poses
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.kinematics import wrist_inverse
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.search.nodes import Nodes, wrist_nodes
+from ftdrive.planning.search.postures import grid
+from ftdrive.planning.search.tours import clear_tour, connected
+from ftdrivers.ur.kinematics import Array
+
+DIRECTIONS, SPINS = 150, 8
+DIRECTIONS_OF_A_LUMP, SPINS_OF_A_LUMP = 60, 4
+"""If joint 6 changes what can collide: each spin is a shape of its own then."""
+MOST_PARTS = 2
+"""Number of disconnected parts of free space that are tried."""
+NEARLY = 1.05
+"""No other posture is tried if the predicted error is within this factor of the best poses of the cone."""
+OTHER_POSTURES = 2
+POSTURE_STEP_DEG = 20
+LOOKS = 24
+"""Number of tool directions that compare postures."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chosen:
+    """Poses in the order of travel."""
+
+    numbers: tuple[int, ...]
+    """From 101 on, in the order of choice: not those of the paper."""
+    q_rad: Array
+    """(n, 6)"""
+    force_rms_N: float
+    """Predicted error of compensation."""
+    ideal_force_rms_N: float
+    """Predicted error of the best poses without limits of reach."""
+    elsewhere: bool
+    """Joints 1 to 3 differ from the present posture."""
+
+
+def chosen_tour(
+    certifier: Certifier,
+    q_rad: ArrayLike,
+    poses: int,
+    half_angle_rad: float,
+    speeds: Speeds,
+    guess: Guess,
+) -> Chosen | None:
+    """Choose poses and find a short closed tour through them, base, shoulder and elbow at rest.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        Present joint angles; another posture of joints 1 to 3 is used if it lowers the predicted error.
+    poses : int
+        4 or more.
+    half_angle_rad : float
+        Between the tool axis (flange z) and straight down; pi for any orientation.
+
+    Returns
+    -------
+    Chosen or None
+        None if too few poses are reachable, or if they are not informative enough to estimate everything.
+    """
+    q_now = np.asarray(q_rad, dtype=np.float64)
+    lumps = certifier.arm.travel_m[:, 5].any()
+    spins, directions = (SPINS_OF_A_LUMP, DIRECTIONS_OF_A_LUMP) if lumps else (SPINS, DIRECTIONS)
+    candidates = cone_candidates(half_angle_rad, spins, directions, certifier.scene.down_base)
+    ideal = predicted_sigma(candidates[choose(candidates, poses, guess)], guess).force_rms_N
+    best = _at(certifier, q_now, candidates, spins, poses, speeds, guess, ideal)
+    if best is None or best.force_rms_N > NEARLY * ideal:
+        for posture in _others(certifier, q_now, candidates):
+            found = _at(certifier, np.array([*posture, *q_now[3:]]), candidates, spins, poses, speeds, guess, ideal)
+            if found is not None and (best is None or found.force_rms_N * NEARLY < best.force_rms_N):
+                best = Chosen(found.numbers, found.q_rad, found.force_rms_N, ideal, elsewhere=True)
+    return best
+
+
+def _at(
+    certifier: Certifier,
+    q_now: Array,
+    candidates: Array,
+    spins: int,
+    poses: int,
+    speeds: Speeds,
+    guess: Guess,
+    ideal: float,
+) -> Chosen | None:
+    """Choose the most informative of the poses that are reachable at this posture."""
+
+    def most_informative(reached: Array) -> Nodes:
+        return choose(reached, poses, guess)
+
+    for numbers, q in _tours_at(certifier, q_now, candidates, spins, poses, most_informative, speeds):
+        rms = predicted_sigma(certifier.arm.frames(q).R_base_flange, guess).force_rms_N
+        if np.isfinite(rms):  # else these poses leave a parameter unobservable
+            return Chosen(numbers, q, rms, ideal, elsewhere=False)
+    return None
+
+
+def verification_tour(
+    certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, speeds: Speeds
+) -> tuple[tuple[int, ...], Array] | None:
+    """Choose poses far from those of a calibration, and find a short closed tour through them.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        Present joint angles; joints 1 to 3 move only if the wrist alone has no such tour here.
+    poses : int
+        2 or more.
+    R_fitted : array, shape (k, 3, 3)
+        Orientations R_base_flange of the calibration.
+
+    Returns
+    -------
+    numbers : tuple of int
+        From 101 on, in the order of choice.
+    q_rad : array, shape (n, 6)
+        In the order of travel. None instead of both if too few poses are reachable.
+    """
+    q_now = np.asarray(q_rad, dtype=np.float64)
+    candidates = cone_candidates(np.pi, SPINS_OF_A_LUMP, DIRECTIONS_OF_A_LUMP, certifier.scene.down_base)
+
+    def far_from_fitted(reached: Array) -> Nodes:
+        return choose_verification_poses(reached, R_fitted, poses, gravity_direction_base=certifier.scene.down_base)
+
+    def tours(q: Array) -> Iterator[tuple[tuple[int, ...], Array]]:
+        return _tours_at(certifier, q, candidates, SPINS_OF_A_LUMP, poses, far_from_fitted, speeds)
+
+    if (here := next(tours(q_now), None)) is not None:
+        return here
+    others = (np.array([*posture, *q_now[3:]]) for posture in _others(certifier, q_now, candidates))
+    return next((tour for q in others for tour in tours(q)), None)
+
+
+def _tours_at(
+    certifier: Certifier,
+    q_now: Array,
+    candidates: Array,
+    spins: int,
+    poses: int,
+    choice: Callable[[Array], Nodes],
+    speeds: Speeds,
+) -> Iterator[tuple[tuple[int, ...], Array]]:
+    """Yield tours of chosen candidates that are reachable at this posture and connected by clear moves.
+
+    Each is given as numbers from 101 on, in the order of choice, and joint vectors (n, 6) in the order of travel.
+    `choice` gets the reachable orientations (m, 3, 3) and returns indices of `poses` of them.
+    """
+    q, group = wrist_nodes(certifier, q_now, candidates)
+    if not len(q):
+        return
+    part = connected(certifier, q, group % spins)
+    reached = [np.unique(group[part == p]) for p in range(part.max() + 1)]
+    for p in sorted(range(len(reached)), key=lambda p: -len(reached[p]))[:MOST_PARTS]:
+        if len(reached[p]) < poses:
+            break
+        chosen = reached[p][choice(candidates[reached[p]])]
+        nodes = np.flatnonzero((part == p) & np.isin(group, chosen))
+        place = np.full(len(candidates), -1)
+        place[chosen] = np.arange(poses)
+        order = clear_tour(certifier, q[nodes], place[group[nodes]], speeds)
+        if order is not None:
+            nodes = nodes[order]
+            yield tuple((101 + place[group[nodes]]).tolist()), q[nodes]
+
+
+def _others(certifier: Certifier, q_now: Array, candidates: Array) -> Array:
+    """Postures (k, 3) of joints 1 to 3 that reach the most tool directions."""
+    postures = grid(certifier, q_now, POSTURE_STEP_DEG)
+    looks = candidates[np.linspace(0, len(candidates) - 1, LOOKS).astype(int)]
+    q = np.array([wrist_inverse(posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)
+    free = certifier.free(q.reshape(-1, 6)).reshape(q.shape[:3]).any(axis=2)
+    return np.asarray(postures[np.argsort(-free.sum(axis=1), kind="stable")][:OTHER_POSTURES])

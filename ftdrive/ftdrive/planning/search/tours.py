@@ -1,0 +1,255 @@
+"""The shortest closed tour through groups of joint vectors, one of each group, over moves that are proven clear.
+
+A generalised travelling salesman: the order is improved by reversing parts of it, the choice within the groups is then
+exact (dynamic programming), and the best tour is shaken until that no longer helps. Moves are proven lazily: those to
+near neighbours first, which shows what hangs together at all, and then those that a tour would use. Deterministic.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.motion import Speeds, durations_s
+from ftdrive.planning.search.nodes import Nodes, distinct
+from ftdrivers.ur.kinematics import Array
+
+FORBIDDEN_S = 1e6
+COST_OF_TRAVEL_S = 0.02
+"""Per radian, summed over the joints: among equally fast tours the calmer one."""
+SHAKES = 150
+SHAKES_A_ROUND = 10
+ROUNDS = 60
+"""Of proving the moves of a tour and finding another one without those that are not clear."""
+FEW = 120
+"""Of this many joint vectors every move is looked at; of more, those to the nearest ones of each group."""
+NEAREST_OF_EACH = 2
+NEIGHBOURS = 10
+"""In all layers together, about."""
+MOST_NODES = (25, 60)
+"""Of each group, the first ones; more where those do not hang together."""
+
+
+def connected(certifier: Certifier, q_rad: Array, layer: Nodes) -> Nodes:
+    """Number (n,) the parts of free joint space, from 0, that hang together by clear moves between neighbours.
+
+    Parameters
+    ----------
+    q_rad : array, shape (n, 6)
+        Free.
+    layer : int array, shape (n,)
+        Neighbours are looked for in each layer, from 0, by itself: for nodes that are dense in some joints only.
+    """
+    shapes, of = distinct(certifier, q_rad)
+    layer_of_shape = layer[np.unique(of, return_index=True)[1]]
+    layers = np.unique(layer_of_shape, return_inverse=True)[1].ravel()
+    moves = _to_every_group(shapes, layers, NEIGHBOURS // (layers.max() + 1) + 1)
+    return _Proof(certifier, shapes).parts(np.arange(len(shapes)), *moves)[of]
+
+
+def clear_tour(certifier: Certifier, q_rad: Array, group: Nodes, speeds: Speeds) -> Nodes | None:
+    """Order of nodes of a short closed tour of clear moves, one of each group.
+
+    Parameters
+    ----------
+    q_rad : array, shape (n, 6)
+        Free.
+    group : int array, shape (n,)
+        From 0, none left out; where a group has many nodes, the preferred ones come first.
+    speeds : Speeds
+
+    Returns
+    -------
+    int array or None
+        None where none was found.
+    """
+    if not len(q_rad):
+        return None
+    proof, before = _Proof(certifier, q_rad), 0
+    for most in MOST_NODES:
+        nodes = _first_of_each_group(group, most)
+        if (
+            len(nodes) > before
+            and (order := _tour_of(certifier, proof, q_rad[nodes], group[nodes], nodes, speeds)) is not None
+        ):
+            return nodes[order]
+        before = len(nodes)
+    return None
+
+
+def _tour_of(
+    certifier: Certifier, proof: "_Proof", q_rad: Array, group: Nodes, known_as: Nodes, speeds: Speeds
+) -> Nodes | None:
+    """Find a clear tour through some of the nodes of a proof."""
+    count = len(q_rad) if len(q_rad) <= FEW else NEAREST_OF_EACH
+    part = proof.parts(known_as, *_to_every_group(proof.shapes[proof.of[known_as]], group, count))
+    covering = [p for p in range(part.max() + 1) if len(np.unique(group[part == p])) == group.max() + 1]
+    if not covering:
+        return None
+    inside = np.flatnonzero(part == max(covering, key=lambda p: np.count_nonzero(part == p)))
+    q, group, known_as = q_rad[inside], group[inside], known_as[inside]
+    cost = durations_s(certifier.arm, q, speeds) + COST_OF_TRAVEL_S * np.abs(q[:, None] - q).sum(axis=2)
+    order, best, shakes = None, None, SHAKES_A_ROUND
+    for _ in range(ROUNDS):
+        allowed = proof.not_refuted(known_as) & (group[:, None] != group)
+        order = shortest_tour(cost, group, allowed, start=order, shakes=shakes)
+        if order is None:
+            break
+        start, end = order, np.roll(order, -1)
+        clear = proof.prove(known_as[start], known_as[end])
+        if clear.all():
+            if shakes == SHAKES:
+                return inside[order]
+            best, shakes = inside[order], SHAKES  # clear, now short as well
+        for i, j in zip(start[~clear], end[~clear], strict=True):
+            # Where one move is blocked others from and to its ends may be too: see them before the next round.
+            others = np.flatnonzero(group == group[j]), np.flatnonzero(group == group[i])
+            proof.prove(known_as[np.repeat(i, len(others[0]))], known_as[others[0]])
+            proof.prove(known_as[np.repeat(j, len(others[1]))], known_as[others[1]])
+    return best
+
+
+def shortest_tour(
+    cost_s: Array, group: Nodes, allowed: NDArray[np.bool_], *, start: Nodes | None = None, shakes: int = SHAKES
+) -> Nodes | None:
+    """Order of nodes of a short closed tour over allowed moves, one of each group; None where none was found.
+
+    Parameters
+    ----------
+    cost_s : array, shape (n, n)
+    group : int array, shape (n,)
+    allowed : bool array, shape (n, n)
+    start : int array, optional
+        A tour to begin from.
+    shakes : int
+    """
+    groups = [np.flatnonzero(group == g) for g in range(group.max() + 1)] if len(group) else []
+    if len(groups) < 2 or not all(len(nodes) for nodes in groups):
+        return None
+    cost = np.where(allowed, cost_s, FORBIDDEN_S)
+    if len(groups) == 2:  # there and back
+        both = (cost + cost.T)[np.ix_(*groups)]
+        i, j = np.unravel_index(both.argmin(), both.shape)
+        return np.array([groups[0][i], groups[1][j]]) if both[i, j] < FORBIDDEN_S else None
+    rng = np.random.default_rng(0)
+    best = _improved(_nearest_neighbours(groups, cost) if start is None else start, groups, cost)
+    for _ in range(shakes):
+        trial = _improved(_shaken(best, rng), groups, cost)
+        if _length(trial, cost) < _length(best, cost) - 1e-9:
+            best = trial
+    return best if _length(best, cost) < FORBIDDEN_S else None
+
+
+class _Proof:
+    """What is known of the moves between joint vectors; every pair of shapes is judged once at most."""
+
+    def __init__(self, certifier: Certifier, q_rad: Array) -> None:
+        self._certifier = certifier
+        self.shapes, self.of = distinct(certifier, q_rad)
+        n = len(self.shapes)
+        self._known = np.eye(n, dtype=np.bool_)
+        self._clear = np.eye(n, dtype=np.bool_)
+
+    def prove(self, start: Nodes, end: Nodes) -> NDArray[np.bool_]:
+        """Say (m,) whether moves between nodes are clear."""
+        i, j = self.of[start], self.of[end]
+        open_ = np.unique(np.sort(np.stack([i, j], axis=1)[~self._known[i, j]], axis=1), axis=0)
+        if len(open_):
+            a, b = open_.T
+            self._known[a, b] = self._known[b, a] = True
+            clear = self._certifier.certify(self.shapes[a], self.shapes[b], tight=False).clear
+            self._clear[a, b] = self._clear[b, a] = clear
+        return np.asarray(self._clear[i, j])
+
+    def not_refuted(self, nodes: Nodes) -> NDArray[np.bool_]:
+        """Say (m, m) which moves between nodes are clear or not judged yet."""
+        of = self.of[nodes]
+        return np.asarray((self._clear | ~self._known)[np.ix_(of, of)])
+
+    def parts(self, nodes: Nodes, start: Nodes, end: Nodes) -> Nodes:
+        """Part (m,) of each of some nodes, from those of these moves between them that are clear."""
+        clear = self.prove(nodes[start], nodes[end])
+        edges = coo_array((np.ones(clear.sum()), (start[clear], end[clear])), shape=(len(nodes), len(nodes)))
+        return np.asarray(connected_components(edges, directed=False)[1], dtype=np.intp)
+
+
+def _to_neighbours(q_rad: Array, count: int, among: Nodes) -> tuple[Nodes, Nodes]:
+    """Moves from every node to its nearest ones among some."""
+    near = cKDTree(q_rad[among]).query(q_rad, range(1, min(count, len(among)) + 1), p=np.inf)[1]
+    return np.repeat(np.arange(len(q_rad)), near.shape[1]), among[near.ravel()]
+
+
+def _to_every_group(q_rad: Array, group: Nodes, count: int) -> tuple[Nodes, Nodes]:
+    """Moves from every node to its nearest ones of each group."""
+    moves = [_to_neighbours(q_rad, count, np.flatnonzero(group == g)) for g in range(group.max() + 1)]
+    start, end = (np.concatenate(ends) for ends in zip(*moves, strict=True))
+    return start, end
+
+
+def _first_of_each_group(group: Nodes, most: int) -> Nodes:
+    return np.sort(np.concatenate([np.flatnonzero(group == g)[:most] for g in np.unique(group)]))
+
+
+def _length(tour: Nodes, cost: Array) -> float:
+    return float(cost[tour, np.roll(tour, -1)].sum())
+
+
+def _nearest_neighbours(groups: list[Nodes], cost: Array) -> Nodes:
+    tour = [int(groups[0][0])]
+    left = set(range(1, len(groups)))
+    while left:
+        g, node = min(((g, int(n)) for g in sorted(left) for n in groups[g]), key=lambda item: cost[tour[-1], item[1]])
+        tour.append(node)
+        left.remove(g)
+    return np.array(tour)
+
+
+def _improved(tour: Nodes, groups: list[Nodes], cost: Array) -> Nodes:
+    of_node = {int(node): g for g, nodes in enumerate(groups) for node in nodes}
+    tour, length = _choice(tour, groups, of_node, cost), np.inf
+    while (now := _length(tour, cost)) < length - 1e-9:
+        length = now
+        tour = _choice(_reversed_parts(tour, cost), groups, of_node, cost)
+    return tour
+
+
+def _reversed_parts(tour: Nodes, cost: Array) -> Nodes:
+    """Reverse the part of the tour that shortens it most, until none does."""
+    n = len(tour)
+    i, j = np.triu_indices(n, 2)
+    while True:
+        a, b, c, d = tour[i], tour[i + 1], tour[j], tour[(j + 1) % n]
+        gain = cost[a, b] + cost[c, d] - cost[a, c] - cost[b, d]
+        best = int(gain.argmax())
+        if gain[best] <= 1e-9:
+            return tour
+        tour = tour.copy()
+        tour[i[best] + 1 : j[best] + 1] = tour[i[best] + 1 : j[best] + 1][::-1]
+
+
+def _choice(tour: Nodes, groups: list[Nodes], of_node: dict[int, int], cost: Array) -> Nodes:
+    """Choose the best node of each group for the order of the groups in a closed tour."""
+    order = [groups[of_node[int(node)]] for node in tour]
+    first = min(range(len(order)), key=lambda k: len(order[k]))
+    order = order[first:] + order[:first]
+    total = cost[np.ix_(order[0], order[1])]  # (first, now)
+    before = []
+    for one, other in zip(order[1:], [*order[2:], order[0]], strict=True):
+        sums = total[:, :, None] + cost[np.ix_(one, other)]
+        before.append(sums.argmin(axis=1))
+        total = sums.min(axis=1)
+    start = int(np.diagonal(total).argmin())
+    picks, now = [start], start
+    for back in reversed(before):
+        now = int(back[start, now])
+        picks.append(now)
+    picks = [start, *picks[:0:-1]]
+    return np.array([nodes[pick] for nodes, pick in zip(order, picks, strict=True)])
+
+
+def _shaken(tour: Nodes, rng: np.random.Generator) -> Nodes:
+    """Exchange two neighbouring parts of the tour (double bridge)."""
+    a, b, c = np.sort(rng.choice(np.arange(1, len(tour) + 1), 3, replace=False))
+    return np.concatenate([tour[:a], tour[b:c], tour[a:b], tour[c:]])

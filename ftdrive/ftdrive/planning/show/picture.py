@@ -1,0 +1,157 @@
+"""Stick figures of a plan."""
+
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import ConvexHull
+
+from ftcalib.files import write_new
+from ftdrive.errors import ConfigError
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.kinematics import Frames
+from ftdrive.planning.geometry.scene import Plane, Scene
+from ftdrive.planning.plan import Plan
+from ftdrivers.ur.kinematics import Array
+
+VIEWS = ((1, 2, "along base x"), (0, 2, "along base y"), (0, 1, "from above"))
+"""Axis to the right, axis up, title."""
+_ALONG = 0.1
+"""A plane is drawn where it is seen from its edge: of its unit normal, the share along the view is below this."""
+_FAR_M = 20.0
+_NEAR_M, _EDGE_M = 1.0, 0.06
+"""How far from arm and ball surroundings are shown, and some room at the edge."""
+_TURN = np.linspace(0, 2 * np.pi, 100)
+
+
+def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) -> None:
+    """Write a PNG with the arm at every pose, its tool and its surroundings, seen from the front, side and above.
+
+    Needs the extra `viz`.
+
+    Parameters
+    ----------
+    certifier : Certifier
+        For the same arm, tool and scene.
+    path : Path
+        A new file.
+    way_rad : array_like, shape (k + 1, 6), optional
+        From the present posture to the first pose; drawn in green.
+
+    Raises
+    ------
+    ConfigError
+        There is no matplotlib.
+    OSError
+        As `write_new`.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ConfigError("a picture needs matplotlib: install ftdrive with its extra viz, `ftdrive[viz]`") from None
+    arm, scene = certifier.arm, certifier.scene
+    poses = arm.frames([step.q_rad for step in plan.steps])
+    before = np.reshape(np.asarray(way_rad, dtype=np.float64), (-1, 6))[:-1]
+    there = _skeletons(arm.frames(before)) if len(before) else np.zeros((0, 7, 3))
+    limits = _limits(plan, poses, there.reshape(-1, 3), scene)
+    figure = Figure(figsize=(12, 4.9), layout="constrained")
+    for column, (across, up, title) in enumerate(VIEWS):
+        axes = figure.add_subplot(1, 3, column + 1)
+        view = [across, up]
+        for one in _skeletons(poses):
+            axes.plot(*one[:, view].T, "-o", color="tab:gray", markersize=3, linewidth=1)
+        for one in there:
+            axes.plot(*one[:, view].T, "--o", color="tab:green", markersize=3, linewidth=1)
+        for outline in _tools(arm, poses, view):
+            axes.fill(*outline.T, facecolor="tab:orange", edgecolor="tab:orange", alpha=0.12, linewidth=1)
+        centre = np.array(plan.ball_centre_m)[view, None]
+        axes.plot(*(centre + plan.ball_m * np.array([np.cos(_TURN), np.sin(_TURN)])), ":", color="tab:blue")
+        axes.plot(0, 0, "ks", markersize=5)
+        _surroundings(axes, scene, view)
+        axes.set(xlim=limits[:, across], ylim=limits[:, up])
+        axes.set_aspect("equal")
+        axes.set_title(title)
+        axes.set_xlabel(f"base {'xyz'[across]} [m]")
+        axes.set_ylabel(f"base {'xyz'[up]} [m]")
+    figure.suptitle(title_of(plan, certifier, on_its_way=len(before) > 0))
+    picture = BytesIO()
+    figure.savefig(picture, format="png", dpi=110)
+    write_new(path, picture.getvalue())
+
+
+def title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
+    """Say what is seen, and what is not."""
+    ball = f"ball of {plan.ball_m:.2f} m"
+    moves = f"all that moves stays in this {ball}" if plan.arm_rests else f"wrist and tool stay in this {ball}"
+    lines = [f"{certifier.arm.name}: {len(plan.steps)} poses; blue, dotted: {moves}"]
+    if not plan.arm_rests:
+        lines[0] += ", the WHOLE ARM moves"
+    lines.append("grey: arm, orange: tool, at every pose; black: base; red: planes and boxes")
+    if on_its_way:
+        lines.append("green: the present posture, and the approach to the first pose")
+    if slanting := sum(not _drawn(plane) for plane in certifier.scene.planes):
+        lines.append(f"not drawn: slanting planes ({slanting})")
+    return "\n".join(lines)
+
+
+def _skeletons(at: Frames) -> Array:
+    """Joints (n, 7, 3) of the arm, from base to flange."""
+    base = np.zeros_like(at.shoulder_m)
+    joints = (base, at.shoulder_m, at.elbow_m, at.forearm_end_m, at.wrist_m, at.wrist_2_m, at.flange_m)
+    return np.stack(joints, axis=1)
+
+
+def _tools(arm: ArmModel, at: Frames, view: list[int]) -> Iterator[Array]:
+    """Outline (k, 2) of every cylinder of the tool at every pose."""
+    for flange_m, R in zip(at.flange_m, at.R_base_flange, strict=True):
+        for part in arm.tool:
+            points = (flange_m + _rims(part) @ R.T)[:, view]
+            yield points[ConvexHull(points).vertices]
+
+
+def _rims(part: Cylinder) -> Array:
+    """Points (n, 3) of both ends, flange axes."""
+    radius = part.diameter_m / 2
+    x, y = part.x_m + radius * np.cos(_TURN[::4]), part.y_m + radius * np.sin(_TURN[::4])
+    return np.concatenate([np.stack([x, y, np.full_like(x, z)], axis=1) for z in (part.from_m, part.to_m)])
+
+
+def _limits(plan: Plan, poses: Frames, before: Array, scene: Scene) -> Array:
+    """Low and high corner (2, 3) of what is looked at: the arm, the ball, and of the surroundings what is near."""
+    centre = np.array(plan.ball_centre_m)
+    points = np.concatenate([_skeletons(poses).reshape(-1, 3), before, [centre - plan.ball_m, centre + plan.ball_m]])
+    low, high = points.min(axis=0) - _NEAR_M, points.max(axis=0) + _NEAR_M
+    around = [np.array(corner) for box in scene.boxes for corner in (box.low_m, box.high_m)]
+    around += [plane.offset_m * np.array(plane.normal) for plane in scene.planes if _drawn(plane)]
+    points = np.concatenate([points, np.clip(np.reshape(around, (-1, 3)), low, high)])
+    return np.array([points.min(axis=0) - _EDGE_M, points.max(axis=0) + _EDGE_M])
+
+
+def _surroundings(axes: Any, scene: Scene, view: list[int]) -> None:
+    """Draw boxes, and planes that are seen from their edge."""
+    for box in scene.boxes:
+        (left, bottom), (right, top) = np.array([box.low_m, box.high_m])[:, view]
+        axes.fill([left, right, right, left], [bottom, bottom, top, top], color="tab:red", alpha=0.3)
+    for plane in scene.planes:
+        if _seen(plane, view):
+            normal = np.array(plane.normal)[view]
+            length = np.linalg.norm(normal)
+            normal = normal / length
+            foot, along = plane.offset_m / length * normal, np.array([-normal[1], normal[0]])
+            edge = np.array([foot - _FAR_M * along, foot + _FAR_M * along])
+            behind = np.concatenate([edge, edge[::-1] - _FAR_M * normal])
+            axes.fill(*behind.T, color="tab:red", alpha=0.15, linewidth=0)
+            axes.plot(*edge.T, color="tab:red", linewidth=1.5)
+
+
+def _drawn(plane: Plane) -> bool:
+    return any(_seen(plane, [across, up]) for across, up, _ in VIEWS)
+
+
+def _seen(plane: Plane, view: list[int]) -> bool:
+    (depth,) = {0, 1, 2} - set(view)
+    return abs(plane.normal[depth]) < _ALONG

@@ -1,0 +1,142 @@
+"""Wrench and orientation of another program, as two CSV files on one clock, each at its own rate."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult
+from ftcalib.data.dataset import LONGEST_VECTOR_RAD, MATRIX_COLUMNS, VECTOR_COLUMNS, CalibrationDataset
+from ftcalib.data.dwell_mean import CHANNELS
+from ftcalib.errors import BadDataset
+from ftdrive.live.delay import DelayEstimator
+from ftdrive.live.pairing import pair_recording
+from ftdrive.live.samples import Stages, StreamInfo, WrenchFrame, mean_rate_Hz
+from ftdrive.recording.compensation import free_samples
+from ftdrive.recording.recording import Header, Recording, rows_of
+from ftdrive.runs.run import versions
+from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtSamples
+
+_WHOLE = 10**6
+"""Seconds: the delay is estimated from all of a recording."""
+_QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
+
+
+def read_pair(
+    wrench: Path, orientation: Path, calibration: CalibrationResult, name: str, delay_s: float | None
+) -> tuple[Recording, dict[str, float]]:
+    """Read and pair two files.
+
+    Parameters
+    ----------
+    wrench, orientation : Path
+        As `read_wrench` and `read_orientation` take them.
+    calibration : CalibrationResult
+    name : str
+        Of the calibration.
+    delay_s : float, optional
+        Of the wrench after the orientation; None estimates it.
+
+    Returns
+    -------
+    recording : Recording
+        The devices are unknown.
+    delay : dict
+        `value` in s and `sigma`, one standard deviation, which is 0 if the delay was given.
+
+    Raises
+    ------
+    BadDataset
+        A file cannot be used, or the two have no time in common.
+    """
+    samples, states = read_wrench(wrench), read_orientation(orientation)
+    unknown, sigma_s = np.full(3, np.nan), 0.0
+    sensor_rate_Hz = mean_rate_Hz(samples.t_host_ns)
+    if delay_s is None:  # from the samples without contact, which would be taken for a delay
+        first = pair_recording(samples, states, 0.0)
+        free = free_samples(calibration.compensate(first.raw, first.R_base_flange), sensor_rate_Hz)
+        estimator = DelayEstimator(calibration, unknown, window=_WHOLE)
+        pair_recording(samples.rows(np.isin(samples.seq, first.seq[free])), states, estimator)
+        delay_s, sigma_s = estimator.delay_s, estimator.sigma_s
+    paired = pair_recording(samples, states, delay_s)
+    info = StreamInfo(
+        calibration=calibration,
+        calibration_name=name,
+        arm=DeviceInfo("unknown", NOT_REPORTED, NOT_REPORTED),
+        sensor=DeviceInfo("unknown", NOT_REPORTED, NOT_REPORTED),
+        tool="",
+        utc_offset_ns=0,
+        sensor_rate_Hz=sensor_rate_Hz,
+        arm_rate_Hz=mean_rate_Hz(states.t_host_ns),
+        p_flange_sensor_m=unknown,
+        R_flange_tcp=np.eye(3),
+        p_flange_tcp_m=unknown,
+        versions=versions(),
+    )
+    recording = Recording(Header(info, WrenchFrame(), Stages()), rows_of(paired), [])
+    return recording, {"value": delay_s, "sigma": sigma_s}
+
+
+def read_wrench(path: Path) -> FtSamples:
+    """Read columns t in s, fx, fy, fz in N, tx, ty, tz in N·m. Raises `BadDataset`.
+
+    Samples are numbered by their times, so that a pause is a gap.
+    """
+    t_s, wrench, _ = _table(path, CHANNELS)
+    step_s = float(np.median(np.diff(t_s)))
+    steps = np.rint(np.diff(t_s) / step_s) if step_s > 0 else np.ones(len(t_s) - 1)
+    seq = np.concatenate([[0], np.cumsum(np.maximum(steps, 1))])
+    return FtSamples.of(_ns(t_s), seq, wrench)
+
+
+def read_orientation(path: Path) -> ArmStates:
+    """Read columns t in s and the orientation of the flange in base; position and joints are NaN. Raises `BadDataset`.
+
+    The orientation is a matrix r11..r33, a quaternion qx, qy, qz, qw, or a rotation vector rx, ry, rz in rad.
+    """
+    t_s, numbers, columns = _table(path, MATRIX_COLUMNS, _QUATERNION_COLUMNS, VECTOR_COLUMNS)
+    n = len(t_s)
+    length = np.linalg.norm(numbers, axis=1)
+    if columns == VECTOR_COLUMNS and length.max() > LONGEST_VECTOR_RAD:
+        raise BadDataset(f"{path.name}: a rotation vector is {length.max():.0f} rad long: convert degrees to rad")
+    if columns == _QUATERNION_COLUMNS and (wrong := np.flatnonzero(abs(length - 1) > 1e-2)).size:
+        raise BadDataset(f"{path.name}: row {wrong[0] + 1}: the quaternion has length {length[wrong[0]]:.3g}, not 1")
+    if columns == MATRIX_COLUMNS:
+        try:
+            checked = CalibrationDataset(numbers.reshape(n, 3, 3), np.zeros((n, 6)), None, np.zeros(n, np.int64), t_s)
+        except BadDataset as error:
+            raise BadDataset(f"{path.name}: {error}") from error
+        R = checked.R_base_flange
+    else:
+        is_vector = columns == VECTOR_COLUMNS
+        R = (Rotation.from_rotvec(numbers) if is_vector else Rotation.from_quat(numbers)).as_matrix()
+    unknown = np.full((n, 6), np.nan)
+    return ArmStates(_ns(t_s), unknown[:, 0], unknown, unknown, R, unknown[:, :3])
+
+
+def _ns(t_s: Array) -> NDArray[np.int64]:
+    return np.rint(t_s * 1e9).astype(np.int64)
+
+
+def _table(path: Path, *choices: Sequence[str]) -> tuple[Array, Array, Sequence[str]]:
+    """Return times (n,), the columns of the first choice that is there (n, k), and that choice."""
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        names = [name.strip() for name in next(csv.reader(file), [])]
+        found = next((choice for choice in choices if {"t", *choice} <= set(names)), None)
+        if found is None:
+            wanted = ", or ".join(", ".join(choice) for choice in choices)
+            raise BadDataset(f"{path.name}: the first row must name t and {wanted}; it names {', '.join(names)}")
+        try:
+            table = np.loadtxt(file, delimiter=",", usecols=[names.index(name) for name in ("t", *found)], ndmin=2)
+        except ValueError as error:
+            raise BadDataset(f"{path.name}: {error}: correct this line") from error
+    if len(table) < 2:
+        raise BadDataset(f"{path.name}: it has {len(table)} rows: at least 2 are needed")
+    wrong = ~np.isfinite(table).all(axis=1) | (np.diff(table[:, 0], prepend=table[0, 0]) < 0)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise BadDataset(f"{path.name}: row {row + 1}: a number is not finite, or t = {table[row, 0]:g} goes back")
+    return table[:, 0], table[:, 1:], found

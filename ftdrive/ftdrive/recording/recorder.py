@@ -1,0 +1,121 @@
+"""The recorder: a consumer of a stream that writes files."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from ftcalib.files import JSON
+from ftdrive.live.samples import Block, StreamEvent, StreamInfo
+from ftdrive.recording.files import RecordingFile, format_of, require_new_recordings
+from ftdrive.recording.recording import ROW, Header, rows_of
+
+_FLUSH_NS = 200_000_000
+"""Writing takes a few ms, in which the stream waits."""
+
+
+class Recorder:
+    """Writes a stream to files, with everything since the first sample; a consumer of blocks and events.
+
+    Changes of frame and stages become events with the time of the first sample after them.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        New files; the ending chooses the format: .mcap, .csv or .parquet.
+    info : StreamInfo
+    configuration : mapping
+        Of the cell, for the header.
+
+    Raises
+    ------
+    ConfigError
+        An ending is unknown, or the package for a format is missing.
+    OSError
+        A file exists, or its folder does not.
+    """
+
+    def __init__(self, paths: Sequence[Path], info: StreamInfo, configuration: Mapping[str, JSON]) -> None:
+        self.samples, self.gaps, self.lost = 0, 0, 0
+        self.first_ns = self.last_ns = 0
+        require_new_recordings(paths)
+        self._paths, self._info, self._configuration = paths, info, configuration
+        self._files: list[RecordingFile] = []
+        self._header: Header | None = None
+        self._blocks: list[Block] = []
+        self._events: list[StreamEvent] = []
+        self._failed = False
+
+    @property
+    def duration_s(self) -> float:
+        """From the first sample to the last."""
+        return (self.last_ns - self.first_ns) * 1e-9
+
+    def write(self, block: Block) -> None:
+        """Record samples. Raises `OSError`; then close: what was written before remains."""
+        if not len(block):
+            return
+        self._follow(block)
+        self._blocks.append(block)
+        self.samples += len(block)
+        self.last_ns = int(block.t_host_ns[-1])
+        if self.last_ns - self._blocks[0].t_host_ns[0] >= _FLUSH_NS:
+            self._flush()
+
+    def event(self, event: StreamEvent) -> None:
+        """Record an event of the stream."""
+        if event.kind == "gap":
+            self.gaps += 1
+            self.lost += int(event.values.get("lost", 0))
+        if event.kind not in ("frame", "stages"):  # `_follow` finds the first sample of each
+            self._events.append(event)
+
+    def close(self) -> None:
+        """Complete all files; without a sample there is none. Raises the first `OSError`, after all were tried."""
+        with ExitStack() as stack:  # runs every callback, then raises
+            for file in self._files:
+                stack.callback(file.complete)
+            if not self._failed:
+                self._flush()
+        self._files = []
+
+    def discard(self) -> None:
+        """Delete what was written."""
+        for file in self._files:
+            file.discard()
+        self._files = []
+
+    def _follow(self, block: Block) -> None:
+        """Begin with the first block; record a change of frame or stages."""
+        t_ns = int(block.t_host_ns[0])
+        if self._header is None:
+            header = Header(self._info, block.frame, block.stages, self._configuration)
+            with ExitStack() as stack:
+                stack.callback(self.discard)
+                for path in self._paths:
+                    self._files.append(format_of(path).new(path, header))
+                stack.pop_all()
+            self._header, self.first_ns = header, t_ns
+        changes = []
+        if block.frame != self._header.frame:
+            text = f"The compensated wrench is in {block.frame}"
+            changes.append(StreamEvent(t_ns, "frame", text, block.frame.to_dict()))
+        if block.stages != self._header.stages:
+            changes.append(StreamEvent(t_ns, "stages", f"The stages are {block.stages}", asdict(block.stages)))
+        if changes:
+            self._flush()  # the samples of one flush are in one frame
+            self._events += changes
+            self._header = replace(self._header, frame=block.frame, stages=block.stages)
+
+    def _flush(self) -> None:
+        blocks, self._blocks = self._blocks, []
+        events, self._events = self._events, []
+        if not blocks and not events:
+            return
+        rows = rows_of(Block.concatenate(blocks)) if blocks else np.zeros(0, ROW)
+        self._failed = True
+        for file in self._files:
+            file.append(rows, events)
+        self._failed = False

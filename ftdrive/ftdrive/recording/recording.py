@@ -1,0 +1,212 @@
+"""A recording: the columns, the header and the events that every file format stores.
+
+The pose is stored as a quaternion, so that all formats hold the same bits.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import pairwise
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult
+from ftcalib.errors import CalibError
+from ftcalib.files import JSON, check_format
+from ftdrive.errors import BadRecording
+from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame
+from ftdrive.runs.verification import VerificationRecord
+from ftdrivers.interfaces import DeviceInfo, Fact
+
+FORMAT: Final = "ftdrive.recording/1"
+
+Rows = NDArray[np.void]
+"""(n,) records of the type `ROW`."""
+
+_AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
+_GROUPS: Mapping[str, tuple[str, Sequence[str]]] = {
+    "t_host_ns": ("<i8", ()),
+    "t_device_s": ("<f8", ()),
+    "seq": ("<i8", ()),
+    "status": ("<u4", ()),
+    "raw": ("<f8", [f"raw_{axis}" for axis in _AXES]),
+    "wrench": ("<f8", _AXES),
+    "chi2": ("<f8", ()),
+    "in_contact": ("?", ()),
+    "q_rad": ("<f8", [f"q{joint}" for joint in range(6)]),
+    "p_base_flange_m": ("<f8", ["px", "py", "pz"]),
+    "quaternion_base_flange": ("<f8", ["qx", "qy", "qz", "qw"]),
+}
+ROW: Final = np.dtype(
+    [(name, kind, (len(names),)) if names else (name, kind) for name, (kind, names) in _GROUPS.items()]
+)
+"""One sample, fields as in `Block`; the quaternion is x, y, z, w."""
+NUMBERS: Final = {name: names or (name,) for name, (_, names) in _GROUPS.items()}
+"""The columns of the table formats, by the field of `ROW` that holds them."""
+COLUMNS: Final = np.dtype([(one, kind) for name, (kind, _) in _GROUPS.items() for one in NUMBERS[name]])
+"""The same bytes, one field a number."""
+
+
+def rows_of(samples: Block | Paired) -> Rows:
+    """Return samples as records; what paired samples do not have is 0."""
+    rows = np.zeros(len(samples), ROW)
+    for name in _GROUPS:
+        if hasattr(samples, name):
+            rows[name] = getattr(samples, name)
+    if len(rows):
+        rows["quaternion_base_flange"] = Rotation.from_matrix(samples.R_base_flange).as_quat()
+    return rows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Header:
+    """What does not change within a recording, and the frame and stages of its first sample."""
+
+    info: StreamInfo
+    frame: WrenchFrame
+    stages: Stages
+    configuration: Mapping[str, JSON] = field(default_factory=dict)
+    """Of the cell, as `ftdrive config show --json` prints it."""
+
+    @property
+    def words(self) -> str:
+        """What the wrench columns hold, for people."""
+        words = (
+            "raw_fx..raw_tz as measured, sensor axes, about the sensor origin; "
+            f"fx..tz compensated, {self.frame}; N, N·m, m, rad"
+        )
+        return f"{words}; {self.info.calibration_state}" if self.info.calibration_state else words
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the header as JSON; numbers that are not finite are null."""
+        info = self.info
+        values: dict[str, Any] = {item.name: getattr(info, item.name) for item in fields(StreamInfo)}
+        values |= {name: _finite(values[name]) for name in _ARRAYS}
+        values |= {"arm": asdict(info.arm), "sensor": asdict(info.sensor), "versions": dict(info.versions)}
+        values["calibration"] = info.calibration.to_dict()
+        values["verification"] = None if info.verification is None else info.verification.to_dict()
+        frame, stages = self.frame.to_dict(), asdict(self.stages)
+        return {"format": FORMAT, **values, "frame": frame, "stages": stages, "configuration": dict(self.configuration)}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Build from the content of a file; unknown fields are ignored. Raises `BadRecording`."""
+        check_format(document, FORMAT, BadRecording)
+        try:
+            values = {
+                item.name: document[item.name]
+                for item in fields(StreamInfo)
+                if item.name in document or item.name not in _LATER
+            }
+            values |= {name: np.array(values[name], np.float64) for name in _ARRAYS}
+            values |= {"arm": _device(values["arm"]), "sensor": _device(values["sensor"])}
+            values["calibration"] = CalibrationResult.from_dict(values["calibration"])
+            if values.get("verification") is not None:
+                values["verification"] = VerificationRecord.from_dict(values["verification"])
+            stages = {item.name: document["stages"][item.name] for item in fields(Stages)}
+            return cls(StreamInfo(**values), frame_of(document["frame"]), Stages(**stages), document["configuration"])
+        except KeyError as error:
+            raise BadRecording(f"the header lacks the field {error.args[0]}: the file is damaged") from error
+        except (CalibError, TypeError, ValueError) as error:
+            raise BadRecording(f"the header cannot be read ({error}): the file is damaged") from error
+
+
+_LATER = ("verification", "calibration_state")
+"""Fields that older recordings lack."""
+_ARRAYS = ("p_flange_sensor_m", "R_flange_tcp", "p_flange_tcp_m")
+
+
+def _finite(value: NDArray[np.float64]) -> JSON:
+    return np.where(np.isfinite(value), value, None).tolist()  # type: ignore[call-overload]  # None makes it an object
+
+
+def _device(document: Mapping[str, Any]) -> DeviceInfo:
+    facts = {
+        name: Fact(tuple(fact["value"]) if isinstance(fact["value"], list) else fact["value"], fact["source"])
+        for name, fact in document["facts"].items()
+    }
+    return DeviceInfo(document["model"], document["serial"], document["firmware"], facts)
+
+
+def frame_of(values: Mapping[str, Any]) -> WrenchFrame:
+    """Build a frame from `WrenchFrame.to_dict`."""
+    about: Any = values["about"]
+    return WrenchFrame(values["axes"], tuple(about) if isinstance(about, list) else about)
+
+
+def event_text(event: StreamEvent) -> str:
+    """Return an event as one line of JSON."""
+    values = {"t_host_ns": event.t_host_ns, "kind": event.kind, "text": event.text, "values": dict(event.values)}
+    return json.dumps(values, ensure_ascii=False)
+
+
+def event_of(text: str) -> StreamEvent:
+    """Build an event from `event_text`. Raises `ValueError`."""
+    try:
+        values = json.loads(text)
+        return StreamEvent(values["t_host_ns"], values["kind"], values["text"], values["values"])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"an event without {error}") from error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """A recording in memory.
+
+    An event of the kind "frame" or "stages" stands where those of the samples change; `values` holds the new ones.
+    """
+
+    header: Header
+    rows: Rows
+    events: Sequence[StreamEvent]
+    cut: str = ""
+    """Why the file ends early; empty if it is complete."""
+
+    @property
+    def duration_s(self) -> float:
+        """From the first sample to the last."""
+        return float(np.ptp(self.rows["t_host_ns"])) * 1e-9 if len(self.rows) else 0.0
+
+    @property
+    def gaps(self) -> int:
+        """Number of places where samples are missing."""
+        return int(np.count_nonzero(np.diff(self.rows["seq"]) != 1))
+
+    def paired(self, which: slice = slice(None)) -> Paired:
+        """Return samples as measured, each with its pose; columns that were not read are 0."""
+        rows = self.rows[which]
+        R_base_flange = Rotation.from_quat(rows["quaternion_base_flange"]).as_matrix()
+        read = rows.dtype.names or ()
+        names = [item.name for item in fields(Paired) if item.name != "R_base_flange"]
+        columns = {name: rows[name] if name in read else np.zeros(len(rows), ROW[name]) for name in names}
+        return Paired(R_base_flange=R_base_flange, **columns)
+
+    def with_calibration(self, calibration: CalibrationResult, name: str) -> Self:
+        """Return the recording with another calibration in its header."""
+        info = replace(
+            self.header.info, calibration=calibration, calibration_name=name, verification=None, calibration_state=""
+        )
+        return replace(self, header=replace(self.header, info=info))
+
+    def pieces(self, length: int) -> Iterator[tuple[Rows, Sequence[StreamEvent], Header]]:
+        """Give samples in pieces of one frame, the events since the piece before, and the header that holds there."""
+        header, n = self.header, len(self.rows)
+        events = sorted(self.events, key=lambda event: event.t_host_ns)
+        at = np.searchsorted(self.rows["t_host_ns"], [event.t_host_ns for event in events]).tolist()
+        changes = [row for row, event in zip(at, events, strict=True) if event.kind in ("frame", "stages")]
+        ends = sorted({*range(length, n, length), *changes, n} - {0})
+        for start, end in pairwise([0, *ends]):
+            found = [event for row, event in zip(at, events, strict=True) if start <= row < end or row == end == n]
+            for event in found:
+                header = changed(header, event)
+            yield self.rows[start:end], found, header
+
+
+def changed(header: Header, event: StreamEvent) -> Header:
+    """Return the header that holds after an event."""
+    if event.kind == "frame":
+        return replace(header, frame=frame_of(event.values))
+    return replace(header, stages=Stages(**event.values)) if event.kind == "stages" else header

@@ -1,0 +1,197 @@
+"""All facts of a report as one JSON object; every format shows only what is here."""
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from ftcalib.assessment.observability import assess
+from ftcalib.assessment.verdict import strong_correlations
+from ftcalib.compare import compare
+from ftcalib.errors import CalibError
+from ftcalib.model import PARAMETER_NAMES, Array
+from ftcalib.poses.sphere import largest_gap
+from ftcalib.routine import drift_check
+from ftdrive.errors import BadPlan, PlanRefused
+from ftdrive.planning.plan import Plan
+from ftdrive.report.comparison import compared
+from ftdrive.report.error_map import direction_in_words, error_map
+from ftdrive.report.subject import Subject
+from ftdrive.runs.pose_hints import hints, names_of
+from ftdrive.runs.run import Run
+from ftdrive.terminal.report import drift_in_words, error_in_words
+
+FORMAT = "ftdrive.report/1"
+NEXT_STEP = {
+    "good": "Use it, and verify it on new poses with `ftdrive verify`, now and from time to time.",
+    "usable": (
+        "Compensate with it if the error below is small enough. To improve it, work through the reasons in their "
+        "order, then calibrate again."
+    ),
+    "rejected": (
+        "Do not compensate with it. Fix the first reason, then calibrate again: later reasons are often its "
+        "consequences."
+    ),
+    "failed": (
+        "Its last verification failed. Run `ftdrive verify` again and accept the update that it proposes, or "
+        "calibrate again."
+    ),
+}
+NOTABLE_CORRELATION = 0.7
+_LONG = ("steps", "made_for", "description")
+"""Parts of a plan that the report leaves out."""
+
+
+def facts_of(subject: Subject) -> dict[str, Any]:
+    """Collect the facts; sections that the source has no data for are null.
+
+    Units are those of the names: rad, m, N, N·m, s. `result` is the content of the calibration file.
+    """
+    result, dataset = subject.result, subject.dataset
+    force_N, torque_Nm = result.likely_error().tolist()
+    last = (subject.trust or {}).get("last_verification")
+    failed = last is not None and not last["passed"] and result.verdict != "rejected"
+    return {
+        "format": FORMAT,
+        "schema_version": 1,
+        "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "source": str(subject.source),
+        "id": result.id,
+        "verdict": result.verdict,
+        "reasons": list(result.reasons),
+        "hints": list(hints(result, subject.records)) if subject.records else [],
+        "trust": subject.trust,
+        "next_step": NEXT_STEP["failed" if failed else result.verdict],
+        "error": {"words": error_in_words(result), "force_N": force_N, "torque_Nm": torque_Nm},
+        "error_map": error_map(result),
+        "correlation": _correlation(result.covariance),
+        "cross_validation": _cross_validation(subject),
+        "poses": _poses(subject),
+        "drift": _drift(subject),
+        "noise": _noise(subject),
+        "coverage": None if dataset is None else _coverage(subject, dataset.R_base_flange),
+        "tour": None if subject.run is None else _tour(subject.run, len(subject.records)),
+        "comparison": None if subject.parent is None else compared(result, subject.parent),
+        "compared_with": subject.parent_name,
+        "reproduce": subject.reproduce,
+        "result": result.to_dict(),
+    }
+
+
+def _correlation(covariance: Array) -> dict[str, Any]:
+    sigma = np.sqrt(np.diag(covariance))
+    sigma[sigma == 0] = np.inf  # known exactly: correlated with nothing
+    return {
+        "names": list(PARAMETER_NAMES),
+        "matrix": np.clip(covariance / np.outer(sigma, sigma), -1, 1).tolist(),
+        "strong": [list(pair) for pair in strong_correlations(covariance, NOTABLE_CORRELATION)],
+    }
+
+
+def _cross_validation(subject: Subject) -> dict[str, Any]:
+    quality = subject.result.quality
+    methods: list[Any] = []
+    reason = "The source holds no poses to compare methods on."
+    if subject.dataset is not None:
+        try:
+            methods, reason = [one.to_dict() for one in compare(subject.dataset, **subject.solved_with)], ""
+        except CalibError as error:
+            reason = str(error)
+    return {
+        "force_N": quality.get("loo_force_rms_N"),
+        "torque_Nm": quality.get("loo_torque_rms_Nm"),
+        "methods": methods,
+        "reason": reason,
+    }
+
+
+def _poses(subject: Subject) -> list[dict[str, Any]]:
+    """List the poses: residual (6,), its size in sigma as the other poses predict it, and whether the pose was used."""
+    result, dataset = subject.result, subject.dataset
+    names = names_of(subject.records) or [str(row + 1) for row in range(result.n_poses)]
+    spread = result.quality.get("residual_sigma") or [None] * result.n_poses
+    t_s = [None] * result.n_poses if dataset is None else [None if np.isnan(t) else t for t in dataset.t_s.tolist()]
+    return [
+        {
+            "row": row + 1,
+            "name": names[row],
+            "t_s": t_s[row],
+            "residual": result.residuals[row].tolist(),
+            "force_N": float(np.linalg.norm(result.residuals[row, :3])),
+            "torque_Nm": float(np.linalg.norm(result.residuals[row, 3:])),
+            "sigmas": spread[row],
+            "used": row + 1 not in result.rejected_poses,
+        }
+        for row in range(result.n_poses)
+    ]
+
+
+def _drift(subject: Subject) -> dict[str, Any]:
+    result, again = subject.result, drift_check(subject.records)
+    return {
+        "in_fit": result.to_dict()["drift"],
+        "components": {k: v for k, v in result.components.items() if k.startswith(("walk", "slope"))},
+        "first_pose_again": None if again is None else {"words": drift_in_words(again)[0], **again.to_dict()},
+        "lag1": result.quality.get("lag1"),
+    }
+
+
+def _noise(subject: Subject) -> dict[str, Any] | None:
+    """Standard error of the mean of one axis at each pose; None if it was not measured."""
+    if subject.dataset is None or subject.dataset.wrench_cov is None:
+        return None
+    variance = np.einsum("nii->ni", subject.dataset.wrench_cov)
+    return {
+        "force_N": np.sqrt(variance[:, :3].mean(axis=1)).tolist(),
+        "torque_Nm": np.sqrt(variance[:, 3:].mean(axis=1)).tolist(),
+        "n_samples": subject.dataset.n_samples.tolist(),
+        "unsteady": [record.stop for record in subject.records if not record.steady],
+    }
+
+
+def _coverage(subject: Subject, R_base_flange: Array) -> dict[str, Any]:
+    parameters = subject.result.parameters
+    seen = assess(R_base_flange, parameters, advise=False)
+    down = parameters.gravity_force_base_N / (np.linalg.norm(parameters.gravity_force_base_N) or 1.0)
+    gravity, tool = down @ R_base_flange, R_base_flange[:, :, 2]
+    gap_rad, towards = largest_gap(gravity)
+    return {
+        "orientations": seen.orientations,
+        "rank": seen.rank,
+        "condition": seen.condition if np.isfinite(seen.condition) else None,
+        "second_gap": seen.second_gap if np.isfinite(seen.second_gap) else None,
+        "words": seen.sentence() if seen.ambiguities else "the poses determine all parameters.",
+        "gravity_in_flange": gravity.tolist(),
+        "tool_in_base": tool.tolist(),
+        "largest_gap_rad": gap_rad,
+        "gap_towards": towards.tolist(),
+        "gap_words": direction_in_words(towards).replace("base", "flange"),
+    }
+
+
+def _tour(run: Run, stops: int) -> dict[str, Any]:
+    """Return settings and devices of a run, and what its plan predicted."""
+    header = run.header()
+    plan, why_not = None, ""
+    if run.plan_path.is_file():
+        try:
+            plan = Plan.load(run.plan_path)
+        except (BadPlan, PlanRefused) as error:
+            why_not = str(error)
+    return {
+        "run": run.folder.name,
+        "mode": header.get("mode", "auto"),
+        "created_utc": header.get("created_utc"),
+        "stops": stops,
+        "emulated": header.get("station") is not None,
+        "devices": _plain(header.get("devices", {})),
+        "config": _plain(header.get("config", {})),
+        "plan_error": why_not,
+        "plan": None if plan is None else {name: value for name, value in plan.to_dict().items() if name not in _LONG},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Copy nested mappings as plain ones."""
+    return {str(k): _plain(v) for k, v in value.items()} if isinstance(value, Mapping) else value

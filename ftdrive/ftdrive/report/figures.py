@@ -1,0 +1,308 @@
+"""The figures of a report: SVG that takes its colours from the page, so that light and dark are one file.
+
+Matplotlib writes fixed colours. Each one used here stands for a CSS variable and is replaced by it afterwards.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from io import StringIO
+from typing import Any
+
+import numpy as np
+
+from ftcalib.model import Array
+from ftdrive.errors import ConfigError
+from ftdrive.report.fit_sections import SUSPICIOUS_SIGMAS
+from ftdrive.report.origin_sections import LIMIT_SIGMAS
+from ftdrive.report.words import label_of, shown_poses
+
+Facts = Mapping[str, Any]
+
+INK, PAPER, GRID, BAD = "#010101", "#020202", "#030303", "#040404"
+SERIES = ("#050505", "#060606", "#070707")
+VARIABLES = {
+    INK: "currentColor",
+    PAPER: "var(--paper)",
+    GRID: "var(--grid)",
+    BAD: "var(--bad)",
+    **{colour: f"var(--series-{k})" for k, colour in enumerate(SERIES)},
+}
+"""Colour that stands for each variable of the page."""
+WIDTH_IN = 5.0
+"""Of every figure: on a phone its letters keep their size, on a desk two stand side by side."""
+LONG_S = 200
+"""Longer times are shown in minutes."""
+MOST_DOTS = 400
+"""Of many poses every second, third, … is drawn, because each dot has its size in the file."""
+INVISIBLE = 0.02
+"""Weaker correlations are not drawn."""
+_MARKERS = "osD"
+_STYLE: Mapping[Any, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "ftdrive",
+    "font.family": "sans-serif",
+    "font.size": 9,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": GRID,
+    "axes.facecolor": "none",
+    "figure.facecolor": "none",
+    "savefig.facecolor": "none",
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "grid.color": GRID,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "hatch.color": PAPER,
+    "legend.frameon": False,
+}
+
+
+def draw(name: str, facts: Facts) -> str:
+    """Draw the figure of this name as an SVG element without links, scripts or fixed ink.
+
+    Raises
+    ------
+    ConfigError
+        There is no matplotlib.
+    """
+    try:
+        import matplotlib as mpl
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ConfigError("figures need matplotlib: pip install 'ftdrive[report]'") from None
+    height, fill = _FIGURES[name]
+    size_in = WIDTH_IN, height(facts) if callable(height) else height
+    with mpl.rc_context(dict(_STYLE)):
+        figure = Figure(figsize=size_in, layout="constrained")
+        fill(figure, facts)
+        written = StringIO()
+        figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    return inlined(written.getvalue(), name)
+
+
+def inlined(svg: str, name: str) -> str:
+    """Make a file of matplotlib an element of a page: unique ids, no prologue or size, colours as variables."""
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
+    svg = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)
+    svg = re.sub(r'\bid="', f'id="{name}-', svg)
+    svg = re.sub(r'xlink:href="#|href="#', f'href="#{name}-', svg).replace("url(#", f"url(#{name}-")
+    svg = re.sub(r"font: ([\d.]+)px [^;\"]+", r"font-size: \1px", svg)
+    for colour, variable in VARIABLES.items():
+        svg = svg.replace(colour, variable)
+    return re.sub(r"\n\s*", "\n", svg)
+
+
+def _map(figure: Any, facts: Facts, kind: str, unit: str) -> None:
+    from matplotlib.ticker import MaxNLocator
+
+    found = facts["error_map"]
+    elevation, azimuth = (np.radians(found[name]) for name in ("elevation_deg", "azimuth_deg"))
+    axes = figure.add_subplot()
+    error = np.array(found[kind]["map"])
+    scale = 1e3
+    x, y = _hammer(*np.meshgrid(elevation, azimuth, indexing="ij"))
+    levels = MaxNLocator(12).tick_values(0, scale * error.max() or 1.0)
+    filled = axes.contourf(x, y, scale * error, levels=levels, cmap="viridis", antialiased=False)
+    filled.set_edgecolor("face")
+    with _globe(axes):
+        if facts["coverage"] is not None:
+            _dots(axes, facts["coverage"]["tool_in_base"], color="white", edgecolor="black", s=16)
+        _dots(axes, [found[kind]["worst_direction"]], color="white", edgecolor="black", marker="X", s=90)
+    bar = figure.colorbar(filled, ax=axes, orientation="horizontal", shrink=0.8, aspect=30, format="{x:.3g}")
+    bar.outline.set_visible(False)
+    bar.set_ticks(levels[::2])
+    bar.set_label(f"predicted {kind.partition('_')[0]} error, {unit}, 1 sigma")
+
+
+def _coverage(figure: Any, facts: Facts) -> None:
+    axes, found = figure.add_subplot(), facts["coverage"]
+    with _globe(axes):
+        _dots(axes, found["gravity_in_flange"], color=SERIES[0], edgecolor=PAPER, s=36)
+        towards, radius = np.array(found["gap_towards"]), found["largest_gap_rad"]
+        across = np.linalg.svd(towards[None])[2][1:]
+        turn = np.linspace(0, 2 * np.pi, 181)
+        circle = np.cos(radius) * towards + np.sin(radius) * np.outer(np.cos(turn), across[0])
+        circle += np.sin(radius) * np.outer(np.sin(turn), across[1])
+        x, y = _on_map(circle)
+        jumps = np.flatnonzero(np.hypot(np.diff(x), np.diff(y)) > 0.7) + 1  # over the edge of the map
+        axes.plot(np.insert(x, jumps, np.nan), np.insert(y, jumps, np.nan), "--", color=SERIES[1], linewidth=1.5)
+
+
+@contextmanager
+def _globe(axes: Any) -> Iterator[None]:
+    """Draw outline and graticule of a map, before and after what is on it, and name the axes."""
+    axes.set_aspect("equal")
+    axes.axis("off")
+    axes.set(xlim=(-2.95, 2.95), ylim=(-1.75, 1.75))
+    quarter, half = np.linspace(-np.pi / 2, np.pi / 2, 61), np.linspace(-np.pi, np.pi, 121)
+    for azimuth in np.radians([-180, -90, 0, 90, 180]):
+        axes.plot(*_hammer(quarter, np.full_like(quarter, azimuth)), color=INK, linewidth=0.5, alpha=0.6)
+    for elevation in np.radians([-45, 0, 45]):
+        axes.plot(*_hammer(np.full_like(half, elevation), half), color=INK, linewidth=0.5, alpha=0.6)
+    yield
+    box = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "edgecolor": "none"}
+    for name, elevation, azimuth in (("+x", 0, 0), ("+y", 0, 90), ("-y", 0, -90), ("-x", 0, 180), ("-x", 0, -180)):
+        x, y = _hammer(*np.radians([elevation, azimuth]))
+        axes.text(x, y - 0.2, name, ha="center", va="center", fontsize=8, bbox=box)  # below a pose that points there
+    axes.text(0, np.sqrt(2) + 0.08, "+z", ha="center", va="bottom", fontsize=8)
+    axes.text(0, -np.sqrt(2) - 0.08, "-z", ha="center", va="top", fontsize=8)
+
+
+def _hammer(elevation: Any, azimuth: Any) -> tuple[Array, Array]:
+    """Equal-area map of the sphere (Hammer 1892), rad; +x in the middle, +z at the top."""
+    length = np.sqrt(1 + np.cos(elevation) * np.cos(azimuth / 2))
+    x = 2 * np.sqrt(2) * np.cos(elevation) * np.sin(azimuth / 2) / length
+    return np.asarray(x), np.asarray(np.sqrt(2) * np.sin(elevation) / length)
+
+
+def _on_map(directions: Any) -> tuple[Array, Array]:
+    x, y, z = np.array(directions).T
+    return _hammer(np.arcsin(np.clip(z, -1, 1)), np.arctan2(y, x))
+
+
+def _dots(axes: Any, directions: Any, **style: Any) -> None:
+    step = -(-len(directions) // MOST_DOTS)
+    axes.scatter(*_on_map(directions[::step]), linewidth=0.8, zorder=3, clip_on=False, **style)
+
+
+def _correlation(figure: Any, facts: Facts) -> None:
+    axes = figure.add_subplot()
+    matrix = np.abs(np.array(facts["correlation"]["matrix"]))
+    n = len(matrix)
+    axes.grid(visible=False)
+    axes.spines[:].set_visible(False)
+    for i, j in np.argwhere(matrix > INVISIBLE):
+        # the strength is opacity, so that 0 is the page itself
+        axes.fill([j, j + 1, j + 1, j], [i, i, i + 1, i + 1], color=SERIES[0], alpha=float(matrix[i, j]), linewidth=0)
+    for edge in range(0, n + 1, 3):
+        axes.plot([0, n], [edge, edge], color=GRID, linewidth=0.8)
+        axes.plot([edge, edge], [0, n], color=GRID, linewidth=0.8)
+    names = [label_of(name) for name in facts["correlation"]["names"]]
+    axes.set_yticks(np.arange(n) + 0.5, names, fontsize=8)
+    axes.set_xticks(np.arange(n) + 0.5, names, fontsize=8, rotation=90)
+    axes.tick_params(length=0)
+    axes.set(xlim=(0, n), ylim=(n, 0))
+    axes.set_aspect("equal")
+
+
+def _methods(figure: Any, facts: Facts) -> None:
+    methods = [one for one in facts["cross_validation"]["methods"] if one.get("cross_validated", {}).get("force_rms_N")]
+    own = facts["result"]["method"]
+    force, torque = figure.subplots(1, 2, sharey=True)
+    for axes, key, scale, label in ((force, "force_rms_N", 1.0, "N rms"), (torque, "torque_rms_Nm", 1e3, "mN·m rms")):
+        values = [scale * one["cross_validated"][key] for one in methods]
+        colours = [SERIES[1] if one["method"] == own else SERIES[0] for one in methods]
+        axes.barh([one["method"] for one in methods], values, color=colours, height=0.6)
+        axes.set_xscale("log")
+        least, most = min(values), max(values)
+        axes.set_xlim(10 ** math.floor(math.log10(least) - 0.2), 10 ** math.ceil(math.log10(most) + 0.05))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.grid(visible=False, axis="y")
+        axes.set_xlabel(label)
+        axes.tick_params(which="minor", length=0)
+    force.invert_yaxis()
+
+
+def _pose_residuals(figure: Any, facts: Facts) -> None:
+    poses, axes = shown_poses(facts["poses"]), figure.add_subplot()
+    places = np.arange(len(poses))
+    sizes = [pose["sigmas"] for pose in poses]
+    bars = axes.bar(places, sizes, color=[SERIES[0] if pose["used"] else BAD for pose in poses])
+    for bar, pose in zip(bars, poses, strict=True):
+        if not pose["used"]:
+            bar.set_hatch("///")
+    axes.axhline(1, color=INK, linewidth=1)
+    axes.axhline(SUSPICIOUS_SIGMAS, color=INK, linewidth=1, linestyle="--")
+    axes.set_ylabel("residual, sigma")
+    _name_poses(axes, poses)
+
+
+def _time_residuals(figure: Any, facts: Facts) -> None:
+    poses = shown_poses(facts["poses"])
+    timed = all(pose["t_s"] is not None for pose in poses)
+    at = np.array([pose["t_s"] if timed else pose["row"] for pose in poses], dtype=float)
+    long = timed and np.ptp(at) > LONG_S
+    at = at / 60 if long else at
+    order = np.argsort(at, kind="stable")
+    residual = np.array([pose["residual"] for pose in poses])[order]
+    both = figure.subplots(2, 1, sharex=True)
+    for k, (axes, scale, label) in enumerate(zip(both, (1, 1e3), ("N", "mN·m"), strict=True)):
+        axes.axhline(0, color=INK, linewidth=1)
+        for j in range(3):
+            axes.plot(
+                at[order],
+                scale * residual[:, 3 * k + j],
+                _MARKERS[j] + "-",
+                color=SERIES[j],
+                markersize=3.5,
+                linewidth=0.9,
+                label=f"{'FT'[k]}{'xyz'[j]}",
+            )
+        axes.set_ylabel(label)
+        axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), borderaxespad=0.1)
+    unit = "min" if long else "s"
+    if not timed:
+        axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.set_xlabel(f"time since the first pose, {unit}" if timed else "pose, in the order of the rows")
+
+
+def _noise(figure: Any, facts: Facts) -> None:
+    rows = [pose["row"] - 1 for pose in shown_poses(facts["poses"])]
+    for axes, key, scale, label in zip(
+        figure.subplots(2, 1, sharex=True), ("force_N", "torque_Nm"), (1e3, 1e3), ("mN", "mN·m"), strict=True
+    ):
+        values = scale * np.array(facts["noise"][key])[rows]
+        axes.bar(np.arange(len(rows)), values, color=SERIES[0])
+        axes.axhline(float(np.median(values)), color=INK, linewidth=1, linestyle="--")
+        axes.grid(visible=False, axis="x")
+        axes.set_ylabel(label)
+    _name_poses(axes, [facts["poses"][row] for row in rows])
+
+
+def _name_poses(axes: Any, poses: Sequence[Facts]) -> None:
+    step = max(1, -(-len(poses) // 24))
+    axes.grid(visible=False, axis="x")
+    axes.set_xticks(np.arange(len(poses))[::step], [pose["name"] for pose in poses][::step], fontsize=8, rotation=90)
+    axes.set_xlabel("pose")
+
+
+def _comparison(figure: Any, facts: Facts) -> None:
+    axes, found = figure.add_subplot(), facts["comparison"]["parameters"]
+    values = [one["sigmas"] or 0.0 for one in found]
+    axes.barh([label_of(one["name"]) for one in found], values, color=SERIES[0], height=0.6)
+    axes.axvline(0, color=INK, linewidth=1)
+    for limit in (-LIMIT_SIGMAS, LIMIT_SIGMAS):
+        axes.axvline(limit, color=INK, linewidth=1, linestyle="--")
+    most = max(10.0, 1.2 * max(map(abs, values)))
+    axes.set_xscale("symlog", linthresh=LIMIT_SIGMAS)
+    axes.set_xlim(-most, most)
+    ticks = LIMIT_SIGMAS * 10.0 ** np.arange(0, math.log10(most / LIMIT_SIGMAS), max(1, math.log10(most) // 2))
+    axes.set_xticks([*-ticks, 0, *ticks])
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.minorticks_off()
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.set_xlabel("difference, sigma")
+
+
+def _methods_height(facts: Facts) -> float:
+    return 1.0 + 0.25 * len(facts["cross_validation"]["methods"])
+
+
+_FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], Callable[[Any, Facts], None]]] = {
+    "force_map": (3.4, lambda figure, facts: _map(figure, facts, "force_N", "mN")),
+    "torque_map": (3.4, lambda figure, facts: _map(figure, facts, "torque_Nm", "mN·m")),
+    "correlation": (4.6, _correlation),
+    "methods": (_methods_height, _methods),
+    "pose_residuals": (2.8, _pose_residuals),
+    "time_residuals": (3.8, _time_residuals),
+    "noise": (3.6, _noise),
+    "coverage": (2.7, _coverage),
+    "comparison": (3.8, _comparison),
+}
+"""Height in inches and how to draw it, by name."""

@@ -1,0 +1,135 @@
+"""What a report is about: a result, and as much of its data as its source holds."""
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from ftcalib import CalibrationDataset, CalibrationResult, Known, solve
+from ftcalib.errors import BadCalibration
+from ftcalib.files import read_object
+from ftcalib.likelihood.session import Drift
+from ftcalib.result import Method
+from ftcalib.routine import PoseRecord
+from ftdrive.checks.plausibility import judged
+from ftdrive.errors import ConfigError
+from ftdrive.runs.run import Run
+from ftdrive.runs.source import Orientation, read_source
+
+
+@dataclass(frozen=True, slots=True)
+class SolveOptions:
+    """Options of `ftdrive solve` for a source without a result."""
+
+    method: Method = "ml"
+    orientation: Orientation = "R_base_flange"
+    drift: Drift = "auto"
+    known: Known | None = None
+    words: tuple[str, ...] = ()
+    """The same as typed, quoted for a shell."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Subject:
+    """A result with its data; what the source does not hold is None or empty."""
+
+    source: Path
+    result: CalibrationResult
+    reproduce: str
+    """Command that gives the result again; empty if the data are not here."""
+    dataset: CalibrationDataset | None = None
+    run: Run | None = None
+    records: Sequence[PoseRecord] = ()
+    solved_with: Mapping[str, Any] = field(default_factory=dict)
+    """What `ftcalib.compare` takes beside the dataset."""
+    parent: CalibrationResult | None = None
+    parent_name: str = ""
+    """Of the result to compare with, or why there is none."""
+    trust: Mapping[str, Any] | None = None
+    """Age and last verification, from `ftdrive.report.trust`; None if nothing was looked up."""
+
+
+def read_subject(source: Path, options: SolveOptions, parent: Path | None = None) -> Subject:
+    """Read a calibration file, a run folder, a dataset.json or a CSV file; solve what is not solved.
+
+    A run folder keeps its saved result if that rests on its present poses and no option asks for another one. A
+    calibration file in a run folder is reported with the data of that run.
+
+    Parameters
+    ----------
+    source : Path
+    options : SolveOptions
+    parent : Path, optional
+        Calibration file or run folder of the result to compare with. Default: the parent that the result names.
+
+    Raises
+    ------
+    BadCalibration, BadDataset, CalibError, ConfigError, OSError
+    """
+    if is_calibration(source):
+        if options != SolveOptions():
+            raise ConfigError(f"{source} is solved already: give its dataset or run, or leave out the options of solve")
+        subject = _of_result(source, CalibrationResult.load(source))
+    else:
+        subject = _of_data(source, options)
+    before, name = _parent(subject.result, source, parent)
+    return replace(subject, parent=before, parent_name=name)
+
+
+def is_calibration(source: Path) -> bool:
+    """Check whether a file says that it is a calibration; False if it is no JSON, which reading it as data reports."""
+    if source.is_dir() or source.suffix != ".json":
+        return False
+    try:
+        return str(read_object(source, BadCalibration).get("format", "")).startswith("ftdrive.calibration/")
+    except BadCalibration:
+        return False
+
+
+def _of_result(source: Path, result: CalibrationResult) -> Subject:
+    folder = source.absolute().parent
+    if (folder / "run.json").is_file():
+        data = read_source(folder, "R_base_flange")
+        if data.dataset.sha256() == result.provenance.get("dataset_sha256"):
+            run = Run(folder)
+            solved_with = _for_compare(data.circumstances, SolveOptions())
+            return Subject(source, result, run.solve_command, data.dataset, run, data.records, solved_with)
+    return Subject(source, result, "")
+
+
+def _of_data(source: Path, options: SolveOptions) -> Subject:
+    data = read_source(source, options.orientation, options.known)
+    run = Run(source) if source.is_dir() else None
+    result = None
+    if run is not None and options == SolveOptions() and run.calibration_path.is_file():
+        result = CalibrationResult.load(run.calibration_path)
+    if result is None or result.provenance.get("dataset_sha256") != data.dataset.sha256():
+        solved = solve(
+            data.dataset, options.method, drift=options.drift, **data.circumstances, provenance=data.provenance
+        )
+        result = judged(solved)
+    command = " ".join(["ftdrive solve", shlex.quote(str(source)), *options.words])
+    solved_with = _for_compare(data.circumstances, options)
+    return Subject(source, result, command, data.dataset, run, data.records, solved_with)
+
+
+def _for_compare(circumstances: Mapping[str, Any], options: SolveOptions) -> dict[str, Any]:
+    return {"drift": options.drift} | {name: value for name, value in circumstances.items() if name != "payload_kg"}
+
+
+def _parent(result: CalibrationResult, source: Path, given: Path | None) -> tuple[CalibrationResult | None, str]:
+    """Load the result to compare with; also return its name, or the reason why there is none."""
+    if given is not None:
+        path = Run(given).calibration_path if given.is_dir() else given
+        return CalibrationResult.load(path), str(given)
+    named = result.provenance.get("parent")
+    if not isinstance(named, Mapping):
+        return None, ""
+    path = Path(str(named.get("path", "")))
+    for at in (path, source.absolute().parent / path):
+        if at.is_file():
+            found = CalibrationResult.load(at)
+            if found.id == named.get("id"):
+                return found, f"{path}, its parent"
+    return None, f"The parent {named.get('id')} is not at {path}: name its file with --parent."

@@ -1,0 +1,84 @@
+"""From a run on disk to a result."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ftcalib import CalibrationDataset, CalibrationResult, solve
+from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
+from ftdrive.checks.plausibility import judged
+from ftdrive.planning.geometry.scene import down_of
+from ftdrive.runs.run import Run, made_now
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """A solved run."""
+
+    run: Run
+    dataset: CalibrationDataset
+    result: CalibrationResult
+    drift: DriftCheck | None
+
+
+def solve_and_save(run: Run) -> Outcome:
+    """Solve a run from its files, so that the files suffice to repeat it."""
+    outcome = solve_records(run, run.records())
+    outcome.dataset.save(run.new_path("dataset"))
+    if outcome.result.verdict != "rejected":
+        outcome.result.save(run.new_path("calibration"))
+    return outcome
+
+
+def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
+    """Solve records of a run, as they are on disk or as a replay gives them."""
+    dataset, circumstances, provenance = dataset_of(run, records)
+    result = judged(solve(dataset, **circumstances, provenance=provenance))
+    return Outcome(run, dataset, result, drift_check(records))
+
+
+def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
+    """Return a run's records as a dataset, the circumstances as `solve` takes them, and the provenance."""
+    circumstances, origin = circumstances_of(run)
+    dataset = dataset_from(records, {"run": run.folder.name, "devices": origin["devices"]})
+    return dataset, circumstances, {**made_now(), **origin}
+
+
+def circumstances_of(run: Run) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return what `solve` takes beside the dataset of a run, and where the dataset comes from, without its poses."""
+    header = run.header()
+    config = header["config"]
+    setup = _setup(run, config)
+    origin: dict[str, Any] = {
+        "devices": header.get("devices", {}),
+        "run": run.folder.name,
+        "station": header.get("station"),
+        "setup": setup,
+        "temperature_C": run.temperature_C(),
+    }
+    circumstances = {
+        "g_m_s2": float(config["site"]["g_m_s2"]),
+        "up_in_base": -down_of(config.get("workcell", {}).get("mounting", "floor")),
+        "payload_kg": None if setup["payload_kg"] is None else setup["payload_kg"] - (setup["sensor_mass_kg"] or 0.0),
+    }
+    return circumstances, origin
+
+
+def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a result is bound to or compared with: payload last reported, tool, mount label and mounting."""
+    payload_kg = p_flange_payload_m = None
+    for event in run.events():
+        if event.get("event") == "weighed":
+            payload_kg, p_flange_payload_m = event["payload_kg"], event.get("p_flange_payload_m")
+    sensor, tool, workcell = (config.get(section, {}) for section in ("sensor", "tool", "workcell"))
+    return {
+        "payload_kg": payload_kg,
+        "p_flange_payload_m": p_flange_payload_m,
+        "sensor_mass_kg": sensor.get("mass_kg"),
+        "mounting": workcell.get("mounting"),
+        "height_mm": sensor.get("height_mm"),
+        "tool_mass_kg": tool.get("mass_kg"),
+        "cylinders_mm": [list(row) for row in tool.get("cylinders_mm", ())] if workcell.get("measured") else [],
+        "tool": tool.get("name"),
+        "mount": sensor.get("mount"),
+    }

@@ -1,0 +1,344 @@
+"""A run folder: the plan, every pose with its raw samples, and the results.
+
+run.json          ftdrive.run/1: when, with what, command line, versions, configuration, devices
+plan.json         ftdrive.plan/1: the plan the arm followed; not where a person moved it
+events.ndjson     what happened, one object a line, as `ftdrive.session.events` has it
+poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on; 01-2.npz took its place
+dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after poses were added or taken again
+calibration.json  ftdrive.calibration/1: the result; calibration-2.json likewise. Of a verification: the accepted update
+verification.json ftdrive.verification/1: the outcome of a verification; see `ftdrive.runs.verified`
+solved-0.1.0.json ftdrive.calibration/1: the result of a later version; see `ftdrive.fleet.resolve`
+"""
+
+import io
+import json
+import os
+import platform
+import shlex
+import sys
+import threading
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from itertools import count, takewhile
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from ftcalib.errors import BadDataset
+from ftcalib.files import check_format, read_object, write_new
+from ftcalib.model import Array
+from ftcalib.routine import PoseRecord, TourPose
+from ftdrive import __version__
+from ftdrive.cell.config import recorded, without_password
+from ftdrive.errors import ConfigError
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.interfaces import FtSamples
+
+RUN_FORMAT = "ftdrive.run/1"
+RECORDING_FORMAT = "ftdrive.recording/1"
+POSE = "pose-taken"
+"""The event of a pose that is on disk, `ftdrive.session.events.PoseTaken`."""
+
+_RESTORE = "take it from a copy"
+_DAMAGE = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError),
+    *(NotImplementedError, zipfile.BadZipFile, zlib.error),
+)
+"""Errors of numpy for a damaged file."""
+_SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
+"""Of a recording, named as in `FtSamples`."""
+
+Mode = Literal["auto", "step", "manual", "listen"]
+"""How a session moves from pose to pose."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """One look at the arm, read back from a recording."""
+
+    t_host_ns: int
+    q_rad: Array
+    R_base_flange: Array
+
+
+class Run:
+    """A run folder on disk.
+
+    Parameters
+    ----------
+    folder : Path
+    clock : Clock
+        Of the cell whose poses are added: each is kept with what to add to its `t_host_ns` for UTC.
+    """
+
+    def __init__(self, folder: Path, clock: Clock = REAL) -> None:
+        self.folder = folder
+        self._clock_offset_ns = time.time_ns() - clock.now_ns()  # the anchor of all times in the files
+        self._events_lock = threading.Lock()
+
+    @classmethod
+    def create(cls, parent: Path, name: str, description: Mapping[str, Any], clock: Clock = REAL) -> "Run":
+        """Make a new folder `<UTC time>-<name>` and write its run.json."""
+        now = datetime.now(UTC)
+        folder = parent / f"{now:%Y-%m-%dT%H%M%SZ}-{name}"
+        number = 1
+        while True:
+            try:
+                folder.mkdir(parents=True)
+                break
+            except FileExistsError:
+                number += 1
+                folder = parent / f"{now:%Y-%m-%dT%H%M%SZ}-{name}-{number}"
+        (folder / "poses").mkdir()
+        header = {
+            "format": RUN_FORMAT,
+            "created_utc": now.isoformat(),
+            "created_host_ns": clock.now_ns(),
+            "argv": command_line(),
+            "versions": versions(),
+            **description,
+        }
+        write_new(folder / "run.json", json.dumps(header, indent=1))
+        return cls(folder, clock)
+
+    @property
+    def calibration_path(self) -> Path:
+        """Where the newest result is kept."""
+        return _newest(self.folder / "calibration.json")
+
+    @property
+    def dataset_path(self) -> Path:
+        """Where the newest dataset is kept."""
+        return _newest(self.folder / "dataset.json")
+
+    @property
+    def plan_path(self) -> Path:
+        """Where the plan is kept."""
+        return self.folder / "plan.json"
+
+    @property
+    def command(self) -> str:
+        """Command that made the run: "calibrate" or "verify"."""
+        return str(self.header().get("command", "calibrate"))
+
+    @property
+    def resume_command(self) -> str:
+        """Command that continues the run."""
+        return f"ftdrive {self.command} --resume {shlex.quote(str(self.folder))}"
+
+    @property
+    def solve_command(self) -> str:
+        """Command that solves the poses taken."""
+        return f"ftdrive solve {shlex.quote(str(self.folder))}"
+
+    def new_path(self, name: str) -> Path:
+        """Give the next free path for a file that may be written again: name.json, name-2.json and so on."""
+        return _next(self.folder / f"{name}.json")
+
+    def append_event(self, event: Mapping[str, Any], *, sync: bool = False) -> None:
+        """Add a line to events.ndjson; with `sync` return when it is on disk. Any thread."""
+        with self._events_lock, (self.folder / "events.ndjson").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(event) + "\n")
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
+
+    def events(self) -> Iterator[Mapping[str, Any]]:
+        """Read events.ndjson; a line cut off by a power failure is ignored."""
+        path = self.folder / "events.ndjson"
+        for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+            try:
+                event = json.loads(line)
+            except ValueError:
+                continue
+            if isinstance(event, dict):
+                yield event
+
+    def temperature_C(self) -> float | None:
+        """Return the mean temperature of the sensor over the poses; None where it reported none."""
+        found = {event.get("stop"): event.get("temperature_C") for event in self.events() if event.get("event") == POSE}
+        known = [float(value) for value in found.values() if isinstance(value, int | float)]
+        return sum(known) / len(known) if known else None
+
+    def header(self) -> Mapping[str, Any]:
+        """Read run.json; raises `BadDataset` if it is damaged."""
+        path = self.folder / "run.json"
+        if not path.exists():
+            raise BadDataset(f"{self.folder} is not a run folder: it has no run.json")
+        try:
+            header = read_object(path, BadDataset)
+            check_format(header, RUN_FORMAT, BadDataset)
+            _require_kinds(header)
+            if "config" in header:
+                header["config"] = recorded(header["config"])
+        except (BadDataset, ConfigError) as error:
+            raise BadDataset(f"{path}: {error}") from error
+        return _Whole(path, header)
+
+    def header_to_resume(self) -> Mapping[str, Any]:
+        """Read run.json; raises `BadDataset` also if the plan of the run is lost."""
+        header = self.header()
+        for section, key in (("robot", "host"), ("sensor", "url")):
+            header["config"][section][key]  # raises if it is missing
+        if header.get("mode", "auto") in ("auto", "step") and not self.plan_path.is_file():
+            raise BadDataset(
+                f"{self.plan_path} is lost, and without its plan a run cannot go on: {_RESTORE}, or solve the poses "
+                f"that are there with {self.solve_command}"
+            )
+        return header
+
+    def commit(self, record: PoseRecord) -> None:
+        """Write one pose; returns when it is on disk."""
+        buffer = io.BytesIO()
+        readings: dict[str, Any] = {
+            f"{when}_{name}": np.asarray(getattr(reading, name))
+            for when, reading in (("before", record.before), ("after", record.after))
+            for name in ("t_host_ns", "q_rad", "R_base_flange")
+        }
+        np.savez_compressed(
+            buffer,
+            format=np.array(RECORDING_FORMAT),
+            stop=np.array(record.stop),
+            number=np.array(record.pose.number),
+            q_target_rad=record.pose.q_rad,
+            steady=np.array(record.steady),
+            clock_offset_ns=np.array(record.clock_offset_ns or self._clock_offset_ns),
+            **readings,
+            **{name: getattr(record.samples, name) for name in _SAMPLE_COLUMNS},
+        )
+        write_new(_next(self.folder / "poses" / f"{record.stop:02d}.npz"), buffer.getvalue())
+
+    def records(self) -> list[PoseRecord]:
+        """Read every pose, in the order of the tour; of a pose taken again, the newest."""
+        return [_read_record(_newest(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
+
+    def stops(self) -> list[int]:
+        """Return the stops taken, without reading them."""
+        names = {path.stem.partition("-")[0] for path in (self.folder / "poses").glob("*.npz")}
+        return sorted(int(name) for name in names if name.isdecimal())
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _is_object(value: Any) -> bool:
+    return isinstance(value, dict)
+
+
+_Kind = tuple[str, Callable[[Any], bool]]
+_TEXT: _Kind = "a text", _is_text
+_TEXT_OR_NULL: _Kind = "a text or null", lambda value: value is None or _is_text(value)
+_TEXTS: _Kind = "a list of texts", lambda value: isinstance(value, list) and all(map(_is_text, value))
+_OBJECT: _Kind = "an object", _is_object
+_OBJECTS: _Kind = "an object of objects", lambda value: _is_object(value) and all(map(_is_object, value.values()))
+_KINDS: Mapping[str, _Kind] = {
+    "config": _OBJECTS,
+    "command": _TEXT,
+    "devices": _OBJECTS,
+    "devices.arm.serial": _TEXT,
+    "devices.sensor.serial": _TEXT,
+    "devices.sensor.facts": _OBJECTS,
+    "mode": (f"one of {', '.join(get_args(Mode))}", lambda value: value in get_args(Mode)),
+    "said": _OBJECT,
+    "said.config": _TEXT_OR_NULL,
+    "said.robot": _TEXT_OR_NULL,
+    "said.sensor": _TEXT_OR_NULL,
+    "said.tool": _TEXTS,
+    "station": _OBJECT,
+    "station.sensor": _TEXT,
+    "station.options": _TEXTS,
+    "verification": _OBJECT,
+}
+"""Types of the fields of run.json; `recorded` checks those of config."""
+
+
+def _require_kinds(header: Mapping[str, Any]) -> None:
+    for place, (words, fits) in _KINDS.items():
+        *above, name = place.split(".")
+        found = header
+        for one in above:
+            found = found.get(one, {})
+        if name in found and not fits(found[name]):
+            raise BadDataset(f"'{place}' is {found[name]!r} and not {words}, the file is damaged: {_RESTORE}")
+
+
+class _Whole(dict[str, Any]):
+    """An object of run.json; a missing key raises an error that names the file."""
+
+    def __init__(self, path: Path, content: Mapping[str, Any]) -> None:
+        super().__init__(
+            {name: _Whole(path, value) if isinstance(value, dict) else value for name, value in content.items()}
+        )
+        self._path = path
+
+    def __missing__(self, name: str) -> Any:
+        raise BadDataset(f"{self._path} is damaged, it has no '{name}': {_RESTORE}")
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    yield path
+    yield from (path.with_stem(f"{path.stem}-{number}") for number in count(2))
+
+
+def _next(path: Path) -> Path:
+    return next(one for one in _numbered(path) if not one.exists())
+
+
+def _newest(path: Path) -> Path:
+    found = path
+    for one in takewhile(Path.exists, _numbered(path)):
+        found = one
+    return found
+
+
+def _read_record(path: Path) -> PoseRecord:
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            data = {name: file[name] for name in file.files}
+        found = str(data.get("format"))
+        if found != RECORDING_FORMAT:
+            raise BadDataset(f"{path} has format {found!r}: this version reads {RECORDING_FORMAT}")
+        return _record(data)
+    except _DAMAGE as error:
+        raise BadDataset(
+            f"{path} is not a recording of a pose ({error}): {_RESTORE}, or move it away and --resume the run"
+        ) from error
+
+
+def _record(data: Mapping[str, Any]) -> PoseRecord:
+    before, after = (
+        Reading(int(data[f"{when}_t_host_ns"]), data[f"{when}_q_rad"], data[f"{when}_R_base_flange"])
+        for when in ("before", "after")
+    )
+    return PoseRecord(
+        stop=int(data["stop"]),
+        pose=TourPose(int(data["number"]), data["q_target_rad"]),
+        before=before,
+        after=after,
+        samples=FtSamples(*(data[name] for name in _SAMPLE_COLUMNS)),
+        steady=bool(data["steady"]),
+        clock_offset_ns=int(data.get("clock_offset_ns", 0)),
+    )
+
+
+def made_now() -> dict[str, Any]:
+    """Return what every file says of its making: when, by which command line, with which versions."""
+    return {"created_utc": datetime.now(UTC).isoformat(), "argv": command_line(), "versions": versions()}
+
+
+def command_line() -> list[str]:
+    """Return the command line without passwords in addresses."""
+    return [without_password(word) for word in sys.argv]
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the software behind a result."""
+    found = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    return found | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}

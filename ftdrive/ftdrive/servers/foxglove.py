@@ -1,0 +1,239 @@
+"""A WebSocket server for Foxglove, Lichtblick and PlotJuggler from 3.16.
+
+Wrenches, poses and joint angles are ROS 2 messages, because the viewers know no other wrench and PlotJuggler no other
+encoding. Frames, arrows and events are Foxglove's own. A client can tare, and set the frame and the stages.
+"""
+
+import json
+import logging
+import os
+import socket
+import stat
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftcalib.files import JSON
+from ftdrive.errors import ConfigError
+from ftdrive.live import ros2
+from ftdrive.live.processing import ProcessedStream
+from ftdrive.live.samples import Block, StreamEvent
+from ftdrive.servers.picked import Picked
+
+try:
+    import foxglove as sdk
+except ImportError:
+    raise ConfigError("a server needs foxglove-sdk: install ftdrive with its extra stream, `ftdrive[stream]`") from None
+
+from foxglove import Channel, Context, MessageSchema, Schema, Service, ServiceRequest, ServiceSchema
+from foxglove.channels import FrameTransformsChannel, LogChannel, SceneUpdateChannel
+from foxglove.messages import Log, LogLevel
+from foxglove.websocket import Capability, StatusLevel
+
+from ftdrive.servers import scene
+from ftdrive.servers.parameters import Parameters
+
+TRANSFORMS, ARROWS, EVENTS, STATUS = "/tf", "/wrench_arrows", "/events", "/stream_status"
+
+SCENE_HZ = 60.0
+"""Of frames and arrows: no screen shows more."""
+STATUS_HZ = 2.0
+BACKLOG = 1 << 15
+"""Messages kept for a client that falls behind: two seconds at 7 kHz. Then the oldest are dropped."""
+
+_WARNINGS = ("tare-refused", "drift", "gap", "stale")
+
+_log = logging.getLogger(__name__)
+
+
+class FoxgloveServer:
+    """Sends a stream to any number of clients.
+
+    No client delays the stream. Messages wait in a queue for each client; the SDK drops the oldest when it is full and
+    does not count them. Therefore `STATUS` has how many messages of each topic were sent: a client that received fewer
+    since the status before has lost the others. The SDK names a slow client at most every 30 s; that is logged.
+
+    What a client requests is done in a thread of the SDK.
+
+    Parameters
+    ----------
+    port : int
+        0 lets the system choose; see `port`.
+
+    Raises
+    ------
+    ConfigError
+        The address cannot be used.
+    """
+
+    def __init__(self, stream: ProcessedStream, host: str = "127.0.0.1", port: int = 8765) -> None:
+        self._stream = stream
+        self._info = stream.info
+        self._context = context = Context()  # server and channels keep only weak references
+        self._channels: dict[str, Any] = {
+            topic: Channel(
+                topic,
+                message_encoding="cdr",
+                schema=Schema(name=schema.name, encoding="ros2msg", data=schema.text.encode()),
+                context=context,
+            ).base  # checks no types, 15 000 times a second
+            for topic, schema in ros2.SCHEMAS.items()
+        } | {
+            TRANSFORMS: FrameTransformsChannel(TRANSFORMS, context=context),
+            ARROWS: SceneUpdateChannel(ARROWS, context=context),
+            EVENTS: LogChannel(EVENTS, context=context),
+            STATUS: Channel(STATUS, message_encoding="json", context=context).base,
+        }
+        self._sent = dict.fromkeys(self._channels, 0)
+        self._arm, self._scene, self._status = Picked(self._info.arm_rate_Hz), Picked(SCENE_HZ), Picked(STATUS_HZ)
+        self._slow_clients = _SlowClients()
+        sdk.set_log_level("INFO")
+        try:
+            self._server = sdk.start_server(
+                name=f"ftdrive: {self._info.tool}, {self._info.calibration_name}",
+                host=host,
+                port=port,
+                capabilities=[Capability.Parameters, Capability.Services],
+                supported_encodings=["json"],
+                services=[self._service("tare", stream.tare), self._service("undo_tare", stream.undo_tare)],
+                server_listener=Parameters(stream, self._warn),
+                context=context,
+                message_backlog_size=BACKLOG,
+            )
+        except RuntimeError as error:
+            self._slow_clients.close()
+            reason = str(error).rpartition("port: ")[2]
+            raise ConfigError(
+                f"the server cannot listen on {host}:{port}: {reason}: choose another --port or --host"
+            ) from error
+        _send_at_once(self._server.port)
+
+    @property
+    def port(self) -> int:
+        """The port on which it listens."""
+        return self._server.port
+
+    @property
+    def app_url(self) -> str:
+        """The address of Foxglove in a browser, with this server as its source."""
+        return self._server.app_url() or ""
+
+    def write(self, block: Block) -> None:
+        """Send a block; never waits."""
+        t_ns = block.t_host_ns + self._info.utc_offset_ns
+        frame = ros2.frame_id(block.frame)
+        self._send(ros2.RAW, t_ns, lambda: ros2.pack_wrenches(t_ns, block.raw, "sensor"))
+        self._send(ros2.COMPENSATED, t_ns, lambda: ros2.pack_wrenches(t_ns, block.wrench, frame))
+        if (rows := self._arm.rows(t_ns)).any():  # the poses between are interpolated
+            poses, t_arm_ns = block.rows(rows), t_ns[rows]
+            R, p = poses.R_base_flange, poses.p_base_flange_m
+            self._send(ros2.POSE, t_arm_ns, lambda: ros2.pack_poses(t_arm_ns, R, p))
+            self._send(ros2.JOINTS, t_arm_ns, lambda: ros2.pack_joints(t_arm_ns, poses.q_rad))
+        newest = t_ns[-1:]
+        if self._scene.rows(newest).any():
+            self._send(TRANSFORMS, newest, lambda: [scene.transforms(block, self._info, int(newest[0]))])
+            self._send(ARROWS, newest, lambda: [scene.arrows(block, int(newest[0]))])
+        if self._status.rows(newest).any():
+            self._send(STATUS, newest, lambda: [json.dumps(_without_nan(self._state())).encode()])
+
+    def event(self, event: StreamEvent) -> None:
+        """Send an event."""
+        t_ns = np.array([event.t_host_ns + self._info.utc_offset_ns])
+        level = LogLevel.Warning if event.kind in _WARNINGS else LogLevel.Info
+        log = Log(timestamp=scene.stamp(int(t_ns[0])), level=level, message=event.text, name=event.kind)
+        self._send(EVENTS, t_ns, lambda: [log])
+
+    def close(self) -> None:
+        """Disconnect the clients."""
+        self._server.stop()
+        self._slow_clients.close()
+
+    def _send(self, topic: str, t_ns: NDArray[np.int64], pack: Callable[[], Sequence[object]]) -> None:
+        channel = self._channels[topic]
+        if channel.has_sinks():
+            for message, t in zip(pack(), t_ns.tolist(), strict=True):
+                channel.log(message, log_time=t)
+            self._sent[topic] += len(t_ns)
+
+    def _state(self) -> dict[str, JSON]:
+        calibration = self._info.calibration
+        return {
+            "frame": str(self._stream.frame),
+            "stages": asdict(self._stream.stages),
+            "calibration": self._info.calibration_name,
+            "verdict": calibration.verdict,
+            "status": asdict(self._stream.status()),
+            "sent": self._sent,
+        }
+
+    def _warn(self, text: str) -> None:
+        self._server.publish_status(text, StatusLevel.Warning)
+
+    def _service(self, name: str, action: Callable[[], StreamEvent]) -> Service:
+        def handle(_: ServiceRequest) -> bytes:
+            event = action()
+            return json.dumps({"success": event.kind != "tare-refused", "message": event.text}).encode()
+
+        # Like the type of the same name in ROS 2, as JSON.
+        empty = b'{"type": "object", "properties": {}}'
+        result = b'{"type": "object", "properties": {"success": {"type": "boolean"}, "message": {"type": "string"}}}'
+        request, response = (
+            MessageSchema(encoding="json", schema=Schema(name=words, encoding="jsonschema", data=schema))
+            for words, schema in (("Trigger_Request", empty), ("Trigger_Response", result))
+        )
+        schema = ServiceSchema(name="std_srvs/srv/Trigger", request=request, response=response)
+        return Service(name, schema=schema, handler=handle)
+
+
+def _send_at_once(port: int) -> None:
+    """Set TCP_NODELAY on the socket that listens on a port of this process; its connections inherit the option.
+
+    The SDK does not set it. Without it a message waits until the client confirms the one before, for up to 40 ms.
+    """
+    folder = Path("/dev/fd")  # Windows has none
+    for name in [path.name for path in folder.iterdir()] if folder.is_dir() else []:
+        with suppress(OSError):  # closed meanwhile
+            if not stat.S_ISSOCK(os.fstat(int(name)).st_mode):
+                continue
+            with socket.socket(fileno=os.dup(int(name))) as found:
+                if found.family in (socket.AF_INET, socket.AF_INET6) and found.getsockname()[1] == port:
+                    found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+class _SlowClients(logging.Handler):
+    """Logs the clients that the SDK names as slow, in our words."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.INFO)
+        logging.getLogger("foxglove").setLevel(logging.WARNING)
+        self._source = logging.getLogger("foxglove.websocket.connected_client.send_lossy")
+        self._source.setLevel(logging.INFO)
+        self._source.propagate = False
+        self._source.addHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Log a report."""
+        address = record.getMessage().removeprefix("outbox for client ").removesuffix(" full")
+        _log.warning("the client %s reads too slowly: its oldest messages are dropped", address)
+
+    def close(self) -> None:
+        """Stop."""
+        self._source.removeHandler(self)
+        super().close()
+
+
+def _without_nan(value: JSON) -> JSON:
+    """Return lists for arrays and None for what JSON cannot write."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return None if isinstance(value, float) and not isfinite(value) else value

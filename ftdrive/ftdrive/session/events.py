@@ -1,0 +1,258 @@
+"""Events of a session: the screen shows them, `--json` writes them, the run folder keeps them."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Any, Literal
+
+import numpy as np
+
+from ftcalib.model import Array
+from ftcalib.routine import PoseRecord
+from ftdrive.planning.plan import Plan
+from ftdrivers.interfaces import ForceTorqueSensor
+
+SCHEMA_VERSION = 1
+
+
+class State(StrEnum):
+    """State of a session. A trip leads from any state to STOP, then HOLD, where the operator decides."""
+
+    IDLE = "idle"
+    PREFLIGHT = "preflight"
+    APPROACH = "approach"
+    MOVE = "move"
+    SETTLE = "settle"
+    SAMPLE = "sample"
+    CLOSE = "close"
+    REPORT = "report"
+    STOP = "stop"
+    HOLD = "hold"
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Event:
+    """Base of all events."""
+
+    t_utc: str = field(default_factory=_now)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `--json` writes, one object a line; arrays become lists, NaN and infinity null."""
+        name = "".join(f"-{c.lower()}" if c.isupper() else c for c in type(self).__name__).lstrip("-")
+        return {"schema_version": SCHEMA_VERSION, "event": name} | {
+            key: _plain(value) for key, value in asdict(self).items()
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunOpened(Event):
+    """A run folder is open; it keeps every pose from now on."""
+
+    folder: str
+    resume: str
+    """The command that continues it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StateChanged(Event):
+    """The session has entered a state."""
+
+    state: State
+    stop: int | None = None
+    """Place in the tour, from 1; the return to the first pose comes last."""
+    stops: int | None = None
+    number: int | None = None
+    """Of the orientation."""
+    words: str = ""
+    """The cause, for STOP and HOLD; else what happens or what to do."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Checked(Event):
+    """Result of a preflight check."""
+
+    name: str
+    passed: bool
+    words: str
+    """What was found; for a failed check, what to do."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Planned(Event):
+    """Every motion to come; shown before any question."""
+
+    plan: Plan
+    """Its file's contents in `to_dict`."""
+    way_rad: Array
+    """(k + 1, 6) joint vectors from where the arm stands to the first pose; (0, 6) if it stands there."""
+    way_words: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what `--json` writes, with the plan as in its file."""
+        return Event.to_dict(self) | {"plan": self.plan.to_dict()}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Noted(Event):
+    """A note for the operator without a type of its own."""
+
+    words: str
+    warning: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseTaken(Event):
+    """A pose is on disk."""
+
+    stop: int
+    stops: int
+    number: int
+    gravity_flange: Array
+    """(3,) unit vector down, in the flange frame, as the base is mounted."""
+    mean: Array
+    """(6,) N and N·m, as measured."""
+    sigma: Array
+    """(6,) of the mean, N and N·m."""
+    samples: int
+    settle_s: float
+    average_s: float
+    attempts: int
+    steady: bool
+    temperature_C: float | None = None
+    """Of the sensor, where it reports it."""
+
+    @classmethod
+    def of(
+        cls,
+        record: PoseRecord,
+        down_base: Array,
+        *,
+        stops: int,
+        settle_s: float,
+        average_s: float,
+        attempts: int,
+        temperature_C: float | None,
+    ) -> "PoseTaken":
+        """Describe a record on disk; `down_base` (3,) is the unit vector down in base, as mounted."""
+        return cls(
+            stop=record.stop,
+            stops=stops,
+            number=record.pose.number,
+            gravity_flange=record.before.R_base_flange.T @ down_base,
+            mean=record.mean.mean,
+            sigma=np.sqrt(np.diag(record.mean.covariance)),
+            samples=len(record.samples.t_host_ns),
+            settle_s=settle_s,
+            average_s=average_s,
+            attempts=attempts,
+            steady=record.steady,
+            temperature_C=temperature_C,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Estimated(Event):
+    """The running fit over the poses so far; only the coverage before a fit is possible."""
+
+    poses: int
+    values: Mapping[str, Any]
+    """By the names of `Parameters` and its derived quantities, SI units; empty before four distinct poses."""
+    sigma: Mapping[str, Any]
+    """One standard deviation each, same names."""
+    residual_sigma: float | None
+    """Of the newest pose: largest of its six residuals over its standard deviation."""
+    residual_force_N: float | None
+    """Of the newest pose: norm."""
+    faces: tuple[int, int, int, int, int, int]
+    """Poses by the flange axis that gravity is nearest to: +x -x +y -y +z -z."""
+    cond9: float
+    cond_u1: float
+    empty_cap_deg: float
+    """Largest angle from any direction of gravity to the nearest one seen."""
+    light: str
+    """green, amber or red: whether the poses suffice."""
+    hint: str
+    """The most useful next pose, in words; empty if the light is green or the arm is not moved by hand."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Compared(Event):
+    """A pose of a verification, beside the prediction of the calibration."""
+
+    stop: int
+    number: int
+    residual: Array
+    """(6,) measured minus predicted, N and N·m."""
+    sigma: Array
+    """(6,) one standard deviation of that, of noise and calibration together."""
+    poses: int
+    """Number of poses so far."""
+    light: str
+    """green if the poses suffice, else amber."""
+    hint: str = ""
+    """What to do, if the pose does not count."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Weighed(Event):
+    """The running fit is reliable: the identified mass, beside the payload set on the controller."""
+
+    mass_kg: float
+    """Of what the sensor carries, so without sensor and adapter."""
+    payload_kg: float
+    p_flange_payload_m: tuple[float, ...] | None
+    """(3,) centre of mass of that payload, flange axes; None for a controller that does not report it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GuardTripped(Event):
+    """A guard has stopped the arm."""
+
+    hazard: int
+    """Row of the hazard table."""
+    words: str
+    """What was found, with the value, and what to do."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Asked(Event):
+    """A question and its answer."""
+
+    question: str
+    answer: str
+    by: Literal["person", "--yes"]
+    """Who answered: the operator, or the option, which gives the assumed answer."""
+
+
+class SensorEvents:
+    """Shows each event of a sensor once, such as interruptions and reconnections."""
+
+    def __init__(self, sensor: ForceTorqueSensor, show: Callable[[Event], None]) -> None:
+        self._sensor, self._show = sensor, show
+        self._shown = 0
+
+    def show_new(self) -> None:
+        """Show the events since the last call."""
+        events = self._sensor.health().events
+        for t_host_ns, words in events[self._shown :]:
+            self._show(Noted(words=f"sensor: {words} (host clock {t_host_ns / 1e9:.3f} s)", warning=True))
+        self._shown = len(events)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,77 @@
+"""Forecast of a tour: its speeds, its duration, and its accuracy with the noise of this sensor."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from ftcalib.model import Array
+from ftcalib.poses.information import Guess, predicted_sigma
+from ftdrive.planning.approach import Approach
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
+from ftdrive.planning.plan import Plan
+from ftdrive.session.tour import APPROACH_RAD_S, SLOW
+
+
+def at_most(plan: Plan, certifier: Certifier, speeds: Speeds) -> Plan:
+    """Return a plan with its speeds reduced to these limits."""
+    q = np.array([step.q_rad for step in plan.steps])
+    allowed = speed_of_leading_joint(certifier.arm, q, np.roll(q, -1, axis=0), speeds)
+    steps = (
+        replace(step, speed_rad_s=min(step.speed_rad_s, float(most)))
+        for step, most in zip(plan.steps, allowed, strict=True)
+    )
+    acceleration_rad_s2 = min(plan.acceleration_rad_s2, speeds.joint_rad_s2)
+    return replace(plan, steps=tuple(steps), acceleration_rad_s2=acceleration_rad_s2)
+
+
+def moves_s(plan: Plan, todo: Sequence[int], q_rad: Array, approach: Approach) -> float:
+    """Return the time of all moves: the approach from `q_rad` to the first stop, then moves of the plan to the rest.
+
+    Parameters
+    ----------
+    plan : Plan
+        With the speeds it is driven at.
+    todo : sequence of int
+        Stops, from 1; where some are left out between two, there is an approach too, counted as a straight move.
+    """
+    turns = np.abs(np.diff(np.vstack([q_rad, approach.q_rad]), axis=0)).max(axis=1)
+    speeds = np.minimum(approach.speed_rad_s, APPROACH_RAD_S)
+    total_s = float(move_duration_s(turns, speeds, SLOW.joint_rad_s2).sum())
+    for stop, following in pairwise(todo):
+        step = plan.steps[stop - 1]
+        turn, speed, acceleration = step.turn_rad, step.speed_rad_s, plan.acceleration_rad_s2
+        if following != stop + 1:
+            goal = plan.steps[(following - 1) % len(plan.steps)].q_rad
+            turn = float(np.abs(np.subtract(goal, step.q_rad)).max())
+            speed, acceleration = APPROACH_RAD_S, SLOW.joint_rad_s2
+        total_s += float(move_duration_s(np.array(turn), speed, acceleration))
+    return total_s
+
+
+def prediction(plan: Plan, guess: Guess, average_s: float, sigma: Array, *, assumed: bool) -> str:
+    """Describe the accuracy that a plan's poses give.
+
+    Parameters
+    ----------
+    guess : Guess
+        Of the tool.
+    average_s : float
+        At each pose.
+    sigma : array, shape (6,)
+        Standard deviation of such an average, as measured, N and N·m.
+    assumed : bool
+        The mass of the tool is not configured.
+    """
+    force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
+    guess = replace(guess, sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
+    found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
+    mass = f"{guess.mass_kg:g} kg" + (" (assumed: [tool] mass_kg is not set)" if assumed else "")
+    return (
+        f"sigma of {average_s:g} s averages: {force_N:.2g} N, {torque_Nm:.2g} N·m; predicted from "
+        f"that for {mass}, one sigma: mass {1e3 * float(found.sigma['mass_kg']):.2g} g, force "
+        f"bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
+        f"{found.torque_rms_Nm:.2g} N·m"
+    )

@@ -1,0 +1,436 @@
+"""Poses to which the operator moves the arm, by hand or pendant, or a program on the pendant.
+
+Nothing here commands the arm, which may be open for reading only. Each time the arm has stood still for 1 s at a new
+orientation, the sensor is averaged and the pose is written to disk.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import degrees, radians
+from typing import Final, Protocol, TypeVar
+
+import numpy as np
+
+from ftcalib.data.dwell_mean import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
+from ftcalib.model import Array
+from ftcalib.routine import (
+    LONGER,
+    MOVED_RAD,
+    PoseRecord,
+    Sampling,
+    TourPose,
+    require_enough,
+    turned_rad,
+)
+from ftdrive.session.events import (
+    Compared,
+    Estimated,
+    Noted,
+    PoseTaken,
+    SensorEvents,
+    State,
+    StateChanged,
+)
+from ftdrive.session.operator import Key, Operator
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
+
+STILL_S: Final = 1.0
+"""On the controller's clock, because the controller's `is_steady` is always false in freedrive."""
+STILL_RAD_S: Final = 0.002
+LEFT_RAD: Final = radians(1)
+"""A smaller turn counts as a nudge, not as a move."""
+REPEAT_RAD: Final = radians(10)
+RETURN_RAD: Final = radians(0.1)
+"""A program returns to its first pose within this angle."""
+LOOK_S: Final = 0.1
+BACK_S: Final = 12.0
+"""A driver that may recover gives up after 10 s."""
+SURPRISE_SIGMA: Final = 5.0
+SURPRISE_N: Final = 0.5
+"""A pose that differs from the fit of the others by both was probably touched."""
+LEAST_TO_COMPARE: Final = 6
+"""Number of poses, the new one included."""
+
+
+T = TypeVar("T")
+
+
+class WatchedArm(Protocol):
+    """An arm that can only be read."""
+
+    def state(self) -> ArmState:
+        """Read a fresh state, or raise."""
+
+    def status(self) -> ArmStatus:
+        """Read the controller's modes, or raise."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorder:
+    """What happens to each pose."""
+
+    judge: Callable[[PoseRecord], Estimated | Compared]
+    """Takes each pose, in place of one with the same stop; judges whether the poses suffice, and gives a hint.
+    `Judge.add` of `ftdrive.session.live_fit`."""
+    commit: Callable[[PoseRecord], None]
+    """Takes each record and returns when it is safe on disk; one with the `stop` of an earlier one replaces it."""
+    earlier: Sequence[PoseRecord] = ()
+    """Poses of the resumed run; `judge` takes them too."""
+    goal: str = "the coverage is green"
+    """When the poses suffice."""
+
+
+def collect_manually(
+    arm: WatchedArm,
+    sensor: ForceTorqueSensor,
+    sampling: Sampling,
+    operator: Operator,
+    recorder: Recorder,
+    *,
+    down_base: Array,
+    listen: bool,
+    clock: Clock = REAL,
+) -> None:
+    """Take poses until there are enough, in place of a tour.
+
+    Keys: keep ends it once the light is green; stop ends it at once; redo takes the newest pose again, where the arm
+    stands or is moved to next; skip leaves out the pose where it stands; pause pauses and resumes. A key takes effect
+    within the time of an average. Without keys, it ends with the first good pose that finds the light green.
+
+    Parameters
+    ----------
+    arm, sensor
+        Open; the arm for reading. An interrupted sensor with `recover` may reconnect.
+    down_base : array, shape (3,)
+        Unit vector down in base, as mounted.
+    listen : bool
+        A program moves the arm, so no pose is suggested. Poses are taken from its start to its end, or until it
+        returns to its first pose when there are enough. That return is committed too and serves
+        `ftcalib.routine.drift_check`. A program that passes its first pose earlier is followed to its end.
+    clock : Clock
+        Of the cell; an emulated one waits for this thread, which must see each standstill.
+
+    Notes
+    -----
+    Poses are numbered in the order of taking, and so are their orientations: they belong to no planned set. The
+    return to the first pose has its orientation number, 1. `pose.q_rad` is where the arm stood.
+
+    Raises
+    ------
+    TooFewSamples
+        The sensor is too slow for the time given to a pose.
+    Exception
+        Whatever the arm or the sensor raises; the poses committed so far stand.
+    """
+    with clock.keeping_up():
+        _Collection(arm, sensor, sampling, operator, recorder, clock, down_base, listen).run()
+
+
+class _Collection:
+    def __init__(
+        self,
+        arm: WatchedArm,
+        sensor: ForceTorqueSensor,
+        sampling: Sampling,
+        operator: Operator,
+        recorder: Recorder,
+        clock: Clock,
+        down_base: Array,
+        listen: bool,
+    ) -> None:
+        self._arm, self._sensor, self._sampling = arm, sensor, sampling
+        self._sensor_events = SensorEvents(sensor, operator.show)
+        self._operator, self._recorder = operator, recorder
+        self._clock, self._down_base, self._listen = clock, down_base, listen
+        self._taken: dict[int, PoseRecord] = {}
+        self._level: Array | None = None
+        self._redo: int | None = None
+        self._light = "red"
+        self._paused = False
+        self._rests_at: ArmState | None = None
+        """Where the arm stopped; None while it moves."""
+        self._still_since_s = 0.0
+        self._dealt_with = False
+        """Whether the pose where the arm rests was taken or left out."""
+        self._program_ran = False
+        self._program = ""
+        """State of the program, as the controller reports it; empty before its start."""
+        self._passes_first = bool(recorder.earlier)
+        """Whether the program passes its first pose before its end, as a restarted one does."""
+        self._fault: str | None = None
+        self._over = False
+        self._ends_by_itself = not (listen or operator.has_keys)
+        self._enough = False
+        """Whether the light is green and the newest pose is good."""
+
+    def run(self) -> None:
+        self._greet()
+        for record in self._recorder.earlier:
+            self._learn(record)
+        if self._ends_by_itself and self._enough:
+            self._note("The poses of the run suffice: it ends with the next one.")
+        self._show_state(State.MOVE)
+        while not self._over:
+            state = self._ask(self._arm.state)
+            self._collect(LOOK_S)  # paces the loop, and raises as soon as the sensor fails
+            self._obey_keys()
+            if self._over or not self._may_measure():
+                continue
+            if self._at_rest(state):
+                self._take(state)
+            elif self._program == "stopped" and self._dealt_with and self._rests_at is not None:
+                self._end("The program has ended")
+
+    def _ask(self, arm: Callable[[], T]) -> T:
+        """Read the arm; wait if it does not answer, because ftdrive does not move it."""
+        try:
+            return arm()
+        except DeviceTimeout as silence:
+            self._note(f"Nothing is measured until the arm answers again: {silence.found}.", warning=True)
+        return self._wait_out(arm, DeviceTimeout)
+
+    def _collect(self, duration_s: float) -> FtSamples | None:
+        """Collect samples; None if the stream was interrupted and the driver has reconnected."""
+        try:
+            samples = self._sensor.collect(duration_s)
+        except (StreamBroken, DeviceTimeout):
+            if not getattr(self._sensor, "recover", False):
+                raise
+            self._wait_out(self._sensor.check, StreamBroken, DeviceTimeout)
+            return None
+        finally:
+            self._sensor_events.show_new()
+        return samples
+
+    def _collect_enough(self) -> FtSamples | None:
+        """Collect the samples of one pose, for longer if there are too few; None as in `_collect`."""
+        for times in LONGER:
+            average_s = times * self._sampling.average_s
+            if (found := self._collect(average_s)) is None:
+                return None
+            samples = found
+            if len(samples) >= LEAST_SAMPLES:
+                break
+        require_enough(samples, average_s)
+        return samples
+
+    def _wait_out(self, ask: Callable[[], T], *losses: type[DriverError]) -> T:
+        """Repeat until an answer arrives, for `BACK_S` at most."""
+        deadline_s = self._clock.now_s() + BACK_S
+        while True:
+            try:
+                return ask()
+            except losses:
+                if self._clock.now_s() > deadline_s:
+                    raise
+            self._sensor_events.show_new()
+            self._clock.sleep(LOOK_S)
+
+    def _may_measure(self) -> bool:
+        """Whether a standstill now may be measured."""
+        status = self._ask(self._arm.status)
+        fault = str(status.fault or "")
+        if fault and fault != self._fault:
+            self._note(f"Nothing is measured: {fault}.", warning=True)
+        self._fault = fault
+        if self._listen:
+            self._program_ran |= status.program == "playing"
+            self._program = status.program if self._program_ran else ""
+        return not (self._paused or self._fault) and (not self._listen or self._program in {"playing", "stopped"})
+
+    def _at_rest(self, state: ArmState) -> bool:
+        """Whether the arm has stood still long enough at a pose that was neither taken nor left out."""
+        still = float(np.abs(state.qd_rad_s).max()) < STILL_RAD_S
+        if self._rests_at is not None and turned_rad(self._rests_at, state) > LEFT_RAD:
+            self._rests_at = None
+            if not self._dealt_with:
+                self._show_state(State.MOVE)
+        if self._rests_at is None:
+            if not still:
+                return False
+            self._dealt_with = False
+            self._show_state(State.SETTLE)
+        elif still and turned_rad(self._rests_at, state) < MOVED_RAD:
+            return not self._dealt_with and state.t_device_s - self._still_since_s >= STILL_S
+        elif self._dealt_with:
+            return False
+        self._rests_at = state
+        self._still_since_s = state.t_device_s
+        return False
+
+    def _take(self, state: ArmState) -> None:
+        """Take the pose where the arm stands, or show why not."""
+        others = {stop: turned_rad(record.before, state) for stop, record in self._taken.items() if stop != self._redo}
+        nearest = min(others, key=others.__getitem__, default=0)
+        first = min(self._taken, default=0)
+        back = self._listen and len(others) > 1 and nearest == first and others[first] < RETURN_RAD
+        returned = back and self._light == "green" and not self._passes_first
+        if others and others[nearest] < REPEAT_RAD and not returned:
+            self._passes_first |= back
+            further = " Press k to finish, or turn the tool further." if self._may_finish else " Turn the tool further."
+            self._note(
+                f"This is pose {nearest} again, {degrees(others[nearest]):.0f}° from it: it is left out."
+                + ("" if self._listen else further)
+            )
+            self._deal_with()
+            return
+        stop = self._next_stop()
+        number = self._taken[first].pose.number if returned else stop
+        if not self._measure(stop, number, settle_s=state.t_device_s - self._still_since_s):
+            return
+        if returned:
+            self._end("The program is back at its first pose")
+        elif self._ends_by_itself and self._enough:
+            self._end("These poses are enough")
+
+    def _measure(self, stop: int, number: int, *, settle_s: float) -> bool:
+        """Average until the samples are quiet, and keep the pose; False if the arm moved."""
+        for attempt in range(1, self._sampling.attempts + 1):
+            self._show_state(State.SAMPLE)
+            before = self._ask(self._arm.state)
+            if (found := self._collect_enough()) is None:
+                return False
+            samples = found
+            after = self._ask(self._arm.state)
+            if turned_rad(before, after) >= MOVED_RAD or np.abs(after.qd_rad_s).max() >= STILL_RAD_S:
+                self._still_since_s = after.t_device_s
+                self._note(f"The arm moved while pose {stop} was measured: {self._hold_still()}.", warning=True)
+                self._show_state(State.SETTLE)
+                return False
+            unrest = self._unrest(samples)
+            if not unrest:
+                break
+            last = attempt == self._sampling.attempts
+            again = "; press r to take it again" if self._operator.has_keys else ""
+            advice = f"It is kept and marked{again}." if last else "Let go of tool and cable."
+            self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
+        self._obey_keys()  # r pressed before this pose is shown means the previous one
+        if self._over or self._paused or self._dealt_with:
+            return False
+        if self._redo is not None:
+            stop = number = self._redo
+        record = PoseRecord(stop, TourPose(number, before.q_rad), before, after, samples, steady=not unrest)
+        self._keep(record, settle_s, attempt)
+        return True
+
+    def _keep(self, record: PoseRecord, settle_s: float, attempts: int) -> None:
+        self._recorder.commit(record)
+        self._redo = None
+        self._operator.show(
+            PoseTaken.of(
+                record,
+                self._down_base,
+                stops=max(record.stop, len(self._taken)),
+                settle_s=settle_s,
+                average_s=self._sampling.average_s,
+                attempts=attempts,
+                temperature_C=self._sensor.temperature_C(),
+            )
+        )
+        self._learn(record)
+        self._deal_with()
+
+    def _deal_with(self) -> None:
+        """Finish the pose where the arm stands, and show it: nothing is measured there any more."""
+        self._dealt_with = True
+        words = "the program goes on" if self._listen else "move on to another orientation"
+        if self._may_finish:
+            words = f"enough: press k to finish, or {words}"
+        self._show_state(State.MOVE, words)
+
+    @property
+    def _may_finish(self) -> bool:
+        """Whether the operator may end with k."""
+        return self._light == "green" and not (self._listen or self._ends_by_itself)
+
+    def _learn(self, record: PoseRecord) -> None:
+        """Add a pose on disk to the estimate, and show it."""
+        self._taken[record.stop] = record
+        if record.steady:  # the quietest pose gives the scatter of the untouched sensor
+            std = record.samples.wrench.std(axis=0, ddof=1)
+            self._level = std if self._level is None else np.minimum(self._level, std)
+        judged = self._recorder.judge(record)
+        self._operator.show(replace(judged, hint="") if self._listen else judged)
+        touched = isinstance(judged, Estimated) and self._note_if_touched(record, judged)
+        self._enough = judged.light == "green" and record.steady and not touched
+        if judged.light == "green" != self._light and not (self._listen or self._ends_by_itself):
+            self._note("These poses are enough: press k to finish, or go on for a better result.")
+        self._light = judged.light
+
+    def _note_if_touched(self, record: PoseRecord, estimated: Estimated) -> bool:
+        """Show a pose that differs from the fit of the others."""
+        sigmas, force_N = estimated.residual_sigma or 0.0, estimated.residual_force_N or 0.0
+        touched = estimated.poses >= LEAST_TO_COMPARE and sigmas > SURPRISE_SIGMA and force_N > SURPRISE_N
+        if touched:
+            again = " and press r to take the pose again" if self._operator.has_keys else ""
+            self._note(
+                f"Pose {record.stop} is {force_N:.1f} N from the fit of the others: if something touched the tool, "
+                f"free it{again}.",
+                warning=True,
+            )
+        return touched
+
+    def _unrest(self, samples: FtSamples) -> str:
+        """Describe what is not quiet; empty if all is."""
+        if self._level is not None:
+            for c in np.flatnonzero(restless_channels(samples.wrench, self._level)):
+                found, unit = samples.wrench[:, c].std(ddof=1), "N" if c < 3 else "N·m"
+                return f"{CHANNELS[c]} scatters by {found:.2g} {unit}, at its quietest by {self._level[c]:.2g}"
+        return "" if is_stationary(samples.wrench) else "its mean still changes"
+
+    def _obey_keys(self) -> None:
+        while not self._over and (key := self._operator.pressed()):
+            self._obey(key)
+
+    def _obey(self, key: Key) -> None:
+        if key is Key.STOP:
+            self._end("Stopped")
+        elif key is Key.KEEP and self._light == "green":
+            self._end("Finished")
+        elif key is Key.KEEP:
+            self._note(f"The light is {self._light}: these poses are not enough yet; press q to stop all the same.")
+        elif key is Key.REDO and self._taken:
+            self._redo = max(self._taken)
+            self._dealt_with = False
+            self._note(f"The next pose takes the place of pose {self._redo}.")
+        elif key is Key.SKIP and self._rests_at is not None:
+            self._note("This pose is left out: move on.")
+            self._deal_with()
+        elif key is Key.PAUSE:
+            self._paused = not self._paused
+            self._rests_at = None
+            self._note("Paused: nothing is measured until p is pressed again." if self._paused else "Going on.")
+
+    def _greet(self) -> None:
+        if self._listen:
+            self._note(f"Start the program at the pendant. Each standstill counts: {self._hold_still()}.")
+        else:
+            self._note(
+                "Move the arm by hand or with the pendant to orientations of the tool as different as you can. At each "
+                f"of them let go of the tool and {self._hold_still()}."
+            )
+        if self._ends_by_itself:
+            self._note(f"It ends once {self._recorder.goal}. Press Ctrl-C to end it earlier.")
+
+    def _hold_still(self) -> str:
+        seconds = STILL_S + self._sampling.average_s + 3 * LOOK_S
+        return (
+            f"let it dwell {seconds:.1f} s at each pose" if self._listen else f"leave the arm still for {seconds:.1f} s"
+        )
+
+    def _end(self, why: str) -> None:
+        self._over = True
+        kept = f"{len(self._taken)} {'pose is' if len(self._taken) == 1 else 'poses are'} kept"
+        enough = "" if self._light == "green" else f"; the light is {self._light}: they may be too few or too similar"
+        self._note(f"{why}: {kept}{enough}.", warning=bool(enough))
+
+    def _show_state(self, state: State, words: str = "") -> None:
+        self._operator.show(StateChanged(state=state, stop=self._next_stop(), words=words))
+
+    def _next_stop(self) -> int:
+        return self._redo or max(self._taken, default=0) + 1
+
+    def _note(self, words: str, *, warning: bool = False) -> None:
+        self._operator.show(Noted(words=words, warning=warning))

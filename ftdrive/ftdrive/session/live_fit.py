@@ -1,0 +1,260 @@
+"""The fit over the poses so far, their coverage, and the most useful next pose."""
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult, NotObservable, solve
+from ftcalib.assessment.observability import (
+    ACCEPTED_DELTA_CHI2,
+    AMBIGUOUS_GAP,
+    LEAST_POSES,
+    RECOMMENDED_POSES,
+    WEAK_GAP,
+    different_orientations,
+)
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
+from ftcalib.poses.information import Guess, Prediction, predicted_sigma
+from ftcalib.poses.selection import next_pose
+from ftcalib.poses.sphere import largest_gap
+from ftcalib.published.yu import weight_and_tilt
+from ftcalib.routine import PoseRecord, dataset_from, is_return
+from ftdrive.cell.config import USUAL_KG
+from ftdrive.checks.controller_settings import axes_along
+from ftdrive.session.events import Compared, Estimated
+
+GREEN = {"cond9": 4.0, "cond_u1": 8.0}
+"""As good as gravity directions within 50 to 60 degrees of one another; see `ftcalib.poses.information.Prediction`."""
+AMBER = {"cond9": 8.0, "cond_u1": 25.0}
+"""As within 30 to 45 degrees."""
+TRUSTED_SHARE = 0.05
+"""`Running.predict` returns None if its sigma of the force is more than this share of the weight."""
+
+
+class Judge(Protocol):
+    """Judges the poses so far."""
+
+    @property
+    def weighed_kg(self) -> float | None:
+        """Mass that the sensor carries; None while it is uncertain."""
+
+    def add(self, record: PoseRecord) -> Estimated | Compared:
+        """Add a pose, in place of one with the same `stop`; return what the poses show now."""
+
+    def remove(self, stop: int) -> None:
+        """Remove a pose, so that it can be taken again; a stop that was not taken is ignored."""
+
+    def predict(self, R_base_flange: Array) -> Array | None:
+        """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain."""
+
+
+class Running:
+    """The calibration so far, and its coverage.
+
+    Parameters
+    ----------
+    g_m_s2 : float
+        Local gravity.
+    down_base : array_like, shape (3,)
+        Unit vector down in base, used for the coverage until the fit gives it.
+    advise : bool
+        Suggest the most useful next pose; False if a plan chooses the poses.
+    """
+
+    def __init__(
+        self, *, g_m_s2: float = STANDARD_GRAVITY_M_S2, down_base: ArrayLike = (0.0, 0.0, -1.0), advise: bool = True
+    ) -> None:
+        self._g_m_s2 = g_m_s2
+        self._advise = advise
+        self._down_base = np.asarray(down_base, dtype=np.float64)
+        self._records: dict[int, PoseRecord] = {}
+        self.result: CalibrationResult | None = None
+        """Of `ftcalib.solve` for the poses so far; None while they do not determine it."""
+
+    @property
+    def weighed_kg(self) -> float | None:
+        """Mass that the sensor carries; None while it is uncertain, as in `predict`."""
+        result = self._trusted()
+        if result is None or result.sigma["weight_N"] > TRUSTED_SHARE * result.weight_N:
+            return None
+        return result.mass_kg
+
+    def add(self, record: PoseRecord) -> Estimated:
+        """Add a pose, in place of one with the same `stop`; return the estimate."""
+        self._records.pop(record.stop, None)
+        residual = _surprise(self.result, record)
+        self._records[record.stop] = record
+        coverage = self._refit()
+        R_base_flange, down = self._orientations(), self._down()
+        gravity_flange = down @ R_base_flange
+        light = _light(coverage)
+        values, sigma = ({}, {}) if self.result is None else _estimates(self.result)
+        return Estimated(
+            poses=len(R_base_flange),
+            values=values,
+            sigma=sigma,
+            residual_sigma=None if residual is None else residual[0],
+            residual_force_N=None if residual is None else residual[1],
+            faces=faces(gravity_flange),
+            cond9=coverage.cond9,
+            cond_u1=coverage.cond_u1,
+            empty_cap_deg=float(np.degrees(largest_gap(gravity_flange)[0])),
+            light=light,
+            hint=hint(R_base_flange, self._guess(), down) if self._advise and light != "green" else "",
+        )
+
+    def remove(self, stop: int) -> None:
+        """Remove a pose, so that it can be taken again; a stop that was not taken is ignored."""
+        if self._records.pop(stop, None) is None:
+            return
+        if self._records:
+            self._refit()
+        else:
+            self.result = None
+
+    def predict(self, R_base_flange: Array) -> Array | None:
+        """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain.
+
+        It is uncertain before six poses, while another mounting of the sensor fits almost as well, and at orientations
+        far from those taken. Any thread may call it.
+        """
+        result = self._trusted()
+        if result is None:
+            return None
+        sigma_N = float(np.sqrt(np.trace(result.wrench_covariance(R_base_flange)[:3, :3])))
+        if sigma_N > TRUSTED_SHARE * result.weight_N:
+            return None
+        return -result.compensate(np.zeros(6), R_base_flange)
+
+    def _trusted(self) -> CalibrationResult | None:
+        result = self.result
+        if result is None or result.n_poses < RECOMMENDED_POSES:
+            return None
+        second = result.second_basin_chi2
+        return result if second is None or second >= ACCEPTED_DELTA_CHI2 else None
+
+    def _kept(self) -> list[PoseRecord]:
+        return [self._records[stop] for stop in sorted(self._records)]
+
+    def _orientations(self) -> Array:
+        records = self._kept()
+        return np.array([record.before.R_base_flange for record in records if not is_return(record, records)])
+
+    def _refit(self) -> Prediction:
+        R_base_flange = self._orientations()
+        coverage = predicted_sigma(R_base_flange, self._guess())
+        different = different_orientations(R_base_flange)
+        # The poses alone show that the solver would fail; its advice would take time.
+        hopeless = different < LEAST_POSES or np.isinf(coverage.cond9) or coverage.second_basin_gap < AMBIGUOUS_GAP
+        self.result = None if hopeless else self._solved()
+        return coverage
+
+    def _solved(self) -> CalibrationResult | None:
+        try:
+            return solve(dataset_from(self._kept(), {}), g_m_s2=self._g_m_s2, up_in_base=-self._down_base)
+        except NotObservable:
+            return None
+
+    def _down(self) -> Array:
+        result = self.result
+        if result is None or result.p_wrong > 0.01 or result.weight_N == 0:
+            return self._down_base
+        return result.gravity_force_base_N / result.weight_N
+
+    def _guess(self) -> Guess:
+        """Return the tool as estimated, or a usual one, with the measured noise of the poses."""
+        variance = np.mean([np.diag(record.mean.covariance) for record in self._records.values()], axis=0)
+        _, alpha, beta = weight_and_tilt(self._down())
+        noise = {
+            "sigma_force_N": float(np.sqrt(variance[:3].mean())),
+            "sigma_torque_Nm": float(np.sqrt(variance[3:].mean())),
+            "tilt_alpha_rad": alpha,
+            "tilt_beta_rad": beta,
+            "g_m_s2": self._g_m_s2,
+        }
+        result = self.result
+        if result is None or result.mass_kg == 0:
+            return Guess(USUAL_KG, **noise)
+        return Guess(
+            result.mass_kg, p_sensor_com_m=result.p_sensor_com_m, R_flange_sensor=result.R_flange_sensor, **noise
+        )
+
+
+def faces(gravity_flange: Array) -> tuple[int, int, int, int, int, int]:
+    """Count directions (n, 3) by the axis they are nearest to: +x -x +y -y +z -z."""
+    nearest = np.abs(gravity_flange).argmax(axis=1)
+    negative = gravity_flange[np.arange(len(gravity_flange)), nearest] < 0
+    a, b, c, d, e, f = np.bincount(2 * nearest + negative, minlength=6).tolist()
+    return a, b, c, d, e, f
+
+
+def hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
+    """Describe the simple motion from the last pose to the most useful next one.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+        Poses taken.
+    """
+    last = R_base_flange[-1]
+    words, candidates = _motions(last, down_base)
+    ranked, _ = next_pose(R_base_flange, candidates, guess)
+    best = int(ranked[0])
+    before, after = (_pointing_down(down_base @ R) for R in (last, candidates[best]))
+    return f"{'keep' if before == after else 'point'} {after} down: {words[best]}"
+
+
+def _motions(last: Array, down_base: Array) -> tuple[list[str], Array]:
+    """Return simple motions at the pendant: in words, and the orientations (m, 3, 3) they lead to."""
+    words, candidates = list[str](), list[Array]()
+    for axis in "zxy":
+        for angle_deg in (90, -90) if axis == "z" else (90, -90, 45, -45):
+            turn = "turn the last joint by" if axis == "z" else f"tilt it about its own {axis} axis by"
+            words.append(f"{turn} {angle_deg:+d}°")
+            candidates.append(last @ Rotation.from_euler(axis, angle_deg, degrees=True).as_matrix())
+    for angle_deg in (90, -90):
+        words.append(f"turn it about the vertical by {angle_deg:+d}°")
+        candidates.append(Rotation.from_rotvec(-np.radians(angle_deg) * down_base).as_matrix() @ last)
+    return words, np.array(candidates)
+
+
+def _pointing_down(gravity_flange: Array) -> str:
+    axes = axes_along(gravity_flange)
+    if len(axes) == 1:
+        return f"the tool's {axes[0]} axis"
+    return f"the middle of the tool's {', '.join(axes[:-1])} and {axes[-1]} axes"
+
+
+def _light(coverage: Prediction) -> str:
+    """Judge by conditioning; poses that another solution explains, or that are too few to be checked, are not green."""
+    found = {"cond9": coverage.cond9, "cond_u1": coverage.cond_u1}
+    if coverage.second_basin_gap < AMBIGUOUS_GAP or any(found[name] > limit for name, limit in AMBER.items()):
+        return "red"
+    few = coverage.n_poses < RECOMMENDED_POSES or coverage.second_basin_gap < WEAK_GAP
+    return "amber" if few or any(found[name] > limit for name, limit in GREEN.items()) else "green"
+
+
+def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[float, float] | None:
+    """Distance of a new pose from the fit of the earlier ones: in sigmas (the worst channel), and in N.
+
+    The noise of the pose counts as larger by as much as the others scatter more than theirs.
+    """
+    if result is None:
+        return None
+    R_base_flange = record.before.R_base_flange
+    residual = result.compensate(record.mean.mean, R_base_flange)
+    noise = max(1.0, result.noise_factor) ** 2 * record.mean.covariance
+    sigma = np.sqrt(np.diag(noise + result.wrench_covariance(R_base_flange)))
+    return float(np.max(np.abs(residual) / sigma)), float(np.linalg.norm(residual[:3]))
+
+
+def _estimates(result: CalibrationResult) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    """Estimates and sigmas by name; with `drift` where one was found: last pose minus first, (6,) N and N·m."""
+    sigma = dict(result.sigma)
+    values = {name: getattr(result, name) for name in sigma}
+    if result.drift is not None:
+        values["drift"], sigma["drift"] = result.drift.change, result.drift.sigma
+    return values, sigma

@@ -1,0 +1,246 @@
+"""The preflight checks: which, in which order, and those that only a session needs. A failed one forbids motion."""
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ftcalib.model import Array
+from ftdrive.cell.config import CellConfig
+from ftdrive.checks import computer, devices
+from ftdrive.checks.check import Check, merged
+from ftdrive.errors import NotAccepted, PlanRefused
+from ftdrive.planning.approach import Approach
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.search.nodes import WRIST_6_RAD
+from ftdrive.session.events import Checked
+from ftdrive.session.guards import Limits, ModelGuard, Tripped
+from ftdrivers.clock import Clock
+from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
+
+LISTEN_S: Final = 2.0
+_EDGE_RAD: Final = float(np.radians(5))
+"""Each question takes the controller some 10 ms. Between two points no part is more than 1 mm off their chord."""
+_ROUNDED_RAD: Final = float(np.radians(1))
+"""A plan is made for rounded joint angles."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Before:
+    """Everything the checks need."""
+
+    cell: CellConfig
+    arm: RobotArm
+    sensor: ForceTorqueSensor
+    certifier: Certifier
+    plan: Plan
+    approach: Approach
+    runs: Path
+    known: bool
+    """Whether this plan has run to its end on this arm before: the controller has accepted its edges then."""
+    quiet: FtSamples
+    """`LISTEN_S` of the sensor at rest."""
+    resumed: bool
+    """Whether a part of the plan has run before."""
+    limits: Limits
+    sensor_range: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One check of a session."""
+
+    name: str
+    """In the event."""
+    judge: Callable[[Before], Check]
+
+    def __call__(self, before: Before) -> Checked:
+        """Return the event; a warning does not forbid motion."""
+        check = self.judge(before)
+        words = f"{check.found}: {check.fix}" if check.fix else check.found
+        return Checked(name=self.name, passed=check.state != "failed", words=words)
+
+
+def check_model(before: Before) -> Check:
+    """Check that this is the configured arm, and that its flange is where the forward kinematics have it."""
+    check = devices.check_arm(before.arm.identify(), before.cell.robot)
+    if check.state == "failed":
+        return check
+    try:
+        ModelGuard(before.limits, before.certifier).judge(before.arm.state())
+    except Tripped as trip:
+        return Check("robot.model", "failed", str(trip))
+    return replace(check, found=f"{check.found}: the flange is where the {before.certifier.arm.name} model has it")
+
+
+def check_payload(before: Before) -> Check:
+    """Check the payload that is set in the controller."""
+    return devices.check_payload(before.arm.status(), before.cell.tool, before.cell.sensor.mass_kg)
+
+
+def check_link(before: Before) -> Check:
+    """Check that states of the arm arrive soon; a controller that reports no TCP is asked for it and needs longer."""
+    limits = before.limits
+    asked_s = limits.link_asked_s if before.arm.status().tcp_offset is None else 0.0
+    usual_s = limits.link_usual_s + asked_s
+    return devices.check_link(before.arm, before.cell.clock, usual_s=usual_s, gap_s=limits.link_gap_s)
+
+
+def check_sensor(before: Before) -> Check:
+    """Check that all six axes are alive, at the nominal rate."""
+    wrench = before.quiet.wrench
+    rate = devices.check_rate(len(wrench) / LISTEN_S, before.sensor.health().nominal_rate_Hz)
+    return merged("sensor", [rate, devices.check_level(wrench)])
+
+
+def check_workcell(before: Before) -> Check:
+    """Check that tool and surroundings are described and measured; `doctor` only warns of a missing tool."""
+    check = computer.check_workcell(before.cell, before.certifier.arm.name)
+    return check if check.state == "ok" else replace(check, state="failed")
+
+
+def check_plan(before: Before) -> Check:
+    """Check that every move of the plan is proven clear, for this arm, tool and scene."""
+    try:
+        before.plan.require(before.certifier)
+    except PlanRefused as error:
+        return Check("plan", "failed", str(error))
+    clear = 1e3 * min(step.clearance_m for step in before.plan.steps)
+    found = f"{len(before.plan.steps)} moves proven clear, nearest {clear:.0f} mm; joint moves only"
+    return Check("plan", "ok", found)
+
+
+def check_approach(before: Before) -> Check:
+    """Check that the moves to the first pose are proven clear."""
+    approach = before.approach
+    if not approach.certified:
+        return Check("approach", "failed", "the approach to the first pose is not proven clear", "jog the arm near it")
+    if not len(approach.q_rad):
+        return Check("approach", "ok", "the arm stands at the first pose")
+    nearest_mm = 1e3 * approach.clearance_m
+    return Check("approach", "ok", f"moves: {len(approach.q_rad)}, proven clear, nearest {nearest_mm:.0f} mm")
+
+
+def check_cable(before: Before) -> Check:
+    """Check that wrist 3 stays in its window about the present angle, at which the cable lies well."""
+    stands = before.arm.state().q_rad[5]
+    turns = [step.q_rad[5] for step in before.plan.steps]  # an approach turns it no farther
+    low, high = min(turns), max(turns)
+    where, least, most = np.degrees([stands, low, high])
+    found = f"wrist 3 stands at {where:.0f}° and turns between {least:.0f}° and {most:.0f}°"
+    has_been_there = (before.known or before.resumed) and low <= stands <= high
+    if has_been_there or max(high - stands, stands - low) <= WRIST_6_RAD + _ROUNDED_RAD:
+        return Check("cable", "ok", found)
+    window = np.degrees(WRIST_6_RAD)
+    fix = f"jog it to between {most - window:.0f}° and {least + window:.0f}°, or make a new plan at the present angle"
+    return Check("cable", "failed", f"{found}, more than {window:.0f}° to one side: the cable may wind up", fix)
+
+
+def check_safety_limits(before: Before) -> Check:
+    """Check that the controller accepts every pose, and before the first run of a plan points between them."""
+    nodes = np.array([step.q_rad for step in before.plan.steps])
+    path = np.vstack([nodes, nodes[:1]])
+    step_rad = np.inf if before.known else _EDGE_RAD
+    for q_rad in (path, before.approach.q_rad):
+        if len(q_rad) and (words := forbidden(before.arm, q_rad, step_rad)):
+            return Check("limits", "failed", words)
+    return Check(
+        "limits", "ok", "the controller accepts every pose" + ("" if before.known else " and the moves between")
+    )
+
+
+def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
+    """Return where the controller's safety limits forbid straight moves through joint vectors (n, 6); empty if none."""
+    for q in edges(q_rad, step_rad):
+        if not arm.within_safety_limits(q.tolist()):
+            return (
+                f"the controller's safety limits forbid joints {np.degrees(q).round().astype(int).tolist()} degrees: "
+                "bring joints 1 to 3 to another posture, or check the safety settings"
+            )
+    return ""
+
+
+def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
+    """Raise `NotAccepted` while a program stays on the controller (row 21): a session never stops it."""
+    deadline_s = clock.now_s() + limits.program_ends_s
+    while (program := arm.status().program) != "stopped":
+        if clock.now_s() > deadline_s:
+            raise NotAccepted(
+                f"another program is on the controller ({arm.reported_program() or program}): stop it at the pendant, "
+                "then start again; nothing was touched"
+            )
+        clock.sleep(0.02)
+
+
+_APPROACH: Final = Row("approach", check_approach)
+
+CHECKS: Final[Sequence[Row]] = (
+    Row("safety", lambda before: devices.check_safety(before.arm.status())),
+    Row("remote", lambda before: devices.check_remote(before.arm)),
+    Row("model", check_model),
+    Row("payload", check_payload),
+    Row("slider", lambda before: devices.check_speed(before.arm.status())),
+    Row("link", check_link),
+    Row("sensor", check_sensor),
+    Row("load", lambda before: devices.check_load(before.sensor_range, before.cell)),
+    Row("workcell", check_workcell),
+    Row("plan", check_plan),
+    _APPROACH,
+    Row("cable", check_cable),
+    Row("disk", lambda before: computer.check_disk(before.runs)),
+)
+"""In the order of their events. None of them takes control of the arm."""
+
+IN_CONTROL: Final[Sequence[Row]] = (Row("limits", check_safety_limits),)
+"""Checks that need a program on the controller, made when all others have passed."""
+
+AGAIN: Final[Sequence[Row]] = (*(row for row in CHECKS if row is not _APPROACH), *IN_CONTROL)
+"""Checks before a stopped session goes on: all, except that its new approach is judged by itself."""
+
+
+def edges(q_rad: Array, step_rad: float) -> Array:
+    """Return points (m, 6) along straight moves through joint vectors (n, 6), at most `step_rad` apart."""
+    parts = []
+    for start, end in pairwise(q_rad):
+        count = max(1, int(np.ceil(np.abs(end - start).max() / step_rad)))
+        parts.append(start + np.arange(count)[:, None] / count * (end - start))
+    return np.vstack([*parts, q_rad[-1:]])
+
+
+@contextmanager
+def awake() -> Iterator[str]:
+    """Keep the computer from going to sleep where systemd can (row 18); yields what was done, in words."""
+    asleep = "this computer is not kept awake: make sure that it does not go to sleep"
+    tool = shutil.which("systemd-inhibit") if sys.platform == "linux" else None
+    if tool is None:
+        yield asleep
+        return
+    command = [tool, "--what=sleep:idle", "--who=ftdrive", "--why=an arm is under way", "--mode=block", "cat"]
+    # `cat` ends with our end of its stdin, so the inhibition cannot outlive us.
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        with suppress(subprocess.TimeoutExpired):  # it only ends by itself when systemd denies the request
+            process.wait(timeout=0.3)
+        yield "this computer is kept awake" if process.returncode is None else asleep
+    finally:
+        if process.stdin is not None:
+            process.stdin.close()
+        try:
+            process.wait(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

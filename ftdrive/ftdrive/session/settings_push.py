@@ -1,0 +1,301 @@
+"""Settings of the controller from a calibration: payload and gravity, sent after a typed word and read back.
+
+A push changes what the controller assumes, so it is refused unless the arm is that of the calibration, rests, and no
+program runs. Every attempt that has sent something leaves a receipt with the old values, from which they are restored.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from ftcalib import CalibrationResult
+from ftcalib.model import Array
+from ftdrive.cell.config import CellConfig
+from ftdrive.checks import computer, devices
+from ftdrive.checks.controller_settings import Lean, lean_from
+from ftdrive.checks.flange_load import FlangeLoad, flange_load
+from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.planning.geometry.scene import down_of
+from ftdrive.runs.push_receipt import Receipt, write_receipt
+from ftdrive.session.guards import Limits
+from ftdrive.session.preflight import require_no_program
+from ftdrivers.interfaces import ControllerSettings, DeviceInfo, ForceTorqueSensor, RobotArm
+
+WORDS: Final = {"payload": "PUSH", "gravity": "GRAVITY"}
+"""What is typed to send each setting."""
+
+_STILL_S: Final = 5.0
+_LISTEN_S: Final = 1.0
+_LISTENS: Final = 3
+"""A steady reading fails the test once in some hundred times."""
+_TOLERANCE: Final = 1e-6
+"""Of a value that is read back; it travels as the same 64 bits."""
+
+Ask = Callable[[str], None]
+"""Asks for the word of a setting, such as "payload"; raises `Declined`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Push:
+    """What is to be set, beside what is set."""
+
+    old: ControllerSettings
+    new: ControllerSettings
+    """None where nothing is to be set."""
+    devices: Mapping[str, DeviceInfo]
+    reason: Mapping[str, Any]
+    """What the values come from, for the receipt."""
+    load: FlangeLoad | None = None
+    lean: Lean | None = None
+    """Of the base, compared with the gravity of the controller, or with the configured mounting if it is unknown."""
+    contact: Array | None = None
+    """(6,) what the sensor reads beyond a free tool: contact, or drift since the calibration."""
+
+    @property
+    def settings(self) -> list[str]:
+        """Return the names of the settings to be sent, as in `WORDS`."""
+        asked = {"payload": self.new.mass_kg, "gravity": self.new.up_base_m_s2}
+        return [name for name, value in asked.items() if value is not None]
+
+
+def propose(
+    cell: CellConfig,
+    arm: RobotArm,
+    sensor: ForceTorqueSensor,
+    result: CalibrationResult,
+    *,
+    payload: bool,
+    gravity: bool,
+    name: str,
+) -> Push:
+    """Compare a calibration with what the controller assumes; nothing is changed.
+
+    Parameters
+    ----------
+    cell : CellConfig
+    arm, sensor
+        Open.
+    result : CalibrationResult
+    payload, gravity : bool
+        Which settings to push.
+    name : str
+        Path of the calibration.
+
+    Raises
+    ------
+    ConfigError
+        Mass or height of the sensor is not configured.
+    NotAccepted
+        The calibration is rejected or of other devices, or the arm is not ready.
+    """
+    if result.verdict == "rejected":
+        raise NotAccepted(f"{name} is rejected ({'; '.join(result.reasons)}): calibrate again")
+    mass_kg, height_m = _sensor_of(cell)
+    connected = {"arm": arm.identify(), "sensor": sensor.identify()}
+    if others := devices.belonging(result, connected, cell.sensor.mount).others:
+        raise NotAccepted(f"{others[0]}: push the calibration of this cell")
+    require_ready(cell, arm)
+    load, old = flange_load(result, mass_kg, height_m), arm.controller_settings()
+    down = down_of(cell.workcell.mounting) if old.up_base_m_s2 is None else -_unit(old.up_base_m_s2)
+    lean = lean_from(down, result.gravity_force_base_N, result.covariance[3:6, 3:6])
+    return Push(
+        old,
+        ControllerSettings(
+            load.mass_kg if payload else None,
+            tuple(load.p_flange_com_m.tolist()) if payload else None,
+            (old.inertia_kg_m2 or (0.0,) * 6) if payload else None,
+            _gravity(result, lean, old) if gravity else None,
+        ),
+        connected,
+        {
+            "calibration": {"path": name, "id": result.id, "created_utc": result.provenance.get("created_utc")},
+            "payload_at_calibration_kg": (result.provenance.get("setup") or {}).get("payload_kg"),
+            "sensor_mass_kg": mass_kg,
+            "sensor_height_mm": 1e3 * height_m,
+            "sigma": {"mass_kg": load.sigma_kg, "p_flange_com_m": load.sigma_m.tolist()},
+            "lean": asdict(lean),
+        },
+        load,
+        lean,
+        _contact(arm, sensor, result),
+    )
+
+
+def _sensor_of(cell: CellConfig) -> tuple[float, float]:
+    """Return mass (kg) and height (m) of the sensor."""
+    mass_kg, height_mm = cell.sensor.mass_kg, cell.sensor.height_mm
+    if mass_kg is None:
+        raise ConfigError(
+            "[sensor] mass_kg is not set, and the sensor cannot weigh itself: set it to the mass of sensor and "
+            "adapter, or to 0 for the sensor inside the wrist"
+        )
+    if height_mm is None:
+        raise ConfigError(
+            "[sensor] height_mm is not set, and gravity does not reveal it: set it to the height of the sensor's "
+            "origin above the flange face"
+        )
+    return mass_kg, height_mm / 1e3
+
+
+def require_ready(cell: CellConfig, arm: RobotArm) -> None:
+    """Raise `NotAccepted` unless this is the configured arm, free of programs, in remote control, and at rest."""
+    require_no_program(arm, cell.clock, Limits())
+    for check in (
+        devices.check_arm(arm.identify(), cell.robot),
+        devices.check_remote(arm),
+        devices.check_safety(arm.status()),
+    ):
+        if check.state == "failed":
+            raise NotAccepted(f"{check.found}: {check.fix}; nothing was sent")
+    _wait_until_still(arm)
+
+
+def _wait_until_still(arm: RobotArm) -> None:
+    arm.wait_until_still(timeout_s=_STILL_S, guard=lambda: None)
+
+
+def _contact(arm: RobotArm, sensor: ForceTorqueSensor, result: CalibrationResult) -> Array | None:
+    """Return the reading beyond a free tool, None where the arm's pose is unknown; raises if it is not steady."""
+    for _ in range(_LISTENS):
+        wrench = sensor.collect(_LISTEN_S).wrench
+        check = devices.check_level(wrench)
+        if check.state == "ok":
+            break
+    else:
+        raise NotAccepted(f"{check.found}: {check.fix}; nothing was sent")
+    if arm.status().tcp_offset is None:
+        return None
+    return np.asarray(result.compensate(wrench.mean(axis=0), arm.state().R_base_flange))
+
+
+def _gravity(result: CalibrationResult, lean: Lean, old: ControllerSettings) -> tuple[float, ...] | None:
+    """Return the gravity to be set, as large as the controller has it; None if it agrees."""
+    if old.up_base_m_s2 is None:
+        raise NotAccepted(
+            f"the controller does not report its gravity, so a change could not be read back; the base {lean}, "
+            "compared with [workcell] mounting: set the mounting at the pendant"
+        )
+    if lean.is_other_mounting:
+        raise NotAccepted(
+            f"gravity is {lean.deg:.0f}° off the direction in the controller: correct the mounting at the pendant; "
+            "near 180°, check the sensor's sign first"
+        )
+    if not lean.is_significant:
+        return None
+    size_m_s2 = float(np.linalg.norm(old.up_base_m_s2))
+    return tuple((-size_m_s2 * _unit(result.gravity_force_base_N)).tolist())
+
+
+def _unit(vector: Any) -> Array:
+    return np.asarray(vector, np.float64) / np.linalg.norm(vector)
+
+
+# ------------------------------------------------------------------------------------------------------------- sending
+
+
+def send(arm: RobotArm, push: Push, folder: Path, ask: Ask) -> tuple[Path, ControllerSettings]:
+    """Ask for a word for each setting, send them, read them back, and write the receipt.
+
+    Returns
+    -------
+    path : Path
+        Of the receipt, a new file in `folder`.
+    read_back : ControllerSettings
+        What the controller keeps.
+
+    Raises
+    ------
+    NotAccepted
+        The controller's values have changed since they were shown, or it reports others than were sent.
+    Declined
+        The word was not typed; nothing was sent.
+    DriverError
+        The arm failed. If something may have been sent, there is a receipt.
+    """
+    disk = computer.check_disk(folder)
+    if disk.state == "failed":
+        raise NotAccepted(f"no receipt can be written, {disk.found}: copy the run to another folder; nothing was sent")
+    for name in push.settings:
+        ask(name)
+    arm.open(control=True)
+    _wait_until_still(arm)
+    if arm.controller_settings() != push.old:
+        raise NotAccepted("the settings of the controller have changed meanwhile: start again; nothing was sent")
+    read_back, failure = None, ""
+    try:
+        _set(arm, push.new)
+        arm.close()  # what the controller keeps without our program
+        arm.open()
+        read_back = arm.controller_settings()
+    except BaseException as error:  # also Ctrl-C
+        failure = str(error) or "interrupted"
+        raise
+    finally:
+        values = {"old": push.old, "new": push.new, "read_back": read_back}
+        path = write_receipt(folder, push.devices, push.reason, values, failure)
+    if different := differences(push.new, read_back):
+        raise NotAccepted(f"the controller reports another {' and '.join(different)} than was sent; receipt: {path}")
+    return path, read_back
+
+
+EFFECTS: Final = {
+    "payload": (
+        "The controller uses the payload to detect collisions and to limit speed. With a wrong one the arm may stop or "
+        "move by itself. Setting it zeroes the arm's own force sensor, and the arm may make a small jump. "
+        "Keep the arm free and still, and hands off. Type PUSH to send the payload"
+    ),
+    "gravity": (
+        "The controller uses gravity as it uses the payload, for the whole arm. With a wrong one the arm may stop, or "
+        "sink in freedrive. Keep the arm free and still, and hands off. Type GRAVITY to send gravity"
+    ),
+}
+"""What each setting does, with the question."""
+
+
+def _set(arm: RobotArm, new: ControllerSettings) -> None:
+    if new.mass_kg is not None and new.p_flange_com_m is not None:
+        arm.set_payload(new.mass_kg, new.p_flange_com_m, new.inertia_kg_m2 or (0.0,) * 6)
+    if new.up_base_m_s2 is not None:
+        arm.set_gravity(new.up_base_m_s2)
+
+
+def differences(sent: ControllerSettings, read_back: ControllerSettings | None) -> list[str]:
+    """Return which settings were read back with another value; what is not reported does not count."""
+    back = read_back or ControllerSettings()
+    pairs = {
+        "mass": (sent.mass_kg, back.mass_kg),
+        "centre of mass": (sent.p_flange_com_m, back.p_flange_com_m),
+        "inertia": (sent.inertia_kg_m2, back.inertia_kg_m2),
+        "gravity": (sent.up_base_m_s2, back.up_base_m_s2),
+    }
+    return [
+        name
+        for name, (a, b) in pairs.items()
+        if a is not None and b is not None and not np.allclose(a, b, rtol=0.0, atol=_TOLERANCE)
+    ]
+
+
+def restore(cell: CellConfig, arm: RobotArm, receipt: Receipt) -> Push:
+    """Return the push that sends the old values of a receipt back; raises as `propose`."""
+    info = arm.identify()
+    made = receipt.devices["arm"]["model"], receipt.devices["arm"]["serial"]
+    if made != (info.model, info.serial):
+        raise NotAccepted(
+            f"{receipt.path} is of the arm {made[0]}, serial {made[1]}, but {info.model}, serial {info.serial} is "
+            "connected: connect the arm of the receipt"
+        )
+    require_ready(cell, arm)
+    old, changed = receipt.old, receipt.new
+    payload = changed.mass_kg is not None
+    if payload and (old.mass_kg is None or old.p_flange_com_m is None):
+        raise NotAccepted(f"{receipt.path} has no old payload, the controller did not report it: set it at the pendant")
+    back = ControllerSettings(
+        old.mass_kg if payload else None,
+        old.p_flange_com_m if payload else None,
+        old.inertia_kg_m2 if payload else None,
+        old.up_base_m_s2 if changed.up_base_m_s2 is not None else None,
+    )
+    return Push(arm.controller_settings(), back, {"arm": info}, {"restores": str(receipt.path)})

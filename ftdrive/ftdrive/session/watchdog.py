@@ -1,0 +1,239 @@
+"""The thread of the guards: 100 looks a second on the cell's clock. It stops the arm, then reports the trip.
+
+A stop that the controller does not answer takes 1 to 2 s: the trip is reported before that ends.
+"""
+
+import logging
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import numpy as np
+
+from ftcalib.model import Array
+from ftcalib.routine import turned_rad
+from ftdrive.session.guards import Guard, Limits, Motion, Seen, Tripped, arm_lost, by_safety, fault
+from ftdrive.session.hazards import Hazard
+from ftdrivers.clock import Clock, Follower
+from ftdrivers.errors import DeviceFault, DriverError
+from ftdrivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
+
+log = logging.getLogger(__name__)
+
+
+class Watcher:
+    """Runs the guards while a `watching` block is open, from `begin` on; it looks for row 11 all the time.
+
+    Parameters
+    ----------
+    arm, sensor
+        Read from the thread.
+    guards : sequence of Guard
+    on_trip : callable
+        Called from the thread once the arm has stopped, or is slow to stop.
+    clock
+        Of the cell; an emulated clock waits for the thread.
+    limits
+        Periods and limits of the thread itself.
+    """
+
+    def __init__(
+        self,
+        arm: RobotArm,
+        sensor: ForceTorqueSensor,
+        guards: Sequence[Guard],
+        on_trip: Callable[[Tripped], None],
+        *,
+        clock: Clock,
+        limits: Limits,
+    ) -> None:
+        self.clock, self._limits = clock, limits
+        self._arm, self._sensor, self._guards, self._on_trip = arm, sensor, tuple(guards), on_trip
+        self._motion: Motion | None = None
+        self._seen: Motion | None = None  # the motion that all guards have looked at
+        self._wake = threading.Event()
+        self._end = threading.Event()
+        self._reported = threading.Event()
+        self._tripped: Tripped | None = None
+        self.report_error: Exception | None = None
+        """Why the last trip could not be reported; the hold shows both."""
+        self.safety_stop: Tripped | None = None
+        """The last emergency or safeguard stop, also one while the arm stood; kept until the session ends."""
+        self.unseen = False
+        """Whether the arm reported nothing for so long that a stop may have come and gone; the reader resets it."""
+        self._blind_since_s: float | None = None
+        self._stopped_by_safety = False
+        self._judging = threading.RLock()
+        self._begun = False
+        self._last: tuple[float, ArmState] | None = None
+        self._looked_s = 0.0
+        self._thread = Follower(clock, self._run, "guards")
+
+    def __enter__(self) -> "Watcher":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end.set()
+        self._wake.set()
+        self._thread.join(timeout=5.0)
+
+    def begin(self) -> None:
+        """Forget a trip, and take the next look as normal."""
+        self._tripped = self.report_error = None
+        self._reported.clear()
+        self._begun = False
+
+    @contextmanager
+    def watching(self, start_rad: Array, goal_rad: Array, *, moving: bool) -> Iterator[None]:
+        """Watch while the block runs, after a first look. A trip is raised before it, after it, and by `check`."""
+        self.check()
+        self._last = None
+        self._looked_s = self.clock.now_s()
+        motion = self._motion = Motion(np.asarray(start_rad), np.asarray(goal_rad), moving)
+        self._wake.set()
+        try:
+            while self._seen is not motion:
+                self.check()
+                self.clock.sleep(0.001)
+            yield
+        finally:
+            self._motion = None
+            self._wake.clear()
+        self.check()
+
+    def look_aside(self) -> None:
+        """Row 11 while the arm stands: the stop may be released again before the operator answers.
+
+        Nothing is shown from here: a question may stand on the screen.
+        """
+        with self._judging:
+            try:
+                status = self._arm.status()
+            except Exception as error:  # another package's arm may raise anything; reopening it reports the cause
+                log.debug("the arm reports no status: %r", error)
+                now_s = self.clock.now_s()
+                self._blind_since_s = self._blind_since_s or now_s
+                self.unseen |= now_s - self._blind_since_s > self._limits.blind_s
+                return
+            self._blind_since_s = None
+            trip = None if status.fault is None else by_safety(status, f"the arm stopped: {status.fault}")
+            if trip is None or trip.hazard != Hazard.EMERGENCY_STOP:
+                self._stopped_by_safety = False
+            elif not self._stopped_by_safety:
+                self.keep(trip)
+
+    def keep(self, trip: Tripped) -> None:
+        """Remember the trip as `safety_stop` if it is one."""
+        if trip.hazard == Hazard.EMERGENCY_STOP:
+            with self._judging:
+                self.safety_stop, self._stopped_by_safety = trip, True
+
+    def check(self) -> None:
+        """Raise a trip, or that the guards have ended or hung. Called in the loops that wait for the arm."""
+        if self._tripped is not None:
+            raise self._tripped
+        if self._has_ended:
+            raise fault(Hazard.UNGUARDED, "the guards' thread has ended, nothing is watched", "quit this session")
+        if self._motion is not None and (late_s := self.clock.now_s() - self._looked_s) > self._limits.hung_s:
+            raise fault(
+                Hazard.UNGUARDED,
+                f"the guards have not looked for {late_s:.1f} s: close other programs on this computer",
+            )
+
+    def tripped(self, *, wait_s: float) -> Tripped | None:
+        """Return the trip once the arm has stopped and the trip was reported; None if none occurs within `wait_s`."""
+        deadline_s = self.clock.now_s() + wait_s
+        while self._tripped is None and self.clock.now_s() < deadline_s:
+            self.clock.sleep(0.005)
+        if self._tripped is not None:
+            self.clock.wait(self._reported, 5.0)
+        return self._tripped
+
+    def turn(self) -> float:
+        """Look once; return the seconds until the next look."""
+        motion = self._motion
+        if motion is None or self._tripped is not None:
+            self.look_aside()
+            return self._limits.aside_s
+        started_s = self.clock.now_s()
+        try:
+            self._look(motion)
+        except Tripped as trip:
+            self._stop(trip)
+        except DriverError as error:
+            self._stop(arm_lost(error, moving=motion.moving))
+        except Exception as error:
+            log.exception("a guard failed")
+            self._stop(fault(Hazard.UNGUARDED, f"a guard failed ({error!r}): report this bug, and quit"))
+        return started_s + self._limits.look_s - self.clock.now_s()
+
+    @property
+    def _has_ended(self) -> bool:
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while not self._end.is_set():
+            pause_s = self.turn()
+            self.clock.wait(self._wake if self._motion is None else self._end, pause_s)
+
+    def _look(self, motion: Motion) -> None:
+        status = self._arm.status()
+        try:
+            state = self._arm.state()
+        except DeviceFault as error:
+            status = self._arm.status()  # the stop may have come between the two readings
+            if status.fault is not None:
+                raise by_safety(status, str(error)) from error
+            raise Tripped(Hazard.WRONG_MODEL, error) from error
+        try:
+            self._sensor.check()
+            sample = self._sensor.latest(timeout_s=0.0)
+        except DriverError as error:
+            raise Tripped(Hazard.SENSOR_LOST, error) from error
+        if motion is not self._motion:  # the block has ended meanwhile: the readings may belong to the next one
+            return
+        now_s = self.clock.now_s()
+        dt_s = min(now_s - self._looked_s, self._limits.counted_s)
+        turn_rad_s = 0.0
+        if self._last is not None:
+            then_s, before = self._last
+            turn_rad_s = turned_rad(before, state) / max(now_s - then_s, 1e-3)
+        self._last, self._looked_s = (now_s, state), now_s
+        seen = Seen(now_s, dt_s, motion, state, status, sample.wrench[-1], int(sample.seq[-1]), turn_rad_s)
+        if not self._begun:
+            for guard in self._guards:
+                guard.begin(seen)
+            self._begun = True
+        for guard in self._guards:
+            guard.look(seen)
+        self._seen = motion
+
+    def _stop(self, trip: Tripped) -> None:
+        self._tripped = trip
+        self.keep(trip)
+        stopped = self._begin_to_stop()
+        self.clock.wait(stopped, self._limits.slow_stop_s)
+        try:
+            self._on_trip(trip)
+        except Exception as error:  # a screen or a disk failed: the arm is watched all the same
+            log.exception("a stop could not be reported")
+            self.report_error = error
+        while not self.clock.wait(stopped, 1.0):
+            pass
+        self._reported.set()
+
+    def _begin_to_stop(self) -> threading.Event:
+        """Stop the arm in a separate thread; the event is set when the stop has ended."""
+        stopped = threading.Event()
+
+        def stop() -> None:
+            try:
+                self._arm.stop()
+            except Exception:
+                log.exception("no stop could be sent to the arm: press the emergency stop")
+            finally:
+                stopped.set()
+
+        threading.Thread(target=stop, name="guards stop", daemon=True).start()
+        return stopped

@@ -1,0 +1,270 @@
+"""What the store keeps: of a run folder, read from its files, and of a cell, as it was configured."""
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ftcalib import CalibrationResult
+from ftcalib.errors import BadDataset, CalibError
+from ftcalib.files import JSON, check_format, read_object
+from ftcalib.model import Array, Parameters
+from ftdrive.runs.run import Run
+from ftdrive.runs.verification import FORMAT
+
+_NUMBERS = tuple(field.name for field in fields(Parameters))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredResult:
+    """One calibration; what its file does not say is None."""
+
+    id: str
+    """`CalibrationResult.id`."""
+    path: str
+    """The calibration file."""
+    run: str
+    """Name of its run folder."""
+    created_utc: str | None
+    """As ISO 8601 with microseconds, so that texts sort as times."""
+    tool: str | None
+    arm_serial: str | None
+    arm_model: str | None
+    sensor_serial: str | None
+    sensor_model: str | None
+    robot_host: str | None
+    """Address of the controller in the configuration of the run."""
+    mount: str | None
+    verdict: str
+    n_poses: int
+    mass_kg: float
+    g_m_s2: float
+    numbers: dict[str, JSON]
+    """The fields of `Parameters` and `covariance`, as in the file."""
+    dataset_sha256: str | None
+    parent: str | None
+    """Id of the calibration that this one updates."""
+    update: str | None
+    """What was updated, such as "bias"."""
+    temperature_C: float | None
+    """Of the sensor, where a device reports it."""
+    payload_kg: float | None
+    """That the controller reported during the calibration."""
+    payload_com_m: list[float] | None
+    """(3,) centre of mass of that payload, flange axes; None also for a run of an earlier version."""
+
+    @property
+    def parameters(self) -> Parameters:
+        """Estimates; with `covariance` they make a `ftcalib.extras.difference.Estimated`."""
+        return Parameters(**{name: np.array(self.numbers[name]) for name in _NUMBERS})
+
+    @property
+    def covariance(self) -> Array:
+        """(15, 15) of the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
+        return np.array(self.numbers["covariance"], dtype=np.float64)
+
+    @property
+    def mass_sigma_kg(self) -> float:
+        """One standard deviation of the mass, without the sensor's gain, which all results of a sensor share."""
+        return mass_sigma_kg(self.parameters, self.covariance, self.g_m_s2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredVerification:
+    """One verification of a calibration."""
+
+    id: str
+    """12 hex digits of the SHA-256 of its file."""
+    path: str
+    run: str
+    calibration_id: str
+    created_utc: str | None
+    passed: bool
+    change: str | None
+    """What has changed since the calibration, such as "bias"."""
+    reason: str | None
+    temperature_C: float | None
+    bias_change: list[float] | None
+    """(6,) change of the bias since the calibration, in N, then N·m, sensor frame."""
+    bias_change_sigma: list[float] | None
+    """(6,) its standard deviation from the readings of this verification."""
+    calibration_sigma: list[float] | None
+    """(6,) its standard deviation from the calibration, which all its verifications share."""
+
+
+class Check(NamedTuple):
+    """What a fleet needs of a verification: a tuple, because it reads 20,000 of them a minute."""
+
+    calibration_id: str
+    created_utc: str
+    passed: bool
+    change: str | None
+    temperature_C: float | None
+    bias: tuple[float | None, ...]
+    """(18,) `bias_change`, `bias_change_sigma` and `calibration_sigma` of `StoredVerification`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredCell:
+    """One cell of a fleet. No run folder contains it, so a rebuild of the store keeps it."""
+
+    name: str
+    config: str
+    """Absolute path of its configuration file."""
+    verify_every_days: float
+    arm_serial: str | None
+    robot_host: str | None
+    sensor_url: str | None
+    tool: str | None
+
+
+Record = StoredResult | StoredVerification
+
+
+def mass_sigma_kg(parameters: Parameters, covariance: Array, g_m_s2: float) -> float:
+    """Return one standard deviation of the mass from the covariance (15, 15) alone."""
+    force = parameters.gravity_force_base_N
+    down = force / (np.linalg.norm(force) or 1.0)
+    return float(np.sqrt(np.maximum(down @ covariance[3:6, 3:6] @ down, 0.0))) / g_m_s2
+
+
+def record_paths(folders: Iterable[Path]) -> list[Path]:
+    """Return the files that become records, of runs or of the runs in folders, each once and by name."""
+    runs = set[Path]()
+    for folder in (one.resolve() for one in folders):
+        if _is_run(folder):
+            runs.add(folder)
+        elif folder.is_dir():
+            runs.update(filter(_is_run, folder.iterdir()))
+    names = ("calibration*.json", "verification*.json")
+    return [path for run in sorted(runs) for name in names for path in sorted(run.glob(name))]
+
+
+def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
+    """Read files; the second list names those that were left out, each with the reason."""
+    records, unreadable = list[Record](), list[str]()
+    for path in paths:
+        try:
+            records.append(read_record(path))
+        except (CalibError, OSError) as error:
+            unreadable.append(f"{path}: {error}")
+    return records, tuple(unreadable)
+
+
+def _is_run(folder: Path) -> bool:
+    try:
+        return (folder / "run.json").is_file()
+    except OSError:  # a folder of another user
+        return False
+
+
+def read_record(path: Path) -> Record:
+    """Read one file of a run folder; fields that this version does not know are ignored.
+
+    Raises
+    ------
+    BadCalibration, BadDataset
+        The file is damaged or of another format.
+    OSError
+    """
+    return _verification(path) if path.name.startswith("verification") else _result(path)
+
+
+def _result(path: Path) -> StoredResult:
+    result = CalibrationResult.load(path)
+    header = _header(path.parent)
+    config = header.get("config", {})
+    provenance, run_devices = result.provenance, header.get("devices", {})
+    setup, devices = _object(provenance.get("setup")), _object(provenance.get("devices")) or run_devices
+    arm, sensor = (_object(devices.get(role)) for role in ("arm", "sensor"))
+    parent = provenance.get("parent")
+    return StoredResult(
+        id=result.id,
+        path=str(path),
+        run=path.parent.name,
+        created_utc=_utc(provenance.get("created_utc") or header.get("created_utc")),
+        tool=_text(setup.get("tool")) or _text(_object(config.get("tool")).get("name")),
+        arm_serial=_text(arm.get("serial")),
+        arm_model=_text(arm.get("model")),
+        sensor_serial=_text(sensor.get("serial")),
+        sensor_model=_text(sensor.get("model")),
+        robot_host=_text(_object(config.get("robot")).get("host")),
+        mount=_text(setup["mount"] if "mount" in setup else _object(config.get("sensor")).get("mount")),
+        verdict=result.verdict,
+        n_poses=result.n_poses,
+        mass_kg=result.mass_kg,
+        g_m_s2=result.g_m_s2,
+        numbers={
+            **{name: getattr(result.parameters, name).tolist() for name in _NUMBERS},
+            "covariance": result.covariance.tolist(),
+        },
+        dataset_sha256=_text(provenance.get("dataset_sha256")),
+        parent=_text(_object(parent).get("id")) or _text(parent),
+        update=_text(provenance.get("update")),
+        temperature_C=_number(provenance.get("temperature_C")),
+        payload_kg=_number(setup.get("payload_kg")),
+        payload_com_m=_numbers(setup.get("p_flange_payload_m"), 3),
+    )
+
+
+def _verification(path: Path) -> StoredVerification:
+    document = read_object(path, BadDataset)
+    check_format(document, FORMAT, BadDataset)
+    calibration_id, passed = _text(_object(document.get("calibration")).get("id")), document.get("passed")
+    if calibration_id is None or not isinstance(passed, bool):
+        raise BadDataset(f"{path.name} lacks the id of its calibration or the outcome: the file is damaged")
+    bias_change = _object(document.get("bias_change"))
+    return StoredVerification(
+        id=hashlib.sha256(path.read_bytes()).hexdigest()[:12],
+        path=str(path),
+        run=path.parent.name,
+        calibration_id=calibration_id,
+        created_utc=_utc(document.get("created_utc")),
+        passed=passed,
+        change=_text(document.get("change")),
+        reason=_text(document.get("reason")),
+        temperature_C=_number(document.get("temperature_C")),
+        bias_change=_numbers(bias_change.get("value"), 6),
+        bias_change_sigma=_numbers(bias_change.get("sigma"), 6),
+        calibration_sigma=_numbers(bias_change.get("calibration_sigma"), 6),
+    )
+
+
+def _header(run: Path) -> Mapping[str, Any]:
+    """Return run.json, or nothing if it is damaged: the calibration file alone suffices."""
+    try:
+        return dict(Run(run).header())
+    except (CalibError, OSError):
+        return {}
+
+
+def _object(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, Mapping) else {}
+
+
+def _text(value: Any) -> str | None:
+    """Return a text that every database takes: without zero characters and halves of a surrogate pair."""
+    return value.encode(errors="replace").decode().replace("\0", "\ufffd") if isinstance(value, str) and value else None
+
+
+def _number(value: Any) -> float | None:
+    usable = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+    return float(value) if usable else None
+
+
+def _numbers(value: Any, n: int) -> list[float] | None:
+    """Return a list of n finite numbers, or None if it is not one."""
+    found = [_number(one) for one in value] if isinstance(value, list) else []
+    known = [one for one in found if one is not None]
+    return known if len(known) == len(found) == n else None
+
+
+def _utc(value: Any) -> str | None:
+    try:
+        return datetime.fromisoformat(value).astimezone(UTC).isoformat(timespec="microseconds")
+    except (TypeError, ValueError):
+        return None

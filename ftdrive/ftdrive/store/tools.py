@@ -1,0 +1,112 @@
+"""Named tools: the newest accepted calibration of a tool on this arm, with this sensor and mount."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ftcalib import CalibrationResult
+from ftcalib.errors import CalibError
+from ftdrive.checks.devices import belonging
+from ftdrive.errors import BadStore, ConfigError
+from ftdrive.store.records import StoredResult, read_records, record_paths
+from ftdrive.store.store import Store
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
+
+RUNS = Path("runs")
+"""Searched beside the store, so that a run that is not indexed yet counts too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tool:
+    """A calibration that was found by the name of its tool."""
+
+    calibration: CalibrationResult
+    path: Path
+    warnings: tuple[str, ...]
+
+
+def calibration_of_tool(
+    name: str,
+    arm: DeviceInfo,
+    sensor: DeviceInfo,
+    mount: str | None = None,
+    *,
+    url: str | None = None,
+    runs: Path = RUNS,
+    force: bool = False,
+) -> Tool:
+    """Return the newest accepted calibration of a tool on these devices.
+
+    Parameters
+    ----------
+    name : str
+        As `[tool] name` was when it was calibrated.
+    arm, sensor : DeviceInfo
+        As connected now.
+    mount : str, optional
+        Label of the mounting, `[sensor] mount`.
+    url : str, optional
+        Of the store.
+    runs : Path
+        Folder of runs that the store may lack.
+    force : bool
+        If no calibration is of these devices, take the newest of any.
+
+    Raises
+    ------
+    ConfigError
+        There is none; the message lists the tools that are calibrated on these devices.
+    """
+    store, warnings = Store(url), list[str]()
+    results: list[StoredResult] = []
+    try:
+        results = store.results()
+    except BadStore as error:
+        warnings.append(f"the run folders in {runs} are searched, because {error}")
+    results += _unindexed(runs, {one.path for one in results})
+    accepted = sorted(
+        (one for one in results if one.verdict != "rejected"), key=lambda one: one.created_utc or "", reverse=True
+    )
+    ours = [one for one in accepted if _may_belong(one, arm, sensor)]
+    for one in (one for one in ours if one.tool == name):
+        if (loaded := _load(one)) and not belonging(loaded, {"arm": arm, "sensor": sensor}, mount).others:
+            return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)))
+    if force:
+        for one in (one for one in accepted if one.tool == name):
+            if loaded := _load(one):
+                return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)))
+    known = sorted({one.tool for one in ours if one.tool and one.tool != name})
+    instead = f", or choose one of {', '.join(known)}" if known else ""
+    raise ConfigError(
+        f"there is no accepted calibration of the tool '{name}' with the arm {arm.serial}, the sensor {sensor.serial} "
+        f"and {'no mount label' if mount is None else f'the mount {mount!r}'}: calibrate it with [tool] name = "
+        f'"{name}"{instead}'
+    )
+
+
+def _unindexed(runs: Path, known: set[str]) -> Iterator[StoredResult]:
+    records, _ = read_records(path for path in record_paths([runs]) if str(path) not in known)
+    yield from (one for one in records if isinstance(one, StoredResult))
+
+
+def _may_belong(one: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:
+    """Compare serial numbers, without reading the file."""
+    pairs: Iterable[tuple[str | None, str]] = ((one.arm_serial, arm.serial), (one.sensor_serial, sensor.serial))
+    return all(made == now or made in {None, NOT_REPORTED} or now == NOT_REPORTED for made, now in pairs)
+
+
+def _load(one: StoredResult) -> CalibrationResult | None:
+    try:
+        return CalibrationResult.load(Path(one.path))
+    except (CalibError, OSError):
+        return None
+
+
+def _failed(store: Store, one: StoredResult) -> Iterator[str]:
+    """Yield a warning if the last verification has failed."""
+    try:
+        last = store.last_verification(one.id)
+    except BadStore:
+        return
+    if last is not None and not last.passed:
+        yield f"the last verification of this calibration failed: {last.reason or 'see ' + last.path}; calibrate again"

@@ -1,0 +1,568 @@
+"""The parts of the live screen as lines of text, each a function of the `View` and the width."""
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.cells import cell_len
+
+from ftdrive.checks.check import Check
+from ftdrive.checks.controller_settings import axes_along
+from ftdrive.checks.devices import AXES, check_rate
+from ftdrive.errors import ConfigError
+from ftdrive.live.frames import FrameTransform
+from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
+from ftdrive.runs.verification import age_in_words
+from ftdrive.terminal.live import braille
+from ftdrive.terminal.live.braille import Codes
+from ftdrive.terminal.live.history import Columns
+from ftdrive.terminal.live.view import (
+    BAD,
+    CONTACT,
+    FAINT,
+    GOOD,
+    STRONG,
+    TRACE,
+    WARNING,
+    Line,
+    Part,
+    Reading,
+    Replay,
+    View,
+)
+from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
+
+LEAST_FULL_SIGMA = 10.0
+"""The scale of a still tool, so that noise looks like noise."""
+_SIGNIFICANT = 4.0
+_NUMBERS = 37
+"""Width of the numbers of the table."""
+_ARROWS = "→↗↑↖←↙↓↘"
+_DISC = 16
+"""Width of a half sphere."""
+_FRAMES = (WrenchFrame(), WrenchFrame("flange", "flange"), WrenchFrame("base", "tcp"), WrenchFrame("tcp", "tcp"))
+_STATE = {"ok": ("✔", GOOD), "warning": ("!", WARNING), "failed": ("✘", BAD), "skipped": ("-", FAINT)}
+
+
+# ---------------------------------------------------------------------------------------------------------- head
+
+
+def title(view: View, width: int) -> Line:
+    """Name the devices, and whether the numbers are live."""
+    line = Line(" ftdrive live", STRONG).add("  ")
+    line.add(" · ".join(filter(None, [view.info.arm.model, _named(view.info.sensor), view.info.tool])))
+    right = Line()
+    if view.is_frozen:
+        right.add(" FROZEN ", "reverse bold", "z").add(" ")
+    if view.replay is not None:
+        right.join(_replay(view.replay)).add(" ")
+    if view.recording_s is not None:
+        right.add(f"● REC {_clock(view.recording_s)}", BAD, "r").add(" ")
+    return line.fit(width - right.width).join(right)
+
+
+def _replay(replay: Replay) -> Line:
+    state = "ended" if replay.has_ended else "paused" if replay.is_paused else f"x {replay.speed:g}"
+    at, end = (f"{int(t_s // 60):02d}:{t_s % 60:04.1f}" for t_s in (replay.at_s, replay.duration_s))
+    return Line(f"REPLAY {at} of {end}, {state}", STRONG, "space")
+
+
+def provenance(view: View, width: int) -> Line:
+    """Name the stages, what the numbers are, their axes and their reference point."""
+    line = Line(" ")
+    if view.reading is None:
+        return line.add("waiting for the first sample").fit(width)
+    stages, frame = view.reading.stages, view.reading.frame
+    chain = [Part("raw")]
+    for number, (name, is_on) in enumerate(_stages(stages), 1):
+        text = f"{number} {name}" if is_on else f"{number} {name}(off)"
+        chain.append(Part(text, "" if is_on else FAINT, str(number)))
+    what = "contact wrench" if stages.bias and stages.gravity else _uncompensated(stages)
+    right = Line(what, STRONG if stages.bias and stages.gravity else WARNING).add(", ")
+    right.add(frame.axes, STRONG, "x").add(" @ ").add(_point(frame), STRONG, "a").add(" ")
+    room = width - right.width - 2 - sum(cell_len(part.text) for part in chain)
+    arrow = " ▸ " if room >= 3 * (len(chain) - 1) else "▸"
+    for i, part in enumerate(chain):
+        line.add(arrow if i else "", FAINT).add(*part)
+    return line.fit(max(width - right.width - 1, 0)).add(" ").join(right).fit(width)
+
+
+def _stages(stages: Stages) -> list[tuple[str, bool]]:
+    lowpass = "LP" if stages.lowpass_Hz is None else f"LP {stages.lowpass_Hz:g} Hz"
+    found = [
+        ("bias", stages.bias),
+        ("gravity", stages.gravity),
+        ("inertia", stages.inertia),
+        (lowpass, stages.lowpass_Hz is not None),
+    ]
+    if stages.notch_Hz is not None:
+        found.append((f"notch {stages.notch_Hz:g} Hz", True))
+    if stages.deadband_N or stages.deadband_Nm:
+        found.append(("deadband", True))
+    return found
+
+
+def _uncompensated(stages: Stages) -> str:
+    if stages.bias:
+        return "weight included"
+    return "bias included" if stages.gravity else "as measured"
+
+
+def _point(frame: WrenchFrame) -> str:
+    if isinstance(frame.about, str):
+        return frame.about
+    return "({:g},{:g},{:g}) mm".format(*(1e3 * x for x in frame.about))
+
+
+def state(view: View, width: int) -> Line:
+    """Name the calibration, the tare and the drift of the bias."""
+    calibration, status = view.info.calibration, view.status
+    line = Line(" cal ")
+    line.add(calibration.id[:6]).add(" ")
+    line.add(calibration.verdict.upper(), GOOD if calibration.verdict == "good" else WARNING)
+    line.add(_age(view)).add(", ").add(*_verified(view))
+    line.add("  tare ")
+    if status.tare is None or status.tare_t_host_ns is None:
+        line.add("none", FAINT)
+    else:
+        force_N = float(np.linalg.norm(status.tare[:3]))
+        line.add(f"{_time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
+    line.add(f"  drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
+    return line.fit(width)
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
+
+
+def _age(view: View) -> str:
+    created = view.info.calibration.provenance.get("created_utc")
+    if not isinstance(created, str) or view.reading is None:
+        return ""
+    return f" {age_in_words(_now(view.info, view.reading) - datetime.fromisoformat(created))}"
+
+
+def _verified(view: View) -> tuple[str, str]:
+    """Name the last verification, and its style."""
+    found = view.info.verification
+    if found is None:
+        return "not verified", FAINT
+    now = found.created_utc if view.reading is None else _now(view.info, view.reading)
+    return found.in_words(now), GOOD if found.passed else BAD
+
+
+def _now(info: StreamInfo, reading: Reading) -> datetime:
+    return datetime.fromtimestamp((reading.t_host_ns + info.utc_offset_ns) * 1e-9, UTC)
+
+
+def rule(view: View, width: int) -> Line:
+    """Separate the head; this line names a silent device."""
+    if view.silent:
+        return Line(f" {view.silent}", "bold white on red").fit(width)
+    return Line("─" * width, FAINT)
+
+
+# --------------------------------------------------------------------------------------------------------- table
+
+
+def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
+    """List each component with sigma, extremes, a bar and, if there is room, a trace."""
+    trace_cells = width - _NUMBERS - 23 - 4 if with_trace else 0
+    if trace_cells < 8:
+        trace_cells = 0
+    bar_cells = 23 if trace_cells else width - _NUMBERS - 5
+    bar_cells = 0 if bar_cells < 11 else bar_cells - 1 + bar_cells % 2
+    columns = view.columns(2 * trace_cells or 20)
+    lines = []
+    for first, unit in ((0, "N"), (3, "N·m")):
+        places = decimals(view.reading, first)
+        full = full_scale(columns, view.reading, first)
+        head = Line("        now     ± σ   -peak   +peak " if first == 0 else "", FAINT).to(_NUMBERS)
+        head.join(_scale(full, unit, bar_cells))
+        if trace_cells and first == 0:
+            head.to(_NUMBERS + bar_cells + 4).add(span(columns), FAINT, "g")
+        lines.append(head.fit(width))
+        for i in range(first, first + 3):
+            line = _component(view, i, places)
+            if bar_cells:
+                line.to(_NUMBERS).join(_bar(view, i, full, bar_cells))
+            if trace_cells:
+                line.add("  ").join(trace(columns, i, full))
+            lines.append(line.fit(width))
+        size = _size(view, first, places).to(_NUMBERS)
+        lines.append(size.join(_contact(view) if first == 0 else line_of_force(view.reading)).fit(width))
+    return lines
+
+
+def span(columns: Columns) -> str:
+    """Return the duration of all columns in words."""
+    return f"{columns.span_s:.{0 if columns.span_s > 5 else 1}f} s"
+
+
+def decimals(reading: Reading | None, first: int) -> int:
+    """Return how many decimals three components need to show their standard deviations."""
+    usual = 3 if first else 2
+    return usual if reading is None or not reading.sigma[first : first + 3].max() < 0.5 * 10**-usual else usual + 1
+
+
+def full_scale(columns: Columns, reading: Reading | None, first: int) -> float:
+    """Return a round full scale for three components: the recent extremes fit, and noise alone stays small."""
+    rows = slice(first, first + 3)
+    largest = np.abs([columns.low[rows], columns.high[rows]])
+    sigma = np.zeros(3) if reading is None else np.nan_to_num(reading.sample_sigma[rows])
+    least = LEAST_FULL_SIGMA * float(sigma.max())
+    wanted = max(least, 1.05 * float(largest[np.isfinite(largest)].max(initial=0.0)), 1e-6)
+    decade = 10.0 ** np.floor(np.log10(wanted))
+    return float(next(step * decade for step in (1, 2, 5, 10) if step * decade >= wanted))
+
+
+def _component(view: View, i: int, places: int) -> Line:
+    reading, line = view.reading, Line(f" {AXES[i]} ", STRONG)
+    if reading is None or view.silent:
+        line.add(f"{'--.--':>8}", BAD if view.silent else FAINT).add(f"{'--':>8}", FAINT)
+        return line.join(_peaks(view, i, places))
+    line.add(f"{reading.wrench[i]:+z8.{places}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
+    return line.add(f"{digits(reading.sigma[i], places):>8}", FAINT).join(_peaks(view, i, places))
+
+
+def digits(sigma: float, places: int) -> str:
+    """Return a standard deviation as text; it is NaN until the noise is known."""
+    return "--" if np.isnan(sigma) else f"{sigma:.{places}f}"
+
+
+def _peaks(view: View, i: int, places: int) -> Line:
+    low, high = view.peaks.low[i], view.peaks.high[i]
+    if low > high:
+        return Line()
+    return Line(f"{low:+z8.{places - 1}f}{high:+z8.{places - 1}f}", "", "p")
+
+
+def _size(view: View, first: int, places: int) -> Line:
+    reading, peak = view.reading, view.peaks.torque_Nm if first else view.peaks.force_N
+    line = Line("|T| " if first else "|F| ", STRONG)
+    if reading is None or view.silent:
+        return line.add(f"{'--.--':>8}", BAD if view.silent else FAINT)
+    part, sigma = reading.wrench[first : first + 3], reading.sigma[first : first + 3]
+    size = float(np.linalg.norm(part))
+    along = float(np.linalg.norm(part * sigma)) / size if size else float(sigma.max())
+    line.add(f"{size:8.{places}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
+    return line.add(f"{digits(along, places):>8}", FAINT).add(" " * 8).add(f"{peak:8.{places - 1}f}", "", "p")
+
+
+def _scale(full: float, unit: str, cells: int) -> Line:
+    if not cells:
+        return Line(unit, FAINT)
+    left, right, half = f"-{full:g}", f"+{full:g} {unit}", cells // 2
+    return Line(left.ljust(half) + "0", FAINT).to(cells - len(f"+{full:g}")).add(right, FAINT)
+
+
+def _bar(view: View, i: int, full: float, cells: int) -> Line:
+    half = cells // 2
+    if view.reading is None or view.silent:
+        return Line("·" * half + "│" + "·" * half, FAINT)
+    value = float(view.reading.wrench[i]) / full
+    halves = min(2 * half, round(2 * half * abs(value)))
+    style = CONTACT if view.reading.in_contact else TRACE
+    filled = "█" * (halves // 2) + ("▌" if value > 0 else "▐") * (halves % 2)
+    rest = "·" * (half - len(filled))
+    if value > 0:
+        return Line("·" * half + "│", FAINT).add(filled, style).add(rest, FAINT)
+    return Line(rest, FAINT).add(filled[::-1], style).add("│" + "·" * half, FAINT)
+
+
+def trace(columns: Columns, i: int, full: float) -> Line:
+    """Draw the recent past of a component in one row."""
+    ink = braille.characters(braille.envelope(columns.low[i], columns.high[i], 1, full))[0]
+    return layers(ink, np.zeros_like(ink), columns.contact_cells)
+
+
+def layers(ink: Codes, paper: Codes, in_contact: NDArray[np.bool_]) -> Line:
+    """Draw packed characters (n,), and the paper where there is no ink; contact has its own colour."""
+    line = Line()
+    kind = np.where(ink > 0, 1 + in_contact, 0)
+    edges = [0, *(np.flatnonzero(np.diff(kind)) + 1).tolist(), len(ink)]
+    for start, end in pairwise(edges):
+        source = ink if kind[start] else paper
+        line.add(braille.text(source[start:end]), (FAINT, TRACE, CONTACT)[kind[start]])
+    return line
+
+
+def _contact(view: View) -> Line:
+    reading, status = view.reading, view.status
+    if reading is None or view.silent:
+        return Line()
+    if np.isnan(reading.chi2):
+        return Line("noise not known yet", FAINT)
+    rate = f"1 in {1 / status.false_alarm_rate:.0f}" if status.false_alarm_rate else ""
+    sign = ">" if reading.chi2 > status.contact_limit else "<"
+    test = f"χ² {reading.chi2:.0f} {sign} {status.contact_limit:.1f}, {rate}"
+    if reading.in_contact:
+        return Line("▲ CONTACT ", f"bold {CONTACT}").add(f"{view.contact_s:.1f} s  ").add(test, FAINT)
+    return Line("free  ", GOOD).add(test, FAINT)
+
+
+def line_of_force(reading: Reading | None) -> Line:
+    """Return where the line of the contact force passes the reference point."""
+    if reading is None or not reading.in_contact:
+        return Line()
+    force, torque = reading.wrench[:3], reading.wrench[3:]
+    square = float(force @ force)
+    if not square > (_SIGNIFICANT * float(reading.sigma[:3].max())) ** 2:  # or the noise is not known
+        return Line()
+    p_m = np.cross(force, torque) / square
+    distance_m = float(np.linalg.norm(p_m))
+    point = _point(reading.frame)
+    if distance_m < 5e-4:
+        return Line(f"line of force passes through {point}")
+    return Line(f"line of force {1e3 * distance_m:.0f} mm from {point}, {' '.join(axes_along(p_m / distance_m))}")
+
+
+# --------------------------------------------------------------------------------------------------------- links
+
+
+def links(view: View, width: int) -> list[Line]:
+    """Show down in tool axes, the raw wrench, the used range, both links and the controller's payload."""
+    dial = _dial(view)
+    rows = [_raw(view), _range(view), _link("sensor", view.status.sensor), _link("robot", view.status.arm)]
+    if view.replay is None:
+        sigma_s = view.status.delay_sigma_s
+        known = f" ± {1e3 * sigma_s:.{0 if sigma_s > 0.01 else 1}f} ms" if sigma_s else " ms, set"
+        rows[3].add(f"  delay {1e3 * view.status.delay_s:.1f}{known}")
+    payload = next((check for check in view.checks if check.name == "robot.payload"), None)
+    rows.append(Line(" payload   ", FAINT).join(_checked(payload) if payload else Line("not checked", FAINT)))
+    return [Line(left).to(12).join(right).fit(width) for left, right in zip(dial, rows, strict=True)]
+
+
+def _dial(view: View) -> list[str]:
+    if view.reading is None:
+        return [""] * 5
+    return _arrow(view.reading.R_base_flange.T @ _unit(view.info.calibration.gravity_force_base_N))
+
+
+def _arrow(down_flange: Array) -> list[str]:
+    """Draw the direction of gravity in the plane of the flange, and its angle to the tool axis."""
+    angle_deg = float(np.degrees(np.arccos(np.clip(down_flange[2], -1, 1))))
+    aside = float(np.hypot(down_flange[0], down_flange[1]))
+    eighth = round(np.arctan2(down_flange[1], down_flange[0]) / (np.pi / 4)) % 8
+    middle = ("•" if down_flange[2] > 0 else "×") if aside < 0.05 else _ARROWS[eighth]
+    return [" down, in", " tool axes", "  · · ·", f"  · {middle} ·", f"  · · ·{angle_deg:4.0f}°"]
+
+
+def _raw(view: View) -> Line:
+    line = Line(" raw       ", FAINT)
+    if view.reading is None or view.silent:
+        return line.add("--.--", BAD if view.silent else FAINT)
+    force = "  ".join(f"{value:.2f}" for value in view.reading.raw[:3])
+    torque = "  ".join(f"{value:.3f}" for value in view.reading.raw[3:])
+    return line.add("F ", FAINT).add(force).add(" N   T ", FAINT).add(torque).add(" N·m", FAINT)
+
+
+def _range(view: View) -> Line:
+    line, fact = Line(" range     ", FAINT), view.info.sensor.facts.get("range")
+    if fact is None or not isinstance(fact.value, tuple):
+        return line.add("unknown: overload is not monitored")
+    if view.reading is None:
+        return line
+    shares = np.abs(view.reading.raw) / np.array(fact.value)
+    worst = int(np.argmax(shares))
+    share = float(shares[worst])
+    style = BAD if share > 0.95 else WARNING if share > 0.8 else ""
+    line.add("▕").add(("█" * min(10, round(10 * share))).ljust(10, "·")).add("▏")
+    return line.add(f" {100 * share:.0f} % used", style).add(f", most by {AXES[worst]}")
+
+
+def _link(name: str, link: LinkStatus) -> Line:
+    line = Line(f" {name:<10}", FAINT)
+    nominal = "" if np.isnan(link.nominal_rate_Hz) else f" of {link.nominal_rate_Hz:.0f}"
+    is_usual = check_rate(link.rate_Hz, link.nominal_rate_Hz).state == "ok"
+    line.add(f"{link.rate_Hz:.0f}{nominal} Hz", "" if is_usual else WARNING)
+    line.add("  ").add(f"lost {link.lost}", WARNING if link.lost else "")
+    return line.add("  ").add(f"age {_short(link.age_s)}", BAD if link.error else "")
+
+
+def _checked(check: Check) -> Line:
+    mark, style = _STATE[check.state]
+    line = Line(f"{mark} ", style).add(check.found)
+    return line.add(f": {check.fix}", STRONG) if check.fix and check.state != "ok" else line
+
+
+# -------------------------------------------------------------------------------------------------------- others
+
+
+def others(view: View, width: int) -> list[Line]:
+    """Show the wrench with fewer stages, and in other frames."""
+    reading, calibration = view.reading, view.info.calibration
+    if reading is None:
+        return []
+    raw = reading.raw
+    bias = np.r_[calibration.force_bias_N, calibration.torque_bias_Nm]
+    tare = np.zeros(6) if view.status.tare is None else view.status.tare
+    contact = calibration.compensate(raw, reading.R_base_flange) - tare
+    now = reading.frame
+    rows = [("as measured", raw, now), ("without bias", raw - bias - tare, now), ("and without gravity", contact, now)]
+    rows += [(f"{frame.axes} @ {_point(frame)}", contact, frame) for frame in _FRAMES if frame != now]
+    lines = [Line(f" in {now.axes} @ {_point(now)}", FAINT).to(21).add("".join(f"{name:>9}" for name in AXES), FAINT)]
+    for name, wrench, frame in rows:
+        shown, line = _in_frame(wrench, frame, view, reading.R_base_flange), Line(f" {name:<20}", FAINT)
+        if view.silent:
+            line.add(f"{'--.--':>9}" * 6, BAD)
+        elif shown is None:
+            line.add("  not configured", FAINT)
+        else:
+            line.add("".join(f"{value:z9.{2 if i < 3 else 3}f}" for i, value in enumerate(shown)))
+        lines.append(line)
+    return [line.fit(width) for line in lines]
+
+
+def _in_frame(wrench: Array, frame: WrenchFrame, view: View, R_base_flange: Array) -> Array | None:
+    try:
+        return FrameTransform(frame, view.info).matrix(R_base_flange) @ wrench
+    except ConfigError:
+        return None
+
+
+def sphere(view: View, width: int) -> list[Line]:
+    """Draw gravity in flange axes on two half spheres, with the calibrated orientations and the error expected here."""
+    reading = view.reading
+    if reading is None:
+        return []
+    calibration, R = view.info.calibration, reading.R_base_flange
+    down = R.T @ _unit(calibration.gravity_force_base_N)
+    known = np.empty((0, 3)) if view.calibrated is None else view.calibrated
+    lines = [Line(" ").add("+z".center(_DISC), FAINT).add("  ").add("-z".center(_DISC), FAINT)]
+    halves = [_half_sphere(known[known[:, 2] * sign >= 0], down if down[2] * sign >= 0 else None) for sign in (1, -1)]
+    lines += [Line(" ").join(a).add("  ").join(b) for a, b in zip(*halves, strict=True)]
+    covariance = calibration.wrench_covariance(R)
+    force_N, torque_Nm = (float(np.sqrt(np.trace(part))) for part in (covariance[:3, :3], covariance[3:, 3:]))
+    words = ["direction of gravity", "in flange axes", "● now"]
+    if len(known):
+        nearest_deg = float(np.degrees(np.arccos(np.clip((known @ down).max(), -1, 1))))
+        words += [f"∘ calibrated: {len(known)}", f"nearest {nearest_deg:.0f}° away"]
+    words += ["", "calibration sigma here", f"{force_N:.3f} N, {1e3 * torque_Nm:.2f} mN·m"]
+    for line, text in zip(lines[1:], words, strict=False):
+        line.to(2 * _DISC + 6).add(text)
+    return [line.fit(width) for line in lines]
+
+
+def _half_sphere(known: Array, down: Array | None) -> list[Line]:
+    """Draw one half of the sphere, seen along z; the distance from the middle is the angle."""
+    disc = [list(row) for row in _rings()]
+    rows = len(disc)
+    styles = [[FAINT] * _DISC for _ in disc]
+    for directions, sign, style in ((known, "∘", ""), (() if down is None else down[None], "●", BAD)):
+        for x, y, z in directions:
+            radius = np.arccos(min(abs(z), 1.0)) / (np.pi / 2) / max(np.hypot(x, y), 1e-9)
+            row = min(rows - 1, int((1 - radius * y) * rows / 2))
+            column = min(_DISC - 1, int((1 + radius * x) * _DISC / 2))
+            disc[row][column], styles[row][column] = sign, style
+    return [Line.of_cells(signs, kinds) for signs, kinds in zip(disc, styles, strict=True)]
+
+
+@cache
+def _rings() -> list[str]:
+    """Draw circles at 45° and 90°."""
+    rows, angle = _DISC // 2, np.linspace(0, 2 * np.pi, 200)
+    dots = np.zeros((4 * rows, 2 * _DISC), np.bool_)
+    for radius in (0.5, 1.0):
+        y = np.round((2 * rows - 0.5) * (1 - radius * np.sin(angle)))
+        x = np.round((_DISC - 0.5) * (1 + radius * np.cos(angle)))
+        dots[y.astype(int), x.astype(int)] = True
+    return [braille.text(row) for row in braille.characters(dots)]
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.linalg.norm(vector), np.float64)
+
+
+def identity(view: View, width: int) -> list[Line]:
+    """Name the devices with serial numbers, the calibration and the checks shared with `doctor`."""
+    info = view.info
+    lines = [
+        Line(" arm       ", FAINT).add(_who(info.arm)),
+        Line(" sensor    ", FAINT).add(_who(info.sensor)),
+        Line(" cal       ", FAINT).add(info.calibration_name),
+    ]
+    for check in view.checks:
+        if check.name == "robot.payload" and check.state == "ok":  # stands beside the links
+            continue
+        words = _checked(check).parts
+        lines += _hanging(Line(f" {check.name.partition('.')[2]:<10}", FAINT).add(*words[0]), words[1:], width)
+    return [line.fit(width) for line in lines]
+
+
+def _who(info: DeviceInfo) -> str:
+    return f"{info.model}, serial {info.serial}, firmware {info.firmware}"
+
+
+def events(view: View, width: int, rows: int) -> list[Line]:
+    """List the newest events first; where few lines are left, several in a line."""
+    lines = list[Line]()
+    for note in view.notes:
+        if len(lines) > rows:
+            break
+        head = Line(" ")
+        if note.t_host_ns is not None:
+            head.add(f"{_time_of_day(view.info, note.t_host_ns)} ", FAINT)
+        text = note.text if note.times == 1 else f"{note.text} ({note.times} times)"
+        item = _hanging(head, [Part(text, note.style)], width)
+        if rows <= 3 and lines and lines[-1].width + item[0].width + 3 <= width and len(item) == 1:
+            lines[-1].add("   ").join(item[0])
+        else:
+            lines += item
+    return [line.fit(width) for line in [*lines, *[Line()] * rows][:rows]]
+
+
+def _hanging(head: Line, words: Sequence[Part], width: int) -> list[Line]:
+    """Put words behind a head; the next lines begin under the first word."""
+    lines, indent = [head], head.width
+    for part in words:
+        for i, word in enumerate(part.text.split(" ")):
+            blank = 1 if i else 0
+            if lines[-1].width > indent and lines[-1].width + blank + cell_len(word) > width:
+                lines.append(Line().to(indent))
+                blank = 0
+            lines[-1].add(" " * blank + word, part.style)
+    return lines
+
+
+def keys(view: View, width: int) -> Line:
+    """List the keys; a click on one presses it."""
+    names = ["t tare", "u undo", "x axes", "a about", "1-4 stage", "z freeze", "b mark", "r rec", "p peak", "g span"]
+    if view.replay is not None:
+        names = ["space pause", "←→ seek", ". step", "+- speed", "x axes", "a about", "1-4 stage", "b mark", "g span"]
+    last = ["? help", "q quit"] if sum(map(cell_len, names)) + len(names) + 15 <= width else ["?", "q"]
+    room = width - sum(cell_len(name) + 1 for name in last)
+    line = Line(" ")
+    for name in names:
+        if line.width + cell_len(name) + 1 <= room:
+            line.join(_key(name))
+    for name in last:
+        line.join(_key(name))
+    return line.fit(width)
+
+
+def _key(name: str) -> Line:
+    key, _, word = name.partition(" ")
+    pressed = key if len(key) == 1 or key == "space" else ""
+    return Line(key, STRONG, pressed).add(f" {word} " if word else " ", FAINT, pressed)
+
+
+def _named(info: DeviceInfo) -> str:
+    return info.model if info.serial == NOT_REPORTED else f"{info.model} {info.serial}"
+
+
+def _time_of_day(info: StreamInfo, t_host_ns: int) -> str:
+    return datetime.fromtimestamp((t_host_ns + info.utc_offset_ns) * 1e-9, UTC).astimezone().strftime("%H:%M:%S")
+
+
+def _clock(duration_s: float) -> str:
+    minutes, seconds = divmod(int(duration_s), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours:02d}:{minutes:02d}:{seconds:02d}"
+
+
+def _short(duration_s: float) -> str:
+    return f"{1e3 * duration_s:.0f} ms" if duration_s < 1 else f"{duration_s:.1f} s"

@@ -1,0 +1,276 @@
+"""Results as text."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+from rich.text import Text
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult
+from ftcalib.compare import Compared
+from ftcalib.routine import DriftCheck, PoseRecord
+from ftdrive.runs.pose_hints import hints, names_of
+from ftdrive.terminal.console import hanging, talk
+from ftdrivers.interfaces import Array
+
+_STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
+_ROUNDED = 1e-9
+"""A standard deviation below this share of the largest one is one of rounding: its value was taken as known."""
+_NO_LIMIT = 10_000
+_RANDOM = Rotation.random(1000, rng=0).as_matrix()
+"""Orientations over which the error of a calibration is averaged if the truth is known."""
+_DERIVED = {"gravity_force_base_N"}
+"""Rows that follow from mass and tilt: printed only with -v."""
+
+
+def print_result(
+    result: CalibrationResult,
+    *,
+    truth: Mapping[str, Any] | None = None,
+    drift: DriftCheck | None = None,
+    records: Sequence[PoseRecord] = (),
+    hinted: bool = True,
+    saved: Path | None = None,
+) -> None:
+    """Print estimates with one sigma, the verdict with the compensation error, hints, and the path of the file.
+
+    Residuals and drift follow if the verdict is not good, if the drift is significant, or with `-v`.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+    truth : mapping, optional
+        Same keys as the result: truth and error are printed beside the estimates.
+    drift : DriftCheck, optional
+    records : sequence of PoseRecord
+        Of the result's dataset: poses are named by their orientation, and bad fits are explained.
+    hinted : bool
+        Print what a user should check in the cell.
+    saved : Path, optional
+        The calibration file, printed in the last line.
+    """
+    talk.print(Text.assemble(("Result", "bold cyan"), f"  {result.n_poses} poses, method {result.method}"))
+    talk.print(_table(result, truth))
+    head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
+    talk.print(hanging(head, f"compensation error {error_in_words(result)}"))
+    if truth is not None:
+        raw, left = free_tool_wrench(truth, _RANDOM), compensation_error(result, truth)
+        words = (
+            f"a free tool reads {left['force_rms_N']:.4f} N, {left['torque_rms_Nm']:.5f} N·m rms; "
+            f"before {_rms(raw[:, :3]):.1f} N, {_rms(raw[:, 3:]):.2f} N·m"
+        )
+        talk.print(hanging(" truth: ", words))
+    for reason in result.reasons:
+        talk.print(hanging("   ", reason))
+    if talk.verbose or result.verdict != "good":
+        _print_fit(result, names_of(records))
+    _print_drift(result, drift)
+    if records and (hinted or talk.verbose):
+        for hint in hints(result, records):
+            talk.print(hanging(" ? ", hint), style="yellow")
+    if saved is not None:
+        talk.print(f" Saved {saved}")
+
+
+def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
+    data = result.to_dict()
+    errors = {} if truth is None else errors_in_sigma(result, truth)
+    fixed_below = _ROUNDED * float(np.sqrt(np.diag(result.covariance).max()))
+    table = Table(box=None, padding=(0, 1))
+    for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
+        if truth is not None or title not in {"truth", "error / sigma"}:
+            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
+    for label, scale, unit, key in QUANTITIES:
+        if key in _DERIVED and not talk.verbose:
+            continue
+        estimates, sigmas = (values_of(source[key], key) * scale for source in (data, data["sigma"]))
+        truths = None if truth is None else values_of(truth[key], key) * scale
+        fixed = sigmas <= fixed_below * scale
+        digits = 4 if fixed.all() else decimals(sigmas[~fixed].min())
+        for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
+            spread = "fixed" if fixed[i] else f"{sigmas[i]:.{digits}f}"
+            known = [] if truths is None else [f"{truths[i]:.{digits}f}"]
+            error = [Text(f"{errors[key][i]:+.1f}", _error_style(errors[key][i]))] if known else []
+            name = f"{label} {axis}".strip() + f", {unit}"
+            table.add_row(name, *known, f"{estimates[i]:.{digits}f}", spread, *error)
+    return table
+
+
+def decimals(sigma: float) -> int:
+    """Return how many decimals show two digits of a sigma, at most 7."""
+    return int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 7))
+
+
+def _error_style(error_sigma: float) -> str:
+    """Colour of an error: one in 20 is above 2 sigma, one in 16,000 above 4."""
+    return "green" if abs(error_sigma) < 2 else "yellow" if abs(error_sigma) < 4 else "bold red"
+
+
+def _print_fit(result: CalibrationResult, names: Sequence[str]) -> None:
+    residual = result.to_dict()["residual"]
+    words = (
+        f"force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
+        f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max"
+    )
+    talk.print(hanging(" residuals: ", words))
+    if (poses := poses_in_words(result, names)) is not None:
+        talk.print(hanging(" worst: ", poses))
+
+
+def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
+    if drift is not None:
+        words, bad = drift_in_words(drift)
+        if bad or talk.verbose or result.verdict != "good":
+            talk.print(hanging(" drift: ", words), style="yellow" if bad else None)
+    if result.drift is not None:
+        change, sigma = result.drift.change, result.drift.sigma
+        words = (
+            f"{np.linalg.norm(change[:3]):.3f} ± {np.max(sigma[:3]):.3f} N, "
+            f"{np.linalg.norm(change[3:]):.4f} ± {np.max(sigma[3:]):.4f} N·m from the first pose to the last"
+        )
+        talk.print(hanging(" drift in the fit: ", words))
+
+
+def error_in_words(result: CalibrationResult) -> str:
+    """Describe the compensation error of a free tool, N and N·m, and its source."""
+    words = "{:.4f} N, {:.5f} N·m".format(*result.predicted_error())
+    if result.noise_explains:
+        return f"{words} rms (predicted)"
+    seen = "{:.4f} N, {:.5f} N·m".format(*result.likely_error())
+    why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
+    return f"{seen} rms (cross-validated, as {why}; predicted: {words})"
+
+
+def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:
+    """Describe the worst pose and the cross-validation; None for results without these figures.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+    names : sequence of str
+        Of the rows of its dataset; their numbers where there are none.
+    """
+    quality = result.quality
+    if not quality:
+        return None
+    row = int(quality["worst_pose"])
+    worst = names[row - 1] if names else f"pose {row}"
+    return (
+        f"{worst}, {quality['residual_sigma'][row - 1]:.1f} sigma; each pose predicted by the others: "
+        f"{quality['loo_force_rms_N']:.4f} N, {quality['loo_torque_rms_Nm']:.5f} N·m rms"
+    )
+
+
+QUANTITIES: Sequence[tuple[str, float, str, str]] = (
+    ("mass", 1.0, "kg", "mass_kg"),
+    ("centre of mass", 1e3, "mm", "p_sensor_com_m"),
+    ("force bias", 1.0, "N", "force_bias_N"),
+    ("torque bias", 1.0, "N·m", "torque_bias_Nm"),
+    ("flange to sensor", 180 / np.pi, "deg", "R_flange_sensor"),
+    ("gravity in base", 1.0, "N", "gravity_force_base_N"),
+    ("base tilt alpha", 180 / np.pi, "deg", "tilt_alpha_rad"),
+    ("base tilt beta", 180 / np.pi, "deg", "tilt_beta_rad"),
+)
+"""Label, factor from the unit of the file to that of the screen, unit on the screen, key in the file."""
+
+
+def values_of(value: Any, key: str) -> Array:
+    """Return a quantity or its sigma as numbers; a mounting as its rotation vector, rad."""
+    values = np.asarray(value, dtype=np.float64)
+    if key == "R_flange_sensor" and values.ndim == 2:  # shown as a rotation vector
+        values = Rotation.from_matrix(values).as_rotvec()
+    return np.atleast_1d(values)
+
+
+def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, Array]:
+    """Errors of the estimates, each divided by its standard deviation.
+
+    That of the rotation is the small rotation about the flange axes that leads from the truth to the estimate; that of
+    an angle is at most half a turn.
+    """
+    data = result.to_dict()
+    errors = {}
+    for _, _, _, key in QUANTITIES:
+        if key == "R_flange_sensor":
+            error = Rotation.from_matrix(result.R_flange_sensor @ np.transpose(truth[key])).as_rotvec()
+        else:
+            error = np.atleast_1d(np.subtract(data[key], truth[key]))
+            if key.endswith("_rad"):
+                error = np.remainder(error + np.pi, 2 * np.pi) - np.pi  # a ceiling is at both +180 and -180 degrees
+        errors[key] = error / np.atleast_1d(data["sigma"][key])
+    return errors
+
+
+def free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
+    """Return what the sensor of a free tool reads, (n, 6): computed from the truth, not with the solver's model."""
+    weight = np.einsum(
+        "ji,nkj,k->ni", np.asarray(truth["R_flange_sensor"]), R_base_flange, np.asarray(truth["gravity_force_base_N"])
+    )
+    force = weight + truth["force_bias_N"]
+    torque = np.cross(truth["p_sensor_com_m"], weight) + truth["torque_bias_Nm"]
+    return np.hstack([force, torque])
+
+
+def compensation_error(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
+    """Rms of the wrench that remains of a free tool after compensation, over `_RANDOM` orientations."""
+    left = result.compensate(free_tool_wrench(truth, _RANDOM), _RANDOM)
+    return {"force_rms_N": _rms(left[:, :3]), "torque_rms_Nm": _rms(left[:, 3:])}
+
+
+def _rms(vectors: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
+
+
+def print_comparison(compared: Sequence[Compared]) -> None:
+    """Print all methods side by side without cutting a number: a narrow terminal gets no vectors, a pipe long lines."""
+    table = _comparison(compared, vectors=True)
+    if talk.is_terminal and table.width is not None and table.width > talk.width:
+        table = _comparison(compared, vectors=False)
+    talk.print(table, soft_wrap=True)
+    for one in compared:
+        if one.reason is not None:
+            talk.print(hanging(f" {one.method}: ", one.reason.removeprefix(f"{one.method} ")))
+
+
+def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
+    table = Table(box=None, padding=(0, 1))
+    for title, shown in (
+        *(("method", True), ("mass\nkg", True)),
+        *(("centre of mass\nmm", vectors), ("force bias\nN", vectors), ("torque bias\nN·m", vectors)),
+        *(("mounting\ndiffers", True), ("residual\nrms N", True), ("residual\nrms N·m", True)),
+        *(("left out\nrms N", True), ("left out\nrms N·m", True)),
+    ):
+        if shown:
+            table.add_column(title, justify="left" if title == "method" else "right", no_wrap=True)
+    for one in compared:
+        if one.parameters is None:
+            continue
+        p = one.parameters
+        three = ((1e3 * p.p_sensor_com_m, 1), (p.force_bias_N, 3), (p.torque_bias_Nm, 4)) if vectors else ()
+        triples = (", ".join(f"{value:.{digits}f}" for value in vector) for vector, digits in three)
+        angle = f"{np.degrees(one.rotation_difference_rad):.3f}°"
+        rms = (one.force_rms_N, one.torque_rms_Nm, one.cv_force_rms_N, one.cv_torque_rms_Nm)
+        cells = ("-" if np.isnan(value) else f"{value:.5f}" for value in rms)
+        table.add_row(one.method, f"{one.mass_kg:.5f}", *triples, angle, *cells)
+    table.width = talk.measure(table, options=talk.options.update(width=_NO_LIMIT)).maximum
+    return table
+
+
+def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
+    """Describe the change of the first pose at the end; True if it exceeds the noise."""
+    worst = float(np.max(np.abs(drift.change) / drift.sigma))
+    force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
+    apart_s = abs(drift.elapsed_s)
+    again = f"first pose again after {apart_s:.0f} s"
+    if drift.elapsed_s < 0:  # --redo 1
+        again = f"first pose, repeated {apart_s:.0f} s after the return to it"
+    words = f"{again}, {force_N:.3f} N, {torque_Nm:.4f} N·m away: "
+    if worst < 4:
+        return words + "none seen", False
+    minutes = max(apart_s, 1.0) / 60
+    in_force = np.max(np.abs(drift.change[:3]) / drift.sigma[:3]) >= 4
+    rate = f"{force_N / minutes:.2g} N/min" if in_force else f"{torque_Nm / minutes:.2g} N·m/min"
+    return words + rate, True

@@ -1,0 +1,236 @@
+"""An emulated ATI Digital F/T sensor: Modbus RTU over RS-485, and a 7 kHz stream of 13-byte records.
+
+Ref: ATI 9620-05-Digital FT, sections 8.1, 8.3, 8.4; ATI 9610-05-1030-04, section 9 (the same port on a NETCANOEM).
+
+Does not model: baud mismatch (a pty has no speed), parity of what the client sends, collisions of a half-duplex line,
+writing calibrations to storage, the power-up time.
+
+Chosen here, because the sources leave it open: an empty calibration slot reads zeros. The 23 registers between two
+slots do not exist. A read of more than 64 registers is exception 3.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftmocks.arrays import Array
+from ftmocks.sensors.ati_gauges import GAUGE_MAX, REFERENCE, WIRE_ORDER, Calibration
+from ftmocks.wires.modbus import (
+    DEVICE_FAILURE,
+    ILLEGAL_ADDRESS,
+    ILLEGAL_FUNCTION,
+    ILLEGAL_VALUE,
+    LONGEST_FRAME,
+    ModbusError,
+    read_registers,
+    reply,
+    written_registers,
+)
+from ftmocks.wires.stream import SerialSensor
+
+ADDRESS = 0x0A
+STREAM_HZ = 7000.0
+RECORD_BYTES = 13
+CHARACTER_BITS = 11
+JAM_BYTES = 14
+JAM_PAUSE_S = 0.050  # a longer pause and the jam counts from the start again
+FRAME_GAP_S = 1.75e-3  # Modbus RTU: fixed above 19 200 baud
+MAX_READ = 64
+
+GAINS, OFFSETS, SESSION, STATUS, BAUD_STORE, BAUD = 0x0000, 0x0006, 0x000C, 0x001D, 0x001E, 0x001F
+WRITABLE = {*range(GAINS, SESSION + 1), BAUD_STORE, BAUD}
+CALIBRATION, CALIBRATION_STRIDE, CALIBRATION_SLOTS, CALIBRATION_REGISTERS = 0x00E3, 192, 16, 169
+DIAGNOSTICS = dict(enumerate((0x07FF, 0x0000, 0x0A3C, 0x09C4, 0x0800, 0x0003), start=0x0027))
+BAUD_RATES = (1_250_000, 19_200, 115_200)
+
+
+def stream_records(gauges: NDArray[np.int16], *, error: bool = False) -> NDArray[np.uint8]:
+    """Stream records of gauge counts.
+
+    Parameters
+    ----------
+    gauges
+        (n, 6) gauge counts, natural order.
+    error
+        Bit 7 of the checksum byte: something is wrong, read the status word.
+
+    Returns
+    -------
+    (n, 13) bytes: gauges 0 2 4 1 3 5 as big-endian int16, then the 7-bit sum of these twelve bytes.
+    """
+    records = np.empty((len(gauges), RECORD_BYTES), dtype=np.uint8)
+    records[:, :12] = gauges[:, WIRE_ORDER].astype(">i2", order="C").view(np.uint8)
+    checksum = np.add.reduce(records[:, :12], axis=1, dtype=np.uint8)
+    records[:, 12] = (checksum & 0x7F) | (0x80 if error else 0)
+    return records
+
+
+def calibration_block(calibration: Calibration) -> bytes:
+    """The 338 bytes of a calibration slot; resolution, range, scale factors, user and spare fields are zero."""
+    block = b"".join(
+        (
+            calibration.serial.encode("ascii").ljust(8, b"\0"),
+            calibration.part_number.encode("ascii").ljust(32, b"\0"),
+            b"Net\0",
+            calibration.date.encode("ascii").ljust(20, b"\0"),
+            calibration.matrix.astype(">f4").tobytes(),
+            bytes((calibration.force_unit, calibration.torque_unit)),
+            struct.pack(">6f", *calibration.max_rating),
+            struct.pack(">2i", calibration.counts_per_force, calibration.counts_per_torque),
+            struct.pack(">6H", *calibration.gauge_gains),
+            struct.pack(">6H", *calibration.gauge_offsets),
+        )
+    )
+    return block.ljust(2 * CALIBRATION_REGISTERS, b"\0")
+
+
+@dataclass(eq=False, kw_only=True)
+class AtiSerialBox(SerialSensor):
+    """The sensor's RS-485 interface.
+
+    A frame is a reply or a record. The stream has no sync byte: the
+    noise must reach a gauge count, or shifted records validate.
+
+    Parameters
+    ----------
+    calibrations
+        What each slot 1 to 16 holds; a slot not named is empty. The lowest one describes the transducer.
+    needs_gains
+        Whether gauges read wrong until gains and offsets of the calibration have been written.
+    status
+        Status word; its bit 15 is the error bit of every record.
+    gauge_offset
+        (6,) or scalar, added to every gauge, in counts.
+    streaming_at_start
+        Streams from power-up on, as after a crash of the last client.
+    refuse_start
+        Answers the start command with "refused".
+    bad_checksum
+        Probability of a record to carry a wrong checksum and right data.
+    """
+
+    has_parity = True
+
+    calibrations: Mapping[int, Calibration] = field(default_factory=lambda: {1: REFERENCE})
+    needs_gains: bool = True
+    status: int = 0
+    gauge_offset: float | Sequence[float] = 0.0
+    streaming_at_start: bool = False
+    refuse_start: bool = False
+    bad_checksum: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._random = np.random.default_rng(self.seed)
+        self._stored_baud_code = 0
+        self._registers: dict[int, int] = {}
+        self._unlocked = False
+        self._burst = bytearray()
+        self._last_byte_s = 0.0
+
+    def _power_up(self) -> None:
+        self._registers = dict.fromkeys(range(GAINS, SESSION + 1), 0)
+        self._registers |= {BAUD_STORE: 0, BAUD: self._stored_baud_code}
+        for slot in range(1, CALIBRATION_SLOTS + 1):
+            calibration = self.calibrations.get(slot)
+            block = calibration_block(calibration) if calibration else bytes(2 * CALIBRATION_REGISTERS)
+            words = struct.unpack(f">{CALIBRATION_REGISTERS}H", block)
+            self._registers |= dict(enumerate(words, start=CALIBRATION + (slot - 1) * CALIBRATION_STRIDE))
+        self._unlocked = False
+        self._burst.clear()
+        self._fall_silent()
+        if self.streaming_at_start:
+            self._start_streaming()
+
+    def _received(self, data: bytes) -> None:
+        now_s = self.clock.now_s()
+        if self.streaming and now_s - self._last_byte_s > JAM_PAUSE_S:
+            self._burst.clear()
+        self._last_byte_s = now_s
+        self._burst += data[: LONGEST_FRAME + 1 - len(self._burst)]  # longer is no frame: remember no more of it
+        if self.streaming and len(self._burst) >= JAM_BYTES:
+            self._fall_silent()  # and what follows without a pause still belongs to the jam
+
+    def _deliver(self, frames: list[bytes]) -> None:
+        for data in frames:
+            self.dropped_frames += self._send(data, RECORD_BYTES if self.streaming else len(data))
+
+    def _work(self, now_s: float) -> float | None:
+        """Answer what came before a pause; return the seconds until the pause is long enough."""
+        if self.streaming or not self._burst:
+            return None
+        wait_s = self._last_byte_s + FRAME_GAP_S - now_s
+        if wait_s > 0:
+            return wait_s
+        answer = self._reply(bytes(self._burst))
+        self._burst.clear()
+        if answer:
+            self._wire.put([answer])
+        return None
+
+    def _reply(self, frame: bytes) -> bytes:
+        return reply(ADDRESS, frame, self._execute)
+
+    def _execute(self, function: int, data: bytes) -> bytes:
+        match function:
+            case 0x03:
+                return read_registers(data, self._registers | {STATUS: self.status}, MAX_READ)
+            case 0x04:
+                return read_registers(data, DIAGNOSTICS, MAX_READ)
+            case 0x10:
+                return self._write_registers(data)
+            case 0x46 | 0x6A if len(data) != 1:
+                raise ModbusError(ILLEGAL_VALUE)
+            case 0x46:
+                accepted = data == b"\x55" and not self.refuse_start
+                if accepted:
+                    self._start_streaming()
+                return bytes([accepted])
+            case 0x6A:
+                accepted = data in (b"\xaa", b"\x18")
+                if accepted:
+                    self._unlocked = data == b"\xaa"
+                return bytes([accepted])
+        raise ModbusError(ILLEGAL_FUNCTION)
+
+    def _write_registers(self, data: bytes) -> bytes:
+        values = written_registers(data)
+        if not values.keys() <= WRITABLE:
+            raise ModbusError(ILLEGAL_ADDRESS)
+        if min(values) < SESSION and not self._unlocked:
+            raise ModbusError(DEVICE_FAILURE)
+        if values.get(BAUD, 0) >= len(BAUD_RATES):
+            raise ModbusError(ILLEGAL_VALUE)
+        self._registers |= values
+        if BAUD in values and self._registers[BAUD_STORE] == 1:
+            self._stored_baud_code = values[BAUD]
+        return data[:4]
+
+    def _start_streaming(self) -> None:
+        self.dropped_frames = 0
+        self._pacer.start(min(STREAM_HZ, BAUD_RATES[self._registers[BAUD]] / (CHARACTER_BITS * RECORD_BYTES)))
+
+    def _samples(self, count: int) -> list[bytes]:
+        records = stream_records(self._gauges(count), error=bool(self.status & 0x8000))
+        if self.bad_checksum:
+            records[self._random.random(count) < self.bad_checksum, 12] ^= 0x01
+        data = records.tobytes()
+        size = RECORD_BYTES if self.faults.harm_frames else len(data)
+        return [data[i : i + size] for i in range(0, len(data), size)]
+
+    def _gauges(self, count: int) -> NDArray[np.int16]:
+        """(count, 6) gauges at the gains and offsets in force, which are right only when they are the calibration's."""
+        calibration = self.calibrations[min(self.calibrations)]
+        gain: Array | float = 1.0
+        shift = np.asarray(self.gauge_offset, dtype=np.float64)
+        if self.needs_gains:
+            active = np.array([self._registers[address] for address in range(GAINS, SESSION)], dtype=np.float64)
+            gain = active[:6] / calibration.gauge_gains
+            shift = gain * shift + (active[6:] - calibration.gauge_offsets) / 4
+        gauges = calibration.gauges(self.measure(count), gain=gain, shift=shift)
+        if self.saturated_axis is not None:
+            gauges[:, self.saturated_axis] = GAUGE_MAX
+        return gauges

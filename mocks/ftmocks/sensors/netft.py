@@ -1,0 +1,315 @@
+"""An emulated ATI Net F/T box (or Ethernet Axia): samples over UDP (RDT), configuration over HTTP.
+
+Ref: ATI 9620-05-Net FT, sections "UDP Interface Using RDT" and "XML"; 9610-05-Ethernet Axia, sections 9 and 10.
+
+Does not model: the TCP interface, multi-unit mode, filters, tool transformation, monitor conditions, more than one
+configuration, the web pages, DHCP, and that a real box answers only a few HTTP requests in a row.
+
+Chosen here, because the sources leave it open: a new request of samples replaces the running one and its address.
+"One-shot" sends its count of samples, one for count 0, at the set rate. A reading at its rating sets the summary and
+saturation bits. A datagram that is no request is ignored.
+"""
+
+import contextlib
+import socket
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import TypedDict
+from urllib.parse import parse_qsl, urlsplit
+from xml.sax.saxutils import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftmocks.arrays import Array
+from ftmocks.sensors.ati_gauges import Scale
+from ftmocks.wires.device import Device
+
+RDT_PORT = 49152
+REQUEST = struct.Struct(">HHI")
+RECORD = np.dtype([("rdt", ">u4"), ("ft", ">u4"), ("status", ">u4"), ("counts", ">i4", 6)])
+REQUEST_HEADER = 0x1234
+INTERNAL_HZ = 7000
+MAX_BUFFER = 40
+SUMMARY, LATCH, SATURATED = 0x8000_0000, 0x0001_0000, 0x8002_0000
+FORCE_UNITS = {1: "lbf", 2: "N", 3: "klbf", 4: "kN", 5: "kgf", 6: "gf"}
+TORQUE_UNITS = {1: "lbf-in", 2: "lbf-ft", 3: "Nm", 4: "Nmm", 5: "kgf-cm", 6: "kNm"}
+
+
+class Command(IntEnum):
+    """Command code of a request."""
+
+    STOP = 0x0000
+    ONE_SHOT = 0x0001
+    REAL_TIME = 0x0002
+    BUFFERED = 0x0003
+    RESET_LATCH = 0x0041
+    BIAS = 0x0042
+
+
+class Endpoint(TypedDict):
+    """Addresses of the box."""
+
+    host: str
+    rdt_port: int
+    http_port: int
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration(Scale):
+    """What the box reports over HTTP about its transducer.
+
+    Parameters
+    ----------
+    serial, part_number
+        Of the transducer.
+    rating
+        (6,) in N and N·m; readings are clipped there.
+    """
+
+    serial: str = "FT12345"
+    part_number: str = "SI-130-10"
+    rating: Sequence[float] = (130.0, 130.0, 400.0, 10.0, 10.0, 10.0)
+
+
+def rdt_records(first: int, ft: NDArray[np.int64], status: NDArray[np.int64], counts: Array) -> bytes:
+    """Return consecutive 36-byte records, big-endian.
+
+    Parameters
+    ----------
+    first
+        RDT sequence number of the first one.
+    ft, status, counts
+        (n,) internal sequence numbers, (n,) status words, (n, 6) counts.
+    """
+    records = np.empty(len(counts), dtype=RECORD)
+    records["rdt"] = (first + np.arange(len(counts))) & 0xFFFFFFFF
+    records["ft"] = ft & 0xFFFFFFFF
+    records["status"] = status
+    records["counts"] = np.clip(np.rint(counts), -(2**31), 2**31 - 1)
+    return records.tobytes()
+
+
+@dataclass(eq=False, kw_only=True)
+class NetFtBox(Device[bytes]):
+    """The box: one thread for RDT, one for HTTP. A box whose wire is stalled by `faults` does not answer HTTP either.
+
+    Parameters
+    ----------
+    host
+        Address to listen at.
+    rdt_port, http_port
+        0 picks a free one. The real ones are 49152 and 80, which needs privileges.
+    calibration
+        Scale and identity.
+    product
+        Name the box gives itself.
+    rate_hz
+        Of samples, 1 to 7000.
+    buffer_size
+        Records in a datagram of the buffered mode, 1 to 40.
+    rdt_enabled
+        Whether the box answers at its UDP port at all.
+    status
+        Status bits sent with every sample.
+    streaming_at_start
+        Address and port of the last client, which crashed while it streamed.
+    """
+
+    host: str = "127.0.0.1"
+    rdt_port: int = RDT_PORT
+    http_port: int = 0
+    calibration: Calibration = Calibration()
+    product: str = "Net F/T"
+    rate_hz: int = INTERNAL_HZ
+    buffer_size: int = 5
+    rdt_enabled: bool = True
+    status: int = 0
+    streaming_at_start: tuple[str, int] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._client: tuple[str, int] | None = None
+        self._left: int | None = None
+        self._buffer = b""
+        self._buffered = False
+        self._stream_hz = float(self.rate_hz)
+        self._bias = np.zeros(6)
+        self._booted_s = 0.0
+        self._ft_start = 0
+
+    def start(self) -> Endpoint:
+        """Power the box up.
+
+        Raises
+        ------
+        RuntimeError
+            If it is running already.
+        OSError
+            If a port cannot be had.
+        """
+        self._require_stopped()
+        with contextlib.ExitStack() as stack:
+            self._socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+            self._socket.bind((self.host, self.rdt_port))
+            self._socket.setblocking(False)
+            self._http = stack.enter_context(_HttpServer((self.host, self.http_port), self))
+            stack.pop_all()
+        self._file = self._socket.fileno()
+        self._launch(lambda: self._http.serve_forever(poll_interval=0.1))
+        return {"host": self.host, "rdt_port": self._socket.getsockname()[1], "http_port": self._http.server_port}
+
+    def _close(self) -> None:
+        self._http.shutdown()
+        self._http.server_close()
+        self._socket.close()
+
+    def _power_up(self) -> None:
+        self._wire.clear()
+        self._pacer.stop()
+        self._bias = np.zeros(6)
+        self._booted_s = self.clock.now_s()
+        if self.streaming_at_start:
+            self._request(Command.REAL_TIME, 0, self.streaming_at_start)
+
+    def _receive(self) -> None:
+        with contextlib.suppress(OSError):  # a client that is gone is reported as a refused connection
+            data, client = self._socket.recvfrom(256)
+            if len(data) == REQUEST.size and self.rdt_enabled:
+                header, command, count = REQUEST.unpack(data)
+                if header == REQUEST_HEADER:
+                    self._request(command, count, client)
+
+    def _request(self, command: int, count: int, client: tuple[str, int]) -> None:
+        match command:
+            case Command.STOP:
+                self._pacer.stop()
+            case Command.ONE_SHOT | Command.REAL_TIME | Command.BUFFERED:
+                self._client = client
+                self._left = count or (1 if command == Command.ONE_SHOT else None)
+                self._buffered, self._buffer = command == Command.BUFFERED, b""
+                self._ft_start = int((self.clock.now_s() - self._booted_s) * INTERNAL_HZ)
+                self._stream_hz = float(min(max(self.rate_hz, 1), INTERNAL_HZ))
+                self._pacer.start(self._stream_hz)
+            case Command.RESET_LATCH if self.status & LATCH:
+                self.status &= ~LATCH
+                self.status = 0 if self.status == SUMMARY else self.status
+            case Command.BIAS:
+                self._bias = self._counts(1)[0][0]
+
+    def _deliver(self, frames: list[bytes]) -> None:
+        for datagram in frames:
+            with contextlib.suppress(OSError):  # no room, or nothing listens there: a datagram is lost
+                if self._client is not None:
+                    self._socket.sendto(datagram, self._client)
+
+    def _sample(self, count: int) -> None:
+        first = self._pacer.made - count  # of this stream, from 0
+        if self._left is not None:
+            count = max(0, min(count, self._left - first))
+            self._pacer.made = first + count
+        if count:
+            counts, saturated = self._counts(count)
+            ft = self._ft_start + ((first + np.arange(count)) * (INTERNAL_HZ / self._stream_hz)).astype(np.int64)
+            status = np.where(saturated, SATURATED, 0) | self.status
+            records = rdt_records(first + 1, ft, status, counts - self._bias)
+            self._send(records, last=self._left is not None and first + count >= self._left)
+        if self._left is not None and first + count >= self._left:
+            self._pacer.stop()
+
+    def _counts(self, count: int) -> tuple[Array, NDArray[np.bool_]]:
+        """(count, 6) counts before bias, and (count,) whether a reading is at its rating."""
+        readings, saturated = self._readings(count, np.asarray(self.calibration.rating))
+        return readings * self.calibration.counts_per_SI, saturated
+
+    def _send(self, records: bytes, *, last: bool) -> None:
+        data = self._buffer + records
+        size = RECORD.itemsize * (min(max(self.buffer_size, 1), MAX_BUFFER) if self._buffered else 1)
+        full = len(data) if last else len(data) - len(data) % size
+        self._wire.put([data[i : min(i + size, full)] for i in range(0, full, size)], stream=not last)
+        self._buffer = data[full:]
+
+    def page(self, path: str) -> bytes | None:
+        """Content of a page, None when there is none; pages that set something do so."""
+        url = urlsplit(path)
+        query = dict(parse_qsl(url.query))
+        match url.path:
+            case "/netftapi2.xml":
+                return _xml("netft", self._configuration())
+            case "/netftcalapi.xml":
+                return _xml("netftCalibration", self._calibration())
+            case "/comm.cgi" if query.keys() <= {"comrdte", "comrdtrate", "comrdtbsiz"}:
+                return self._communication(query)
+        return None
+
+    def _communication(self, query: dict[str, str]) -> bytes | None:
+        if not all(value.isdecimal() for value in query.values()):
+            return None
+        self.rdt_enabled = query.get("comrdte", str(int(self.rdt_enabled))) != "0"
+        self.rate_hz = min(max(int(query.get("comrdtrate", self.rate_hz)), 1), INTERNAL_HZ)
+        self.buffer_size = min(max(int(query.get("comrdtbsiz", self.buffer_size)), 1), MAX_BUFFER)
+        return b"<html><body>Communications</body></html>"
+
+    def _configuration(self) -> dict[str, object]:
+        calibration = self.calibration
+        return {
+            "runstat": f"0x{self.status:08X}",
+            "cfgcalsel": 0,
+            "cfgcalsn": calibration.serial,
+            "cfgfu": calibration.force_unit,
+            "scfgfu": FORCE_UNITS[calibration.force_unit],
+            "cfgtu": calibration.torque_unit,
+            "scfgtu": TORQUE_UNITS[calibration.torque_unit],
+            "cfgcpf": calibration.counts_per_force,
+            "cfgcpt": calibration.counts_per_torque,
+            "comrdte": "Enabled" if self.rdt_enabled else "Disabled",
+            "comrdtrate": self.rate_hz,
+            "comrdtbsiz": self.buffer_size,
+            "setrate": INTERNAL_HZ,
+            "prodname": self.product,
+        }
+
+    def _calibration(self) -> dict[str, object]:
+        calibration = self.calibration
+        return {
+            "calsn": calibration.serial,
+            "calpn": calibration.part_number,
+            "calfu": calibration.force_unit,
+            "caltu": calibration.torque_unit,
+            "calcpf": calibration.counts_per_force,
+            "calcpt": calibration.counts_per_torque,
+            "calmr": ";".join(f"{rating:g}" for rating in calibration.rating / calibration.units_SI),
+        }
+
+
+def _xml(root: str, elements: dict[str, object]) -> bytes:
+    body = "".join(f"<{name}>{escape(str(value))}</{name}>\r\n" for name, value in elements.items())
+    return f'<?xml version="1.0" encoding="ISO-8859-1"?>\r\n<{root}>\r\n{body}</{root}>\r\n'.encode("latin-1")
+
+
+class _HttpServer(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def __init__(self, address: tuple[str, int], box: NetFtBox) -> None:
+        super().__init__(address, _HttpHandler)
+        self.box = box
+
+
+class _HttpHandler(BaseHTTPRequestHandler):
+    server: _HttpServer
+
+    def do_GET(self) -> None:
+        if self.server.box.faults.stall:
+            return  # the connection closes without an answer
+        content = self.server.box.page(self.path)
+        self.send_response(404 if content is None else 200)
+        self.send_header("Content-Type", "text/xml" if self.path.endswith("xml") else "text/html")
+        self.send_header("Content-Length", str(len(content or b"")))
+        self.end_headers()
+        self.wfile.write(content or b"")
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Log nothing."""

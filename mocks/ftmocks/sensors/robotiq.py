@@ -1,0 +1,143 @@
+"""An emulated Robotiq FT 300 or FT 300-S: Modbus RTU, and a 100 Hz stream of 16-byte frames.
+
+Ref: Robotiq FT 300 instruction manual, section "Control" (registers, data stream).
+
+Does not model: parity and baud mismatch, accelerometer readings (they report gravity along the sensor's z axis).
+
+Chosen here, because the sources leave it open: requests during a stream are not answered. Only 50 bytes FF in a row end
+the stream. A register that does not exist is exception 2. Only register 410 can be written: 0x0200 starts the stream,
+any other value has no effect. The stream has neither status nor overload.
+"""
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftmocks.arrays import Array
+from ftmocks.wires import modbus
+from ftmocks.wires.stream import SerialSensor
+
+ADDRESS = 0x09
+STREAM_HZ = 100.0
+HEADER = b"\x20\x4e"
+STOP_BYTE, STOP_COUNT = 0xFF, 50
+FRAME_GAP_S = 2e-3  # 3.5 characters at 19200 baud
+MAX_READ = 125
+WRENCH, ACCELERATION, OUTPUT, FIRMWARE, SERIAL, YEAR = 180, 190, 410, 500, 510, 514
+STREAM_OUTPUT = 0x0200
+COUNTS_PER_SI = np.array([100.0] * 3 + [1000.0] * 3)
+ONE_G = (0, 0, 1000)
+
+
+def raw_values(wrench: Array) -> NDArray[np.int16]:
+    """Counts of (n, 6) wrenches in N and N·m: hundredths of N, thousandths of N·m, clipped."""
+    counts: Array = np.rint(wrench * COUNTS_PER_SI)
+    return counts.clip(-32768, 32767).astype(np.int16)
+
+
+def stream_frame(raw: list[int]) -> bytes:
+    """One sample: header, six little-endian int16, CRC-16/MODBUS over both."""
+    return modbus.with_crc(HEADER + struct.pack("<6h", *raw))
+
+
+@dataclass(eq=False, kw_only=True)
+class RobotiqBox(SerialSensor):
+    """The sensor on its RS-485 or USB line.
+
+    Parameters
+    ----------
+    firmware
+        Three letters, the first an F, then three numbers.
+    serial
+        Three letters and a number; 0 means the sensor does not know it.
+    year
+        Of production.
+    streaming_at_start
+        Streams from power-up on, as some sensors do, and as after a crash of the last client.
+    """
+
+    firmware: tuple[str, int, int, int] = ("FTS", 2, 0, 1)
+    serial: tuple[str, int] = ("FTS", 1234)
+    year: int = 2022
+    streaming_at_start: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._output = 0
+        self._burst = bytearray()
+        self._last_byte_s = 0.0
+        self._stop_bytes = 0
+
+    def _power_up(self) -> None:
+        self._burst.clear()
+        self._fall_silent()
+        self._output = self._stop_bytes = 0
+        if self.streaming_at_start:
+            self._pacer.start(STREAM_HZ)
+
+    def _received(self, data: bytes) -> None:
+        self._last_byte_s = self.clock.now_s()
+        for byte in data:
+            if not self.streaming:
+                self._burst += bytes([byte])[: modbus.LONGEST_FRAME + 1 - len(self._burst)]
+                continue
+            self._stop_bytes = self._stop_bytes + 1 if byte == STOP_BYTE else 0
+            if self._stop_bytes == STOP_COUNT:
+                self._stop_bytes = 0
+                self._pacer.stop()  # what follows without a pause is no request either: its CRC is wrong
+
+    def _work(self, now_s: float) -> float | None:
+        if not self._burst:
+            return None
+        wait_s = self._last_byte_s + FRAME_GAP_S - now_s
+        if wait_s > 0:
+            return wait_s
+        request = bytes(self._burst)
+        self._burst.clear()
+        answer = modbus.reply(ADDRESS, request, self._execute)
+        if answer:
+            self._wire.put([answer])
+        if self._output == STREAM_OUTPUT:
+            self._output = 0
+            self._pacer.start(STREAM_HZ)
+        return None
+
+    def _execute(self, function: int, data: bytes) -> bytes:
+        match function:
+            case 0x03:
+                return modbus.read_registers(data, self._registers(), MAX_READ)
+            case 0x10:
+                written = modbus.written_registers(data)
+                if written.keys() != {OUTPUT}:
+                    raise modbus.ModbusError(modbus.ILLEGAL_ADDRESS)
+                self._output = written[OUTPUT]
+                return data[:4]
+        raise modbus.ModbusError(modbus.ILLEGAL_FUNCTION)
+
+    def _registers(self) -> dict[int, int]:
+        letters, *numbers = self.firmware
+        firmware = struct.unpack(">3H", letters.encode("ascii") + bytes(numbers))
+        series, number = self.serial
+        third_letter = series.encode("ascii")[2] << 8
+        first_letters = int.from_bytes(series.encode("ascii")[:2], "big")
+        serial = (first_letters, third_letter, number & 0xFFFF, number >> 16)
+        blocks = {
+            WRENCH: [value & 0xFFFF for value in self._raw(1)[0].tolist()],
+            ACCELERATION: ONE_G,
+            OUTPUT: (self._output,),
+            FIRMWARE: firmware,
+            SERIAL: serial,
+            YEAR: (self.year,),
+        }
+        return {first + i: value for first, values in blocks.items() for i, value in enumerate(values)}
+
+    def _raw(self, count: int) -> NDArray[np.int16]:
+        raw = raw_values(self.measure(count))
+        if self.saturated_axis is not None:
+            raw[:, self.saturated_axis] = 32767
+        return raw
+
+    def _samples(self, count: int) -> list[bytes]:
+        return [stream_frame(raw) for raw in self._raw(count).tolist()]

@@ -1,0 +1,292 @@
+"""An emulated Robotous RFT force/torque sensor: one device, on a CAN bus or on a UART.
+
+Ref: Robotous RFT series installation and operation manual, revision 1.7 (commands, data field, CAN and UART packets).
+
+Does not model: the low-pass filter (its type and code are stored and reported), storage wear, line speed.
+
+Chosen here, because the manual leaves it open: an unknown command or a damaged packet gets no answer. A setting of the
+other wire is answered as unsupported. 1000 Hz on a slower line becomes the rate that the line carries. A reading at the
+end of the int16 range, or beyond the capacity, sets the overload bit of its axis. The overload counters count the
+beginnings of overloads up to 255. CAN identifiers and the baud rate need a reboot; `reset` is one. All other settings
+survive it, except bias and streaming.
+"""
+
+import random
+import struct
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from enum import IntEnum
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftmocks.arrays import Array
+from ftmocks.wires.faults import Frame
+from ftmocks.wires.pty import PtyDevice
+from ftmocks.wires.slcan import CanFrame
+from ftmocks.wires.stream import CanSensor, SerialSensor
+
+COMMAND_BYTES, RESPONSE_BYTES = 8, 16
+START_OF_PACKET, END_OF_PACKET = 0x55, 0xAA
+RATES_HZ = (200, 10, 20, 50, 100, 200, 333, 500, 1000)
+BAUD_RATES = (115_200, 921_600, 460_800, 230_400, 115_200, 57_600)
+FILTER_TYPES, FILTER_CODES = (0, 1), range(15)
+SUCCESS, FAILURE = 1, 0
+UNSUPPORTED, OUT_OF_RANGE = 1, 2
+
+
+class Command(IntEnum):
+    """First byte of a command field, and of its response."""
+
+    MODEL_NAME = 0x01
+    SERIAL_NUMBER = 0x02
+    FIRMWARE_VERSION = 0x03
+    SET_IDS = 0x04
+    GET_IDS = 0x05
+    SET_BAUD = 0x06
+    GET_BAUD = 0x07
+    SET_FILTER = 0x08
+    GET_FILTER = 0x09
+    ONE_SAMPLE = 0x0A
+    START = 0x0B
+    STOP = 0x0C
+    SET_RATE = 0x0F
+    GET_RATE = 0x10
+    BIAS = 0x11
+    OVERLOAD_COUNTS = 0x12
+
+
+@dataclass(frozen=True)
+class Model:
+    """A member of the series.
+
+    Parameters
+    ----------
+    force_divisor, torque_divisor
+        Counts per newton and per newton metre.
+    capacity
+        (6,) in N and N·m; beyond it an axis is overloaded.
+    """
+
+    name: str = "RFT60-HA01"
+    force_divisor: float = 50.0
+    torque_divisor: float = 2000.0
+    capacity: Sequence[float] = (200.0, 200.0, 200.0, 8.0, 8.0, 8.0)
+
+
+def raw_values(wrench: Array, model: Model) -> NDArray[np.int16]:
+    """Counts of wrenches, rounded and clipped.
+
+    Parameters
+    ----------
+    wrench
+        (n, 6) in N and N·m.
+    """
+    counts = np.rint(wrench * ([model.force_divisor] * 3 + [model.torque_divisor] * 3))
+    return np.clip(counts, -32768, 32767).astype(np.int16)
+
+
+def sample_field(response: int, raw: Sequence[int], overload: int) -> bytes:
+    """Response field of a sample: identifier, six big-endian int16, overload bits, two bytes of padding."""
+    return struct.pack(">B6hB2x", response, *raw, overload)
+
+
+def packet(field: bytes) -> bytes:
+    """A command or response field as the UART carries it."""
+    return bytes((START_OF_PACKET, *field, sum(field) & 0xFF, END_OF_PACKET))
+
+
+def fields(stream: bytearray) -> list[bytes]:
+    """Remove received bytes and return the whole command packets in them."""
+    found = []
+    size = COMMAND_BYTES + 3
+    while (start := stream.find(START_OF_PACKET)) >= 0 and len(stream) >= start + size:
+        candidate = bytes(stream[start : start + size])
+        valid = packet(candidate[1:-2]) == candidate
+        if valid:
+            found.append(candidate[1:-2])
+        del stream[: start + (size if valid else 1)]
+    if start < 0:
+        stream.clear()
+    return found
+
+
+@dataclass(eq=False)
+class RobotousSensor(PtyDevice[Frame]):
+    """The device behind either wire: commands in, response fields out.
+
+    Parameters
+    ----------
+    model
+        Name, divisors and capacity.
+    serial, firmware
+        At most 15 ASCII characters each.
+    baud_code
+        Of the UART in force, the index in `BAUD_RATES`; a pty does not notice a client at another rate.
+    overload
+        Overload bits set besides those of the readings: bit 5 to 0 are Fx to Tz.
+    streaming_at_start
+        Streams from power-up on, as after a crash of the last client.
+    """
+
+    unsupported: ClassVar[frozenset[Command]] = frozenset()
+    _: KW_ONLY
+    model: Model = Model()
+    serial: str = "A60HA00123"
+    firmware: str = "VER 1.7"
+    baud_code: int = 0
+    overload: int = 0
+    streaming_at_start: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.rate_code = 0
+        self.filter = (0, 0)
+        self.ids = self.stored_ids = (0x64, 0x01, 0x02)
+        self.stored_baud_code = self.baud_code
+        self.overload_counts = [0] * 6
+        self._overloaded = 0
+        self._bias = np.zeros(6)
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples a second of a stream."""
+        return RATES_HZ[self.rate_code]
+
+    def boot(self) -> None:
+        """Set the state after power-up."""
+        self.ids, self.baud_code = self.stored_ids, self.stored_baud_code
+        self._bias = np.zeros(6)
+        self._pacer.stop()
+        if self.streaming_at_start:
+            self._pacer.start(self.rate_hz)
+
+    def execute(self, command: bytes) -> list[bytes]:
+        """Return the responses to a command field: one or none."""
+        code, *arguments = command
+        if self._pacer.running and code not in (Command.STOP, Command.BIAS):
+            return []
+        settings: dict[int, Sequence[int]] = {
+            Command.MODEL_NAME: self.model.name.encode("ascii"),
+            Command.SERIAL_NUMBER: self.serial.encode("ascii"),
+            Command.FIRMWARE_VERSION: self.firmware.encode("ascii"),
+            Command.GET_IDS: (*self.ids, *self.stored_ids),
+            Command.GET_BAUD: (self.baud_code, self.stored_baud_code),
+            Command.GET_FILTER: self.filter,
+            Command.GET_RATE: (self.rate_code,),
+            Command.OVERLOAD_COUNTS: self.overload_counts,
+        }
+        if code in settings:
+            return [self._response(code, *settings[code])]
+        match code:
+            case Command.SET_IDS | Command.SET_BAUD | Command.SET_FILTER | Command.SET_RATE:
+                error = self._set(code, *arguments[:3])
+                return [self._response(code, FAILURE if error else SUCCESS, error)]
+            case Command.ONE_SAMPLE:
+                return self.samples(1, code)
+            case Command.START:
+                self._pacer.start(self.rate_hz)
+            case Command.STOP:
+                self._pacer.stop()
+            case Command.BIAS if arguments[0] in (0, 1):
+                self._bias = self.measure(1)[0] if arguments[0] else np.zeros(6)
+        return []
+
+    def samples(self, count: int, response: int = Command.START) -> list[bytes]:
+        """Response fields of the next samples."""
+        wrench = self.measure(count)
+        raw = raw_values(wrench - self._bias, self.model)
+        if self.saturated_axis is not None:
+            raw[:, self.saturated_axis] = 32767
+        overloaded = (np.abs(wrench) > self.model.capacity) | (raw == 32767) | (raw == -32768)
+        bits = (overloaded @ (1 << np.arange(5, -1, -1))).tolist()
+        sent = []
+        for values, overload in zip(raw.tolist(), bits, strict=True):
+            self._count_overload(overload | self.overload)
+            sent.append(sample_field(response, values, overload | self.overload))
+        return sent
+
+    def _count_overload(self, overload: int) -> None:
+        if overload & ~self._overloaded:
+            for axis in range(6):
+                if overload & ~self._overloaded & (0x20 >> axis):
+                    self.overload_counts[axis] = min(self.overload_counts[axis] + 1, 255)
+        self._overloaded = overload
+
+    def _set(self, code: int, first: int, second: int, third: int) -> int:
+        """Change a setting; return the error code, 0 for success."""
+        if code in self.unsupported:
+            return UNSUPPORTED
+        match code:
+            case Command.SET_FILTER if first in FILTER_TYPES and second in FILTER_CODES:
+                self.filter = (first, second)
+            case Command.SET_RATE if first < len(RATES_HZ):
+                self.rate_code = first
+            case Command.SET_BAUD if first < len(BAUD_RATES):
+                self.stored_baud_code = first
+            case Command.SET_IDS if len({first, second, third}) == 3:
+                self.stored_ids = (first, second, third)
+            case _:
+                return OUT_OF_RANGE
+        return 0
+
+    def _response(self, code: int, *values: int) -> bytes:
+        return bytes((code, *values)).ljust(RESPONSE_BYTES, b"\0")
+
+
+@dataclass(eq=False)
+class RobotousCanNode(RobotousSensor[CanFrame], CanSensor):
+    """The sensor on a CAN bus: 8 bytes of command, and a response in two frames of 8 bytes."""
+
+    unsupported = frozenset({Command.SET_BAUD})
+
+    def _boot(self) -> None:
+        self.boot()
+
+    def _answer(self, request: CanFrame) -> list[CanFrame]:
+        if request != CanFrame(self.ids[0], request.data) or len(request.data) != COMMAND_BYTES:
+            return []
+        return self._frames(self.execute(request.data))
+
+    def _samples(self, count: int) -> list[CanFrame]:
+        return self._frames(self.samples(count))
+
+    def _frames(self, responses: list[bytes]) -> list[CanFrame]:
+        _receive, first, second = self.ids
+        halves = [((first, field[:8]), (second, field[8:])) for field in responses]
+        return [CanFrame(identifier, data) for pair in halves for identifier, data in pair]
+
+    def _foreign_frame(self, rng: random.Random) -> CanFrame:
+        identifier = rng.choice([i for i in (0x000, 0x003, 0x080, 0x101, 0x701) if i not in self.ids])
+        extended = rng.random() < 0.5
+        return CanFrame(self.ids[1] if extended else identifier, rng.randbytes(8), extended)
+
+
+@dataclass(eq=False)
+class RobotousSerialBox(RobotousSensor[bytes], SerialSensor):
+    """The sensor on a UART: packets with start byte, checksum and end byte."""
+
+    unsupported = frozenset({Command.SET_IDS})
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._line = bytearray()
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples a second of a stream, and no more than the line carries."""
+        return min(super().rate_hz, BAUD_RATES[self.baud_code] / (10 * (RESPONSE_BYTES + 3)))
+
+    def _power_up(self) -> None:
+        self._line.clear()
+        self._fall_silent()
+        self.boot()
+
+    def _received(self, data: bytes) -> None:
+        self._line += data
+        for field in fields(self._line):
+            self._wire.put([packet(response) for response in self.execute(field)])
+
+    def _samples(self, count: int) -> list[bytes]:
+        return [packet(field) for field in self.samples(count)]

@@ -1,0 +1,206 @@
+"""Connections of clients to the controller: one class for each kind of port but RTDE."""
+
+import socket
+import struct
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+from ftmocks.ur import api, dashboard, http_wire, primary
+from ftmocks.ur.script import take_uploads
+
+if TYPE_CHECKING:
+    from ftmocks.ur.server import UrServer
+
+BACKLOG_LIMIT_S = 10.0  # a client that does not read for so long is disconnected
+
+
+class Client(ABC):
+    """One TCP connection: bytes in, bytes out, never blocking."""
+
+    kind = ""
+
+    def __init__(self, server: "UrServer", connection: socket.socket) -> None:
+        self.server = server
+        self.robot = server.robot
+        self.open = True
+        self.greeted = False
+        """Whether the greeting was sent."""
+        self._socket = connection
+        self._in = bytearray()
+        self._out = bytearray()
+        self._stuck_since: float | None = None
+
+    def fileno(self) -> int:
+        """The socket's."""
+        return self._socket.fileno()
+
+    @property
+    def lagging(self) -> bool:
+        """Whether the client has not yet read what was sent before."""
+        return bool(self._out)
+
+    def greeting(self) -> bytes:
+        """Return what the port sends first."""
+        return b""
+
+    def on_cycle(self) -> None:
+        """Send what a control cycle has brought, and what is left."""
+        self.flush()
+
+    def on_ready(self) -> None:
+        """Read what has arrived and act on it."""
+        try:
+            data = self._socket.recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+            return
+        self._in += data
+        self.on_bytes(self._in)
+
+    @abstractmethod
+    def on_bytes(self, buffer: bytearray) -> None:
+        """Consume what is complete at the start of `buffer`."""
+
+    def send(self, data: bytes) -> None:
+        """Send what the socket takes, keep the rest."""
+        self._out += data
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what is left; disconnect a client that has not read for `BACKLOG_LIMIT_S`."""
+        if not self._out or not self.open:
+            return
+        try:
+            sent = self._socket.send(self._out)
+        except BlockingIOError:
+            sent = 0
+        except OSError:
+            self.close()
+            return
+        del self._out[:sent]
+        now = self.robot.clock.now_s()
+        if sent or self._stuck_since is None:
+            self._stuck_since = now
+        elif now - self._stuck_since > BACKLOG_LIMIT_S:
+            self.close()
+        if not self._out:
+            self._stuck_since = None
+
+    def close(self, *, reset: bool = False) -> None:
+        """Close the connection: in order, or with a TCP reset."""
+        if self.open:
+            self.open = False
+            self.server.forget(self)
+            if reset:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            self._socket.close()
+
+
+class ScriptClient(Client):
+    """Ports 30002 and 30003: receives programs, sends nothing."""
+
+    kind = "script"
+
+    def on_bytes(self, buffer: bytearray) -> None:
+        """Start every complete program."""
+        for upload in take_uploads(buffer):
+            self.robot.upload(upload)
+
+
+class PrimaryClient(Client):
+    """Port 30001: receives programs; sends the state, messages of programs, and errors.
+
+    A connection that was opened in local control can only read, also when the pendant is switched to remote control
+    later. A connection that was opened in remote control ends when the pendant is switched to local control.
+    """
+
+    kind = "primary"
+
+    def __init__(self, server: "UrServer", connection: socket.socket) -> None:
+        super().__init__(server, connection)
+        self._can_write = self.robot.remote_control
+        self._switches = self.robot.remote_switches
+        self._every = self.robot.frequency_hz // primary.STATES_HZ
+        self._seen = len(self.robot.events)
+        """Entries of the event log that were sent, or are older than this connection."""
+
+    def greeting(self) -> bytes:
+        """Return the version and a complete state."""
+        return primary.version_message(self.robot) + primary.state_package(self.robot, complete=True)
+
+    def on_bytes(self, buffer: bytearray) -> None:
+        """Start every complete program."""
+        for upload in take_uploads(buffer):
+            command = primary.COMMANDS.get(upload.text.strip())
+            if not self._can_write:
+                self.robot.note("primary port", f"program {upload.name}", accepted=False, why="read-only connection")
+                self.send(primary.read_only_error(self.robot))
+            elif command is not None:
+                self.robot.note("primary port", upload.text.strip())
+                command(self.robot)
+            else:
+                self.robot.upload(upload, by="primary port")
+
+    def on_cycle(self) -> None:
+        """Send what has happened, and the state when it is due."""
+        super().on_cycle()
+        if self._can_write and self._switches != self.robot.remote_switches:
+            self.close()
+            return
+        news, self._seen = self.robot.events[self._seen :], len(self.robot.events)
+        if messages := b"".join(map(primary.messages_of, news)):
+            self.send(messages)
+        if self.robot.cycle % self._every == 0 and not self.lagging:
+            self.send(primary.state_package(self.robot))
+
+
+class DashboardClient(Client):
+    """Port 29999: a banner, then one line for each line."""
+
+    kind = "dashboard"
+
+    def __init__(self, server: "UrServer", connection: socket.socket) -> None:
+        super().__init__(server, connection)
+        self._switches = self.robot.remote_switches
+        self._opened_remote = self.robot.remote_control
+
+    def greeting(self) -> bytes:
+        """Return the banner."""
+        return dashboard.BANNER.encode() + b"\n"
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the pendant was in remote control since this client connected; else it can only query."""
+        return self._opened_remote and self._switches == self.robot.remote_switches
+
+    def on_bytes(self, buffer: bytearray) -> None:
+        """Answer every complete line."""
+        while b"\n" in buffer and self.open:
+            line, _, rest = bytes(buffer).partition(b"\n")
+            buffer[:] = rest
+            text = line.decode("utf-8", "replace")
+            self.send(dashboard.answer(self.robot, text, trusted=self.trusted).encode() + b"\n")
+            if text.strip().lower() == "quit":
+                self.close()
+
+
+class ApiClient(Client):
+    """The port of the Robot API: HTTP requests, answered in their order."""
+
+    kind = "api"
+
+    def on_bytes(self, buffer: bytearray) -> None:
+        """Answer every complete request."""
+        try:
+            while self.open and (request := http_wire.take_request(buffer)):
+                status, answer = api.respond(self.robot, request.method, request.path, request.body)
+                self.send(http_wire.response(status, answer))
+                if request.is_last:
+                    self.close()
+        except http_wire.HttpError as error:
+            self.send(http_wire.response(400, {"message": str(error)}))
+            self.close()

@@ -1,0 +1,450 @@
+"""How the arm moves: the paths of motion commands, and an arm that follows them.
+
+A path is a function of *path time*, which runs slower when the speed slider is down and stands still while the program
+is paused. A motion that meets a moving arm first brings it to rest: position and velocity never jump.
+"""
+
+import math
+from collections import deque
+from collections.abc import Generator, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from ftmocks.arrays import Array
+from ftmocks.kinematics import (
+    ZERO6,
+    Dh,
+    JointState,
+    Vector6,
+    cross,
+    flange_motion,
+    forward,
+    inverse_matrix,
+    jacobian,
+    refine,
+    rotation,
+    rotvec,
+    vector6,
+)
+
+FOLLOW_TIME_S = 0.005
+"""Time constant with which the joints follow the set-point."""
+
+SETTLED_RAD = 1e-9
+"""Joints that are so near to a set-point at rest are there."""
+
+PAUSE_TIME_S = 0.15
+"""Time in which the arm comes to rest on its path when the program pauses, or follows the speed slider."""
+
+IDLE_DECELERATION_RAD_S2 = 8.0
+"""Deceleration of an arm that lost its path."""
+
+
+NO_WAY_ON = "the straight line leaves the workspace or meets a singularity"
+
+
+class MotionError(ValueError):
+    """The motion cannot be executed; the running program ends."""
+
+
+class CannotFollow(Exception):
+    """The path leads where the arm cannot follow; the safety system stops it."""
+
+
+class Trapezoid:
+    """Distance over time from rest to rest, with a speed limit and constant acceleration.
+
+    Parameters
+    ----------
+    length, speed, acceleration
+        In any one unit of length and seconds; speed and acceleration positive.
+    """
+
+    def __init__(self, length: float, speed: float, acceleration: float) -> None:
+        if not (speed > 0.0 and acceleration > 0.0):
+            raise MotionError(f"speed {speed} and acceleration {acceleration} must be positive")
+        self.length = length
+        self.acceleration = acceleration
+        self.peak = min(speed, math.sqrt(length * acceleration))
+        self.ramp_s = self.peak / acceleration
+        self.duration_s = length / self.peak + self.ramp_s if length > 0.0 else 0.0
+
+    def at(self, t: float) -> tuple[float, float, float]:
+        """Distance covered `t` seconds after the start, speed and acceleration."""
+        left, acceleration = self.duration_s - t, self.acceleration
+        if left <= 0.0:
+            return self.length, 0.0, 0.0
+        if t < self.ramp_s:
+            return 0.5 * acceleration * t * t, acceleration * t, acceleration
+        if left < self.ramp_s:
+            return self.length - 0.5 * acceleration * left * left, acceleration * left, -acceleration
+        return self.peak * (t - 0.5 * self.ramp_s), self.peak, 0.0
+
+
+class Path(Protocol):
+    """One motion, planned when the arm starts it."""
+
+    duration_s: float
+    real_time: bool
+    """Whether it ignores speed slider and limiter."""
+
+    def begin(self, q: Vector6, qd: Vector6, /) -> None:
+        """Plan from the present set-point: angles (rad) and speeds (rad/s). Sets `duration_s`."""
+
+    def at(self, t: float) -> JointState:
+        """Return the set-point at path time `t` with its derivatives, called with rising `t` up to `duration_s`."""
+
+
+class JointMove:
+    """movej: all joints start and end together, the one with the longest travel leads.
+
+    Parameters
+    ----------
+    goal
+        Joint angles, rad.
+    speed, acceleration
+        Of the leading joint, rad/s and rad/s²; no joint exceeds its own speed limit.
+    """
+
+    real_time = False
+
+    def __init__(self, dh: Dh, goal: Vector6, speed: float, acceleration: float) -> None:
+        Trapezoid(0.0, speed, acceleration)  # refuses impossible values now, not in mid-motion
+        self._dh, self._goal, self._speed, self._acceleration = dh, goal, speed, acceleration
+
+    def begin(self, q: Vector6, _qd: Vector6, /) -> None:
+        """See `Path`."""
+        self._q0 = q
+        self._travel = vector6([b - a for a, b in zip(q, self._goal, strict=True)])
+        longest = max(abs(w) for w in self._travel)
+        speed = self._speed
+        for travel, limit in zip(self._travel, self._dh.max_speed, strict=True):
+            if abs(travel) * speed > limit * longest:
+                speed = limit * longest / abs(travel)
+        self._profile = Trapezoid(longest, speed, self._acceleration)
+        self.duration_s = self._profile.duration_s
+
+    def at(self, t: float) -> JointState:
+        """See `Path`."""
+        if t >= self.duration_s:
+            return JointState(self._goal)
+        share, speed, acceleration = (value / self._profile.length for value in self._profile.at(t))
+        return JointState(
+            vector6([a + w * share for a, w in zip(self._q0, self._travel, strict=True)]),
+            vector6([w * speed for w in self._travel]),
+            vector6([w * acceleration for w in self._travel]),
+        )
+
+
+class LineMove:
+    """movel: the TCP moves along a straight line and turns about a fixed axis, on the present branch of the arm.
+
+    Parameters
+    ----------
+    X_flange_tcp, goal
+        Active TCP and its goal in base, (4, 4).
+    speed, acceleration
+        m/s and m/s²; a turn of one radian counts as one metre where it is the longer of the two.
+    """
+
+    real_time = False
+
+    def __init__(self, dh: Dh, X_flange_tcp: Array, goal: Array, speed: float, acceleration: float) -> None:
+        Trapezoid(0.0, speed, acceleration)
+        self._dh, self._goal, self._speed, self._acceleration = dh, goal, speed, acceleration
+        self._X_flange_tcp, self._X_tcp_flange = X_flange_tcp, inverse_matrix(X_flange_tcp)
+
+    def begin(self, q: Vector6, _qd: Vector6, /) -> None:
+        """See `Path`."""
+        self._q = q
+        self._start = forward(self._dh, q) @ self._X_flange_tcp
+        self._travel = self._goal[:3, 3] - self._start[:3, 3]
+        self._turn = rotvec(self._goal[:3, :3] @ self._start[:3, :3].T)
+        length = max(math.hypot(*self._travel), math.hypot(*self._turn))
+        self._profile = Trapezoid(length, self._speed, self._acceleration)
+        self.duration_s = self._profile.duration_s
+
+    def at(self, t: float) -> JointState:
+        """See `Path`."""
+        if self._profile.length == 0.0:
+            return JointState(self._q)
+        share, speed, acceleration = (value / self._profile.length for value in self._profile.at(t))
+        X = self._start.copy()
+        X[:3, 3] += share * self._travel
+        X[:3, :3] = rotation(share * self._turn) @ self._start[:3, :3]
+        X_base_flange = X @ self._X_tcp_flange
+        q = refine(self._dh, X_base_flange, self._q)
+        if q is None:
+            raise CannotFollow(NO_WAY_ON)
+        self._q = q
+        try:
+            return self._derived(q, X_base_flange[:3, 3] - X[:3, 3], speed, acceleration)
+        except np.linalg.LinAlgError:
+            raise CannotFollow(NO_WAY_ON) from None
+
+    def _derived(self, q: Vector6, lever: Array, speed: float, acceleration: float) -> JointState:
+        """Return the joints with their derivatives; `lever` (3,) is the flange from the TCP, in base."""
+        turning = speed * self._turn
+        moving = speed * self._travel + cross(turning, lever)
+        J = jacobian(self._dh, q)
+        qd = vector6(np.linalg.solve(J, np.concatenate((moving, turning))).tolist())
+        turned = acceleration * self._turn
+        moved = acceleration * self._travel + cross(turned, lever) + cross(turning, cross(turning, lever))
+        coasting = flange_motion(self._dh, JointState(q, qd))
+        rest = np.concatenate((moved - coasting.acceleration, turned - coasting.angular_acceleration))
+        return JointState(q, qd, vector6(np.linalg.solve(J, rest).tolist()))
+
+
+class HandMove(JointMove):
+    """The operator pushes the arm: as movej, but slider and limiter do not act on it."""
+
+    real_time = True
+
+
+class Stop:
+    """stopj and stopl: slow down linearly along the present direction, within `duration_s` at any slider."""
+
+    real_time = True
+
+    def __init__(self, duration_s: float) -> None:
+        self.duration_s = duration_s
+
+    def begin(self, q: Vector6, qd: Vector6, /) -> None:
+        """See `Path`."""
+        self._q0, self._qd0 = q, qd
+
+    def at(self, t: float) -> JointState:
+        """See `Path`."""
+        if self.duration_s <= 0.0:
+            return JointState(self._q0)
+        rolled_s, left, braking = t - t * t / (2 * self.duration_s), 1.0 - t / self.duration_s, -1.0 / self.duration_s
+        return JointState(
+            vector6([p + v * rolled_s for p, v in zip(self._q0, self._qd0, strict=True)]),
+            vector6([v * left for v in self._qd0]),
+            vector6([v * braking for v in self._qd0]),
+        )
+
+
+class Following(NamedTuple):
+    """The actual joints from one control cycle on: they follow a set-point that accelerates evenly.
+
+    Parameters
+    ----------
+    target
+        The set-point in that cycle.
+    qd
+        Speeds of the joints in that cycle, rad/s, with which they are `FOLLOW_TIME_S` behind the set-point.
+    off_rad
+        How far the joints are pushed off.
+    """
+
+    target: JointState
+    qd: Vector6
+    off_rad: Vector6 = ZERO6
+
+    def at(self, t: float) -> JointState:
+        """Return the actual joints `t` seconds later, or earlier; exact as long as the acceleration stays."""
+        T = FOLLOW_TIME_S
+        left = math.exp(-t / T)
+        target_qd = [v + c * t for v, c in zip(self.target.qd, self.target.qdd, strict=True)]
+        qd = _followed(self.qd, self.target.qd, target_qd, self.target.qdd, left)
+        q = [
+            p + (v + 0.5 * c * t) * t + off - T * own
+            for p, v, c, off, own in zip(*self.target, self.off_rad, qd, strict=True)
+        ]
+        qdd = [(v - own) / T for v, own in zip(target_qd, qd, strict=True)]
+        return JointState(vector6(q), vector6(qd), vector6(qdd))
+
+
+class Arm:
+    """Set-point and actual joints, and the path being followed.
+
+    Parameters
+    ----------
+    dh
+        The real arm.
+    q
+        Joint angles (rad) to start with.
+    """
+
+    obstacle: str | None = None
+    """Why this arm cannot be moved."""
+
+    def __init__(self, dh: Dh, q: Vector6) -> None:
+        self.dh = dh
+        self.q = self.actual_q = q
+        self.qd = self.actual_qd = self.qdd = ZERO6
+        self.motion: Following | None = None
+        """The actual joints from the last cycle on, None while they rest."""
+        self.speed_fraction = 1.0
+        """Speed slider, 0 to 1."""
+        self.pushed_rad = ZERO6
+        """How far the operator pushes the joints off their set-points."""
+        self.scaling = 1.0
+        """Fraction of the speed that the trajectory limiter allows, 0 to 1."""
+        self.paused = False
+        """Whether the arm should stand still on its path."""
+        self.pace = 1.0
+        """Present speed of path time, without the slider: `scaling` running, 0 paused, between while it changes."""
+        self.still_s = 0.0
+        """How long the set-point has stood still."""
+        self._slider = self._rate = 1.0
+        self._off_rad = ZERO6
+        self._paths: deque[Path] = deque()
+        self._planned: Path | None = None
+        self._t = 0.0
+        self._owner: str | None = None
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the set-point stands still."""
+        return not any(self.qd)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a path is not yet finished."""
+        return bool(self._paths)
+
+    def start(self, path: Path, owner: str) -> None:
+        """Follow `path` for the program thread `owner`, from rest.
+
+        Raises
+        ------
+        MotionError
+            When another thread of the program controls the arm.
+        """
+        self._seize(owner)
+        self._follow([self._rundown(), path] if not self.at_rest else [path])
+
+    def stop_joints(self, deceleration: float, owner: str) -> None:
+        """stopj: the fastest joint slows down by `deceleration` (rad/s²)."""
+        self._brake(max(abs(v) for v in self.qd), deceleration, owner)
+
+    def stop_tool(self, deceleration: float, owner: str) -> None:
+        """stopl: the tool slows down by `deceleration` (m/s² or rad/s², whichever takes longer)."""
+        twist = jacobian(self.dh, self.q) @ self.qd
+        self._brake(max(math.hypot(*twist[:3]), math.hypot(*twist[3:])), deceleration, owner)
+
+    def until_finished(self, owner: str) -> Generator[None, None, None]:
+        """Wait a cycle at a time until the path has ended; closing this generator takes the arm from its path."""
+        try:
+            while self.busy:
+                yield
+        finally:
+            self.release(owner)
+
+    def release(self, owner: str | None = None) -> None:
+        """Drop the path of `owner` (None: of any owner); a moving arm comes to rest by itself."""
+        if owner is None or owner == self._owner:
+            self._owner = None
+            self._follow([self._rundown()] if not self.at_rest else [])
+
+    def step(self, dt: float, _t_s: float = 0.0) -> None:
+        """Let `dt` seconds pass, up to a time of the cell's clock.
+
+        Raises
+        ------
+        CannotFollow
+            When the path leads out of the workspace; the arm stands where it is.
+        """
+        change = dt / PAUSE_TIME_S
+        self.pace = _towards(0.0 if self.paused else self.scaling, self.pace, change)
+        self._slider = _towards(self.speed_fraction, self._slider, change)
+        before_rate, self._rate = self._rate, self.pace * self._slider
+        state, before_qd = JointState(self.q), self.qd
+        if self._paths:
+            try:
+                state = self._along(dt, before_rate)
+            except CannotFollow:
+                self._paths.clear()
+                self.qd = self.qdd = ZERO6
+                raise
+        if state.q != self.q:  # else the same object stays: readers recognise a resting arm by it
+            self.q = state.q
+        self.qd, self.qdd = (value if any(value) else ZERO6 for value in state[1:])
+        self.still_s = 0.0 if any(self.qd) else self.still_s + dt
+        self._lag(dt, before_qd)
+
+    def _seize(self, owner: str) -> None:
+        if self.busy and self._owner not in (None, owner):
+            raise MotionError("Another thread is already controlling the robot")
+        self._owner = owner
+
+    def _follow(self, paths: list[Path]) -> None:
+        self._paths = deque(paths)
+        self._planned = None
+
+    def _rundown(self) -> Stop:
+        return Stop(max(abs(v) for v in self.qd) / IDLE_DECELERATION_RAD_S2)
+
+    def _brake(self, speed: float, deceleration: float, owner: str) -> None:
+        if not deceleration > 0.0:
+            raise MotionError(f"deceleration {deceleration} must be positive")
+        self._seize(owner)
+        self._follow([Stop(speed / deceleration)] if not self.at_rest else [])
+
+    def _along(self, dt: float, before: float) -> JointState:
+        """Let path time pass, whose rate changed evenly from `before` in this cycle; return the new set-point."""
+        path = self._paths[0]
+        if path is not self._planned:
+            path.begin(self.q, self.qd)
+            self._planned, self._t = path, 0.0
+        before, rate = (1.0, 1.0) if path.real_time else (before, self._rate)
+        self._t = min(self._t + 0.5 * (before + rate) * dt, path.duration_s)
+        state = path.at(self._t)
+        if self._t >= path.duration_s:
+            self._paths.popleft()
+            return JointState(state.q)
+        change = (rate - before) / dt
+        return JointState(
+            state.q,
+            vector6([v * rate for v in state.qd]),
+            vector6([c * rate * rate + v * change for v, c in zip(*state[1:], strict=True)]),
+        )
+
+    def _lag(self, dt: float, before_qd: Vector6) -> None:
+        """Let the joints follow the set-point, and give way to the hand that pushes them."""
+        if self.motion is None and self.qd is ZERO6 and before_qd is ZERO6 and self._off_rad is self.pushed_rad:
+            self.actual_qd = ZERO6
+            return
+        left = math.exp(-dt / FOLLOW_TIME_S)
+        qdd = [(new - old) / dt for new, old in zip(self.qd, before_qd, strict=True)]
+        qd = vector6(_followed(self.motion.qd if self.motion else ZERO6, before_qd, self.qd, qdd, left))
+        off_rad = self._yielded(left)
+        pushed = [(new - old) / dt for new, old in zip(off_rad, self._off_rad, strict=True)]
+        self._off_rad = off_rad
+        if self.qd is ZERO6 and FOLLOW_TIME_S * max(map(abs, qd)) < SETTLED_RAD:
+            qd, self.motion = ZERO6, None
+        else:
+            self.motion = Following(JointState(self.q, self.qd, self.qdd), qd, off_rad)
+        behind = zip(self.q, off_rad, qd, strict=True)
+        settled = self.motion is None and off_rad is ZERO6
+        self.actual_q = self.q if settled else vector6([q + off - FOLLOW_TIME_S * v for q, off, v in behind])
+        self.actual_qd = vector6([v + push for v, push in zip(qd, pushed, strict=True)])
+
+    def _yielded(self, left: float) -> Vector6:
+        """Return how far the joints are pushed off one cycle later."""
+        before, goal = self._off_rad, self.pushed_rad
+        after = vector6([g + (off - g) * left for off, g in zip(before, goal, strict=True)])
+        return goal if max(abs(off - g) for off, g in zip(after, goal, strict=True)) < SETTLED_RAD else after
+
+
+def _followed(qd: Vector6, before: Vector6, target: Sequence[float], qdd: Sequence[float], left: float) -> list[float]:
+    """Return the speeds of joints that follow a set-point for a time.
+
+    Parameters
+    ----------
+    qd
+        Speeds of the joints before.
+    before, target, qdd
+        Speeds of the set-point before and now, and its acceleration meanwhile.
+    left
+        exp(-time / `FOLLOW_TIME_S`).
+    """
+    T = FOLLOW_TIME_S
+    return [v - T * c + (own - old + T * c) * left for own, old, v, c in zip(qd, before, target, qdd, strict=True)]
+
+
+def _towards(goal: float, value: float, change: float) -> float:
+    return min(goal, value + change) if value < goal else max(goal, value - change)

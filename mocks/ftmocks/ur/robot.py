@@ -1,0 +1,559 @@
+"""The controller without its sockets: arm, modes, safety, program and registers, one step per control cycle.
+
+Time: a cycle takes one control period on the cell's clock; the controller and its arm live through `time_scale` times
+as much in it (clock, motion, settling, the waiting times of the controller). The watchdog, which watches the client,
+keeps the cell's time, and so does the controller's clock when the arm's own sensor is the station's sensor.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ftmocks.arrays import Array
+from ftmocks.kinematics import ZERO6, Dh, Vector3, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
+from ftmocks.ur.events import Event
+from ftmocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Runtime, SafetyMode
+from ftmocks.ur.motion import Arm, CannotFollow, HandMove, MotionError
+from ftmocks.ur.rtde import Value
+from ftmocks.ur.script import STOP_SCRIPT, ControlScript, Upload
+from ftmocks.ur.swing import SwingProgram
+from ftmocks.ur.urscript.program import Program
+from ftmocks.ur.urscript.syntax import Place, UrscriptSyntaxError
+from ftmocks.ur.urscript.values import ScriptError
+from ftmocks.world import World
+
+UNLOCK_AFTER_S = 5.0
+STEADY_AFTER_S = 0.5
+PROGRAM_START_S = 0.1
+POWER_STEP_S = 0.5
+COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
+HAND_ACCELERATION_RAD_S2 = 1.5
+INSTALLED_G_M_S2 = 9.82
+"""Gravity in an installation, wherever on earth."""
+
+AnyProgram = ControlScript | Program | SwingProgram
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Safety limits of the installation.
+
+    Parameters
+    ----------
+    dh
+        The real arm.
+    joint_rad
+        Largest angle of any joint either way.
+    plane
+        ``(nx, ny, nz, d)`` in base: flange, TCP and elbow must keep ``n · p >= d`` (m); None for no plane.
+    """
+
+    dh: Dh
+    joint_rad: float = 2 * np.pi
+    plane: tuple[float, float, float, float] | None = None
+
+    def allow(self, q: Vector6, X_flange_tcp: Array) -> bool:
+        """Whether the arm may stand at `q`."""
+        if any(abs(v) > self.joint_rad for v in q):
+            return False
+        if self.plane is None:
+            return True
+        normal, distance = np.array(self.plane[:3]), self.plane[3]
+        flange = forward(self.dh, q)
+        points = (forward(self.dh, q, joints=2), flange, flange @ X_flange_tcp)
+        return all(float(normal @ X[:3, 3]) >= distance for X in points)
+
+
+@dataclass(frozen=True)
+class RobotSettings:
+    """Identity and installation of the emulated arm.
+
+    Parameters
+    ----------
+    model
+        Name of the arm, as in `ftmocks.kinematics.MODELS`.
+    polyscope
+        Software version, three numbers.
+    tcp
+        Active TCP at power-up as a UR pose, m and rad.
+    gravity_m_s2
+        Of the installation, away from the earth: what its mounting implies, base axes.
+    unknown_outputs
+        RTDE outputs this controller answers with NOT_FOUND although its version knows them.
+    time_scale
+        How many times faster than real the physics runs.
+    """
+
+    model: str = "UR5e"
+    polyscope: tuple[int, int, int] = (5, 15, 0)
+    serial_number: str = "20225500001"
+    tcp: Vector6 = ZERO6
+    payload_kg: float = 0.0
+    payload_cog_m: Vector3 = (0.0, 0.0, 0.0)
+    gravity_m_s2: Vector3 = (0.0, 0.0, INSTALLED_G_M_S2)
+    joint_limit_rad: float = 2 * np.pi
+    plane: tuple[float, float, float, float] | None = None
+    unknown_outputs: frozenset[str] = frozenset()
+    time_scale: float = 1.0
+
+
+class Robot:
+    """State of the controller and the arm, advanced by `tick`.
+
+    Parameters
+    ----------
+    world
+        The shared truth; its `q` is written in every cycle. Its clock is the controller's.
+    arm
+        None makes one that stands where the world has it.
+    """
+
+    def __init__(self, world: World, settings: RobotSettings, arm: Arm | None = None) -> None:
+        self.world = world
+        self.clock = world.clock
+        self.settings = settings
+        self.arm = arm or Arm(world.dh, world.q)
+        self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
+        self.frequency_hz = 125 if settings.polyscope[0] <= 3 else 500
+        self.period_s = 1.0 / self.frequency_hz
+        self.cycle = 0
+        self.cycle_s = world.now_s
+        """When the present cycle was due, on the cell's clock."""
+        self.runtime = Runtime.STOPPED
+        self.robot_mode = RobotMode.RUNNING
+        self.safety_mode = SafetyMode.NORMAL
+        self.remote_switches = 0
+        """How often the pendant changed between local and remote control."""
+        self.loaded_program: str | None = None
+        self.payload_kg = settings.payload_kg
+        self.payload_cog_m = settings.payload_cog_m
+        self.payload_inertia: Vector6 = ZERO6
+        self.target_gravity_m_s2 = settings.gravity_m_s2
+        """What the controller takes for the acceleration away from the earth, base axes."""
+        self.tcp_offset = settings.tcp
+        self.inputs: dict[str, Value] = {}
+        self.output_ints = [0] * 48
+        self.output_doubles = [0.0] * 48
+        self.events: list[Event] = []
+        """The event log, newest last: commands accepted and refused, program, safety, start and end of motion."""
+        self.hand: Iterator[None] | None = None
+        """The operator who guides the arm by hand; one `next` per control cycle."""
+        self._remote_control = True
+        self._reduced = False
+        self._program: AnyProgram | None = None
+        self.popup: str | None = None
+        """Text of the popup that a program shows, until the operator closes it."""
+        self.wrist_sensor: Callable[[int], Array] | None = None
+        """Readings (n, 6) of a wrist sensor with bias and noise; without one `ft_raw_wrench` is exact."""
+        self._physical_s = 0.0
+        self._stopped_at_s = 0.0
+        self._later: list[tuple[float, Callable[[], object]]] = []
+        self._watchdog: tuple[str, float] | None = None
+        self._watchdog_age_s = 0.0
+        self._ft_zero = np.zeros(6)
+        self._reading: tuple[int, Vector6] | None = None
+        self._wrench: tuple[tuple[object, ...], Vector6] | None = None
+        self._poses: dict[str, tuple[Vector6, Vector6, Vector6]] = {}
+
+    @property
+    def timestamp_s(self) -> float:
+        """Controller clock on the wire; it is the cell's clock where it stamps the samples of the station's sensor."""
+        scale = 1.0 if self.wrist_sensor else self.settings.time_scale
+        return 100.0 + self.cycle * self.period_s * scale
+
+    def tick(self, t_s: float | None = None) -> None:
+        """One control cycle, due at `t_s` of the cell's clock (None: now): program, then motion."""
+        self.cycle_s = self.clock.now_s() if t_s is None else t_s
+        self.cycle += 1
+        dt = self.period_s * self.settings.time_scale
+        self._physical_s += dt
+        due = [action for when, action in self._later if when <= self._physical_s]
+        self._later = [(when, action) for when, action in self._later if when > self._physical_s]
+        for action in due:
+            action()
+        self._watch()
+        if self.hand is not None:
+            next(self.hand, None)
+        if self.runtime == Runtime.PLAYING and self._program is not None:
+            try:
+                if not self._program.step():
+                    self.stop_program("ended")
+            except (ScriptError, MotionError, ArithmeticError, ValueError) as error:
+                self.crash(str(error))
+        before, stood = self.arm.q, self.arm.at_rest
+        try:
+            self.arm.step(dt, self.cycle_s)
+        except CannotFollow as error:
+            self.protective_stop(str(error))
+        if self.arm.q is not before and self._leaves_limits(before):
+            self.protective_stop("safety limit reached")
+        if stood != self.arm.at_rest:
+            self.note("arm", "moves" if stood else "stands", q_rad=list(self.arm.q))
+        self._move_world()
+
+    def _move_world(self) -> None:
+        """Let the world follow the arm, whose time runs `time_scale` times faster."""
+        begun_s, scale, motion = self.cycle_s, self.settings.time_scale, self.arm.motion
+        at = None if motion is None else lambda t_s: motion.at((t_s - begun_s) * scale)
+        self.world.move(begun_s, self.arm.actual_q, at)
+
+    def note(self, by: str, what: str, *, accepted: bool = True, why: str = "", **detail: Any) -> None:
+        """Add an entry to the event log."""
+        self.events.append(Event(self.clock.now_ns(), self.timestamp_s, by, what, accepted, why, detail))
+
+    def _leaves_limits(self, before: Vector6) -> bool:
+        """Whether the last step crossed a safety limit outwards; a move back inside is allowed."""
+        X = self.X_flange_tcp
+        return not self.limits.allow(self.arm.q, X) and self.limits.allow(before, X)
+
+    def _watch(self) -> None:
+        """Age the watchdog by a cycle; stop the program when its client has not written in time."""
+        if self._watchdog is None or self.runtime != Runtime.PLAYING:
+            return
+        self._watchdog_age_s += self.period_s
+        name, period_s = self._watchdog
+        if self._watchdog_age_s > period_s:
+            self.stop_program(f"watchdog: {name} not written for {period_s:.3f} s")
+
+    def _after(self, seconds: float, action: Callable[[], object]) -> None:
+        self._later.append((self._physical_s + seconds, action))
+
+    @property
+    def program_name(self) -> str:
+        """Name of the program, as the dashboard shows it."""
+        return self._program.name if self._program is not None else self.loaded_program or "unnamed"
+
+    @property
+    def remote_control(self) -> bool:
+        """Whether the pendant is switched to remote control."""
+        return self._remote_control
+
+    @remote_control.setter
+    def remote_control(self, on: bool) -> None:
+        self.remote_switches += on != self._remote_control
+        self._remote_control = on
+
+    @property
+    def obstacle(self) -> str | None:
+        """Why no program may start now; None when one may."""
+        if self.robot_mode != RobotMode.RUNNING:
+            return f"robot mode {self.robot_mode.name}"
+        if self.safety_mode not in PERMITTED:
+            return f"safety mode {self.safety_mode.name}"
+        return self.arm.obstacle
+
+    def upload(self, upload: Upload, *, by: str = "script port") -> bool:
+        """Accept a program from a client, which replaces the running one; return False when it is refused."""
+        if upload.secondary:
+            self.note(by, f"secondary program {upload.name}", accepted=False, why="not interpreted")
+            return False
+        obstacle = self.obstacle if self.remote_control else "local control"
+        program: ControlScript | Program | None = None
+        detail: dict[str, Any] = {}
+        try:
+            program = self._program_of(upload)
+        except UrscriptSyntaxError as error:
+            obstacle = obstacle or f"syntax error: {error}"
+            detail = _exception(error.report, error.place)
+        self.note(by, f"program {upload.name}", accepted=obstacle is None, why=obstacle or "", **detail)
+        if obstacle or program is None:
+            return False
+        self._start_soon(program)
+        return True
+
+    def pendant_start(self, program: SwingProgram) -> bool:
+        """Start a program of the operator, which replaces the running one; return False when it is refused."""
+        obstacle = self.obstacle
+        self.note("operator", f"program {program.name}", accepted=obstacle is None, why=obstacle or "")
+        if obstacle is None:
+            self._start_soon(program)
+        return obstacle is None
+
+    def _start_soon(self, program: AnyProgram) -> None:
+        self.stop_program("replaced")
+        self._after(PROGRAM_START_S, lambda: self._start(program))
+
+    def _program_of(self, upload: Upload) -> ControlScript | Program:
+        if upload.is_control_script:
+            return ControlScript(self, upload.register_offset("int"), upload.register_offset("float"))
+        return Program(self, upload.name, upload.text)
+
+    def _start(self, program: AnyProgram) -> None:
+        if self.obstacle is not None:
+            self.note("program", f"started {program.name}", accepted=False, why=self.obstacle)
+            return
+        self.stop_program("replaced")
+        self._program = program
+        self.runtime = Runtime.PLAYING
+        self.arm.paused = False
+        self.zero_ft()  # e-Series zeroes its sensor at every program start
+        self.note("program", f"started {program.name}")
+
+    def crash(self, error: str) -> bool:
+        """End the program with a run-time error, which is logged with its place; return False when there was none."""
+        place = self._program.place if isinstance(self._program, Program) else Place()
+        return self.stop_program(f"run-time error: {error}", **_exception(error, place))
+
+    def stop_program(self, reason: str, **detail: Any) -> bool:
+        """End the program; a moving arm comes to rest by itself. Return False when there was none."""
+        program, self._program = self._program, None
+        if program is not None:
+            program.close()
+            self.note("program", f"stopped {program.name}", why=reason, **detail)
+        self.popup = None
+        self.arm.release()
+        self.arm.paused = self.safety_mode not in PERMITTED
+        self.runtime = Runtime.STOPPED
+        self._watchdog = None
+        return program is not None
+
+    def pause(self, reason: str) -> bool:
+        """Hold the program where it is, and the arm on its path; False when no program plays."""
+        if self.runtime != Runtime.PLAYING:
+            return False
+        self.runtime = Runtime.PAUSED
+        self.arm.paused = True
+        self.note("program", f"paused {self.program_name}", why=reason)
+        return True
+
+    def play(self) -> bool:
+        """Resume a paused program or start the loaded one; return False when neither is possible."""
+        if self.obstacle is not None:
+            return False
+        if self.runtime == Runtime.PAUSED:
+            self.runtime = Runtime.PLAYING
+            self.arm.paused = False
+            self.note("program", f"resumed {self.program_name}")
+            return True
+        if self.loaded_program is None or self.runtime == Runtime.PLAYING:
+            return False
+        self._start(Program(self, self.loaded_program, ""))
+        return True
+
+    @property
+    def hand_obstacle(self) -> str | None:
+        """Why the arm cannot be moved by hand now; None when it can."""
+        return "a program plays" if self.runtime == Runtime.PLAYING else self.obstacle
+
+    def hand_move(self, q: Vector6, speed_rad_s: float) -> None:
+        """Move the arm by hand, as in freedrive: no program plays, and the set-point follows the joints.
+
+        Raises
+        ------
+        ValueError
+            When a program plays or the arm has no power.
+        """
+        if self.hand_obstacle:
+            raise ValueError(f"the arm cannot be moved by hand: {self.hand_obstacle}")
+        self.arm.start(HandMove(self.arm.dh, q, speed_rad_s, HAND_ACCELERATION_RAD_S2), "hand")
+
+    def protective_stop(self, reason: str) -> None:
+        """Come to rest on the path and pause the program."""
+        if self.safety_mode in PERMITTED:
+            self._stopped_at_s = self._physical_s
+            self.set_safety(SafetyMode.PROTECTIVE_STOP, reason)
+
+    def unlock(self) -> bool:
+        """Leave the protective stop, with the program still paused; False when it is too early."""
+        if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
+            return True
+        if self._physical_s - self._stopped_at_s < UNLOCK_AFTER_S:
+            return False
+        self.set_safety(SafetyMode.NORMAL, "unlocked")
+        return True
+
+    def safeguard_stop(self, on: bool) -> None:
+        """Open or close the safeguard input. Closing it resumes the paused program."""
+        if on and self.safety_mode in PERMITTED:
+            self.set_safety(SafetyMode.SAFEGUARD_STOP, "safeguard opened")
+        elif not on and self.safety_mode == SafetyMode.SAFEGUARD_STOP:
+            self.set_safety(SafetyMode.NORMAL, "safeguard closed")
+            if self.runtime == Runtime.PAUSED:
+                self.play()
+
+    def reduced_mode(self, on: bool) -> None:
+        """Switch to the reduced safety limits or back; programs continue."""
+        self._reduced = on
+        if self.safety_mode in PERMITTED:
+            self.set_safety(SafetyMode.NORMAL, "reduced limits" if on else "normal limits")
+
+    def emergency_stop(self, pressed: bool) -> None:
+        """Press or release the emergency stop, which cuts the power and ends the program."""
+        if pressed:
+            self.set_safety(SafetyMode.ROBOT_EMERGENCY_STOP, "emergency stop pressed")
+        elif self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
+            self.set_safety(SafetyMode.NORMAL, "emergency stop released")
+
+    def restart_safety(self) -> None:
+        """Restart the safety system after a violation or fault; the arm has no power then."""
+        if self.safety_mode in (SafetyMode.VIOLATION, SafetyMode.FAULT):
+            self.set_safety(SafetyMode.NORMAL, "safety restarted")
+            self.set_mode(RobotMode.POWER_OFF)
+
+    def set_safety(self, mode: SafetyMode, reason: str) -> None:
+        """Enter a safety mode, with its effects on program and power; NORMAL means REDUCED when that is on."""
+        if mode in PERMITTED:
+            mode = SafetyMode.REDUCED if self._reduced else SafetyMode.NORMAL
+        self.safety_mode = mode
+        self.note("safety", mode.name, why=reason)
+        if mode in PERMITTED:
+            self.arm.paused = self.runtime == Runtime.PAUSED
+        elif mode in PAUSING:
+            self.arm.paused = True
+            self.pause(mode.name)
+        elif mode in POWERLESS:
+            self.set_mode(RobotMode.POWER_OFF)
+        else:
+            self.stop_program(mode.name)
+
+    def set_mode(self, mode: RobotMode) -> None:
+        """Enter a robot mode; any but RUNNING ends the program, and loss of power cancels what was under way."""
+        if mode != RobotMode.RUNNING:
+            self.stop_program(f"robot mode {mode.name}")
+        if mode not in POWERED:
+            self._later.clear()
+        self.robot_mode = mode
+        self.note("power", mode.name)
+
+    def power_off(self) -> None:
+        """Stop the program, brake, cut the power."""
+        self.set_mode(RobotMode.POWER_OFF)
+
+    def power_on(self) -> bool:
+        """Go from off to idle, brakes closed; return False when safety does not allow it."""
+        if self.safety_mode in POWERLESS:
+            return False
+        if self.robot_mode == RobotMode.POWER_OFF:
+            self.set_mode(RobotMode.POWER_ON)
+            self._after(POWER_STEP_S, lambda: self.set_mode(RobotMode.IDLE))
+        return True
+
+    def brake_release(self) -> bool:
+        """Go up to running from any mode; return False when safety does not allow it."""
+        if not self.power_on():
+            return False
+        if self.robot_mode == RobotMode.POWER_ON:
+            self._after(POWER_STEP_S, self.brake_release)
+        elif self.robot_mode == RobotMode.IDLE:
+            self._after(POWER_STEP_S, lambda: self.set_mode(RobotMode.RUNNING))
+        return True
+
+    def set_watchdog(self, name: str, min_frequency_hz: float) -> None:
+        """Stop the program when input `name` is not written at least this often (Hz)."""
+        if not min_frequency_hz > 0.0:
+            raise ScriptError(f"rtde_set_watchdog: frequency {min_frequency_hz} must be positive")
+        self._watchdog = (name, 1.0 / min_frequency_hz)
+        self._watchdog_age_s = 0.0
+
+    def write_inputs(self, fields: dict[str, Value]) -> None:
+        """Store input variables from a client."""
+        self._note_lost_command(fields)
+        self.inputs.update(fields)
+        if self._watchdog is not None and self._watchdog[0] in fields:
+            self._watchdog_age_s = 0.0
+        fraction = fields.get("speed_slider_fraction")
+        if isinstance(fraction, float) and fields.get("speed_slider_mask"):
+            self.arm.speed_fraction = min(1.0, max(0.0, fraction))
+
+    def _note_lost_command(self, fields: dict[str, Value]) -> None:
+        """Log a command that no program will read."""
+        for name in COMMAND_REGISTERS & fields.keys():
+            command = fields[name]
+            listening = self.runtime == Runtime.PLAYING and isinstance(self._program, ControlScript)
+            if not listening and command not in (0, STOP_SCRIPT, self.inputs.get(name)):
+                why = f"no control script reads it: {self.runtime.name} {self.program_name}"
+                self.note("rtde", f"command {command}", accepted=False, why=why)
+
+    def input_int(self, index: int) -> int:
+        """Present value of input_int_register_`index`."""
+        value = self.inputs.get(f"input_int_register_{index}", 0)
+        return value if isinstance(value, int) else 0
+
+    def input_double(self, index: int) -> float:
+        """Present value of input_double_register_`index`."""
+        value = self.inputs.get(f"input_double_register_{index}", 0.0)
+        return value if isinstance(value, float) else 0.0
+
+    @property
+    def tcp_offset(self) -> Vector6:
+        """Active TCP as a UR pose in the flange frame, m and rad."""
+        return self._tcp_offset
+
+    @tcp_offset.setter
+    def tcp_offset(self, pose: Vector6) -> None:
+        self._tcp_offset = pose
+        self.X_flange_tcp = matrix_of(pose)
+
+    def tcp_pose(self, which: str) -> Vector6:
+        """UR pose in base of the active TCP, at the "actual" joints or at their "target"."""
+        q = self.arm.actual_q if which == "actual" else self.arm.q
+        known = self._poses.get(which)
+        if known is None or known[0] is not q or known[1] is not self._tcp_offset:
+            known = (q, self._tcp_offset, pose_of(forward(self.arm.dh, q) @ self.X_flange_tcp))
+            self._poses[which] = known
+        return known[2]
+
+    def tcp_speed(self, which: str) -> Vector6:
+        """Velocity of the active TCP and angular velocity, m/s and rad/s, base axes."""
+        arm = self.arm
+        q, qd = (arm.actual_q, arm.actual_qd) if which == "actual" else (arm.q, arm.qd)
+        if not any(qd):
+            return ZERO6
+        twist = jacobian(arm.dh, q) @ qd
+        lever = forward(arm.dh, q)[:3, :3] @ self.X_flange_tcp[:3, 3]
+        return vector6(np.concatenate((twist[:3] + cross(twist[3:], lever), twist[3:])))
+
+    @property
+    def steady(self) -> bool:
+        """Whether the set-point has stood still for half a second."""
+        return self.arm.still_s >= STEADY_AFTER_S
+
+    def flange_wrench(self) -> Array:
+        """Return the wrench on the arm's own sensor, (6,): N and N·m, exerted on the flange, its axes and origin.
+
+        What hangs on the flange are the tool and the station's sensor.
+        """
+        truth = self.world.truth
+        felt = self.world.load_wrench(self.cycle_s) + self.world.contact_wrench(self.cycle_s)
+        force = truth.R_flange_sensor @ felt[:3]
+        torque = truth.R_flange_sensor @ felt[3:] + cross(truth.p_flange_sensor_m, force)
+        wrench: Array = np.concatenate((force, torque)) + self.world.sensor_load(self.cycle_s)
+        return wrench
+
+    def raw_wrench(self) -> Vector6:
+        """ft_raw_wrench: a new reading in every cycle, flange axes."""
+        if self.wrist_sensor is None:
+            return vector6(self.flange_wrench())
+        if self._reading is None or self._reading[0] != self.cycle:
+            self._reading = (self.cycle, vector6(self.wrist_sensor(1)[0]))
+        return self._reading[1]
+
+    def tcp_wrench(self) -> Vector6:
+        """actual_TCP_force: payload-compensated and zeroed, base axes, at the TCP, exerted on the tool."""
+        world = self.world
+        felt_now = (world.q, world.load_wrench(self.cycle_s), world.contact_wrench(self.cycle_s))
+        assumed = (self.payload_kg, self.payload_cog_m, self.target_gravity_m_s2)
+        key = (*felt_now, *assumed, self._tcp_offset, self._ft_zero)
+        if self._wrench is None or any(a is not b for a, b in zip(self._wrench[0], key, strict=True)):
+            felt = self._compensated() - self._ft_zero
+            R_base_flange = forward(self.arm.dh, world.q)[:3, :3]
+            torque = felt[3:] - cross(self.X_flange_tcp[:3, 3], felt[:3])
+            self._wrench = (key, vector6(np.concatenate((R_base_flange @ felt[:3], R_base_flange @ torque))))
+        return self._wrench[1]
+
+    def zero_ft(self) -> None:
+        """zero_ftsensor: take the present reading as zero."""
+        self._ft_zero = self._compensated()
+
+    def _compensated(self) -> Array:
+        R = forward(self.arm.dh, self.world.q)[:3, :3]
+        weight = R.T @ np.array(self.target_gravity_m_s2) * -self.payload_kg
+        rest: Array = self.flange_wrench() - np.concatenate((weight, cross(self.payload_cog_m, weight)))
+        return rest
+
+
+def _exception(text: str, place: Place) -> dict[str, Any]:
+    """Return what the event log keeps of an error in a program."""
+    return {"error": text, "line": place.line, "column": place.column}

@@ -1,0 +1,345 @@
+"""Programs from the script port, and a behavioural twin of the ur_rtde control script.
+
+The script port takes URScript text. The control script of ur_rtde is recognised by its name and not interpreted: this
+twin runs instead, one step per control cycle, with the same loop, registers and blocking behaviour. Any other program
+is run as it stands, by `ftmocks.ur.urscript.program`.
+
+Source: the control script inside ur_rtde 1.6.5 (`ScriptClient.getScript()`), read for behaviour.
+"""
+
+import math
+import re
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ftmocks.arrays import Array
+from ftmocks.kinematics import Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of
+from ftmocks.ur.motion import JointMove, LineMove, Path
+from ftmocks.ur.urscript.values import ScriptError
+
+if TYPE_CHECKING:
+    from ftmocks.ur.robot import Robot
+
+READY, DONE = 1, 2
+STOP_SCRIPT = 255
+REALTIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
+"""Commands executed in every cycle as long as the register holds their number."""
+
+MOVING = {1: "moveJ", 2: "moveJ_IK", 3: "moveL", 4: "moveL_FK", 33: "stopL", 34: "stopJ"}
+SETTING = {8: "zeroFtSensor", 17: "setPayload", 29: "setTcp", 31: "triggerProtectiveStop", 35: "setWatchdog"}
+SETTING |= {59: "setGravity", 65: "setTargetPayload", STOP_SCRIPT: "stopScript"}
+LOGGED = MOVING | SETTING
+"""Commands that enter the event log: those that move the arm or change a setting."""
+
+Steps = Generator[None, None, None]
+"""A thread of a program: one `next()` is one control cycle."""
+
+
+@dataclass(frozen=True)
+class Upload:
+    """One program from the script port."""
+
+    name: str
+    text: str
+    secondary: bool
+
+    @property
+    def is_control_script(self) -> bool:
+        """Whether the twin knows this program."""
+        return self.name == "rtde_control"
+
+    def register_offset(self, kind: str) -> int:
+        """First register of `kind` (int or float) that the script uses: 0 or 24."""
+        found = re.search(rf"# {kind} register offset\s*\n(\d+)", self.text)
+        return int(found.group(1)) if found else 0
+
+
+def take_uploads(buffer: bytearray) -> list[Upload]:
+    """Remove every complete program from `buffer`.
+
+    A program reaches from ``def`` or ``sec`` to the first ``end`` in column 0; a line of its own outside of one is a
+    program too.
+    """
+    uploads: list[Upload] = []
+    while True:
+        text = buffer.decode("latin-1")  # one character per byte
+        head = re.match(r"\s*(def|sec)\s+(\w+)\s*\([^)]*\)\s*:[^\n]*\n", text)
+        if head:
+            whole = re.compile(r"^end\b[^\n]*\n", re.MULTILINE).search(text, head.end())
+            if whole is None:
+                return uploads
+            end, name, secondary = whole.end(), head.group(2), head.group(1) == "sec"
+        else:
+            end, name, secondary = text.find("\n") + 1, "statement", False
+            if end == 0 or re.match(r"\s*(def|sec)\b[^\n]*$", text):
+                return uploads
+        if text[:end].strip() and not text[:end].lstrip().startswith("#"):
+            uploads.append(Upload(name, text[:end], secondary))
+        del buffer[:end]
+
+
+class ControlScript:
+    """Register machine with the behaviour of the ur_rtde control script.
+
+    Parameters
+    ----------
+    robot
+        The controller whose registers it reads and writes.
+    int_offset, double_offset
+        First general purpose registers in use.
+    """
+
+    name = "rtde_control"
+
+    def __init__(self, robot: "Robot", int_offset: int = 0, double_offset: int = 0) -> None:
+        self._robot = robot
+        self._int_offset, self._double_offset = int_offset, double_offset
+        self._threads: dict[str, Steps] = {}
+        self._stop_is_linear = False
+        self._writes = self._operation = 0
+        self._main = self._control_loop()
+        self._commands: dict[int, Callable[[], Steps | None]] = {
+            1: self._movej,
+            2: self._movej_ik,
+            3: self._movel,
+            4: self._movel_fk,
+            8: robot.zero_ft,
+            17: self._set_payload,
+            20: self._accept,
+            21: self._accept,
+            26: self._step_time,
+            28: self._target_waypoint,
+            29: self._set_tcp,
+            30: lambda: self._write_vector(self._inverse_kin(qnear=self._vector(6))),
+            31: self._protective_stop,
+            33: self._stop,
+            34: self._stop,
+            35: self._set_watchdog,
+            36: self._pose_within_limits,
+            37: lambda: self._write_flag(robot.limits.allow(self._vector(0), robot.X_flange_tcp)),
+            39: lambda: self._write_pose(matrix_of(self._vector(0)) @ matrix_of(self._vector(6))),
+            40: lambda: self._write_vector(robot.tcp_offset),
+            43: lambda: self._write_pose(forward(robot.arm.dh, robot.arm.actual_q) @ robot.X_flange_tcp),
+            44: lambda: self._write_pose(forward(robot.arm.dh, self._vector(0)) @ matrix_of(self._vector(6))),
+            46: lambda: self._write_vector(self._inverse_kin(qnear=robot.arm.actual_q)),
+            47: lambda: self._write_flag(robot.steady),
+            58: lambda: self._write_pose(forward(robot.arm.dh, robot.arm.actual_q)),
+            59: self._set_gravity,
+            60: lambda: self._write_flag(self._solve(robot.arm.actual_q) is not None),
+            61: lambda: self._write_flag(self._solve(self._vector(6)) is not None),
+            65: self._set_target_payload,
+        }
+
+    def step(self) -> bool:
+        """One control cycle; False when the program has ended.
+
+        Raises
+        ------
+        ScriptError, MotionError
+            When the program stops with a run-time error.
+        """
+        for thread in [("main", self._main), *self._threads.items()]:
+            name, steps = thread
+            if name != "main" and self._threads.get(name) is not steps:
+                continue  # killed in this cycle
+            try:
+                next(steps)
+            except StopIteration:
+                if name == "main":
+                    return False
+                del self._threads[name]
+        return True
+
+    def close(self) -> None:
+        """End the program and its threads; a moving arm comes to rest."""
+        for steps in (self._main, *self._threads.values()):
+            steps.close()
+        self._threads.clear()
+
+    def _control_loop(self) -> Steps:
+        self._report_async(-1)
+        self._write_int(0, READY)
+        executing = False
+        while True:
+            command = self._read_int(0)
+            if command in REALTIME:
+                yield from self._execute(command)
+                self._write_int(0, READY)
+            elif command == 0:
+                executing = False
+                self._write_int(0, READY)
+            else:
+                if not executing:
+                    if command in LOGGED:
+                        self._robot.note("rtde", f"command {command}", why=LOGGED[command])
+                    if command == STOP_SCRIPT:
+                        return
+                    yield from self._execute(command)
+                    self._write_int(0, DONE)
+                executing = True
+            yield
+
+    def _execute(self, command: int) -> Steps:
+        handler = self._commands.get(command)
+        if handler is None:
+            raise ScriptError(f"command {command} is not modelled by this emulator")
+        steps = handler()
+        if steps is not None:
+            yield from steps
+
+    def _accept(self) -> None:
+        """Ignore a setting that has no counterpart here."""
+
+    def _read_int(self, index: int) -> int:
+        return self._robot.input_int(index + self._int_offset)
+
+    def _read(self, index: int) -> float:
+        value = self._robot.input_double(index + self._double_offset)
+        if not math.isfinite(value):
+            raise ScriptError(f"input_double_register_{index + self._double_offset} holds {value}")
+        return value
+
+    def _vector(self, first: int) -> Vector6:
+        a, b, c, d, e, f = (self._read(first + i) for i in range(6))
+        return (a, b, c, d, e, f)
+
+    def _write_int(self, index: int, value: int) -> None:
+        self._robot.output_ints[index + self._int_offset] = value
+
+    def _write_flag(self, value: bool) -> None:
+        self._write_int(1, int(value))
+
+    def _write_vector(self, values: Vector6) -> None:
+        first = self._double_offset
+        self._robot.output_doubles[first : first + 6] = values
+
+    def _write_pose(self, X: Array) -> None:
+        self._write_vector(pose_of(X))
+
+    def _report_async(self, progress: int) -> None:
+        """Output register 2: operation id, change counter, running bit and progress; -1 is the end, 0 a new start."""
+        self._writes = (self._writes + 1) % 128
+        if progress == 0:
+            self._operation = (self._operation + 1) % 128
+        running = 0x8000 | min(progress, 0x7FFF) if progress >= 0 else 0
+        self._write_int(2, self._operation << 24 | self._writes << 16 | running)
+
+    def _movej(self) -> Steps:
+        return self._move(JointMove(self._robot.arm.dh, self._vector(0), self._read(6), self._read(7)))
+
+    def _movej_ik(self) -> Steps:
+        goal = self._inverse_kin(qnear=self._robot.arm.actual_q)
+        return self._move(JointMove(self._robot.arm.dh, goal, self._read(6), self._read(7)))
+
+    def _movel(self) -> Steps:
+        return self._move_line(matrix_of(self._vector(0)))
+
+    def _movel_fk(self) -> Steps:
+        return self._move_line(forward(self._robot.arm.dh, self._vector(0)) @ self._robot.X_flange_tcp)
+
+    def _move_line(self, goal: Array) -> Steps:
+        robot = self._robot
+        return self._move(LineMove(robot.arm.dh, robot.X_flange_tcp, goal, self._read(6), self._read(7)))
+
+    def _move(self, path: Path) -> Steps:
+        self._kill_async_move()
+        if self._read_int(1) == 1:
+            self._threads["move"] = self._move_thread(path)
+        else:
+            yield from self._follow(path, "main")
+
+    def _move_thread(self, path: Path) -> Steps:
+        self._report_async(0)
+        yield from self._follow(path, "move")
+        self._report_async(-1)
+
+    def _follow(self, path: Path, owner: str) -> Steps:
+        arm = self._robot.arm
+        arm.start(path, owner)
+        yield from arm.until_finished(owner)
+
+    def _kill_async_move(self) -> None:
+        if self._kill("move"):
+            self._report_async(-1)
+
+    def _kill(self, name: str) -> bool:
+        thread = self._threads.pop(name, None)
+        if thread is None:
+            return False
+        thread.close()
+        return True
+
+    def _stop(self) -> Steps:
+        """Both stops: an asynchronous one is always linear, and so is every synchronous one after it."""
+        deceleration = self._read(0)
+        if self._kill("stop"):
+            self._report_async(-1)
+        else:
+            self._kill_async_move()
+        if self._read_int(1) == 1:
+            self._stop_is_linear = True
+            self._threads["stop"] = self._stop_thread(deceleration)
+        else:
+            yield from self._brake(deceleration, "main")
+
+    def _stop_thread(self, deceleration: float) -> Steps:
+        self._report_async(0)
+        yield from self._brake(deceleration, "stop")
+        self._report_async(-1)
+
+    def _brake(self, deceleration: float, owner: str) -> Steps:
+        arm = self._robot.arm
+        if self._stop_is_linear:
+            arm.stop_tool(deceleration, owner)
+        else:
+            arm.stop_joints(deceleration, owner)
+        yield from arm.until_finished(owner)
+
+    def _protective_stop(self) -> Steps:
+        self._robot.protective_stop("requested by the program")
+        yield  # paused from here on: the command is not reported done
+
+    def _solve(self, qnear: Vector6) -> Vector6 | None:
+        X_base_flange = matrix_of(self._vector(0)) @ inverse_matrix(self._robot.X_flange_tcp)
+        return inverse(self._robot.arm.dh, X_base_flange, qnear)
+
+    def _inverse_kin(self, qnear: Vector6) -> Vector6:
+        q = self._solve(qnear)
+        if q is None:
+            raise ScriptError(f"get_inverse_kin: no solution for the pose {list(self._vector(0))}")
+        return q
+
+    def _pose_within_limits(self) -> None:
+        q = self._solve(self._robot.arm.actual_q)
+        self._write_flag(q is not None and self._robot.limits.allow(q, self._robot.X_flange_tcp))
+
+    def _target_waypoint(self) -> None:
+        self._write_pose(forward(self._robot.arm.dh, self._robot.arm.q) @ self._robot.X_flange_tcp)
+
+    def _set_payload(self) -> None:
+        self._robot.payload_kg = self._read(0)
+        self._set_cog()
+
+    def _set_target_payload(self) -> None:
+        self._set_payload()
+        a, b, c, d, e, f = (self._read(4 + i) for i in range(6))
+        self._robot.payload_inertia = (a, b, c, d, e, f)
+        self._robot.zero_ft()
+
+    def _set_cog(self) -> None:
+        cog = (self._read(1), self._read(2), self._read(3))
+        if any(cog):  # all zero keeps the old one: a special case of the script
+            self._robot.payload_cog_m = cog
+
+    def _set_tcp(self) -> None:
+        self._robot.tcp_offset = self._vector(0)
+
+    def _set_gravity(self) -> None:
+        self._robot.target_gravity_m_s2 = (self._read(0), self._read(1), self._read(2))
+
+    def _set_watchdog(self) -> None:
+        self._robot.set_watchdog(f"input_int_register_{self._int_offset}", self._read(0))
+
+    def _step_time(self) -> None:
+        self._robot.output_doubles[self._double_offset] = self._robot.period_s

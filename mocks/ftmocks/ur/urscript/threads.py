@@ -1,0 +1,65 @@
+"""The threads of a URScript program, what they see, and how they leave a block."""
+
+from collections.abc import Generator
+from dataclasses import dataclass
+
+from ftmocks.ur.urscript.syntax import Function, Place
+from ftmocks.ur.urscript.values import Value
+
+Run = Generator[None, None, Value]
+"""What is being computed; each `next()` is one control cycle."""
+
+
+class Halt(Exception):
+    """The program ends itself."""
+
+
+class Leave(Exception):
+    """A statement that leaves the block it is in: break, continue, return."""
+
+    def __init__(self, word: str, value: Value = None) -> None:
+        self.word, self.value = word, value
+
+
+class Thread:
+    """A thread of a program: its name for the arm, how far it is, and the place in the text."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.steps: Run | None = None
+        self.place = Place()
+
+    @property
+    def is_done(self) -> bool:
+        """Whether it has ended or was killed."""
+        return self.steps is None
+
+    def step(self) -> None:
+        """Run one control cycle."""
+        try:
+            if self.steps is not None:
+                next(self.steps)
+        except StopIteration:
+            self.steps = None
+
+    def kill(self) -> None:
+        """End it; an arm that it moves slows down by itself."""
+        steps, self.steps = self.steps, None
+        if steps is not None:
+            steps.close()
+
+
+@dataclass
+class Scope:
+    """Where a statement runs: the thread, the variables of its own function, and the functions it sees."""
+
+    thread: Thread
+    function: Function
+    outer: "Scope | None"
+    variables: dict[str, Value]
+
+    def find(self, name: str) -> "tuple[Function, Scope] | None":
+        """Find a function and the scope in which it is defined."""
+        if name in self.function.functions:
+            return self.function.functions[name], self
+        return self.outer.find(name) if self.outer else None

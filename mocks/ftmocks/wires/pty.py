@@ -1,0 +1,151 @@
+"""A sensor behind a pseudo-terminal, which answers and streams through a faulty wire.
+
+Ref: pty(7), termios(3). The slave end stays open here, or the master would read EIO when a client closes its end.
+
+A pty has no parity. Where the line has, a client requests marks with INPCK and PARMRK, as on a real port. The emulator
+then clears PARMRK, or the kernel would double the marks. While INPCK is set, the emulator does all marking. Bytes in
+the terminal while the client changes its flags arrive in either form.
+
+Does not model: line speed (a pty has none), INPCK without PARMRK, IGNPAR, parity of what the client sends, modem lines,
+breaks.
+"""
+
+import os
+import termios
+import tty
+from abc import abstractmethod
+from bisect import bisect_left
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ftmocks.wires.device import Device
+from ftmocks.wires.faults import Frame
+from ftmocks.wires.uart import marked
+
+
+@dataclass(eq=False)
+class PtyDevice(Device[Frame]):
+    """Base of the emulated serial and CAN sensors: opening, unplugging, reading, and writing that never blocks.
+
+    `dropped_frames` counts those the terminal had no room for, because the client does not read.
+    """
+
+    has_parity = False  # of the line: whether wrong parity can be marked
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.dropped_frames = 0
+        self._slave = -1
+        self._unsent = b""
+        self._begun = b""  # the rest of a mark that left in part
+
+    def start(self) -> str:
+        """Power the device up behind a new pseudo-terminal.
+
+        Returns
+        -------
+        Path a client opens, for example ``/dev/pts/3``.
+        """
+        self._require_stopped()
+        self._file, self._slave = os.openpty()
+        tty.setraw(self._file)
+        tty.setraw(self._slave)  # else the terminal echoes the device's own bytes back to it
+        os.set_blocking(self._file, False)
+        self._unsent = self._begun = b""
+        path = os.ttyname(self._slave)
+        self._launch()
+        return path
+
+    @abstractmethod
+    def _received(self, data: bytes) -> None:
+        """Take what the client wrote, in whatever pieces it arrives."""
+
+    @abstractmethod
+    def _samples(self, count: int) -> list[Frame]:
+        """Return the frames of that many samples of the stream."""
+
+    @abstractmethod
+    def _encode(self, frames: list[Frame]) -> bytes:
+        """Return what the client reads of these frames, and what else the adapter has for it."""
+
+    def _receive(self) -> None:
+        self._received(os.read(self._file, 4096))
+
+    def _sample(self, count: int) -> None:
+        self._wire.put(self._samples(count))
+
+    def _deliver(self, frames: list[Frame]) -> None:
+        data = self._encode(frames)
+        if data and self._send(data, len(data)):
+            self.dropped_frames += len(frames)
+
+    def _close(self) -> None:
+        os.close(self._file)
+        os.close(self._slave)
+
+    def _send(self, data: bytes, record_bytes: int) -> int:
+        """Write without blocking; when the client does not read, drop whole records and keep none.
+
+        Parameters
+        ----------
+        data
+            Whole records; the first may lack bytes at its start.
+        record_bytes
+            Length of a record: a record whose first bytes left is finished before the next one.
+
+        Returns
+        -------
+        Number of records dropped.
+        """
+        self._finish_record()
+        rest = data if self._unsent else data[self._write(data) :]
+        if not rest:
+            return 0
+        if not self._unsent:
+            self._unsent = rest[: len(rest) % record_bytes]
+        return len(rest) // record_bytes
+
+    @property
+    def _unfinished(self) -> bool:
+        return bool(self._unsent or self._begun)
+
+    def _finish_record(self) -> None:
+        if self._unfinished:
+            self._unsent = self._unsent[self._write(self._unsent) :]
+
+    def _fall_silent(self) -> None:
+        """End the stream and forget what is on its way, a record that left in part too."""
+        self._pacer.stop()
+        self._wire.clear()
+        self._unsent = b""
+
+    def _write(self, data: bytes) -> int:
+        """Write without blocking; return how many bytes are gone, with one whose mark left in part."""
+        # The flags are read before every write: while PARMRK is on, the kernel would double what is marked here.
+        form: Callable[[bytes], bytes] = marked if self.has_parity and self._client_wants_marks() else bytes
+        wire = self._begun + form(data)
+        try:
+            wire_sent = os.write(self._file, wire)
+        except BlockingIOError:
+            return 0
+        if wire_sent == len(wire):
+            self._begun = b""
+            return len(data)
+        wire_sent -= len(self._begun)
+        if wire_sent < 0:
+            self._begun = self._begun[wire_sent:]
+            return 0
+        sent = bisect_left(range(len(data)), wire_sent, key=lambda count: len(form(data[:count])))
+        self._begun = form(data[:sent])[wire_sent:]
+        return sent
+
+    def _client_wants_marks(self) -> bool:
+        """Whether wrong parity must be marked; the kernel marks nothing any more when this returns True."""
+        attributes = termios.tcgetattr(self._file)  # the client's: both ends have the same
+        flags = attributes[0]
+        if flags & (termios.INPCK | termios.IGNPAR) != termios.INPCK:
+            return False
+        if flags & termios.PARMRK:
+            attributes[0] = flags & ~termios.PARMRK
+            termios.tcsetattr(self._file, termios.TCSANOW, attributes)
+        return True

@@ -1,0 +1,73 @@
+"""The two sorts of pseudo-terminal sensors: on a serial line, and on a CAN bus behind an adapter."""
+
+import random
+from abc import abstractmethod
+from dataclasses import KW_ONLY, dataclass
+
+from ftmocks.wires.pty import PtyDevice
+from ftmocks.wires.slcan import CanFrame, SlcanAdapter
+
+
+class SerialSensor(PtyDevice[bytes]):
+    """A sensor on a serial line."""
+
+    def _encode(self, frames: list[bytes]) -> bytes:
+        return b"".join(frames)
+
+
+@dataclass(eq=False)
+class CanSensor(PtyDevice[CanFrame]):
+    """A sensor on a CAN bus, and the adapter a client opens.
+
+    Parameters
+    ----------
+    bitrate
+        Of the sensor; a client at another one gets no answer.
+    """
+
+    _: KW_ONLY
+    bitrate: int = 1_000_000
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._wire.foreign = self._foreign_frame
+        self._adapter = SlcanAdapter()
+        self._answers = b""
+
+    @abstractmethod
+    def _boot(self) -> None:
+        """Set the state the sensor has after power-up."""
+
+    @abstractmethod
+    def _answer(self, request: CanFrame) -> list[CanFrame]:
+        """Answer to a frame on the bus; nothing when it is no request."""
+
+    @abstractmethod
+    def _foreign_frame(self, rng: random.Random) -> CanFrame:
+        """Another node's frame, which a hasty client could take for the sensor's."""
+
+    def _power_up(self) -> None:
+        self._adapter = SlcanAdapter()
+        self._answers = b""
+        self._wire.clear()
+        self._boot()
+
+    def _restart(self) -> None:
+        self._wire.clear()
+        self._boot()
+
+    def _received(self, data: bytes) -> None:
+        answers, frames = self._adapter.feed(data)
+        self._answers += answers
+        for frame in frames:
+            if self._adapter.bitrate == self.bitrate:
+                self._wire.put(self._answer(frame))
+            else:
+                self._adapter.bus_error = True
+
+    def _encode(self, frames: list[CanFrame]) -> bytes:
+        data = self._answers
+        self._answers = b""
+        if self._adapter.bitrate == self.bitrate:
+            data += b"".join(self._adapter.line(frame) for frame in frames)
+        return data

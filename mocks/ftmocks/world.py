@@ -1,0 +1,359 @@
+"""The truth of one robot cell: arm, gravity, payload, sensor mounting, bias and noise.
+
+Every quantity that a calibration has to find is drawn or set here and nowhere else. A wrench is exerted *on the sensor*
+by what hangs on it or pushes on it, about the sensor origin, force first. A sensor whose z axis points down reads
+``+m g`` on z.
+"""
+
+import math
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ftmocks.arrays import Array
+from ftmocks.clock import CellClock
+from ftmocks.disturbances import Contact, Drift
+from ftmocks.inertia import drawn_gyration, moved_load
+from ftmocks.kinematics import Dh, FlangeMotion, JointState, Vector6, cross, flange_motion, forward, rotation
+
+MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
+"""Tilt beta of the base for each mounting."""
+
+AHEAD_S = 0.02
+"""The arm of a controller that has run no cycle for so long stands still."""
+BURST_GAP_S = 0.001
+"""A burst begins so soon behind the last one, where it is measured from: half the work."""
+REMEMBERED = 8
+"""Control cycles whose motion is known: a sensor may be later than the controller."""
+_MINUTE_S = 60.0
+_NOTHING: Array = np.zeros(6)
+
+
+def _zero3() -> Array:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The true quantities of the cell. Angles in rad, SI units, axes in the names; noise per reading."""
+
+    mass_kg: float
+    p_sensor_com_m: Array
+    R_flange_sensor: Array
+    tilt_alpha_rad: float
+    tilt_beta_rad: float
+    force_bias_N: Array
+    torque_bias_Nm: Array
+    noise_force_N: float = 0.05
+    noise_torque_Nm: float = 0.002
+    force_drift_N_min: Array = field(default_factory=_zero3)
+    torque_drift_Nm_min: Array = field(default_factory=_zero3)
+    g_m_s2: float = 9.80665
+    p_flange_sensor_m: Array = field(default_factory=_zero3)
+    gyration_m2: Array | None = None
+    """Inertia tensor per mass about the centre of mass, (3, 3), sensor axes; None for a payload without inertia."""
+    sensor_mass_kg: float = 0.0
+    """Sensor and adapter, which the sensor does not feel: a point mass halfway between flange and sensor origin."""
+
+    @classmethod
+    def drawn(cls, seed: int, mount: str = "floor") -> "Truth":
+        """Draw a plausible cell: 0.5 to 2.5 kg, centre of mass 30 to 100 mm away, any yaw, base up to 2 degrees off."""
+        rng = np.random.default_rng([seed, 1])
+        reach = rng.uniform(0.030, 0.100)
+        direction = np.append(rng.normal(scale=0.15, size=2), 1.0)
+        tilt = np.radians(rng.uniform(0.0, 2.0)) * _on_circle(rng)
+        lean = rotation(np.append(np.radians(rng.uniform(0.0, 3.0)) * _on_circle(rng), 0.0))
+        return cls(
+            mass_kg=float(rng.uniform(0.5, 2.5)),
+            p_sensor_com_m=reach * direction / np.linalg.norm(direction),
+            R_flange_sensor=rotation([0.0, 0.0, rng.uniform(-math.pi, math.pi)]) @ lean,
+            tilt_alpha_rad=float(tilt[0]),
+            tilt_beta_rad=math.remainder(MOUNTS_RAD[mount] + float(tilt[1]), 2 * math.pi),
+            force_bias_N=rng.uniform(-15.0, 15.0, 3),
+            torque_bias_Nm=rng.uniform(-1.0, 1.0, 3),
+            gyration_m2=drawn_gyration(np.random.default_rng([seed, 5]), reach),
+        )
+
+    @property
+    def weight_N(self) -> float:
+        """Weight of what hangs on the sensor."""
+        return self.mass_kg * self.g_m_s2
+
+    @property
+    def inertia_kg_m2(self) -> Array | None:
+        """Inertia tensor about the centre of mass, (3, 3), sensor axes; None for a payload without inertia."""
+        return None if self.gyration_m2 is None else self.mass_kg * self.gyration_m2
+
+    @property
+    def gravity_m_s2(self) -> Array:
+        """Acceleration of gravity in base axes, (3,): ``R_base_gravity = Ry(beta) Rx(alpha)`` applied to -z."""
+        return -self.g_m_s2 * up_of(self.tilt_alpha_rad, self.tilt_beta_rad)
+
+    @property
+    def gravity_force_base_N(self) -> Array:
+        """Weight as a force vector in base axes, (3,)."""
+        return self.mass_kg * self.gravity_m_s2
+
+    @property
+    def p_flange_sensor_com_m(self) -> Array:
+        """Centre of mass of sensor and adapter in the flange frame, (3,)."""
+        return self.p_flange_sensor_m / 2
+
+    @property
+    def payload_kg(self) -> float:
+        """Mass of all that hangs on the flange: tool, sensor and adapter."""
+        return self.mass_kg + self.sensor_mass_kg
+
+    @property
+    def payload_cog_m(self) -> Array:
+        """Centre of mass of all that hangs on the flange, (3,), flange frame; zeros where nothing does."""
+        p_flange_tool_m = self.p_flange_sensor_m + self.R_flange_sensor @ self.p_sensor_com_m
+        moment = self.mass_kg * p_flange_tool_m + self.sensor_mass_kg * self.p_flange_sensor_com_m
+        return moment / (self.payload_kg or 1.0)
+
+    def to_json(self) -> dict[str, Any]:
+        """The truth as plain numbers and row-major lists."""
+        return {
+            "mass_kg": self.mass_kg,
+            "weight_N": self.weight_N,
+            "gravity_force_base_N": self.gravity_force_base_N.tolist(),
+            "R_flange_sensor": self.R_flange_sensor.tolist(),
+            "force_bias_N": self.force_bias_N.tolist(),
+            "torque_bias_Nm": self.torque_bias_Nm.tolist(),
+            "p_sensor_com_m": self.p_sensor_com_m.tolist(),
+            "inertia_kg_m2": None if self.inertia_kg_m2 is None else self.inertia_kg_m2.tolist(),
+            "p_flange_sensor_m": self.p_flange_sensor_m.tolist(),
+            "sensor_mass_kg": self.sensor_mass_kg,
+            "payload_kg": self.payload_kg,
+            "payload_cog_m": self.payload_cog_m.tolist(),
+            "tilt_alpha_rad": self.tilt_alpha_rad,
+            "tilt_beta_rad": self.tilt_beta_rad,
+            "noise_force_N": self.noise_force_N,
+            "noise_torque_Nm": self.noise_torque_Nm,
+            "force_drift_N_min": self.force_drift_N_min.tolist(),
+            "torque_drift_Nm_min": self.torque_drift_Nm_min.tolist(),
+            "g_m_s2": self.g_m_s2,
+        }
+
+
+def up_of(alpha_rad: float, beta_rad: float) -> Array:
+    """Return the direction away from the earth in base axes, (3,), for a tilted base."""
+    a, b = alpha_rad, beta_rad
+    return np.array([math.cos(a) * math.sin(b), -math.sin(a), math.cos(a) * math.cos(b)])
+
+
+def _on_circle(rng: np.random.Generator) -> Array:
+    angle = rng.uniform(-math.pi, math.pi)
+    return np.array([math.cos(angle), math.sin(angle)])
+
+
+class Cycle(NamedTuple):
+    """What the arm does from a control cycle on."""
+
+    t_s: float
+    """When, on the cell's clock."""
+    q: Vector6
+    motion: Callable[[float], JointState] | None
+    """Joints at a time of the cell's clock; None for an arm that stands at `q`."""
+
+
+class World:
+    """The cell at this instant. The arm emulator moves it; sensor emulators call `measure` from their own threads.
+
+    A change replaces a value as a whole, so that other threads read one instant.
+
+    Parameters
+    ----------
+    truth
+        The true quantities.
+    dh
+        The real arm, calibration deviations included.
+    q
+        Joint angles (rad) to start with.
+    seed
+        Seed of the noise.
+    clock
+        Of the cell, for drift and pushes, whatever the speed of the arm; None makes one.
+    """
+
+    def __init__(self, truth: Truth, dh: Dh, q: Vector6, seed: int = 0, clock: CellClock | None = None) -> None:
+        self.clock = clock or CellClock()
+        self.truth = truth
+        self.dh = dh
+        self.q = q
+        self.contacts: dict[str, Contact] = {}
+        """What touches the tool, by name."""
+        self.drifts: tuple[Drift, ...] = ()
+        """Drifts of the zero besides the drift of the truth."""
+        self._t0_s = self.now_s
+        self._lock = threading.Lock()
+        self._noise = np.random.default_rng([seed, 2])
+        self._noise_sd = np.repeat([truth.noise_force_N, truth.noise_torque_Nm], 3)
+        self._still: tuple[Vector6, Truth, tuple[Array, Array]] | None = None
+        self._moved: tuple[JointState, FlangeMotion] | None = None
+        self._override: Array | None = None
+        self._known: tuple[float, Array] = (-math.inf, _NOTHING)
+        """The truth at the end of the last burst, where the next one begins."""
+
+    @property
+    def now_s(self) -> float:
+        """The clock of pushes and drift."""
+        return self.clock.now_s()
+
+    @property
+    def q(self) -> Vector6:
+        """Actual joint angles (rad) in the last control cycle; setting them lets the arm stand there."""
+        return self._cycles[-1].q
+
+    @q.setter
+    def q(self, q: Vector6) -> None:
+        self._cycles: tuple[Cycle, ...] = (Cycle(-math.inf, q, None),)
+
+    def move(self, t_s: float, q: Vector6, motion: Callable[[float], JointState] | None) -> None:
+        """Set what the arm does from a control cycle on, see `Cycle`."""
+        last = self._cycles[-1]
+        if motion is not None or last.motion is not None or last.q is not q:
+            self._cycles = (*self._cycles[1 - REMEMBERED :], Cycle(t_s, q, motion))
+
+    def true_wrench(self, t_s: float | None = None) -> Array:
+        """Return the wrench on the sensor without noise, (6,): N and N·m, sensor axes, bias and drift included.
+
+        Parameters
+        ----------
+        t_s
+            On the cell's clock, near the present; None for now.
+        """
+        t_s = self.now_s if t_s is None else t_s
+        return self.load_wrench(t_s) + self.contact_wrench(t_s) + self._bias(t_s)
+
+    def _bias(self, t_s: float) -> Array:
+        truth = self.truth
+        minutes = (t_s - self._t0_s) / _MINUTE_S
+        force_bias_N = truth.force_bias_N + minutes * truth.force_drift_N_min
+        torque_bias_Nm = truth.torque_bias_Nm + minutes * truth.torque_drift_Nm_min
+        return np.concatenate((force_bias_N, torque_bias_Nm)) + sum((d.at(t_s) for d in self.drifts), _NOTHING)
+
+    def _joints(self, t_s: float) -> tuple[JointState, bool]:
+        """Return the joints at a time, and whether they move."""
+        cycles = self._cycles
+        cycle = next((cycle for cycle in reversed(cycles) if cycle.t_s <= t_s), cycles[0])
+        if cycle.motion is None or t_s > cycle.t_s + AHEAD_S:
+            return JointState(cycle.q), False
+        return cycle.motion(t_s), True
+
+    def load_wrench(self, t_s: float | None = None) -> Array:
+        """Return the wrench of gravity and inertia, (6,), sensor axes, about the sensor origin; time as above."""
+        joints, moves = self._joints(self.now_s if t_s is None else t_s)
+        if not moves:
+            return self._still_loads(joints.q)[0]
+        truth = self.truth
+        if truth.gyration_m2 is None:
+            return _weight(truth, forward(self.dh, joints.q)[:3, :3])
+        load: Array = truth.mass_kg * moved_load(
+            self._motion(joints),
+            truth.gravity_m_s2,
+            truth.R_flange_sensor,
+            truth.p_flange_sensor_m,
+            truth.p_sensor_com_m,
+            truth.gyration_m2,
+        )
+        return load
+
+    def sensor_load(self, t_s: float) -> Array:
+        """Return the wrench of sensor and adapter on the flange, (6,), its axes and origin; time as above."""
+        joints, moves = self._joints(t_s)
+        truth = self.truth
+        if not moves or truth.gyration_m2 is None:
+            return self._still_loads(joints.q)[1]
+        at_flange = np.eye(3), np.zeros(3), truth.p_flange_sensor_com_m, np.zeros((3, 3))
+        load: Array = truth.sensor_mass_kg * moved_load(self._motion(joints), truth.gravity_m_s2, *at_flange)
+        return load
+
+    def _still_loads(self, q: Vector6) -> tuple[Array, Array]:
+        """Return the wrench of gravity alone on the sensor, and that of the sensor on the flange."""
+        truth, known = self.truth, self._still
+        if known is not None and known[0] is q and known[1] is truth:
+            return known[2]
+        R_base_flange = forward(self.dh, q)[:3, :3]
+        sensor_N = truth.sensor_mass_kg * R_base_flange.T @ truth.gravity_m_s2
+        sensor_load = np.concatenate((sensor_N, cross(truth.p_flange_sensor_com_m, sensor_N)))
+        loads = (_weight(truth, R_base_flange), sensor_load)
+        self._still = (q, truth, loads)
+        return loads
+
+    def _motion(self, joints: JointState) -> FlangeMotion:
+        """Return the motion of the flange, which one control cycle needs several times."""
+        known = self._moved
+        if known is None or known[0] != joints:
+            self._moved = known = (joints, flange_motion(self.dh, joints))
+        return known[1]
+
+    def contact_wrench(self, t_s: float | None = None) -> Array:
+        """Return the wrench of all contacts, (6,), sensor axes, about the sensor origin; time as above."""
+        contacts = self.contacts
+        if not contacts:
+            return _NOTHING
+        t_s = self.now_s if t_s is None else t_s
+        q = self._joints(t_s)[0].q
+        R_base_sensor = forward(self.dh, q)[:3, :3] @ self.truth.R_flange_sensor
+        felt = {name: contact.wrench(t_s, q, R_base_sensor) for name, contact in contacts.items()}
+        return sum((wrench for wrench in felt.values() if wrench is not None), _NOTHING)
+
+    def measure(self, n: int) -> Array:
+        """Return `n` successive noisy readings at this instant, (n, 6): N and N·m, sensor axes. Thread-safe."""
+        return self.measure_at(np.full(n, self.now_s))
+
+    def measure_at(self, t_s: Array) -> Array:
+        """Return noisy readings at rising times near the present, (n, 6): N and N·m, sensor axes. Thread-safe.
+
+        Parameters
+        ----------
+        t_s
+            (n,) on the cell's clock. The truth is exact at the ends of a burst, and linear in between.
+        """
+        override = self._override
+        if override is not None:
+            return np.tile(override, (len(t_s), 1))
+        with self._lock:
+            noise = self._noise.standard_normal((len(t_s), 6))
+        readings: Array = self._true_wrenches(t_s) + noise * self._noise_sd
+        return readings
+
+    def _true_wrenches(self, t_s: Array) -> Array:
+        """Return the wrench on the sensor at these times, (n, 6), or (6,) where it is the same."""
+        first_s, last_s = float(t_s[0]), float(t_s[-1])
+        last = self.true_wrench(last_s)
+        if first_s == last_s or not (self._joints(last_s)[1] or self.contacts):
+            return last
+        known_s, known = self._known
+        if not 0.0 <= first_s - known_s < BURST_GAP_S:
+            known_s, known = first_s, self.true_wrench(first_s)
+        self._known = (last_s, last)
+        wrenches: Array = known + np.outer((t_s - known_s) / (last_s - known_s), last - known)
+        return wrenches
+
+    def touch(self, name: str, contact: Contact | None) -> None:
+        """Set the contact of that name; None removes it."""
+        others = {key: value for key, value in self.contacts.items() if key != name}
+        self.contacts = others if contact is None else {**others, name: contact}
+
+    def shift_payload(self, mass_kg: float | None, p_sensor_com_m: Array | None) -> None:
+        """Change the true payload from now on, as when a part is lost, added or slips."""
+        if mass_kg is not None:
+            self.truth = replace(self.truth, mass_kg=mass_kg)
+        if p_sensor_com_m is not None:
+            self.truth = replace(self.truth, p_sensor_com_m=p_sensor_com_m)
+
+    def read_always(self, reading: Array | None) -> None:
+        """Fix every reading to this one, (6,); None measures again."""
+        self._override = reading
+
+
+def _weight(truth: Truth, R_base_flange: Array) -> Array:
+    """Return the wrench of gravity alone, (6,), sensor axes, about the sensor origin."""
+    R_base_sensor = R_base_flange @ truth.R_flange_sensor
+    force_N = R_base_sensor.T @ truth.gravity_force_base_N
+    return np.concatenate((force_N, cross(truth.p_sensor_com_m, force_N)))
