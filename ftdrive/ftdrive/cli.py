@@ -11,7 +11,7 @@ from io import StringIO
 
 import click
 
-from ftdrive import __version__, _siblings
+from ftdrive import __version__
 
 # A command, its module, its line in the help. The module is imported only when the command is called: help is fast.
 _COMMANDS = {
@@ -147,7 +147,6 @@ def main() -> int:
 def run(arguments: Sequence[str]) -> int:
     """Run one command line without the program's name; errors are printed, the exit code is returned."""
     try:
-        _siblings.check()
         return int(cli.main(list(arguments), prog_name="ftdrive", standalone_mode=False) or 0)
     except click.ClickException as error:
         from ftdrive.terminal.console import in_whole_words

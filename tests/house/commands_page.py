@@ -14,7 +14,7 @@ _HEAD = """\
 
 This page is generated: run `uv run python tests/house/commands_page.py` after a change of an option. A module here
 reads the options of one command, makes one call and prints text or JSON. Configuration, exit codes and file formats are
-described in [../README.md](../README.md).
+described in [../README.md](../../ftdrive/README.md).
 """
 
 

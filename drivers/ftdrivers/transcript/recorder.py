@@ -14,8 +14,9 @@ time of the driver's clock as `t_ns`:
                                     "mean_force_N", "mean_torque_Nm" and more
 
 Where `parity_marks` is true, received bytes contain the marks of `drivers/ftdrivers/wires/parity.py`; older transcripts
-lack the field and the marks. An slcan adapter is recorded as a serial port. The frames of other CAN interfaces are written
-as lines of slcan, and an emulated slcan adapter plays them. Commands of python-can to that adapter are not compared.
+lack the field and the marks. An slcan adapter is recorded as a serial port. The frames of other CAN interfaces are
+written as lines of slcan, and an emulated slcan adapter plays them. Commands of
+python-can to that adapter are not compared.
 """
 
 import json
