@@ -17,7 +17,7 @@ import numpy as np
 from ftcalib import CalibrationDataset, CalibrationResult, solve
 from ftcalib.errors import BadDataset, CalibError
 from ftcalib.extras.difference import difference
-from ftcalib.files import read_object, write_new
+from ftcalib.files import object_of, object_text, read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
 from ftdrive import __version__
 from ftdrive.checks.plausibility import judged
@@ -93,12 +93,8 @@ def solved(dataset: bytes, task: bytes) -> bytes:
     CalibError
     """
     solve_as_the_run = solver(task)
-    try:
-        document = json.loads(dataset)
-    except ValueError as error:
-        raise BadDataset(f"the dataset is not valid JSON ({error}): the file is damaged") from error
-    result = solve_as_the_run(CalibrationDataset.from_dict(document))
-    return (json.dumps(result.to_dict(), allow_nan=False, indent=1) + "\n").encode()
+    result = solve_as_the_run(CalibrationDataset.from_dict(object_of(dataset, BadDataset)))
+    return object_text(result.to_dict()).encode()
 
 
 @dataclass(frozen=True, slots=True)

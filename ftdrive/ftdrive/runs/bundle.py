@@ -11,11 +11,11 @@ import json
 import os
 import platform
 import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from errno import EINVAL
 from importlib.metadata import distributions
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -27,7 +27,7 @@ from ftdrive.cell.config import recorded_cell
 from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, check_permissions, check_workcell
 from ftdrive.errors import BadBundle, ConfigError
 from ftdrive.runs.redaction import Redaction
-from ftdrive.runs.run import Run, versions
+from ftdrive.runs.run import LOCK, ZIP_DAMAGE, Run, versions
 
 FORMAT: Final = "ftdrive.bundle/1"
 MOST_BYTES: Final = 4_000_000_000
@@ -62,7 +62,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
     redaction, left_out = Redaction(), []
     texts = {"environment.json": json.dumps(_environment(folder))}
     poses: dict[str, bytes] = {}
-    for file in sorted(file for file in folder.rglob("*") if not file.is_dir() or file.is_symlink()):
+    for file in sorted(one for one in folder.rglob("*") if (not one.is_dir() or one.is_symlink()) and one.name != LOCK):
         name = file.relative_to(folder.parent).as_posix()
         content = None if file.is_symlink() else file.read_bytes()
         if content is not None and file.suffix == ".npz":
@@ -120,8 +120,9 @@ def _unpack(source: Path, folder: Path) -> Path:
         raise BadBundle(f"{source}: {error}") from error
     except FileNotFoundError as error:
         raise BadBundle(f"{source} is not a bundle, it has no bundle.json: {_COPY_AGAIN}") from error
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        # NotImplementedError: a compression that Python does not know; RuntimeError: a password.
+    except (*ZIP_DAMAGE, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in (None, EINVAL):  # such as a full disk
+            raise
         raise BadBundle(f"{source} is not a zip file or is damaged ({error}): {_COPY_AGAIN}") from error
 
 
@@ -152,7 +153,7 @@ def _require_small(poses: Path) -> None:
     try:
         with zipfile.ZipFile(poses) as arrays:
             size = sum(one.file_size for one in arrays.infolist())
-    except zipfile.BadZipFile:
+    except (*ZIP_DAMAGE, OSError):
         return
     if size > MOST_BYTES:
         raise BadBundle(f"{poses.name} unpacks to {size / 1e9:.0f} GB: do not use this file")

@@ -1,7 +1,7 @@
 """A whole session: open the cell, then look, check, predict and tour. A calibration is then solved and saved."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -129,9 +129,7 @@ def take_poses(
         raise ConfigError(f"{run.folder} was not made by {task.command}: continue it with {run.resume_command}")
     plan = None if by_hand else _plan_on_disk(options, run)
     device, driver = build_sensor(cell), build_arm(cell)
-    if run is not None:
-        journal.keep_in(run)
-    with device as sensor, closing(driver) as arm, preflight.awake() as kept_awake:
+    with _opened(run, journal) as runs, device as sensor, closing(driver) as arm, preflight.awake() as kept_awake:
         arm.open()
         journal.show(StateChanged(state=State.PREFLIGHT))
         if not by_hand:
@@ -142,7 +140,7 @@ def take_poses(
         for words in task.require(connected, cell.sensor.mount):
             journal.show(Noted(words=words, warning=True))
         devices = {role: asdict(device) for role, device in connected.items()}
-        session = _Session(cell, arm, sensor, journal, options, task, limits, run, devices)
+        session = _Session(cell, arm, sensor, journal, options, task, limits, run, devices, runs)
         run = _by_hand(session) if by_hand else _along_a_plan(session, *_certified_plan(session, plan))
     if run is None:
         return None
@@ -150,6 +148,15 @@ def take_poses(
         raise Declined(f"ended before the first pose: {run.folder} has no pose to solve")
     journal.show(StateChanged(state=State.REPORT))
     return run
+
+
+@contextmanager
+def _opened(run: Run | None, journal: Journal) -> Iterator[ExitStack]:
+    """Lock a resumed run and record in it; the stack also takes a new run, and unlocks them."""
+    with ExitStack() as runs:
+        if run is not None:
+            journal.keep_in(runs.enter_context(run))
+        yield runs
 
 
 def with_recorded_mode(options: Options) -> Options:
@@ -217,6 +224,8 @@ class _Session:
     """The run that is resumed."""
     devices: Mapping[str, Any]
     """Identities of arm and sensor."""
+    runs: ExitStack
+    """Unlocks the run at the end."""
 
     @property
     def serial(self) -> str:
@@ -230,7 +239,7 @@ class _Session:
         """Create the run folder."""
         options = self.options
         description = {"command": self.task.command, **_description(self.cell, self.devices, options)}
-        return Run.create(options.runs, options.name, description, self.cell.clock)
+        return self.runs.enter_context(Run.create(options.runs, options.name, description, self.cell.clock))
 
     def listen(self, duration_s: float) -> FtSamples:
         """Collect samples of the resting sensor; reopen it once if it fails, as after a killed session."""

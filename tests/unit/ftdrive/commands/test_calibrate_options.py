@@ -18,6 +18,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.session import session
 from ftdrive.session.session import Options
+from tests.edited_files import edit
 
 CELL = """format = "ftdrive.config/1"
 [robot]
@@ -208,8 +209,7 @@ def test_a_run_with_a_field_of_the_wrong_type_is_refused_in_one_sentence(
 ) -> None:
     Path("ftdrive.toml").write_text(CELL)
     folder = Path(begin())
-    header = json.loads((folder / "run.json").read_text())
-    (folder / "run.json").write_text(json.dumps(header | wrong))
+    edit(folder / "run.json", lambda header: header.update(wrong))
     outcome = CliRunner().invoke(cli, ["calibrate", "--resume", str(folder), *more])
     assert isinstance(outcome.exception, BadDataset)
     assert str(outcome.exception).startswith(f"{folder / 'run.json'}: '{next(iter(wrong))}")

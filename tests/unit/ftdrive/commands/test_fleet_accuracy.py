@@ -12,6 +12,7 @@ from ftcalib import CalibrationResult
 from ftdrive import __version__
 from ftdrive.store.store import Store
 from tests.calibrated_runs import calibrated_run, white_run
+from tests.edited_files import edit
 
 Ran = tuple[int, str, str]
 
@@ -67,8 +68,7 @@ def test_a_run_that_fails_and_one_without_a_calibration(run: Callable[..., Ran],
     (calibrated_run(runs, "rejected") / "calibration.json").unlink()
     (calibrated_run(runs, "damaged") / "dataset.json").write_text("{}")
     few = white_run(runs, "few")
-    document = json.loads((few / "calibration.json").read_text())
-    (few / "calibration.json").write_text(json.dumps(document | {"weights": [1, 1, 1, 0, 0, 0, 0, 0]}))
+    edit(few / "calibration.json", lambda document: document.update(weights=[1, 1, 1, 0, 0, 0, 0, 0]))
     code, out, err = run("runs", "--draws", "20")
     assert code == 7
     assert "they have no calibration: 1 runs; `ftdrive solve RUN` shows why." in err

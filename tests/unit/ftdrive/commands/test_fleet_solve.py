@@ -4,12 +4,14 @@ import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from ftdrive import __version__
 from ftdrive.store.store import Store
 from tests.calibrated_runs import calibrated_run
+from tests.edited_files import edit
 
 Ran = tuple[int, str, str]
 
@@ -25,10 +27,12 @@ def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(
     runs = tmp_path / "runs"
     old = calibrated_run(runs, "old", day=-400)
     worse = calibrated_run(runs, "worse")
-    file = worse / "calibration.json"
-    document = json.loads(file.read_text())
-    document["force_bias_N"][2] += 1.0
-    file.write_text(json.dumps(document | {"verdict": "usable"}))
+
+    def worsen(document: dict[str, Any]) -> None:
+        document["force_bias_N"][2] += 1.0
+        document["verdict"] = "usable"
+
+    edit(worse / "calibration.json", worsen)
     damaged = calibrated_run(runs, "damaged")
     Store().index(runs)
     (damaged / "dataset.json").write_text("{}")

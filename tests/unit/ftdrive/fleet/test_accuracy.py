@@ -15,6 +15,7 @@ from ftdrive.fleet.accuracy import BLOCK, Accuracy, accuracy_of, compared
 from ftdrive.fleet.draws import ACCEPTED, DRAW, NOT_OBSERVABLE, REJECTED, stated_sigma
 from ftdrive.fleet.workers import Answer, OtherVersion, Workers
 from tests.calibrated_runs import calibrated_run, dataset, rewrite_dataset, white_run
+from tests.edited_files import edit
 
 
 def at_once(function: Callable[..., list[Answer]], *arguments: Any) -> "Future[list[Answer]]":
@@ -99,11 +100,11 @@ def test_a_failure_has_its_reason(tmp_path: Path) -> None:
     folder = white_run(tmp_path, "run")
     path = folder / "calibration.json"
     document = json.loads(path.read_text())
-    path.write_text(json.dumps(document | {"components": {"hysteresis_N": 1.0}}))
+    edit(path, lambda found: found.update(components={"hysteresis_N": 1.0}))
     assert "this version does not know" in str(accuracy_of(folder, HERE, draws=20))
     covariance = np.array(document["covariance"])
     covariance[:3] = covariance[:, :3] = 0.0
-    path.write_text(json.dumps(document | {"covariance": covariance.tolist()}))
+    edit(path, lambda found: found.update(covariance=covariance.tolist(), components=document["components"]))
     assert "exactly known values" in str(accuracy_of(folder, HERE, draws=20))
     path.write_text(json.dumps(document))
 

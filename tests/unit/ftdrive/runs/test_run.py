@@ -1,6 +1,5 @@
 """A run folder that is damaged or incomplete: the file is named, with what to do; and what to type to go on with it."""
 
-import json
 import shlex
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from ftcalib.errors import BadDataset
 from ftcalib.routine import PoseRecord, TourPose
 from ftdrive.runs.run import Reading, Run
 from ftdrivers.interfaces import FtSamples
+from tests.edited_files import edit
 
 CONFIG = {"robot": {"host": "10.0.0.2"}, "sensor": {"url": "ati-can://can0"}, "tool": {"mass_kg": None, "later": 1}}
 
@@ -33,13 +33,6 @@ def run(tmp_path: Path) -> Run:
     )
     run.commit(PoseRecord(1, TourPose(1, np.zeros(6)), reading, reading, samples, steady=True))
     return run
-
-
-def edit(run: Run, change: Callable[[dict[str, Any]], object]) -> None:
-    path = run.folder / "run.json"
-    header = json.loads(path.read_text())
-    change(header)
-    path.write_text(json.dumps(header))
 
 
 @pytest.mark.parametrize(
@@ -77,7 +70,7 @@ def test_a_damaged_header_names_its_file_and_what_is_wrong(
     change: Callable[[dict[str, Any]], object], words: str, run: Run
 ) -> None:
     run.plan_path.touch()
-    edit(run, change)
+    edit(run.folder / "run.json", change)
     with pytest.raises(BadDataset, match=rf"run\.json.*{words}"):
         assert run.header_to_resume()["devices"]["arm"]["serial"]
 
@@ -94,10 +87,10 @@ def test_what_a_later_version_keeps_is_left_out(run: Run) -> None:
 
 @pytest.mark.parametrize("mode", ["auto", "step"])
 def test_without_its_plan_a_run_cannot_go_on_and_says_how_to_solve_it(mode: str, run: Run) -> None:
-    edit(run, lambda header: header.update(mode=mode))
+    edit(run.folder / "run.json", lambda header: header.update(mode=mode))
     with pytest.raises(BadDataset, match=r"plan\.json .*ftdrive solve "):
         run.header_to_resume()
-    edit(run, lambda header: header.update(mode="manual"))
+    edit(run.folder / "run.json", lambda header: header.update(mode="manual"))
     assert run.header_to_resume()["mode"] == "manual"
 
 

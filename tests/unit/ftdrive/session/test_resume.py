@@ -31,6 +31,7 @@ from ftdrive.session.operator import Key
 from ftdrive.terminal.report import drift_in_words
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
+from tests.edited_files import edit
 from tests.unit.ftdrive.fake_cell import Lab
 
 
@@ -322,8 +323,8 @@ def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
     then: tuple[str, str], now: tuple[str, str], cure: str, lab: Lab
 ) -> None:
     folder = broken_off(lab)
-    header = folder / "run.json"
-    header.write_text(header.read_text().replace('"fake"', f'"{then[0]}"').replace('"S1"', f'"{then[1]}"'))
+    model, serial = then
+    edit(folder / "run.json", lambda header: header["devices"]["sensor"].update(model=model, serial=serial))
     reports(lab, *now)
     if not cure:
         assert lab.calibrate(resume=folder) is not None

@@ -15,6 +15,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.store.database import default_file
 from ftdrive.store.records import StoredCell
 from ftdrive.store.store import Store
+from tests.edited_files import edit
 from tests.postgres import Server
 from tests.unit.ftdrive.store.contents import dump, wipe
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
@@ -175,8 +176,7 @@ def test_a_run_that_names_nothing_still_counts(store_url: str, tmp_path: Path) -
 def test_models_host_and_payload_come_from_the_run(store_url: str, tmp_path: Path) -> None:
     setup = {"tool": "gripper", "payload_kg": 1.5, "p_flange_payload_m": [0.0, 0.01, 0.1 + 0.2]}
     folder = new_run(tmp_path, "a", result(setup=setup))
-    header = json.loads((folder / "run.json").read_text())
-    (folder / "run.json").write_text(json.dumps(header | {"config": {"robot": {"host": "10.0.0.7"}}}))
+    edit(folder / "run.json", lambda header: header.update(config={"robot": {"host": "10.0.0.7"}}))
     Store(store_url).index(folder)
     (one,) = Store(store_url).results()
     assert (one.arm_model, one.sensor_model, one.robot_host) == ("ARM", "SENSOR", "10.0.0.7")
