@@ -408,7 +408,7 @@ class CalibrationResult:
         if not accept_edited:
             raise BadCalibration(
                 f"the content is not that of calibration {document.get('id')}: the file is damaged or was edited. Take "
-                "it from a copy, or apply it as it is with --force."
+                "it from a copy, or apply it as it is with --force (live, record, stream, compensate, export)."
             )
         return replace(result, provenance={**result.provenance, "edited": True})
 

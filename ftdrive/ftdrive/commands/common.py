@@ -54,6 +54,9 @@ def CELL(command: F) -> F:
     return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
 
 
+EDITED = "one that was edited by hand; every output then says so"
+FORCE = click.option("--force", is_flag=True, help=f"Apply {EDITED}.")
+
 CALIBRATION = click.option(
     "--calibration",
     "path",
@@ -66,7 +69,9 @@ CALIBRATION = click.option(
 def CALIBRATION_OR_TOOL(command: F) -> F:
     """Add the options --calibration, --tool and --force, which `open_source` takes."""
     tool = click.option("--tool", metavar="NAME", help="Newest accepted calibration of this tool on this cell.")
-    force = click.option("--force", is_flag=True, help="Apply a calibration of another arm, sensor or mount.")
+    force = click.option(
+        "--force", is_flag=True, help=f"Apply a calibration of another arm, sensor or mount, or {EDITED}."
+    )
     return CALIBRATION(tool(force(command)))
 
 

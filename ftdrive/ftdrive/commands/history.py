@@ -88,7 +88,7 @@ def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime)
     return (
         one.id[:6],
         "-" if one.created_utc is None else one.created_utc[:10],
-        one.tool or "-",
+        one.tool_in_words,
         one.verdict,
         f"{one.mass_kg:.4f}",
         " ".join(f"{value:.2f}" for value in one.parameters.force_bias_N),

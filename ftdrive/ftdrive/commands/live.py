@@ -86,15 +86,15 @@ def live(
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
     if speed is not None and replay is None:
         raise ConfigError("--speed goes only with --replay: add it, or leave --speed out")
-    if replay is not None and (tool or force):
-        raise ConfigError(f"{'--tool' if tool else '--force'} does not go with --replay: leave one of the two out")
+    if replay is not None and tool:
+        raise ConfigError("--tool does not go with --replay: leave one of the two out")
     frame = read_frame(axes, about)
     with ExitStack() as stack:
         stream: CompensatedStream | ReplayedStream
         checks = list[Check]()
         recorder: Callable[[Path], Recorder] | None = None
         if replay is not None:
-            stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed)
+            stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed, force=force)
         else:
             stream, cell = open_source(
                 path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
@@ -111,15 +111,16 @@ def live(
             _show_table(stream)
 
 
-def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, speed: float) -> ReplayedStream:
+def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> ReplayedStream:
     """Replay a run folder, or a recording with its own calibration unless another one is given."""
+    loaded = None if calibration is None else load_calibration(calibration, accept_edited=force)
     if path.is_dir() and path.suffix != ".partial":
-        if calibration is None:
+        if loaded is None:
             raise ConfigError("no calibration: give --calibration PATH")
-        return replay_run(Run(path), load_calibration(calibration), str(calibration), frame=frame, speed=speed)
+        return replay_run(Run(path), loaded, str(calibration), frame=frame, speed=speed)
     recording = read_recording(path)
-    if calibration is not None:
-        recording = recording.with_calibration(load_calibration(calibration), str(calibration))
+    if loaded is not None:
+        recording = recording.with_calibration(loaded, str(calibration))
     return ReplayedStream(recording.header.info, recording.paired(), frame=frame, speed=speed)
 
 
@@ -239,6 +240,7 @@ def _reading(look: Look, stream: ProcessedStream) -> dict[str, Any]:
         "calibration": calibration.provenance.get("created_utc"),
         "calibration_id": calibration.id,
         "verdict": calibration.verdict,
+        "marks": list(stream.info.marks),
         "verification": None if verification is None else verification.to_dict(),
     }
 

@@ -40,12 +40,12 @@ def open_source(
     config, robot, sensor
         As `read_cell` takes them.
     force : bool
-        Apply a calibration of another arm, sensor or mount.
+        Apply a calibration of another arm, sensor or mount, or one that was edited by hand.
     """
     check_simulate(simulate, real={"--tool": tool})
     if path is not None and tool is not None:
         raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
-    calibration = None if path is None else load_calibration(path)
+    calibration = None if path is None else load_calibration(path, accept_edited=force)
     if simulate:
         calibration, cell = _emulated(calibration, sensor, stack)
     elif calibration is None and tool is None:

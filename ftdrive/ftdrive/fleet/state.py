@@ -4,6 +4,8 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Literal
 
+from ftdrive.store.records import tool_in_words
+
 
 @dataclass(frozen=True, slots=True)
 class Drift:
@@ -42,6 +44,13 @@ class CellState:
     temperature_C: float | None = None
     drift: Drift | None = None
     """None with too few verifications."""
+    emulated: bool = False
+    """Whether the calibration was made in an emulated cell."""
+
+    @property
+    def tool_in_words(self) -> str:
+        """Name of the tool, and whether the cell was emulated."""
+        return tool_in_words(self.tool, emulated=self.emulated)
 
     def is_due(self, now: datetime) -> bool:
         """Whether a verification, or the first calibration, is due."""

@@ -82,4 +82,5 @@ def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: St
         mass_kg=result.mass_kg,
         temperature_C=next((one for one in temperatures if one is not None), None),
         drift=drift_of(observed.changes.get(result.id), calibrated),
+        emulated=result.emulated,
     )

@@ -33,7 +33,7 @@ from ftdrive.live.samples import (
     sensor_origin_m,
 )
 from ftdrive.runs.run import Run, versions
-from ftdrive.runs.verification import VerificationRecord, calibration_in_words, last_verification
+from ftdrive.runs.verification import VerificationRecord, calibration_in_words, marks_of, verification_near
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceTimeout, DriverError
 from ftdrivers.follow import Follow
@@ -65,7 +65,8 @@ class CompensatedStream(ProcessedStream):
     name : str
         Of the calibration, such as its path.
     force : bool
-        Warn instead of raising an error if the calibration is of another arm, sensor or mount.
+        Warn instead of raising an error if the calibration is of another arm, sensor or mount; of a tool, take one
+        that was edited by hand too.
     frame : WrenchFrame
         Axes and reference point; may be set at any time.
     stages : Stages
@@ -179,13 +180,16 @@ class CompensatedStream(ProcessedStream):
             versions=versions(),
             verification=verification,
             calibration_state=state,
+            emulated=self._cell.clock.emulated,
         )
 
     def _trusted(self) -> tuple[VerificationRecord | None, str]:
         """Return the last verification of the calibration, and what is said of its age and of that."""
         path = Path(self._name)
-        verification = last_verification(path) if path.name and path.exists() else None
-        return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC))
+        known = path.name and path.exists()
+        verification = verification_near(path, self._calibration.id) if known else None
+        marks = marks_of(self._calibration, emulated=self._cell.clock.emulated)
+        return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC), marks)
 
     def use_tool(self, name: str) -> StreamEvent:
         """Continue with the newest accepted calibration of another tool, after a change of tools.
@@ -385,7 +389,8 @@ def open_stream(
     frame : WrenchFrame
     stages : Stages
     force : bool
-        Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`.
+        Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`, or one that
+        was edited by hand, with a mark in `StreamInfo.marks`.
 
     Raises
     ------
@@ -409,9 +414,10 @@ def open_stream(
     if isinstance(calibration, CalibrationResult):
         return CompensatedStream(cell, calibration, frame=frame, stages=stages, force=force)
     path = Path(str(calibration))
-    return CompensatedStream(cell, load_calibration(path), name=str(path), frame=frame, stages=stages, force=force)
+    loaded = load_calibration(path, accept_edited=force)
+    return CompensatedStream(cell, loaded, name=str(path), frame=frame, stages=stages, force=force)
 
 
-def load_calibration(path: Path) -> CalibrationResult:
-    """Read a calibration.json, or the newest one of a run folder. Raises `BadCalibration` or `OSError`."""
-    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path)
+def load_calibration(path: Path, *, accept_edited: bool = False) -> CalibrationResult:
+    """Read a calibration.json, or the newest one of a run folder, as `CalibrationResult.load`."""
+    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path, accept_edited=accept_edited)

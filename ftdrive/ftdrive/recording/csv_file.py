@@ -51,6 +51,8 @@ class CsvFile:
 
     def __init__(self, path: Path, header: Header) -> None:
         self._file = GrowingFile(path)
+        self.partial = self._file.partial
+        self.samples = 0
         self._crc = 0
         self._start_ns: int | None = None
         self._utc_offset_ns = header.info.utc_offset_ns
@@ -68,6 +70,7 @@ class CsvFile:
             text.write(f"{_EVENT}{event_text(event)}\n")
         table.writerows(lines[places[-1] :])
         self._add(text.getvalue())
+        self.samples += len(rows)
 
     def _lines(self, rows: Rows) -> Iterator[tuple[float, ...]]:
         self._start_ns = int(rows["t_host_ns"][0]) if self._start_ns is None else self._start_ns
@@ -88,6 +91,10 @@ class CsvFile:
         with self._file:
             self._file.add(f"{_END}\n".encode())
             self._file.complete()
+
+    def keep(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
 
     def discard(self) -> None:
         """Delete what was written."""

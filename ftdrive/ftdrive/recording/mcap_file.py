@@ -80,6 +80,8 @@ class McapFile:
 
         self._header = header
         self._file = GrowingFile(path)
+        self.partial = self._file.partial
+        self.samples = 0
         self._crc = 0
         self._chunks: list[McapRecord] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
@@ -137,6 +139,7 @@ class McapFile:
         self._first_ns, self._last_ns = min(first_ns, self._first_ns), max(last_ns, self._last_ns)
         for number, table in tables.items():
             self._counts[number] += len(table)
+        self.samples += len(rows)
 
     def _messages(self, rows: Rows, events: Sequence[StreamEvent]) -> tuple[bytes, dict[int, NDArray[np.uint64]]]:
         """Return the messages of a chunk, and for each channel (n, 2) times and places in it."""
@@ -195,6 +198,10 @@ class McapFile:
         with self._file:
             self._file.add(end + summary + footer + _MAGIC)
             self._file.complete()
+
+    def keep(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
 
     def discard(self) -> None:
         """Delete what was written."""

@@ -7,9 +7,13 @@ The library writes no checksums of pages, so the metadata have a CRC-32 of each 
 """
 
 import json
+import os
+import re
 import shutil
 import zlib
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import closing, suppress
+from errno import EIO
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -33,9 +37,10 @@ class ParquetFile:
 
         self._path, self._header = path, header
         self._database = duckdb.connect()
-        self._folder = partial_of(path)
-        self._folder.mkdir()
-        self._names = (self._folder / f"{number:06d}.parquet" for number in count(1))
+        self.partial = partial_of(path)
+        self.partial.mkdir()
+        self.samples = 0
+        self._names = (self.partial / f"{number:06d}.parquet" for number in count(1))
         self._waiting: list[Rows] = []
         self._events: list[StreamEvent] = []
         self._start_ns: int | None = None
@@ -52,26 +57,33 @@ class ParquetFile:
         """Join the parts. Raises `OSError`; the parts remain then, and can be read."""
         try:
             self._write_part()
-            parts = {"parts": f"{self._folder}/*.parquet"}
-            self._copy("read_parquet($parts)", self._folder / "whole", parts, self._crcs)
-            publish(self._folder / "whole", self._path)
-            shutil.rmtree(self._folder)
+            parts = {"parts": f"{self.partial}/*.parquet"}
+            self._copy("read_parquet($parts)", self.partial / "whole", parts, self._crcs)
+            publish(self.partial / "whole", self._path)
+            shutil.rmtree(self.partial)
         finally:
             self._database.close()
+
+    def keep(self) -> None:
+        """Write the samples that wait, if possible."""
+        with suppress(OSError), closing(self._database):
+            self._write_part()
 
     def discard(self) -> None:
         """Delete what was written."""
         self._database.close()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self.partial, ignore_errors=True)
 
     def _write_part(self) -> None:
-        rows, self._waiting = np.concatenate([np.zeros(0, ROW), *self._waiting]), []
+        rows = np.concatenate([np.zeros(0, ROW), *self._waiting])
         if len(rows):
             self._start_ns = int(rows["t_host_ns"][0]) if self._start_ns is None else self._start_ns
             table = table_of(rows, self._start_ns, self._header.info.utc_offset_ns)
             self._database.register("rows", table)
             self._copy("rows", next(self._names), {}, _crcs(table, {}))
             self._database.unregister("rows")
+            self._waiting = []
+            self.samples += len(rows)
             self._crcs = _crcs(table, self._crcs)
 
     def _copy(self, source: str, path: Path, values: dict[str, Any], crcs: Mapping[str, int]) -> None:
@@ -90,7 +102,9 @@ class ParquetFile:
             )
         except duckdb.Error as error:
             path.unlink(missing_ok=True)
-            raise OSError(f"{path} cannot be written ({error}): make room there; the parts are kept") from error
+            number = re.search(r'"errno":"(\d+)"', str(error))
+            code = int(number[1]) if number else EIO
+            raise OSError(code, os.strerror(code) if number else str(error)) from error
 
 
 def read_parquet(path: Path, columns: Collection[str]) -> Recording:

@@ -103,7 +103,8 @@ class Header:
             "raw_fx..raw_tz as measured, sensor axes, about the sensor origin; "
             f"fx..tz compensated, {self.frame}; N, N·m, m, rad"
         )
-        return f"{words}; {self.info.calibration_state}" if self.info.calibration_state else words
+        state = self.info.calibration_state or ", ".join(self.info.marks)
+        return f"{words}; {state}" if state else words
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the header as JSON; numbers that are not finite are null."""
@@ -139,7 +140,7 @@ class Header:
             raise BadRecording(f"the header cannot be read ({error}): the file is damaged") from error
 
 
-_LATER = ("verification", "calibration_state")
+_LATER = ("verification", "calibration_state", "emulated")
 """Fields that older recordings lack."""
 _ARRAYS = ("p_flange_sensor_m", "R_flange_tcp", "p_flange_tcp_m")
 

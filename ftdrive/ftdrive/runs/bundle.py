@@ -1,6 +1,6 @@
 """A bundle: a run in one zip file, without addresses and names, which `replay` and `solve` read like the run folder.
 
-bundle.json         ftdrive.bundle/1: name of the run, what was redacted, what was left out
+bundle.json         ftdrive.bundle/1: name of the run, whether it is emulated, what was redacted, what was left out
 environment.json    versions of all packages, and the checks of the computer that need no device
 <run>/...           the files of the run folder; texts are redacted, poses are copied byte for byte
 transcripts/...     the files of `ftdrive transcript record`, redacted
@@ -79,7 +79,13 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
         redaction.learn(text)
     clean = {name: redaction.file(text) for name, text in texts.items()}
     bundled = Bundled(redaction.counts, left_out)
-    about = {"format": FORMAT, "created_utc": datetime.now(UTC).isoformat(), "run": folder.name, **asdict(bundled)}
+    about = {
+        "format": FORMAT,
+        "created_utc": datetime.now(UTC).isoformat(),
+        "run": folder.name,
+        "emulated": _is_emulated(folder),
+        **asdict(bundled),
+    }
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("bundle.json", json.dumps(about, indent=1))
@@ -165,6 +171,13 @@ def _text(content: bytes) -> str | None:
     except UnicodeDecodeError:
         return None
     return None if "\0" in text else text
+
+
+def _is_emulated(folder: Path) -> bool | None:
+    try:
+        return Run(folder).header().get("station") is not None
+    except BadDataset:  # a damaged run is worth a report too
+        return None
 
 
 def _environment(folder: Path) -> dict[str, Any]:

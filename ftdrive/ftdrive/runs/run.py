@@ -185,12 +185,17 @@ class Run:
         return _next(self.folder / f"{name}.json")
 
     def append_event(self, event: Mapping[str, Any], *, sync: bool = False) -> None:
-        """Add a line to events.ndjson; with `sync` return when it is on disk. Any thread."""
-        line = json.dumps(with_crc32(event)) + "\n"
-        with self._events_lock, self._events_path.open("a", encoding="utf-8") as file:
-            file.write(line)
+        """Add a line to events.ndjson, or nothing; with `sync` return when it is on disk. Any thread."""
+        line = (json.dumps(with_crc32(event)) + "\n").encode()
+        with self._events_lock, self._events_path.open("ab", buffering=0) as file:
+            begin = file.tell()
+            try:
+                while line:
+                    line = line[file.write(line) :]
+            except OSError:
+                file.truncate(begin)  # half a line would make the next one unreadable
+                raise
             if sync:
-                file.flush()
                 os.fsync(file.fileno())
 
     def events(self) -> Iterator[Mapping[str, Any]]:

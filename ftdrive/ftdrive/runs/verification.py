@@ -5,7 +5,7 @@ in the run folders beside that of the calibration, in those in `runs` beside the
 `runs` of the current folder.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -17,6 +17,14 @@ from ftcalib.files import JSON, check_format, read_object
 from ftdrive.runs.run import Run
 
 FORMAT: Final = "ftdrive.verification/1"
+
+EMULATED: Final = "EMULATED"
+EDITED: Final = "EDITED BY HAND"
+MARKS: Final[Mapping[str, str]] = {
+    EMULATED: "The cell was EMULATED: these are not the values of a real tool.",
+    EDITED: "The file was EDITED BY HAND after it was solved: its verdict and its sigmas are not those of its numbers.",
+}
+"""What every output says of some calibrations: a mark, and its meaning in a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +149,23 @@ def age_of(calibration: CalibrationResult, now: datetime) -> list[str]:
     return [f"{age_in_words(now - datetime.fromisoformat(created))} old"] if isinstance(created, str) else []
 
 
-def calibration_in_words(calibration: CalibrationResult, verification: VerificationRecord | None, now: datetime) -> str:
-    """Return id, verdict and age of a calibration, and the result of its last verification."""
+def marks_of(calibration: CalibrationResult, *, emulated: bool = False) -> tuple[str, ...]:
+    """Return the `MARKS` of a calibration; `emulated` says that what it is applied to is emulated anyhow."""
+    found = {
+        EMULATED: emulated or calibration.provenance.get("station") is not None,
+        EDITED: calibration.is_edited,
+    }
+    return tuple(mark for mark, applies in found.items() if applies)
+
+
+def calibration_in_words(
+    calibration: CalibrationResult,
+    verification: VerificationRecord | None,
+    now: datetime,
+    marks: Sequence[str] | None = None,
+) -> str:
+    """Return id, verdict, age and marks of a calibration, by default its own, and its last verification's result."""
     verified = "not verified" if verification is None else verification.in_words(now)
-    return ", ".join([f"calibration {calibration.id[:6]}", calibration.verdict, *age_of(calibration, now), verified])
+    found = marks_of(calibration) if marks is None else marks
+    words = [f"calibration {calibration.id[:6]}", calibration.verdict, *found, *age_of(calibration, now), verified]
+    return ", ".join(words)

@@ -19,7 +19,7 @@ from ftcalib.files import JSON, write_object
 from ftcalib.model import Array
 from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check, is_return
 from ftdrive.runs.run import Run, made_now
-from ftdrive.runs.verification import FORMAT, fitted_dataset
+from ftdrive.runs.verification import FORMAT, fitted_dataset, marks_of
 
 FALSE_ALARMS: Final = 0.01
 """Share of verifications of an unchanged cell that fail."""
@@ -87,6 +87,11 @@ class Verified:
         )
 
     @property
+    def marks(self) -> tuple[str, ...]:
+        """Of the calibration, and of a verification in an emulated cell."""
+        return marks_of(self.calibration, emulated=self.run.header().get("station") is not None)
+
+    @property
     def update(self) -> Update | None:
         """The smallest sufficient update; None if the calibration holds, or if only a new calibration helps."""
         return self.verification.update
@@ -104,6 +109,7 @@ class Verified:
             "schema_version": 1,
             **made_now(),
             "run": self.run.folder.name,
+            "marks": list(self.marks),
             "calibration": {
                 "id": self.calibration.id,
                 "path": str(self.calibration_path.absolute()),

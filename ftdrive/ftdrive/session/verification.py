@@ -86,7 +86,7 @@ class Verifying(Task):
             return earlier
         guess = guess_of(certifier, cell.tool.mass_kg)
         plan = plan_verification(certifier, q_rad, poses, self.R_fitted, speeds=speeds_of(cell), guess=guess)
-        return plan.marked(measured=cell.workcell.measured)
+        return plan.marked(measured=cell.workcell.measured, emulated=cell.clock.emulated)
 
     def _earlier(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan | None:
         """Find a plan that was driven before: it may have been completed, so that it may run fast."""

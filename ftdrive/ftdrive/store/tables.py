@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from sqlalchemy import JSON, Boolean, Column, Float, Integer, MetaData, Row, String, Table
+from sqlalchemy import JSON, Boolean, Column, Float, Integer, MetaData, Row, String, Table, false
 
 from ftdrive.store.records import Check, Record, StoredCell, StoredResult, StoredVerification
 
-SCHEMA: Final = 2
+SCHEMA: Final = 3
 """Version of the tables, kept in the database."""
 
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
@@ -37,6 +37,7 @@ results: Final = Table(
     *(Column(name, String) for name in ("arm_model", "sensor_model", "robot_host")),
     Column("payload_kg", Float),
     Column("payload_com_m", JSON(none_as_null=True)),
+    Column("emulated", Boolean, nullable=False, server_default=false()),
 )
 verifications: Final = Table(
     "ftdrive_verifications",

@@ -66,7 +66,7 @@ def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
         drift = f"{one.drift.level_sigmas:.1f}{' DRIFTS' if one.drift.found else ''}"
     return (
         one.cell,
-        one.tool or "-",
+        one.tool_in_words,
         one.verdict or "none",
         "-" if one.calibrated is None else age_in_words(now - one.calibrated),
         verified_in_words(one, now),

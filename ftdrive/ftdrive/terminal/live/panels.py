@@ -55,6 +55,8 @@ def title(view: View, width: int) -> Line:
     line = Line(" ftdrive live", STRONG).add("  ")
     line.add(" · ".join(filter(None, [view.info.arm.model, _named(view.info.sensor), view.info.tool])))
     right = Line()
+    for mark in view.info.marks:
+        right.add(f" {mark} ", WARNING)
     if view.is_frozen:
         right.add(" FROZEN ", "reverse bold", "z").add(" ")
     if view.replay is not None:

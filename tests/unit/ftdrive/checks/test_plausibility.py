@@ -15,6 +15,7 @@ from ftcalib.poses.information import special
 from ftdrive.cell.config import SensorConfig
 from ftdrive.checks.plausibility import com_in_words, judged
 from ftdrive.runs.outcome import solve_records
+from tests.edited_files import edit
 from tests.unit.ftdrive.fake_cell import Lab
 
 Array = NDArray[np.float64]
@@ -157,6 +158,5 @@ def test_a_session_saves_no_such_result_as_good(lab: Lab) -> None:
 def test_a_tool_that_was_not_measured_is_no_reason(lab: Lab) -> None:
     lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", height_mm=180.0))
     lab.calibrate()
-    path = lab.run().folder / "run.json"
-    path.write_text(path.read_text().replace('"measured": true', '"measured": false'))
+    edit(lab.run().folder / "run.json", lambda header: header["config"]["workcell"].update(measured=False))
     assert solve_records(lab.run(), lab.run().records()).result.verdict == "good"

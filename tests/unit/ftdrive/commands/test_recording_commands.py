@@ -106,7 +106,8 @@ def test_control_c_keeps_the_data(run_record: Run) -> None:
     assert code == 130
     assert answer is not None
     assert answer["samples"] == 300
-    assert "Saved a.mcap: 300 samples" in err
+    assert "Saved a.mcap: 300 samples, 0.30 s, 1000 Hz, gaps: 0" in err
+    assert answer["rate_Hz"] == pytest.approx(1000.0, rel=1e-4)
     assert read_recording(Path("a.mcap")).cut == ""
 
 
@@ -176,16 +177,19 @@ def test_a_conversion_is_complete_and_says_what_was_cut(
     monkeypatch.chdir(tmp_path)
     recorder = Recorder([Path("a.csv")], info(), {})
     recorder.write(block(1500))
-    Path("b.csv.partial").write_bytes(Path("a.csv.partial").read_bytes()[:-5])
+    recorder.write(block(100, 1500))
+    recorder.write(block(100, 1600))
+    recorder.write(block(100, 1700))
+    Path("b.csv.partial").write_bytes(Path("a.csv.partial").read_bytes()[:-30])
     recorder.close()
     assert cli.run(["convert", "a.csv", "b.mcap", "--json"]) == 0
     out, err = capsys.readouterr()
-    assert json.loads(out)["samples"] == 1500
+    assert json.loads(out)["samples"] == 1800
     assert json.loads(out)["complete"]
     assert read_recording(Path("b.mcap")).rows.tobytes() == read_recording(Path("a.csv")).rows.tobytes()
     assert cli.run(["convert", "b.csv.partial", "b.parquet", "--json"]) == 0
     out, err = capsys.readouterr()
-    assert (json.loads(out)["samples"], json.loads(out)["complete"]) == (1499, False)
+    assert (json.loads(out)["samples"], json.loads(out)["complete"]) == (1500, False)
     assert "incomplete" in err
     assert cli.run(["convert", "a.csv", "b.mcap"]) == 2
     Path("d.csv").write_text("t,fx\n")

@@ -90,7 +90,7 @@ def test_an_older_store_is_neither_read_nor_changed_before(store_url: str, runs:
     become_version_1(store_url)
     before, built = dump(store_url), columns(store_url)
     for act in (store.results, store.cells, lambda: store.index(runs), lambda: store.rebuild(runs)):
-        with pytest.raises(BadStore, match=r"has version 1, this ftdrive uses version 2: upgrade it with `ftdrive h"):
+        with pytest.raises(BadStore, match=r"has version 1, this ftdrive uses version 3: upgrade it with `ftdrive h"):
             act()
     assert (dump(store_url), columns(store_url)) == (before, built)
 
@@ -99,10 +99,10 @@ def test_a_newer_store_is_neither_read_nor_changed(store_url: str, runs: Path) -
     store = Store(store_url)
     store.index(runs)
     with connected(store_url) as connection:
-        connection.execute(tables.schema.update().values(version=3))
+        connection.execute(tables.schema.update().values(version=4))
     before = dump(store_url)
     for act in (store.results, store.upgrade, lambda: store.index(runs), lambda: store.remove_cells(["a"])):
-        with pytest.raises(BadStore, match="has version 3, this ftdrive uses version 2: install a newer"):
+        with pytest.raises(BadStore, match="has version 4, this ftdrive uses version 3: install a newer"):
             act()
     assert dump(store_url) == before
 
@@ -144,7 +144,7 @@ def test_only_index_and_rebuild_upgrade_a_store(
     Store(store_url).index(runs / "2026-03-01-calibrate")
     become_version_1(store_url)
     monkeypatch.setenv("FTDRIVE_STORE_URL", store_url)
-    fix = "has version 1, this ftdrive uses version 2: upgrade it with `ftdrive history --index .`"
+    fix = "has version 1, this ftdrive uses version 3: upgrade it with `ftdrive history --index .`"
     assert cli.run(["history"]) == 6
     assert fix in " ".join(capsys.readouterr().err.split())
     index_run(runs / "2026-03-02-calibrate")

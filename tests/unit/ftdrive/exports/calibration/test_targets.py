@@ -111,7 +111,7 @@ def test_admittance_has_the_weight_positive_and_prints_the_bias_that_it_lacks() 
     assert equal(parameters["gravity_compensation"]["CoG"]["pos"], COM)
     assert parameters["gravity_compensation"]["frame"]["id"] == "ft_sensor"
     assert parameters["fixed_world_frame"]["frame"]["id"] == "base"
-    assert any("[1, -2, 1e-05, 0.1, -0.2, 0.3]" in note for note in made("admittance").notes)
+    assert any("[1.0, -2.0, 1e-05, 0.1, -0.2, 0.3]" in note for note in made("admittance").notes)
 
 
 def test_kit_has_the_weight_positive_and_the_offset_static() -> None:
