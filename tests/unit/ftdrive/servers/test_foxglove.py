@@ -210,6 +210,7 @@ def test_the_status_says_what_is_shown_and_is_valid_json(server: FoxgloveServer,
     assert status["frame"] == "sensor axes, about the sensor origin"
     assert status["stages"]["lowpass_Hz"] is None
     assert status["calibration"] == "calibration.json"
+    assert status["marks"] == ["EMULATED"]
     assert status["status"]["arm"]["lost"] == 3
     assert status["status"]["drift_N_h"] is None  # NaN there
 
