@@ -2,6 +2,7 @@
 
 import importlib
 import logging
+import os
 import platform
 import signal
 import sys
@@ -141,7 +142,15 @@ def main() -> int:
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.default_int_handler)
+    _open_closed_streams()
     return run(sys.argv[1:])
+
+
+def _open_closed_streams() -> None:
+    """Connect standard streams that the caller has closed to nothing, so that no other file gets their numbers."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
 
 
 def run(arguments: Sequence[str]) -> int:
