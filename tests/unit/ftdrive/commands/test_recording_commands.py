@@ -1,8 +1,10 @@
 """`record`, `convert` and `compensate`: when they end, with what exit code, and what is in the files then."""
 
+import errno
 import json
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +19,7 @@ from ftdrive import cli
 from ftdrive.commands.record import Duration
 from ftdrive.live.samples import Block, StreamEvent
 from ftdrive.recording import Recorder, read_recording
+from ftdrive.recording.growing_file import GrowingFile
 from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.recorded import UTC_OFFSET_NS, block, calibration, info
 
@@ -125,6 +128,29 @@ def test_a_stream_without_a_sample_leaves_no_file(run_record: Run, tmp_path: Pat
     code, answer, _ = run_record(FakeStream([], DeviceTimeout("sensor silent")), "-o", "a.csv")
     assert (code, answer) == (4, None)
     assert [path.name for path in tmp_path.iterdir()] == ["c.json"]
+
+
+def test_a_full_disk_completes_no_file_and_names_what_is_safe(run_record: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    add, written = GrowingFile.add, Counter[Path]()
+
+    def full(file: GrowingFile, content: bytes) -> int:
+        written[file.path] += 1
+        if file.path.suffix == ".csv" and written[file.path] > 5:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return add(file, content)
+
+    monkeypatch.setattr(GrowingFile, "add", full)
+    code, answer, err = run_record(FakeStream(blocks(30)), "-o", "a.mcap", "-o", "a.csv")
+    assert code == 6
+    assert answer is not None
+    assert answer["files"] == []
+    assert "Saved" not in err
+    assert answer["partial"].keys() == {"a.mcap.partial", "a.csv.partial"}
+    for path, samples in answer["partial"].items():
+        assert f"{path} keeps {samples} samples" in err
+        assert len(read_recording(Path(path)).rows) == samples > 0
+    assert not Path("a.mcap").exists()
+    assert not Path("a.csv").exists()
 
 
 def test_a_gap_is_exit_code_8(run_record: Run) -> None:

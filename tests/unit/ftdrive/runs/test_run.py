@@ -1,5 +1,6 @@
 """A run folder that is damaged or incomplete: the file is named, with what to do; and what to type to go on with it."""
 
+import errno
 import os
 import platform
 import re
@@ -8,8 +9,10 @@ import shlex
 import signal
 import subprocess
 import sys
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +21,7 @@ import pytest
 from ftcalib.errors import BadDataset
 from ftcalib.routine import PoseRecord, TourPose
 from ftdrive.errors import ConfigError
+from ftdrive.runs import outcome
 from ftdrive.runs.run import Reading, Run
 from ftdrivers.interfaces import FtSamples
 from tests.edited_files import edit
@@ -169,6 +173,24 @@ def test_a_pose_is_checked_to_its_last_bit(run: Run) -> None:
     assert all("01.npz" in words for words in refused)
 
 
+def test_a_pose_that_seems_to_have_a_password_is_named(run: Run) -> None:
+    path = run.folder / "poses" / "01.npz"
+    content = bytearray(path.read_bytes())
+    content[content.index(b"PK\1\2") + 8] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(BadDataset, match=r"01\.npz .*password.*--resume"):
+        run.records()
+
+
+def test_an_array_that_cannot_be_parsed_is_named(run: Run) -> None:
+    path = run.folder / "poses" / "01.npz"
+    header = b"{'descr': '<f8', 'fortran_order': (".ljust(118) + b"\n"
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("steady.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    with pytest.raises(BadDataset, match=r"01\.npz .*--resume"):
+        run.records()
+
+
 def test_an_edited_header_is_refused(run: Run) -> None:
     path = run.folder / "run.json"
     path.write_text(path.read_text().replace('"10.0.0.2"', '"10.0.0.3"'))
@@ -240,3 +262,13 @@ def test_a_second_process_that_resumes_a_run_is_refused_and_a_crash_leaves_no_lo
         pass
     with Run(run.folder):
         pass
+
+
+def test_without_room_for_the_result_the_poses_are_safe(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    solved = SimpleNamespace(dataset=SimpleNamespace(save=full))
+    monkeypatch.setattr(outcome, "solve_records", lambda *_: solved)
+    with pytest.raises(OSError, match=r"No space left .*not saved, but all poses are.*ftdrive solve .* --output"):
+        outcome.solve_and_save(run)

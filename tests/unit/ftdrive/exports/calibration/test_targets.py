@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
 
 from ftdrive import __version__
 from ftdrive.exports.calibration.formats import FORMATS
@@ -206,6 +207,9 @@ def test_mujoco_has_the_tool_at_the_site_of_the_sensor_and_the_parameters_of_the
     assert plugin["type"] == "mujoco_ros2_control_plugins/FtsGravCompPlugin"
     assert plugin["ft_sensor"]["frame_id"] == "ft_sensor"
     assert equal([plugin["ft_sensor"]["CoG"]["mass"], *plugin["ft_sensor"]["CoG"]["pos"]], [2.0, *COM])
+    assert any(
+        "Plain MuJoCo sensors have the opposite sign: negate sensordata" in note for note in made("mujoco").notes
+    )
     assert made("mujoco").elsewhere["option gravity"] == pytest.approx([0, 0, -G_M_S2], abs=1e-15)
 
 
@@ -282,3 +286,27 @@ def test_a_name_that_yaml_would_read_as_true_is_quoted() -> None:
     filter1 = document("ros2-control", settings)["force_torque_sensor_broadcaster"]["ros__parameters"]
     assert filter1["sensor_name"] == "yes"
     assert filter1["sensor_filter_chain"]["filter1"]["params"]["world_frame"] == "on"
+
+
+def numbers_after(words: str, notes: tuple[str, ...]) -> list[float]:
+    """Read the numbers in the brackets that follow some words in a note."""
+    (note,) = (one for one in notes if words in one)
+    found = re.search(r"[(\[](-?\d[^)\]]*)[)\]]", note[note.index(words) :])
+    assert found is not None
+    return [float(number) for number in found[1].split(",")]
+
+
+def test_notes_have_all_digits() -> None:
+    """A user who copies six digits would turn the sensor by 1e-5 rad, and be wrong by 1e-5 N."""
+    R = Rotation.random(rng=7).as_matrix()
+    parameters = replace(calibration(R_flange_sensor=R).parameters, force_bias_N=np.array([1, -2, 3]) / 7)
+    odd = replace(calibration(), parameters=parameters)
+    for name in ("ft-tools", "ros2-control", "admittance"):
+        notes = export(odd, name, MEASURED, max_force_error_N=1e3).notes
+        rpy = numbers_after("roll, pitch, yaw = ", notes)
+        np.testing.assert_allclose(Rotation.from_euler("xyz", rpy).as_matrix(), R, rtol=0, atol=1e-15)
+    bias = numbers_after("subtracts no bias: subtract ", notes)
+    assert bias == [*(np.array([1, -2, 3]) / 7), *TORQUE]
+    raised = replace(MEASURED, height_mm=100 / 3)
+    notes = export(odd, "mc-rtc", raised, max_force_error_N=1e3).notes
+    assert numbers_after("with the sensor at ", notes)[2] == raised.p_frame_sensor_m("mc-rtc")[2]
