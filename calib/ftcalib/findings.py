@@ -193,283 +193,145 @@ def _plain(value: Any) -> Any:
 
 # --------------------------------------------------------------------------------------------------------------- codes
 
-_REJECT: Final[Sequence[Severity]] = ("reject",)
-_LIMIT: Final[Sequence[Severity]] = ("limit",)
-_NOTE: Final[Sequence[Severity]] = ("note",)
-_CORRECTED = "(force residual {residual_N:.2g}, corrected {corrected_N:.2g})"
-_CHECK_UNITS = "check the units of force and torque"
-_CONTRADICTED = "correct the data or the known value"
-_FOR_THIS_LOAD = "which the calibration corrects for its own load"
+_REJECT: Final = ("reject",)
+_LIMIT: Final = ("limit",)
+_NOTE: Final = ("note",)
+_REJECT_OR_LIMIT: Final = ("reject", "limit")
+_REJECT_OR_NOTE: Final = ("reject", "note")
+_LIMIT_OR_NOTE: Final = ("limit", "note")
 
+# fmt: off
 CODES: Final[Mapping[str, Code]] = {
     # Data that cannot be right
-    "stuck_channels": Code(
-        _REJECT, "the reading of {channels} is the same in all poses", "check the sensor for a channel that is stuck"
-    ),
+    "stuck_channels": Code(_REJECT, "the reading of {channels} is the same in all poses",
+        "check the sensor for a channel that is stuck"),
     "repeated_poses": Code(_REJECT, "{poses:poses} have identical wrenches and orientations", "keep one of the copies"),
-    "repeated_wrenches": Code(
-        _REJECT, "{poses:poses} have identical wrenches in different orientations", "repeat these poses"
-    ),
-    "constant_force": Code(
-        _REJECT,
-        "the force is {force_N:.2g} in all poses, as if the wrench were given in base axes",
-        "record it in the axes of the sensor",
-    ),
-    "wrench_in_base": Code(
-        _REJECT, f"the wrench looks given in base axes {_CORRECTED}", "record it in the axes of the sensor"
-    ),
-    "orientations_inverted": Code(
-        _REJECT, f"the orientations look inverted {_CORRECTED}", "state that they map base to flange"
-    ),
-    "quaternion_order": Code(
-        _REJECT,
-        f"the quaternions look like ({{order}}), but were read as ({{read_as}}) {_CORRECTED}",
-        "read them as ({order})",
-    ),
-    "pairing_shifted": Code(
-        _REJECT,
-        f"each wrench looks like that of the pose {{neighbour}} it {_CORRECTED}",
-        "pair each wrench with the pose at which it was measured",
-    ),
-    "pairing_or_rotations": Code(
-        _REJECT,
-        "the forces are those of a weight of {weight_N:.3g} to {radial_N:.2g}, but in these orientations only to "
-        "{residual_N:.2g}, so wrenches are paired with other poses, or the orientations have another form",
-        "check the pairing, and look for Euler angles, degrees or another order",
-    ),
-    "axes_disagree": Code(
-        _REJECT,
-        "force and torque axes disagree, because with {corrections:axes} the torque residual is {corrected_Nm:.2g} "
-        "instead of {residual_Nm:.2g}",
-        "check the wiring of the axes, or the sensor's matrix",
-    ),
-    # Known values
-    "known_mass": Code(
-        ("limit", "note"),
-        "the known mass of {known_kg:g} contradicts the data, which give {mass_kg:.5g} (sigma {sigma_kg:.2g})"
-        "{units:units}",
-        _CONTRADICTED,
-    ),
-    "known_gravity_direction": Code(
-        ("limit", "note"),
-        "the known direction of gravity contradicts the data, which give one {off_deg:.3g} away (sigma "
-        "{sigma_deg:.2g})",
-        _CONTRADICTED,
-    ),
-    "known_mounting": Code(
-        ("limit", "note"),
-        "the known mounting of the sensor contradicts the data, which give one {off_deg:.3g} away (sigma "
-        "{sigma_deg:.2g})"
-        "{corrections:?, as with |}{corrections:axes}",
-        _CONTRADICTED,
-    ),
-    # Causes that one session has
-    "payload_units": Code(
-        _LIMIT,
-        "the load is {load_kg:.2f}, but {expected_kg:.2f} by the payload in the controller{units:units}",
-        "check the units of the sensor before you correct the payload",
-    ),
-    "drift": Code(
-        ("limit", "note"),
-        "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the last",
-        "let the sensor warm up and calibrate again",
-    ),
-    "com_shifted": Code(
-        ("reject", "note"),
-        "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the load had shifted",
-        "fix the load and calibrate again",
-    ),
-    "load_changed": Code(
-        ("reject", "note"),
-        "from {pose:poses} on the weight has changed by {change_N:+.2g}",
-        "check whether something was lost or picked up, and calibrate again",
-    ),
-    "weight_insignificant": Code(
-        _REJECT,
-        "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty of {sigma_N:.2g}",
-        "hang something heavier on the sensor, or record longer and in more orientations",
-    ),
-    "second_solution": Code(
-        _REJECT,
-        "a very different mounting of the sensor explains the data almost as well (probability "
-        "{probability_percent:.2g})",
-        "add poses with another angle between the tool and the vertical",
-    ),
-    "weight_implausible": Code(("reject", "limit"), "the weight is {weight_N:.5g}{units:units}", _CHECK_UNITS),
-    "com_too_far": Code(
-        _REJECT,
-        "the centre of mass is {distance_m:.2f} from the sensor, farther than {most_m:g}{units:units}",
-        _CHECK_UNITS,
-    ),
-    "com_too_near": Code(
-        _LIMIT,
-        "the centre of mass is only {distance_mm:.2g} from the sensor, as if torques were 1000 times too small or "
-        "forces were in mN",
-        _CHECK_UNITS,
-    ),
+    "repeated_wrenches": Code(_REJECT, "{poses:poses} have identical wrenches in different orientations",
+        "repeat these poses"),
+    "constant_force": Code(_REJECT, "the force is {force_N:.2g} in all poses, as if the wrench were given in base axes",
+        "record it in the axes of the sensor"),
+    "wrench_in_base": Code(_REJECT, "the wrench looks given in base axes (force residual {residual_N:.2g}, corrected "
+        "{corrected_N:.2g})", "record it in the axes of the sensor"),
+    "orientations_inverted": Code(_REJECT, "the orientations look inverted (force residual {residual_N:.2g}, "
+        "corrected {corrected_N:.2g})", "state that they map base to flange"),
+    "quaternion_order": Code(_REJECT, "the quaternions look like ({order}), but were read as ({read_as}) (force "
+        "residual {residual_N:.2g}, corrected {corrected_N:.2g})", "read them as ({order})"),
+    "pairing_shifted": Code(_REJECT, "each wrench looks like that of the pose {neighbour} it (force residual "
+        "{residual_N:.2g}, corrected {corrected_N:.2g})", "pair each wrench with the pose at which it was measured"),
+    "pairing_or_rotations": Code(_REJECT, "the forces are those of a weight of {weight_N:.3g} to {radial_N:.2g}, but "
+        "in these orientations only to {residual_N:.2g}, so wrenches are paired with other poses, or the "
+        "orientations have another form", "check the pairing, and look for Euler angles, degrees or another order"),
+    "axes_disagree": Code(_REJECT, "force and torque axes disagree, because with {corrections:axes} the torque "
+        "residual is {corrected_Nm:.2g} instead of {residual_Nm:.2g}",
+        "check the wiring of the axes, or the sensor's matrix"),
+    # Known values that the data contradict
+    "known_mass": Code(_LIMIT_OR_NOTE, "the known mass of {known_kg:g} contradicts the data, which give {mass_kg:.5g} "
+        "(sigma {sigma_kg:.2g}){units:units}", "correct the data or the known value"),
+    "known_gravity_direction": Code(_LIMIT_OR_NOTE, "the known direction of gravity contradicts the data, which give "
+        "one {off_deg:.3g} away (sigma {sigma_deg:.2g})", "correct the data or the known value"),
+    "known_mounting": Code(_LIMIT_OR_NOTE, "the known mounting of the sensor contradicts the data, which give one "
+        "{off_deg:.3g} away (sigma {sigma_deg:.2g}){corrections:?, as with |}{corrections:axes}",
+        "correct the data or the known value"),
+    # Units, drift and changes of one session
+    "payload_units": Code(_LIMIT, "the load is {load_kg:.2f}, but {expected_kg:.2f} by the payload in the "
+        "controller{units:units}", "check the units of the sensor before you correct the payload"),
+    "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
+        "last", "let the sensor warm up and calibrate again"),
+    "com_shifted": Code(_REJECT_OR_NOTE, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
+        "load had shifted", "fix the load and calibrate again"),
+    "load_changed": Code(_REJECT_OR_NOTE, "from {pose:poses} on the weight has changed by {change_N:+.2g}",
+        "check whether something was lost or picked up, and calibrate again"),
+    "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
+        "of {sigma_N:.2g}", "hang something heavier on the sensor, or record longer and in more orientations"),
+    "second_solution": Code(_REJECT, "a very different mounting of the sensor explains the data almost as well "
+        "(probability {probability_percent:.2g})", "add poses with another angle between the tool and the vertical"),
+    "weight_implausible": Code(_REJECT_OR_LIMIT, "the weight is {weight_N:.5g}{units:units}",
+        "check the units of force and torque"),
+    "com_too_far": Code(_REJECT, "the centre of mass is {distance_m:.2f} from the sensor, farther than "
+        "{most_m:g}{units:units}", "check the units of force and torque"),
+    "com_too_near": Code(_LIMIT, "the centre of mass is only {distance_mm:.2g} from the sensor, as if torques were "
+        "1000 times too small or forces were in mN", "check the units of force and torque"),
     # Directions and signs
-    "gravity_off_mounting": Code(
-        _LIMIT,
-        "gravity is {off_deg:.0f} off the direction of the declared mounting",
+    "gravity_off_mounting": Code(_LIMIT, "gravity is {off_deg:.0f} off the direction of the declared mounting",
         "correct the mounting ([workcell] mounting, --up), here and in the controller, or check the order and the "
-        "direction of the rotations",
-    ),
-    "mounting_undeclared": Code(
-        _LIMIT,
-        "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot on a wall, but no mounting is "
-        "declared",
-        "declare the mounting ([workcell] mounting, --up), or check the order and the direction of the rotations",
-    ),
-    "weight_upwards": Code(
-        _LIMIT,
-        "the weight pulls upwards ({off_deg:.0f} from down)",
-        "set sign = -1 if the sensor reports the reaction, or correct axes that are reversed or swapped in forces and "
-        "torques alike. If the robot hangs so, declare its mounting ([workcell] mounting, --up). Otherwise check the "
-        "order and the direction of the rotations",
-    ),
-    "forces_reversed": Code(
-        _LIMIT,
-        "the weight pulls upwards ({off_deg:.0f} from down) and the centre of mass lies on the robot's side of the "
-        "sensor, as if the forces were reversed and the torques not, or the orientations mirrored",
-        "reverse the forces, or give the orientations in right-handed axes",
-    ),
-    "torques_reversed": Code(
-        _LIMIT,
-        "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor",
-        "reverse the torques, unless the tool reaches back that far",
-    ),
+        "direction of the rotations"),
+    "mounting_undeclared": Code(_LIMIT, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot "
+        "on a wall, but no mounting is declared",
+        "declare the mounting ([workcell] mounting, --up), or check the order and the direction of the rotations"),
+    "weight_upwards": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down)",
+        "set sign = -1 if the sensor reports the reaction, or correct axes that are reversed or swapped in forces "
+        "and torques alike. If the robot hangs so, declare its mounting ([workcell] mounting, --up). Otherwise check "
+        "the order and the direction of the rotations"),
+    "forces_reversed": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down) and the centre of mass lies "
+        "on the robot's side of the sensor, as if the forces were reversed and the torques not, or the orientations "
+        "mirrored", "reverse the forces, or give the orientations in right-handed axes"),
+    "torques_reversed": Code(_LIMIT, "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor",
+        "reverse the torques, unless the tool reaches back that far"),
     # The described cell
-    "tool_mass_mismatch": Code(
-        _LIMIT,
-        "{load_kg:.3g} hang on the sensor, but the described tool has {tool_kg:.3g}{units:units}",
-        "check the sensor's units and what is mounted, or correct [tool] mass_kg",
-    ),
-    "payload_mismatch": Code(
-        _LIMIT,
-        "the controller has a payload of {payload_kg:.2f}, but {load_kg:.2f} hang on the sensor{sensor_kg:?|, whose "
-        "own mass is not configured}",
+    "tool_mass_mismatch": Code(_LIMIT, "{load_kg:.3g} hang on the sensor, but the described tool has "
+        "{tool_kg:.3g}{units:units}", "check the sensor's units and what is mounted, or correct [tool] mass_kg"),
+    "payload_mismatch": Code(_LIMIT, "the controller has a payload of {payload_kg:.2f}, but {load_kg:.2f} hang on the "
+        "sensor{sensor_kg:?|, whose own mass is not configured}",
         "set the payload in the controller to {set_kg:.2f}{sensor_kg:?, with sensor and adapter| plus the mass of "
-        "sensor and adapter ([sensor] mass_kg)}",
-    ),
-    "com_outside_tool": Code(
-        ("reject", "limit"),
-        "the centre of mass, at {com_mm:.0f} from the {origin} in flange axes, lies {outside_mm:.0f} outside the "
-        "described tool{units:units}",
-        "check signs and units of forces and torques, then [tool] cylinders_mm",
-    ),
+        "sensor and adapter ([sensor] mass_kg)}"),
+    "com_outside_tool": Code(_REJECT_OR_LIMIT, "the centre of mass, at {com_mm:.0f} from the {origin} in flange axes, "
+        "lies {outside_mm:.0f} outside the described tool{units:units}",
+        "check signs and units of forces and torques, then [tool] cylinders_mm"),
     # How well the data fit
-    "force_error": Code(
-        ("reject", "limit"),
-        "judged by the {source}, the force error is {share_percent:.1f} of the weight ({error_N:.2g}), more than "
-        "{limit_percent:g}",
-        "check cables, contact and orientations, and take more poses",
-    ),
-    "torque_error": Code(
-        ("reject", "limit"),
-        "judged by the {source}, the torque error is {share_percent:.1f} of the weight at {lever_m:.2g} "
-        "({error_Nm:.2g}), more than {limit_percent:g}",
-        "check cables, contact and orientations, and take more poses",
-    ),
-    "known_values_misfit_force": Code(
-        _LIMIT,
-        "without known values the forces fit to {free_N:.2g} instead of {residual_N:.2g} (method ml)",
-        "check the known mass and the assumption of a level base",
-    ),
-    "known_values_misfit_torque": Code(
-        _LIMIT,
-        "without known values the torques fit to {free_Nm:.2g} instead of {residual_Nm:.2g} (method ml)",
-        "check the known mass and the assumption of a level base",
-    ),
-    "noise_exceeded": Code(
-        ("limit", "note"),
-        "the residuals are {factor:.1f} times the measured noise ({components:?found: |the stated uncertainties do not "
-        "include this}{components:.2g})",
-        "look for drift, cables, contact and inexact orientations",
-    ),
-    "poses_rejected": Code(
-        ("limit", "note"),
-        "{count} of {n_poses} poses were rejected because they do not fit the others",
-        "repeat {poses:poses}",
-    ),
+    "force_error": Code(_REJECT_OR_LIMIT, "judged by the {source}, the force error is {share_percent:.1f} of the "
+        "weight ({error_N:.2g}), more than {limit_percent:g}",
+        "check cables, contact and orientations, and take more poses"),
+    "torque_error": Code(_REJECT_OR_LIMIT, "judged by the {source}, the torque error is {share_percent:.1f} of the "
+        "weight at {lever_m:.2g} ({error_Nm:.2g}), more than {limit_percent:g}",
+        "check cables, contact and orientations, and take more poses"),
+    "known_values_misfit_force": Code(_LIMIT, "without known values the forces fit to {free_N:.2g} instead of "
+        "{residual_N:.2g} (method ml)", "check the known mass and the assumption of a level base"),
+    "known_values_misfit_torque": Code(_LIMIT, "without known values the torques fit to {free_Nm:.2g} instead of "
+        "{residual_Nm:.2g} (method ml)", "check the known mass and the assumption of a level base"),
+    "noise_exceeded": Code(_LIMIT_OR_NOTE, "the residuals are {factor:.1f} times the measured noise "
+        "({components:?found: |the stated uncertainties do not include this}{components:.2g})",
+        "look for drift, cables, contact and inexact orientations"),
+    "poses_rejected": Code(_LIMIT_OR_NOTE, "{count} of {n_poses} poses were rejected because they do not fit the "
+        "others", "repeat {poses:poses}"),
     "few_poses": Code(_LIMIT, "there are only {n_poses} poses", "take {recommended} or more"),
-    "poses_unchecked": Code(
-        _LIMIT,
-        "{poses:poses} cannot be checked because the others do not determine all parameters",
-        "add similar poses",
-    ),
+    "poses_unchecked": Code(_LIMIT, "{poses:poses} cannot be checked because the others do not determine all "
+        "parameters", "add similar poses"),
     # Notes
-    **{
-        f"gain_{axis}": Code(
-            _NOTE, f"the gain of the sensor along {axis} is {{gain_percent:+.1f}} off, {_FOR_THIS_LOAD}"
-        )
-        for axis in "xyz"
-    },
-    "axes_mixed": Code(_NOTE, f"the sensor mixes forces along {{axes}} by {{share_percent:.1f}}, {_FOR_THIS_LOAD}"),
-    "cross_talk": Code(
-        _NOTE, f"the sensor reads up to {{torque_mNm:.2g}} of torque for 1 N of force, {_FOR_THIS_LOAD}"
-    ),
-    "response_small": Code(_NOTE, f"the sensor has a small error of gain or cross-talk, {_FOR_THIS_LOAD}"),
-    "residuals_alike": Code(
-        _NOTE,
-        "successive poses have similar residuals (correlation {correlation:.2f}), most likely from drift",
-        "let the sensor warm up and mix the order of the poses",
-    ),
-    "pose_deviates": Code(
-        _NOTE, "{pose:poses} deviates from the others by {sigmas:.1f} sigma", "consider repeating it"
-    ),
-    "gravity_tilted": Code(
-        _NOTE,
-        "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot on a slope",
-        "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations",
-    ),
-    "base_leans": Code(
-        _NOTE,
-        "the base leans {lean_deg:.2f} (sigma {sigma_deg:.2f}) towards its {side}, compared with the declared mounting",
-        "level the base, or set its mounting in the controller",
-    ),
-    "noise_unknown": Code(
-        _NOTE,
-        "the noise was estimated from the residuals, so chi2 does not test the fit",
-        "state the noise of each pose to test it",
-    ),
+    **{f"gain_{axis}": Code(_NOTE, f"the gain of the sensor along {axis} is {{gain_percent:+.1f}} off, corrected for "
+        "this load") for axis in "xyz"},
+    "axes_mixed": Code(_NOTE, "the sensor mixes forces along {axes} by {share_percent:.1f}, corrected for this load"),
+    "cross_talk": Code(_NOTE, "the sensor reads up to {torque_mNm:.2g} of torque for 1 N of force, corrected for this "
+        "load"),
+    "response_small": Code(_NOTE, "the sensor has a small error of gain or cross-talk, corrected for this load"),
+    "residuals_alike": Code(_NOTE, "successive poses have similar residuals (correlation {correlation:.2f}), most "
+        "likely from drift", "let the sensor warm up and mix the order of the poses"),
+    "pose_deviates": Code(_NOTE, "{pose:poses} deviates from the others by {sigmas:.1f} sigma",
+        "consider repeating it"),
+    "bias_stepped": Code(_NOTE, "from {pose:poses} on the bias differs by {force_N:.2g} and {torque_Nm:.2g}",
+        "check whether the sensor was tared or a cable pulls, and calibrate again"),
+    "sensor_turned": Code(_NOTE, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
+        "fasten its screws and calibrate again"),
+    "gravity_tilted": Code(_NOTE, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot on a "
+        "slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
+    "base_leans": Code(_NOTE, "the base leans {lean_deg:.2f} (sigma {sigma_deg:.2f}) towards its {side}, compared "
+        "with the declared mounting", "level the base, or set its mounting in the controller"),
+    "noise_unknown": Code(_NOTE, "the noise was estimated from the residuals, so chi2 does not test the fit",
+        "state the noise of each pose to test it"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),
     # Hints about single poses, beside the result
-    "bias_stepped": Code(
-        _NOTE,
-        "from {pose:poses} on the bias differs by {force_N:.2g} and {torque_Nm:.2g}",
-        "check whether the sensor was tared or a cable pulls, and calibrate again",
-    ),
-    "sensor_turned": Code(
-        _NOTE, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}", "fasten its screws and calibrate again"
-    ),
     "pose_turned": Code(_NOTE, "{pose:poses} turned by {turn_deg:.2f} while it was averaged", "repeat it"),
-    "pose_unsteady": Code(
-        _NOTE, "{pose:poses} was not steady while it was averaged", "look for what swings or touches, and repeat it"
-    ),
+    "pose_unsteady": Code(_NOTE, "{pose:poses} was not steady while it was averaged",
+        "look for what swings or touches, and repeat it"),
     "pose_off": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}"),
-    "pose_touched": Code(
-        _NOTE,
-        "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}, as if touched, bumped or pulled by a cable",
-        "repeat it",
-    ),
-    "load_swings": Code(
-        _NOTE,
-        "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}, torque without force",
-        "check whether the load tilts or swings",
-    ),
-    "cable_pulls": Code(
-        _NOTE,
-        "something pulls in {poses:poses}",
-        "give slack to a cable that is too short there, and repeat these poses",
-    ),
-    "sensor_drifts": Code(
-        _NOTE,
-        "the first pose reads otherwise at the end, and the poses between drift alike",
-        "let the sensor warm up for 15 to 30 min, then calibrate again",
-    ),
-    "return_differs": Code(
-        _NOTE,
-        "{pose:poses} reads otherwise at the end, and the poses between do not drift, as if it was touched then",
-        "repeat the last stop",
-    ),
+    "pose_touched": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}, as if touched, bumped or "
+        "pulled by a cable", "repeat it"),
+    "load_swings": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}, torque without force",
+        "check whether the load tilts or swings"),
+    "cable_pulls": Code(_NOTE, "something pulls in {poses:poses}",
+        "give slack to a cable that is too short there, and repeat these poses"),
+    "sensor_drifts": Code(_NOTE, "the first pose reads otherwise at the end, and the poses between drift alike",
+        "let the sensor warm up for 15 to 30 min, then calibrate again"),
+    "return_differs": Code(_NOTE, "{pose:poses} reads otherwise at the end, and the poses between do not drift, as if "
+        "it was touched then", "repeat the last stop"),
 }
+# fmt: on

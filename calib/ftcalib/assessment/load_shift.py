@@ -40,8 +40,8 @@ class Change:
         """Whether the poses before and after have no calibration in common, whatever the bias does."""
         return self.what in {"centre of mass", "load"}
 
-    def finding(self, pose: int | str, severity: Severity = "note") -> Finding:
-        """Return what changed from a pose on, given by its row from 1 or by its name."""
+    def finding(self, pose: int, severity: Severity) -> Finding:
+        """Return what changed from a pose on, given by its row from 1."""
         step, size = self.step, float(np.linalg.norm(self.step))
         code, values = {
             "centre of mass": ("com_shifted", {"shift_mm": 1e3 * size}),

@@ -127,7 +127,7 @@ def judge(
         *([] if contradicted or at.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
         *_noise(fit, at),
         *_poses(fit, at, "note" if few_rejected else "limit"),
-        *_drift(fit.drift, weight_N, is_cause=not (broken or mistakes or changed)),
+        *_drift(fit.drift, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
         *_response(fit.response),
     ]
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
@@ -404,9 +404,9 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
 
 
 def _change(fit: AssessedFit, at: _Statistics, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
-    """Report poses of two different loads, which no white noise explains: all poses after the change deviate alike.
+    """Name a lasting change between two poses, which no white noise explains: all poses after it deviate alike.
 
-    If all poses before the change were rejected, the others describe the present load, and nothing is reported.
+    Poses of two different loads have no result in common, unless all poses before the change were rejected.
     """
     if measured_sigma is None or at.chi2_p is None or (at.fits_measured_noise and at.used.all()):
         return []
@@ -421,9 +421,10 @@ def _change(fit: AssessedFit, at: _Statistics, measured_sigma: Array | None, t_s
         times[order],
         np.flatnonzero(np.isin(order, out_of_line(at.residual_sigma, at.used))).tolist(),
     )
-    if change is None or not change.of_the_tool or not at.used[order[: change.position]].any():
+    if change is None:
         return []
-    return [change.finding(int(order[change.position]) + 1, "reject")]
+    two_loads = change.of_the_tool and at.used[order[: change.position]].any()
+    return [change.finding(int(order[change.position]) + 1, "reject" if two_loads else "note")]
 
 
 def _rms(vectors: Array) -> float:

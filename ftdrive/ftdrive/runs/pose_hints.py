@@ -5,12 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from ftcalib import CalibrationResult, Finding
-from ftcalib.assessment.load_shift import Change, lasting_change
 from ftcalib.assessment.verdict import out_of_line
 from ftcalib.model import Array
 from ftcalib.routine import MOVED_RAD, DriftCheck, PoseRecord, drift_check, is_return, turned_rad
 
 _SIGNIFICANT = 4.0
+_CHANGES = {"com_shifted", "load_changed", "bias_stepped", "sensor_turned"}
+"""Findings of a result that changed between two poses."""
 
 
 def names_of(records: Sequence[PoseRecord]) -> tuple[str, ...]:
@@ -35,10 +36,8 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Fin
     if len(records) != result.n_poses:
         raise ValueError(f"{len(records)} records do not belong to a result of {result.n_poses} poses")
     names, found = names_of(records), moved(records)
-    change = _lasting_change(result, records)
-    if change is not None:
-        what, row = change
-        return (what.finding(names[row]), *found)
+    if any(one.code in _CHANGES for one in result.findings):  # which explains the rest
+        return tuple(found)
     odd = [row for row in _out_of_line(result) if _steady(records[row])]
     pulled = [row for row in odd if _pulled(result, row)]
     for row in odd:
@@ -97,20 +96,3 @@ def _drifts_alike(result: CalibrationResult, again: DriftCheck) -> bool:
         return False
     k = np.abs(again.change / again.sigma).argmax()
     return bool(result.drift.change[k] / again.change[k] > 0.5)
-
-
-def _lasting_change(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Change, int] | None:
-    """Find a lasting change, and the row of the first pose after it, in the order of taking."""
-    if result.measured_sigma is None:
-        return None
-    t_ns = np.array([record.t_mid_ns for record in records])
-    order = np.argsort(t_ns, kind="stable")
-    change = lasting_change(
-        result.parameters,
-        np.array([record.before.R_base_flange for record in records])[order],
-        result.residuals[order],
-        result.measured_sigma,
-        (t_ns[order] - t_ns.min()) * 1e-9,
-        np.flatnonzero(np.isin(order, _out_of_line(result))).tolist(),
-    )
-    return None if change is None else (change, int(order[change.position]))

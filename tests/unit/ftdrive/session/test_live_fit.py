@@ -17,7 +17,7 @@ from ftcalib.poses.information import T12, Prediction, TOOL_DOWN_R_base_flange, 
 from ftcalib.poses.selection import cone_candidates
 from ftcalib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from ftdrive.planning.search.constant_tour import NUMBERS
-from ftdrive.runs.pose_hints import hints
+from ftdrive.runs.pose_hints import _CHANGES, hints
 from ftdrive.session.events import Estimated
 from ftdrive.session.live_fit import Running, _light, faces
 from ftdrive.terminal.report import print_result
@@ -300,6 +300,14 @@ def said(taken: list[PoseRecord]) -> tuple[Finding, ...]:
     return hints(solve(dataset_from(taken, {})), taken)
 
 
+def changed(taken: list[PoseRecord]) -> Finding:
+    """What changed between two poses, without any hint about single ones."""
+    result = solve(dataset_from(taken, {}))
+    assert hints(result, taken) == ()
+    (change,) = (one for one in result.findings if one.code in _CHANGES)
+    return change
+
+
 def name(stop: int) -> str:
     return f"R{TOUR[stop - 1]:02d}"
 
@@ -340,19 +348,19 @@ def test_a_cable_that_pulls_in_three_poses_is_named_with_them() -> None:
 @pytest.mark.parametrize("since", [6, 12, 20])
 def test_a_load_that_shifts_is_named_with_the_pose_from_which_on(since: int) -> None:
     shifted = replace(TRUTH, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.004, 0.002, 0]))
-    (hint,) = said(disturbed(lambda stop, R, _: predict(shifted if stop >= since else TRUTH, R)))
-    assert (hint.code, hint.values["pose"]) == ("com_shifted", name(since))
+    change = changed(disturbed(lambda stop, R, _: predict(shifted if stop >= since else TRUTH, R)))
+    assert (change.code, change.values["pose"]) == ("com_shifted", since)
 
 
 def test_a_tare_and_a_lost_part_in_mid_tour_are_told_apart() -> None:
     step = np.array([0.3, 0, 0.2, 0, 0, 0])
-    (hint,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop >= 10) * step))
-    assert (hint.code, hint.values["pose"]) == ("bias_stepped", name(10))
-    assert hint.values["force_N"] == pytest.approx(np.linalg.norm(step), abs=0.03)
+    change = changed(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop >= 10) * step))
+    assert (change.code, change.values["pose"]) == ("bias_stepped", 10)
+    assert change.values["force_N"] == pytest.approx(np.linalg.norm(step), abs=0.03)
     lighter = replace(TRUTH, gravity_force_base_N=0.95 * TRUTH.gravity_force_base_N)
-    (hint,) = said(disturbed(lambda stop, R, _: predict(lighter if stop >= 14 else TRUTH, R)))
-    assert (hint.code, hint.values["pose"]) == ("load_changed", name(14))
-    assert hint.values["change_N"] == pytest.approx(-0.05 * np.linalg.norm(TRUTH.gravity_force_base_N), rel=0.1)
+    change = changed(disturbed(lambda stop, R, _: predict(lighter if stop >= 14 else TRUTH, R)))
+    assert (change.code, change.values["pose"]) == ("load_changed", 14)
+    assert change.values["change_N"] == pytest.approx(-0.05 * np.linalg.norm(TRUTH.gravity_force_base_N), rel=0.1)
 
 
 def test_a_pose_that_moved_is_named_and_not_explained_otherwise() -> None:
