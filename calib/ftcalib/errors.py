@@ -7,6 +7,11 @@ CalibError
 └── NotObservable    the poses do not determine the parameters: the message names what is missing
 """
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ftcalib.findings import Finding
+
 
 class CalibError(Exception):
     """Base of all errors of the solver core."""
@@ -25,4 +30,8 @@ class TooFewSamples(CalibError):
 
 
 class NotObservable(CalibError):
-    """The poses do not determine the parameters."""
+    """The poses do not determine the parameters; `finding` is the mistake in the data that explains it, if any."""
+
+    def __init__(self, message: str, finding: "Finding | None" = None) -> None:
+        super().__init__(message)
+        self.finding = finding

@@ -12,10 +12,11 @@ from typing import Any, Literal, Self
 import numpy as np
 from scipy.special import expit
 
-from ftcalib.assessment.verdict import SURE, Verdict, expected_error
+from ftcalib.assessment.verdict import SURE, expected_error
 from ftcalib.compensation import Compensator
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, read_object, write_new
+from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from ftcalib.model import PARAMETER_NAMES, Array, Parameters, is_rotation, read_only
 from ftcalib.published.yu import weight_and_tilt
@@ -24,19 +25,6 @@ FORMAT = "ftdrive.calibration/1"
 
 COMMON_GAIN = float(np.sqrt(5 / 3 / 3))
 """Sigma of the mean of three gains over that of one; five numbers determine that one, so 5/3 as in Student's t."""
-
-LATER = (
-    "p_value",
-    "measured_sigma",
-    "weights",
-    "components",
-    "drift",
-    "response",
-    "gain_sigma",
-    "second_basin_chi2",
-    "quality",
-)
-"""Fields that the first files of this format lack."""
 
 Method = Literal[
     "ml",
@@ -88,9 +76,8 @@ class CalibrationResult:
     """Source of the noise: the spread within each pose, or the residuals of the fit."""
     g_m_s2: float
     method: Method
-    verdict: Verdict
-    reasons: tuple[str, ...]
-    """Reasons for a verdict below good, then notes."""
+    findings: tuple[Finding, ...]
+    """What gives the verdict, the first one to be fixed first; then notes."""
     provenance: Mapping[str, JSON] = field(default_factory=dict)
     p_value: float | None = None
     """Probability of a larger chi2 if there is only the measured noise; None if the noise was not measured."""
@@ -140,7 +127,8 @@ class CalibrationResult:
             given = self.response
             object.__setattr__(self, "response", Response(given["coefficients"], given["covariance"]))
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
-        object.__setattr__(self, "reasons", tuple(self.reasons))
+        found = (one if isinstance(one, Finding) else Finding.from_dict(one) for one in self.findings)
+        object.__setattr__(self, "findings", tuple(found))
         for name in ("provenance", "quality"):
             try:
                 value = json.loads(json.dumps(dict(getattr(self, name)), allow_nan=False))
@@ -159,6 +147,16 @@ class CalibrationResult:
         if self.response is not None:
             numbers.append(self.response.to_dict())
         return hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:12]
+
+    @property
+    def verdict(self) -> Verdict:
+        """That of the worst finding."""
+        return verdict_of(self.findings)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return tuple(one.words for one in self.findings)
 
     @property
     def n_poses(self) -> int:
@@ -292,7 +290,7 @@ class CalibrationResult:
 
     @property
     def noise_explains(self) -> bool:
-        """Whether the residuals agree with the noise model; True for files of the first version, which lack it."""
+        """Whether the residuals agree with the noise model; True for an update, whose poses are too few for a test."""
         return not self.quality or (self.p_value is not None and self.p_value >= SURE)
 
     def likely_error(self) -> Array:
@@ -326,7 +324,7 @@ class CalibrationResult:
             "id": self.id,
             "method": self.method,
             "verdict": self.verdict,
-            "reasons": list(self.reasons),
+            "findings": [one.to_dict() for one in self.findings],
             "n_poses": self.n_poses,
             "mass_kg": self.mass_kg,
             "weight_N": self.weight_N,
@@ -371,11 +369,7 @@ class CalibrationResult:
         try:
             return cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
-                **{
-                    field.name: document[field.name]
-                    for field in fields(cls)
-                    if field.name != "parameters" and not (field.name in LATER and field.name not in document)
-                },
+                **{field.name: document[field.name] for field in fields(cls) if field.name != "parameters"},
             )
         except KeyError as exc:
             raise BadCalibration(f"the calibration lacks the field {exc.args[0]}: the file is damaged.") from exc

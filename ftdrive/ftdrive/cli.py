@@ -24,7 +24,7 @@ _COMMANDS = {
     "doctor": ("ftdrive.commands.doctor", "Check robot, sensor and computer. Moves nothing."),
     "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
-    "report": ("ftdrive.commands.report", "Report a calibration in one file: verdict, reasons, figures."),
+    "report": ("ftdrive.commands.report", "Report a calibration in one file: verdict, findings, figures."),
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
     "push": ("ftdrive.commands.push", "Set payload or gravity in the controller as calibrated."),
     "record": ("ftdrive.commands.record", "Record raw and compensated wrench with pose and events."),

@@ -1,5 +1,7 @@
 """Errors of the application itself."""
 
+from pathlib import Path
+
 
 class ConfigError(Exception):
     """The configuration or the combination of options cannot be used."""
@@ -14,7 +16,18 @@ class BadPlan(Exception):
 
 
 class BadRecording(Exception):
-    """A file does not contain a recording that this version can read."""
+    """A file does not contain a recording that this version can read.
+
+    Parameters
+    ----------
+    problem : str
+    path : Path, optional
+        Of the file; it stands before the problem.
+    """
+
+    def __init__(self, problem: str, path: Path | None = None) -> None:
+        super().__init__(problem if path is None else f"{path}: {problem}")
+        self.problem = problem
 
 
 class BadStore(Exception):

@@ -112,8 +112,7 @@ def check_workcell(cell: CellConfig, model: str | None) -> Check:
     try:
         require_possible(cell, model)
     except ConfigError as error:
-        found, _, fix = str(error).rpartition(": ")
-        return Check(name, "failed", found, fix)
+        return Check(name, "failed", str(error))
     if not cell.workcell.measured:
         fix = "measure tool, planes and boxes, then set measured = true in [workcell] of ftdrive.toml"
         return Check(name, "failed", "tool and surroundings are placeholders", fix)

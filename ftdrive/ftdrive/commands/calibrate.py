@@ -245,6 +245,6 @@ def _as_json(outcome: "Outcome") -> dict[str, Any]:
     return {
         "run": str(outcome.run.folder),
         "drift_check": None if outcome.drift is None else outcome.drift.to_dict(),
-        "hints": list(hints(outcome.result, outcome.run.records())),
+        "hints": [one.to_dict() for one in hints(outcome.result, outcome.run.records())],
         **outcome.result.to_dict(),
     }

@@ -118,7 +118,12 @@ def init(
         ask.number("Tool, kg, about (Enter: unknown)", "tool.mass_kg", tool_mass, ""),
     )
     workcell = WorkcellConfig(
-        ask.text("Mounting: floor, wall, ceiling or degrees", "workcell.mounting", mounting),
+        ask.text(
+            "Mounting: floor, wall, ceiling or degrees",
+            "workcell.mounting",
+            mounting,
+            ask.defaults["workcell.mounting"] or "floor",
+        ),
         ask.rows(
             "First wall or table, NX:NY:NZ:MM; -1:0:0:-800 is 800 mm away towards +x",
             "workcell.planes_mm",

@@ -97,8 +97,8 @@ def compensated_file(recording: bytes, name: str, task: bytes) -> bytes:
             source.write_bytes(recording)
             try:
                 numbers = _compensated(source, output, given)
-            except (BadRecording, ConfigError) as error:  # the temporary folder means nothing to a user
-                raise type(error)(str(error).removeprefix(f"{source}: ").replace(str(source), name)) from error
+            except BadRecording as error:  # the temporary folder means nothing to a user
+                raise BadRecording(error.problem) from error
             with output.open("ab") as file:
                 file.write(b"\n" + json.dumps(numbers).encode())
             return output.read_bytes()

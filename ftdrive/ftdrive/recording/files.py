@@ -90,9 +90,9 @@ def read_recording(path: Path, columns: Collection[str] = ROW.names or ()) -> Re
     try:
         recording = file_format.read(path, columns)
     except BadRecording as error:
-        raise BadRecording(f"{path}: {error}") from error
+        raise BadRecording(error.problem, path) from error
     if not len(recording.rows):
-        raise BadRecording(f"{path}: it contains no sample: the file was cut, or the stream ended at once")
+        raise BadRecording("it contains no sample: the file was cut, or the stream ended at once", path)
     return recording
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from ftcalib import CalibrationDataset, Known, read_csv
-from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE
+from ftcalib import CalibrationDataset, Known, Setup, read_csv
+from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.routine import PoseRecord
 from ftdrive.runs.outcome import dataset_of
 from ftdrive.runs.run import Run, versions
@@ -20,13 +20,15 @@ class Source:
 
     dataset: CalibrationDataset
     circumstances: dict[str, Any]
-    """What else `ftcalib.solve` takes; `payload_kg` only for a run."""
+    """What else `ftcalib.solve` takes: gravity, known values and the described cell."""
     provenance: dict[str, Any]
     records: Sequence[PoseRecord] = ()
     """Only of a run."""
 
 
-def read_source(source: Path, orientation: Orientation, known: Known | None = None) -> Source:
+def read_source(
+    source: Path, orientation: Orientation, known: Known | None = None, up_in_base: Sequence[float] | None = None
+) -> Source:
     """Read the data of a place.
 
     Parameters
@@ -37,6 +39,8 @@ def read_source(source: Path, orientation: Orientation, known: Known | None = No
         Of the rotations in a CSV file.
     known : Known, optional
         A known direction of gravity means a base that is level with respect to the mounting.
+    up_in_base : sequence of float, optional
+        (3,) declared up direction, instead of that of a run's mounting.
 
     Raises
     ------
@@ -49,8 +53,11 @@ def read_source(source: Path, orientation: Orientation, known: Known | None = No
     else:
         records = []
         dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
-        circumstances = {"g_m_s2": STANDARD_GRAVITY_M_S2, "up_in_base": UP_IN_BASE}
+        circumstances = {"g_m_s2": STANDARD_GRAVITY_M_S2, "setup": Setup()}
         provenance = {"source": source.name, "versions": versions()}
+    if up_in_base is not None:
+        circumstances["setup"] = replace(circumstances["setup"], up_in_base=up_in_base)
+        provenance["up_in_base"] = list(up_in_base)
     if known is not None and known.gravity_direction_base is not None:
-        known = replace(known, gravity_direction_base=-circumstances["up_in_base"])
+        known = replace(known, gravity_direction_base=-circumstances["setup"].up)
     return Source(dataset, {**circumstances, "known": known}, provenance, records)
