@@ -1,28 +1,74 @@
-"""Errors of the solver core.
+"""The tree of all errors: whatever a user of the library can fix is a `FtdriveError`.
 
-CalibError
-├── BadDataset       the data are invalid: the message names the row and the reason
-├── BadCalibration   a file is not a calibration that this version can read
-├── TooFewSamples    the sensor sends too few samples for an average
-└── NotObservable    the poses do not determine the parameters: the message names what is missing
+FtdriveError
+├── UsageError        an argument, an option or a configuration cannot be used
+├── DeviceError       a robot, a sensor or its stream has failed
+│   └── TooFewSamples     the sensor sends too few samples for an average
+├── DataError         a file, or the data in it, cannot be used
+│   ├── BadDataset        the data are invalid: the message names the row and the reason
+│   └── BadCalibration    a file is not a calibration that this version can read
+└── AcceptanceError   what was measured is not good enough, or a check failed
+    └── NotObservable     the poses do not determine the parameters: the message names what is missing
+
+`ftdrivers.errors` and `ftdrive.errors` add theirs below the same four. Python's own `ValueError` and `TypeError` mean a
+defect of the program that calls.
 """
 
 
-class CalibError(Exception):
-    """Base of all errors of the solver core."""
+class FtdriveError(Exception):
+    """Base of all errors of ftdrive.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> try:
+    ...     ftdrive.open_stream(calibration="no/such/calibration.json", simulate=True)
+    ... except (ftdrive.FtdriveError, OSError) as error:
+    ...     print(type(error).__name__)
+    FileNotFoundError
+    """
 
 
-class BadDataset(CalibError):
-    """The data are invalid."""
+class UsageError(FtdriveError):
+    """An argument, an option or a configuration cannot be used."""
 
 
-class BadCalibration(CalibError):
-    """A stored calibration cannot be read."""
+class DeviceError(FtdriveError):
+    """A robot, a sensor or its stream has failed. The text of the error is "found; fix".
+
+    Parameters
+    ----------
+    found
+        What happened, with the value; without capital and full stop.
+    fix
+        What to do next, from a verb on; empty where that is unknown. A conversion to another class keeps it.
+    """
+
+    def __init__(self, found: str, fix: str = "") -> None:
+        super().__init__(f"{found}; {fix}" if fix else found)  # one argument: two would be those of an `OSError`
+        self.found = found
+        self.fix = fix
 
 
-class TooFewSamples(CalibError):
+class DataError(FtdriveError):
+    """A file, or the data in it, cannot be used."""
+
+
+class AcceptanceError(FtdriveError):
+    """What was measured is not good enough, or a check failed."""
+
+
+class TooFewSamples(DeviceError):
     """The sensor sends too few samples for an average."""
 
 
-class NotObservable(CalibError):
+class BadDataset(DataError):
+    """The data are invalid."""
+
+
+class BadCalibration(DataError):
+    """A stored calibration cannot be read."""
+
+
+class NotObservable(AcceptanceError):
     """The poses do not determine the parameters."""

@@ -30,6 +30,7 @@ from typing import IO, Any, Final, Self
 from urllib.parse import parse_qsl, urlencode
 
 from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import BadTranscript
 from ftdrivers.registry import split_url
 
 FORMAT: Final = "ftdrive.transcript/1"
@@ -39,10 +40,6 @@ INTERRUPTED: Final = "interrupted"
 """The error of a recording that the user has interrupted."""
 _LONGEST_PAGE_S: Final = 60.0
 """Longer than any driver waits for a page."""
-
-
-class BadTranscript(Exception):
-    """The file is not a transcript, or is damaged."""
 
 
 class Writer:

@@ -278,8 +278,8 @@ def _robot(ask: Questions, given: str | None, model: str | None, clock: Clock) -
 
 def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
     """Return address and what the sensor reports; the operator may keep an address that does not answer."""
+    from ftcalib.errors import UsageError
     from ftdrive.checks.discovery import identify_sensor, is_place, places, sensor_at
-    from ftdrive.errors import ConfigError
     from ftdrivers.errors import DeviceError
 
     found = [] if given or not ask.interactive else places()
@@ -299,7 +299,7 @@ def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
         try:
             url = sensor_at(url, clock) if is_place(url) else url
             report = identify_sensor(url, clock)
-        except (DeviceError, ConfigError) as error:
+        except (DeviceError, UsageError) as error:
             if not ask.interactive:
                 raise
             _say(str(error), "  ✘ ")

@@ -13,13 +13,12 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, CalibrationResult, Known
 from ftcalib import solve as solve_dataset
 from ftcalib.compare import compare
-from ftcalib.errors import CalibError
+from ftcalib.errors import AcceptanceError, DataError
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import UP_IN_BASE
 from ftcalib.result import Method
 from ftcalib.routine import drift_check
 from ftdrive.checks.plausibility import judged
-from ftdrive.cli import exit_code
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,
@@ -33,7 +32,7 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.commands.emulated_run import rehearsed_run
-from ftdrive.errors import BadBundle, ConfigError, NotAccepted
+from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.source import Orientation, read_source
@@ -121,7 +120,7 @@ def _solve_each(
     force: bool,
     as_json: bool,
 ) -> None:
-    first_failure: CalibError | NotAccepted | BadBundle | None = None
+    first_failure: AcceptanceError | DataError | None = None
     for source in sources:
         try:
             with unpacked(source) as place:
@@ -143,7 +142,7 @@ def _solve_each(
                 if output is not None:
                     result.save(output)
                     talk.print(f" Saved {output}")
-        except (CalibError, NotAccepted, BadBundle) as error:
+        except (AcceptanceError, DataError) as error:
             if len(sources) == 1:
                 raise
             first_failure = first_failure or error

@@ -84,7 +84,7 @@ def compensated_file(recording: bytes, name: str, task: bytes) -> bytes:
     ------
     OtherVersion
         The task was made by another version.
-    BadRecording, ConfigError, CalibError
+    ConfigError, DataError
         The recording cannot be compensated in this way.
     OSError
         The temporary folder of the worker cannot be written.

@@ -65,7 +65,7 @@ def read_subject(source: Path, options: SolveOptions, parent: Path | None = None
 
     Raises
     ------
-    BadCalibration, BadDataset, CalibError, ConfigError, OSError
+    ConfigError, DataError, NotObservable, OSError
     """
     if is_calibration(source):
         if options != SolveOptions():

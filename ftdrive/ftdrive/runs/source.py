@@ -40,7 +40,7 @@ def read_source(source: Path, orientation: Orientation, known: Known | None = No
 
     Raises
     ------
-    BadDataset, CalibError
+    BadDataset, OSError
     """
     if source.is_dir():
         run = Run(source)

@@ -8,9 +8,8 @@ from typing import Any, Self, cast
 import pytest
 from click.testing import CliRunner
 
-from ftdrive.cli import exit_code
 from ftdrive.commands import live_source, stream
-from ftdrive.errors import ConfigError
+from ftdrive.errors import ConfigError, exit_code
 from ftdrive.live.samples import Block, StreamEvent, WrenchFrame
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
