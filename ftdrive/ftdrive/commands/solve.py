@@ -96,7 +96,7 @@ def solve(
 ) -> None:
     """Solve each DATASET: a run folder, the file of `ftdrive bundle`, a dataset.json, or a CSV file.
 
-    A CSV has a header with r11..r33 (or the rotation vector rx,ry,rz), fx,fy,fz,tx,ty,tz in N and N·m, and optionally
+    A CSV has a header with r11..r33, qx,qy,qz,qw or rx,ry,rz in rad, fx,fy,fz,tx,ty,tz in N and N·m, and optionally
     t in seconds and sigma_fx..sigma_tz, the standard error of each pose's mean. With --json, one object a line.
     """
     check_simulate(simulate, real={"DATASET": sources}, emulated={"--sensor": sensor})
