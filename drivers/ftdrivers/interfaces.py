@@ -237,12 +237,23 @@ class Finding:
 
 class _Device(ABC):
     @abstractmethod
+    def open(self) -> None:
+        """Connect. Idempotent. Raises `ConnectError`."""
+
+    @abstractmethod
     def close(self) -> None:
         """Disconnect. Idempotent; never raises on a lost device."""
 
     @abstractmethod
     def identify(self) -> DeviceInfo:
         """Return model, serial number and firmware, as read when the device was opened."""
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 class ForceTorqueSensor(_Device):
@@ -286,16 +297,9 @@ class ForceTorqueSensor(_Device):
         """Return the sensor's temperature, as it came with its newest sample; None where a sensor reports none."""
         return None
 
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 class RobotArm(_Device):
-    """A six-joint arm."""
+    """A six-joint arm. `with arm:` opens it for reading."""
 
     @abstractmethod
     def open(self, *, control: bool = False) -> None:

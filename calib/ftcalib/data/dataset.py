@@ -10,13 +10,13 @@ from types import MappingProxyType
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, read_object, write_new
-from ftcalib.model import ROUNDING, Array, nearest_rotation, read_only
+from ftcalib.model import ROUNDING, Array, Rotations, matrices_of, nearest_rotation, read_only
 
 FORMAT = "ftdrive.dataset/1"
 
@@ -89,6 +89,47 @@ class CalibrationDataset:
             raise BadDataset(f"meta cannot be written as JSON ({exc}): use text, numbers, lists and mappings.") from exc
         object.__setattr__(self, "meta", MappingProxyType(meta))
 
+    @classmethod
+    def of(
+        cls,
+        R_base_flange: Rotations,
+        wrench: ArrayLike,
+        *,
+        wrench_cov: ArrayLike | None = None,
+        n_samples: ArrayLike = 0,
+        t_s: ArrayLike = np.nan,
+        meta: Mapping[str, JSON] | None = None,
+    ) -> Self:
+        """Build from rotations, such as a list of scipy's, and mean wrenches; what is unknown may be left out.
+
+        Parameters
+        ----------
+        R_base_flange : array, shape (n, 3, 3), or n Rotations
+        wrench : array_like, shape (n, 6)
+        wrench_cov : array_like, shape (n, 6, 6) or (6, 6), optional
+        n_samples, t_s : array_like, shape (n,) or one number for all
+        meta : mapping, optional
+
+        Raises
+        ------
+        BadDataset
+        """
+        wrench = np.asarray(wrench)
+        n = len(np.atleast_1d(wrench))
+
+        def of_each(value: ArrayLike, ndim: int) -> Any:
+            array = np.asarray(value)
+            return array if array.ndim > ndim else np.broadcast_to(array, (n, *array.shape))
+
+        return cls(
+            R_base_flange=matrices_of(R_base_flange),
+            wrench=wrench,
+            wrench_cov=None if wrench_cov is None else of_each(wrench_cov, 2),
+            n_samples=of_each(n_samples, 0),
+            t_s=of_each(t_s, 0),
+            meta=meta or {},
+        )
+
     def __len__(self) -> int:
         """Count the poses."""
         return len(self.wrench)
@@ -122,17 +163,17 @@ class CalibrationDataset:
             meta=meta,
         )
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write a new file; raises `FileExistsError` if it exists."""
         write_new(path, json.dumps(self.to_dict(), allow_nan=False) + "\n")
 
     @classmethod
-    def load(cls, path: Path) -> Self:
+    def load(cls, path: str | Path) -> Self:
         """Read a dataset file. Raises `BadDataset` or `OSError`."""
         try:
             return cls.from_dict(read_object(path, BadDataset))
         except BadDataset as exc:
-            raise BadDataset(f"{path.name}: {exc}") from exc
+            raise BadDataset(f"{Path(path).name}: {exc}") from exc
 
     def sha256(self) -> str:
         """Hash the content, independent of spacing and order of fields in the file.

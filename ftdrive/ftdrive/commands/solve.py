@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, CalibrationResult, Known
 from ftcalib import solve as solve_dataset
 from ftcalib.compare import compare
+from ftcalib.data.dataset import Orientation
 from ftcalib.errors import AcceptanceError, DataError
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import UP_IN_BASE
@@ -35,7 +36,7 @@ from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.pose_hints import hints
-from ftdrive.runs.source import Orientation, read_source
+from ftdrive.runs.source import read_source
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.report import print_comparison, print_result
 

@@ -56,6 +56,23 @@ def test_arrays_are_copies_that_cannot_be_written_to() -> None:
         data.meta["sensor"] = "other"  # type: ignore[index]  # the point of the test
 
 
+@pytest.mark.parametrize("rotations", [R, list(R), Rotation.from_matrix(R), [Rotation.from_matrix(one) for one in R]])
+def test_of_takes_rotations_in_any_form_and_fills_in_what_is_unknown(rotations: Any) -> None:
+    data = CalibrationDataset.of(rotations, np.zeros((4, 6)).tolist(), wrench_cov=np.eye(6))
+    np.testing.assert_allclose(data.R_base_flange, R, atol=1e-15)
+    assert data.n_samples.tolist() == [0] * 4
+    assert np.isnan(data.t_s).all()
+    assert data.wrench_cov is not None
+    np.testing.assert_array_equal(data.wrench_cov, [np.eye(6)] * 4)
+
+
+def test_of_names_what_does_not_fit() -> None:
+    with pytest.raises(BadDataset, match=r"wrench has shape \(3, 6\), expected \(4, 6\)"):
+        CalibrationDataset.of(R, np.zeros((3, 6)))
+    with pytest.raises(BadDataset, match=r"t_s has shape \(3,\), expected \(4,\)"):
+        CalibrationDataset.of(R, np.zeros((4, 6)), t_s=[1, 2, 3])
+
+
 NOT_SYMMETRIC = np.tile(np.eye(6), (4, 1, 1))
 NOT_SYMMETRIC[1, 0, 1] = 0.5
 INDEFINITE = np.tile(np.eye(6), (4, 1, 1))
@@ -284,6 +301,14 @@ def test_csv_errors_name_column_or_row(tmp_path: Path, lines: list[str], snapsho
     with pytest.raises(BadDataset) as caught:
         read_csv(csv(tmp_path, *lines))
     assert wording(caught.value) == snapshot
+
+
+def test_a_path_may_be_text(tmp_path: Path) -> None:
+    path = str(tmp_path / "dataset.json")
+    dataset().save(path)
+    assert CalibrationDataset.load(path).sha256() == dataset().sha256()
+    with pytest.raises(BadDataset, match=r"^dataset.json: the header|^dataset.json: missing column"):
+        read_csv(path)
 
 
 def test_csv_that_is_not_text(tmp_path: Path) -> None:

@@ -102,7 +102,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *arguments: str) -> tup
         return Source()
 
     monkeypatch.setattr(live_source, "CompensatedStream", open_)
-    monkeypatch.setattr(live_source, "load_calibration", lambda _: SimpleNamespace())
+    monkeypatch.setattr(live_source, "read_calibration", lambda _: SimpleNamespace())
     monkeypatch.setattr(live_source, "read_cell", lambda *_: SimpleNamespace())
     calibration = tmp_path / "calibration.json"
     calibration.touch()

@@ -13,9 +13,11 @@ import pytest
 from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.errors import ConfigError
+from ftdrive.library import open_stream
 from ftdrive.live import stream as module
 from ftdrive.live.samples import Stages, WrenchFrame
-from ftdrive.live.stream import CompensatedStream, load_calibration, open_stream
+from ftdrive.live.stream import CompensatedStream
+from ftdrive.runs.source import read_calibration
 from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmStates, DeviceInfo, FtSamples, Health
@@ -314,6 +316,6 @@ def test_a_stream_is_opened_from_paths(cell: Cell, tmp_path: Any) -> None:
         assert stream.info.calibration.mass_kg == pytest.approx(cell.calibration.mass_kg)
         assert stream.info.tool == "gripper"
         np.testing.assert_allclose(stream.info.p_flange_sensor_m, [0, 0, 0.03])
-    assert load_calibration(tmp_path).mass_kg == pytest.approx(cell.calibration.mass_kg)  # as a run folder
+    assert read_calibration(tmp_path).mass_kg == pytest.approx(cell.calibration.mass_kg)  # as a run folder
     with pytest.raises(ConfigError, match="no calibration"):
         open_stream(cell.config)
