@@ -43,6 +43,15 @@ class Compensator:
     Notes
     -----
     Nothing is written after construction: threads may share an instance.
+
+    Examples
+    --------
+    >>> import ftdrive, numpy as np
+    >>> calibration = ftdrive.solve(ftdrive.read_dataset("poses.csv"))
+    >>> compensate = ftdrive.Compensator(calibration.parameters, response=calibration.response)
+    >>> free = ftdrive.predict(calibration.parameters, np.eye(3))
+    >>> bool(np.abs(compensate(free, np.eye(3))).max() < 0.01)
+    True
     """
 
     def __init__(

@@ -16,21 +16,33 @@ defect of the program that calls.
 
 
 class FtdriveError(Exception):
-    """Base of all errors of ftdrive.
+    """Base of all errors of ftdrive that a user can fix; the message says what happened and what to do.
+
+    Files that are missing or cannot be written raise Python's `OSError`.
 
     Examples
     --------
     >>> import ftdrive
     >>> try:
-    ...     ftdrive.open_stream(calibration="no/such/calibration.json", simulate=True)
-    ... except (ftdrive.FtdriveError, OSError) as error:
+    ...     ftdrive.open_sensor("emulated://scale")
+    ... except ftdrive.FtdriveError as error:
     ...     print(type(error).__name__)
-    FileNotFoundError
+    ConfigError
     """
 
 
 class UsageError(FtdriveError):
-    """An argument, an option or a configuration cannot be used."""
+    """An argument, an option or a configuration cannot be used.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> try:
+    ...     ftdrive.plan_tour("ur5e", [(0, 200, 100)], poses=7)
+    ... except ftdrive.UsageError as error:
+    ...     print(error)
+    a plan of 7 poses does not exist: choose 24, 12, 6
+    """
 
 
 class DeviceError(FtdriveError):
@@ -42,6 +54,15 @@ class DeviceError(FtdriveError):
         What happened, with the value; without capital and full stop.
     fix
         What to do next, from a verb on; empty where that is unknown. A conversion to another class keeps it.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> try:
+    ...     ftdrive.open_sensor("bota:///dev/no-such-port")
+    ... except ftdrive.DeviceError as error:
+    ...     print(bool(error.found), bool(error.fix))
+    True True
     """
 
     def __init__(self, found: str, fix: str = "") -> None:
@@ -51,11 +72,31 @@ class DeviceError(FtdriveError):
 
 
 class DataError(FtdriveError):
-    """A file, or the data in it, cannot be used."""
+    """A file, or the data in it, cannot be used.
+
+    Examples
+    --------
+    >>> import ftdrive, numpy as np
+    >>> try:
+    ...     ftdrive.CalibrationDataset.of(np.zeros((4, 3, 3)), np.zeros((4, 6)))
+    ... except ftdrive.DataError as error:
+    ...     print(str(error).partition(",")[0])
+    row 1: the orientation is not a rotation matrix
+    """
 
 
 class AcceptanceError(FtdriveError):
-    """What was measured is not good enough, or a check failed."""
+    """What was measured is not good enough, or a check failed.
+
+    Examples
+    --------
+    >>> import ftdrive, numpy as np
+    >>> try:
+    ...     ftdrive.solve(ftdrive.CalibrationDataset.of([np.eye(3)] * 4, np.ones((4, 6))))
+    ... except ftdrive.AcceptanceError as error:
+    ...     print(type(error).__name__)
+    NotObservable
+    """
 
 
 class TooFewSamples(DeviceError):

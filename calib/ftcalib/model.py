@@ -37,7 +37,15 @@ BIASES = np.r_[6:9, 12:15]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameters:
-    """The estimated quantities."""
+    """The estimated quantities.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> parameters = ftdrive.solve(ftdrive.read_dataset("poses.csv")).parameters
+    >>> parameters.p_sensor_com_m.round(3)
+    array([0.004, 0.002, 0.061])
+    """
 
     R_flange_sensor: Array
     """(3, 3) maps sensor coordinates to flange coordinates."""

@@ -74,7 +74,15 @@ class DriftResult:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """Estimates with their covariance; arrays are read-only. Frames and signs are those of calib/README.md."""
+    """Estimates with their covariance; arrays are read-only. Frames and signs are those of calib/README.md.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> result = ftdrive.solve(ftdrive.read_dataset("poses.csv"))
+    >>> f"{result.mass_kg:.4f} kg, sigma {result.sigma['mass_kg']:.4f} kg, {result.verdict}"
+    '1.2350 kg, sigma 0.0002 kg, good'
+    """
 
     parameters: Parameters
     covariance: Array

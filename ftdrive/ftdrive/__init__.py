@@ -8,7 +8,7 @@ Modules behind them may move; these names stay.
 | calibrate from data | `read_dataset`, `CalibrationDataset`, `solve`, `compare`, `Known`, `CalibrationResult` |
 | keep and read results | `read_calibration`, `Run`, `read_recording`, `write_recording` |
 | compensate | `CalibrationResult.compensate`, `Compensator`, `predict`, `Parameters` |
-| live | `open_stream`, `WrenchFrame`, `Stages` |
+| live | `open_stream`, `WrenchFrame`, `Stages`, `Contact` |
 | devices | `open_sensor`, `open_arm`, `ForceTorqueSensor`, `RobotArm`, `FtSamples`, `ArmState`, `DeviceInfo` |
 | own drivers | `StreamingSensor`, `ReadOnlyArm` |
 | plan | `plan_tour` |
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ftcalib.result import CalibrationResult
     from ftcalib.solver import solve
     from ftdrive.library import open_arm, open_sensor, open_stream, plan_tour
+    from ftdrive.live.contact import Contact
     from ftdrive.live.samples import Stages, WrenchFrame
     from ftdrive.recording.files import read_recording, write_recording
     from ftdrive.runs.run import Run
@@ -44,6 +45,7 @@ __all__ = [
     "CalibrationDataset",
     "CalibrationResult",
     "Compensator",
+    "Contact",
     "DataError",
     "DeviceError",
     "DeviceInfo",
@@ -82,6 +84,7 @@ _MODULES = {
     "ftcalib.result": ("CalibrationResult",),
     "ftcalib.solver": ("solve",),
     "ftdrive.library": ("open_arm", "open_sensor", "open_stream", "plan_tour"),
+    "ftdrive.live.contact": ("Contact",),
     "ftdrive.live.samples": ("Stages", "WrenchFrame"),
     "ftdrive.recording.files": ("read_recording", "write_recording"),
     "ftdrive.runs.run": ("Run",),

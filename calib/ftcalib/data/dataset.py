@@ -47,6 +47,15 @@ class CalibrationDataset:
     ------
     BadDataset
         The message names the row, counted from 1, and the fault.
+
+    Examples
+    --------
+    >>> import ftdrive, numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> poses = [Rotation.from_rotvec([0, 0, 0]), Rotation.from_rotvec([np.pi / 2, 0, 0])]
+    >>> dataset = ftdrive.CalibrationDataset.of(poses, np.zeros((2, 6)))
+    >>> len(dataset), dataset.R_base_flange.shape
+    (2, (2, 3, 3))
     """
 
     R_base_flange: Array

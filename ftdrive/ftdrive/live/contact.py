@@ -101,7 +101,17 @@ def _hotelling(rate: float, dof: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """A contact, up to now or to its end."""
+    """A contact, up to now or to its end.
+
+    Examples
+    --------
+    `open_stream` passes it to `on_contact`:
+
+    >>> import ftdrive, numpy as np
+    >>> contact = ftdrive.Contact(begin_ns=0, last_ns=10**9, peak_N=5.0, peak=np.array([0, 0, -5.0, 0, 0, 0]))
+    >>> contact.over, contact.duration_s, contact.direction
+    (False, 1.0, array([ 0.,  0., -1.]))
+    """
 
     begin_ns: int
     """Clock of the cell."""

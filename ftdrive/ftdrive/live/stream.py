@@ -98,8 +98,6 @@ class CompensatedStream(ProcessedStream):
         false_alarm_rate: float = FALSE_ALARM_RATE,
         devices: tuple[ForceTorqueSensor | None, RobotArm | None] = (None, None),
     ) -> None:
-        self.station = cell if isinstance(cell, Station) else None
-        """The emulated cell: its `control(do="push", wrench=…)` and other requests are in mocks/README.md."""
         self._given = cell
         self._devices = devices
         self._wanted = calibration
@@ -153,6 +151,16 @@ class CompensatedStream(ProcessedStream):
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
+
+    @property
+    def station(self) -> Station:
+        """The emulated cell, such as `station.control(do="push", wrench=[0, 0, -5, 0, 0, 0], seconds=1)`.
+
+        mocks/README.md lists the requests. Raises `ConfigError` for a real cell.
+        """
+        if not isinstance(self._given, Station):
+            raise ConfigError("this is a real cell: only a stream with simulate=True has a station")
+        return self._given
 
     def _chosen(self, arm: DeviceInfo, sensor: DeviceInfo) -> tuple[CalibrationResult, str, tuple[str, ...]]:
         """Return the calibration, its name and warnings; it belongs to the devices and their mounting."""

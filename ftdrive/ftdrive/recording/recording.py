@@ -166,6 +166,12 @@ class Recording:
     """Why the file ends early; empty if it is complete."""
 
     @property
+    def table(self) -> NDArray[np.void]:
+        """(n,) the samples, one named field a number, as `pandas.DataFrame` takes them; names as in the CSV format."""
+        names = self.rows.dtype.names or ()
+        return self.rows.view([(one, COLUMNS[one]) for name in names for one in NUMBERS[name]])
+
+    @property
     def duration_s(self) -> float:
         """From the first sample to the last."""
         return float(np.ptp(self.rows["t_host_ns"])) * 1e-9 if len(self.rows) else 0.0
