@@ -145,24 +145,35 @@ def open_stream(
     name = str(calibration) if isinstance(calibration, str | Path) else ""
     given = read_calibration(calibration) if isinstance(calibration, str | Path) else calibration
     cell: CellConfig | Station
+    chosen: CalibrationResult | str
     if simulate:
         if any(one is not None for one in (config, tool, sensor, arm)):
             raise ConfigError("simulate=True opens an emulated cell: leave config, tool, sensor and arm out")
         given = short_calibration(NoOperator()) if given is None else given
-        cell = station_of(given)
-    elif isinstance(config, CellConfig):
-        cell = config
-    elif config is None and sensor is not None and arm is not None:
-        cell = _NOT_CONFIGURED
+        cell, chosen = station_of(given), given
     else:
-        cell = load(None if config is None else Path(config), devices=sensor is None and arm is None)
-    chosen = given if tool is None else tool
-    if chosen is None or (given is not None and tool is not None):
-        found = "no calibration" if chosen is None else "both a calibration and a tool"
-        raise ConfigError(f"{found}: give the path of a calibration.json or of its run folder, or the name of a tool")
+        chosen = _only_one(given, tool)
+        cell = _cell(config, sensor, arm)
     stream = CompensatedStream(cell, chosen, name=name, frame=frame, stages=stages, force=force, devices=(sensor, arm))
     stream.on_contact = on_contact
     return stream
+
+
+def _only_one(calibration: CalibrationResult | None, tool: str | None) -> CalibrationResult | str:
+    if calibration is not None and tool is None:
+        return calibration
+    if tool is not None and calibration is None:
+        return tool
+    found = "no calibration" if tool is None else "both a calibration and a tool"
+    raise ConfigError(f"{found}: give the path of a calibration.json or of its run folder, or the name of a tool")
+
+
+def _cell(config: str | Path | CellConfig | None, sensor: ForceTorqueSensor | None, arm: RobotArm | None) -> CellConfig:
+    if isinstance(config, CellConfig):
+        return config
+    if config is None and sensor is not None and arm is not None:
+        return _NOT_CONFIGURED
+    return load(None if config is None else Path(config), devices=sensor is None and arm is None)
 
 
 def plan_tour(
