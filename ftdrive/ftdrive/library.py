@@ -18,7 +18,6 @@ from ftdrive.planning.cell_plan import certifier_for, plan_for
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
 from ftdrive.runs.source import read_calibration
-from ftdrive.session.rehearsal import NoOperator, short_calibration, station_of
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 
 _NOT_CONFIGURED = CellConfig(RobotConfig(""), SensorConfig(""))
@@ -147,6 +146,8 @@ def open_stream(
     cell: CellConfig | Station
     chosen: CalibrationResult | str
     if simulate:
+        from ftdrive.session.rehearsal import NoOperator, short_calibration, station_of
+
         if any(one is not None for one in (config, tool, sensor, arm)):
             raise ConfigError("simulate=True opens an emulated cell: leave config, tool, sensor and arm out")
         given = short_calibration(NoOperator()) if given is None else given
