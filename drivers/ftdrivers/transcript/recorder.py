@@ -30,7 +30,7 @@ from typing import IO, Any, Final, Self
 from urllib.parse import parse_qsl, urlencode
 
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import BadTranscript
+from ftdrivers.errors import BadTranscript, BadUrl
 from ftdrivers.registry import split_url
 
 FORMAT: Final = "ftdrive.transcript/1"
@@ -214,7 +214,7 @@ class Transcript:
                         pages.append(_checked_page(line))
                     elif line.get("event") == "end":
                         end = _checked_end(line)
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        except (BadUrl, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             raise BadTranscript(
                 f"{path}, line {number}: not a line of a transcript ({error}); record it again"
             ) from error
