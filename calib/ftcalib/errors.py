@@ -3,11 +3,11 @@
 FtdriveError
 ├── UsageError        an argument, an option or a configuration cannot be used
 ├── DeviceError       a robot, a sensor or its stream has failed
-│   └── TooFewSamples     the sensor sends too few samples for an average
 ├── DataError         a file, or the data in it, cannot be used
 │   ├── BadDataset        the data are invalid: the message names the row and the reason
 │   └── BadCalibration    a file is not a calibration that this version can read
 └── AcceptanceError   what was measured is not good enough, or a check failed
+    ├── TooFewSamples     the sensor sends too few samples for an average
     └── NotObservable     the poses do not determine the parameters: the message names what is missing
 
 `ftdrivers.errors` and `ftdrive.errors` add theirs below the same four. Python's own `ValueError` and `TypeError` mean a
@@ -99,7 +99,7 @@ class AcceptanceError(FtdriveError):
     """
 
 
-class TooFewSamples(DeviceError):
+class TooFewSamples(AcceptanceError):
     """The sensor sends too few samples for an average."""
 
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from ftcalib.errors import AcceptanceError, DataError, DeviceError, FtdriveError, UsageError
+from ftcalib.errors import AcceptanceError, DataError, DeviceError, FtdriveError, TooFewSamples, UsageError
 from ftdrivers.errors import ConnectError, DeviceFault
 
 
@@ -50,6 +50,7 @@ _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (RecordingHasGaps, 8),
     (DataError, 6),
     (OSError, 6),
+    (TooFewSamples, 4),
     (AcceptanceError, 7),
 )
 """The first kind that fits counts."""

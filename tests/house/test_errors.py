@@ -39,7 +39,7 @@ def test_only_the_root_derives_from_an_exception_of_python() -> None:
         (ConnectError("silent"), 3),
         (DeviceError("silent"), 4),
         (DeviceTimeout("silent"), 4),
-        (TooFewSamples("3 samples"), 4),
+        (TooFewSamples(), 4),
         (DeviceFault("hot"), 5),
         (DataError(), 6),
         (BadDataset(), 6),
@@ -55,6 +55,10 @@ def test_only_the_root_derives_from_an_exception_of_python() -> None:
 )
 def test_each_kind_of_error_has_its_exit_code(error: Exception, code: int | None) -> None:
     assert exit_code(error) == code
+
+
+def test_too_few_samples_are_no_failed_device() -> None:
+    assert not issubclass(TooFewSamples, DeviceError)  # a session would take the controller for lost
 
 
 @pytest.mark.parametrize("module", ["ftcalib.errors", "ftdrivers.errors", "ftdrive.errors"])
