@@ -78,6 +78,13 @@ def compare(
     ------
     NotObservable
         The default method cannot use these data.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> compared = ftdrive.compare(ftdrive.read_dataset("poses.csv"))
+    >>> compared[0].method, round(compared[0].mass_kg, 3)
+    ('ml', 1.235)
     """
     default = solve(dataset, "ml", drift=drift, known=known, g_m_s2=g_m_s2, setup=setup)
     compared = []

@@ -54,7 +54,8 @@ class Finding:
 
     Examples
     --------
-    >>> finding = Finding.of("few_poses", n_poses=5, recommended=6)
+    >>> import ftdrive
+    >>> finding = ftdrive.Finding.of("few_poses", n_poses=5, recommended=6)
     >>> finding.severity, finding.values["n_poses"]
     ('limit', 5)
     >>> finding.words

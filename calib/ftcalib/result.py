@@ -10,6 +10,7 @@ from types import MappingProxyType
 from typing import Any, Literal, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import expit
 
 from ftcalib.assessment.verdict import SURE, expected_error
@@ -18,7 +19,7 @@ from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, read_object, write_new
 from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
-from ftcalib.model import PARAMETER_NAMES, Array, Parameters, is_rotation, read_only
+from ftcalib.model import PARAMETER_NAMES, Array, Parameters, Rotations, is_rotation, read_only
 from ftcalib.published.yu import weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
@@ -61,7 +62,15 @@ class DriftResult:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """Estimates with their covariance; arrays are read-only. Frames and signs are those of calib/README.md."""
+    """Estimates with their covariance; arrays are read-only. Frames and signs are those of calib/README.md.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> result = ftdrive.solve(ftdrive.read_dataset("poses.csv"))
+    >>> f"{result.mass_kg:.4f} kg, sigma {result.sigma['mass_kg']:.4f} kg, {result.verdict}"
+    '1.2350 kg, sigma 0.0002 kg, good'
+    """
 
     parameters: Parameters
     covariance: Array
@@ -245,14 +254,14 @@ class CalibrationResult:
             "tilt_beta_rad": beta,
         }
 
-    def compensate(self, wrench: Array, R_base_flange: Array, *, response: bool = True) -> Array:
+    def compensate(self, wrench: ArrayLike, R_base_flange: Rotations, *, response: bool = True) -> Array:
         """Subtract weight and bias to give the contact wrench.
 
         Parameters
         ----------
         wrench : array, shape (6,) or (n, 6)
             As measured, N and N·m, in the sensor frame.
-        R_base_flange : array, shape (3, 3) or (n, 3, 3)
+        R_base_flange : array, shape (3, 3) or (n, 3, 3), or Rotation
         response : bool
             Whether to apply gain and cross-talk of the sensor to the weight. False gives the result of a program that
             knows only mounting, weight, centre of mass and bias.
@@ -376,17 +385,17 @@ class CalibrationResult:
         except (TypeError, ValueError) as exc:
             raise BadCalibration(f"the calibration cannot be read ({exc}): the file is damaged.") from exc
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write a new file; raises `FileExistsError` if it exists."""
         write_new(path, json.dumps(self.to_dict(), allow_nan=False, indent=1) + "\n")
 
     @classmethod
-    def load(cls, path: Path) -> Self:
+    def load(cls, path: str | Path) -> Self:
         """Read a calibration file. Raises `BadCalibration` or `OSError`."""
         try:
             return cls.from_dict(read_object(path, BadCalibration))
         except BadCalibration as exc:
-            raise BadCalibration(f"{path.name}: {exc}") from exc
+            raise BadCalibration(f"{Path(path).name}: {exc}") from exc
 
 
 def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:

@@ -15,7 +15,8 @@ class Setup:
 
     Examples
     --------
-    >>> Setup(up_in_base=(1.0, 0.0, 0.0), tool_mass_kg=1.2).up
+    >>> import ftdrive
+    >>> ftdrive.Setup(up_in_base=(1.0, 0.0, 0.0), tool_mass_kg=1.2).up
     array([1., 0., 0.])
 
     Raises

@@ -68,6 +68,17 @@ def solve(
     ------
     NotObservable
         The poses do not determine the parameters; the message names what is missing and what to add.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> dataset = ftdrive.read_dataset("poses.csv")
+    >>> result = ftdrive.solve(dataset)
+    >>> result.verdict, result.n_poses
+    ('good', 24)
+    >>> contact = result.compensate(dataset.wrench, dataset.R_base_flange)
+    >>> contact.shape
+    (24, 6)
     """
     for name, value, choices in (("method", method, get_args(Method)), ("drift", drift, get_args(Drift))):
         if value not in choices:

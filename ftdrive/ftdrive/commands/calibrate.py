@@ -99,9 +99,9 @@ def calibrate(
     continues.
     """
     from ftdrive.cell.emulated import MOVED_BY, Station
-    from ftdrive.commands.emulated_run import described
     from ftdrive.errors import Declined
     from ftdrive.runs.run import Run
+    from ftdrive.session.rehearsal import described
     from ftdrive.session.session import Options, with_recorded_mode
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import talk

@@ -9,6 +9,7 @@ from typing import get_args
 import click
 from click.core import ParameterSource
 
+from ftcalib.data.dataset import Orientation
 from ftcalib.files import require_new, write_new
 from ftcalib.likelihood.session import Drift
 from ftcalib.result import Method
@@ -31,7 +32,6 @@ from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject
 from ftdrive.report.trust import trust
 from ftdrive.runs.bundle import unpacked
-from ftdrive.runs.source import Orientation
 from ftdrive.terminal.console import hanging, talk
 
 _SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up")

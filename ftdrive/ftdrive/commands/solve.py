@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, CalibrationResult, Known
 from ftcalib import solve as solve_dataset
 from ftcalib.compare import compare
-from ftcalib.errors import CalibError
+from ftcalib.data.dataset import Orientation
+from ftcalib.errors import AcceptanceError, DataError
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import UP_IN_BASE
 from ftcalib.result import Method
 from ftcalib.routine import drift_check
-from ftdrive.cli import exit_code
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,
@@ -32,10 +32,10 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.commands.emulated_run import rehearsed_run
-from ftdrive.errors import BadBundle, ConfigError, NotAccepted
+from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.pose_hints import hints
-from ftdrive.runs.source import Orientation, read_source
+from ftdrive.runs.source import read_source
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.report import print_comparison, print_result
 
@@ -100,7 +100,7 @@ def solve(
 ) -> None:
     """Solve each DATASET: a run folder, the file of `ftdrive bundle`, a dataset.json, or a CSV file.
 
-    A CSV has a header with r11..r33 (or the rotation vector rx,ry,rz), fx,fy,fz,tx,ty,tz in N and N·m, and optionally
+    A CSV has a header with r11..r33, qx,qy,qz,qw or rx,ry,rz in rad, fx,fy,fz,tx,ty,tz in N and N·m, and optionally
     t in seconds and sigma_fx..sigma_tz, the standard error of each pose's mean. With --json, one object a line.
     """
     check_simulate(simulate, real={"DATASET": sources}, emulated={"--sensor": sensor})
@@ -128,7 +128,7 @@ def _solve_each(
     force: bool,
     as_json: bool,
 ) -> None:
-    first_failure: CalibError | NotAccepted | BadBundle | None = None
+    first_failure: AcceptanceError | DataError | None = None
     for source in sources:
         try:
             with unpacked(source) as place:
@@ -148,7 +148,7 @@ def _solve_each(
                 if output is not None:
                     result.save(output)
                     talk.print(f" Saved {output}")
-        except (CalibError, NotAccepted, BadBundle) as error:
+        except (AcceptanceError, DataError) as error:
             if len(sources) == 1:
                 raise
             first_failure = first_failure or error

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Setup, solve
-from ftcalib.errors import BadDataset, CalibError
+from ftcalib.errors import BadCalibration, BadDataset
 from ftcalib.extras.difference import difference
 from ftcalib.files import read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
@@ -90,7 +90,7 @@ def solved(dataset: bytes, task: bytes) -> bytes:
     ------
     OtherVersion
         The task was made by another version.
-    CalibError
+    BadDataset, NotObservable
     """
     solve_as_the_run = solver(task)
     try:
@@ -156,7 +156,7 @@ def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
             write_new(solved_path(folder), document)
         new, path = CalibrationResult.load(solved_path(folder)), Run(folder).calibration_path
         old = CalibrationResult.load(path) if path.is_file() else None
-    except (CalibError, OSError) as error:
+    except (BadCalibration, OSError) as error:
         return in_words(error)
     finding = None if new.verdict == "good" else new.findings[0]
     if old is None or old.provenance.get("dataset_sha256") != new.provenance["dataset_sha256"]:

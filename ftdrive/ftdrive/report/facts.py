@@ -9,7 +9,7 @@ import numpy as np
 from ftcalib.assessment.observability import assess
 from ftcalib.assessment.verdict import strong_correlations
 from ftcalib.compare import compare
-from ftcalib.errors import CalibError
+from ftcalib.errors import NotObservable
 from ftcalib.model import PARAMETER_NAMES, Array
 from ftcalib.routine import drift_check
 from ftcalib.sphere import largest_gap
@@ -100,7 +100,7 @@ def _cross_validation(subject: Subject) -> dict[str, Any]:
     if subject.dataset is not None:
         try:
             methods, reason = [one.to_dict() for one in compare(subject.dataset, **subject.solved_with)], ""
-        except CalibError as error:
+        except NotObservable as error:
             reason = str(error)
     return {
         "force_N": quality.get("loo_force_rms_N"),

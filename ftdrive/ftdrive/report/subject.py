@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, solve
+from ftcalib.data.dataset import Orientation
 from ftcalib.errors import BadCalibration
 from ftcalib.files import read_object
 from ftcalib.likelihood.session import Drift
@@ -14,7 +15,7 @@ from ftcalib.result import Method
 from ftcalib.routine import PoseRecord
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
-from ftdrive.runs.source import Orientation, read_source
+from ftdrive.runs.source import read_source
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ def read_subject(source: Path, options: SolveOptions, parent: Path | None = None
 
     Raises
     ------
-    BadCalibration, BadDataset, CalibError, ConfigError, OSError
+    ConfigError, DataError, NotObservable, OSError
     """
     if is_calibration(source):
         if options != SolveOptions():

@@ -1,17 +1,16 @@
-"""Data of a calibration from any place that `solve` and `report` accept: a run folder, a dataset or a CSV file."""
+"""Datasets and calibrations from any place that commands accept: run folders and single files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from ftcalib import CalibrationDataset, Known, Setup, read_csv
+from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, read_csv
+from ftcalib.data.dataset import Orientation
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.routine import PoseRecord
 from ftdrive.runs.outcome import dataset_of
 from ftdrive.runs.run import Run, versions
-
-Orientation = Literal["R_base_flange", "R_flange_base"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +43,7 @@ def read_source(
 
     Raises
     ------
-    BadDataset, CalibError
+    BadDataset, OSError
     """
     if source.is_dir():
         run = Run(source)
@@ -61,3 +60,56 @@ def read_source(
     if known is not None and known.gravity_direction_base is not None:
         known = replace(known, gravity_direction_base=-circumstances["setup"].up)
     return Source(dataset, {**circumstances, "known": known}, provenance, records)
+
+
+def read_dataset(path: str | Path, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
+    """Read the poses of a calibration; `CalibrationDataset.save` writes them.
+
+    Parameters
+    ----------
+    path : str or Path
+        A run folder, a dataset.json or a CSV file, whose columns are those of `ftcalib.read_csv`.
+    orientation : {"R_base_flange", "R_flange_base"}
+        Of the rotations in a CSV file: flange to base coordinates, like a robot pose, or the inverse.
+
+    Raises
+    ------
+    DataError
+        The message names the file, and the row or the field.
+    OSError
+        It cannot be read.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> dataset = ftdrive.read_dataset("poses.csv")
+    >>> dataset.wrench.shape
+    (24, 6)
+    """
+    return read_source(Path(path), orientation).dataset
+
+
+def read_calibration(path: str | Path) -> CalibrationResult:
+    """Read a calibration; `CalibrationResult.save` writes it.
+
+    Parameters
+    ----------
+    path : str or Path
+        A calibration.json, or a run folder: its newest calibration.
+
+    Raises
+    ------
+    DataError
+        The file is not a calibration that this version can read.
+    OSError
+        It cannot be read.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> ftdrive.solve(ftdrive.read_dataset("poses.csv")).save("calibration.json")
+    >>> ftdrive.read_calibration("calibration.json").verdict
+    'good'
+    """
+    path = Path(path)
+    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path)
