@@ -14,12 +14,12 @@ JSON: TypeAlias = Any
 """What `json` can write: numbers, strings, None, and lists and dicts of them."""
 
 
-def write_new(path: Path, content: str | bytes) -> None:
+def write_new(path: str | Path, content: str | bytes) -> None:
     """Write a new file: to `<name>.partial`, fsynced, then renamed.
 
     Parameters
     ----------
-    path : Path
+    path : str or Path
         A file that does not exist yet, in a folder that does.
     content : str or bytes
         Text is written as UTF-8.
@@ -31,6 +31,7 @@ def write_new(path: Path, content: str | bytes) -> None:
     OSError
         The folder is missing, the disk is full, …; no partial file remains.
     """
+    path = Path(path)
     require_new(path)
     partial = path.with_name(path.name + ".partial")
     try:
@@ -63,7 +64,9 @@ def _refuse_existing(path: Path) -> None:
         raise FileExistsError(f"{path} exists already and is never overwritten: choose another name")
 
 
-def write_object(path: Path, document: Mapping[str, JSON], *, indent: int | None = 1, allow_nan: bool = False) -> None:
+def write_object(
+    path: str | Path, document: Mapping[str, JSON], *, indent: int | None = 1, allow_nan: bool = False
+) -> None:
     """Write a new JSON file with its checksum. Raises as `write_new`."""
     write_new(path, object_text(document, indent=indent, allow_nan=allow_nan))
 
@@ -74,9 +77,9 @@ def object_text(document: Mapping[str, JSON], *, indent: int | None = 1, allow_n
     return json.dumps(sealed, indent=indent, allow_nan=allow_nan) + "\n"
 
 
-def read_object(path: Path, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:
+def read_object(path: str | Path, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:
     """Read a JSON file as `object_of` takes its content. Raises `OSError` too."""
-    return object_of(path.read_bytes(), error, accept_changed=accept_changed)
+    return object_of(Path(path).read_bytes(), error, accept_changed=accept_changed)
 
 
 def object_of(content: bytes, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:

@@ -56,12 +56,12 @@ def compensate(
     two CSV files on one clock, each at its own rate: the wrench in N and N·m, and the orientation of the flange in base
     as r11..r33, qx,qy,qz,qw or rx,ry,rz in rad.
     """
-    from ftdrive.live.stream import load_calibration
     from ftdrive.recording.compensation import compensated
+    from ftdrive.runs.source import read_calibration
     from ftdrive.terminal.console import talk
 
     frame = read_frame(axes, about)
-    loaded = None if calibration is None else load_calibration(calibration, accept_edited=force)
+    loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     recording, found = _read(path, calibration, loaded, wrench, orientation_file, delay, everything=output is not None)
     result = {
         **compensated(recording, frame, output, estimate_bias=bias == "estimate"),

@@ -157,13 +157,13 @@ def calibration(
     from ftcalib.files import write_new
     from ftdrive.exports.calibration import registry
     from ftdrive.exports.calibration.settings import Settings, recorded_sensor
-    from ftdrive.live.stream import load_calibration
+    from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verification import marks_of, verification_near
     from ftdrive.terminal.console import hanging, talk
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})
     with _calibrated(source, sensor, simulate=simulate) as path:
-        result = load_calibration(path, accept_edited=force)
+        result = read_calibration(path, accept_edited=force)
         recorded_height_mm, recorded_mass_kg = recorded_sensor(path, result)
         verification = verification_near(path, result.id)
     settings = Settings(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib import CalibrationDataset, CalibrationResult
-from ftcalib.errors import BadCalibration, CalibError
+from ftcalib.errors import BadCalibration, FtdriveError
 from ftdrive.fleet.draws import ACCEPTED, DRAW, NOT_OBSERVABLE, REJECTED, solved_draws, stated_sigma
 from ftdrive.fleet.resolve import task_of
 from ftdrive.fleet.workers import Answer, OtherVersion, Workers, answers, in_words
@@ -114,7 +114,7 @@ def accuracy_of(
     """
     try:
         given = _arguments(folder)
-    except (CalibError, OSError) as error:
+    except (FtdriveError, OSError) as error:
         return in_words(error)
 
     def block(first: int) -> tuple[object, ...]:

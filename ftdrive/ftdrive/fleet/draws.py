@@ -90,7 +90,7 @@ def solved_draws(dataset: bytes, calibration: bytes, task: bytes, seed: int, fir
     ------
     OtherVersion
         The task was made by another version.
-    CalibError
+    NotObservable
     """
     solve_as_the_run = solver(task)
     given = CalibrationDataset.from_dict(json.loads(dataset))

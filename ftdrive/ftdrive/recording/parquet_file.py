@@ -102,7 +102,7 @@ class ParquetFile:
             )
         except duckdb.Error as error:
             path.unlink(missing_ok=True)
-            number = re.search(r'"errno":"(\d+)"', str(error))
+            number = re.search(r'"errno":"(\d+)"', error.args[0])  # DuckDB has it only in the JSON of its text
             code = int(number[1]) if number else EIO
             raise OSError(code, os.strerror(code) if number else str(error)) from error
 
@@ -139,18 +139,17 @@ def _read_part(path: Path, groups: Sequence[str]) -> tuple[Header, list[StreamEv
             header = Header.from_dict(json.loads(metadata["header"]))
             events = [event_of(json.dumps(one)) for one in json.loads(metadata["events"])]
         except (duckdb.Error, KeyError, TypeError, ValueError) as error:
-            raise BadRecording(
-                f"{error}: the file is damaged or was cut; a Parquet file cannot be read then"
-            ) from error
+            what = type(error).__name__  # its text may name a temporary folder
+            raise BadRecording(f"the file is damaged or was cut, and cannot be read then ({what})") from error
     return header, events, rows.view([(name, ROW[name]) for name in groups])
 
 
 def _require(crcs: Mapping[str, int], metadata: Mapping[str, str], rows: Rows) -> None:
-    """Raise `ValueError` if columns, header or events differ from their CRC-32."""
+    """Raise `BadRecording` if columns, header or events differ from their CRC-32."""
     found = _crcs({name: rows[name] for name in rows.dtype.names or ()}, {})
     found |= {name: zlib.crc32(metadata[name].encode()) for name in ("header", "events")}
     if wrong := [name for name, crc in found.items() if crcs[name] != crc]:
-        raise ValueError(f"{wrong[0]} differs from its checksum")
+        raise BadRecording(f"{wrong[0]} differs from its checksum: the file is damaged")
 
 
 def _crcs(table: Mapping[str, NDArray[Any]], before: Mapping[str, int]) -> dict[str, int]:

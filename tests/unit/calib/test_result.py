@@ -191,13 +191,34 @@ def test_a_file_whose_numbers_are_not_those_of_its_id_is_refused_or_marked(tmp_p
 def test_what_the_id_does_not_cover_is_covered_by_the_checksum(tmp_path: Path) -> None:
     path = tmp_path / "c.json"
     RESULT.save(path)
-    path.write_text(path.read_text().replace(f'"verdict": "{RESULT.verdict}"', '"verdict": "good"'))
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps(document | {"findings": [], "verdict": "good"}))
     assert RESULT.verdict != "good"
     with pytest.raises(BadCalibration, match="edited"):
         CalibrationResult.load(path)
 
 
-@pytest.mark.parametrize("change", [{"verdict": "gooe"}, {"method": 5}, {"noise_source": None}, {"components": [1]}])
+def test_a_verdict_unlike_its_findings_is_refused_or_follows_them() -> None:
+    better = RESULT.to_dict() | {"verdict": "good"}
+    assert RESULT.verdict != "good"
+    with pytest.raises(BadCalibration, match="edited"):
+        CalibrationResult.from_dict(better)
+    edited = CalibrationResult.from_dict(better, accept_edited=True)
+    assert edited.is_edited
+    assert edited.verdict == RESULT.verdict
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"method": 5},
+        {"noise_source": None},
+        {"components": [1]},
+        {"findings": None},
+        {"findings": [5]},
+        {"findings": [{"code": "constant_force", "severity": "limit", "values": {"force_N": "x"}}]},
+    ],
+)
 def test_an_unknown_word_is_one_sentence(change: dict[str, Any]) -> None:
     with pytest.raises(BadCalibration, match="cannot be read"):
         CalibrationResult.from_dict({**RESULT.to_dict(), **change})

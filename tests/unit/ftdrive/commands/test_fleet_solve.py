@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from ftcalib import Finding
 from ftdrive import __version__
 from ftdrive.store.store import Store
 from tests.calibrated_runs import calibrated_run
@@ -30,7 +31,8 @@ def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(
 
     def worsen(document: dict[str, Any]) -> None:
         document["force_bias_N"][2] += 1.0
-        document["verdict"] = "usable"
+        few = Finding.of("few_poses", n_poses=5, recommended=6)
+        document |= {"findings": [few.to_dict()], "verdict": "usable"}
 
     edit(worse / "calibration.json", worsen)
     damaged = calibrated_run(runs, "damaged")
@@ -58,7 +60,7 @@ def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(
     (changed,) = found["changed"]
     assert (changed["run"], changed["parameter"]) == (str(worse), "force_bias_N.z")
     assert changed["sigmas"] < -3
-    assert found["other_verdict"] == [{"run": str(worse), "before": "usable", "now": "good", "reason": ""}]
+    assert found["other_verdict"] == [{"run": str(worse), "before": "usable", "now": "good", "finding": None}]
 
 
 def test_runs_without_a_dataset_and_an_empty_store_are_mentioned(run: Callable[..., Ran], tmp_path: Path) -> None:
