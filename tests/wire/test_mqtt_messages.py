@@ -72,7 +72,8 @@ def test_each_cell_has_a_retained_message_and_the_server_one(tmp_path: Path) -> 
     assert kept[A]["tools"][0]["due"] == "2026-11-21T12:00:00+00:00"
     assert kept[A]["tools"][0]["drift"] == {"level_sigmas": 6.5, "found": True, "words": DRIFTING.words}
     assert (kept[A]["tools"][1]["is_due"], kept[A]["tools"][1]["change"]) == (False, "bias")
-    assert kept[B]["tools"] == [{**dict.fromkeys(kept[A]["tools"][0]), "cell": "B", "is_due": True}]
+    uncalibrated = {"cell": "B", "is_due": True, "emulated": False}
+    assert kept[B]["tools"] == [dict.fromkeys(kept[A]["tools"][0]) | uncalibrated]
     assert kept[A]["findings"] == kept[B]["findings"] == [{"kind": "base", "words": base.words}]
 
 
