@@ -214,14 +214,6 @@ def index_run(folder: Path, cell: "CellConfig | None" = None) -> None:
         talk.print(f" The run is saved but not in the history yet, because {error}.")
 
 
-def upgrade_store(store: "Store") -> None:
-    """Migrate the tables of an older version, and print it."""
-    from ftdrive.terminal.console import talk
-
-    if (version := store.upgrade()) is not None:
-        talk.print(f"The store {store.name} is upgraded from version {version}.")
-
-
 STORE = click.option("--store", "url", metavar="URL", help="Database to use, instead of [store] url.")
 
 
