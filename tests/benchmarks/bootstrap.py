@@ -89,7 +89,7 @@ def drawn(dataset: CalibrationDataset, result: CalibrationResult, rng: np.random
 def stated_sigma(result: CalibrationResult) -> Array:
     """Return the stated sigmas (16,); that of the mass without a gain common to all axes, which is not drawn."""
     mass_kg = mass_sigma_kg(result.parameters, result.covariance, result.g_m_s2)
-    return np.sqrt(np.append(np.diag(result.covariance), mass_kg**2))
+    return np.asarray(np.sqrt(np.append(np.diag(result.covariance), mass_kg**2)))
 
 
 @cache
