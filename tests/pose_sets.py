@@ -16,7 +16,7 @@ SUBSET_8 = (2, 3, 6, 8, 17, 19, 22, 23)
 AMBIGUOUS_6 = (4, 6, 9, 15, 18, 23)
 """A-optimal for the forces, but another mounting of the sensor explains them exactly (gap 0): do not use."""
 
-# Found by tests/benchmarks/design_table.py --optimise; rotation vectors in rad of R_base_flange, tool down first.
+# Found by numerical optimisation; rotation vectors in rad of R_base_flange, tool down first.
 _OPTIMISED: Mapping[int, tuple[tuple[float, float, float], ...]] = {
     6: (
         (3.141593, 0.000000, 0.000000),

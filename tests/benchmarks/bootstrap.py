@@ -1,6 +1,6 @@
 """Check by simulation whether the stated sigmas of a calibration hold: a parametric bootstrap of its run.
 
-    uv run python tests/benchmarks/bootstrap.py RUN [--draws 1000] [--seed 0]
+    uv run python -m tests.benchmarks.bootstrap RUN [--draws 1000] [--seed 0]
 
 The result of the run is the truth. Each draw has the poses, times and measured covariances of the run, is solved as the
 run was, and is compared with that truth. Draw i has random numbers of (seed, i), so the figures do not depend on the

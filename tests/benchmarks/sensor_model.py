@@ -1,6 +1,6 @@
 """How well sensors of inexact calibration are predicted, and whether stated uncertainties hold on real data.
 
-    FTDRIVE_REAL_DATA=… uv run python tests/benchmarks/sensor_model.py [--quick] [--only PART]
+    FTDRIVE_REAL_DATA=… uv run python -m tests.benchmarks.sensor_model [--quick] [--only PART]
 
 Prints one row per figure: name, figure, target, pass or FAIL; the exit code is the number of rows that failed.
 """

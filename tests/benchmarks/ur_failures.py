@@ -1,6 +1,6 @@
 """How soon a failure of arm, links or processes is reported, and the arm stands and works again, at real speed.
 
-    python tests/benchmarks/ur_failures.py [--repeats 3] [--only silent]
+    python -m tests.benchmarks.ur_failures [--repeats 3] [--only silent]
 
 The events are those of tests/wire/test_ur_failures.py, which shows what is raised. They befall an emulated UR5e in the
 middle of a move of 1.3 s. Three times, each the worst of the repeats: from the event until the error is raised, from

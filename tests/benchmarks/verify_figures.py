@@ -1,6 +1,6 @@
 """False alarms of a verification, and the changes that it names, in simulation.
 
-    uv run python tests/benchmarks/verify_figures.py [--quick] [--only PART]
+    uv run python -m tests.benchmarks.verify_figures [--quick] [--only PART]
 
 Prints one row per figure: name, figure, target, pass or FAIL, runs; then the names given to each change. The exit code
 is the number of rows that failed.
