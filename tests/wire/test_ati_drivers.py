@@ -1,7 +1,6 @@
 """What is peculiar to the ATI drivers, against the emulators; what all sensors share is in `test_sensor_drivers.py`."""
 
 import signal
-import threading
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout
 from ftdrivers.streaming.sensor import StreamingSensor
 
 WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])  # what the emulators of conftest.py measure
@@ -42,35 +41,6 @@ def test_gauges_and_wrench_tell_the_same(start: Start, scheme: str) -> None:
     matrix, *_ = np.linalg.lstsq(counts, samples.wrench, rcond=None)
     np.testing.assert_allclose(counts @ matrix, samples.wrench, atol=1e-9)
     np.testing.assert_allclose(matrix.T[0], np.array([0, 0, 0, -4250, 0, 4250]) * 1e-6, atol=1e-9)
-
-
-def test_unplugged_is_a_broken_stream_at_once(start: Start, scheme: str) -> None:
-    emulator = start(scheme)
-    sensor = emulator.sensor()
-    calls: list[Callable[[], object]] = [
-        lambda: sensor.collect(60.0),
-        lambda: sensor.latest(timeout_s=0.01),
-        sensor.check,
-    ]
-    broken: list[Callable[[], object]] = []
-
-    def call_until_broken(call: Callable[[], object]) -> None:
-        try:
-            while not pause.wait(0.01):
-                call()
-        except StreamBroken:
-            broken.append(call)
-
-    pause = threading.Event()
-    with sensor:
-        threads = [threading.Thread(target=call_until_broken, args=[call]) for call in calls]
-        for thread in threads:
-            thread.start()
-        sensor.collect(0.05)
-        emulator.unplug()
-        for thread in threads:
-            thread.join()
-        assert len(broken) == 3
 
 
 def test_saturated_gauge_is_a_fault(start: Start, scheme: str) -> None:
@@ -151,11 +121,6 @@ def test_can_old_firmware(start: Start, caplog: pytest.LogCaptureFixture) -> Non
         assert sensor.identify().facts["counts_per_N"].source == "configured"
     with pytest.raises(ConnectError, match=r"per lbf .*1000000 per N-m"):
         start("ati-can").sensor("units=lbf,N-m").open()
-
-
-def test_serial_left_streaming_by_a_dead_program(start: Start) -> None:
-    with start("ati-serial", streaming_at_start=True).sensor() as sensor:
-        np.testing.assert_allclose(sensor.collect(0.1).wrench.mean(axis=0), WRENCH, atol=0.05)
 
 
 def test_serial_bad_checksums_are_dropped_and_counted(start: Start) -> None:
