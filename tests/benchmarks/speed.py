@@ -13,8 +13,10 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, Parameters, solve
@@ -24,6 +26,7 @@ from ftcalib.model import Array
 from tests.benchmarks import scenarios as sim
 
 MANY = 1_000_000
+Floats = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True)
@@ -146,8 +149,8 @@ def compensated_sample(repeats: int) -> Iterator[Figure]:
 def compensated_samples(repeats: int, dtype: type[np.float64 | np.float32]) -> Iterator[Figure]:
     rng, name = np.random.default_rng(0), np.dtype(dtype).name
     parameters = Parameters(Rotation.random(rng=rng).as_matrix(), *rng.normal(size=(4, 3)))
-    wrench = rng.normal(size=(MANY, 6)).astype(dtype)
-    R = np.tile(Rotation.random(1000, rng=rng).as_matrix(), (MANY // 1000, 1, 1)).astype(dtype)
+    wrench: Floats = rng.normal(size=(MANY, 6)).astype(dtype)
+    R: Floats = np.tile(Rotation.random(1000, rng=rng).as_matrix(), (MANY // 1000, 1, 1)).astype(dtype)
     out, compensator = np.zeros((MANY, 6), dtype), Compensator(parameters, dtype)
     source = np.ones(MANY * (6 + 9 + 6) // 2, dtype)  # as many bytes as wrench, rotation and contact
     target = np.ones_like(source)

@@ -37,6 +37,7 @@ from ftdrivers.errors import DriverError
 from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 from ftdrivers.ur.arm import UrArm
 from tests.wire.conftest import Station
+from tests.wire.laboratory import Laboratory, numbers_in
 from tests.wire.test_sensor_faults import (
     CYCLES,
     HEALTHY,
@@ -44,11 +45,9 @@ from tests.wire.test_sensor_faults import (
     SCRIPT,
     UNASKED,
     Emulator,
-    Laboratory,
     Watched,
     applies,
     chances,
-    numbers_in,
     starts,
     suffer,
 )

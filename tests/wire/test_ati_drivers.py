@@ -1,15 +1,13 @@
 """What is peculiar to the ATI drivers, against the emulators; what all sensors share is in `test_sensor_drivers.py`."""
 
-import signal
-import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 import pytest
 
-from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, DeviceFault
 from ftdrivers.streaming.sensor import StreamingSensor
 
 WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])  # what the emulators of conftest.py measure
@@ -154,20 +152,3 @@ def test_serial_refused_start(start: Start) -> None:
 def test_serial_empty_calibration(start: Start) -> None:
     with pytest.raises(ConnectError, match=r"^ATI serial.*slot 9: .*empty"):
         start("ati-serial").sensor("calibration=9").open()
-
-
-@pytest.mark.realtime
-def test_stopped_emulator_process_is_silence_not_old_values(start: Start, scheme: str) -> None:
-    emulator = start(scheme)
-    with emulator.sensor(clock=REAL) as sensor:
-        emulator.laboratory.process.send_signal(signal.SIGSTOP)
-        try:
-            with pytest.raises(DeviceTimeout, match=r"no new sample|in a row"):
-                sensor.collect(1.0)
-            with pytest.raises(DeviceTimeout, match=r"no new sample|in a row"):
-                sensor.latest(timeout_s=0.05)
-            started = time.monotonic()
-            sensor.close()
-            assert time.monotonic() - started < 1.0
-        finally:
-            emulator.laboratory.process.send_signal(signal.SIGCONT)
