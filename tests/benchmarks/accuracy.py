@@ -11,7 +11,7 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
@@ -873,27 +873,25 @@ def laboratory(*, quick: bool) -> tuple[Pool, Lab]:
     return pool, Lab(pool, quick=quick)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description="Accuracy of the calibration, measured against targets.")
-    parser.add_argument("--quick", action="store_true", help="few runs, wider targets, about a minute")
-    parser.add_argument("--only", choices=SECTIONS, action="append", help="one part; may be repeated")
+def run(parts: Mapping[str, Callable[[Lab], Iterator[Row]]], description: str, after: Sequence[str] = ()) -> int:
+    """Print the rows of all parts, or of those named on the command line; return how many failed."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--quick", action="store_true", help="few runs, wider targets")
+    parser.add_argument("--only", choices=parts, action="append", help="one part; may be repeated")
     options = parser.parse_args()
-    failed = 0
-    write = partial(print, flush=True)
-    start = time.perf_counter()
+    failed, start, write = 0, time.perf_counter(), partial(print, flush=True)
     pool, lab = laboratory(quick=options.quick)
     with pool:
-        for name in options.only or SECTIONS:
-            for row in SECTIONS[name](lab):
+        for name in options.only or parts:
+            for row in parts[name](lab):
                 failed += not row.passed
-                write(
-                    f"{row.name:66} {row.figure:>28}   {row.target:24} {'pass' if row.passed else 'FAIL'} {row.runs:8}"
-                )
-    for line in MARKDOWN:
+                mark = "pass" if row.passed else "FAIL"
+                write(f"{row.name:75} {row.figure:>28}   {row.target:24} {mark} {row.runs:8}")
+    for line in after:
         write(line)
     write(f"{failed} rows failed; {time.perf_counter() - start:.0f} s")
     return failed
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(SECTIONS, "Accuracy of the calibration, measured against targets.", MARKDOWN))
