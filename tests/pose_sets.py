@@ -58,8 +58,6 @@ def optimised(n: int) -> Array:
     They have the least mean inverse efficiency for centres of mass in all directions. The first has the tool straight
     down. A turn of the whole set about the vertical, or by one rotation of the flange, keeps its information.
     """
-    if n not in _OPTIMISED:
-        raise ValueError(f"there is no stored set of {n} poses: take {' or '.join(map(str, _OPTIMISED))}, or `choose`")
     return Rotation.from_rotvec(_OPTIMISED[n]).as_matrix()
 
 

@@ -201,8 +201,7 @@ def hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
     """
     last = R_base_flange[-1]
     words, candidates = _motions(last, down_base)
-    ranked, _ = next_pose(R_base_flange, candidates, guess)
-    best = int(ranked[0])
+    best = int(next_pose(R_base_flange, candidates, guess)[0])
     before, after = (_pointing_down(down_base @ R) for R in (last, candidates[best]))
     return f"{'keep' if before == after else 'point'} {after} down: {words[best]}"
 
