@@ -547,13 +547,12 @@ def carlson_figure_1(trials: int, rng: Rng) -> Array:
 
 
 def carlson_figure_2(runs: int, rng: Rng) -> tuple[Array, Array]:
-    """(run,) errors of R in degrees and of gravity as a share, where algorithm 1 ends from a random start."""
+    """(run,) errors of R in degrees and of gravity as a share, where algorithm 1 ends."""
     R_error, gravity_error = np.empty((2, runs))
     for run in range(runs):
         X, R = Rotation.random(rng=rng).as_matrix(), Rotation.random(100, rng=rng).as_matrix()
-        gravity, start = 100 * rng.normal(size=3), rng.normal(size=3)
-        force_N = gravity @ R @ X + rng.normal(size=(100, 3))
-        fit = iterative(R, force_N, bias=False, gravity_start_base=start, max_iterations=20_000)
+        gravity = 100 * rng.normal(size=3)
+        fit = iterative(R, gravity @ R @ X + rng.normal(size=(100, 3)), bias=False)
         R_error[run] = np.rad2deg(np.linalg.norm(Rotation.from_matrix(fit.R_flange_sensor.T @ X).as_rotvec()))
         gravity_error[run] = np.linalg.norm(fit.gravity_force_base_N - gravity) / np.linalg.norm(gravity)
     return R_error, gravity_error
