@@ -173,26 +173,6 @@ def read_frame(axes: "Axes", about: str) -> "WrenchFrame":
     return WrenchFrame(axes, (x, y, z))
 
 
-def host_and_port(option: str, text: str, example: str, *, lowest: int = 1) -> tuple[str, int]:
-    """Read HOST:PORT, with brackets round an IPv6 address; raises `ConfigError`."""
-    from ftdrive.errors import ConfigError
-
-    host, _, port = text.rpartition(":")
-    if not host or not (port.isascii() and port.isdecimal()) or not lowest <= int(port) < 65536:
-        raise ConfigError(f"{option} is '{text}': give HOST:PORT, such as {example}")
-    return host.strip("[]"), int(port)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this computer reaches an address."""
-    import ipaddress
-
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 def write_json(value: Mapping[str, Any]) -> None:
     """Write one JSON object to stdout, on one line."""
     click.echo(json.dumps(value))

@@ -14,6 +14,9 @@ from ftdrive.live.samples import WrenchFrame
 from ftdrive.live.stream import CompensatedStream, load_calibration
 from ftdrive.terminal.console import talk
 
+RECOVER_S = 10.0
+"""So long a stream with an interruption may take to deliver again; then the command ends."""
+
 
 def open_source(
     path: Path | None,
