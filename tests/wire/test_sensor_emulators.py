@@ -314,6 +314,7 @@ def test_rdt_count_is_honoured(net_box: NetFtBox, command: int, count: int, sent
         client.socket.send(struct.pack(">HHI", 0x1234, command, count))
         records = client.records(3 if command == 3 else sent)
         assert records["rdt"].tolist() == list(range(1, sent + 1))
+        assert (np.diff(records["ft"].astype(int)) == 7).all(), "it samples at 7000 Hz inside"
         assert client.is_silent()
         assert not net_box.streaming
 
