@@ -22,7 +22,7 @@ from functools import partial
 from math import isnan, nan, radians
 from pathlib import Path
 
-from ftdrivers.errors import ConnectError, DriverError
+from ftdrivers.errors import ConnectError, DeviceError
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control_process import ControlProcess
 from tests.wire.conftest import Station
@@ -31,7 +31,7 @@ from tests.wire.test_ur_failures import EVENTS, Once, nothing, on, wait_until_mo
 
 APPLICATION = """
 import sys
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.ur.arm import UrArm
 arm = UrArm(sys.argv[1], speed_rad_s=float(sys.argv[2]), acceleration_rad_s2=3.0)
 arm.open(control=True)
@@ -41,7 +41,7 @@ q[5] += -1.2 if q[5] > 0.5 else 1.2
 try:
     arm.move_to(q.tolist(), timeout_s=20, guard=lambda: None)
     print("arrived", abs(arm.state().q_rad[5] - q[5]) < 1e-3, flush=True)
-except DriverError as error:
+except DeviceError as error:
     print(type(error).__name__, error, flush=True)
 arm.close()
 """
@@ -113,7 +113,7 @@ def befall(do: Do, fix: Act, *, later_s: float = 0.0, frozen: bool = False) -> R
         try:
             arm.move_to(q, timeout_s=10, guard=provoke)
             raise AssertionError("the arm arrived")
-        except DriverError:
+        except DeviceError:
             reported_s = provoke.ago_s()
         assert provoke.t_s is not None
         stood = (nan, "frozen itself") if frozen else stands(station, provoke.t_s, q[5])

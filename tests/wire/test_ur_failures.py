@@ -48,7 +48,7 @@ import numpy as np
 import pytest
 
 from ftdrivers.clock import REAL
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DeviceError, StreamBroken
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import Control, ControlPath
 from ftdrivers.ur.control_process import ControlProcess
@@ -120,7 +120,7 @@ class Event:
     name: str
     do: Act
     fix: Act
-    error: type[DriverError] | tuple[type[DriverError], ...]
+    error: type[DeviceError] | tuple[type[DeviceError], ...]
     says: str
     reachable: bool = True
     """Whether the controller can still receive a stop."""

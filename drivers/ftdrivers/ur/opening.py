@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import Final
 
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceTimeout, DeviceError, StreamBroken
 from ftdrivers.interfaces import Finding
 from ftdrivers.ur import control_process, control_program, primary
 from ftdrivers.ur.control import Control, ControlPath, ControlSetting, ProgramRefused
@@ -102,7 +102,7 @@ class Opening:
         def finding(name: str, require: Callable[[], None], found: str) -> Finding:
             try:
                 require()
-            except DriverError as error:
+            except DeviceError as error:
                 return Finding(name, False, error.found, error.fix)
             return Finding(name, True, found)
 
@@ -199,7 +199,7 @@ class Opening:
                 )
 
 
-def _refusal(host: str, path: ControlPath, error: DriverError) -> ConnectError:
+def _refusal(host: str, path: ControlPath, error: DeviceError) -> ConnectError:
     """Convert why a control path did not start to an error with a fix."""
     if "already in use" in error.found:
         return registers_taken(host, ())

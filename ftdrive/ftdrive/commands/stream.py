@@ -23,7 +23,7 @@ from ftdrive.live.stream import CompensatedStream
 from ftdrive.servers.address import host_and_port, is_loopback, with_port
 from ftdrive.servers.udp import UdpSender
 from ftdrive.terminal.console import talk
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 
 if TYPE_CHECKING:
     from ftdrive.servers.foxglove import FoxgloveServer
@@ -81,7 +81,7 @@ def serve(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender
         while True:
             try:
                 block = source.read()
-            except DriverError as error:
+            except DeviceError as error:
                 now_s = source.clock.now_s()
                 if silent_since_s is None:
                     silent_since_s = now_s

@@ -145,7 +145,7 @@ def verify_cell(
     ------
     Declined
         The operator ended the session.
-    NotAccepted, PlanRefused, ConfigError, DriverError, OSError
+    NotAccepted, PlanRefused, ConfigError, DeviceError, OSError
         As `ftdrive.session.session.take_poses`.
     """
     from ftdrive.runs.verified import verify_run

@@ -15,7 +15,7 @@ from ftcalib.model import Array
 from ftdrive.checks.devices import AXES
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.hazards import Hazard
-from ftdrivers.errors import DeviceFault, DeviceTimeout, DriverError
+from ftdrivers.errors import DeviceFault, DeviceTimeout, DeviceError
 from ftdrivers.interfaces import ArmState, ArmStatus
 
 G_M_S2: Final = 9.81
@@ -411,7 +411,7 @@ class ContactGuard(Guard):
             )
 
 
-def arm_lost(error: DriverError, *, moving: bool) -> Tripped:
+def arm_lost(error: DeviceError, *, moving: bool) -> Tripped:
     """Row 16: the arm reports no state. An arm in a move may not receive the stop either."""
     if not moving:
         return Tripped(Hazard.CONTROLLER_LOST, error)

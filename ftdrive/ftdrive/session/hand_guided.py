@@ -33,7 +33,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.operator import Key, Operator
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.errors import DeviceTimeout, DeviceError, StreamBroken
 from ftdrivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
 
 STILL_S: Final = 1.0
@@ -216,7 +216,7 @@ class _Collection:
         require_enough(samples, average_s)
         return samples
 
-    def _wait_out(self, ask: Callable[[], T], *losses: type[DriverError]) -> T:
+    def _wait_out(self, ask: Callable[[], T], *losses: type[DeviceError]) -> T:
         """Repeat until an answer arrives, for `BACK_S` at most."""
         deadline_s = self._clock.now_s() + BACK_S
         while True:

@@ -10,7 +10,7 @@ from ftdrive.session.guards import ContactGuard, Tripped, arm_lost, by_safety
 from ftdrive.session.hazards import Hazard
 from ftdrive.session.journal import Journal
 from ftdrive.session.watchdog import Watcher
-from ftdrivers.errors import DeviceFault, DriverError
+from ftdrivers.errors import DeviceFault, DeviceError
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 
 _LOOK_AGAIN_S: Final = 0.4
@@ -69,13 +69,13 @@ class Recovery:
         unseen = self._watcher.unseen
         try:
             self._arm.open(control=True)
-        except DriverError:
-            with suppress(DriverError):
+        except DeviceError:
+            with suppress(DeviceError):
                 self._arm.open()  # to see an emergency stop that is pressed meanwhile
             raise
         try:
             self._sensor.check()
-        except DriverError:
+        except DeviceError:
             self._sensor_events.show_new()
             self._sensor.close()
             self._sensor.open()
@@ -99,19 +99,19 @@ class Recovery:
     def _row_of(self, error: Exception, *, moving: bool) -> Tripped | None:
         if isinstance(error, Tripped):
             return error
-        if isinstance(error, OSError) and not isinstance(error, DriverError):
+        if isinstance(error, OSError) and not isinstance(error, DeviceError):
             return Tripped(Hazard.DISK_FULL, error)
-        if not isinstance(error, DriverError):
+        if not isinstance(error, DeviceError):
             return None
         if (trip := self._watcher.tripped(wait_s=0.3)) is not None:
             return trip
         try:
             self._sensor.check()
-        except DriverError:
+        except DeviceError:
             return Tripped(Hazard.SENSOR_LOST, error)
         try:
             status = self._arm.status()
-        except DriverError:
+        except DeviceError:
             return arm_lost(error, moving=moving)
         if status.fault is not None:
             return by_safety(status, str(error))

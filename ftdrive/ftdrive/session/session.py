@@ -53,7 +53,7 @@ from ftdrive.session.safety_questions import SafetyQuestions
 from ftdrive.session.task import Task
 from ftdrive.session.tour import SLOW, Measuring, Pace, Tour
 from ftdrive.session.watchdog import Watcher
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import NOT_REPORTED, ForceTorqueSensor, FtSamples, RobotArm
 
 _GRID_RAD: Final = float(np.radians(0.1))
@@ -116,7 +116,7 @@ def take_poses(
         The operator ended it.
     NotAccepted, PlanRefused, ConfigError
         The session refuses to start.
-    DriverError, OSError
+    DeviceError, OSError
         The session failed; the poses taken are in the run, which can be resumed.
     """
     limits = limits or (Limits.emulated() if cell.clock.emulated else Limits())
@@ -236,7 +236,7 @@ class _Session:
         """Collect samples of the resting sensor; reopen it once if it fails, as after a killed session."""
         try:
             return self.sensor.collect(duration_s)
-        except DriverError as error:
+        except DeviceError as error:
             self.note(f"{error}; trying once more", warning=True)
         self.sensor.close()
         self.sensor.open()

@@ -39,7 +39,7 @@ from ftdrive.session.operator import Key, Question
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.progress import Progress
 from ftdrive.session.recovery import GuardedCell, Recovery
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 
 log = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ class Tour:
         ------
         Declined
             The operator ended it, or no operator answered.
-        Tripped, DriverError, OSError
+        Tripped, DeviceError, OSError
             What stopped the arm, if the operator then ended the tour.
         """
         self._now = replace(self._now, todo=tuple(todo))
@@ -132,7 +132,7 @@ class Tour:
                 self._next()
             except Turned as turned:
                 self._turn(turned.key)
-            except (Tripped, DriverError, OSError, Stopped, TooFewSamples, NotAccepted) as error:
+            except (Tripped, DeviceError, OSError, Stopped, TooFewSamples, NotAccepted) as error:
                 self._hold(error)
         self._recovery.show_new()
         self._show_state(State.CLOSE)
@@ -451,7 +451,7 @@ class Tour:
                 raise end
             try:
                 self._recovery.reopen()
-            except (Tripped, DriverError, NotAccepted, Declined) as again:
+            except (Tripped, DeviceError, NotAccepted, Declined) as again:
                 self._journal.show(Noted(words=f"not yet: {again}", warning=True))
                 continue
             if answer == "skip":
@@ -468,7 +468,7 @@ class Tour:
         self._now = replace(self._now, reopened=self._now.reopened | {stop})
         try:
             self._recovery.reopen()
-        except (Tripped, DriverError, NotAccepted, Declined) as error:
+        except (Tripped, DeviceError, NotAccepted, Declined) as error:
             log.info("the sensor cannot be reopened: %s", error)
             return False
         self._journal.show(Noted(words=f"{trip}; the sensor was reopened, pose {stop} restarts", warning=True))

@@ -15,7 +15,7 @@ from ftcalib.routine import turned_rad
 from ftdrive.session.guards import Guard, Limits, Motion, Seen, Tripped, arm_lost, by_safety, fault
 from ftdrive.session.hazards import Hazard
 from ftdrivers.clock import Clock, Follower
-from ftdrivers.errors import DeviceFault, DriverError
+from ftdrivers.errors import DeviceFault, DeviceError
 from ftdrivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
 
 log = logging.getLogger(__name__)
@@ -161,7 +161,7 @@ class Watcher:
             self._look(motion)
         except Tripped as trip:
             self._stop(trip)
-        except DriverError as error:
+        except DeviceError as error:
             self._stop(arm_lost(error, moving=motion.moving))
         except Exception as error:
             log.exception("a guard failed")
@@ -189,7 +189,7 @@ class Watcher:
         try:
             self._sensor.check()
             sample = self._sensor.latest(timeout_s=0.0)
-        except DriverError as error:
+        except DeviceError as error:
             raise Tripped(Hazard.SENSOR_LOST, error) from error
         if motion is not self._motion:  # the block has ended meanwhile: the readings may belong to the next one
             return
