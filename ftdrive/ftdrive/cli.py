@@ -102,7 +102,7 @@ def exit_code(error: BaseException) -> int | None:
         NotAccepted,
         RecordingHasGaps,
     )
-    from ftdrivers.errors import ConnectError, DeviceFault, DeviceError
+    from ftdrivers.errors import ConnectError, DeviceError, DeviceFault
     from ftdrivers.transcript.recorder import BadTranscript
 
     codes: list[tuple[int, tuple[type[BaseException], ...]]] = [

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DeviceTimeout, DeviceError, StreamBroken
+from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.follow import Unread
 from ftdrivers.interfaces import FtSamples
 from ftdrivers.registry import sensor_from_url

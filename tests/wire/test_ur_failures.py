@@ -48,7 +48,7 @@ import numpy as np
 import pytest
 
 from ftdrivers.clock import REAL
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DeviceError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import Control, ControlPath
 from ftdrivers.ur.control_process import ControlProcess

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from ftdrivers.clock import REAL, Clock, Follower
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DeviceError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.follow import Follow, Unread
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
 from ftdrivers.streaming.plausibility import DeviceClock, Liveness, Rate

@@ -17,7 +17,7 @@ from math import radians
 from typing import Final, Literal
 
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DeviceError, ProtocolError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import (
     ArmState,

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import Final
 
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceTimeout, DeviceError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import Finding
 from ftdrivers.ur import control_process, control_program, primary
 from ftdrivers.ur.control import Control, ControlPath, ControlSetting, ProgramRefused

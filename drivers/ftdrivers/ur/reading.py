@@ -25,9 +25,9 @@ import numpy as np
 from ftdrivers.clock import Clock, Follower
 from ftdrivers.errors import (
     ConnectError,
+    DeviceError,
     DeviceFault,
     DeviceTimeout,
-    DeviceError,
     ModelUnknown,
     NoDashboard,
     StreamBroken,

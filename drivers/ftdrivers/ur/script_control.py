@@ -18,7 +18,7 @@ from functools import partial
 from typing import Any, Final
 
 from ftdrivers.clock import Clock, Follower
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DeviceError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.ur.control import Control, LookOut, ProgramRefused
 from ftdrivers.ur.control_program import COMMANDS, INPUTS, NAME, NUMBERS, OUTPUTS, Report, program_text
 from ftdrivers.ur.primary import Code, Failed, Primary, RobotType, Stopped

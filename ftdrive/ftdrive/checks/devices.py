@@ -20,9 +20,9 @@ from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE, payloa
 from ftdrivers.clock import Clock
 from ftdrivers.errors import (
     ConnectError,
+    DeviceError,
     DeviceFault,
     DeviceTimeout,
-    DeviceError,
     ModelUnknown,
     PortInUse,
     ProtocolError,

@@ -35,7 +35,7 @@ from ftdrive.live.samples import (
 from ftdrive.runs.run import Run, versions
 from ftdrive.runs.verification import VerificationRecord, calibration_in_words, last_verification
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DeviceTimeout, DeviceError
+from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmStates, ArmStatus, DeviceInfo, FtSamples
 

@@ -15,7 +15,7 @@ from ftcalib.model import Array
 from ftdrive.checks.devices import AXES
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.hazards import Hazard
-from ftdrivers.errors import DeviceFault, DeviceTimeout, DeviceError
+from ftdrivers.errors import DeviceError, DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ArmState, ArmStatus
 
 G_M_S2: Final = 9.81

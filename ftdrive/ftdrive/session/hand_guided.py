@@ -33,7 +33,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.operator import Key, Operator
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import DeviceTimeout, DeviceError, StreamBroken
+from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
 
 STILL_S: Final = 1.0

@@ -10,7 +10,7 @@ from ftdrive.session.guards import ContactGuard, Tripped, arm_lost, by_safety
 from ftdrive.session.hazards import Hazard
 from ftdrive.session.journal import Journal
 from ftdrive.session.watchdog import Watcher
-from ftdrivers.errors import DeviceFault, DeviceError
+from ftdrivers.errors import DeviceError, DeviceFault
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 
 _LOOK_AGAIN_S: Final = 0.4

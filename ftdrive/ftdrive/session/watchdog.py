@@ -15,7 +15,7 @@ from ftcalib.routine import turned_rad
 from ftdrive.session.guards import Guard, Limits, Motion, Seen, Tripped, arm_lost, by_safety, fault
 from ftdrive.session.hazards import Hazard
 from ftdrivers.clock import Clock, Follower
-from ftdrivers.errors import DeviceFault, DeviceError
+from ftdrivers.errors import DeviceError, DeviceFault
 from ftdrivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
 
 log = logging.getLogger(__name__)

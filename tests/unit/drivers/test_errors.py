@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from ftdrivers import errors
-from ftdrivers.errors import DeviceTimeout, DeviceError
+from ftdrivers.errors import DeviceError, DeviceTimeout
 
 KINDS = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, DeviceError)]
 

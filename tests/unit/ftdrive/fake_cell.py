@@ -37,7 +37,7 @@ from ftdrive.session.operator import Key, Question
 from ftdrive.session.session import Options
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DeviceFault, DeviceError
+from ftdrivers.errors import DeviceError, DeviceFault
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
 from tests.fake_clock import FakeClock

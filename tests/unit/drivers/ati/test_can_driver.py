@@ -9,7 +9,7 @@ import pytest
 
 from ftdrivers.ati.can import AtiCanSensor
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DeviceError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import Fact
 from tests.unit.drivers.dialogue import CanWire, Table
 from tests.unit.drivers.in_one_thread import InOneThread

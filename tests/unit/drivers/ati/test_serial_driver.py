@@ -12,7 +12,7 @@ import pytest
 
 from ftdrivers.ati.serial import AtiSerialSensor
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceError, ProtocolError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, ProtocolError, StreamBroken
 from ftdrivers.interfaces import Fact
 from tests.unit.drivers.dialogue import Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread

@@ -17,9 +17,9 @@ from ftdrive.checks.check import Check
 from ftdrive.checks.computer import SensorAddress
 from ftdrivers.errors import (
     ConnectError,
+    DeviceError,
     DeviceFault,
     DeviceTimeout,
-    DeviceError,
     Frozen,
     NoDashboard,
     PortInUse,

@@ -16,7 +16,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.live import stream as module
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.live.stream import CompensatedStream, load_calibration, open_stream
-from ftdrivers.errors import DeviceTimeout, DeviceError
+from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmStates, DeviceInfo, FtSamples, Health
 from tests.fake_clock import FakeClock
