@@ -57,7 +57,7 @@ def result_of(folder: Path, answer: Json) -> CalibrationResult:
     """Read the newest result of a run."""
     found = list((folder / answer["run"]).glob("calibration*.json"))
     if not found:
-        raise RuntimeError(f"{answer['verdict']}: {answer['reasons']}")
+        raise RuntimeError(f"{answer['verdict']}: {answer['findings']}")
     return CalibrationResult.load(max(found, key=lambda path: path.stat().st_mtime))
 
 

@@ -12,12 +12,12 @@ from click.testing import CliRunner, Result
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL
-from ftdrivers.errors import StreamBroken
+from ftdrivers.errors import BadTranscript, StreamBroken
 from ftdrivers.interfaces import ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.streaming.sensor import StreamingSensor
 from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import BadTranscript, Writer
+from ftdrivers.transcript.recorder import Writer
 from ftmocks.sensors.bota import BotaBox
 
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])

@@ -21,11 +21,11 @@ from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
 from ftdrivers.ati.netft import NetFtSensor
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, ProtocolError
+from ftdrivers.errors import BadTranscript, ConnectError, ProtocolError
 from ftdrivers.interfaces import DeviceInfo, FtSamples
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import BadTranscript, Page, Passage, Transcript, Writer
+from ftdrivers.transcript.recorder import Page, Passage, Transcript, Writer
 from ftdrivers.transcript.relays import _DatagramRelay, _PageRelay
 from ftdrivers.transcript.taps import recording
 from ftmocks.sensors.netft import NetFtBox

@@ -14,6 +14,7 @@ from scipy.special import chdtrc as chi2_sf
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
 from ftcalib.errors import NotObservable
+from ftcalib.findings import Finding
 from ftcalib.likelihood.gain_and_cross_talk import Response, response_columns
 from ftcalib.model import BIASES, Array, Parameters, jacobian, read_only, skew
 from ftcalib.result import CalibrationResult
@@ -170,7 +171,7 @@ def updated(
     if update.dof == 0:
         raise NotObservable("one pose leaves no reading for a check of the new bias: use 2 poses or more.")
     given = dict(provenance or {})
-    note = f"{update.kind} updated from {len(update.residuals)} poses; the verdict is that of {calibration.id}"
+    note = Finding.of("updated", kind=update.kind, n_poses=len(update.residuals), parent=calibration.id)
     return CalibrationResult(
         parameters=update.parameters,
         covariance=update.covariance,
@@ -180,8 +181,7 @@ def updated(
         noise_source="measured",
         g_m_s2=calibration.g_m_s2,
         method=calibration.method,
-        verdict=calibration.verdict,
-        reasons=(*calibration.reasons, note),
+        findings=(*calibration.findings, note),
         provenance={
             **given,
             "parent": {**given.get("parent", {}), "id": calibration.id},

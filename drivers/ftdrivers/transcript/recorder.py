@@ -30,6 +30,7 @@ from typing import IO, Any, Final, Self
 from urllib.parse import parse_qsl, urlencode
 
 from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import BadTranscript, BadUrl
 from ftdrivers.registry import split_url
 
 FORMAT: Final = "ftdrive.transcript/1"
@@ -39,10 +40,6 @@ INTERRUPTED: Final = "interrupted"
 """The error of a recording that the user has interrupted."""
 _LONGEST_PAGE_S: Final = 60.0
 """Longer than any driver waits for a page."""
-
-
-class BadTranscript(Exception):
-    """The file is not a transcript, or is damaged."""
 
 
 class Writer:
@@ -217,7 +214,7 @@ class Transcript:
                         pages.append(_checked_page(line))
                     elif line.get("event") == "end":
                         end = _checked_end(line)
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        except (BadUrl, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             raise BadTranscript(
                 f"{path}, line {number}: not a line of a transcript ({error}); record it again"
             ) from error

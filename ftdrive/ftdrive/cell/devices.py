@@ -8,6 +8,7 @@ from ftcalib.ports import Arm, Sensor
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import sensor_reached
 from ftdrive.errors import ConfigError
+from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrivers.registry import arm_class, sensor_from_url
 
@@ -16,7 +17,7 @@ def build_arm(cell: CellConfig) -> RobotArm:
     """Build the arm's driver, not yet open; it moves at the speed of the cell unless a move names its own."""
     try:
         build = cast("Callable[..., RobotArm]", arm_class(cell.robot.driver))
-    except ValueError as error:
+    except BadUrl as error:
         raise ConfigError(f"[robot] driver: {error}") from error
     # Only an emulated arm takes a clock: an arm of another package may not know it.
     emulated = {"clock": cell.clock} if cell.clock.emulated else {}
@@ -36,9 +37,6 @@ def build_arm(cell: CellConfig) -> RobotArm:
 def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
     """Build the sensor's driver, not yet open."""
     url, clock = sensor_reached(cell.sensor.url, cell.clock)
-    try:
-        sensor = sensor_from_url(url, sign=cell.sensor.sign, clock=clock)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+    sensor = sensor_from_url(url, sign=cell.sensor.sign, clock=clock)
     _fits: Sensor = sensor
     return sensor

@@ -99,9 +99,9 @@ def calibrate(
     continues.
     """
     from ftdrive.cell.emulated import MOVED_BY, Station
-    from ftdrive.commands.emulated_run import described
     from ftdrive.errors import Declined
     from ftdrive.runs.run import Run
+    from ftdrive.session.rehearsal import described
     from ftdrive.session.session import Options, with_recorded_mode
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import talk
@@ -245,6 +245,6 @@ def _as_json(outcome: "Outcome") -> dict[str, Any]:
     return {
         "run": str(outcome.run.folder),
         "drift_check": None if outcome.drift is None else outcome.drift.to_dict(),
-        "hints": list(hints(outcome.result, outcome.run.records())),
+        "hints": [one.to_dict() for one in hints(outcome.result, outcome.run.records())],
         **outcome.result.to_dict(),
     }

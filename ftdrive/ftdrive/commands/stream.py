@@ -63,7 +63,7 @@ def stream(
     frame = read_frame(axes, about)
     udp_address = None if udp is None else host_and_port("--udp", udp, "127.0.0.1:9870")
     with ExitStack() as stack:
-        source, _ = open_source(
+        source = open_source(
             path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
         )
         server = stack.enter_context(closing(FoxgloveServer(source, host, port)))

@@ -17,12 +17,11 @@ from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import versions
 from ftdrive.terminal.console import talk
-from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceTimeout, ProtocolError
+from ftdrivers.errors import BadTranscript, ConnectError, DeviceTimeout, ProtocolError
 from ftdrivers.interfaces import ForceTorqueSensor
-from ftdrivers.registry import BadUrl, sensor_from_url
+from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import INTERRUPTED, BadTranscript, Transcript, Writer
+from ftdrivers.transcript.recorder import INTERRUPTED, Transcript, Writer
 from ftdrivers.transcript.taps import recording
 
 _PIECE_S = 60.0
@@ -78,7 +77,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
             f"{sensor} is neither on a serial port or a CAN bus nor an ati-netft: only these can be recorded; capture "
             "others with Wireshark"
         )
-    device = _sensor(url, clock)
+    device = sensor_from_url(url, clock=clock)
     header = {
         "url": url,
         "duration_s": duration_s,
@@ -134,7 +133,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
         raise ConfigError("no transcript is given: add its FILE, or --simulate")
     player = Player(loaded, clock)
     with player as port:
-        device = _sensor(loaded.url_at(port), clock)
+        device = sensor_from_url(loaded.url_at(port), clock=clock)
         duration_s = float(loaded.header["duration_s"])
         try:
             with device:
@@ -159,13 +158,6 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     if duration_s < loaded.header["duration_s"]:
         whole_s = loaded.header["duration_s"]
         talk.print(f" The recording was broken off: {duration_s:.3g} s of {whole_s:g} s were played.")
-
-
-def _sensor(url: str, clock: Clock) -> ForceTorqueSensor:
-    try:
-        return sensor_from_url(url, clock=clock)
-    except BadUrl as error:
-        raise ConfigError(str(error)) from error
 
 
 def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:

@@ -206,15 +206,15 @@ def _take_poses(
 ) -> tuple["Run", "CalibrationResult", Path]:
     """Guide the operator through the poses; return the run, and the calibration with its file."""
     from ftdrive.cell.emulated import MOVED_BY
-    from ftdrive.commands.emulated_run import described
-    from ftdrive.live.stream import load_calibration
     from ftdrive.runs.run import Run
+    from ftdrive.runs.source import read_calibration
+    from ftdrive.session.rehearsal import described
     from ftdrive.session.session import take_poses, with_recorded_mode
     from ftdrive.session.verification import Verifying
     from ftdrive.terminal.console import talk
     from ftdrive.terminal.screen import open_operator
 
-    calibration = load_calibration(path)
+    calibration = read_calibration(path)
     path = Run(path).calibration_path if path.is_dir() else path
     about = {**asdict(wanted), "id": calibration.id, "path": str(path.absolute())}
     description = {"verification": about}
@@ -251,9 +251,9 @@ def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Pat
     """Start the cell of a calibration, or calibrate a new one; return it with the path of its calibration."""
     from ftdrive.cell.emulated import Station
     from ftdrive.commands.emulated_run import rehearse
-    from ftdrive.live.stream import load_calibration
+    from ftdrive.runs.source import read_calibration
 
-    made_by = None if path is None else load_calibration(path).provenance.get("station")
+    made_by = None if path is None else read_calibration(path).provenance.get("station")
     station = stack.enter_context(Station.of(made_by, sensor))
     if path is None:
         outcome = rehearse(station, runs, "simulated", poses=6)

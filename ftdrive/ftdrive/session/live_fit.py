@@ -19,11 +19,10 @@ from ftcalib.assessment.observability import (
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.poses.information import Guess, Prediction, predicted_sigma
 from ftcalib.poses.selection import next_pose
-from ftcalib.poses.sphere import largest_gap
 from ftcalib.published.yu import weight_and_tilt
 from ftcalib.routine import PoseRecord, dataset_from, is_return
+from ftcalib.sphere import axes_along, largest_gap
 from ftdrive.cell.config import USUAL_KG
-from ftdrive.checks.controller_settings import axes_along
 from ftdrive.session.events import Compared, Estimated
 
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
@@ -154,7 +153,7 @@ class Running:
 
     def _solved(self) -> CalibrationResult | None:
         try:
-            return solve(dataset_from(self._kept(), {}), g_m_s2=self._g_m_s2, up_in_base=-self._down_base)
+            return solve(dataset_from(self._kept(), {}), g_m_s2=self._g_m_s2)
         except NotObservable:
             return None
 

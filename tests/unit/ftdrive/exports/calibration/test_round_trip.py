@@ -54,8 +54,7 @@ def arbitrary(rng: np.random.Generator, has: tuple[Property, ...]) -> Calibratio
         noise_source="measured",
         g_m_s2=rng.uniform(9.78, 9.84),
         method="ml",
-        verdict="good",
-        reasons=(),
+        findings=(),
         response=response,
     )
 

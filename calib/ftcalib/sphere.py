@@ -1,4 +1,4 @@
-"""Directions: evenly spread over the sphere, and the largest gap between given ones."""
+"""Directions: evenly spread over the sphere, the largest gap between given ones, and the axes that they are near."""
 
 import numpy as np
 
@@ -8,6 +8,7 @@ _POINTS = 4000
 """Neighbours are about 3° apart."""
 _PART = 500
 """Directions that are compared with all points at once, to save memory."""
+_ALIGNED = np.sin(np.radians(22.5))
 
 
 def evenly_spread(n: int) -> Array:
@@ -33,3 +34,12 @@ def largest_gap(directions: Array) -> tuple[float, Array]:
     nearest = np.max([(everywhere @ part.T).max(axis=1) for part in parts], axis=0)
     worst = int(np.argmin(nearest))
     return float(np.arccos(np.clip(nearest[worst], -1, 1))), everywhere[worst]
+
+
+def axes_along(direction: Array) -> list[str]:
+    """Return the names of the axes along or between which a unit vector (3,) points, such as "-x"."""
+    return [
+        f"{'-' if part < 0 else '+'}{axis}"
+        for axis, part in zip("xyz", direction.tolist(), strict=True)
+        if abs(part) > _ALIGNED
+    ]
