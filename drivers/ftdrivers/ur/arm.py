@@ -25,8 +25,8 @@ from ftdrivers.interfaces import (
     ArmStatus,
     ControllerSettings,
     DeviceInfo,
+    Diagnosis,
     Fact,
-    Finding,
     Guard,
     RobotArm,
 )
@@ -255,7 +255,7 @@ class UrArm(RobotArm):
         """
         return self._reading().reported_program()
 
-    def diagnose(self) -> list[Finding]:
+    def diagnose(self) -> list[Diagnosis]:
         """Check what control needs: a control path, the version, free RTDE registers, an open port for programs."""
         return self._opening(self._reading()).diagnose()
 

@@ -102,7 +102,7 @@ def calibrate(
     from ftdrive.commands.emulated_run import described
     from ftdrive.errors import Declined
     from ftdrive.runs.run import Run
-    from ftdrive.session.session import Options, with_recorded_mode
+    from ftdrive.session.session import SessionOptions, with_recorded_mode
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import talk
     from ftdrive.terminal.report import print_result
@@ -122,7 +122,7 @@ def calibrate(
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool, control)
             description = {"said": asdict(said)}
             cell = said.cell() if resume is None else _cell_to_resume(resume, said)
-        options = Options(
+        options = SessionOptions(
             runs,
             poses=6 if minimal else 12 if quick else 24,
             mode=mode,

@@ -130,7 +130,7 @@ def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], Rob
         Check("robot.reachable", "ok", f"{host} answers"),
         devices.check_arm(info, cell.robot),
         devices.check_remote(arm),
-        *map(devices.check_finding, arm.diagnose()),
+        *map(devices.check_diagnosis, arm.diagnose()),
         devices.check_safety(status),
         devices.check_program(status),
         devices.check_speed(status),

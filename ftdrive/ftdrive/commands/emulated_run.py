@@ -10,7 +10,7 @@ from ftdrive.cell.emulated import Station, sensor_name
 from ftdrive.runs.outcome import Outcome
 from ftdrive.session.events import Event
 from ftdrive.session.operator import Key, Operator, Question
-from ftdrive.session.session import Options, calibrate
+from ftdrive.session.session import SessionOptions, calibrate
 from ftdrive.terminal.screen import open_operator
 
 
@@ -43,7 +43,7 @@ def described(station: Station) -> dict[str, Any]:
 
 def rehearse(station: Station, runs: Path, name: str, *, poses: int = 24, kept: bool = True) -> Outcome:
     """Calibrate an emulated cell without questions; `kept` says whether the folder `runs` outlives the command."""
-    options = Options(runs, name, poses=poses, real=False, questions=False, description=described(station))
+    options = SessionOptions(runs, name, poses=poses, real=False, questions=False, description=described(station))
     with open_operator() as operator:
         outcome = calibrate(station.cell, operator if kept else _Unkept(operator, runs), options)
     if outcome is None:

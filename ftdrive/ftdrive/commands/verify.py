@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ftdrive.cell.emulated import Station
     from ftdrive.runs.run import Run
     from ftdrive.runs.verified import AcceptanceLimits, Verified
-    from ftdrive.session.session import Options
+    from ftdrive.session.session import SessionOptions
 
 Answer = Literal["ask", "no", "yes"]
 
@@ -83,12 +83,12 @@ def verify(
     """
     from ftdrive.errors import Declined, NotAccepted
     from ftdrive.runs.verified import AcceptanceLimits
-    from ftdrive.session.session import Options
+    from ftdrive.session.session import SessionOptions
     from ftdrive.terminal.console import talk
 
     check_simulate(simulate, real={"--config": config, "--robot": robot})
     wanted = _wanted(path, quick, poses, AcceptanceLimits(force_N, torque_Nm), resume)
-    options = Options(
+    options = SessionOptions(
         runs,
         "verify",
         poses=wanted.poses,
@@ -118,7 +118,7 @@ def verify_cell(
     cell: "CellConfig",
     path: Path,
     wanted: "Wanted",
-    options: "Options",
+    options: "SessionOptions",
     station: "Station | None" = None,
     *,
     update: Answer = "ask",
@@ -132,7 +132,7 @@ def verify_cell(
     path : Path
         The calibration file or its run folder.
     wanted : Wanted
-    options : Options
+    options : SessionOptions
         Of the session.
     station : Station, optional
         The emulated cell that `cell` describes.
@@ -179,7 +179,7 @@ def _wanted(
 ) -> Wanted:
     from ftdrive.runs.run import Run
     from ftdrive.runs.verified import AcceptanceLimits
-    from ftdrive.session.verification import POSES, QUICK_POSES
+    from ftdrive.session.verifying import POSES, QUICK_POSES
 
     if quick and poses is not None:
         raise ConfigError("--quick and --poses exclude one another: leave one of them out")
@@ -200,7 +200,7 @@ def _take_poses(
     station: "Station | None",
     path: Path,
     wanted: Wanted,
-    options: "Options",
+    options: "SessionOptions",
     *,
     as_json: bool,
 ) -> tuple["Run", "CalibrationResult", Path]:
@@ -210,7 +210,7 @@ def _take_poses(
     from ftdrive.live.stream import load_calibration
     from ftdrive.runs.run import Run
     from ftdrive.session.session import take_poses, with_recorded_mode
-    from ftdrive.session.verification import Verifying
+    from ftdrive.session.verifying import Verifying
     from ftdrive.terminal.console import talk
     from ftdrive.terminal.screen import open_operator
 

@@ -33,7 +33,7 @@ from ftdrive.live.samples import (
     sensor_origin_m,
 )
 from ftdrive.runs.run import Run, versions
-from ftdrive.runs.verification import VerificationRecord, calibration_in_words, last_verification
+from ftdrive.runs.verification_record import VerificationRecord, calibration_in_words, last_verification
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceTimeout, DriverError
 from ftdrivers.follow import Follow

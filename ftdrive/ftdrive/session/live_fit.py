@@ -31,7 +31,7 @@ GREEN = {"cond9": 4.0, "cond_u1": 8.0}
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
 """As within 30 to 45 degrees."""
 TRUSTED_SHARE = 0.05
-"""`Running.predict` returns None if its sigma of the force is more than this share of the weight."""
+"""`RunningFit.predict` returns None if its sigma of the force is more than this share of the weight."""
 
 
 class Judge(Protocol):
@@ -51,7 +51,7 @@ class Judge(Protocol):
         """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain."""
 
 
-class Running:
+class RunningFit:
     """The calibration so far, and its coverage.
 
     Parameters

@@ -70,7 +70,7 @@ _NO_SERIAL: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class SessionOptions:
     """Options of a session, as the operator gave them."""
 
     runs: Path
@@ -99,14 +99,16 @@ class Options:
     """Goes into run.json."""
 
 
-def calibrate(cell: CellConfig, operator: Operator, options: Options, limits: Limits | None = None) -> Outcome | None:
+def calibrate(
+    cell: CellConfig, operator: Operator, options: SessionOptions, limits: Limits | None = None
+) -> Outcome | None:
     """Guide the operator through a calibration; None after a dry run. Raises as `take_poses`."""
     run = take_poses(cell, operator, options, Task(), limits)
     return None if run is None else solve_and_save(run)
 
 
 def take_poses(
-    cell: CellConfig, operator: Operator, options: Options, task: Task, limits: Limits | None = None
+    cell: CellConfig, operator: Operator, options: SessionOptions, task: Task, limits: Limits | None = None
 ) -> Run | None:
     """Guide the operator through the poses of a task; None after a dry run.
 
@@ -152,7 +154,7 @@ def take_poses(
     return run
 
 
-def with_recorded_mode(options: Options) -> Options:
+def with_recorded_mode(options: SessionOptions) -> SessionOptions:
     """Return options with the mode of the resumed run; raises `ConfigError` for options that exclude each other."""
     begun = options.mode if options.resume is None else Run(options.resume).header().get("mode", "auto")
     if options.mode != "auto" and (begun in _BY_HAND) != (options.mode in _BY_HAND):
@@ -177,7 +179,7 @@ def with_recorded_mode(options: Options) -> Options:
     return options
 
 
-def _plan_on_disk(options: Options, run: Run | None) -> Plan | None:
+def _plan_on_disk(options: SessionOptions, run: Run | None) -> Plan | None:
     """Load the plan of the resumed run, or the given one; raises `ConfigError` if it lacks a pose of `redo`."""
     if run is None:
         return None if options.plan is None else Plan.load(options.plan)
@@ -210,7 +212,7 @@ class _Session:
     arm: RobotArm
     sensor: ForceTorqueSensor
     journal: Journal
-    options: Options
+    options: SessionOptions
     task: Task
     limits: Limits
     run: Run | None
@@ -557,5 +559,5 @@ def _by_hand(session: _Session) -> Run:
     return run
 
 
-def _description(cell: CellConfig, devices: Mapping[str, Any], options: Options) -> dict[str, Any]:
+def _description(cell: CellConfig, devices: Mapping[str, Any], options: SessionOptions) -> dict[str, Any]:
     return {"config": cell.to_dict(), "devices": dict(devices), "mode": options.mode, **options.description}

@@ -10,7 +10,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of
 from ftdrive.session.forecast import prediction
-from ftdrive.session.live_fit import Judge, Running
+from ftdrive.session.live_fit import Judge, RunningFit
 from ftdrivers.interfaces import DeviceInfo
 
 
@@ -36,7 +36,7 @@ class Task:
 
     def judge(self, cell: CellConfig, down_base: Array, *, by_hand: bool) -> Judge:
         """Return who judges the poses; `by_hand` says that no plan chooses them."""
-        return Running(g_m_s2=cell.site.g_m_s2, down_base=down_base, advise=by_hand)
+        return RunningFit(g_m_s2=cell.site.g_m_s2, down_base=down_base, advise=by_hand)
 
     def forecast(
         self, cell: CellConfig, certifier: Certifier, plan: Plan, average_s: float, sigma: Array, *, real: bool

@@ -34,7 +34,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key, Question
-from ftdrive.session.session import Options
+from ftdrive.session.session import SessionOptions
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceFault, DriverError
@@ -398,7 +398,7 @@ class Lab:
         return any(watcher.looking for watcher in self.watchers)
 
     def calibrate(self, **options: Any) -> Outcome | None:
-        return session.calibrate(self.cell, self.operator, Options(self.folder / "runs", poses=6, **options))
+        return session.calibrate(self.cell, self.operator, SessionOptions(self.folder / "runs", poses=6, **options))
 
     def run(self) -> Run:
         (folder,) = (self.folder / "runs").iterdir()

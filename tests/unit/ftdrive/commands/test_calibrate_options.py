@@ -17,7 +17,7 @@ from ftdrive.cli import cli, exit_code
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.session import session
-from ftdrive.session.session import Options
+from ftdrive.session.session import SessionOptions
 
 CELL = """format = "ftdrive.config/1"
 [robot]
@@ -39,11 +39,11 @@ class Opened(Exception):
 
 
 @pytest.fixture
-def cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[CellConfig, Options]]:
+def cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[CellConfig, SessionOptions]]:
     """What the session would begin with."""
-    found = list[tuple[CellConfig, Options]]()
+    found = list[tuple[CellConfig, SessionOptions]]()
 
-    def guide(cell: CellConfig, operator: object, options: Options) -> None:
+    def guide(cell: CellConfig, operator: object, options: SessionOptions) -> None:
         del operator
         found.append((cell, options))
         raise Opened

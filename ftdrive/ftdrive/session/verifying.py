@@ -22,7 +22,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_verification
 from ftdrive.planning.search.nodes import WRIST_6_RAD
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import fitted_dataset
+from ftdrive.runs.verification_record import fitted_dataset
 from ftdrive.session.events import Compared
 from ftdrive.session.live_fit import Judge
 from ftdrive.session.task import Task
@@ -107,7 +107,7 @@ class Verifying(Task):
     def judge(self, cell: CellConfig, down_base: Array, *, by_hand: bool) -> Judge:
         """Return who compares each pose with the calibration."""
         del cell, down_base
-        return Comparison(self.calibration, self.R_fitted if by_hand else np.zeros((0, 3, 3)), self.poses)
+        return RunningComparison(self.calibration, self.R_fitted if by_hand else np.zeros((0, 3, 3)), self.poses)
 
     def forecast(
         self, cell: CellConfig, certifier: Certifier, plan: Plan, average_s: float, sigma: Array, *, real: bool
@@ -122,7 +122,7 @@ class Verifying(Task):
         )
 
 
-class Comparison:
+class RunningComparison:
     """Compares each pose with the prediction of a calibration.
 
     Parameters
