@@ -166,6 +166,6 @@ def test_a_driver_with_a_wire_of_its_own_is_not_recorded(tmp_path: Path, monkeyp
     monkeypatch.syspath_prepend(tmp_path / "site")
     outcome = run("record", "--sensor", "own-wire:///dev/own0", "-o", str(tmp_path / "a.jsonl"), "--duration", "0.1")
     assert isinstance(outcome.exception, ConfigError)
-    assert "pynetft" in str(outcome.exception)
+    assert "neither pyserial nor python-can" in str(outcome.exception)
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
     assert "Saved" not in outcome.stderr

@@ -35,7 +35,7 @@ _TAIL_S = 0.3
 def transcript() -> None:
     """Record the bytes on a sensor's wire, or play them to the driver: a bug report becomes a test.
 
-    For sensors on a serial port or a CAN bus, and Net F/T. The arm's own sensor is not recorded.
+    For sensors on a serial port or a CAN bus. Capture others, such as a Net F/T, with Wireshark.
     """
 
 
@@ -73,10 +73,10 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
         )
     url, clock = sensor_reached(sensor, clock_in_force())
     address = SensorAddress.of(url)
-    if address.serial_port is None and address.scheme != "ati-netft" and not address.scheme.endswith("-can"):
+    if address.serial_port is None and not address.scheme.endswith("-can"):
         raise ConfigError(
-            f"{sensor} is neither on a serial port or a CAN bus nor an ati-netft: only these can be recorded; capture "
-            "others with Wireshark"
+            f"{sensor} is neither on a serial port nor on a CAN bus: only these can be recorded; capture others with "
+            "Wireshark"
         )
     device = _sensor(url, clock)
     header = {
@@ -104,9 +104,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
             if kept:
                 talk.print(f" Saved {path}")
     if not writer.has_port:
-        raise ConfigError(
-            f"the driver of {sensor} uses neither pyserial nor python-can nor pynetft: only these can be recorded"
-        )
+        raise ConfigError(f"the driver of {sensor} uses neither pyserial nor python-can: only these can be recorded")
     return url, seen
 
 
