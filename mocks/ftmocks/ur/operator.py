@@ -9,9 +9,9 @@ from ftmocks.ur import dashboard
 from ftmocks.ur.hand import REST_S, guided_by_hand, pendant_program
 from ftmocks.ur.modes import PERMITTED, RobotMode, Runtime, SafetyMode
 from ftmocks.ur.robot import INSTALLED_G_M_S2, Robot
-from ftmocks.ur.script import Upload
 from ftmocks.ur.server import UrServer
 from ftmocks.ur.swing import Swing, SwingProgram
+from ftmocks.ur.uploads import Upload, start_upload
 
 Request = dict[str, Any]
 Verb = Callable[[Request], dict[str, Any]]
@@ -167,7 +167,7 @@ class Operator:
         return {"done": "hand-guide"}
 
     def _pendant_program(self, request: Request) -> dict[str, Any]:
-        accepted = self._robot.upload(pendant_program(self._robot, _rest_s(request)), by="operator")
+        accepted = start_upload(self._robot, pendant_program(self._robot, _rest_s(request)), by="operator")
         return {"done": "pendant-program", "accepted": accepted}
 
     def _swing(self, request: Request) -> dict[str, Any]:
@@ -176,7 +176,7 @@ class Operator:
         if not robot.arm.at_rest:
             raise ValueError("the arm moves: let it stand first")
         swing = Swing(robot.arm.dh, robot.arm.q, float(request["seconds"]), **limits)
-        accepted = robot.pendant_start(SwingProgram(robot, swing))
+        accepted = robot.start_soon(SwingProgram(robot, swing), by="operator", obstacle=robot.obstacle)
         return {"done": "swing", "accepted": accepted, "seconds": swing.duration_s, "period_s": swing.period_s}
 
     def _dashboard_stop(self, _request: Request) -> dict[str, Any]:
@@ -191,7 +191,7 @@ class Operator:
             speed = float(request.get("speed_rad_s", FOREIGN_SPEED_RAD_S))
             does = f"movej({list(vector6(request['q_rad']))}, a=1.4, v={speed})"
         upload = Upload("other", f"def other():\n  {does}\nend\n", secondary=False)
-        accepted = self._robot.upload(upload, by="another script client")
+        accepted = start_upload(self._robot, upload, by="another script client")
         return {"done": "foreign-program", "accepted": accepted}
 
     def _speed_scaling(self, request: Request) -> dict[str, Any]:
@@ -232,7 +232,8 @@ class Operator:
     def _claim_registers(self, request: Request) -> dict[str, Any]:
         first = {"lower": 0, "upper": 24}[request["range"]]
         names = {f"input_{kind}_register_{first + i}" for kind in ("int", "double") for i in range(24)}
-        self._server.claimed = self._server.claimed | names if _on(request) else self._server.claimed - names
+        link = self._server.rtde
+        link.claimed = link.claimed | names if _on(request) else link.claimed - names
         return {"done": "claim-registers"}
 
 
