@@ -9,35 +9,21 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from ftdrive.cell.config import CLOCK
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
-from ftdrivers.clock import REAL
 from ftdrivers.errors import StreamBroken
-from ftdrivers.interfaces import ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.streaming.sensor import StreamingSensor
-from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import BadTranscript, Writer
+from ftdrivers.transcript.recorder import BadTranscript
 from ftmocks.sensors.bota import BotaBox
 
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
 
 
-@pytest.fixture(autouse=True)
-def _cell_time(cell_time: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command knows nothing of an emulator that a test has started."""
-    clock = cell_time.of_drivers
-
-    def build(url: str, **_: object) -> ForceTorqueSensor:
-        return sensor_from_url(url, clock=clock if url.startswith("bota") else REAL)
-
-    monkeypatch.setattr(transcript, "sensor_from_url", build)
-    monkeypatch.setattr(transcript, "Writer", lambda path, header, *_: Writer(path, header, clock))
-    monkeypatch.setattr(transcript, "Player", lambda loaded, *_: Player(loaded, clock))
-
-
 @pytest.fixture
-def url(cell_time: Any) -> Iterator[str]:
+def url(cell_time: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    monkeypatch.setenv(CLOCK, cell_time.of_devices.path)  # the command knows nothing of an emulator of a test
     rng = np.random.default_rng(5)
     device = BotaBox(lambda n: WRENCH + 1e-3 * rng.normal(size=(n, 6)), seed=1, clock=cell_time.of_devices)
     yield f"bota://{device.start()}"

@@ -7,7 +7,7 @@ import threading
 import tty
 from typing import Final
 
-from ftdrivers.clock import REAL, Clock
+from ftdrivers.clock import REAL, Clock, Follower
 from ftdrivers.transcript.recorder import Passage, Transcript
 from ftdrivers.wires.parity import leave_marks_to_far_side, marks_asked_for
 
@@ -31,7 +31,7 @@ class Player:
         self._t = 0.0
         self._asked = bytearray()
         self._ended = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread: Follower | None = None
         self.divergence: str | None = None
         """The request of the driver that is not in the recording."""
 
@@ -44,7 +44,7 @@ class Player:
     def __enter__(self) -> str:
         """Open the far side and return the path of its pseudo-terminal."""
         path = self._far.open()
-        self._thread = threading.Thread(target=self._serve, name=f"player on {path}", daemon=True)
+        self._thread = Follower(self._clock, self._serve, f"player on {path}")
         self._thread.start()
         return path
 
@@ -56,20 +56,20 @@ class Player:
             self._far.close()
 
     def _serve(self) -> None:
-        if not self._far.wait_for_driver(self._ended):
-            return
-        with self._clock.keeping_up():
-            self._t = self._clock.now_s()
-            while not self._ended.is_set():
-                self._clock.now_ns()  # an emulated cell waits for this thread
-                wait_s = min(self._clock.poll_s, max(0.0, self._play()))
-                readable, _, _ = select.select([self._far], [], [], wait_s)
-                if readable:
-                    data = self._far.read()
-                    if data is None:
-                        return
-                    self._asked += data
-                    self._listen()
+        while not self._far.is_awaited():  # nothing is sent before the driver is ready for it
+            if self._clock.wait(self._ended, 0.001):
+                return
+        self._t = self._clock.now_s()
+        while not self._ended.is_set():
+            self._clock.now_ns()  # an emulated cell waits for this thread
+            wait_s = min(self._clock.poll_s, max(0.0, self._play()))
+            readable, _, _ = select.select([self._far], [], [], wait_s)
+            if readable:
+                data = self._far.read()
+                if data is None:
+                    return
+                self._asked += data
+                self._listen()
 
     def _play(self) -> float:
         """Send the data that is due; return the seconds until more may be."""
@@ -137,17 +137,15 @@ class _Terminal:
     def close(self) -> None:
         os.close(self._master)
 
-    def wait_for_driver(self, ended: threading.Event) -> bool:
-        """Wait until the driver has opened the port; return False when `ended` comes first."""
+    def is_awaited(self) -> bool:
+        """Whether the driver has opened the port, and asked for marks if there are any."""
         poll = select.poll()
         poll.register(self._master, 0)
-        while poll.poll(0):  # "hung up" until a driver has opened the other end
-            if ended.wait(0.005):
+        if poll.poll(0):  # "hung up" until a driver has opened the other end
+            return False
+        if self._parity_marks:
+            if not marks_asked_for(self._master):
                 return False
-        if self._parity_marks:  # nothing is sent before the driver is ready for them
-            while not marks_asked_for(self._master):
-                if ended.wait(0.001):
-                    return False
             leave_marks_to_far_side(self._master)
         return True
 

@@ -2,14 +2,16 @@
 
 from collections.abc import Callable
 from math import radians
-from typing import cast
+from typing import Any, cast
 
 from ftcalib.ports import Arm, Sensor
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import sensor_reached
 from ftdrive.errors import ConfigError
+from ftdrivers.clock import REAL
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrivers.registry import arm_class, sensor_from_url
+from ftdrivers.ur.timing import STRICT, UrTiming
 
 
 def build_arm(cell: CellConfig) -> RobotArm:
@@ -19,15 +21,16 @@ def build_arm(cell: CellConfig) -> RobotArm:
     except ValueError as error:
         raise ConfigError(f"[robot] driver: {error}") from error
     # Only an emulated arm takes a clock: an arm of another package may not know it.
-    emulated = {"clock": cell.clock} if cell.clock.emulated else {}
-    ur = {"control": cell.robot.control, "api_port": cell.robot.api_port} if cell.robot.driver == "ur" else {}
+    more: dict[str, Any] = {} if cell.clock is REAL else {"clock": cell.clock}
+    if cell.robot.driver == "ur":
+        timing = STRICT if cell.clock is REAL else UrTiming.emulated()
+        more |= {"control": cell.robot.control, "api_port": cell.robot.api_port, "timing": timing}
     arm = build(
         cell.robot.host,
         model=cell.robot.model,
         speed_rad_s=radians(cell.robot.speed_deg_s),
         acceleration_rad_s2=radians(cell.robot.acceleration_deg_s2),
-        **ur,
-        **emulated,
+        **more,
     )
     _fits: Arm = arm  # checked statically: what the routine asks for is what the driver gives
     return arm

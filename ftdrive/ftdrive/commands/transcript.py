@@ -12,6 +12,7 @@ import numpy as np
 
 from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import EMULATED, sensor_name, sensor_reached
+from ftdrive.cell.emulated_clock import LocalClock
 from ftdrive.checks.computer import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
@@ -119,9 +120,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     A recording that was interrupted is played to its end.
     """
     check_simulate(simulate, real={"FILE": file}, emulated={"--sensor": sensor})
-    clock = clock_in_force()
     if simulate:
-        _, clock = sensor_reached(_emulated(sensor))
         with TemporaryDirectory(prefix="ftdrive-") as folder:
             path = Path(folder) / "sensor.jsonl"
             _record(_emulated(sensor), path, 1.0, kept=False)
@@ -130,6 +129,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
         loaded = Transcript.load(file)
     else:
         raise ConfigError("no transcript is given: add its FILE, or --simulate")
+    clock = LocalClock()  # a busy computer makes it slow, never late
     player = Player(loaded, clock)
     with player as port:
         device = _sensor(loaded.url_at(port), clock)

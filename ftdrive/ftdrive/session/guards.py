@@ -15,6 +15,7 @@ from ftcalib.model import Array
 from ftdrive.checks.devices import AXES
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.hazards import Hazard
+from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceFault, DeviceTimeout, DriverError
 from ftdrivers.interfaces import ArmState, ArmStatus
 
@@ -82,9 +83,9 @@ class Limits:
     """The program of a killed session ends by itself within 0.5 s."""
 
     @classmethod
-    def emulated(cls) -> Self:
-        """Limits of an emulated cell, whose clock leads each follower by 10 ms and waits for no control process."""
-        return cls(link_usual_s=0.05, stalled_s=60.0)
+    def of(cls, clock: Clock) -> Self:
+        """Limits of a cell: the control process of an emulated one may starve."""
+        return cls(stalled_s=clock.patience_s(cls().stalled_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -121,7 +121,7 @@ def take_poses(
     DriverError, OSError
         The session failed; the poses taken are in the run, which can be resumed.
     """
-    limits = limits or (Limits.emulated() if cell.clock.emulated else Limits())
+    limits = limits or Limits.of(cell.clock)
     journal = Journal(operator, yes=options.yes)
     journal.show(StateChanged(state=State.IDLE))
     options = with_recorded_mode(options)
