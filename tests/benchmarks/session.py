@@ -13,7 +13,8 @@ import numpy as np
 
 from ftcalib.routine import Sampling
 from ftdrive.cell.emulated import Station
-from ftdrive.session.session import SessionOptions, calibrate
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.session import calibrate
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.report import errors_in_sigma
 

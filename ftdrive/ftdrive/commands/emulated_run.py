@@ -6,11 +6,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from ftdrive.cell.emulated import Station, sensor_name
+from ftdrive.cell.emulated import MOVED_BY, Station, sensor_name
 from ftdrive.runs.outcome import Outcome
 from ftdrive.session.events import Event
 from ftdrive.session.operator import Key, Operator, Question
-from ftdrive.session.session import SessionOptions, calibrate
+from ftdrive.session.options import SessionOptions, with_recorded_mode
+from ftdrive.session.session import calibrate
+from ftdrive.terminal.console import talk
 from ftdrive.terminal.screen import open_operator
 
 
@@ -39,6 +41,14 @@ def described(station: Station) -> dict[str, Any]:
     """Return what run.json says about an emulated cell."""
     said = {"sensor": station.sensor, "options": station.options, "control_path": station.control_path}
     return {"station": {**said, "truth": station.truth}}
+
+
+def start_mover(station: Station, options: SessionOptions) -> None:
+    """Let the emulated cell move its arm, in a mode in which the session does not move it."""
+    if mover := MOVED_BY.get(with_recorded_mode(options).mode):
+        request, words = mover
+        station.control(**request)
+        talk.print(f"The cell is emulated: {words}.")
 
 
 def rehearse(station: Station, runs: Path, name: str, *, poses: int = 24, kept: bool = True) -> Outcome:

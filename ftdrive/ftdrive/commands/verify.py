@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ftdrive.cell.emulated import Station
     from ftdrive.runs.run import Run
     from ftdrive.runs.verified import AcceptanceLimits, Verified
-    from ftdrive.session.session import SessionOptions
+    from ftdrive.session.options import SessionOptions
 
 Answer = Literal["ask", "no", "yes"]
 
@@ -83,7 +83,7 @@ def verify(
     """
     from ftdrive.errors import Declined, NotAccepted
     from ftdrive.runs.verified import AcceptanceLimits
-    from ftdrive.session.session import SessionOptions
+    from ftdrive.session.options import SessionOptions
     from ftdrive.terminal.console import talk
 
     check_simulate(simulate, real={"--config": config, "--robot": robot})
@@ -205,13 +205,11 @@ def _take_poses(
     as_json: bool,
 ) -> tuple["Run", "CalibrationResult", Path]:
     """Guide the operator through the poses; return the run, and the calibration with its file."""
-    from ftdrive.cell.emulated import MOVED_BY
-    from ftdrive.commands.emulated_run import described
+    from ftdrive.commands.emulated_run import described, start_mover
     from ftdrive.live.stream import load_calibration
     from ftdrive.runs.run import Run
-    from ftdrive.session.session import take_poses, with_recorded_mode
+    from ftdrive.session.session import take_poses
     from ftdrive.session.verifying import Verifying
-    from ftdrive.terminal.console import talk
     from ftdrive.terminal.screen import open_operator
 
     calibration = load_calibration(path)
@@ -220,13 +218,10 @@ def _take_poses(
     description = {"verification": about}
     if station is not None:
         description |= described(station)
-        if mover := MOVED_BY.get(with_recorded_mode(options).mode):
-            request, words = mover
-            station.control(**request)
-            talk.print(f"The cell is emulated: {words}.")
-    task = Verifying(calibration, path, wanted.poses, options.runs)
+        start_mover(station, options)
+    task = Verifying(cell, calibration, path, wanted.poses, options.runs)
     with open_operator(as_json=as_json, command=task.command) as operator:
-        run = take_poses(cell, operator, replace(options, description=description), task)
+        run = take_poses(task, operator, replace(options, description=description))
     if run is None:
         raise RuntimeError("a verification is never a dry run")
     return run, calibration, path

@@ -84,8 +84,9 @@ class Limits:
 
     @classmethod
     def of(cls, clock: Clock) -> Self:
-        """Limits of a cell: the control process of an emulated one may starve."""
-        return cls(stalled_s=clock.patience_s(cls().stalled_s))
+        """Limits of a cell: the clock of an emulated one may lead its arm, whose control process may starve."""
+        usual = cls()
+        return cls(link_usual_s=usual.link_usual_s + clock.lead_s, stalled_s=clock.patience_s(usual.stalled_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,22 +23,19 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.show.words import way_in_words
-from ftdrive.runs.run import Run
 from ftdrive.session.events import (
     GuardTripped,
-    Noted,
-    PoseTaken,
     State,
     StateChanged,
     Weighed,
 )
-from ftdrive.session.guards import RangeGuard, Tripped, fault
+from ftdrive.session.guards import Tripped, fault
 from ftdrive.session.hazards import Hazard
-from ftdrive.session.live_fit import Judge
 from ftdrive.session.operator import Key, Question
+from ftdrive.session.pose_book import PoseBook
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.progress import Progress
-from ftdrive.session.recovery import GuardedCell, Recovery
+from ftdrive.session.recovery import GuardedCell
 from ftdrivers.errors import DriverError
 
 log = logging.getLogger(__name__)
@@ -69,10 +66,23 @@ class Turned(Exception):
         self.key = key
 
 
-@dataclass(frozen=True, slots=True)
-class Pace:
-    """What the operator confirms."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Route:
+    """Where the arm goes: a plan with the speeds of this session, and who proves approaches to it."""
 
+    plan: Plan
+    certifier: Certifier
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TourOptions:
+    """What the operator confirms, and how each pose is measured."""
+
+    sampling: Sampling
+    quiet_std: Array
+    """(6,) standard deviation of the resting sensor's samples."""
+    sensor_kg: float | None
+    """Mass of sensor and adapter; None if unknown. The payload is compared with it."""
     step: bool
     """Enter for each pose."""
     trusted: bool
@@ -82,38 +92,16 @@ class Pace:
     """Whether `--yes` was given."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Measuring:
-    """How the sensor is averaged at a pose."""
-
-    sampling: Sampling
-    quiet_std: Array
-    """(6,) standard deviation of the resting sensor's samples."""
-    load: RangeGuard
-    """Judges every sample of a pose."""
-    sensor_kg: float | None
-    """Mass of sensor and adapter; None if unknown. The payload is compared with it."""
-
-
 class Tour:
-    """Takes the arm along one plan, which has the speeds of this session; the run keeps every pose."""
+    """Takes the arm along one route; the book keeps every pose."""
 
-    def __init__(
-        self,
-        cell: GuardedCell,
-        plan: Plan,
-        certifier: Certifier,
-        run: Run,
-        judge: Judge,
-        recovery: Recovery,
-        measuring: Measuring,
-        pace: Pace,
-    ) -> None:
-        self._arm, self._sensor, self._journal, self._watcher = cell.arm, cell.sensor, cell.journal, cell.watcher
-        self._plan, self._certifier, self._run, self._judge = plan, certifier, run, judge
-        self._recovery, self._measuring, self._pace = recovery, measuring, pace
-        self._nodes = np.array([step.q_rad for step in plan.steps])
-        self._now = Progress(len(plan.steps))
+    def __init__(self, guarded: GuardedCell, route: Route, book: PoseBook, options: TourOptions) -> None:
+        self._guarded, self._watcher = guarded, guarded.watcher
+        self._arm, self._sensor, self._journal = guarded.cell.arm, guarded.cell.sensor, guarded.cell.journal
+        self._note = guarded.cell.note
+        self._plan, self._certifier, self._book, self._options = route.plan, route.certifier, book, options
+        self._nodes = np.array([step.q_rad for step in route.plan.steps])
+        self._now = Progress(len(route.plan.steps))
 
     def run(self, todo: Sequence[int]) -> None:
         """Take the poses of these stops, counted from 1; the return to the first pose is the last.
@@ -134,7 +122,7 @@ class Tour:
                 self._turn(turned.key)
             except (Tripped, DriverError, OSError, Stopped, TooFewSamples, NotAccepted) as error:
                 self._hold(error)
-        self._recovery.show_new()
+        self._guarded.show_new()
         self._show_state(State.CLOSE)
 
     @property
@@ -149,7 +137,7 @@ class Tour:
         self._obey_keys()
         stop = self._now.todo[0]
         index = self._now.index(stop)
-        if self._pace.step and not self._step(stop, index):
+        if self._options.step and not self._step(stop, index):
             return
         self._now = replace(self._now, under_way=stop)
         self._go(index, stop)
@@ -161,7 +149,7 @@ class Tour:
 
     def _compare_payload(self) -> None:
         """Row 7: show the mass on the sensor, and whether the configured payload differs; once for each payload."""
-        mass_kg = self._judge.weighed_kg
+        mass_kg = self._book.judge.weighed_kg
         if mass_kg is None:
             return
         status = self._arm.status()
@@ -170,7 +158,7 @@ class Tour:
             return
         self._now = replace(self._now, payload_kg=payload_kg)
         self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=payload_kg, p_flange_payload_m=com_m))
-        if words := payload_in_words(payload_kg, mass_kg, self._measuring.sensor_kg):
+        if words := payload_in_words(payload_kg, mass_kg, self._options.sensor_kg):
             self._note(words, warning=True)
 
     def _step(self, stop: int, index: int) -> bool:
@@ -200,7 +188,7 @@ class Tour:
         largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
-            drives = ", and drives it where --yes may confirm it" if self._pace.trusted and self._pace.yes else ""
+            drives = ", and drives it where --yes may confirm it" if self._options.trusted and self._options.yes else ""
             return f"Enter plans the way and shows it{drives}, {joints}, {largest}"
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
 
@@ -252,7 +240,7 @@ class Tour:
         stop = self._now.taken_last
         if stop is None:
             return
-        self._judge.remove(stop)
+        self._book.judge.remove(stop)
         self._now = self._now.redo(stop)
         self._note(f"pose {stop} is taken again")
 
@@ -260,25 +248,23 @@ class Tour:
         """Drop the pose, and the return to it. A pose that was to be taken again keeps its earlier samples."""
         self._now, dropped = self._now.skip()
         names = {stop: "the return to pose 1" if stop == self._now.stops else f"pose {stop}" for stop in dropped}
-        stay = set(dropped).intersection(self._run.stops())
-        for record in self._run.records() if stay else ():
+        stay = set(dropped).intersection(self._book.run.stops())
+        for record in self._book.run.records() if stay else ():
             if record.stop in stay:
-                self._journal.show(self._judge.add(record))
+                self._journal.show(self._book.judge.add(record))
                 self._note(f"{names[record.stop]} stays as it was measured", warning=True)
         if left := [name for stop, name in names.items() if stop not in stay]:
             way = f"the arm goes on to pose {self._now.todo[0]}" if self._now.todo else "it was the last"
             self._note(f"skipped: {' and '.join(left)}, {way}; --resume takes skipped poses", warning=True)
 
     def _take(self, stop: int, index: int) -> None:
-        step = self._plan.steps[index]
+        step, options, clock = self._plan.steps[index], self._options, self._watcher.clock
         pose = TourPose(step.number, np.array(step.q_rad))
-        clock = self._watcher.clock
-        began_s, settled_s, attempts = clock.now_s(), 0.0, 0
+        began_s, settled_s = clock.now_s(), 0.0
 
         def on_stage(stage: Stage) -> None:
-            nonlocal settled_s, attempts
-            if stage == "sample":
-                settled_s, attempts = clock.now_s() - began_s, attempts + 1
+            nonlocal settled_s
+            settled_s = clock.now_s() - began_s
             self._show_state(State.SETTLE if stage == "settle" else State.SAMPLE, stop)
 
         with self._watcher.watching(pose.q_rad, pose.q_rad, moving=False):
@@ -287,27 +273,16 @@ class Tour:
                 self._sensor,
                 stop,
                 pose,
-                self._measuring.sampling,
+                options.sampling,
                 guard=self._between_looks,
                 on_stage=on_stage,
-                quiet_std=self._measuring.quiet_std,
+                quiet_std=options.quiet_std,
             )
-        self._measuring.load.judge(record.samples.wrench)
-        self._run.commit(record)
-        self._journal.show(
-            PoseTaken.of(
-                record,
-                self._certifier.scene.down_base,
-                stops=self._now.stops,
-                settle_s=settled_s,
-                average_s=self._measuring.sampling.average_s,
-                attempts=attempts,
-                temperature_C=self._sensor.temperature_C(),
-            ),
-            sync=True,
-        )
-        self._recovery.show_new()
-        self._journal.show(self._judge.add(record))
+        self._guarded.load.judge(record.samples.wrench)
+        average_s = options.sampling.average_s
+        judged = self._book.keep(record, stops=self._now.stops, settle_s=settled_s, average_s=average_s)
+        self._guarded.show_new()
+        self._journal.show(judged)
 
     def _go(self, index: int, stop: int) -> None:
         """Move the arm to a pose of the plan, along certified moves only."""
@@ -371,9 +346,9 @@ class Tour:
 
     def _confirm(self, text: str, *, by_operator: bool = False) -> None:
         """Ask before a motion; the first motion needs a typed word."""
-        if not self._pace.asks:
+        if not self._options.asks:
             return
-        trusted = self._pace.trusted and not by_operator
+        trusted = self._options.trusted and not by_operator
         if self._now.confirmed:
             if self._journal.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
                 raise Stopped(f"not confirmed: {text}")
@@ -388,7 +363,7 @@ class Tour:
         """Make one certified move, only from where it was certified to begin."""
         if not self._now.confirmed:
             self._confirm("The arm begins the tour.")
-        self._recovery.require_answers()
+        self._guarded.require_answers()
         off_rad = np.abs(self._arm.state().q_rad - start)
         if off_rad.max() > _AT_RAD:
             self._now = self._now.lose_place()
@@ -419,7 +394,7 @@ class Tour:
         if isinstance(error, Stopped) and error.for_good:
             self._show_state(State.STOP, words=str(error))
             raise Declined(str(error))
-        trip = self._recovery.cause(error, moving=not self._now.standing)
+        trip = self._guarded.cause(error, moving=not self._now.standing)
         if trip is not None and self._reopened_sensor(trip):
             return
         stop, back = self._now.todo[0], self._now.came_from
@@ -431,7 +406,7 @@ class Tour:
         if report_error is not None:
             self._note(f"{reported} (reported late, {report_error!r}: check screen, pipe and disk)", warning=True)
         self._show_state(State.STOP, words=words)
-        self._recovery.show_new()
+        self._guarded.show_new()
         self._show_state(State.HOLD, words=words)
         by_operator = isinstance(error, Stopped)
         end = Declined(words) if by_operator else error if trip is None else trip.error
@@ -441,7 +416,7 @@ class Tour:
             ways["back"] = f"return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f}°/s"
         ways["quit"] = "stop; continue later with --resume"
         choices = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
-        question = Question(f"{len(self._run.stops())} poses are saved. {choices}", tuple(ways))
+        question = Question(f"{len(self._book.run.stops())} poses are saved. {choices}", tuple(ways))
         while True:
             try:
                 answer = self._journal.ask(question)
@@ -450,9 +425,9 @@ class Tour:
             if answer == "quit":
                 raise end
             try:
-                self._recovery.reopen()
+                self._guarded.reopen()
             except (Tripped, DriverError, NotAccepted, Declined) as again:
-                self._journal.show(Noted(words=f"not yet: {again}", warning=True))
+                self._note(f"not yet: {again}", warning=True)
                 continue
             if answer == "skip":
                 self._skip()
@@ -467,16 +442,13 @@ class Tour:
             return False
         self._now = replace(self._now, reopened=self._now.reopened | {stop})
         try:
-            self._recovery.reopen()
+            self._guarded.reopen()
         except (Tripped, DriverError, NotAccepted, Declined) as error:
             log.info("the sensor cannot be reopened: %s", error)
             return False
-        self._journal.show(Noted(words=f"{trip}; the sensor was reopened, pose {stop} restarts", warning=True))
+        self._note(f"{trip}; the sensor was reopened, pose {stop} restarts", warning=True)
         return True
 
     def _show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
         number = None if stop is None else self._plan.steps[self._now.index(stop)].number
         self._journal.show(StateChanged(state=state, stop=stop, stops=self._now.stops, number=number, words=words))
-
-    def _note(self, words: str, *, warning: bool = False) -> None:
-        self._journal.show(Noted(words=words, warning=warning))

@@ -17,7 +17,8 @@ from ftdrive.cli import cli, exit_code
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.session import session
-from ftdrive.session.session import SessionOptions
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.task import Calibrating
 
 CELL = """format = "ftdrive.config/1"
 [robot]
@@ -116,7 +117,7 @@ def begin(cells: list[Any], tmp_path: Path) -> Begin:
     def begun(*arguments: str) -> str:
         assert isinstance(call(*arguments), Opened)
         cell, options = cells.pop()
-        description = session._description(cell, {}, options)
+        description = session.description_of(Calibrating(cell), options, {})
         run = Run.create(tmp_path / "runs", "calibrate", json.loads(json.dumps(description)))
         run.plan_path.touch()
         return str(run.folder)

@@ -22,7 +22,8 @@ from ftdrive.runs.verification_record import last_verification
 from ftdrive.runs.verified import AcceptanceLimits, Verified, save_update, verify_run
 from ftdrive.session.completed_plans import has_completed
 from ftdrive.session.events import Checked, Compared, Noted, PoseTaken, RunOpened, State
-from ftdrive.session.session import SessionOptions, take_poses
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.session import take_poses
 from ftdrive.session.verifying import RunningComparison, Verifying
 from ftdrivers.interfaces import DeviceInfo
 from tests.unit.ftdrive.fake_cell import Lab
@@ -55,10 +56,10 @@ def take(lab: Lab, calibration: CalibrationResult) -> Callable[..., Run]:
 
     def run(poses: int = 2, **options: Any) -> Run:
         path = lab.folder / "runs" / str(calibration.provenance["run"]) / "calibration.json"
-        task = Verifying(calibration, path, poses, lab.folder / "runs")
+        task = Verifying(lab.cell, calibration, path, poses, lab.folder / "runs")
         about = {"verification": {"id": calibration.id, "path": str(path), "poses": poses}}
         given = SessionOptions(lab.folder / "runs", "verify", poses=poses, description=about, **options)
-        taken = take_poses(lab.cell, lab.operator, given, task)
+        taken = take_poses(task, lab.operator, given)
         assert taken is not None
         return taken
 
