@@ -43,7 +43,7 @@ from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Befor
 from ftdrive.session.recovery import GuardedCell
 from ftdrive.session.safety_questions import SafetyQuestions
 from ftdrive.session.task import Task
-from ftdrive.session.tour import SLOW, Route, Tour, TourOptions
+from ftdrive.session.tour import SLOW, Pace, Tour
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.interfaces import NOT_REPORTED
 
@@ -57,15 +57,6 @@ _NO_SERIAL: Final = (
     "the controller reports no serial number, so a completed plan cannot be assigned to an arm: newer PolyScope "
     "versions report it"
 )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Pace:
-    """How a plan is driven and measured in this session."""
-
-    route: Route
-    """The plan with its speeds, and its certifier."""
-    sampling: Sampling
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,14 +78,14 @@ class AlongPlan:
         """
         cell, dry_run = self.cell, self.options.dry_run
         certifier = self._certifier()
-        route = Route(plan or self._plan(certifier), certifier)
+        plan = plan or self._plan(certifier)
         kept = self._kept()
         taken = {record.stop for record in kept}
-        todo = [stop for stop in range(1, len(route.plan.steps) + 2) if stop not in taken]
+        todo = [stop for stop in range(1, len(plan.steps) + 2) if stop not in taken]
         judge = self.task.judge(by_hand=False)
         for record in kept:
             cell.journal.show(judge.add(record))
-        before = self._look(route, todo)
+        before = self._look(certifier, plan, todo)
         check(before, CHECKS)
         if dry_run:
             cell.note("the controller's safety limits are not checked: only a program on the controller can query them")
@@ -131,18 +122,18 @@ class AlongPlan:
         records = [] if self.resumed is None else self.resumed.records()
         return [record for record in records if record.stop not in self.options.redo]
 
-    def _look(self, route: Route, todo: Sequence[int]) -> Before:
+    def _look(self, certifier: Certifier, plan: Plan, todo: Sequence[int]) -> Before:
         """Plan the approach to the first pose that is left, listen to the resting sensor, and show every motion."""
-        cell, options, steps = self.cell, self.options, route.plan.steps
+        cell, options, steps = self.cell, self.options, plan.steps
         goal = steps[(todo[0] - 1) % len(steps) if todo else 0].q_rad
         before = Before(
             cell=cell,
             config=self.task.cell,
-            certifier=route.certifier,
-            plan=route.plan,
-            approach=plan_approach(route.certifier, cell.arm.state().q_rad, np.array(goal), SLOW),
+            certifier=certifier,
+            plan=plan,
+            approach=plan_approach(certifier, cell.arm.state().q_rad, np.array(goal), SLOW),
             runs=options.runs,
-            known=not options.real or has_completed(self._serial, route.plan.sha256),
+            known=not options.real or has_completed(self._serial, plan.sha256),
             quiet=cell.listen(LISTEN_S),
             resumed=self.resumed is not None,
         )
@@ -167,15 +158,21 @@ class AlongPlan:
             f"{len(todo)} stops left, at most {np.degrees(fastest_rad_s):.0f}°/s: about {total_s / 60:.1f} min; "
             f"{taken} poses taken before"
         )
-        return Pace(Route(driven, before.certifier), sampling)
+        window = int(len(before.quiet) * min(1.0, sampling.average_s / LISTEN_S))
+        return Pace(
+            driven,
+            before.certifier,
+            sampling,
+            quiet_std=noise_level(before.quiet.wrench, max(LEAST_SAMPLES, window)),
+            sensor_kg=before.config.sensor.mass_kg,
+            trusted=before.known,
+        )
 
     def _tour(self, before: Before, pace: Pace, todo: Sequence[int], judge: Judge) -> Run:
         """Ask the safety questions, then visit every pose that is left; each is on disk before the next move."""
         cell, options, way = self.cell, self.options, before.approach.way_rad
-        window = int(len(before.quiet) * min(1.0, pace.sampling.average_s / LISTEN_S))
-        quiet_std = noise_level(before.quiet.wrench, max(LEAST_SAMPLES, window))
         load = RangeGuard(cell.limits, before.sensor_range)
-        contact = self._contact_guard(pace, quiet_std, judge)
+        contact = self._contact_guard(pace, judge)
         guards = (
             SafetyGuard(),
             PathGuard(cell.limits),
@@ -198,32 +195,20 @@ class AlongPlan:
                 questions.ask(way, assumed=before.known and not arm_moves(way))  # one with base or elbow is new
             run = self.resumed or self._keep_plan(before.plan)
             book = PoseBook(cell, run, judge, before.certifier.scene.down_base)
-            tour = Tour(
-                GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck),
-                pace.route,
-                book,
-                TourOptions(
-                    sampling=pace.sampling,
-                    quiet_std=quiet_std,
-                    sensor_kg=before.config.sensor.mass_kg,
-                    step=options.mode == "step",
-                    trusted=before.known,
-                    asks=options.questions,
-                    yes=options.yes,
-                ),
-            )
+            guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)
+            tour = Tour(guarded, pace, book, options)
             with book.reporting_early_end():
                 tour.run(todo)
         if todo and not before.known:
             self._judge_completed(before.plan, run, tour.undriven)
         return run
 
-    def _contact_guard(self, pace: Pace, quiet_std: Array, judge: Judge) -> ContactGuard:
-        arm = pace.route.certifier.arm
+    def _contact_guard(self, pace: Pace, judge: Judge) -> ContactGuard:
+        arm = pace.certifier.arm
         heaviest_kg = self.task.cell.tool.mass_kg or _HEAVIEST_KG.get(arm.name, _HEAVIEST_OF_ALL_KG)
         reach_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in arm.tool)
-        acceleration_rad_s2 = pace.route.plan.acceleration_rad_s2
-        return ContactGuard(self.cell.limits, heaviest_kg, reach_m, acceleration_rad_s2, quiet_std, judge.predict)
+        acceleration_rad_s2 = pace.plan.acceleration_rad_s2
+        return ContactGuard(self.cell.limits, heaviest_kg, reach_m, acceleration_rad_s2, pace.quiet_std, judge.predict)
 
     def _keep_plan(self, plan: Plan) -> Run:
         """Create the run, with the plan in it."""

@@ -6,7 +6,7 @@ planned from where the arm stands, shown and confirmed.
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
@@ -23,15 +23,11 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.show.words import way_in_words
-from ftdrive.session.events import (
-    GuardTripped,
-    State,
-    StateChanged,
-    Weighed,
-)
+from ftdrive.session.events import GuardTripped, State, StateChanged, Weighed
 from ftdrive.session.guards import Tripped, fault
 from ftdrive.session.hazards import Hazard
 from ftdrive.session.operator import Key, Question
+from ftdrive.session.options import SessionOptions
 from ftdrive.session.pose_book import PoseBook
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.progress import Progress
@@ -67,41 +63,37 @@ class Turned(Exception):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Route:
-    """Where the arm goes: a plan with the speeds of this session, and who proves approaches to it."""
+class Pace:
+    """How a plan is driven and measured in this session."""
 
     plan: Plan
+    """With the speeds of this session."""
     certifier: Certifier
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TourOptions:
-    """What the operator confirms, and how each pose is measured."""
-
     sampling: Sampling
     quiet_std: Array
     """(6,) standard deviation of the resting sensor's samples."""
     sensor_kg: float | None
     """Mass of sensor and adapter; None if unknown. The payload is compared with it."""
-    step: bool
-    """Enter for each pose."""
     trusted: bool
     """Whether `--yes` may answer: the plan has run to its end on this arm, or the cell is emulated."""
-    asks: bool = True
-    yes: bool = False
-    """Whether `--yes` was given."""
 
 
 class Tour:
-    """Takes the arm along one route; the book keeps every pose."""
+    """Takes the arm along a plan; the book keeps every pose."""
 
-    def __init__(self, guarded: GuardedCell, route: Route, book: PoseBook, options: TourOptions) -> None:
+    def __init__(self, guarded: GuardedCell, pace: Pace, book: PoseBook, options: SessionOptions) -> None:
         self._guarded, self._watcher = guarded, guarded.watcher
         self._arm, self._sensor, self._journal = guarded.cell.arm, guarded.cell.sensor, guarded.cell.journal
         self._note = guarded.cell.note
-        self._plan, self._certifier, self._book, self._options = route.plan, route.certifier, book, options
-        self._nodes = np.array([step.q_rad for step in route.plan.steps])
-        self._now = Progress(len(route.plan.steps))
+        self._plan, self._certifier, self._pace, self._book, self._options = (
+            pace.plan,
+            pace.certifier,
+            pace,
+            book,
+            options,
+        )
+        self._nodes = np.array([step.q_rad for step in pace.plan.steps])
+        self._now = Progress(len(pace.plan.steps))
 
     def run(self, todo: Sequence[int]) -> None:
         """Take the poses of these stops, counted from 1; the return to the first pose is the last.
@@ -113,7 +105,7 @@ class Tour:
         Tripped, DriverError, OSError
             What stopped the arm, if the operator then ended the tour.
         """
-        self._now = replace(self._now, todo=tuple(todo))
+        self._now.todo = list(todo)
         self._watcher.begin()
         while self._now.todo:
             try:
@@ -133,19 +125,19 @@ class Tour:
     def _next(self) -> None:
         if self._now.back is not None:
             self._go_back(*self._now.back)
-        self._now = replace(self._now, under_way=None)
+        self._now.under_way = None
         self._obey_keys()
         stop = self._now.todo[0]
         index = self._now.index(stop)
-        if self._options.step and not self._step(stop, index):
+        if self._options.mode == "step" and not self._step(stop, index):
             return
-        self._now = replace(self._now, under_way=stop)
+        self._now.under_way = stop
         self._go(index, stop)
         self._obey_keys()
         self._take(stop, index)
-        self._now = replace(self._now, taken_last=stop)
+        self._now.taken_last = stop
         self._compare_payload()
-        self._now = self._now.finish()
+        del self._now.todo[0]
 
     def _compare_payload(self) -> None:
         """Row 7: show the mass on the sensor, and whether the configured payload differs; once for each payload."""
@@ -156,9 +148,9 @@ class Tour:
         payload_kg, com_m = status.payload_kg, status.p_flange_payload_m
         if payload_kg is None or payload_kg == self._now.payload_kg:
             return
-        self._now = replace(self._now, payload_kg=payload_kg)
+        self._now.payload_kg = payload_kg
         self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=payload_kg, p_flange_payload_m=com_m))
-        if words := payload_in_words(payload_kg, mass_kg, self._options.sensor_kg):
+        if words := payload_in_words(payload_kg, mass_kg, self._pace.sensor_kg):
             self._note(words, warning=True)
 
     def _step(self, stop: int, index: int) -> bool:
@@ -188,7 +180,7 @@ class Tour:
         largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
-            drives = ", and drives it where --yes may confirm it" if self._options.trusted and self._options.yes else ""
+            drives = ", and drives it where --yes may confirm it" if self._pace.trusted and self._options.yes else ""
             return f"Enter plans the way and shows it{drives}, {joints}, {largest}"
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
 
@@ -212,7 +204,7 @@ class Tour:
                     raise Turned(key)
                 self._note("s skips the pose that is under way: none is under way")
             if key is Key.REDO and (last := self._redoable()) is not None:
-                self._now = replace(self._now, again=True)
+                self._now.again = True
                 if not moving:
                     raise Turned(key)
                 self._note(f"the arm completes its move, then goes back to pose {last}")
@@ -241,12 +233,12 @@ class Tour:
         if stop is None:
             return
         self._book.judge.remove(stop)
-        self._now = self._now.redo(stop)
+        self._now.redo(stop)
         self._note(f"pose {stop} is taken again")
 
     def _skip(self) -> None:
         """Drop the pose, and the return to it. A pose that was to be taken again keeps its earlier samples."""
-        self._now, dropped = self._now.skip()
+        dropped = self._now.skip()
         names = {stop: "the return to pose 1" if stop == self._now.stops else f"pose {stop}" for stop in dropped}
         stay = set(dropped).intersection(self._book.run.stops())
         for record in self._book.run.records() if stay else ():
@@ -258,7 +250,7 @@ class Tour:
             self._note(f"skipped: {' and '.join(left)}, {way}; --resume takes skipped poses", warning=True)
 
     def _take(self, stop: int, index: int) -> None:
-        step, options, clock = self._plan.steps[index], self._options, self._watcher.clock
+        step, pace, clock = self._plan.steps[index], self._pace, self._watcher.clock
         pose = TourPose(step.number, np.array(step.q_rad))
         began_s, settled_s = clock.now_s(), 0.0
 
@@ -273,13 +265,13 @@ class Tour:
                 self._sensor,
                 stop,
                 pose,
-                options.sampling,
+                pace.sampling,
                 guard=self._between_looks,
                 on_stage=on_stage,
-                quiet_std=options.quiet_std,
+                quiet_std=pace.quiet_std,
             )
         self._guarded.load.judge(record.samples.wrench)
-        average_s = options.sampling.average_s
+        average_s = pace.sampling.average_s
         judged = self._book.keep(record, stops=self._now.stops, settle_s=settled_s, average_s=average_s)
         self._guarded.show_new()
         self._journal.show(judged)
@@ -295,13 +287,13 @@ class Tour:
             self._show_state(State.MOVE, stop)
             self._move(self._nodes[at], self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
             driven_from = at if index == (at + 1) % len(self._nodes) else None
-        self._now = self._now.arrive(index, driven_from=driven_from)
+        self._now.arrive(index, driven_from=driven_from)
 
     def _go_back(self, index: int, why: str) -> None:
         """Return to the previous pose, then raise `Stopped`: the operator decides again."""
-        self._now = replace(self._now, back=None, under_way=self._now.todo[0])
+        self._now.back, self._now.under_way = None, self._now.todo[0]
         self._approach(self._arm.state().q_rad, index, index + 1, back=True)
-        self._now = self._now.arrive(index)
+        self._now.arrive(index)
         raise Stopped(f"back at pose {index + 1}; what stopped the arm: {why}")
 
     def _own_speed(self, index: int) -> float | None:
@@ -346,9 +338,9 @@ class Tour:
 
     def _confirm(self, text: str, *, by_operator: bool = False) -> None:
         """Ask before a motion; the first motion needs a typed word."""
-        if not self._options.asks:
+        if not self._options.questions:
             return
-        trusted = self._options.trusted and not by_operator
+        trusted = self._pace.trusted and not by_operator
         if self._now.confirmed:
             if self._journal.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
                 raise Stopped(f"not confirmed: {text}")
@@ -357,7 +349,7 @@ class Tour:
         question = Question(f"{text} Hand on the emergency stop. Type {_FIRST_WORD}", (_FIRST_WORD,), assumed)
         if self._journal.ask(question) != _FIRST_WORD:
             raise Declined(f"{_FIRST_WORD} was not typed: nothing moves")
-        self._now = replace(self._now, confirmed=True)
+        self._now.confirmed = True
 
     def _move(self, start: Array, goal: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Make one certified move, only from where it was certified to begin."""
@@ -366,7 +358,7 @@ class Tour:
         self._guarded.require_answers()
         off_rad = np.abs(self._arm.state().q_rad - start)
         if off_rad.max() > _AT_RAD:
-            self._now = self._now.lose_place()
+            self._now.lose_place()
             raise fault(
                 Hazard.OTHER_CLIENT,
                 f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° from where its move begins: "
@@ -374,7 +366,7 @@ class Tour:
             )
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
-        self._now = self._now.start_move()
+        self._now.standing = False
         with self._watcher.watching(start, goal, moving=True):
             self._arm.move_to(
                 goal.tolist(),
@@ -398,7 +390,7 @@ class Tour:
         if trip is not None and self._reopened_sensor(trip):
             return
         stop, back = self._now.todo[0], self._now.came_from
-        self._now = self._now.start_move()
+        self._now.standing = False
         words = str(error if trip is None else trip).rstrip(".")
         reported, report_error = self._watcher.tripped(wait_s=0.0), self._watcher.report_error
         if trip is not None and (trip is not reported or report_error is not None):
@@ -432,7 +424,7 @@ class Tour:
             if answer == "skip":
                 self._skip()
             if answer == "back" and back is not None:
-                self._now = replace(self._now, back=(back, words))
+                self._now.back = (back, words)
             return
 
     def _reopened_sensor(self, trip: Tripped) -> bool:
@@ -440,7 +432,7 @@ class Tour:
         stop = self._now.todo[0]
         if trip.hazard != Hazard.SENSOR_LOST or not self._now.standing or stop in self._now.reopened:
             return False
-        self._now = replace(self._now, reopened=self._now.reopened | {stop})
+        self._now.reopened.add(stop)
         try:
             self._guarded.reopen()
         except (Tripped, DriverError, NotAccepted, Declined) as error:
