@@ -21,20 +21,10 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.constant_tour import constant_tour
 from ftdrive.planning.show.words import way_in_words
 from ftdrive.runs.run import Run
+from ftdrive.session import guards
 from ftdrive.session.completed_plans import has_completed, remember_completed
 from ftdrive.session.events import GuardTripped, Planned
 from ftdrive.session.forecast import Averages, at_most, moves_s
-from ftdrive.session.guards import (
-    ContactGuard,
-    ModelGuard,
-    PathGuard,
-    RangeGuard,
-    SafetyGuard,
-    SensorGuard,
-    SettingsGuard,
-    StallGuard,
-    Tripped,
-)
 from ftdrive.session.live_fit import Judge
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.options import SessionOptions
@@ -171,23 +161,23 @@ class AlongPlan:
     def _tour(self, before: Before, pace: Pace, todo: Sequence[int], judge: Judge) -> Run:
         """Ask the safety questions, then visit every pose that is left; each is on disk before the next move."""
         cell, options, way = self.cell, self.options, before.approach.way_rad
-        load = RangeGuard(cell.limits, before.sensor_range)
+        load = guards.RangeGuard(cell.limits, before.sensor_range)
         contact = self._contact_guard(pace, judge)
-        guards = (
-            SafetyGuard(),
-            PathGuard(cell.limits),
-            SensorGuard(cell.limits),
+        rows = (
+            guards.SafetyGuard(),
+            guards.PathGuard(cell.limits),
+            guards.SensorGuard(cell.limits),
             load,
             contact,
-            ModelGuard(cell.limits, before.certifier),
-            SettingsGuard(),
-            StallGuard(cell.limits),
+            guards.ModelGuard(cell.limits, before.certifier),
+            guards.SettingsGuard(),
+            guards.StallGuard(cell.limits),
         )
 
-        def on_trip(trip: Tripped) -> None:
+        def on_trip(trip: guards.Tripped) -> None:
             cell.journal.show(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
-        watcher = Watcher(cell.arm, cell.sensor, guards, on_trip, clock=cell.clock, limits=cell.limits)
+        watcher = Watcher(cell, rows, on_trip)
         questions = SafetyQuestions(cell, before.plan)
         recheck = partial(self._recheck, before, questions)
         with watcher:  # sees an emergency stop at a question too
@@ -203,12 +193,14 @@ class AlongPlan:
             self._judge_completed(before.plan, run, tour.undriven)
         return run
 
-    def _contact_guard(self, pace: Pace, judge: Judge) -> ContactGuard:
+    def _contact_guard(self, pace: Pace, judge: Judge) -> guards.ContactGuard:
         arm = pace.certifier.arm
         heaviest_kg = self.task.cell.tool.mass_kg or _HEAVIEST_KG.get(arm.name, _HEAVIEST_OF_ALL_KG)
         reach_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in arm.tool)
         acceleration_rad_s2 = pace.plan.acceleration_rad_s2
-        return ContactGuard(self.cell.limits, heaviest_kg, reach_m, acceleration_rad_s2, pace.quiet_std, judge.predict)
+        return guards.ContactGuard(
+            self.cell.limits, heaviest_kg, reach_m, acceleration_rad_s2, pace.quiet_std, judge.predict
+        )
 
     def _keep_plan(self, plan: Plan) -> Run:
         """Create the run, with the plan in it."""

@@ -54,14 +54,8 @@ class Judge(Protocol):
 class RunningFit:
     """The calibration so far, and its coverage.
 
-    Parameters
-    ----------
-    g_m_s2 : float
-        Local gravity.
-    down_base : array_like, shape (3,)
-        Unit vector down in base, used for the coverage until the fit gives it.
-    advise : bool
-        Suggest the most useful next pose; False if a plan chooses the poses.
+    `down_base` (3,), the unit vector down in base, serves the coverage until the fit gives it. With `advise` it
+    suggests the most useful next pose.
     """
 
     def __init__(
@@ -192,13 +186,7 @@ def faces(gravity_flange: Array) -> tuple[int, int, int, int, int, int]:
 
 
 def hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
-    """Describe the simple motion from the last pose to the most useful next one.
-
-    Parameters
-    ----------
-    R_base_flange : array, shape (n, 3, 3)
-        Poses taken.
-    """
+    """Describe the simple motion from the last of the poses taken (n, 3, 3) to the most useful next one."""
     last = R_base_flange[-1]
     words, candidates = _motions(last, down_base)
     ranked, _ = next_pose(R_base_flange, candidates, guess)

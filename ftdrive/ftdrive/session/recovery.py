@@ -17,12 +17,8 @@ _LOOK_AGAIN_S: Final = 0.4
 class GuardedCell:
     """A cell under control with its guards, and what leads from a stop back to motion.
 
-    Parameters
-    ----------
-    contact, load
-        Of the guards: one accepts the zero of a reopened sensor, the other judges every sample of a pose.
-    recheck : callable
-        Repeats the checks; with True, the safety questions too. Raises if the arm may not go on.
+    Of the guards, `contact` accepts the zero of a reopened sensor, and `load` judges every sample of a pose. `recheck`
+    repeats the checks, with True the safety questions too; it raises if the arm may not go on.
     """
 
     def __init__(

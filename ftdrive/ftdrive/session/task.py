@@ -49,14 +49,7 @@ class Task(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Calibrating:
-    """A calibration.
-
-    Parameters
-    ----------
-    cell : CellConfig
-    real : bool
-        A real arm moves.
-    """
+    """A calibration."""
 
     command: ClassVar[str] = "calibrate"
     goal: ClassVar[str] = "the coverage is green"
@@ -64,6 +57,7 @@ class Calibrating:
     warnings: ClassVar[tuple[str, ...]] = ()
     cell: CellConfig
     real: bool = True
+    """Whether a real arm moves."""
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
         """Return a tour."""

@@ -36,26 +36,17 @@ HOLDS_POSES: Final = 3
 
 @dataclass(frozen=True, eq=False)
 class Verifying:
-    """A verification.
-
-    Parameters
-    ----------
-    cell : CellConfig
-    calibration : CalibrationResult
-    path : Path
-        Its file.
-    poses : int
-        Number of fresh poses.
-    runs : Path
-        Folder of runs: the plan of an earlier verification is driven again if it still fits the cell.
-    """
+    """A verification."""
 
     command: ClassVar[str] = "verify"
     cell: CellConfig
     calibration: CalibrationResult
     path: Path
+    """The file of the calibration."""
     poses: int
+    """Number of fresh poses."""
     runs: Path
+    """Folder of runs: the plan of an earlier verification is driven again if it still fits the cell."""
 
     @property
     def goal(self) -> str:
@@ -114,12 +105,7 @@ class Verifying:
 class RunningComparison:
     """Compares each pose with the prediction of a calibration.
 
-    Parameters
-    ----------
-    R_fitted : array, shape (k, 3, 3)
-        Orientations of the calibration: poses near them do not count.
-    wanted : int
-        Number of poses that count.
+    Of the poses far from `R_fitted` (k, 3, 3), the orientations of the calibration, as many are needed as `wanted`.
     """
 
     weighed_kg: float | None = None
