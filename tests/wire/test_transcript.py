@@ -27,7 +27,7 @@ from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript.player import Player
 from ftdrivers.transcript.recorder import BadTranscript, Passage, Transcript, Writer
 from ftdrivers.transcript.taps import recording
-from ftdrivers.wires.parity import Unmarker, ask_for_marks
+from ftdrivers.wires.parity import ask_for_marks
 from ftdrivers.wires.serial_port import SerialPort
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.ati_serial import AtiSerialBox
@@ -196,31 +196,6 @@ def ati(cell_time: Any) -> Iterator[str]:
     device = AtiSerialBox(measured(), seed=1, clock=cell_time.of_devices)
     yield f"ati-serial://{device.start()}"
     device.stop()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
-def test_a_transcript_from_before_parity_was_checked_is_played_as_ever(ati: str, tmp_path: Path, clock: Clock) -> None:
-    path = tmp_path / "sensor.jsonl"
-    writer = Writer(path, {"url": ati, "duration_s": DURATION_S}, clock)
-    with recording(writer):
-        identity, wrench = look(sensor_from_url(ati, clock=clock), DURATION_S + 0.3)
-    writer.end(error=None)
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert [line["parity_marks"] for line in lines if line.get("event") == "open"] == [True]
-
-    marks = Unmarker()
-    for line in lines:
-        line.pop("parity_marks", None)
-        if line.get("dir") == "rx":
-            line["hex"] = marks.undo(bytes.fromhex(line["hex"]))[0].hex()
-    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    old = Transcript.load(path)
-    assert not old.parity_marks
-    with Player(old, clock) as port:
-        again, played = look(sensor_from_url(old.url_at(port), clock=clock), DURATION_S)
-    assert again == identity
-    recorded = {row.tobytes() for row in wrench}
-    assert sum(row.tobytes() in recorded for row in played) > 0.7 * len(played) > 14
 
 
 def read_through(player: Player, request: bytes, size: int) -> tuple[bytes, list[int]]:

@@ -16,20 +16,21 @@ from ftdrivers.ur.timing import STRICT, UrTiming
 
 def build_arm(cell: CellConfig) -> RobotArm:
     """Build the arm's driver, not yet open; it moves at the speed of the cell unless a move names its own."""
+    robot = cell.robot
     try:
-        build = cast("Callable[..., RobotArm]", arm_class(cell.robot.driver))
+        build = cast("Callable[..., RobotArm]", arm_class(robot.driver))
     except ValueError as error:
         raise ConfigError(f"[robot] driver: {error}") from error
     # Only an emulated arm takes a clock: an arm of another package may not know it.
     more: dict[str, Any] = {} if cell.clock is REAL else {"clock": cell.clock}
-    if cell.robot.driver == "ur":
+    if robot.driver == "ur":
         timing = STRICT if cell.clock is REAL else UrTiming.emulated()
-        more |= {"control": cell.robot.control, "api_port": cell.robot.api_port, "timing": timing}
+        more |= {"control": robot.control, "api_port": robot.api_port, "timing": timing}
     arm = build(
-        cell.robot.host,
-        model=cell.robot.model,
-        speed_rad_s=radians(cell.robot.speed_deg_s),
-        acceleration_rad_s2=radians(cell.robot.acceleration_deg_s2),
+        robot.host,
+        model=robot.model,
+        speed_rad_s=radians(robot.speed_deg_s),
+        acceleration_rad_s2=radians(robot.acceleration_deg_s2),
         **more,
     )
     _fits: Arm = arm  # checked statically: what the routine asks for is what the driver gives

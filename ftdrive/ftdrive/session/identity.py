@@ -20,17 +20,27 @@ _OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range")
 """Facts that differ for another scale or calibration."""
 
 
-def require_devices_of(
-    calibration: CalibrationResult, connected: Mapping[str, DeviceInfo], mount: str | None
+def require_devices(
+    connected: Mapping[str, DeviceInfo], config: SensorConfig, *, calibration: CalibrationResult | None, run: Run | None
 ) -> tuple[str, ...]:
-    """Return what is uncertain; raises `ConfigError` for another arm, sensor or mounting than the calibration's."""
-    belongs = belonging(calibration, connected, mount)
-    if belongs.others:
+    """Return what is uncertain about the connected devices, where a calibration or a resumed run must have the same.
+
+    Raises
+    ------
+    ConfigError
+        Arm, sensor or mounting is not that of the calibration.
+    PlanRefused
+        As `_require_same_devices`.
+    """
+    belongs = None if calibration is None else belonging(calibration, connected, config.mount)
+    if belongs is not None and belongs.others:
         raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
-    return belongs.unknown
+    if run is not None:
+        _require_same_devices(run, config, connected)
+    return () if belongs is None else belongs.unknown
 
 
-def require_same_devices(run: Run, config: SensorConfig, connected: Mapping[str, DeviceInfo]) -> None:
+def _require_same_devices(run: Run, config: SensorConfig, connected: Mapping[str, DeviceInfo]) -> None:
     """Raise `PlanRefused` for other devices than those of the run, or a sensor that is scaled otherwise now.
 
     Without a serial number a device counts as the same if its model is, and the run has no serial number either.

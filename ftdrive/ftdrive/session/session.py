@@ -17,7 +17,7 @@ from ftdrive.session.along_plan import AlongPlan
 from ftdrive.session.events import State, StateChanged
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import HandGuided
-from ftdrive.session.identity import require_devices_of, require_same_devices
+from ftdrive.session.identity import require_devices
 from ftdrive.session.journal import Journal
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Operator
@@ -65,13 +65,9 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
             if options.real and not options.dry_run:
                 cell.note(kept_awake)
         connected = {"arm": arm.identify(), "sensor": sensor.identify()}
-        if task.calibration is not None:
-            for words in require_devices_of(task.calibration, connected, config.sensor.mount):
-                cell.note(words, warning=True)
-        for words in task.warnings:
+        uncertain = require_devices(connected, config.sensor, calibration=task.calibration, run=resumed)
+        for words in (*uncertain, *task.warnings):
             cell.note(words, warning=True)
-        if resumed is not None:
-            require_same_devices(resumed, config.sensor, connected)
         new_run = partial(
             Run.create, options.runs, options.name, description_of(task, options, connected), config.clock
         )
