@@ -90,7 +90,7 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class ExpectedMotion:
     """The expected motion: a straight move in joint space, or standing."""
 
     start_rad: Array
@@ -106,7 +106,7 @@ class Seen:
     """Of the guards' own clock."""
     dt_s: float
     """Since the previous look; at most `Limits.counted_s`."""
-    motion: Motion
+    motion: ExpectedMotion
     state: ArmState
     status: ArmStatus
     wrench: Array

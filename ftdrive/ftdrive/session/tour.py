@@ -46,7 +46,7 @@ _NEAR_RAD: Final = float(np.radians(10))
 _FIRST_WORD: Final = "MOVE"
 
 
-class Stopped(Exception):
+class OperatorStop(Exception):
     """The operator paused, stopped, sent the arm back or answered no; the tour holds until the operator decides."""
 
     def __init__(self, words: str, *, for_good: bool = False) -> None:
@@ -112,7 +112,7 @@ class Tour:
                 self._next()
             except Turned as turned:
                 self._turn(turned.key)
-            except (Tripped, DriverError, OSError, Stopped, TooFewSamples, NotAccepted) as error:
+            except (Tripped, DriverError, OSError, OperatorStop, TooFewSamples, NotAccepted) as error:
                 self._hold(error)
         self._guarded.show_new()
         self._show_state(State.CLOSE)
@@ -194,9 +194,9 @@ class Tour:
             raise Turned(Key.REDO)
         while (key := self._journal.pressed()) is not None:
             if key is Key.PAUSE:
-                raise Stopped("paused by the operator")
+                raise OperatorStop("paused by the operator")
             if key is Key.STOP:
-                raise Stopped("stopped by the operator", for_good=True)
+                raise OperatorStop("stopped by the operator", for_good=True)
             if key is Key.KEEP:
                 self._note("every pose is saved without a key; press r to take it again")
             if key is Key.SKIP:
@@ -290,11 +290,11 @@ class Tour:
         self._now.arrive(index, driven_from=driven_from)
 
     def _go_back(self, index: int, why: str) -> None:
-        """Return to the previous pose, then raise `Stopped`: the operator decides again."""
+        """Return to the previous pose, then raise `OperatorStop`: the operator decides again."""
         self._now.back, self._now.under_way = None, self._now.todo[0]
         self._approach(self._arm.state().q_rad, index, index + 1, back=True)
         self._now.arrive(index)
-        raise Stopped(f"back at pose {index + 1}; what stopped the arm: {why}")
+        raise OperatorStop(f"back at pose {index + 1}; what stopped the arm: {why}")
 
     def _own_speed(self, index: int) -> float | None:
         """Speed of the plan's move from where the arm stands to a pose, rad/s; None if the plan has no such move."""
@@ -343,7 +343,7 @@ class Tour:
         trusted = self._pace.trusted and not by_operator
         if self._now.confirmed:
             if self._journal.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
-                raise Stopped(f"not confirmed: {text}")
+                raise OperatorStop(f"not confirmed: {text}")
             return
         assumed = _FIRST_WORD if trusted else None
         question = Question(f"{text} Hand on the emergency stop. Type {_FIRST_WORD}", (_FIRST_WORD,), assumed)
@@ -383,7 +383,7 @@ class Tour:
     def _hold(self, error: Exception) -> None:
         """Show why the arm has stopped, and wait for the operator; returns when the tour may go on."""
         self._arm.stop()
-        if isinstance(error, Stopped) and error.for_good:
+        if isinstance(error, OperatorStop) and error.for_good:
             self._show_state(State.STOP, words=str(error))
             raise Declined(str(error))
         trip = self._guarded.cause(error, moving=not self._now.standing)
@@ -400,7 +400,7 @@ class Tour:
         self._show_state(State.STOP, words=words)
         self._guarded.show_new()
         self._show_state(State.HOLD, words=words)
-        by_operator = isinstance(error, Stopped)
+        by_operator = isinstance(error, OperatorStop)
         end = Declined(words) if by_operator else error if trip is None else trip.error
         ways = {"resume": f"go on with pose {stop}{'' if by_operator else ' after fixing the cause'}"}
         ways["skip"] = f"leave pose {stop} out"

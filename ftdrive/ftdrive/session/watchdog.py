@@ -12,7 +12,7 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftcalib.routine import turned_rad
-from ftdrive.session.guards import Guard, Motion, Seen, Tripped, arm_lost, by_safety, fault
+from ftdrive.session.guards import ExpectedMotion, Guard, Seen, Tripped, arm_lost, by_safety, fault
 from ftdrive.session.hazards import Hazard
 from ftdrive.session.open_cell import OpenCell
 from ftdrivers.clock import Follower
@@ -31,8 +31,8 @@ class Watcher:
     def __init__(self, cell: OpenCell, guards: Sequence[Guard], on_trip: Callable[[Tripped], None]) -> None:
         self.clock, self._limits = cell.clock, cell.limits
         self._arm, self._sensor, self._guards, self._on_trip = cell.arm, cell.sensor, tuple(guards), on_trip
-        self._motion: Motion | None = None
-        self._seen: Motion | None = None  # the motion that all guards have looked at
+        self._motion: ExpectedMotion | None = None
+        self._seen: ExpectedMotion | None = None  # the motion that all guards have looked at
         self._wake = threading.Event()
         self._end = threading.Event()
         self._reported = threading.Event()
@@ -72,7 +72,7 @@ class Watcher:
         self.check()
         self._last = None
         self._looked_s = self.clock.now_s()
-        motion = self._motion = Motion(np.asarray(start_rad), np.asarray(goal_rad), moving)
+        motion = self._motion = ExpectedMotion(np.asarray(start_rad), np.asarray(goal_rad), moving)
         self._wake.set()
         try:
             while self._seen is not motion:
@@ -159,7 +159,7 @@ class Watcher:
             pause_s = self.turn()
             self.clock.wait(self._wake if self._motion is None else self._end, pause_s)
 
-    def _look(self, motion: Motion) -> None:
+    def _look(self, motion: ExpectedMotion) -> None:
         status = self._arm.status()
         try:
             state = self._arm.state()

@@ -40,7 +40,7 @@ from ftdrive.terminal.console import hanging, talk
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
-from ftdrive.terminal.session_text import Line, SessionText, in_words, rms_sigma, sigmas_of
+from ftdrive.terminal.session_text import SessionText, TextLine, in_words, rms_sigma, sigmas_of
 from ftdrivers.interfaces import Array
 
 REFRESH_HZ = 4
@@ -417,7 +417,7 @@ class Screen:
             self._live.transient = kind is None  # after an error the frame stays: it has the command to resume
             self._live.stop()
         if kind is None and self._view.folder:
-            self._print([Line(" ✔ ", f"{len(self._view.taken)} averages kept in {self._view.folder}", "green")])
+            self._print([TextLine(" ✔ ", f"{len(self._view.taken)} averages kept in {self._view.folder}", "green")])
 
     def show(self, event: Event) -> None:
         """Show an event."""
@@ -446,7 +446,7 @@ class Screen:
         """Return the oldest unread key, or None."""
         return None if self._keyboard is None else self._keyboard.pressed()
 
-    def _print(self, lines: Sequence[Line]) -> None:
+    def _print(self, lines: Sequence[TextLine]) -> None:
         for line in lines:
             head, words = self._view.shown(line.head), self._view.shown(line.words)
             self._console.print(hanging(head, words, self._console), style=line.style)
