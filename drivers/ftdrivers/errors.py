@@ -1,4 +1,4 @@
-"""What can go wrong with a device; `DriverError` is the base of all.
+"""What can go wrong with a device; `DeviceError` is the base of all.
 
 `found` is what happened, with the value. `fix` starts with a verb and is what to do next, where the driver knows it.
 The text of an error is "found; fix", without capital and full stop. A conversion to another class keeps the fix.
@@ -10,7 +10,7 @@ UNUSABLE: Final = "discard its data, check load, supply and cable, then power it
 """The fix for a critical status."""
 
 
-class DriverError(Exception):
+class DeviceError(Exception):
     """Base of all device errors.
 
     Parameters
@@ -27,7 +27,7 @@ class DriverError(Exception):
         self.fix = fix
 
 
-class ConnectError(DriverError):
+class ConnectError(DeviceError):
     """The device could not be opened, or is not what it should be."""
 
 
@@ -47,19 +47,19 @@ class NoDashboard(ConnectError):
     """The dashboard server of an arm, or its Robot API, does not answer or refuses."""
 
 
-class StreamBroken(DriverError):
+class StreamBroken(DeviceError):
     """The connection was lost after it had worked."""
 
 
-class DeviceTimeout(DriverError, TimeoutError):
+class DeviceTimeout(DeviceError, TimeoutError):
     """Nothing arrived in time; also a `TimeoutError`."""
 
 
-class ProtocolError(DriverError):
+class ProtocolError(DeviceError):
     """Bytes arrived that the device's document does not allow."""
 
 
-class DeviceFault(DriverError):
+class DeviceFault(DeviceError):
     """The device reports a fault of its own."""
 
 

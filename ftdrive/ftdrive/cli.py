@@ -102,14 +102,14 @@ def exit_code(error: BaseException) -> int | None:
         NotAccepted,
         RecordingHasGaps,
     )
-    from ftdrivers.errors import ConnectError, DeviceFault, DriverError
+    from ftdrivers.errors import ConnectError, DeviceError, DeviceFault
     from ftdrivers.transcript.recorder import BadTranscript
 
     codes: list[tuple[int, tuple[type[BaseException], ...]]] = [
         (2, (ConfigError,)),
         (3, (ConnectError,)),
         (5, (DeviceFault,)),
-        (4, (DriverError, TooFewSamples)),
+        (4, (DeviceError, TooFewSamples)),
         (6, (BadDataset, BadCalibration, BadTranscript, BadPlan, BadRecording, BadStore, BadBundle)),
         (7, (CalibError, NotAccepted)),
         (8, (RecordingHasGaps,)),

@@ -33,7 +33,7 @@ import serial
 
 from ftdrivers.ati import modbus
 from ftdrivers.clock import REAL
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 from ftdrivers.ur.arm import UrArm
 from tests.wire.conftest import Station
@@ -272,7 +272,7 @@ def endure(emulator: Emulator, fault: str, samples: int) -> Counter[str]:
         sensor = emulator.sensor()
         try:
             sensor.open()
-        except DriverError as error:  # a busy computer
+        except DeviceError as error:  # a busy computer
             count[type(error).__name__] += 1
             continue
         with closing(sensor):
@@ -295,7 +295,7 @@ def repeat(emulator: Emulator, fault: str, samples: int, cycles: int) -> Counter
             for watched in CYCLES[fault](emulator, PIECE_S):
                 count["received"] += len(watched.samples())
                 count["wrong"] += watched.wrong()
-        except DriverError as error:  # a busy computer
+        except DeviceError as error:  # a busy computer
             count[type(error).__name__] += 1
         except (AssertionError, pytest.fail.Exception) as error:
             sys.stderr.write(f"{emulator.kind.scheme}, {fault}: {error}\n")

@@ -22,7 +22,7 @@ from functools import partial
 from math import isnan, nan, radians
 from pathlib import Path
 
-from ftdrivers.errors import ConnectError, DriverError
+from ftdrivers.errors import ConnectError, DeviceError
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control_process import ControlProcess
 from tests.wire.conftest import Station
@@ -97,7 +97,7 @@ def befall(do: Do, fix: Act, *, later_s: float = 0.0, frozen: bool = False) -> R
         try:
             arm.move_to(q, timeout_s=10, guard=provoke)
             raise AssertionError("the arm arrived")
-        except DriverError:
+        except DeviceError:
             reported_s = provoke.ago_s()
         assert provoke.t_s is not None
         stood = (nan, "frozen itself") if frozen else stands(station, provoke.t_s, q[5])

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ftdrive.cell.emulated_clock import EmulatedClock
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.follow import Unread
 from ftdrivers.interfaces import Array, FtSamples
 from ftdrivers.registry import sensor_from_url
@@ -288,15 +288,15 @@ def applies(scheme: str, fault: str) -> bool:
     return packets if fault in {"swap", "foreign"} else not packets if fault in {"corrupt", "byte_slip"} else True
 
 
-def suffer(sensor: StreamingSensor, clock: Clock, seconds: float) -> list[DriverError]:
+def suffer(sensor: StreamingSensor, clock: Clock, seconds: float) -> list[DeviceError]:
     """Use a sensor for a while as a program would; return its errors."""
-    told: list[DriverError] = []
+    told: list[DeviceError] = []
     end_s = clock.now_s() + seconds
     while clock.now_s() < end_s:
         try:
             sensor.collect(0.2)
             sensor.latest(timeout_s=0.1)
-        except DriverError as exc:
+        except DeviceError as exc:
             told.append(exc)
             if sensor._failure is not None:
                 break

@@ -24,7 +24,7 @@ from ftdrive.cell.emulated import SENSORS, Station
 PROGRAM = """
 import json, sys, threading, time
 import numpy as np
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.registry import sensor_from_url
 
 one_line = threading.Lock()
@@ -40,7 +40,7 @@ def report(what, call):
             samples = call()
             push_N = np.linalg.norm(samples.wrench[:, :3] - still_N, axis=1)
             outcome = {"rows": len(samples), "unpushed_ns": samples.t_host_ns[push_N < 90].tolist()}
-        except DriverError as exc:
+        except DeviceError as exc:
             outcome = {"error": type(exc).__name__, "says": str(exc)}
         send(what=what, begin_ns=begin_ns, end_ns=time.monotonic_ns(), **outcome)
         if what == "latest" or "error" in outcome:

@@ -57,7 +57,7 @@ import numpy as np
 import pytest
 
 from ftdrivers.clock import REAL
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import Control, ControlPath
 from ftdrivers.ur.control_process import ControlProcess
@@ -131,7 +131,7 @@ class Event:
     name: str
     do: Act
     fix: Act
-    error: type[DriverError] | tuple[type[DriverError], ...]
+    error: type[DeviceError] | tuple[type[DeviceError], ...]
     says: str
     reachable: bool = True
     """Whether the controller can still receive a stop."""
@@ -681,7 +681,7 @@ def test_a_silent_dashboard(station: Station) -> None:
 
 APPLICATION = """
 import sys
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.ur.arm import UrArm
 arm = UrArm(sys.argv[1], speed_rad_s=float(sys.argv[2]), acceleration_rad_s2=3.0)
 arm.open(control=True)
@@ -691,7 +691,7 @@ q[5] += -1.2 if q[5] > 0.5 else 1.2
 try:
     arm.move_to(q.tolist(), timeout_s=20, guard=lambda: None)
     print("arrived", abs(arm.state().q_rad[5] - q[5]) < 1e-3, flush=True)
-except DriverError as error:
+except DeviceError as error:
     print(type(error).__name__, error, flush=True)
 arm.close()
 """

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import Final
 
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import Diagnosis
 from ftdrivers.ur import control_process, control_program, primary
 from ftdrivers.ur.control import Control, ControlPath, ControlSetting, ProgramRefused
@@ -102,7 +102,7 @@ class Opening:
         def diagnosis(name: str, require: Callable[[], None], found: str) -> Diagnosis:
             try:
                 require()
-            except DriverError as error:
+            except DeviceError as error:
                 return Diagnosis(name, False, error.found, error.fix)
             return Diagnosis(name, True, found)
 
@@ -199,7 +199,7 @@ class Opening:
                 )
 
 
-def _refusal(host: str, path: ControlPath, error: DriverError) -> ConnectError:
+def _refusal(host: str, path: ControlPath, error: DeviceError) -> ConnectError:
     """Convert why a control path did not start to an error with a fix."""
     if "already in use" in error.found:
         return registers_taken(host, ())

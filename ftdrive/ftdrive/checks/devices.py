@@ -20,9 +20,9 @@ from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE, payloa
 from ftdrivers.clock import Clock
 from ftdrivers.errors import (
     ConnectError,
+    DeviceError,
     DeviceFault,
     DeviceTimeout,
-    DriverError,
     ModelUnknown,
     PortInUse,
     ProtocolError,
@@ -126,13 +126,13 @@ def check_load(limits: ArrayLike | None, cell: CellConfig) -> Check:
     return Check(name, "ok", found) if share <= _LOAD else Check(name, "failed", found, "take a larger sensor")
 
 
-def check_sensor_error(name: str, error: DriverError, address: SensorAddress, permissions: Sequence[Check]) -> Check:
+def check_sensor_error(name: str, error: DeviceError, address: SensorAddress, permissions: Sequence[Check]) -> Check:
     """Return an error of a sensor's driver, and what to do about it.
 
     The error's own fix comes first. If the sensor was not reached and a permission is missing, that is the fix. If
     neither names one, it is the usual fix for errors of this kind.
     """
-    kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DriverError) else error
+    kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DeviceError) else error
     fix = error.fix
     permission = next((check.fix for check in permissions if check.state == "failed"), None)
     if permission is not None and not isinstance(kind, PortInUse | DeviceFault) and (_not_reached(kind) or not fix):
@@ -286,7 +286,7 @@ def check_level(wrench: Array) -> Check:
 # ------------------------------------------------------------------------------------------------------------- the arm
 
 
-def check_unreachable(error: DriverError, host: str) -> Check:
+def check_unreachable(error: DeviceError, host: str) -> Check:
     """Return why an arm could not be opened, and what to do about it."""
     fix = error.fix or f"ping {host}"
     if isinstance(error, ModelUnknown):
@@ -316,7 +316,7 @@ def check_remote(arm: RobotArm) -> Check:
     name = "robot.remote"
     try:
         remote = arm.in_remote_control()
-    except DriverError as error:
+    except DeviceError as error:
         return Check(name, "failed", error.found, error.fix or None)
     if remote is None:
         return Check(name, "skipped", "this controller does not report whether it accepts programs from the network")
@@ -425,7 +425,7 @@ def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> 
         try:
             with clock.keeping_up():
                 took_s = _answers_s(arm, clock)
-        except DriverError as error:
+        except DeviceError as error:
             return Check(name, "failed", error.found, error.fix or "check the robot and the network")
         median_s = float(np.median(took_s))
         found = f"the arm answers within {1e3 * median_s:.0f} ms, at worst {1e3 * max(took_s):.0f} ms"

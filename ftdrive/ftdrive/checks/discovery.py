@@ -29,7 +29,7 @@ _SLCAN = "slcan:///dev/ttyACM0?bitrate=250000"
 
 
 def identify_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[str, str]:
-    """Return the model of the arm at an address, and in words what it reports; raises `DriverError`."""
+    """Return the model of the arm at an address, and in words what it reports; raises `DeviceError`."""
     with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
         arm.open()
         info, remote = arm.identify(), arm.in_remote_control()
@@ -38,7 +38,7 @@ def identify_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[s
 
 
 def identify_sensor(url: str, clock: Clock = REAL) -> str:
-    """Return in words which sensor is at an address, and its rate; raises `DriverError` or `ConfigError`."""
+    """Return in words which sensor is at an address, and its rate; raises `DeviceError` or `ConfigError`."""
     with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url), clock=clock)) as sensor:
         info = sensor.identify()
         rate_Hz = len(sensor.collect(_LOOK_S).t_host_ns) / _LOOK_S

@@ -17,7 +17,7 @@ from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.console import hanging
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 
 _PLACES = """\b
 A PLACE is
@@ -81,7 +81,7 @@ def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[s
     nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
     try:
         answers = [nothing | {"url": answer.url, "what": answer.what} for answer in ask(place, clock)]
-    except (ConfigError, DriverError, OSError) as error:
+    except (ConfigError, DeviceError, OSError) as error:
         failures.append(error)
         return [nothing | {"what": "could not be probed", "error": str(error)}]
     return answers or [nothing]

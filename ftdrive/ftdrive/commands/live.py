@@ -39,7 +39,7 @@ from ftdrive.recording import Recorder, read_recording
 from ftdrive.runs.run import Run
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import Array
 
 _PERIOD_S = 0.1
@@ -175,7 +175,7 @@ def _looks(stream: CompensatedStream | ReplayedStream, *, raises: bool = False) 
     while not ended:
         try:
             block = stream.read()
-        except DriverError as error:
+        except DeviceError as error:
             now_s = stream.clock.now_s()
             failing_since_s = now_s if failing_since_s is None else failing_since_s
             if raises or look is None or now_s - failing_since_s > _RECOVER_S:

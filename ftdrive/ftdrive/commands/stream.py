@@ -24,7 +24,7 @@ from ftdrive.live.samples import Axes
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.servers.udp import UdpSender
 from ftdrive.terminal.console import talk
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 
 if TYPE_CHECKING:
     from ftdrive.servers.foxglove import FoxgloveServer
@@ -85,7 +85,7 @@ def serve(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender
         while True:
             try:
                 block = source.read()
-            except DriverError as error:
+            except DeviceError as error:
                 now_s = source.clock.now_s()
                 if silent_since_s is None:
                     silent_since_s = now_s

@@ -35,7 +35,7 @@ from ftdrive.live.samples import (
 from ftdrive.runs.run import Run, versions
 from ftdrive.runs.verification_record import VerificationRecord, calibration_in_words, last_verification
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DeviceTimeout, DriverError
+from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmStates, ArmStatus, DeviceInfo, FtSamples
 
@@ -101,7 +101,7 @@ class CompensatedStream(ProcessedStream):
         self._begin = frame, stages, false_alarm_rate
         self._stack = ExitStack()
         self._follows: ExitStack | None = None
-        self._failure: tuple[str, DriverError] | None = None
+        self._failure: tuple[str, DeviceError] | None = None
         """The device that has failed, "sensor" or "arm", and why."""
         self._silent_since_ns: int | None = None
         self._arrivals: deque[tuple[int, int]] = deque()
@@ -251,7 +251,7 @@ class CompensatedStream(ProcessedStream):
             samples = self._sensor_follow.read(0.0) if waits_for_pose else self._read_sensor(wait_s)
             role = "arm"
             states = self._arm_follow.read(wait_s if waits_for_pose else 0.0)
-        except DriverError as error:
+        except DeviceError as error:
             self._fail(role, error)
         self._count(states)
         self._pairing.add_states(states)
@@ -300,14 +300,14 @@ class CompensatedStream(ProcessedStream):
                 raise DeviceTimeout(f"the {device} sent {len(rows)} samples in {_RATE_S:g} s", "check cable and supply")
         return found
 
-    def _fail(self, role: str, error: DriverError) -> NoReturn:
+    def _fail(self, role: str, error: DeviceError) -> NoReturn:
         if self._silent_since_ns is None:
             self._silent_since_ns = self.clock.now_ns()
             self._processor.note("stale", f"{role}: {error}", {"device": role}, self._silent_since_ns)
         self._failure = role, error
         raise error
 
-    def _reopen(self, role: str, failure: DriverError) -> None:
+    def _reopen(self, role: str, failure: DeviceError) -> None:
         """Open what has ended again; raises the failure that remains."""
         self.clock.sleep((self._next_ns - self.clock.now_ns()) * 1e-9)
         self._next_ns = self.clock.now_ns() + round(_RETRY_S * 1e9)
@@ -317,7 +317,7 @@ class CompensatedStream(ProcessedStream):
             self._arm.open()
             self._sensor.check()
             self._follow()
-        except DriverError as error:
+        except DeviceError as error:
             self._failure = role, error
             raise
         if (arm := self._arm.identify()) != self.info.arm or self._sensor.identify() != self.info.sensor:

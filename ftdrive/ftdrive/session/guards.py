@@ -16,7 +16,7 @@ from ftdrive.checks.devices import AXES
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.hazards import Hazard
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DeviceFault, DeviceTimeout, DriverError
+from ftdrivers.errors import DeviceError, DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ArmState, ArmStatus
 
 G_M_S2: Final = 9.81
@@ -413,7 +413,7 @@ class ContactGuard(Guard):
             )
 
 
-def arm_lost(error: DriverError, *, moving: bool) -> Tripped:
+def arm_lost(error: DeviceError, *, moving: bool) -> Tripped:
     """Row 16: the arm reports no state. An arm in a move may not receive the stop either."""
     if not moving:
         return Tripped(Hazard.CONTROLLER_LOST, error)

@@ -19,7 +19,7 @@ from ftdrive.session.events import Compared, Estimated, SensorEvents, State, Sta
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key
 from ftdrive.session.pose_book import PoseBook
-from ftdrivers.errors import DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmState, FtSamples
 
 STILL_S: Final = 1.0
@@ -190,7 +190,7 @@ class HandGuided:
         finally:
             self._sensor_events.show_new()
 
-    def _wait_out(self, ask: Callable[[], T], *losses: type[DriverError]) -> T:
+    def _wait_out(self, ask: Callable[[], T], *losses: type[DeviceError]) -> T:
         """Repeat until an answer arrives, for `BACK_S` at most."""
         deadline_s = self._clock.now_s() + BACK_S
         while True:

@@ -6,7 +6,7 @@ from ftdrive.session.events import Noted
 from ftdrive.session.guards import Limits
 from ftdrive.session.journal import Journal
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 
 
@@ -28,7 +28,7 @@ class OpenCell:
         """Collect samples of the resting sensor; reopen it once if it fails, as after a killed session."""
         try:
             return self.sensor.collect(duration_s)
-        except DriverError as error:
+        except DeviceError as error:
             self.note(f"{error}; trying once more", warning=True)
         self.sensor.close()
         self.sensor.open()

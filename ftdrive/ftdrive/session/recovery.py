@@ -9,7 +9,7 @@ from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, arm_lost, 
 from ftdrive.session.hazards import Hazard
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.watchdog import Watcher
-from ftdrivers.errors import DeviceFault, DriverError
+from ftdrivers.errors import DeviceError, DeviceFault
 
 _LOOK_AGAIN_S: Final = 0.4
 
@@ -61,13 +61,13 @@ class GuardedCell:
         unseen = self.watcher.unseen
         try:
             self.cell.arm.open(control=True)
-        except DriverError:
-            with suppress(DriverError):
+        except DeviceError:
+            with suppress(DeviceError):
                 self.cell.arm.open()  # to see an emergency stop that is pressed meanwhile
             raise
         try:
             self.cell.sensor.check()
-        except DriverError:
+        except DeviceError:
             self._sensor_events.show_new()
             self.cell.sensor.close()
             self.cell.sensor.open()
@@ -91,19 +91,19 @@ class GuardedCell:
     def _row_of(self, error: Exception, *, moving: bool) -> Tripped | None:
         if isinstance(error, Tripped):
             return error
-        if isinstance(error, OSError) and not isinstance(error, DriverError):
+        if isinstance(error, OSError) and not isinstance(error, DeviceError):
             return Tripped(Hazard.DISK_FULL, error)
-        if not isinstance(error, DriverError):
+        if not isinstance(error, DeviceError):
             return None
         if (trip := self.watcher.tripped(wait_s=0.3)) is not None:
             return trip
         try:
             self.cell.sensor.check()
-        except DriverError:
+        except DeviceError:
             return Tripped(Hazard.SENSOR_LOST, error)
         try:
             status = self.cell.arm.status()
-        except DriverError:
+        except DeviceError:
             return arm_lost(error, moving=moving)
         if status.fault is not None:
             return by_safety(status, str(error))

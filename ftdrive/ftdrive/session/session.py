@@ -42,7 +42,7 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
         The operator ended it.
     NotAccepted, PlanRefused, ConfigError
         The session refuses to start.
-    DriverError, OSError
+    DeviceError, OSError
         The session failed; the poses taken are in the run, which can be resumed.
     """
     config = task.cell

@@ -196,7 +196,7 @@ def send(arm: RobotArm, push: Push, folder: Path, ask: Ask) -> tuple[Path, Contr
         The controller's values have changed since they were shown, or it reports others than were sent.
     Declined
         The word was not typed; nothing was sent.
-    DriverError
+    DeviceError
         The arm failed. If something may have been sent, there is a receipt.
     """
     disk = computer.check_disk(folder)

@@ -32,7 +32,7 @@ from ftdrive.session.pose_book import PoseBook
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.progress import Progress
 from ftdrive.session.recovery import GuardedCell
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 
 log = logging.getLogger(__name__)
 
@@ -102,7 +102,7 @@ class Tour:
         ------
         Declined
             The operator ended it, or no operator answered.
-        Tripped, DriverError, OSError
+        Tripped, DeviceError, OSError
             What stopped the arm, if the operator then ended the tour.
         """
         self._now.todo = list(todo)
@@ -112,7 +112,7 @@ class Tour:
                 self._next()
             except Turned as turned:
                 self._turn(turned.key)
-            except (Tripped, DriverError, OSError, OperatorStop, TooFewSamples, NotAccepted) as error:
+            except (Tripped, DeviceError, OSError, OperatorStop, TooFewSamples, NotAccepted) as error:
                 self._hold(error)
         self._guarded.show_new()
         self._show_state(State.CLOSE)
@@ -418,7 +418,7 @@ class Tour:
                 raise end
             try:
                 self._guarded.reopen()
-            except (Tripped, DriverError, NotAccepted, Declined) as again:
+            except (Tripped, DeviceError, NotAccepted, Declined) as again:
                 self._note(f"not yet: {again}", warning=True)
                 continue
             if answer == "skip":
@@ -435,7 +435,7 @@ class Tour:
         self._now.reopened.add(stop)
         try:
             self._guarded.reopen()
-        except (Tripped, DriverError, NotAccepted, Declined) as error:
+        except (Tripped, DeviceError, NotAccepted, Declined) as error:
             log.info("the sensor cannot be reopened: %s", error)
             return False
         self._note(f"{trip}; the sensor was reopened, pose {stop} restarts", warning=True)

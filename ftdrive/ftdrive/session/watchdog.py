@@ -16,7 +16,7 @@ from ftdrive.session.guards import ExpectedMotion, Guard, Seen, Tripped, arm_los
 from ftdrive.session.hazards import Hazard
 from ftdrive.session.open_cell import OpenCell
 from ftdrivers.clock import Follower
-from ftdrivers.errors import DeviceFault, DriverError
+from ftdrivers.errors import DeviceError, DeviceFault
 from ftdrivers.interfaces import ArmState
 
 log = logging.getLogger(__name__)
@@ -143,7 +143,7 @@ class Watcher:
             self._look(motion)
         except Tripped as trip:
             self._stop(trip)
-        except DriverError as error:
+        except DeviceError as error:
             self._stop(arm_lost(error, moving=motion.moving))
         except Exception as error:
             log.exception("a guard failed")
@@ -171,7 +171,7 @@ class Watcher:
         try:
             self._sensor.check()
             sample = self._sensor.latest(timeout_s=0.0)
-        except DriverError as error:
+        except DeviceError as error:
             raise Tripped(Hazard.SENSOR_LOST, error) from error
         if motion is not self._motion:  # the block has ended meanwhile: the readings may belong to the next one
             return

@@ -76,7 +76,7 @@ def run_live(stream: Stream, *, recorder: Callable[[Path], Sink] | None = None, 
 
     Raises
     ------
-    DriverError
+    DeviceError
         The stream had failed when the user quit.
     """
     info = stream.info

@@ -40,7 +40,7 @@ from ftdrive.session.operator import Key, Question
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DeviceFault, DriverError
+from ftdrivers.errors import DeviceError, DeviceFault
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
 from tests.fake_clock import FakeClock
@@ -81,7 +81,7 @@ class FakeArm(RobotArm):
         """Called whenever the status is read."""
         self.forbidden: Array | None = None
         self.halted = threading.Event()
-        self.gone: DriverError | None = None
+        self.gone: DeviceError | None = None
         self.gone_status: dict[str, Any] = {}
 
     def open(self, *, control: bool = False) -> None:
@@ -177,7 +177,7 @@ class FakeSensor(ForceTorqueSensor):
         self.rng = np.random.default_rng(1)
         self.push = np.zeros(6)
         self.noise = NOISE
-        self.failure: DriverError | None = None
+        self.failure: DeviceError | None = None
         self.stuck = False
         self.heals = False
         self.warm_C: float | None = None

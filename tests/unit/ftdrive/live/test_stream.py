@@ -16,7 +16,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.live import stream as module
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.live.stream import CompensatedStream, load_calibration, open_stream
-from ftdrivers.errors import DeviceTimeout, DriverError
+from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmStates, DeviceInfo, FtSamples, Health
 from tests.fake_clock import FakeClock
@@ -34,7 +34,7 @@ class Link:
         self.begin_ns = clock.now_ns()
         self.sent = 0
         self.silent = False
-        self.failure: DriverError | None = None
+        self.failure: DeviceError | None = None
         self.opened = 0
         self.info = DEVICE
         self.motion = Motion(turn_rad_s=0.0, acceleration_m_s2=0.0)
