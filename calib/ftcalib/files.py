@@ -10,12 +10,12 @@ JSON: TypeAlias = Any
 """What `json` can write: numbers, strings, None, and lists and dicts of them."""
 
 
-def write_new(path: Path, content: str | bytes) -> None:
+def write_new(path: str | Path, content: str | bytes) -> None:
     """Write a new file: to `<name>.partial`, fsynced, then renamed.
 
     Parameters
     ----------
-    path : Path
+    path : str or Path
         A file that does not exist yet, in a folder that does.
     content : str or bytes
         Text is written as UTF-8.
@@ -27,6 +27,7 @@ def write_new(path: Path, content: str | bytes) -> None:
     OSError
         The folder is missing, the disk is full, …; no partial file remains.
     """
+    path = Path(path)
     require_new(path)
     partial = path.with_name(path.name + ".partial")
     try:
@@ -59,10 +60,10 @@ def _refuse_existing(path: Path) -> None:
         raise FileExistsError(f"{path} exists already and is never overwritten: choose another name")
 
 
-def read_object(path: Path, error: type[Exception]) -> dict[str, Any]:
+def read_object(path: str | Path, error: type[Exception]) -> dict[str, Any]:
     """Read a JSON file with one object; raise `error`, one sentence without the file name, if it has none."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = Path(path).read_text(encoding="utf-8")
     except UnicodeDecodeError as exc:
         raise error(f"this is not a text file (byte {exc.start} is not UTF-8): is it the right file?") from exc
     if not text.strip():

@@ -12,7 +12,7 @@ import numpy as np
 
 from ftcalib.data.dataset import CalibrationDataset
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_quiet, is_stationary, mean_and_covariance
-from ftcalib.errors import CalibError, TooFewSamples
+from ftcalib.errors import NotObservable, TooFewSamples
 from ftcalib.model import Array
 from ftcalib.ports import Arm, ArmReading, Sensor, WrenchSamples
 
@@ -173,7 +173,7 @@ def dataset_from(records: Sequence[PoseRecord], meta: Mapping[str, Any]) -> Cali
     The return to the first pose is left out, because `drift_check` uses it.
     """
     if not records:
-        raise CalibError("the run contains no pose: record poses first")
+        raise NotObservable("the run contains no pose: record poses first")
     kept = [record for record in records if not is_return(record, records)]
     t_ns = np.array([record.t_mid_ns for record in kept])
     return CalibrationDataset(

@@ -1,6 +1,6 @@
 """A whole session at the pace of a real cell, questions answered at once: wall time, and the truth against its sigma.
 
-uv run python tests/benchmarks/session.py
+uv run python -m tests.benchmarks.session
 """
 
 import sys

@@ -5,10 +5,12 @@ import subprocess
 import sys
 from importlib.metadata import distribution
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
-from tests.house import commands_page
+from tests.house import codes_page, commands_page
+from tests.house.sentences import sentences_in
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -30,10 +32,37 @@ def test_checker_is_content(command: list[str]) -> None:
     assert outcome.returncode == 0, outcome.stdout + outcome.stderr
 
 
-def test_the_page_of_commands_is_up_to_date() -> None:
-    assert commands_page.PAGE.read_text(encoding="utf-8") == commands_page.page(), (
-        "an option has changed: uv run python tests/house/commands_page.py"
-    )
+@pytest.mark.parametrize("module", [commands_page, codes_page])
+def test_the_generated_pages_are_up_to_date(module: ModuleType) -> None:
+    assert module.PAGE.read_text(encoding="utf-8") == module.page(), f"uv run python {module.__file__}"
+
+
+def test_no_code_tests_or_edits_a_sentence() -> None:
+    """A program that has to know what was found takes it as data, such as `ftcalib.Finding` or a class of errors."""
+    folders = ("ftdrive/ftdrive", "calib/ftcalib", "drivers/ftdrivers", "mocks/ftmocks")
+    assert sentences_in([ROOT / folder for folder in folders]) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "is_hit"),
+    [
+        ("causes = [one for one in causes if one in result.reasons]", True),
+        ('if view.note.startswith("STOP"): pass', True),
+        ('words = direction_in_words(x).replace("base", "flange")', True),
+        ('found, _, fix = str(error).rpartition(": ")', True),
+        ('if "already in use" in error.found: pass', True),
+        ('if text == "the arm has stopped": pass', True),
+        ('if re.search("remote control", str(exc).lower()): pass', True),
+        ('if finding.code == "drift": pass', False),
+        ('if not event.words or event.words == "": pass', False),
+        ('KINDS = {"centre of mass": 1}\nif kind == "centre of mass": pass', False),
+        ('print(f"{finding.found}: {finding.fix}")', False),
+        ('name = path.name.removesuffix(".partial")', False),
+    ],
+)
+def test_tests_of_a_sentence_are_recognised(code: str, is_hit: bool, tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text(code, encoding="utf-8")
+    assert bool(sentences_in([tmp_path])) == is_hit
 
 
 def test_the_readme_is_short_and_its_links_exist() -> None:

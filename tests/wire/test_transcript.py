@@ -21,11 +21,11 @@ import pytest
 import serial
 
 from ftdrivers.clock import Clock, Follower
-from ftdrivers.errors import ConnectError
+from ftdrivers.errors import BadTranscript, ConnectError
 from ftdrivers.interfaces import DeviceInfo, ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import BadTranscript, Passage, Transcript, Writer
+from ftdrivers.transcript.recorder import Passage, Transcript, Writer
 from ftdrivers.transcript.taps import recording
 from ftdrivers.wires.parity import ask_for_marks
 from ftdrivers.wires.serial_port import SerialPort

@@ -12,10 +12,9 @@ from click.testing import CliRunner, Result
 from ftdrive.cell.config import CLOCK
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
-from ftdrivers.errors import StreamBroken
+from ftdrivers.errors import BadTranscript, StreamBroken
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.streaming.sensor import StreamingSensor
-from ftdrivers.transcript.recorder import BadTranscript
 from ftmocks.sensors.bota import BotaBox
 
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])

@@ -82,6 +82,24 @@ class StreamingSensor(ForceTorqueSensor):
     recover : bool
         Reconnect after an interruption or silence, for up to `recover_s`, instead of ending the stream. Calls made
         meanwhile still fail, and so does a `collect` with an interruption inside. May be set until `open`.
+
+    Examples
+    --------
+    >>> import ftdrive, time, numpy as np
+    >>> class Acme(ftdrive.StreamingSensor):
+    ...     def _connect(self):
+    ...         self._seq = 0
+    ...         return ftdrive.DeviceInfo("Acme", "A1", "1.0")
+    ...
+    ...     def _read_block(self):
+    ...         time.sleep(0.002)
+    ...         self._seq += 1
+    ...         return ftdrive.FtSamples.of(time.monotonic_ns(), self._seq, np.random.normal(0, 0.1, (1, 6)))
+    ...
+    ...     def _disconnect(self): ...
+    >>> with Acme("Acme on /dev/acme0") as sensor:
+    ...     sensor.latest(timeout_s=10.0).wrench.shape
+    (1, 6)
     """
 
     def __init__(

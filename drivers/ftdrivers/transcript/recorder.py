@@ -26,6 +26,7 @@ from typing import IO, Any, Final, Self
 from urllib.parse import parse_qsl, urlencode
 
 from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import BadTranscript, BadUrl
 from ftdrivers.registry import split_url
 
 FORMAT: Final = "ftdrive.transcript/1"
@@ -33,10 +34,6 @@ FORMAT: Final = "ftdrive.transcript/1"
 _TOGETHER_NS: Final = 2_000_000
 INTERRUPTED: Final = "interrupted"
 """The error of a recording that the user has interrupted."""
-
-
-class BadTranscript(Exception):
-    """The file is not a transcript, or is damaged."""
 
 
 class Writer:
@@ -186,7 +183,7 @@ class Transcript:
                         frames = line.get("frames") is True
                     elif line.get("event") == "end":
                         end = _checked_end(line)
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        except (BadUrl, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
             raise BadTranscript(
                 f"{path}, line {number}: not a line of a transcript ({error}); record it again"
             ) from error

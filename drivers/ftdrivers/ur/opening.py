@@ -201,11 +201,8 @@ class Opening:
 
 def _refusal(host: str, path: ControlPath, error: DeviceError) -> ConnectError:
     """Convert why a control path did not start to an error with a fix."""
-    if "already in use" in error.found:
-        return registers_taken(host, ())
-    if "remote control" in error.found:
-        return ConnectError(f"{host} is not in remote control", _LOCAL)
     return ConnectError(
         f"{path} cannot control {host}: {error.found}",
-        "check at the pendant that no dialog is open and that no other program starts automatically",
+        "check at the pendant that it is in remote control, that no dialog is open, and that no other program starts "
+        "automatically or uses the RTDE registers, such as EtherNet/IP",
     )

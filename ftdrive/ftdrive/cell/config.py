@@ -127,9 +127,10 @@ class ToolConfig:
 class WorkcellConfig:
     """Base and surroundings, in base axes, mm from the centre of the base. PLACEHOLDERS until measured."""
 
-    mounting: str = entry(
-        "floor, wall, ceiling, or degrees the base leans towards its -x; 90 is wall",
-        "floor",
+    mounting: str | None = entry(
+        "floor, wall, ceiling, or degrees the base leans towards its -x, 90 is wall; a floor where it is not set, but "
+        "then no result is good whose gravity points elsewhere",
+        None,
         option="--mounting",
         reject=rules.reject_mounting,
     )

@@ -9,6 +9,7 @@ from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import sensor_reached
 from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL
+from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrivers.registry import arm_class, sensor_from_url
 from ftdrivers.ur.timing import STRICT, UrTiming
@@ -19,7 +20,7 @@ def build_arm(cell: CellConfig) -> RobotArm:
     robot = cell.robot
     try:
         build = cast("Callable[..., RobotArm]", arm_class(robot.driver))
-    except ValueError as error:
+    except BadUrl as error:
         raise ConfigError(f"[robot] driver: {error}") from error
     # Only an emulated arm takes a clock: an arm of another package may not know it.
     more: dict[str, Any] = {} if cell.clock is REAL else {"clock": cell.clock}
@@ -40,9 +41,6 @@ def build_arm(cell: CellConfig) -> RobotArm:
 def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
     """Build the sensor's driver, not yet open."""
     url, clock = sensor_reached(cell.sensor.url, cell.clock)
-    try:
-        sensor = sensor_from_url(url, sign=cell.sensor.sign, clock=clock)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+    sensor = sensor_from_url(url, sign=cell.sensor.sign, clock=clock)
     _fits: Sensor = sensor
     return sensor

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ftcalib import CalibrationDataset, CalibrationResult
+from ftcalib.assessment import described_cell
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from ftcalib.poses.information import Guess, predicted_sigma, special
 from ftdrive.cell.config import CellConfig, RobotConfig, ToolConfig
 from ftdrive.checks.check import Check, State
 from ftdrive.checks.computer import SensorAddress, latency_command
-from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE, payload_in_words
 from ftdrivers.clock import Clock
 from ftdrivers.errors import (
     ConnectError,
@@ -208,9 +208,8 @@ def _check_lost(health: Health, address: SensorAddress) -> Check:
 
 
 def _check_status(status: NDArray[np.uint32]) -> Check:
-    words = [f"0x{int(word):x}" for word in np.unique(status)]
-    found = f"status {', '.join(words)}"
-    if words == ["0x0"]:
+    found = f"status {', '.join(f'0x{int(word):x}' for word in np.unique(status))}"
+    if not status.any():
         return Check("sensor.status", "ok", found)
     return Check("sensor.status", "warning", found, "look the bits up in the sensor's manual; the driver continues")
 
@@ -355,7 +354,7 @@ def check_speed(status: ArmStatus) -> Check:
 def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) -> Check:
     """Check the payload configured in the controller, and compare it with tool and sensor as far as they are described.
 
-    The mass may differ by the larger of `PAYLOAD_KG` and `PAYLOAD_SHARE`; the centre must be at the tool.
+    The mass may differ by the larger of `described_cell.PAYLOAD_KG` and its share; the centre must be at the tool.
     """
     name, payload_kg, p_m = "robot.payload", status.payload_kg, status.p_flange_payload_m
     if payload_kg is None:
@@ -374,7 +373,7 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
     if tool.mass_kg is not None:
         expected_kg = tool.mass_kg + (sensor_kg or 0.0)
         found += f", sensor and tool are {expected_kg:.2f} kg"
-        if abs(payload_kg - expected_kg) > max(PAYLOAD_KG, PAYLOAD_SHARE * expected_kg):
+        if abs(payload_kg - expected_kg) > max(described_cell.PAYLOAD_KG, described_cell.PAYLOAD_SHARE * expected_kg):
             return Check(name, "failed", found, "correct the payload at the pendant, or the masses in [tool], [sensor]")
     if p_m is not None and not any(p_m):
         fix = "set the centre of gravity at the pendant: Installation, Payload"
@@ -396,9 +395,8 @@ def check_weighed_payload(payload_kg: float | None, result: CalibrationResult, s
     name = "robot.payload"
     if payload_kg is None:
         return Check(name, "skipped", "this controller does not report its payload")
-    if words := payload_in_words(payload_kg, result.mass_kg, sensor_kg):
-        found, _, fix = words.partition(": ")
-        return Check(name, "warning", found, fix)
+    for finding in described_cell.payload(payload_kg, result.mass_kg, sensor_kg):
+        return Check(name, "warning", finding.found, finding.fix)
     known = "sensor" if sensor_kg is None else f"{sensor_kg:.2f} kg sensor"
     return Check(name, "ok", f"robot {payload_kg:.2f} kg; weighed {result.mass_kg:.2f} kg + {known}")
 

@@ -93,9 +93,10 @@ def calibrate(
     continues.
     """
     from ftdrive.cell.emulated import Station
-    from ftdrive.commands.emulated_run import described, start_mover
+    from ftdrive.commands.emulated_run import start_mover
     from ftdrive.runs.run import Run
     from ftdrive.session.options import SessionOptions
+    from ftdrive.session.rehearsal import described
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import talk
     from ftdrive.terminal.report import print_result
@@ -220,6 +221,6 @@ def _as_json(outcome: "Outcome") -> dict[str, Any]:
     return {
         "run": str(outcome.run.folder),
         "drift_check": None if outcome.drift is None else outcome.drift.to_dict(),
-        "hints": list(hints(outcome.result, outcome.run.records())),
+        "hints": [one.to_dict() for one in hints(outcome.result, outcome.run.records())],
         **outcome.result.to_dict(),
     }

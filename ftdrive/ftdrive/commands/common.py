@@ -174,26 +174,6 @@ def read_frame(axes: "Axes", about: str) -> "WrenchFrame":
     return WrenchFrame(axes, (x, y, z))
 
 
-def host_and_port(option: str, text: str, example: str, *, lowest: int = 1) -> tuple[str, int]:
-    """Read HOST:PORT, with brackets round an IPv6 address; raises `ConfigError`."""
-    from ftdrive.errors import ConfigError
-
-    host, _, port = text.rpartition(":")
-    if not host or not (port.isascii() and port.isdecimal()) or not lowest <= int(port) < 65536:
-        raise ConfigError(f"{option} is '{text}': give HOST:PORT, such as {example}")
-    return host.strip("[]"), int(port)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this computer reaches an address."""
-    import ipaddress
-
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
-
-
 @contextmanager
 def declined_aborts() -> Iterator[None]:
     """Print why the operator ended a session, and abort the command."""
@@ -226,14 +206,6 @@ def index_run(folder: Path, cell: "CellConfig | None" = None) -> None:
         Store(store_url() if cell is None else cell.store.url).index(folder.resolve().parent)
     except (BadStore, ConfigError, OSError) as error:
         talk.print(f" The run is saved but not in the history yet, because {error}.")
-
-
-def upgrade_store(store: "Store") -> None:
-    """Migrate the tables of an older version, and print it."""
-    from ftdrive.terminal.console import talk
-
-    if (version := store.upgrade()) is not None:
-        talk.print(f"The store {store.name} is upgraded from version {version}.")
 
 
 STORE = click.option("--store", "url", metavar="URL", help="Database to use, instead of [store] url.")

@@ -82,13 +82,13 @@ def _read(
 ) -> tuple["Recording", dict[str, float] | None]:
     """Return the recording with the calibration, and the delay of the wrench with one sigma, where it is known."""
     from ftdrive.errors import ConfigError
-    from ftdrive.live.stream import load_calibration
     from ftdrive.recording.compensation import NEEDED, read_with_calibration
     from ftdrive.recording.csv_pair import read_pair
     from ftdrive.recording.recording import ROW
+    from ftdrive.runs.source import read_calibration
     from ftdrive.terminal.console import talk
 
-    loaded = None if calibration is None else load_calibration(calibration)
+    loaded = None if calibration is None else read_calibration(calibration)
     if path is None:
         if wrench is None or orientation is None or loaded is None:
             raise ConfigError("no recording: give its file, or --wrench, --orientation-file and --calibration")

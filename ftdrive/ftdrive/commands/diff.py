@@ -82,12 +82,12 @@ def diff(first: str, second: str, as_json: bool) -> None:
 def _side(text: str) -> Side:
     """Find a calibration by path or id; raises `ConfigError`."""
     from ftdrive.errors import ConfigError
-    from ftdrive.live.stream import load_calibration
+    from ftdrive.runs.source import read_calibration
     from ftdrive.store.records import mass_sigma_kg
     from ftdrive.store.store import Store
 
     if (path := Path(text)).exists():
-        result = load_calibration(path)
+        result = read_calibration(path)
         sigma_kg = mass_sigma_kg(result.parameters, result.covariance, result.g_m_s2)
         created = result.provenance.get("created_utc")
         return Side(result, result.id, text, created if isinstance(created, str) else None, result.mass_kg, sigma_kg)

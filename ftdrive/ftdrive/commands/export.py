@@ -154,13 +154,13 @@ def calibration(
     from ftcalib.files import write_new
     from ftdrive.exports.calibration import registry
     from ftdrive.exports.calibration.settings import Settings, recorded_sensor
-    from ftdrive.live.stream import load_calibration
+    from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verification_record import verification_near
     from ftdrive.terminal.console import hanging, talk
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})
     with _calibrated(source, sensor, simulate=simulate) as path:
-        result = load_calibration(path)
+        result = read_calibration(path)
         recorded_height_mm, recorded_mass_kg = recorded_sensor(path, result)
         verification = verification_near(path, result.id)
     settings = Settings(

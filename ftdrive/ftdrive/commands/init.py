@@ -118,7 +118,12 @@ def init(
         ask.number("Tool, kg, about (Enter: unknown)", "tool.mass_kg", tool_mass, ""),
     )
     workcell = WorkcellConfig(
-        ask.text("Mounting: floor, wall, ceiling or degrees", "workcell.mounting", mounting),
+        ask.text(
+            "Mounting: floor, wall, ceiling or degrees",
+            "workcell.mounting",
+            mounting,
+            ask.defaults["workcell.mounting"] or "floor",
+        ),
         ask.rows(
             "First wall or table, NX:NY:NZ:MM; -1:0:0:-800 is 800 mm away towards +x",
             "workcell.planes_mm",
@@ -278,8 +283,8 @@ def _robot(ask: Questions, given: str | None, model: str | None, clock: Clock) -
 
 def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
     """Return address and what the sensor reports; the operator may keep an address that does not answer."""
+    from ftcalib.errors import UsageError
     from ftdrive.checks.discovery import identify_sensor, is_place, places, sensor_at
-    from ftdrive.errors import ConfigError
     from ftdrivers.errors import DeviceError
 
     found = [] if given or not ask.interactive else places()
@@ -299,7 +304,7 @@ def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
         try:
             url = sensor_at(url, clock) if is_place(url) else url
             report = identify_sensor(url, clock)
-        except (DeviceError, ConfigError) as error:
+        except (DeviceError, UsageError) as error:
             if not ask.interactive:
                 raise
             _say(str(error), "  ✘ ")

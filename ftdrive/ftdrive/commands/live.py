@@ -28,23 +28,22 @@ from ftdrive.commands.common import (
     simulate,
     write_json,
 )
-from ftdrive.commands.live_source import open_source
+from ftdrive.commands.live_source import RECOVER_S, open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Axes, Block, StreamInfo, WrenchFrame
-from ftdrive.live.stream import CompensatedStream, load_calibration
+from ftdrive.live.stream import CompensatedStream
 from ftdrive.recording import Recorder, read_recording
 from ftdrive.runs.run import Run
+from ftdrive.runs.source import read_calibration
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import Array
 
 _PERIOD_S = 0.1
-_RECOVER_S = 10.0
-"""So long a stream with an interruption may take to deliver again."""
 
 
 @click.command()
@@ -96,11 +95,11 @@ def live(
         if replay is not None:
             stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed)
         else:
-            stream, cell = open_source(
+            stream = open_source(
                 path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
             )
-            checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, cell.sensor.mass_kg)]
-            recorder = partial(_recorder, stream.info, cell.to_dict())
+            checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, stream.cell.sensor.mass_kg)]
+            recorder = partial(_recorder, stream.info, stream.cell.to_dict())
         if once or as_json:
             _print(stream, once=once, as_json=as_json)
         elif talk.is_terminal and sys.stdout.isatty() and sys.stdin.isatty() and not plain:
@@ -116,10 +115,10 @@ def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, speed: f
     if path.is_dir() and path.suffix != ".partial":
         if calibration is None:
             raise ConfigError("no calibration: give --calibration PATH")
-        return replay_run(Run(path), load_calibration(calibration), str(calibration), frame=frame, speed=speed)
+        return replay_run(Run(path), read_calibration(calibration), str(calibration), frame=frame, speed=speed)
     recording = read_recording(path)
     if calibration is not None:
-        recording = recording.with_calibration(load_calibration(calibration), str(calibration))
+        recording = recording.with_calibration(read_calibration(calibration), str(calibration))
     return ReplayedStream(recording.header.info, recording.paired(), frame=frame, speed=speed)
 
 
@@ -178,7 +177,7 @@ def _looks(stream: CompensatedStream | ReplayedStream, *, raises: bool = False) 
         except DeviceError as error:
             now_s = stream.clock.now_s()
             failing_since_s = now_s if failing_since_s is None else failing_since_s
-            if raises or look is None or now_s - failing_since_s > _RECOVER_S:
+            if raises or look is None or now_s - failing_since_s > RECOVER_S:
                 raise
             blocks.clear()
             yield replace(look, stale=str(error))

@@ -89,10 +89,10 @@ def record(
     require_new_recordings(paths)
     frame = read_frame(axes, about)
     with ExitStack() as stack:
-        stream, cell = open_source(
+        stream = open_source(
             path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
         )
-        recorder = Recorder(paths, stream.info, cell.to_dict())
+        recorder = Recorder(paths, stream.info, stream.cell.to_dict())
         talk.print(f" Recording at {stream.info.sensor_rate_Hz:.0f} Hz, {frame}. Ctrl-C ends.")
         try:
             record_stream(stream, recorder, duration_s, count)

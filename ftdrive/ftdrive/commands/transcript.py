@@ -18,12 +18,11 @@ from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import versions
 from ftdrive.terminal.console import talk
-from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceTimeout, ProtocolError
+from ftdrivers.errors import BadTranscript, ConnectError, DeviceTimeout, ProtocolError
 from ftdrivers.interfaces import ForceTorqueSensor
-from ftdrivers.registry import BadUrl, sensor_from_url
+from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import INTERRUPTED, BadTranscript, Transcript, Writer
+from ftdrivers.transcript.recorder import INTERRUPTED, Transcript, Writer
 from ftdrivers.transcript.taps import recording
 
 _PIECE_S = 60.0
@@ -79,7 +78,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
             f"{sensor} is neither on a serial port nor on a CAN bus: only these can be recorded; capture others with "
             "Wireshark"
         )
-    device = _sensor(url, clock)
+    device = sensor_from_url(url, clock=clock)
     header = {
         "url": url,
         "duration_s": duration_s,
@@ -132,7 +131,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     clock = LocalClock()  # a busy computer makes it slow, never late
     player = Player(loaded, clock)
     with player as port:
-        device = _sensor(loaded.url_at(port), clock)
+        device = sensor_from_url(loaded.url_at(port), clock=clock)
         duration_s = float(loaded.header["duration_s"])
         try:
             with device:
@@ -157,13 +156,6 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     if duration_s < loaded.header["duration_s"]:
         whole_s = loaded.header["duration_s"]
         talk.print(f" The recording was broken off: {duration_s:.3g} s of {whole_s:g} s were played.")
-
-
-def _sensor(url: str, clock: Clock) -> ForceTorqueSensor:
-    try:
-        return sensor_from_url(url, clock=clock)
-    except BadUrl as error:
-        raise ConfigError(str(error)) from error
 
 
 def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:

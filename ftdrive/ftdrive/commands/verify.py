@@ -119,15 +119,16 @@ def verify_cell(
     `path` is the calibration file or its run folder, `station` the emulated cell that `cell` describes. Raises as
     `ftdrive.session.session.take_poses`.
     """
-    from ftdrive.commands.emulated_run import described, start_mover
-    from ftdrive.live.stream import load_calibration
+    from ftdrive.commands.emulated_run import start_mover
     from ftdrive.runs.run import Run
+    from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verified import verify_run
+    from ftdrive.session.rehearsal import described
     from ftdrive.session.session import take_poses
     from ftdrive.session.verifying import Verifying
     from ftdrive.terminal.screen import open_operator
 
-    calibration = load_calibration(path)
+    calibration = read_calibration(path)
     path = Run(path).calibration_path if path.is_dir() else path
     description = {"verification": {**asdict(wanted), "id": calibration.id, "path": str(path.absolute())}}
     if wanted.quick:  # 12 s of noise would take longer than the poses
@@ -201,9 +202,9 @@ def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Pat
     """Start the cell of a calibration, or calibrate a new one; return it with the path of its calibration."""
     from ftdrive.cell.emulated import Station
     from ftdrive.commands.emulated_run import rehearse
-    from ftdrive.live.stream import load_calibration
+    from ftdrive.runs.source import read_calibration
 
-    made_by = None if path is None else load_calibration(path).provenance.get("station")
+    made_by = None if path is None else read_calibration(path).provenance.get("station")
     station = stack.enter_context(Station.of(made_by, sensor))
     if path is None:
         outcome = rehearse(station, runs, "simulated", poses=6)

@@ -19,7 +19,14 @@ Ns = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class WrenchFrame:
-    """Axes and reference point of a wrench, which belong together: a torque without its point means nothing."""
+    """Axes and reference point of a wrench, which belong together: a torque without its point means nothing.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> print(ftdrive.WrenchFrame("base", "tcp"))
+    base axes, about the tcp origin
+    """
 
     axes: Axes = "sensor"
     about: Point | tuple[float, float, float] = "sensor"
@@ -39,7 +46,15 @@ class WrenchFrame:
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """What is done to the raw wrench, in this order. Raw samples are always kept beside the result."""
+    """What is done to the raw wrench, in this order. Raw samples are always kept beside the result.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> stages = ftdrive.Stages(lowpass_Hz=20.0)  # open_stream(…, stages=stages), or stream.stages = stages at any time
+    >>> stages.bias, stages.gravity, stages.inertia
+    (True, True, False)
+    """
 
     bias: bool = True
     gravity: bool = True

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
-from ftdrive.cell.config import CellConfig, load
+from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
+from ftdrive.cell.emulated import Station
 from ftdrive.checks.devices import belonging
 from ftdrive.errors import ConfigError
 from ftdrive.live.delay import DelayEstimator
@@ -32,12 +33,12 @@ from ftdrive.live.samples import (
     mean_rate_Hz,
     sensor_origin_m,
 )
-from ftdrive.runs.run import Run, versions
+from ftdrive.runs.run import versions
 from ftdrive.runs.verification_record import VerificationRecord, calibration_in_words, last_verification
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
-from ftdrivers.interfaces import ArmStates, ArmStatus, DeviceInfo, FtSamples
+from ftdrivers.interfaces import ArmStates, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 
 STALE_S = 0.3
 """Without a new sample of either device for so long, `CompensatedStream.read` raises."""
@@ -59,7 +60,8 @@ class CompensatedStream(ProcessedStream):
 
     Parameters
     ----------
-    cell : CellConfig
+    cell : CellConfig or Station
+        An emulated cell is started on entry and ended with the stream.
     calibration : CalibrationResult or str
         Of these devices, or the name of a tool: its newest accepted calibration is looked up on entry.
     name : str
@@ -72,6 +74,8 @@ class CompensatedStream(ProcessedStream):
         May be set at any time.
     false_alarm_rate : float
         Share of readings of a free tool that count as contact.
+    devices : ForceTorqueSensor and RobotArm, optional
+        Used in place of those that the cell names.
 
     Raises
     ------
@@ -84,7 +88,7 @@ class CompensatedStream(ProcessedStream):
 
     def __init__(
         self,
-        cell: CellConfig,
+        cell: CellConfig | Station,
         calibration: CalibrationResult | str,
         *,
         name: str = "",
@@ -92,9 +96,10 @@ class CompensatedStream(ProcessedStream):
         frame: WrenchFrame = SENSOR_FRAME,
         stages: Stages = STANDARD,
         false_alarm_rate: float = FALSE_ALARM_RATE,
+        devices: tuple[ForceTorqueSensor | None, RobotArm | None] = (None, None),
     ) -> None:
-        self._cell = cell
-        self.clock: Clock = cell.clock
+        self._given = cell
+        self._devices = devices
         self._wanted = calibration
         self._name = name
         self._force = force
@@ -111,8 +116,11 @@ class CompensatedStream(ProcessedStream):
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            self._sensor = stack.enter_context(build_sensor(self._cell))
-            self._arm = stack.enter_context(closing(build_arm(self._cell)))
+            self.cell = self._given if isinstance(self._given, CellConfig) else stack.enter_context(self._given).cell
+            self.clock: Clock = self.cell.clock
+            sensor_device, arm_device = self._devices
+            self._sensor = stack.enter_context(sensor_device or build_sensor(self.cell))
+            self._arm = stack.enter_context(closing(arm_device or build_arm(self.cell)))
             self._arm.open()
             arm, sensor = self._arm.identify(), self._sensor.identify()
             self._calibration, self._name, self.warnings = self._chosen(arm, sensor)
@@ -131,7 +139,7 @@ class CompensatedStream(ProcessedStream):
             self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, status)
             frame, stages, false_alarm_rate = self._begin
             self._processor = Processor(self.info, frame, stages, false_alarm_rate=false_alarm_rate)
-            delay_ms = self._cell.sensor.delay_ms
+            delay_ms = self.cell.sensor.delay_ms
             delay = (
                 DelayEstimator(self._calibration, self.info.p_flange_sensor_m) if delay_ms is None else delay_ms / 1e3
             )
@@ -144,14 +152,24 @@ class CompensatedStream(ProcessedStream):
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
+    @property
+    def station(self) -> Station:
+        """The emulated cell, such as `station.control(do="push", wrench=[0, 0, -5, 0, 0, 0], seconds=1)`.
+
+        mocks/README.md lists the requests. Raises `ConfigError` for a real cell.
+        """
+        if not isinstance(self._given, Station):
+            raise ConfigError("this is a real cell: only a stream with simulate=True has a station")
+        return self._given
+
     def _chosen(self, arm: DeviceInfo, sensor: DeviceInfo) -> tuple[CalibrationResult, str, tuple[str, ...]]:
         """Return the calibration, its name and warnings; it belongs to the devices and their mounting."""
         calibration, name, warnings = self._wanted, self._name, tuple[str, ...]()
-        mount = self._cell.sensor.mount
+        mount = self.cell.sensor.mount
         if isinstance(calibration, str):
             from ftdrive.store.tools import calibration_of_tool
 
-            url = self._cell.store.url
+            url = self.cell.store.url
             tool = calibration_of_tool(calibration, arm, sensor, mount, url=url, force=self._force)
             calibration, name, warnings = tool.calibration, str(tool.path), tool.warnings
         belongs = belonging(calibration, {"arm": arm, "sensor": sensor}, mount)
@@ -169,11 +187,11 @@ class CompensatedStream(ProcessedStream):
             calibration_name=self._name,
             arm=arm,
             sensor=sensor,
-            tool=self._wanted if isinstance(self._wanted, str) else self._cell.tool.name,
+            tool=self._wanted if isinstance(self._wanted, str) else self.cell.tool.name,
             utc_offset_ns=time.time_ns() - self.clock.now_ns(),  # the anchor of all times in files
             sensor_rate_Hz=sensor_rate_Hz,
             arm_rate_Hz=arm_rate_Hz,
-            p_flange_sensor_m=sensor_origin_m(self._cell.sensor.height_mm),
+            p_flange_sensor_m=sensor_origin_m(self.cell.sensor.height_mm),
             R_flange_tcp=np.eye(3) if status.tcp_offset is None else Rotation.from_rotvec(tcp[3:]).as_matrix(),
             p_flange_tcp_m=tcp[:3],
             versions=versions(),
@@ -205,6 +223,8 @@ class CompensatedStream(ProcessedStream):
             self._wanted = before
             raise
         verification, state = self._trusted()
+        self._processor.restart()  # a contact is not continued
+        self._report_contacts()
         old, self.info = (
             self._processor,
             replace(
@@ -259,7 +279,7 @@ class CompensatedStream(ProcessedStream):
         paired = self._pairing.take()
         if paired is None:
             return None
-        block = self._processor.process(paired)
+        block = self._process(paired)
         return block if len(block) else None
 
     def _read_sensor(self, wait_s: float) -> FtSamples:
@@ -360,58 +380,3 @@ class CompensatedStream(ProcessedStream):
             steps = np.diff(states.t_device_s, prepend=self._arm_newest[1]) / self._arm_step_s
             self._arm_lost += int(np.maximum(np.rint(steps) - 1, 0).sum())
         self._arm_newest = t_ns, float(states.t_device_s[-1])
-
-
-def open_stream(
-    config: Path | CellConfig | None = None,
-    calibration: Path | str | CalibrationResult | None = None,
-    *,
-    tool: str | None = None,
-    frame: WrenchFrame = SENSOR_FRAME,
-    stages: Stages = STANDARD,
-    force: bool = False,
-) -> CompensatedStream:
-    """Return the stream of a cell, for use with `with`.
-
-    Parameters
-    ----------
-    config : Path or CellConfig, optional
-        A configuration file instead of ./ftdrive.toml, or the cell itself.
-    calibration : Path, str or CalibrationResult
-        A calibration.json or its run folder.
-    tool : str
-        Instead of `calibration`: the newest accepted one of this tool on the devices and mount of the cell, from the
-        store and from the run folders in ./runs. `CompensatedStream.use_tool` switches to another one.
-    frame : WrenchFrame
-    stages : Stages
-    force : bool
-        Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`.
-
-    Raises
-    ------
-    ConfigError
-        The configuration cannot be used, or there is not one of calibration and tool.
-    BadCalibration, OSError
-        The calibration cannot be read.
-
-    Examples
-    --------
-    >>> with open_stream(calibration="runs/tool") as stream:  # doctest: +SKIP
-    ...     for sample in stream:
-    ...         print(sample.t_s, sample.force_N, sample.torque_Nm, sample.frame)
-    """
-    if (calibration is None) == (tool is None):
-        found = "no calibration" if tool is None else "both a calibration and a tool"
-        raise ConfigError(f"{found}: give the path of a calibration.json or of its run folder, or the name of a tool")
-    cell = config if isinstance(config, CellConfig) else load(config)
-    if tool is not None:
-        return CompensatedStream(cell, tool, frame=frame, stages=stages, force=force)
-    if isinstance(calibration, CalibrationResult):
-        return CompensatedStream(cell, calibration, frame=frame, stages=stages, force=force)
-    path = Path(str(calibration))
-    return CompensatedStream(cell, load_calibration(path), name=str(path), frame=frame, stages=stages, force=force)
-
-
-def load_calibration(path: Path) -> CalibrationResult:
-    """Read a calibration.json, or the newest one of a run folder. Raises `BadCalibration` or `OSError`."""
-    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path)

@@ -79,6 +79,16 @@ class Plan:
         return replace(self, description={**self.description, "measured": measured})
 
     @property
+    def R_base_flange(self) -> Array:
+        """(n, 3, 3) orientations of the poses; maps flange coordinates to base coordinates."""
+        return np.array([step.R_base_flange for step in self.steps])
+
+    @property
+    def motion_time_s(self) -> float:
+        """Sum of the moves at the plan's speeds, the last one back included."""
+        return float(sum(step.duration_s for step in self.steps))
+
+    @property
     def sha256(self) -> str:
         """Hash of the file."""
         return str(self.to_dict()["sha256"])
@@ -93,7 +103,7 @@ class Plan:
             "certified": self.certified,
             "uncertified_segments": sum(not step.certified for step in self.steps),
             "max_move_deg": float(np.degrees(max(step.turn_rad for step in self.steps))),
-            "motion_time_s": float(sum(step.duration_s for step in self.steps)),
+            "motion_time_s": self.motion_time_s,
             "min_clearance_mm": 1e3 * min(step.clearance_m for step in self.steps),
             "ball_m": self.ball_m,
             "ball_centre_m": list(self.ball_centre_m),
@@ -106,12 +116,12 @@ class Plan:
         document = json.loads(json.dumps(document))  # tuples become lists, as they come back from a file
         return document | {"sha256": digest(document)}
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write a new file."""
         write_new(path, json.dumps(self.to_dict(), indent=1) + "\n")
 
     @classmethod
-    def load(cls, path: Path) -> "Plan":
+    def load(cls, path: str | Path) -> "Plan":
         """Read a file; raises `BadPlan` if it is not a plan, `PlanRefused` if it was changed."""
         try:
             document = read_object(path, BadPlan)

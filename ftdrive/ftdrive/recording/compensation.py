@@ -58,7 +58,7 @@ def read_with_calibration(
         return recording
     info = recording.header.info
     if others := belonging(calibration, {"arm": info.arm, "sensor": info.sensor}).others:
-        raise ConfigError(f"{path} is of other devices than the calibration: {others[0]}")
+        raise ConfigError(f"{path.name} is of other devices than the calibration: {others[0]}")
     return recording.with_calibration(calibration, name)
 
 

@@ -1,15 +1,14 @@
 """Wrench and orientation of another program, as two CSV files on one clock, each at its own rate."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
-from ftcalib.data.dataset import LONGEST_VECTOR_RAD, MATRIX_COLUMNS, VECTOR_COLUMNS, CalibrationDataset
+from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns, rotations_of
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
 from ftdrive.live.delay import DelayEstimator
@@ -22,7 +21,6 @@ from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtS
 
 _WHOLE = 10**6
 """Seconds: the delay is estimated from all of a recording."""
-_QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 
 
 def read_pair(
@@ -85,7 +83,7 @@ def read_wrench(path: Path) -> FtSamples:
 
     Samples are numbered by their times, so that a pause is a gap.
     """
-    t_s, wrench, _ = _table(path, CHANNELS)
+    t_s, wrench, _ = _table(path, lambda _: CHANNELS, ", ".join(CHANNELS))
     step_s = float(np.median(np.diff(t_s)))
     steps = np.rint(np.diff(t_s) / step_s) if step_s > 0 else np.ones(len(t_s) - 1)
     seq = np.concatenate([[0], np.cumsum(np.maximum(steps, 1))])
@@ -97,23 +95,12 @@ def read_orientation(path: Path) -> ArmStates:
 
     The orientation is a matrix r11..r33, a quaternion qx, qy, qz, qw, or a rotation vector rx, ry, rz in rad.
     """
-    t_s, numbers, columns = _table(path, MATRIX_COLUMNS, _QUATERNION_COLUMNS, VECTOR_COLUMNS)
-    n = len(t_s)
-    length = np.linalg.norm(numbers, axis=1)
-    if columns == VECTOR_COLUMNS and length.max() > LONGEST_VECTOR_RAD:
-        raise BadDataset(f"{path.name}: a rotation vector is {length.max():.0f} rad long: convert degrees to rad")
-    if columns == _QUATERNION_COLUMNS and (wrong := np.flatnonzero(abs(length - 1) > 1e-2)).size:
-        raise BadDataset(f"{path.name}: row {wrong[0] + 1}: the quaternion has length {length[wrong[0]]:.3g}, not 1")
-    if columns == MATRIX_COLUMNS:
-        try:
-            checked = CalibrationDataset(numbers.reshape(n, 3, 3), np.zeros((n, 6)), None, np.zeros(n, np.int64), t_s)
-        except BadDataset as error:
-            raise BadDataset(f"{path.name}: {error}") from error
-        R = checked.R_base_flange
-    else:
-        is_vector = columns == VECTOR_COLUMNS
-        R = (Rotation.from_rotvec(numbers) if is_vector else Rotation.from_quat(numbers)).as_matrix()
-    unknown = np.full((n, 6), np.nan)
+    t_s, numbers, columns = _table(path, orientation_columns, ORIENTATION_FORMS)
+    try:
+        R = rotations_of(columns, numbers)
+    except BadDataset as error:
+        raise BadDataset(f"{path.name}: {error}") from error
+    unknown = np.full((len(t_s), 6), np.nan)
     return ArmStates(_ns(t_s), unknown[:, 0], unknown, unknown, R, unknown[:, :3])
 
 
@@ -121,13 +108,14 @@ def _ns(t_s: Array) -> NDArray[np.int64]:
     return np.rint(t_s * 1e9).astype(np.int64)
 
 
-def _table(path: Path, *choices: Sequence[str]) -> tuple[Array, Array, Sequence[str]]:
-    """Return times (n,), the columns of the first choice that is there (n, k), and that choice."""
+def _table(
+    path: Path, columns_of: Callable[[Sequence[str]], Sequence[str]], wanted: str
+) -> tuple[Array, Array, Sequence[str]]:
+    """Return times (n,), the columns that are chosen by the names of all (n, k), and their names."""
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
         names = [name.strip() for name in next(csv.reader(file), [])]
-        found = next((choice for choice in choices if {"t", *choice} <= set(names)), None)
-        if found is None:
-            wanted = ", or ".join(", ".join(choice) for choice in choices)
+        found = columns_of(names)
+        if not {"t", *found} <= set(names):
             raise BadDataset(f"{path.name}: the first row must name t and {wanted}; it names {', '.join(names)}")
         try:
             table = np.loadtxt(file, delimiter=",", usecols=[names.index(name) for name in ("t", *found)], ndmin=2)

@@ -103,9 +103,8 @@ def read_parquet(path: Path, columns: Collection[str]) -> Recording:
             events = [event_of(json.dumps(one)) for one in json.loads(metadata["events"])]
             found = database.execute(f"SELECT {', '.join(names)} FROM read_parquet($1)", [parts]).fetchnumpy()
         except (duckdb.Error, KeyError, ValueError) as error:
-            raise BadRecording(
-                f"{error}: the file is damaged or was cut; a Parquet file cannot be read then"
-            ) from error
+            what = type(error).__name__  # its text may name a temporary folder
+            raise BadRecording(f"the file is damaged or was cut, and cannot be read then ({what})") from error
     rows = np.empty(len(found[names[0]]), [(name, COLUMNS[name]) for name in names])
     for name in names:
         rows[name] = np.ma.filled(found[name], np.nan) if np.ma.isMaskedArray(found[name]) else found[name]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
-from ftcalib.errors import CalibError
+from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame
@@ -110,7 +110,7 @@ class Header:
             return cls(StreamInfo(**values), frame_of(document["frame"]), Stages(**stages), document["configuration"])
         except KeyError as error:
             raise BadRecording(f"the header lacks the field {error.args[0]}: the file is damaged") from error
-        except (CalibError, TypeError, ValueError) as error:
+        except (BadCalibration, TypeError, ValueError) as error:
             raise BadRecording(f"the header cannot be read ({error}): the file is damaged") from error
 
 
@@ -164,6 +164,12 @@ class Recording:
     events: Sequence[StreamEvent]
     cut: str = ""
     """Why the file ends early; empty if it is complete."""
+
+    @property
+    def table(self) -> NDArray[np.void]:
+        """(n,) the samples, one named field a number, as `pandas.DataFrame` takes them; names as in the CSV format."""
+        names = self.rows.dtype.names or ()
+        return self.rows.view([(one, COLUMNS[one]) for name in names for one in NUMBERS[name]])
 
     @property
     def duration_s(self) -> float:

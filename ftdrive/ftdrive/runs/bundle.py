@@ -21,11 +21,11 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-from ftcalib.errors import BadDataset
+from ftcalib.errors import BadDataset, UsageError
 from ftcalib.files import check_format, read_object, write_new
 from ftdrive.cell.config import recorded_cell
 from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, check_permissions, check_workcell
-from ftdrive.errors import BadBundle, ConfigError
+from ftdrive.errors import BadBundle
 from ftdrive.runs.redaction import Redaction
 from ftdrive.runs.run import Run, versions
 
@@ -180,6 +180,6 @@ def _environment(folder: Path) -> dict[str, Any]:
         cell = recorded_cell(Run(folder).header()["config"])
         checks = [check_disk(folder), check_workcell(cell, cell.robot.model)]
         checks += check_permissions(SensorAddress.of(cell.sensor.url))
-    except (BadDataset, ConfigError, TypeError) as error:  # a damaged run is worth a report too
+    except (BadDataset, UsageError, TypeError) as error:  # a damaged run is worth a report too
         return facts | {"error": str(error)}
     return facts | {"checks": [asdict(check) for check in checks]}

@@ -72,13 +72,24 @@ class Run:
 
     Parameters
     ----------
-    folder : Path
+    folder : str or Path
     clock : Clock
         Of the cell whose poses are added: each is kept with what to add to its `t_host_ns` for UTC.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> run = ftdrive.Run("runs/gripper")
+    >>> run.stops()  # the poses taken; run.records() reads their samples
+    [1, 2, 3, 4, 5, 6]
+    >>> ftdrive.read_dataset(run.folder).wrench.shape
+    (6, 6)
+    >>> ftdrive.read_calibration(run.folder).n_poses
+    6
     """
 
-    def __init__(self, folder: Path, clock: Clock = REAL) -> None:
-        self.folder = folder
+    def __init__(self, folder: str | Path, clock: Clock = REAL) -> None:
+        self.folder = Path(folder)
         self._clock_offset_ns = time.time_ns() - clock.now_ns()  # the anchor of all times in the files
         self._events_lock = threading.Lock()
 

@@ -19,11 +19,10 @@ from ftcalib.assessment.observability import (
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.poses.information import Guess, Prediction, predicted_sigma
 from ftcalib.poses.selection import next_pose
-from ftcalib.poses.sphere import largest_gap
 from ftcalib.published.yu import weight_and_tilt
 from ftcalib.routine import PoseRecord, dataset_from, is_return
+from ftcalib.sphere import axes_along, largest_gap
 from ftdrive.cell.config import USUAL_KG
-from ftdrive.checks.controller_settings import axes_along
 from ftdrive.session.events import Compared, Estimated
 
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
@@ -148,7 +147,7 @@ class RunningFit:
 
     def _solved(self) -> CalibrationResult | None:
         try:
-            return solve(dataset_from(self._kept(), {}), g_m_s2=self._g_m_s2, up_in_base=-self._down_base)
+            return solve(dataset_from(self._kept(), {}), g_m_s2=self._g_m_s2)
         except NotObservable:
             return None
 
@@ -189,8 +188,7 @@ def hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
     """Describe the simple motion from the last of the poses taken (n, 3, 3) to the most useful next one."""
     last = R_base_flange[-1]
     words, candidates = _motions(last, down_base)
-    ranked, _ = next_pose(R_base_flange, candidates, guess)
-    best = int(ranked[0])
+    best = int(next_pose(R_base_flange, candidates, guess)[0])
     before, after = (_pointing_down(down_base @ R) for R in (last, candidates[best]))
     return f"{'keep' if before == after else 'point'} {after} down: {words[best]}"
 

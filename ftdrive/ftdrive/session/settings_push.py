@@ -12,10 +12,10 @@ from typing import Any, Final
 import numpy as np
 
 from ftcalib import CalibrationResult
+from ftcalib.assessment.described_cell import Lean, lean_from
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.checks import computer, devices
-from ftdrive.checks.controller_settings import Lean, lean_from
 from ftdrive.checks.flange_load import FlangeLoad, flange_load
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.planning.geometry.scene import down_of

@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
+from ftcalib.assessment import described_cell
 from ftcalib.errors import TooFewSamples
 from ftcalib.model import Array
 from ftcalib.routine import Sampling, Stage, TourPose, take_pose
-from ftdrive.checks.controller_settings import payload_in_words
 from ftdrive.checks.devices import SLOWEST_SLIDER
 from ftdrive.errors import Declined, NotAccepted, PlanRefused
 from ftdrive.planning.approach import arm_moves, plan_approach
@@ -150,8 +150,8 @@ class Tour:
             return
         self._now.payload_kg = payload_kg
         self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=payload_kg, p_flange_payload_m=com_m))
-        if words := payload_in_words(payload_kg, mass_kg, self._pace.sensor_kg):
-            self._note(words, warning=True)
+        for finding in described_cell.payload(payload_kg, mass_kg, self._pace.sensor_kg):
+            self._note(finding.words, warning=True)
 
     def _step(self, stop: int, index: int) -> bool:
         """Ask for Enter; return whether to move."""
@@ -391,7 +391,7 @@ class Tour:
             return
         stop, back = self._now.todo[0], self._now.came_from
         self._now.standing = False
-        words = str(error if trip is None else trip).rstrip(".")
+        words = str(error if trip is None else trip)
         reported, report_error = self._watcher.tripped(wait_s=0.0), self._watcher.report_error
         if trip is not None and (trip is not reported or report_error is not None):
             self._journal.show(GuardTripped(hazard=trip.hazard, words=words))

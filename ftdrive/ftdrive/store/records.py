@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ftcalib import CalibrationResult
-from ftcalib.errors import BadDataset, CalibError
+from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_object
 from ftcalib.model import Array, Parameters
 from ftdrive.runs.run import Run
@@ -150,7 +150,7 @@ def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
     for path in paths:
         try:
             records.append(read_record(path))
-        except (CalibError, OSError) as error:
+        except (DataError, OSError) as error:
             unreadable.append(f"{path}: {error}")
     return records, tuple(unreadable)
 
@@ -238,7 +238,7 @@ def _header(run: Path) -> Mapping[str, Any]:
     """Return run.json, or nothing if it is damaged: the calibration file alone suffices."""
     try:
         return dict(Run(run).header())
-    except (CalibError, OSError):
+    except (DataError, OSError):
         return {}
 
 

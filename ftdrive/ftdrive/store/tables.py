@@ -1,6 +1,6 @@
 """The tables of the store as this version reads and writes them, and their rows as records.
 
-A change of a column raises `SCHEMA` and adds a migration in `ftdrive.store.migrations`.
+A change of a column of results or verifications raises `SCHEMA`: an older index is then built again from its files.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from sqlalchemy import JSON, Boolean, Column, Float, Integer, MetaData, Row, Str
 from ftdrive.store.records import BriefVerification, Record, StoredCell, StoredResult, StoredVerification
 
 SCHEMA: Final = 2
-"""Version of the tables, kept in the database."""
+"""Version of the index, kept in the database."""
 
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 _WRENCHES = ("bias_change", "bias_change_sigma", "calibration_sigma")

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ftcalib import CalibrationResult
-from ftcalib.errors import CalibError
+from ftcalib.errors import BadCalibration
 from ftdrive.checks.devices import belonging
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.store.records import StoredResult, read_records, record_paths
@@ -98,7 +98,7 @@ def _may_belong(one: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:
 def _load(one: StoredResult) -> CalibrationResult | None:
     try:
         return CalibrationResult.load(Path(one.path))
-    except (CalibError, OSError):
+    except (BadCalibration, OSError):
         return None
 
 

@@ -88,7 +88,9 @@ class SessionView:
     compared: dict[int, Compared] = field(default_factory=dict)
     """By stop, in a verification."""
     drift: DriftCheck | None = None
-    note: str = ""
+    note: Noted | GuardTripped | None = None
+    tripped: bool = False
+    """A guard has stopped the arm, and STOP and HOLD repeat its words."""
     waiting: tuple[Key, ...] = ()
     ascii_only: bool = False
     """The terminal's encoding is ASCII."""
@@ -102,14 +104,17 @@ class SessionView:
                 self.folder, self.resume = event.folder, event.resume
             case StateChanged():
                 self.now, self.since_s = event, now_s
+                self.tripped = self.tripped and event.state in {State.STOP, State.HOLD}
             case PoseTaken():
                 self._take(event, now_s)
             case Estimated():
                 self.estimated = event
             case Compared():
                 self.compared[event.stop] = event
-            case Noted(warning=True) | GuardTripped():
-                self.note = in_words(event)
+            case Noted(warning=True):
+                self.note = event
+            case GuardTripped():
+                self.note, self.tripped = event, True
 
     def shown(self, text: str) -> str:
         """Replace what the terminal's encoding lacks, which lengthens the text: call it before measuring or cutting."""
@@ -117,7 +122,7 @@ class SessionView:
 
     def _take(self, event: PoseTaken, now_s: float) -> None:
         self.taken[event.stop] = event, now_s
-        self.last, self.note = event, ""
+        self.last, self.note = event, None
         first, first_s = self.taken[min(self.taken)]
         if event.number == first.number and event.stop != first.stop:
             sigma = np.hypot(first.sigma, event.sigma)
@@ -138,8 +143,9 @@ def frame(view: SessionView, now_s: float, *, width: int = 80, height: int = 24)
             *_findings(view, width, with_cube=wide and height > 20),
             (5, [_drift(view)]),
         ]
+    note = "" if view.note is None else in_words(view.note)
     blocks += [
-        (1, _folded(view, view.note, width, "bold red" if view.note.startswith("STOP") else "yellow")),
+        (1, _folded(view, note, width, "bold red" if isinstance(view.note, GuardTripped) else "yellow")),
         (9, [_rule(width)]),
         (0, _keys(view)),
         (0, _kept(view, width)),
@@ -187,7 +193,7 @@ def _state(view: SessionView, now_s: float, width: int) -> list[Text]:
     stopped = now.state in {State.STOP, State.HOLD}
     line.append(now.state.upper(), "bold red" if stopped else "bold cyan")
     line.append(f"  {_minutes(now_s - view.since_s)}" if now.state is not State.HOLD else "")
-    words = "" if now.words in view.note else now.words
+    words = "" if view.tripped else now.words
     if len(line) + 2 + len(words) > width:
         return [line, *_folded(view, words, width)]
     line.append(f"  {words}" if words else "")
@@ -488,7 +494,7 @@ def _history(event: Event, view: SessionView) -> bool:
     """Whether an event is printed above the frame, where the frame does not show it already."""
     match event:
         case StateChanged():
-            return event.state is State.HOLD and event.words not in view.note
+            return event.state is State.HOLD and not view.tripped
         case Asked():
             return event.answer != ""
         case Estimated() | Compared():

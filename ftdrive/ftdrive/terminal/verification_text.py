@@ -21,8 +21,8 @@ def print_verification(verified: Verified) -> None:
     talk.print(hanging(Text.assemble(" ", verdict, "  "), verdict_in_words(verified)))
     if not found.passed:
         talk.print(hanging("   ", found.reason), style="yellow")
-    for words in moved(verified.records):
-        talk.print(hanging(" ? ", words), style="yellow")
+    for finding in moved(verified.records):
+        talk.print(hanging(" ? ", finding.words), style="yellow")
     if verified.drift is not None:
         words, bad = drift_in_words(verified.drift)
         if bad or talk.verbose:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Generator
 
 from ftmocks.arrays import Array
-from ftmocks.kinematics import Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of
+from ftmocks.kinematics import Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of, vector6
 from ftmocks.ur.controller_program import ControllerProgram, ScriptError
 from ftmocks.ur.motion import JointMove, LineMove, Path
 from ftmocks.ur.robot import STOP_SCRIPT, Robot
@@ -62,7 +62,7 @@ class ControlScript(ControllerProgram):
             20: self._accept,
             21: self._accept,
             26: self._step_time,
-            28: self._target_waypoint,
+            28: lambda: self._write_pose(forward(robot.arm.dh, robot.arm.q) @ robot.X_flange_tcp),
             29: self._set_tcp,
             30: lambda: self._write_vector(self._inverse_kin(qnear=self._vector(6))),
             31: self._protective_stop,
@@ -154,8 +154,7 @@ class ControlScript(ControllerProgram):
         return value
 
     def _vector(self, first: int) -> Vector6:
-        a, b, c, d, e, f = (self._read(first + i) for i in range(6))
-        return (a, b, c, d, e, f)
+        return vector6([self._read(first + i) for i in range(6)])
 
     def _write_int(self, index: int, value: int) -> None:
         self._robot.output_ints[index + self._int_offset] = value
@@ -267,23 +266,16 @@ class ControlScript(ControllerProgram):
         q = self._solve(self._robot.arm.actual_q)
         self._write_flag(q is not None and self._robot.limits.allow(q, self._robot.X_flange_tcp))
 
-    def _target_waypoint(self) -> None:
-        self._write_pose(forward(self._robot.arm.dh, self._robot.arm.q) @ self._robot.X_flange_tcp)
-
     def _set_payload(self) -> None:
         self._robot.payload_kg = self._read(0)
-        self._set_cog()
-
-    def _set_target_payload(self) -> None:
-        self._set_payload()
-        a, b, c, d, e, f = (self._read(4 + i) for i in range(6))
-        self._robot.payload_inertia = (a, b, c, d, e, f)
-        self._robot.zero_ft()
-
-    def _set_cog(self) -> None:
         cog = (self._read(1), self._read(2), self._read(3))
         if any(cog):  # all zero keeps the old one: a special case of the script
             self._robot.payload_cog_m = cog
+
+    def _set_target_payload(self) -> None:
+        self._set_payload()
+        self._robot.payload_inertia = self._vector(4)
+        self._robot.zero_ft()
 
     def _set_tcp(self) -> None:
         self._robot.tcp_offset = self._vector(0)

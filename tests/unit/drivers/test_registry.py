@@ -18,8 +18,9 @@ from ftdrivers.ati.can import AtiCanSensor
 from ftdrivers.ati.netft import NetFtSensor
 from ftdrivers.ati.serial import AtiSerialSensor
 from ftdrivers.bota.sensor import BotaSensor
+from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import Fact
-from ftdrivers.registry import BadUrl, arm_class, in_url, sensor_from_url, split_url
+from ftdrivers.registry import arm_class, in_url, sensor_from_url, split_url
 from ftdrivers.robotiq.sensor import RobotiqFt300
 from ftdrivers.robotous.can import RobotousCan
 from ftdrivers.robotous.serial import RobotousSerial

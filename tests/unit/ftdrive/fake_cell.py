@@ -377,7 +377,7 @@ class Lab:
             RobotConfig("fake"),
             SensorConfig("fake://"),
             ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)),
-            WorkcellConfig(measured=True),
+            WorkcellConfig("floor", measured=True),
             Sampling(average_s=0.1, noise_record_s=0.0),
             clock=self.clock,
         )

@@ -150,7 +150,8 @@ def _is_attended(one: "StoredCell", cell: "CellConfig") -> bool:
 
 def _sentence(error: Exception) -> str:
     """Return the message of an error that a user can fix; raises any other."""
-    from ftdrive.cli import exit_code, in_a_sentence
+    from ftdrive.cli import in_a_sentence
+    from ftdrive.errors import exit_code
 
     if exit_code(error) is None:
         raise error

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.cells import cell_len
 
+from ftcalib.sphere import axes_along
 from ftdrive.checks.check import Check
-from ftdrive.checks.controller_settings import axes_along
 from ftdrive.checks.devices import AXES, check_rate
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform

@@ -307,7 +307,9 @@ def test_the_payload_is_compared_with_the_weighed_load(
     check = diagnosis.check_weighed_payload(payload_kg, calibration, sensor_kg)
     assert (check.name, check.state) == ("robot.payload", state)
     assert words in check.found
-    assert (state == "warning") == bool(check.fix and check.fix.startswith("set the payload in PolyScope"))
+    assert (state == "warning") == bool(
+        check.fix and check.fix.startswith("set the payload in the controller to 1.74 kg")
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from ftcalib.errors import BadDataset, CalibError
+from ftcalib.errors import BadDataset, NotObservable
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.emulated import Station
-from ftdrive.cli import cli, exit_code
-from ftdrive.errors import ConfigError
+from ftdrive.cli import cli
+from ftdrive.errors import ConfigError, exit_code
 from ftdrive.runs.run import Run
 from ftdrive.session import session
 from ftdrive.session.options import SessionOptions
@@ -218,4 +218,4 @@ def test_a_run_with_a_field_of_the_wrong_type_is_refused_in_one_sentence(
 
 
 def test_every_error_of_the_solver_has_an_exit_code() -> None:
-    assert exit_code(CalibError("holds no pose yet")) == 7
+    assert exit_code(NotObservable("the run contains no pose")) == 7

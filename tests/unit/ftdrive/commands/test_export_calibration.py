@@ -10,9 +10,9 @@ import pytest
 import yaml
 from click.testing import CliRunner, Result
 
-from ftdrive.cli import cli, exit_code
+from ftdrive.cli import cli
 from ftdrive.commands import emulated_run
-from ftdrive.errors import ConfigError
+from ftdrive.errors import ConfigError, exit_code
 from ftdrive.exports.calibration.formats import FORMATS
 from ftdrive.runs.run import Run
 from tests.unit.ftdrive.exports.calibration.example import calibration, tilted

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from ftdrive import cli
+from ftdrive.cell.config import CellConfig
 from ftdrive.commands.record import Duration
 from ftdrive.live.samples import Block, StreamEvent
 from ftdrive.recording import Recorder, read_recording
@@ -25,6 +26,8 @@ END = KeyboardInterrupt()
 
 class FakeStream:
     """Blocks and what follows them: an error, or nothing more."""
+
+    cell: CellConfig
 
     def __init__(
         self, blocks: list[Block], end: BaseException = END, events: dict[int, StreamEvent] | None = None
@@ -62,7 +65,11 @@ def run_record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.C
     calibration().save(tmp_path / "c.json")
 
     def run(stream: FakeStream, *options: str) -> tuple[int, dict[str, Any] | None, str]:
-        monkeypatch.setattr("ftdrive.commands.live_source.CompensatedStream", lambda *_, **__: stream)
+        def opened(cell: CellConfig, *_: Any, **__: Any) -> FakeStream:
+            stream.cell = cell
+            return stream
+
+        monkeypatch.setattr("ftdrive.commands.live_source.CompensatedStream", opened)
         given = ["--calibration", "c.json", "--robot", "10.0.0.2", "--sensor", "ati-can://can0", "--json", *options]
         code = cli.run(["record", *given])
         out, err = capsys.readouterr()

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from ftdrive.cli import cli, exit_code
-from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.cli import cli
+from ftdrive.errors import ConfigError, PlanRefused, exit_code
 from ftdrive.exports import targets_csv, urscript
 from ftdrive.planning.plan import Plan
 

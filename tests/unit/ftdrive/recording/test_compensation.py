@@ -152,7 +152,7 @@ def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(orientation: st
         ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n1,1,2,x,4,5,6\n", "'x'"),
         ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n-1,1,2,3,4,5,6\n", "row 2: .* t = -1 goes back"),
         ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n1,1,nan,3,4,5,6\n", "row 2: a number is not finite"),
-        ("poses", "t,rx,ry,rz\n0,0,90,0\n1,0,90,0\n", "convert degrees"),
+        ("poses", "t,rx,ry,rz\n0,0,90,0\n1,0,90,0\n", "look like degrees"),
         ("poses", "t,qx,qy,qz,qw\n0,0,0,0,1\n1,0,0,0,2\n", "row 2: the quaternion has length 2"),
         ("poses", "t,r11,r12,r13,r21,r22,r23,r31,r32,r33\n" + "0,1,0,0,0,1,0,0,0,-1\n" * 2, "reflection"),
         ("poses", "t,rx,ry,rz\n900,0,0,0\n901,0,0,0\n", "no time in common"),

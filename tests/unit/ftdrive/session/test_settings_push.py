@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftcalib import CalibrationResult, Parameters
+from ftcalib import CalibrationResult, Finding, Parameters
 from ftcalib.errors import BadDataset
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted
@@ -90,8 +90,7 @@ class Cell:
         bias = np.array([1.0, 2, 3, 0.1, 0.2, 0.3])
         parameters = Parameters(np.eye(3), 1.2 * 9.81 * down, bias[:3], np.array([0.01, 0, 0.06]), bias[3:])
         found = {
-            "verdict": "good",
-            "reasons": (),
+            "findings": (),
             "provenance": {
                 "devices": {"arm": {"model": "UR5e", "serial": "A1"}, "sensor": {"model": "fake", "serial": "S1"}},
                 "setup": {"payload_kg": 0.9, "sensor_mass_kg": None, "mounting": "floor"},
@@ -196,8 +195,9 @@ def test_a_calibration_of_other_devices_is_refused(cell: Cell, devices: Any, say
 
 
 def test_a_rejected_calibration_is_refused(cell: Cell) -> None:
-    with pytest.raises(NotAccepted, match=r"rejected \(too noisy\)"):
-        cell.propose(cell.result(verdict="rejected", reasons=("too noisy",)))
+    rejected = Finding.of("second_solution", probability_percent=40.0)
+    with pytest.raises(NotAccepted, match=r"rejected \(a very different mounting .* 40 %"):
+        cell.propose(cell.result(findings=(rejected,)))
 
 
 @pytest.mark.parametrize(

@@ -62,8 +62,7 @@ def calibration() -> CalibrationResult:
         noise_source="measured",
         g_m_s2=9.80665,
         method="ml",
-        verdict="good",
-        reasons=(),
+        findings=(),
         provenance={
             "created_utc": "2026-11-14T08:00:00+00:00",
             "dataset_sha256": "7c1e9a" + "0" * 58,
