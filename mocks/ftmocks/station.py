@@ -303,7 +303,7 @@ class Station:
                 raise ValueError("this station has no sensor")
             for emulator in emulators:
                 emulator.faults.delay_s = 1e-3 * given["sensor_ms"]
-        self.server.delay_s = 1e-3 * given.get("rtde_ms", 1e3 * self.server.delay_s)
+        self.server.rtde.delay_s = 1e-3 * given.get("rtde_ms", 1e3 * self.server.rtde.delay_s)
         self.robot.note("network", "delay", why=json.dumps(given))
 
     def _play(self, recording: Recording, request: dict[str, Any]) -> dict[str, Any]:
@@ -334,7 +334,7 @@ class Station:
             "speed_scaling": arm.pace,
             **({} if self._recording is None else {"recording_s": self._recording.at_s(self._clock.now_s())}),
             "true_wrench": self.world.true_wrench().tolist(),
-            "bad_inputs": self.server.bad_inputs,
+            "bad_inputs": self.server.rtde.bad_inputs,
             "t_host_ns": self._clock.now_ns(),
             "events": [event.to_json() for event in robot.events[int(request.get("since", 0)) :]],
         }

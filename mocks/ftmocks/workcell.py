@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ftmocks.arrays import Array
-from ftmocks.disturbances import FOREVER_S, Cable, Drift, Push
+from ftmocks.disturbances import FOREVER_S, Cable, Push, SensorDrift
 from ftmocks.sensors.catalogue import Sensor
 from ftmocks.wires.faults import Faults
 from ftmocks.world import World
@@ -81,7 +81,7 @@ class Workcell:
     def _drift(self, request: Request) -> None:
         zero = [0.0] * 3
         total = [*_numbers(request.get("force_N", zero), 3), *_numbers(request.get("torque_Nm", zero), 3)]
-        self._world.drifts += (Drift(np.array(total), self._world.now_s, float(request["seconds"])),)
+        self._world.drifts += (SensorDrift(np.array(total), self._world.now_s, float(request["seconds"])),)
 
     def _payload_shift(self, request: Request) -> dict[str, Any]:
         mass_kg = float(request["mass_kg"]) if "mass_kg" in request else None

@@ -27,7 +27,7 @@ from ftcalib.extras.verification import SINGLE, verify
 from ftcalib.likelihood.gain_and_cross_talk import response_columns
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, predict
 from ftcalib.poses.information import SUBSET_6, T12, special
-from ftcalib.poses.verification import choose_verification_poses
+from ftcalib.poses.verification_poses import choose_verification_poses
 from tests.benchmarks.accuracy import Lab, Row, band, run
 from tests.benchmarks.scenarios import Rng, direction
 

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from ftdrive.cell.emulated_clock import EmulatedClock
 from ftmocks.clock import LEAD_NS
 from ftmocks.ur import rtde
-from ftmocks.ur.script import take_uploads
+from ftmocks.ur.uploads import take_uploads
 from ftmocks.ur.variables import INPUTS, OUTPUTS
 from tests.ur_rtde import require_ur_rtde
 from tests.wire.rtde_socket import RtdeSocket
@@ -195,7 +195,6 @@ def test_programs_are_cut_at_end_in_column_zero() -> None:
         tail.append(byte)
         found += take_uploads(tail)
     assert [(u.name, u.secondary) for u in found] == [("note", True), ("statement", False), ("rtde_control", False)]
-    assert found[2].is_control_script
     assert (found[2].register_offset("float"), found[2].register_offset("int")) == (24, 0)
 
 

@@ -1,7 +1,8 @@
 """What several commands share: options, JSON on stdout."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from os import fsdecode
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args
@@ -171,6 +172,19 @@ def read_frame(axes: "Axes", about: str) -> "WrenchFrame":
         return WrenchFrame(axes, cast("Point", about))
     x, y, z = numbers("--about", about, ",", [3])
     return WrenchFrame(axes, (x, y, z))
+
+
+@contextmanager
+def declined_aborts() -> Iterator[None]:
+    """Print why the operator ended a session, and abort the command."""
+    from ftdrive.errors import Declined
+    from ftdrive.terminal.console import talk
+
+    try:
+        yield
+    except Declined as error:
+        talk.print(str(error))
+        raise click.Abort from error
 
 
 def write_json(value: Mapping[str, Any]) -> None:

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class BiasDrift:
     """Drift of the bias, from the verifications of the newest calibration."""
 
     level_sigmas: float
@@ -40,7 +40,7 @@ class CellState:
     """When the next verification is due, UTC; None for a cell that was never calibrated, which is due at once."""
     mass_kg: float | None = None
     temperature_C: float | None = None
-    drift: Drift | None = None
+    drift: BiasDrift | None = None
     """None with too few verifications."""
 
     def is_due(self, now: datetime) -> bool:
@@ -59,7 +59,7 @@ FindingKind = Literal["payload", "temperature", "base", "overdue"]
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class FleetFinding:
     """Something that several results show together."""
 
     kind: FindingKind
@@ -73,4 +73,4 @@ class Fleet:
     """All cells and what they show together."""
 
     cells: tuple[CellState, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[FleetFinding, ...]

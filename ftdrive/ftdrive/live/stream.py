@@ -34,7 +34,7 @@ from ftdrive.live.samples import (
     sensor_origin_m,
 )
 from ftdrive.runs.run import versions
-from ftdrive.runs.verification import VerificationRecord, calibration_in_words, last_verification
+from ftdrive.runs.verification_record import VerificationRecord, calibration_in_words, last_verification
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow

@@ -12,7 +12,7 @@ from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete
 from ftdrive.store import tables
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import (
-    Check,
+    BriefVerification,
     Record,
     StoredCell,
     StoredResult,
@@ -158,7 +158,9 @@ class Store:
         """Return all cells by name."""
         return sorted(self._read(select(tables.cells), tables.to_cell), key=lambda cell: cell.name)
 
-    def fleet(self, newest: int, since: datetime) -> tuple[list[StoredCell], list[StoredResult], list[Check]]:
+    def fleet(
+        self, newest: int, since: datetime
+    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification]]:
         """Return what a fleet needs, in one look at the database: cells, results and checks, the oldest first.
 
         Parameters

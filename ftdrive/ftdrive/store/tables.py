@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from sqlalchemy import JSON, Boolean, Column, Float, Integer, MetaData, Row, String, Table
 
-from ftdrive.store.records import Check, Record, StoredCell, StoredResult, StoredVerification
+from ftdrive.store.records import BriefVerification, Record, StoredCell, StoredResult, StoredVerification
 
 SCHEMA: Final = 2
 """Version of the index, kept in the database."""
@@ -62,7 +62,7 @@ cells: Final = Table(
 RECORDS: Final[Mapping[type[Record], Table]] = {StoredResult: results, StoredVerification: verifications}
 
 CHECK: Final = [
-    *(verifications.c[name] for name in Check._fields[:-1]),
+    *(verifications.c[name] for name in BriefVerification._fields[:-1]),
     *(verifications.c[f"{name}_{axis}"] for name in _WRENCHES for axis in _WRENCH),
 ]
 """Columns of a check."""
@@ -98,10 +98,10 @@ def to_verification(row: Row[Any]) -> StoredVerification:
     )
 
 
-def to_check(row: Sequence[Any]) -> Check:
+def to_check(row: Sequence[Any]) -> BriefVerification:
     """Return a row with the columns `CHECK` as a check."""
     calibration_id, created_utc, passed, change, temperature_C, *bias = row
-    return Check(calibration_id, created_utc, passed, change, temperature_C, tuple(bias))
+    return BriefVerification(calibration_id, created_utc, passed, change, temperature_C, tuple(bias))
 
 
 def _wrench(values: Sequence[Any]) -> list[float] | None:

@@ -9,9 +9,9 @@ from ftmocks.ur import dashboard
 from ftmocks.ur.hand import REST_S, guided_by_hand, pendant_program
 from ftmocks.ur.modes import PERMITTED, RobotMode, Runtime, SafetyMode
 from ftmocks.ur.robot import INSTALLED_G_M_S2, Robot
-from ftmocks.ur.script import Upload
 from ftmocks.ur.server import UrServer
 from ftmocks.ur.swing import Swing, SwingProgram
+from ftmocks.ur.uploads import Upload, start_upload
 
 Request = dict[str, Any]
 Verb = Callable[[Request], dict[str, Any] | None]
@@ -145,7 +145,7 @@ class Operator:
         self._robot.note("operator", "hand-guide", on=_on(request))
 
     def _pendant_program(self, request: Request) -> dict[str, Any]:
-        accepted = self._robot.upload(pendant_program(self._robot, _rest_s(request)), by="operator")
+        accepted = start_upload(self._robot, pendant_program(self._robot, _rest_s(request)), by="operator")
         return {"accepted": accepted}
 
     def _swing(self, request: Request) -> dict[str, Any]:
@@ -154,7 +154,7 @@ class Operator:
         if not robot.arm.at_rest:
             raise ValueError("the arm moves: let it stand first")
         swing = Swing(robot.arm.dh, robot.arm.q, float(request["seconds"]), **limits)
-        accepted = robot.pendant_start(SwingProgram(robot, swing))
+        accepted = robot.start_soon(SwingProgram(robot, swing), by="operator", obstacle=robot.obstacle)
         return {"accepted": accepted, "seconds": swing.duration_s, "period_s": swing.period_s}
 
     def _foreign_program(self, request: Request) -> dict[str, Any]:
@@ -163,7 +163,7 @@ class Operator:
             speed = float(request.get("speed_rad_s", FOREIGN_SPEED_RAD_S))
             does = f"movej({list(vector6(request['q_rad']))}, a=1.4, v={speed})"
         upload = Upload("other", f"def other():\n  {does}\nend\n", secondary=False)
-        accepted = self._robot.upload(upload, by="another script client")
+        accepted = start_upload(self._robot, upload, by="another script client")
         return {"accepted": accepted}
 
     def _speed_scaling(self, request: Request) -> None:
@@ -200,7 +200,8 @@ class Operator:
     def _claim_registers(self, request: Request) -> None:
         first = {"lower": 0, "upper": 24}[request["range"]]
         names = {f"input_{kind}_register_{first + i}" for kind in ("int", "double") for i in range(24)}
-        self._server.claimed = self._server.claimed | names if _on(request) else self._server.claimed - names
+        link = self._server.rtde
+        link.claimed = link.claimed | names if _on(request) else link.claimed - names
 
 
 def _on(request: Request) -> bool:
