@@ -109,7 +109,7 @@ def _read(
 
 
 def _words(result: dict[str, Any], frame: str) -> Iterator[str]:
-    from ftdrive.runs.verification import MARKS
+    from ftdrive.runs.verification_record import MARKS
 
     yield from (f" {MARKS[mark]}" for mark in result["marks"])
     yield f" {result['samples']} samples, {result['duration_s']:.2f} s, gaps: {result['gaps']}"

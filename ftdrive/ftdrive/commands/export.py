@@ -158,7 +158,7 @@ def calibration(
     from ftdrive.exports.calibration import registry
     from ftdrive.exports.calibration.settings import Settings, recorded_sensor
     from ftdrive.runs.source import read_calibration
-    from ftdrive.runs.verification import marks_of, verification_near
+    from ftdrive.runs.verification_record import marks_of, verification_near
     from ftdrive.terminal.console import hanging, talk
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})

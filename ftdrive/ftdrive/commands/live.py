@@ -28,7 +28,7 @@ from ftdrive.commands.common import (
     simulate,
     write_json,
 )
-from ftdrive.commands.live_source import open_source
+from ftdrive.commands.live_source import RECOVER_S, open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.processing import ProcessedStream
@@ -44,8 +44,6 @@ from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import Array
 
 _PERIOD_S = 0.1
-_RECOVER_S = 10.0
-"""So long a stream with an interruption may take to deliver again."""
 
 
 @click.command()
@@ -180,7 +178,7 @@ def _looks(stream: CompensatedStream | ReplayedStream, *, raises: bool = False) 
         except DeviceError as error:
             now_s = stream.clock.now_s()
             failing_since_s = now_s if failing_since_s is None else failing_since_s
-            if raises or look is None or now_s - failing_since_s > _RECOVER_S:
+            if raises or look is None or now_s - failing_since_s > RECOVER_S:
                 raise
             blocks.clear()
             yield replace(look, stale=str(error))

@@ -14,6 +14,9 @@ from ftdrive.session.rehearsal import short_calibration, station_of
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.screen import open_operator
 
+RECOVER_S = 10.0
+"""So long a stream with an interruption may take to deliver again; then the command ends."""
+
 
 def open_source(
     path: Path | None,

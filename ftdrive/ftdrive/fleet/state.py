@@ -8,7 +8,7 @@ from ftdrive.store.records import tool_in_words
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class BiasDrift:
     """Drift of the bias, from the verifications of the newest calibration."""
 
     level_sigmas: float
@@ -42,7 +42,7 @@ class CellState:
     """When the next verification is due, UTC; None for a cell that was never calibrated, which is due at once."""
     mass_kg: float | None = None
     temperature_C: float | None = None
-    drift: Drift | None = None
+    drift: BiasDrift | None = None
     """None with too few verifications."""
     emulated: bool = False
     """Whether the calibration was made in an emulated cell."""
@@ -68,7 +68,7 @@ FindingKind = Literal["payload", "temperature", "base", "overdue"]
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class FleetFinding:
     """Something that several results show together."""
 
     kind: FindingKind
@@ -82,4 +82,4 @@ class Fleet:
     """All cells and what they show together."""
 
     cells: tuple[CellState, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[FleetFinding, ...]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
 from ftcalib.files import JSON
-from ftdrive.runs.verification import VerificationRecord, marks_of
+from ftdrive.runs.verification_record import VerificationRecord, marks_of
 from ftdrivers.interfaces import Array, DeviceInfo
 
 Axes = Literal["sensor", "flange", "base", "tcp"]

@@ -34,7 +34,7 @@ from ftdrive.live.samples import (
     sensor_origin_m,
 )
 from ftdrive.runs.run import versions
-from ftdrive.runs.verification import VerificationRecord, calibration_in_words, marks_of, verification_near
+from ftdrive.runs.verification_record import VerificationRecord, calibration_in_words, marks_of, verification_near
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
@@ -198,7 +198,7 @@ class CompensatedStream(ProcessedStream):
             versions=versions(),
             verification=verification,
             calibration_state=state,
-            emulated=self.cell.clock.emulated,
+            emulated=self.cell.is_emulated,
         )
 
     def _trusted(self) -> tuple[VerificationRecord | None, str]:
@@ -206,7 +206,7 @@ class CompensatedStream(ProcessedStream):
         path = Path(self._name)
         known = path.name and path.exists()
         verification = verification_near(path, self._calibration.id) if known else None
-        marks = marks_of(self._calibration, emulated=self.cell.clock.emulated)
+        marks = marks_of(self._calibration, emulated=self.cell.is_emulated)
         return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC), marks)
 
     def use_tool(self, name: str) -> StreamEvent:

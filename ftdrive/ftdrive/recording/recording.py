@@ -18,7 +18,7 @@ from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame
-from ftdrive.runs.verification import VerificationRecord
+from ftdrive.runs.verification_record import VerificationRecord
 from ftdrivers.interfaces import DeviceInfo, Fact
 
 FORMAT: Final = "ftdrive.recording/1"

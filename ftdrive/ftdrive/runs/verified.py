@@ -19,7 +19,7 @@ from ftcalib.files import JSON, write_object
 from ftcalib.model import Array
 from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check, is_return
 from ftdrive.runs.run import Run, made_now
-from ftdrive.runs.verification import FORMAT, fitted_dataset, marks_of
+from ftdrive.runs.verification_record import FORMAT, fitted_dataset, marks_of
 
 FALSE_ALARMS: Final = 0.01
 """Share of verifications of an unchanged cell that fail."""

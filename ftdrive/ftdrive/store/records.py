@@ -14,7 +14,7 @@ from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_object
 from ftcalib.model import Array, Parameters
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import EMULATED, FORMAT, marks_of
+from ftdrive.runs.verification_record import EMULATED, FORMAT, marks_of
 
 _NUMBERS = tuple(field.name for field in fields(Parameters))
 
@@ -103,7 +103,7 @@ class StoredVerification:
     """(6,) its standard deviation from the calibration, which all its verifications share."""
 
 
-class Check(NamedTuple):
+class BriefVerification(NamedTuple):
     """What a fleet needs of a verification: a tuple, because it reads 20,000 of them a minute."""
 
     calibration_id: str

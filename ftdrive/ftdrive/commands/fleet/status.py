@@ -59,7 +59,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
 
 def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
     from ftdrive.fleet.words import due_in_words, verified_in_words
-    from ftdrive.runs.verification import age_in_words
+    from ftdrive.runs.verification_record import age_in_words
 
     drift = "-"
     if one.drift is not None:

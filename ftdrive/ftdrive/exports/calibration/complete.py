@@ -9,7 +9,7 @@ from ftcalib.files import JSON
 from ftdrive import __version__
 from ftdrive.exports.calibration.settings import Settings
 from ftdrive.exports.calibration.text import Exported, yaml_text
-from ftdrive.runs.verification import marks_of
+from ftdrive.runs.verification_record import marks_of
 
 FORMAT = "ftdrive.export/1"
 

@@ -15,7 +15,7 @@ from ftdrive.exports.calibration.difference import compensations, largest_differ
 from ftdrive.exports.calibration.formats import FORMATS, MAX_FORCE_ERROR_N, Format
 from ftdrive.exports.calibration.settings import Settings
 from ftdrive.exports.calibration.text import Exported, made_by, with_header
-from ftdrive.runs.verification import MARKS, marks_of
+from ftdrive.runs.verification_record import MARKS, marks_of
 
 TARGETS: Mapping[str, Callable[[CalibrationResult, Settings], Exported]] = {
     "kth": ros1.kth,

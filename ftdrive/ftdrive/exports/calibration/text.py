@@ -13,7 +13,7 @@ from ftcalib.files import JSON
 from ftdrive import __version__
 from ftdrive.exports.calibration.formats import Comment
 from ftdrive.exports.common import plain
-from ftdrive.runs.verification import VerificationRecord, marks_of
+from ftdrive.runs.verification_record import VerificationRecord, marks_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from ftdrive.checks.devices import AXES, check_rate
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
-from ftdrive.runs.verification import age_in_words
+from ftdrive.runs.verification_record import age_in_words
 from ftdrive.terminal.live import braille
 from ftdrive.terminal.live.braille import Codes
 from ftdrive.terminal.live.history import Columns

@@ -17,7 +17,8 @@ from ftdrive.cli import cli
 from ftdrive.errors import ConfigError, exit_code
 from ftdrive.runs.run import Run
 from ftdrive.session import session
-from ftdrive.session.session import Options
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.task import Calibrating
 from tests.edited_files import edit
 
 CELL = """format = "ftdrive.config/1"
@@ -40,11 +41,11 @@ class Opened(Exception):
 
 
 @pytest.fixture
-def cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[CellConfig, Options]]:
+def cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[CellConfig, SessionOptions]]:
     """What the session would begin with."""
-    found = list[tuple[CellConfig, Options]]()
+    found = list[tuple[CellConfig, SessionOptions]]()
 
-    def guide(cell: CellConfig, operator: object, options: Options) -> None:
+    def guide(cell: CellConfig, operator: object, options: SessionOptions) -> None:
         del operator
         found.append((cell, options))
         raise Opened
@@ -117,7 +118,7 @@ def begin(cells: list[Any], tmp_path: Path) -> Begin:
     def begun(*arguments: str) -> str:
         assert isinstance(call(*arguments), Opened)
         cell, options = cells.pop()
-        description = session._description(cell, {}, options)
+        description = session.description_of(Calibrating(cell), options, {})
         run = Run.create(tmp_path / "runs", "calibrate", json.loads(json.dumps(description)))
         run.plan_path.touch()
         return str(run.folder)

@@ -34,7 +34,7 @@ def test_the_limit_is_that_of_the_check_before_the_tour(payload_kg: float, lab: 
     )
     lab.arm.set_status(payload_kg=float(payload_kg), p_flange_payload_m=None)
     nothing: Any = None
-    before = Before(lab.cell, lab.arm, *[nothing] * 10)
+    before = Before(lab.open_cell(), lab.cell, *[nothing] * 7)
     assert (check_payload(before).state == "ok") == (described_cell.payload(float(payload_kg), 1.7, 0.3) == [])
 
 

@@ -1,6 +1,5 @@
-"""The verification of a calibration: a session with other poses, and a comparison at its end."""
+"""A verification: a session with fresh poses, each compared with the prediction of a calibration."""
 
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,19 +13,17 @@ from ftcalib.errors import BadDataset
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord
 from ftdrive.cell.config import CellConfig
-from ftdrive.checks.devices import belonging
-from ftdrive.errors import BadPlan, ConfigError, PlanRefused
+from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.cell_plan import speeds_of
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_verification
 from ftdrive.planning.search.nodes import WRIST_6_RAD
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import fitted_dataset
+from ftdrive.runs.verification_record import fitted_dataset
 from ftdrive.session.events import Compared
+from ftdrive.session.forecast import Averages
 from ftdrive.session.live_fit import Judge
-from ftdrive.session.task import Task
-from ftdrivers.interfaces import DeviceInfo
 
 POSES: Final = 6
 QUICK_POSES: Final = 2
@@ -38,25 +35,18 @@ HOLDS_POSES: Final = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Verifying(Task):
-    """A verification.
-
-    Parameters
-    ----------
-    calibration : CalibrationResult
-    path : Path
-        Its file.
-    poses : int
-        Number of fresh poses.
-    runs : Path
-        Folder of runs: the plan of an earlier verification is driven again if it still fits the cell.
-    """
+class Verifying:
+    """A verification."""
 
     command: ClassVar[str] = "verify"
+    cell: CellConfig
     calibration: CalibrationResult
     path: Path
+    """The file of the calibration."""
     poses: int
+    """Number of fresh poses."""
     runs: Path
+    """Folder of runs: the plan of an earlier verification is driven again if it still fits the cell."""
 
     @property
     def goal(self) -> str:
@@ -69,24 +59,31 @@ class Verifying(Task):
         dataset = fitted_dataset(self.calibration, self.path)
         return np.zeros((0, 3, 3)) if dataset is None else dataset.R_base_flange
 
-    def require(self, devices: Mapping[str, DeviceInfo], mount: str | None) -> tuple[str, ...]:
-        """Raise `ConfigError` for another arm, sensor or mounting than the calibration's."""
-        belongs = belonging(self.calibration, devices, mount)
-        if belongs.others:
-            raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Whether the poses may be those of the calibration."""
         if len(self.R_fitted):
-            return belongs.unknown
+            return ()
         lost = f"the poses of the calibration are unknown, because its dataset.json is not beside {self.path}"
-        return (*belongs.unknown, f"{lost}: the poses of the verification may be the same")
+        return (f"{lost}: the poses of the verification may be the same",)
 
-    def plan(self, cell: CellConfig, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
+    def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
         """Return the plan of the newest verification with as many poses, or a new one from joint angles (6,)."""
         earlier = self._earlier(certifier, q_rad, poses)
         if earlier is not None:
             return earlier
-        guess = guess_of(certifier, cell.tool.mass_kg)
-        plan = plan_verification(certifier, q_rad, poses, self.R_fitted, speeds=speeds_of(cell), guess=guess)
-        return plan.marked(measured=cell.workcell.measured, emulated=cell.clock.emulated)
+        guess = guess_of(certifier, self.cell.tool.mass_kg)
+        plan = plan_verification(certifier, q_rad, poses, self.R_fitted, speeds=speeds_of(self.cell), guess=guess)
+        return plan.marked(measured=self.cell.workcell.measured, emulated=self.cell.is_emulated)
+
+    def judge(self, *, by_hand: bool) -> Judge:
+        """Return who compares each pose with the calibration."""
+        return RunningComparison(self.calibration, self.R_fitted if by_hand else np.zeros((0, 3, 3)), self.poses)
+
+    def forecast(self, averages: Averages) -> str:
+        """Describe how far poses of an unchanged cell may be from the prediction."""
+        error_N, error_Nm = self.calibration.likely_error()
+        return f"{averages}; error of the calibration: {error_N:.2g} N, {error_Nm:.2g} N·m"
 
     def _earlier(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan | None:
         """Find a plan that was driven before: it may have been completed, so that it may run fast."""
@@ -104,33 +101,11 @@ class Verifying(Task):
         found = Run(folder).header().get("verification", {})
         return bool(found.get("id") == self.calibration.id)
 
-    def judge(self, cell: CellConfig, down_base: Array, *, by_hand: bool) -> Judge:
-        """Return who compares each pose with the calibration."""
-        del cell, down_base
-        return Comparison(self.calibration, self.R_fitted if by_hand else np.zeros((0, 3, 3)), self.poses)
 
-    def forecast(
-        self, cell: CellConfig, certifier: Certifier, plan: Plan, average_s: float, sigma: Array, *, real: bool
-    ) -> str:
-        """Describe how far poses of an unchanged cell may be from the prediction."""
-        del cell, certifier, plan, real
-        force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
-        error_N, error_Nm = self.calibration.likely_error()
-        return (
-            f"sigma of {average_s:g} s averages: {force_N:.2g} N, {torque_Nm:.2g} N·m; error of the calibration: "
-            f"{error_N:.2g} N, {error_Nm:.2g} N·m"
-        )
-
-
-class Comparison:
+class RunningComparison:
     """Compares each pose with the prediction of a calibration.
 
-    Parameters
-    ----------
-    R_fitted : array, shape (k, 3, 3)
-        Orientations of the calibration: poses near them do not count.
-    wanted : int
-        Number of poses that count.
+    Of the poses far from `R_fitted` (k, 3, 3), the orientations of the calibration, as many are needed as `wanted`.
     """
 
     weighed_kg: float | None = None

@@ -18,12 +18,13 @@ from ftcalib.routine import PoseRecord
 from ftdrive.errors import ConfigError, Declined
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Reading, Run
-from ftdrive.runs.verification import last_verification
+from ftdrive.runs.verification_record import last_verification
 from ftdrive.runs.verified import AcceptanceLimits, Verified, save_update, verify_run
 from ftdrive.session.completed_plans import has_completed
 from ftdrive.session.events import Checked, Compared, Noted, PoseTaken, RunOpened, State
-from ftdrive.session.session import Options, take_poses
-from ftdrive.session.verification import Comparison, Verifying
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.session import take_poses
+from ftdrive.session.verifying import RunningComparison, Verifying
 from ftdrivers.interfaces import DeviceInfo
 from tests.unit.ftdrive.fake_cell import Lab
 
@@ -55,10 +56,10 @@ def take(lab: Lab, calibration: CalibrationResult) -> Callable[..., Run]:
 
     def run(poses: int = 2, **options: Any) -> Run:
         path = lab.folder / "runs" / str(calibration.provenance["run"]) / "calibration.json"
-        task = Verifying(calibration, path, poses, lab.folder / "runs")
+        task = Verifying(lab.cell, calibration, path, poses, lab.folder / "runs")
         about = {"verification": {"id": calibration.id, "path": str(path), "poses": poses}}
-        given = Options(lab.folder / "runs", "verify", poses=poses, description=about, **options)
-        taken = take_poses(lab.cell, lab.operator, given, task)
+        given = SessionOptions(lab.folder / "runs", "verify", poses=poses, description=about, **options)
+        taken = take_poses(task, lab.operator, given)
         assert taken is not None
         return taken
 
@@ -224,7 +225,7 @@ def test_without_an_answer_nothing_moves(lab: Lab, take: Callable[..., Run]) -> 
 def test_only_fresh_poses_count_by_hand(lab: Lab, calibration: CalibrationResult) -> None:
     records = records_of(lab, calibration)
     used = np.array([record.before.R_base_flange for record in records])
-    comparison = Comparison(calibration, used, wanted=1)
+    comparison = RunningComparison(calibration, used, wanted=1)
     assert comparison.add(records[0]).light == "amber"
     assert comparison.add(records[0]).poses == 1
     near = comparison.add(turned(records[1], TURNED))
@@ -235,7 +236,7 @@ def test_only_fresh_poses_count_by_hand(lab: Lab, calibration: CalibrationResult
 
 def test_the_contact_guard_trusts_the_calibration_once_it_holds(lab: Lab, calibration: CalibrationResult) -> None:
     records = records_of(lab, calibration)
-    comparison, seen = Comparison(calibration, np.zeros((0, 3, 3)), wanted=6), []
+    comparison, seen = RunningComparison(calibration, np.zeros((0, 3, 3)), wanted=6), []
     for record in records[:3]:
         seen.append(comparison.predict(record.before.R_base_flange))
         comparison.add(record)
@@ -244,7 +245,7 @@ def test_the_contact_guard_trusts_the_calibration_once_it_holds(lab: Lab, calibr
     assert predicted is not None
     assert predicted == pytest.approx(records[4].mean.mean, abs=0.1)
     off = replace(calibration.parameters, force_bias_N=calibration.force_bias_N + np.array([3.0, 0.0, 0.0]))
-    comparison = Comparison(replace(calibration, parameters=off), np.zeros((0, 3, 3)), wanted=6)
+    comparison = RunningComparison(replace(calibration, parameters=off), np.zeros((0, 3, 3)), wanted=6)
     for record in records:
         comparison.add(record)
     assert comparison.predict(records[4].before.R_base_flange) is None
