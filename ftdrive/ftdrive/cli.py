@@ -7,6 +7,7 @@ import platform
 import signal
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from errno import ENOSPC
 from io import StringIO
 
@@ -45,7 +46,7 @@ _COMMANDS = {
 _EPILOG = """\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
 5 device fault, 6 file cannot be read or written, 7 check or acceptance failed, 8 recording has gaps,
-130 interrupted (data kept)."""
+9 supervisor gone (terminal, reader or input closed; data kept), 130 interrupted (data kept)."""
 
 
 class _LazyGroup(click.Group):
@@ -87,7 +88,8 @@ class _TalkHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         from ftdrive.terminal.console import talk
 
-        talk.print(self.format(record))
+        with suppress(OSError):  # a terminal that is closed
+            talk.print(self.format(record))
 
 
 def in_a_sentence(error: BaseException) -> str:
@@ -104,12 +106,25 @@ def in_a_sentence(error: BaseException) -> str:
 def main() -> int:
     """Run the command line; return the exit code."""
     # Ctrl-C, `kill` and a terminal that closes all end a command the same way: the arm is stopped first. Set even where
-    # they are inherited as ignored, as in a job in the background.
+    # they are inherited as ignored, as in a job in the background; but `nohup` means that the terminal may close.
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        if hasattr(signal, name):
+        if hasattr(signal, name) and not (name == "SIGHUP" and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN):
             signal.signal(getattr(signal, name), signal.default_int_handler)
     _open_closed_streams()
-    return run(sys.argv[1:])
+    try:
+        return run(sys.argv[1:])
+    finally:
+        _leave_dead_streams()
+
+
+def _leave_dead_streams() -> None:
+    """Connect standard streams without a reader to nothing: Python flushes them at its end, and fails."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _open_closed_streams() -> None:
@@ -130,7 +145,7 @@ def run(arguments: Sequence[str]) -> int:
         click.echo(in_whole_words(message.getvalue(), sys.stderr), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted", err=True)
+        _say("interrupted")
         return 130
     except Exception as error:
         code = exit_code(error)
@@ -138,5 +153,11 @@ def run(arguments: Sequence[str]) -> int:
             raise
         from ftdrive.terminal.console import in_whole_words
 
-        click.echo(in_whole_words(f"error: {in_a_sentence(error)}", sys.stderr), err=True)
+        _say(in_whole_words(f"error: {in_a_sentence(error)}", sys.stderr))
         return code
+
+
+def _say(text: str) -> None:
+    """Print on stderr, if that is open."""
+    with suppress(OSError):
+        click.echo(text, err=True)

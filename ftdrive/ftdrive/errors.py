@@ -54,6 +54,21 @@ class Declined(FtdriveError):
     """The operator answered no, or the input ended before an answer."""
 
 
+class SupervisorGone(FtdriveError):
+    """The operator, or the program in their place, does not follow the session any more.
+
+    Parameters
+    ----------
+    why : str
+        What was closed.
+    effect : str
+        What happens therefore, and what to do.
+    """
+
+    def __init__(self, why: str, effect: str = "the session ends, the arm at rest; continue it with --resume") -> None:
+        super().__init__(f"{why}: {effect}")
+
+
 _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (UsageError, 2),
     (ConnectError, 3),
@@ -64,6 +79,7 @@ _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (OSError, 6),
     (TooFewSamples, 4),
     (AcceptanceError, 7),
+    (SupervisorGone, 9),
 )
 """The first kind that fits counts."""
 

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any
@@ -78,16 +79,15 @@ class CommandLine:
         answer: dict[str, Any] = json.loads(outcome.stdout.splitlines()[-1])
         return answer
 
-    def start(self, *arguments: str | Path) -> subprocess.Popen[str]:
-        """Start it as a process: for signals, and for what happens while it runs."""
-        process = subprocess.Popen(
+    def start(self, *arguments: str | Path, **how: Any) -> subprocess.Popen[str]:
+        """Start it as a process: for signals, and for what happens while it runs. `how` is for `Popen`."""
+        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        process: subprocess.Popen[str] = subprocess.Popen(
             [sys.executable, "-m", "ftdrive", *map(str, arguments)],
             cwd=self.folder,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
             text=True,
             env=os.environ | self._environment,
+            **{**pipes, **how},
         )
         self._started.append(process)
         return process
@@ -134,8 +134,14 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str] | N
 
 
 def end_of(process: subprocess.Popen[str], typed: str = "") -> tuple[int, str]:
-    """Return the exit code and what was printed for people since."""
-    _, said = process.communicate(typed or None, timeout=_LONG_S)
+    """Return the exit code and what was printed for people since; the input stays open, as in a terminal."""
+    if typed:
+        say(process, typed)
+    stdin, process.stdin = process.stdin, None
+    _, said = process.communicate(timeout=_LONG_S)
+    if stdin is not None:
+        with suppress(BrokenPipeError):
+            stdin.close()
     return process.returncode, said
 
 

@@ -49,6 +49,9 @@ class Unattended:
     def ask(self, question: Question) -> str:
         raise Declined(question.text)
 
+    def absence(self) -> None:
+        return None
+
     def pressed(self) -> None:
         return None
 

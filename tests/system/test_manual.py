@@ -99,6 +99,9 @@ class Person:
     def ask(self, question: Question) -> str:
         raise AssertionError(question)
 
+    def absence(self) -> None:
+        return None
+
     def pressed(self) -> Key | None:
         return None
 

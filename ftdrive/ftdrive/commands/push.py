@@ -15,14 +15,14 @@ from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
 from ftdrive.commands.common import CELL, JSON, check_simulate, declined_aborts, read_cell, simulate, write_json
 from ftdrive.commands.emulated_run import rehearsed_run
-from ftdrive.errors import ConfigError
+from ftdrive.errors import ConfigError, SupervisorGone
 from ftdrive.runs.push_receipt import Receipt
 from ftdrive.runs.source import read_calibration
-from ftdrive.session.operator import Operator, Question
+from ftdrive.session.operator import Question
 from ftdrive.session.settings_push import EFFECTS, WORDS, propose, restore, send
 from ftdrive.terminal.console import in_whole_words, talk
-from ftdrive.terminal.operators import JsonOperator, PlainOperator
 from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
+from ftdrive.terminal.screen import open_operator
 
 _PATH = click.Path(exists=True, path_type=Path)
 
@@ -59,8 +59,8 @@ def push(
         raise ConfigError("--restore takes everything from the receipt: leave RESULT, --payload and --gravity out")
     if not (source or receipt or simulate):
         raise ConfigError("nothing to push: give a calibration.json or a run folder, --restore or --simulate")
-    operator: Operator = JsonOperator() if as_json else PlainOperator()
     with ExitStack() as stack:
+        operator = stack.enter_context(open_operator(as_json=as_json, live=False))
         path = source or receipt or stack.enter_context(rehearsed_run(sensor))
         folder = path if path.is_dir() else path.parent
         of = read_calibration(path) if receipt is None else Receipt.load(path)
@@ -87,8 +87,12 @@ def push(
             if not simulate:
                 operator.ask(Question(EFFECTS[name], (WORDS[name],)))
 
+        def require_supervisor() -> None:
+            if why := operator.absence():
+                raise SupervisorGone(why, "nothing more is sent; start the push again")
+
         with declined_aborts():
-            saved, read_back = send(arm, proposal, folder, ask)
+            saved, read_back = send(arm, proposal, folder, ask, require_supervisor)
         if as_json:
             write_json({"schema_version": 1, **json.loads(saved.read_text(encoding="utf-8")), "file": str(saved)})
             return

@@ -12,7 +12,7 @@ from ftcalib.data.averaging_time import averaging_time
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, mean_and_covariance, noise_level
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord, Sampling
-from ftdrive.errors import ConfigError
+from ftdrive.errors import ConfigError, SupervisorGone
 from ftdrive.planning.approach import arm_moves, plan_approach
 from ftdrive.planning.cell_plan import certifier_for, speeds_of
 from ftdrive.planning.geometry.certify import Certifier
@@ -164,6 +164,7 @@ class AlongPlan:
         load = guards.RangeGuard(cell.limits, before.sensor_range)
         contact = self._contact_guard(pace, judge)
         rows = (
+            guards.SupervisorGuard(cell.journal.absence),
             guards.SafetyGuard(),
             guards.PathGuard(cell.limits),
             guards.SensorGuard(cell.limits),
@@ -175,7 +176,8 @@ class AlongPlan:
         )
 
         def on_trip(trip: guards.Tripped) -> None:
-            cell.journal.show(GuardTripped(hazard=trip.hazard, words=str(trip)))
+            with suppress(SupervisorGone):  # it is recorded all the same, and the tour asks the operator next
+                cell.journal.show(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
         watcher = Watcher(cell, rows, on_trip)
         questions = SafetyQuestions(cell, before.plan)

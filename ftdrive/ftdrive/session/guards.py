@@ -13,6 +13,7 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftdrive.checks.devices import AXES
+from ftdrive.errors import SupervisorGone
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.hazards import Hazard
 from ftdrivers.clock import Clock
@@ -127,6 +128,20 @@ class Guard(ABC):
     @abstractmethod
     def look(self, seen: Seen) -> None:
         """Raise `Tripped`."""
+
+
+@dataclass
+class SupervisorGuard(Guard):
+    """Row 27: an operator, or a program in their place, follows the session."""
+
+    absence: Callable[[], str | None]
+    """As `Operator.absence`."""
+
+    def look(self, seen: Seen) -> None:
+        """Look at the far ends of the streams."""
+        del seen  # the arm does not show it
+        if why := self.absence():
+            raise Tripped(Hazard.SUPERVISOR_GONE, SupervisorGone(why))
 
 
 @dataclass

@@ -344,6 +344,7 @@ class HandGuided:
         self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
 
     def _obey_keys(self) -> None:
+        self._operator.require_operator()
         while not self._over and (key := self._operator.pressed()):
             self._obey(key)
 

@@ -35,3 +35,5 @@ class Hazard(IntEnum):
     LOOSE_BASE = 24
     WRONG_PLAN = 25
     DISK_FULL = 26
+    SUPERVISOR_GONE = 27
+    """The operator, or the program in their place, does not follow the session any more."""

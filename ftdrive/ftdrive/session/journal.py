@@ -2,10 +2,13 @@
 
 import logging
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 
-from ftdrive.errors import Declined
+from ftdrive.errors import Declined, SupervisorGone
 from ftdrive.runs.run import Run
-from ftdrive.session.events import Asked, Event, RunOpened
+from ftdrive.session.events import Asked, Event, GuardTripped, RunOpened
+from ftdrive.session.hazards import Hazard
 from ftdrive.session.operator import Key, Operator, Question
 
 log = logging.getLogger(__name__)
@@ -22,6 +25,8 @@ class Journal:
         self._lock = threading.RLock()
         self._run: Run | None = None
         self._early: list[Event] = []
+        self._is_seen = True
+        self._absence_recorded = False
 
     def keep_in(self, run: Run) -> None:
         """Record in the run, starting with the events so far."""
@@ -33,21 +38,54 @@ class Journal:
         self.show(RunOpened(folder=str(run.folder), resume=run.resume_command), sync=True)
 
     def show(self, event: Event, *, sync: bool = False) -> None:
-        """Show and record an event."""
+        """Show and record an event. Raises `SupervisorGone` at the first one that cannot be seen any more."""
         with self._lock:
-            self._operator.show(event)
-            if self._run is None:
-                self._early.append(event)
-                return
             try:
-                self._run.append_event(event.to_dict(), sync=sync)
-            except OSError as error:  # a pose that cannot be written raises
-                log.warning("events.ndjson cannot be written: %s", error)
+                self._operator.show(event)
+            except SupervisorGone:
+                self._record(event, sync=sync)
+                if self._is_seen:
+                    self._is_seen = False
+                    raise
+            else:
+                self._record(event, sync=sync)
+
+    def _record(self, event: Event, *, sync: bool) -> None:
+        self._absence_recorded |= isinstance(event, GuardTripped) and event.hazard == Hazard.SUPERVISOR_GONE
+        if self._run is None:
+            self._early.append(event)
+            return
+        try:
+            self._run.append_event(event.to_dict(), sync=sync)
+        except OSError as error:  # a pose that cannot be written raises
+            log.warning("events.ndjson cannot be written: %s", error)
+
+    def absence(self) -> str | None:
+        """As `Operator.absence`."""
+        return self._operator.absence()
+
+    def require_operator(self) -> None:
+        """Raise `SupervisorGone` if no operator follows the session any more."""
+        if why := self.absence():
+            raise SupervisorGone(why)
+
+    @contextmanager
+    def recording_absence(self) -> Iterator[None]:
+        """Record a `SupervisorGone` of the block, unless its event is recorded already."""
+        try:
+            yield
+        except SupervisorGone as gone:
+            if not self._absence_recorded:
+                with suppress(SupervisorGone):
+                    self.show(GuardTripped(hazard=Hazard.SUPERVISOR_GONE, words=str(gone)), sync=True)
+            raise
 
     def ask(self, question: Question) -> str:
-        """Ask; record the answer and who gave it."""
+        """Ask; record the answer and who gave it. Raises `SupervisorGone`, also where `--yes` would answer."""
         assumed = question.assumed if self._yes else None
-        answer = self._operator.ask(question) if assumed is None else assumed
+        with self.recording_absence():  # the arm stands
+            self.require_operator()
+            answer = self._operator.ask(question) if assumed is None else assumed
         self.show(Asked(question=question.text, answer=answer, by="person" if assumed is None else "--yes"))
         return answer
 

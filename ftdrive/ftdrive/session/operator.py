@@ -33,10 +33,16 @@ class Operator(Protocol):
     """The operator as the session sees them."""
 
     def show(self, event: Event) -> None:
-        """Show an event; returns at once."""
+        """Show an event; returns at once. Raises `SupervisorGone` if it cannot be seen any more."""
 
     def ask(self, question: Question) -> str:
-        """Wait for one of the question's answers; raises `Declined` if no operator can answer."""
+        """Wait for one of the question's answers; raises `Declined` or `SupervisorGone` if no operator can answer."""
+
+    def absence(self) -> str | None:
+        """Return what shows that no operator follows the session any more, such as a closed terminal; else None.
+
+        Any thread may call it; returns at once.
+        """
 
     @property
     def has_keys(self) -> bool:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
+from ftdrive.errors import SupervisorGone
 from ftdrive.session.events import GuardTripped, SensorEvents
 from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, arm_lost, by_safety
 from ftdrive.session.hazards import Hazard
@@ -91,6 +92,8 @@ class GuardedCell:
     def _row_of(self, error: Exception, *, moving: bool) -> Tripped | None:
         if isinstance(error, Tripped):
             return error
+        if isinstance(error, SupervisorGone):
+            return Tripped(Hazard.SUPERVISOR_GONE, error)
         if isinstance(error, OSError) and not isinstance(error, DeviceError):
             return Tripped(Hazard.DISK_FULL, error)
         if not isinstance(error, DeviceError):

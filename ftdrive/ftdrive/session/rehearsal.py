@@ -26,6 +26,10 @@ class NoOperator:
         """Raise `Declined`."""
         raise Declined(f"no operator can answer: {question.text}")
 
+    def absence(self) -> str | None:
+        """Return None: a session without an operator misses none."""
+        return None
+
     def pressed(self) -> Key | None:
         """Return None."""
         return None
@@ -47,6 +51,9 @@ class _Unkept:
 
     def ask(self, question: Question) -> str:
         return self._operator.ask(question)
+
+    def absence(self) -> str | None:
+        return self._operator.absence()
 
     def pressed(self) -> Key | None:
         return self._operator.pressed()

@@ -41,7 +41,7 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
         The operator ended it.
     NotAccepted, PlanRefused, ConfigError
         The session refuses to start.
-    DeviceError, OSError
+    DeviceError, OSError, SupervisorGone
         The session failed; the poses taken are in the run, which can be resumed.
     """
     config = task.cell
@@ -53,7 +53,13 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
         raise ConfigError(f"{resumed.folder} was not made by {task.command}: continue it with {resumed.resume_command}")
     plan = None if options.by_hand else plan_on_disk(options, resumed)
     device, driver = build_sensor(config), build_arm(config)
-    with ExitStack() as locked, device as sensor, closing(driver) as arm, preflight.awake() as kept_awake:
+    with (
+        ExitStack() as locked,
+        device as sensor,
+        closing(driver) as arm,
+        preflight.awake() as kept_awake,
+        journal.recording_absence(),
+    ):
         if resumed is not None:
             journal.keep_in(locked.enter_context(resumed))
         cell = OpenCell(arm, sensor, config.clock, journal, Limits.of(config.clock))

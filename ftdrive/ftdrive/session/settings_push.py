@@ -22,7 +22,7 @@ from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.push_receipt import Receipt, write_receipt
 from ftdrive.session.guards import Limits
 from ftdrive.session.preflight import require_no_program
-from ftdrivers.interfaces import ControllerSettings, DeviceInfo, ForceTorqueSensor, RobotArm
+from ftdrivers.interfaces import ControllerSettings, DeviceInfo, ForceTorqueSensor, Guard, RobotArm
 
 WORDS: Final = {"payload": "PUSH", "gravity": "GRAVITY"}
 """What is typed to send each setting."""
@@ -185,8 +185,12 @@ def _unit(vector: Any) -> Array:
 # ------------------------------------------------------------------------------------------------------------- sending
 
 
-def send(arm: RobotArm, push: Push, folder: Path, ask: Ask) -> tuple[Path, ControllerSettings]:
+def send(
+    arm: RobotArm, push: Push, folder: Path, ask: Ask, guard: Guard = lambda: None
+) -> tuple[Path, ControllerSettings]:
     """Ask for a word for each setting, send them, and read them back.
+
+    `guard` is called before each setting is sent, and may raise.
 
     Returns the path of the receipt, a new file in `folder`, and what the controller keeps.
 
@@ -208,9 +212,10 @@ def send(arm: RobotArm, push: Push, folder: Path, ask: Ask) -> tuple[Path, Contr
     _wait_until_still(arm)
     if arm.controller_settings() != push.old:
         raise NotAccepted("the settings of the controller have changed meanwhile: start again; nothing was sent")
+    guard()
     read_back, failure = None, ""
     try:
-        _set(arm, push.new)
+        _set(arm, push.new, guard)
         arm.close()  # what the controller keeps without our program
         arm.open()
         read_back = arm.controller_settings()
@@ -239,9 +244,10 @@ EFFECTS: Final = {
 """What each setting does, with the question."""
 
 
-def _set(arm: RobotArm, new: ControllerSettings) -> None:
+def _set(arm: RobotArm, new: ControllerSettings, guard: Guard) -> None:
     if new.mass_kg is not None and new.p_flange_com_m is not None:
         arm.set_payload(new.mass_kg, new.p_flange_com_m, new.inertia_kg_m2 or (0.0,) * 6)
+        guard()
     if new.up_base_m_s2 is not None:
         arm.set_gravity(new.up_base_m_s2)
 

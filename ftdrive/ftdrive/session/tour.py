@@ -17,7 +17,7 @@ from ftcalib.errors import TooFewSamples
 from ftcalib.model import Array
 from ftcalib.routine import Sampling, Stage, TourPose, take_pose
 from ftdrive.checks.devices import SLOWEST_SLIDER
-from ftdrive.errors import Declined, NotAccepted, PlanRefused
+from ftdrive.errors import Declined, NotAccepted, PlanRefused, SupervisorGone
 from ftdrive.planning.approach import arm_moves, plan_approach
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
@@ -102,7 +102,7 @@ class Tour:
         ------
         Declined
             The operator ended it, or no operator answered.
-        Tripped, DeviceError, OSError
+        Tripped, DeviceError, OSError, SupervisorGone
             What stopped the arm, if the operator then ended the tour.
         """
         self._now.todo = list(todo)
@@ -112,7 +112,7 @@ class Tour:
                 self._next()
             except Turned as turned:
                 self._turn(turned.key)
-            except (Tripped, DeviceError, OSError, OperatorStop, TooFewSamples, NotAccepted) as error:
+            except (Tripped, DeviceError, OSError, OperatorStop, TooFewSamples, NotAccepted, SupervisorGone) as error:
                 self._hold(error)
         self._guarded.show_new()
         self._show_state(State.CLOSE)
@@ -387,6 +387,9 @@ class Tour:
             self._show_state(State.STOP, words=str(error))
             raise Declined(str(error))
         trip = self._guarded.cause(error, moving=not self._now.standing)
+        if trip is not None and trip.hazard == Hazard.SUPERVISOR_GONE:
+            self._show_state(State.STOP, words=str(trip))
+            raise trip.error
         if trip is not None and self._reopened_sensor(trip):
             return
         stop, back = self._now.todo[0], self._now.came_from
@@ -410,12 +413,7 @@ class Tour:
         choices = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
         question = Question(f"{len(self._book.run.stops())} poses are saved. {choices}", tuple(ways))
         while True:
-            try:
-                answer = self._journal.ask(question)
-            except Declined:
-                raise end from error
-            if answer == "quit":
-                raise end
+            answer = self._choose(question, end)
             try:
                 self._guarded.reopen()
             except (Tripped, DeviceError, NotAccepted, Declined) as again:
@@ -426,6 +424,18 @@ class Tour:
             if answer == "back" and back is not None:
                 self._now.back = (back, words)
             return
+
+    def _choose(self, question: Question, end: Exception) -> str:
+        """Ask how to go on; raise `end`, the first cause, if the operator quits or does not answer."""
+        try:
+            answer = self._journal.ask(question)
+        except SupervisorGone as gone:
+            raise (gone if isinstance(end, Declined) else end) from gone
+        except Declined:
+            raise end from None
+        if answer == "quit":
+            raise end
+        return answer
 
     def _reopened_sensor(self, trip: Tripped) -> bool:
         """Reopen a sensor that failed while the arm stood at a pose, once for each pose; the pose is restarted."""

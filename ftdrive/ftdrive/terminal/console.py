@@ -14,6 +14,10 @@ class Talk(Console):
 
     verbose = False
 
+    def on_broken_pipe(self) -> None:
+        """Go on without output: rich would end the thread that prints, and close standard output too."""
+        self.quiet = True
+
 
 talk = Talk(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
 """Folds between words in a terminal, never in a file. Prints brackets and colons as they are: paths contain them."""

@@ -127,6 +127,6 @@ class Keyboard:
                         self._keys.append(key)
                 word += letters
         except OSError:
-            return  # the terminal is gone: SIGHUP ends the program
+            return  # the terminal is gone: the supervisor reports it
         finally:
             os.close(wake)

@@ -12,6 +12,7 @@ from ftdrive.session.events import SCHEMA_VERSION, Asked, Event
 from ftdrive.session.operator import Key, Question
 from ftdrive.terminal.console import in_whole_words
 from ftdrive.terminal.session_text import SessionText, TextLine
+from ftdrive.terminal.supervisor import Supervisor
 
 
 def match(question: Question, typed: str) -> str | None:
@@ -37,20 +38,22 @@ def prompt(question: Question) -> str:
     return f"{question.text} [{'/'.join(answer or 'Enter' for answer in question.answers)}] "
 
 
-def read_line(stdin: TextIO, question: Question) -> str:
-    """Read one line; raises `Declined` at the end of the input."""
-    line = stdin.readline()
-    if not line:
-        raise Declined(
-            f"no answer to '{prompt(question).strip()}': run it in a terminal, or put the answer on standard input"
-        )
-    return line
+def read_line(supervisor: Supervisor, question: Question) -> str:
+    """Read one line; raises as `Supervisor.read_line`."""
+    return supervisor.read_line(
+        f"no answer to '{prompt(question).strip()}': run it in a terminal, or put the answer on standard input"
+    )
 
 
 class _Keyless:
     """An operator without keys: SIGINT stops a session."""
 
     has_keys = False
+    supervisor: Supervisor
+
+    def absence(self) -> str | None:
+        """Return why the session is not followed any more; see `Operator`."""
+        return self.supervisor.absence()
 
     def pressed(self) -> Key | None:
         """Return None."""
@@ -65,7 +68,8 @@ class JsonOperator(_Keyless):
     """
 
     def __init__(self, *, stdin: TextIO | None = None, stdout: TextIO | None = None) -> None:
-        self._stdin, self._stdout = stdin or sys.stdin, stdout or sys.stdout
+        self._stdout = stdout or sys.stdout
+        self.supervisor = Supervisor(stdin or sys.stdin, self._stdout, "standard output")
         self._lock = Lock()
 
     def show(self, event: Event) -> None:
@@ -85,14 +89,14 @@ class JsonOperator(_Keyless):
                     "error": error,
                 }
             )
-            typed = read_line(self._stdin, question)
+            typed = read_line(self.supervisor, question)
             if (answer := match(question, typed)) is not None:
                 return answer
             error = f"'{typed.strip()}' is none of the answers"
 
     def _write(self, value: Mapping[str, Any]) -> None:
         line = json.dumps(value, allow_nan=False) + "\n"
-        with self._lock:
+        with self._lock, self.supervisor.writing():
             self._stdout.write(line)
             self._stdout.flush()
 
@@ -112,6 +116,7 @@ class PlainOperator(_Keyless):
         self, *, stdin: TextIO | None = None, stderr: TextIO | None = None, quiet: bool = False, verbose: bool = False
     ) -> None:
         self._stdin, self._stderr = stdin or sys.stdin, stderr or sys.stderr
+        self.supervisor = Supervisor(self._stdin, self._stderr, "standard error")
         self._text = SessionText(verbose=verbose)
         self._quiet, self._withheld = quiet, list[TextLine]()
         self._lock = Lock()
@@ -138,7 +143,7 @@ class PlainOperator(_Keyless):
         while True:
             self._write(prompt(question))
             try:
-                typed = read_line(self._stdin, question)
+                typed = read_line(self.supervisor, question)
             except (KeyboardInterrupt, Declined):
                 self._write("\n")  # the next message begins on a new line
                 raise
@@ -160,6 +165,6 @@ class PlainOperator(_Keyless):
             self._write(f"{line.head}{line.words}\n", line.head)
 
     def _write(self, text: str, head: str = "") -> None:
-        with self._lock:
+        with self._lock, self.supervisor.writing():
             self._stderr.write(in_whole_words(text, self._stderr, head))
             self._stderr.flush()

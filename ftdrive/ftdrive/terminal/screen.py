@@ -5,7 +5,7 @@ import sys
 import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import median
@@ -21,7 +21,7 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from ftcalib.routine import DriftCheck
-from ftdrive.errors import Declined
+from ftdrive.errors import Declined, SupervisorGone
 from ftdrive.session.events import (
     Asked,
     Compared,
@@ -41,6 +41,7 @@ from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
 from ftdrive.terminal.session_text import SessionText, TextLine, in_words, rms_sigma, sigmas_of
+from ftdrive.terminal.supervisor import Supervisor
 from ftdrivers.interfaces import Array
 
 REFRESH_HZ = 4
@@ -400,7 +401,8 @@ class Screen:
         command: str = "calibrate",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._console, self._keyboard, self._stdin = console, keyboard, stdin or sys.stdin
+        self._console, self._keyboard = console, keyboard
+        self.supervisor = Supervisor(stdin or sys.stdin, console.file, "standard error")
         self._clock = clock
         self._view = SessionView(command, ascii_only=console.options.ascii_only)
         self._text = SessionText(verbose=verbose, poses=False)
@@ -418,7 +420,8 @@ class Screen:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._view.keys = "over"
-        with self._stack:
+        gone = suppress(OSError) if self.supervisor.absence() else nullcontext()  # nothing is drawn any more
+        with gone, self._stack:
             self._print(self._text.pending())
             self._live.transient = kind is None  # after an error the frame stays: it has the command to resume
             self._live.stop()
@@ -429,7 +432,8 @@ class Screen:
         """Show an event."""
         with self._lock:
             self._view.update(event, self._clock())
-        self._print(self._text.lines(event) if _history(event, self._view) else self._text.pending())
+        with self.supervisor.writing():
+            self._print(self._text.lines(event) if _history(event, self._view) else self._text.pending())
 
     def ask(self, question: Question) -> str:
         """Ask below the frame, which is not redrawn until the answer is there."""
@@ -442,6 +446,10 @@ class Screen:
         self._live = self._new_live()  # the old one would erase the lines of its last frame
         self._live.start(refresh=True)
         return answer
+
+    def absence(self) -> str | None:
+        """Return why the session is not followed any more; see `Operator`."""
+        return self.supervisor.absence()
 
     @property
     def has_keys(self) -> bool:
@@ -470,7 +478,7 @@ class Screen:
                 self._console.print(line)
             self._console.print(last, end=" ", soft_wrap=True)
             try:
-                typed = read_line(self._stdin, question)
+                typed = read_line(self.supervisor, question)
             except (KeyboardInterrupt, Declined):
                 self._console.file.write("\n")  # the next message begins on a new line
                 raise
@@ -504,21 +512,25 @@ def _history(event: Event, view: SessionView) -> bool:
 
 
 @contextmanager
-def open_operator(*, as_json: bool = False, command: str = "calibrate") -> Iterator[Operator]:
+def open_operator(*, as_json: bool = False, command: str = "calibrate", live: bool = True) -> Iterator[Operator]:
     """Choose the operator of a task: JSON if requested, a live screen in a terminal, otherwise plain lines.
 
-    The screen is drawn on stderr. A dumb terminal and `-q` get plain lines.
+    The screen is drawn on stderr. A dumb terminal, `-q` and tasks that are not `live` get plain lines.
     """
     if as_json:
-        yield JsonOperator()
+        scripted = JsonOperator()
+        with scripted.supervisor:
+            yield scripted
         return
-    if talk.quiet or not talk.is_terminal or talk.is_dumb_terminal or not os.isatty(0):
+    if not live or talk.quiet or not talk.is_terminal or talk.is_dumb_terminal or not os.isatty(0):
         operator = PlainOperator(quiet=talk.quiet, verbose=talk.verbose)
-        try:
-            yield operator
-        finally:
-            operator.finish()
+        with operator.supervisor:
+            try:
+                yield operator
+            finally:
+                with suppress(SupervisorGone):
+                    operator.finish()
         return
     keyboard = Keyboard(0) if Keyboard.usable(0) else None
-    with Screen(talk, keyboard, verbose=talk.verbose, command=command) as screen:
+    with Screen(talk, keyboard, verbose=talk.verbose, command=command) as screen, screen.supervisor:
         yield screen

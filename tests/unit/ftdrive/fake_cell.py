@@ -264,6 +264,8 @@ class Scripted:
     has_keys: bool = True
     shown: list[Event] = field(default_factory=list)
     asked: list[Question] = field(default_factory=list)
+    gone: str | None = None
+    """What was closed between the session and its operator."""
 
     def show(self, event: Event) -> None:
         self.shown.append(event)
@@ -280,6 +282,9 @@ class Scripted:
         if "resume" in question.answers:
             raise Declined("unattended")
         return question.answers[0]
+
+    def absence(self) -> str | None:
+        return self.gone
 
     def pressed(self) -> Key | None:
         return self.keys.pop(0) if self.keys else None

@@ -15,6 +15,7 @@ from ftcalib import solve
 from ftcalib.errors import TooFewSamples
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord, Sampling, dataset_from, drift_check
+from ftdrive.errors import SupervisorGone
 from ftdrive.session.events import Compared, Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import HandGuided
@@ -171,6 +172,7 @@ class Person:
     def __init__(self, cell: Cell, keys: dict[float, Key], *, has_keys: bool = True) -> None:
         self.cell = cell
         self.has_keys = has_keys
+        self.gone: str | None = None
         self.keys = keys | {cell.end_s + 20: Key.STOP}
         self.shown: list[Event] = []
 
@@ -180,6 +182,10 @@ class Person:
 
     def ask(self, question: Question) -> str:
         raise AssertionError(question)
+
+    def require_operator(self) -> None:
+        if self.gone:
+            raise SupervisorGone(self.gone)
 
     def pressed(self) -> Key | None:
         if not self.has_keys:
@@ -623,6 +629,19 @@ def test_a_slow_sensor_is_averaged_for_longer() -> None:
 def test_a_sensor_that_is_too_slow_is_refused() -> None:
     outcome = Outcome(dwells(UP), rate_Hz=2, raises=pytest.raises(TooFewSamples, match=r"16 samples in 8\.0 s"))
     assert outcome.stops == []
+
+
+def test_without_an_operator_it_ends_and_what_is_committed_stands() -> None:
+    cell = Cell(dwells(*AROUND))
+    person, kept = Person(cell, {}), list[PoseRecord]()
+
+    def commit(record: PoseRecord) -> None:
+        kept.append(record)
+        person.gone = "the terminal was closed" if len(kept) == 2 else None
+
+    with pytest.raises(SupervisorGone, match="terminal"):
+        guided(cell, person, SimpleNamespace(commit=commit), Fit(), Sampling(average_s=AVERAGE_S)).run((), "")
+    assert len(kept) == 2
 
 
 def test_a_disk_that_is_full_ends_it() -> None:

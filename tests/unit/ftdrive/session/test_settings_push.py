@@ -11,7 +11,7 @@ import pytest
 from ftcalib import CalibrationResult, Finding, Parameters
 from ftcalib.errors import BadDataset
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
-from ftdrive.errors import ConfigError, Declined, NotAccepted
+from ftdrive.errors import ConfigError, Declined, NotAccepted, SupervisorGone
 from ftdrive.runs.push_receipt import Receipt
 from ftdrive.session.settings_push import Push, propose, restore, send
 from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
@@ -248,6 +248,19 @@ def test_without_the_word_nothing_is_sent(cell: Cell) -> None:
     with pytest.raises(Declined):
         cell.send(cell.propose())
     assert (cell.arm.sent, cell.receipts()) == ([], [])
+
+
+@pytest.mark.parametrize("sent", [0, 1])
+def test_nothing_more_is_sent_once_the_supervisor_is_gone(sent: int, cell: Cell) -> None:
+    def guard() -> None:
+        if len(cell.arm.sent) == sent:
+            raise SupervisorGone("the terminal was closed")
+
+    push = cell.propose(cell.result(lean_deg=2.0), payload=True, gravity=True)
+    with pytest.raises(SupervisorGone):
+        send(cell.arm, push, cell.folder, cell.ask, guard)
+    assert len(cell.arm.sent) == sent
+    assert ["the terminal was closed" in receipt["error"] for receipt in cell.receipts()] == [True] * sent
 
 
 def test_values_that_change_during_the_question_are_not_overwritten(cell: Cell) -> None:

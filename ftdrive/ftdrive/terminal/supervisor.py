@@ -1,0 +1,126 @@
+"""Whether an operator, or a program in their place, still follows a session through its streams and its terminal."""
+
+import os
+import select
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import IO, Any, Final, Self, TextIO
+
+from ftdrive.errors import Declined, SupervisorGone
+
+_LOOK_MS: Final = 50
+"""Period of the looks while an answer is awaited."""
+
+
+class Supervisor:
+    """The far ends of the streams of a session. Only `read_line` reads, never beyond its line.
+
+    Within its `with` block the hang-up of the terminal (SIGHUP) is noticed too, unless it is ignored, as under `nohup`.
+    The end of an input matters only if its writer was there when a question was asked: answers that were all prepared
+    before, and an input that no question is read from, may end.
+
+    Parameters
+    ----------
+    stdin : TextIO
+        Answers come from there.
+    output : TextIO
+        Shows the session.
+    name : str
+        Of the output, for messages.
+    """
+
+    def __init__(self, stdin: TextIO, output: IO[str], name: str) -> None:
+        self._stdin, self._input, self._output, self._name = stdin, _descriptor(stdin), _descriptor(output), name
+        self._terminals = [fd for fd in (self._input, self._output) if fd is not None and os.isatty(fd)]
+        self._answers = False  # whether a writer was there when a question was asked
+        self._hung_up = False
+        self._handler_before: Any = None
+
+    def __enter__(self) -> Self:
+        if hasattr(signal, "SIGHUP") and threading.current_thread() is threading.main_thread():
+            before = signal.getsignal(signal.SIGHUP)
+            if before not in {signal.SIG_IGN, None}:
+                self._handler_before = signal.signal(signal.SIGHUP, self._hang_up)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        before, self._handler_before = self._handler_before, None
+        if before is not None:
+            signal.signal(signal.SIGHUP, before)
+
+    def _hang_up(self, *_: object) -> None:
+        self._hung_up = True
+
+    def absence(self) -> str | None:
+        """Return why the session is not followed any more; see `Operator`."""
+        if self._hung_up or any(map(_is_closed, self._terminals)):
+            return "the terminal was closed"
+        if self._output is not None and _is_closed(self._output):
+            return f"the reader of {self._name} is gone"
+        if self._answers and self._input is not None and _is_closed(self._input, reading=True):
+            return "standard input, from which answers come, was closed"
+        return None
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Raise `SupervisorGone` for an error of the block if the output has lost its reader."""
+        try:
+            yield
+        except OSError as error:
+            if why := self.absence():
+                raise SupervisorGone(why) from error
+            raise
+
+    def read_line(self, unanswered: str) -> str:
+        """Read one line; raises `SupervisorGone`, or `Declined` with `unanswered` if the input has ended before."""
+        fd = self._input
+        if fd is None or not hasattr(select, "poll"):
+            line = self._stdin.readline()
+        else:
+            self._answers |= fd not in self._terminals and not _is_closed(fd, reading=True)
+            line = self._read_bytes(fd).decode(self._stdin.encoding or "utf-8", errors="replace")
+        if not line:
+            if why := self.absence():
+                raise SupervisorGone(why)
+            raise Declined(unanswered)
+        return line
+
+    def _read_bytes(self, fd: int) -> bytes:
+        """Read one byte after another, as a shell does: what is left stays in the stream, where its end is seen."""
+        poller, line = select.poll(), b""
+        poller.register(fd, select.POLLIN)
+        while not line.endswith(b"\n"):
+            while not poller.poll(_LOOK_MS):
+                if why := self.absence():
+                    raise SupervisorGone(why)
+            try:
+                byte = os.read(fd, 1)
+            except OSError:
+                if fd not in self._terminals:
+                    raise
+                byte = b""  # a closed terminal
+            if not byte:
+                break
+            line += byte
+        return line
+
+
+def _descriptor(stream: IO[str]) -> int | None:
+    """Return the file descriptor of a stream; None for one that is not of the system."""
+    try:
+        return stream.fileno()
+    except (OSError, ValueError):
+        return None
+
+
+def _is_closed(fd: int, *, reading: bool = False) -> bool:
+    """Whether the far end of a pipe, socket or terminal was closed; never of a file. Reads nothing."""
+    if not hasattr(select, "poll"):  # Windows
+        return False
+    poller = select.poll()
+    # A socket reports only this if its far end sends no more; a terminal or a pipe reports POLLHUP.
+    half_closed = getattr(select, "POLLRDHUP", 0) if reading else 0
+    poller.register(fd, half_closed)
+    return any(events & (select.POLLERR | select.POLLHUP | half_closed) for _, events in poller.poll(0))

@@ -1,0 +1,39 @@
+"""A supervisor that is gone: the arm stops, the event and the message come, and the run is resumed."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from ftdrive.cell.emulated import Station
+from ftdrivers.ur.control import ControlPath
+from tests.system.command_line import CommandLine
+from tests.system.supervisor_trial import GONE, KINDS, Kind, trial
+from tests.ur_rtde import require_ur_rtde
+
+LONG_BEFORE_ITS_GOAL_S = 1.0
+"""The move takes 3 s. `tests/benchmarks/supervisor.py` has the figure of 0.3 s: here the computer may be busy."""
+
+
+@pytest.fixture(scope="module", params=["script", "ur-rtde"])
+def station(request: pytest.FixtureRequest) -> Iterator[Station]:
+    path: ControlPath = request.param
+    if path == "ur-rtde":
+        require_ur_rtde()
+    with Station("serial", ["--seed", "3"], control_path=path) as station:
+        yield station
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moving", [True, False], ids=["in mid-move", "at rest"])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_supervisor_that_leaves_ends_the_session(
+    kind: Kind, moving: bool, station: Station, ftdrive: CommandLine
+) -> None:
+    seen = trial(kind, station, ftdrive, moving=moving)
+    assert seen.exit_code == GONE, seen
+    assert seen.moved == moving
+    assert seen.rest_s is None or seen.rest_s < LONG_BEFORE_ITS_GOAL_S
+    assert len(seen.events) == 1
+    assert kind == "terminal closed" or "error: " in seen.said
+    assert "Traceback" not in seen.said
+    assert seen.resumed == 0

@@ -1,0 +1,130 @@
+"""Row 27: what a session does when no operator follows it any more, on the fake cell."""
+
+import json
+
+import pytest
+
+from ftdrive.errors import SupervisorGone, exit_code
+from ftdrive.session.events import Event, GuardTripped, State, StateChanged
+from ftdrive.session.hazards import Hazard
+from ftdrive.session.operator import Key
+from ftdrivers.errors import DeviceFault
+from tests.unit.ftdrive.fake_cell import Lab, Scripted
+
+WHY = "the reader of standard output is gone"
+
+
+def leave(lab: Lab) -> None:
+    lab.operator.gone = WHY
+
+
+def cannot_be_shown(lab: Lab, event: Event) -> None:
+    del event
+    if lab.operator.gone:
+        raise SupervisorGone(lab.operator.gone)
+
+
+def recorded(lab: Lab) -> list[dict[str, object]]:
+    lines = (lab.run().folder / "events.ndjson").read_text().splitlines()
+    events = [json.loads(line) for line in lines]
+    return [event for event in events if event["event"] == "guard-tripped" and event["hazard"] == 27]
+
+
+def resumes(lab: Lab, poses: int) -> None:
+    """Continue the run with another operator."""
+    kept = lab.stops()
+    assert kept == list(range(1, poses + 1))
+    lab.operator = Scripted()
+    assert lab.calibrate(resume=lab.run().folder) is not None
+    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
+
+
+@pytest.mark.parametrize("shown", [True, False], ids=["input ended", "output closed"])
+def test_the_arm_stops_in_mid_move_before_anything_else(shown: bool, lab: Lab) -> None:
+    begun_s: list[float] = []
+
+    def gone() -> None:
+        leave(lab)
+        begun_s.append(lab.clock.now_s())
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, GuardTripped):
+            assert lab.arm.halted.is_set()
+            assert lab.clock.now_s() - begun_s[0] < 0.03
+        if not shown:
+            cannot_be_shown(lab, event)
+
+    lab.arm.at_move[4] = gone
+    lab.operator.on_event = on_event
+    with pytest.raises(SupervisorGone, match=f"{WHY}.*--resume") as error:
+        lab.calibrate()
+    assert exit_code(error.value) == 9
+    assert lab.arm.stops
+    assert len(lab.arm.moves) == 4
+    (event,) = recorded(lab)
+    assert WHY in str(event["words"])
+    assert not lab.holds()  # there is no operator to ask
+    resumes(lab, 3)
+
+
+def test_a_pose_in_progress_is_given_up(lab: Lab) -> None:
+    def on_event(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.SAMPLE and event.stop == 3:
+            leave(lab)
+
+    lab.operator.on_event = on_event
+    with pytest.raises(SupervisorGone):
+        lab.calibrate()
+    assert len(lab.arm.moves) == 3
+    assert len(recorded(lab)) == 1
+    resumes(lab, 2)
+
+
+def test_no_question_is_answered_for_an_absent_operator(lab: Lab) -> None:
+    lab.operator.gone = WHY
+    with pytest.raises(SupervisorGone):
+        lab.calibrate(yes=True, real=False)
+    assert not lab.arm.moves
+
+
+def test_an_operator_who_leaves_at_a_question_moves_nothing(lab: Lab) -> None:
+    lab.arm.at_move[4] = lambda: leave(lab)
+    with pytest.raises(SupervisorGone):
+        lab.calibrate()
+    lab.operator = Scripted()
+
+    def refuse() -> None:
+        leave(lab)
+        raise SupervisorGone(WHY)
+
+    lab.operator.at_question = [("emergency stop", refuse)]
+    with pytest.raises(SupervisorGone):
+        lab.calibrate(resume=lab.run().folder)
+    assert len(lab.arm.moves) == 4
+    assert len(recorded(lab)) == 2
+    resumes(lab, 3)
+
+
+def test_a_hold_without_an_operator_ends_with_its_first_cause(lab: Lab) -> None:
+    def gone() -> None:
+        leave(lab)
+        raise SupervisorGone(WHY)
+
+    lab.operator.at_question = [("resume:", gone)]
+    lab.push_on_the_way(4)
+    with pytest.raises(DeviceFault, match="contact"):
+        lab.calibrate()
+    assert [event.hazard for event in lab.operator.of(GuardTripped)] == [Hazard.CONTACT, Hazard.SUPERVISOR_GONE]
+    assert len(recorded(lab)) == 1
+
+
+def test_a_pause_without_an_operator_ends_with_their_absence(lab: Lab) -> None:
+    def gone() -> None:
+        leave(lab)
+        raise SupervisorGone(WHY)
+
+    lab.operator.at_question = [("resume:", gone)]
+    lab.press((Key.PAUSE, StateChanged, 3))
+    with pytest.raises(SupervisorGone):
+        lab.calibrate()
+    assert len(recorded(lab)) == 1

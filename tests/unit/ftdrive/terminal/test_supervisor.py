@@ -1,0 +1,159 @@
+"""The far ends of a session's streams: which ends count, and that nothing is read beyond a line."""
+
+import io
+import os
+import pty
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, TextIO
+
+import pytest
+
+from ftdrive.errors import Declined, SupervisorGone
+from ftdrive.terminal.supervisor import Supervisor
+
+
+def reader(fd: int) -> TextIO:
+    return os.fdopen(fd, "r", encoding="utf-8")
+
+
+class Pipes:
+    """A session's standard input and output, and their far ends."""
+
+    def __init__(self) -> None:
+        stdin, self.answers = os.pipe()
+        self.seen, stdout = os.pipe()
+        self.stdin, self.stdout = reader(stdin), os.fdopen(stdout, "w", encoding="utf-8")
+        self.supervisor = Supervisor(self.stdin, self.stdout, "standard output")
+
+    def close(self) -> None:
+        for stream in (self.stdin, self.stdout):
+            try:
+                stream.close()
+            except BrokenPipeError:
+                stream.close()
+        for fd in (self.answers, self.seen):
+            try:
+                os.close(fd)
+            except OSError:  # closed by the test
+                continue
+
+
+@pytest.fixture
+def pipes() -> Iterator[Pipes]:
+    pipes = Pipes()
+    yield pipes
+    pipes.close()
+
+
+def test_a_reader_that_is_gone_is_seen_without_a_write(pipes: Pipes) -> None:
+    assert pipes.supervisor.absence() is None
+    os.close(pipes.seen)
+    assert "standard output" in str(pipes.supervisor.absence())
+    pipes.stdout.write("{}\n")
+    with pytest.raises(SupervisorGone, match="standard output"), pipes.supervisor.writing():
+        pipes.stdout.flush()
+
+
+def test_an_error_of_the_disk_stays_what_it_is(pipes: Pipes) -> None:
+    with pytest.raises(OSError, match="full"), pipes.supervisor.writing():
+        raise OSError("the disk is full")
+
+
+def test_an_input_counts_once_its_writer_was_there_at_a_question(pipes: Pipes) -> None:
+    os.write(pipes.answers, b"yes\nMOVE\n")
+    assert pipes.supervisor.read_line("?") == "yes\n"
+    assert os.read(pipes.stdin.fileno(), 99) == b"MOVE\n"  # nothing was taken beyond the line
+    assert pipes.supervisor.absence() is None
+    os.close(pipes.answers)
+    assert "standard input" in str(pipes.supervisor.absence())
+    with pytest.raises(SupervisorGone, match="standard input"):
+        pipes.supervisor.read_line("?")
+
+
+def test_an_input_that_is_never_read_may_end(pipes: Pipes) -> None:
+    os.close(pipes.answers)
+    assert pipes.supervisor.absence() is None
+
+
+def test_answers_that_were_all_prepared_may_end(pipes: Pipes) -> None:
+    os.write(pipes.answers, b"yes\nMOVE\n")
+    os.close(pipes.answers)
+    assert [pipes.supervisor.read_line("?") for _ in range(2)] == ["yes\n", "MOVE\n"]
+    assert pipes.supervisor.absence() is None
+    with pytest.raises(Declined, match="no answer"):
+        pipes.supervisor.read_line("no answer")
+
+
+def test_a_question_that_waits_ends_with_its_reader(pipes: Pipes) -> None:
+    os.close(pipes.seen)
+    with pytest.raises(SupervisorGone, match="standard output"):
+        pipes.supervisor.read_line("?")
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_a_socket_is_as_a_pipe(half: bool) -> None:
+    near, far = socket.socketpair()
+    with near, far, near.makefile("r") as stdin, near.makefile("w") as stdout:
+        supervisor = Supervisor(stdin, stdout, "standard output")
+        far.sendall(b"yes\n")
+        assert supervisor.read_line("?") == "yes\n"
+        assert supervisor.absence() is None
+        if half:
+            far.shutdown(socket.SHUT_WR)
+        else:
+            far.close()
+        assert ("standard input" if half else "standard output") in str(supervisor.absence())
+
+
+def test_a_terminal_that_closes_is_gone_though_nothing_was_asked() -> None:
+    person, program = pty.openpty()
+    with os.fdopen(program, "r+b", buffering=0) as device:
+        terminal = io.TextIOWrapper(device, write_through=True)
+        supervisor = Supervisor(terminal, terminal, "standard error")
+        os.write(person, b"yes\nno\n")
+        assert supervisor.read_line("?") == "yes\n"
+        assert supervisor.absence() is None
+        os.close(person)
+        assert "terminal" in str(supervisor.absence())
+        with pytest.raises(SupervisorGone, match="terminal"):
+            supervisor.read_line("?")
+
+
+def test_a_terminal_beside_a_pipe_counts(pipes: Pipes) -> None:
+    person, program = pty.openpty()
+    with reader(program) as terminal:
+        supervisor = Supervisor(terminal, pipes.stdout, "standard output")  # calibrate --json | tee log
+        assert supervisor.absence() is None
+        os.close(person)
+        assert "terminal" in str(supervisor.absence())
+
+
+@pytest.mark.parametrize("path", [os.devnull, "log"])
+def test_files_are_never_gone(path: str, tmp_path: Path) -> None:
+    with (tmp_path / path).open("w+") as output, Path(os.devnull).open() as stdin:
+        supervisor = Supervisor(stdin, output, "standard output")
+        with pytest.raises(Declined, match="no answer"):
+            supervisor.read_line("no answer")
+        assert supervisor.absence() is None
+
+
+def test_streams_that_are_not_of_the_system_are_never_gone() -> None:
+    output: IO[str] = io.StringIO()
+    supervisor = Supervisor(io.StringIO("yes\n"), output, "standard output")
+    assert supervisor.read_line("?") == "yes\n"
+    assert supervisor.absence() is None
+
+
+@pytest.mark.parametrize("ignored", [False, True], ids=["", "nohup"])
+def test_a_hang_up_is_noticed_unless_it_is_ignored(ignored: bool, pipes: Pipes) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if ignored else signal.default_int_handler)
+    try:
+        with pipes.supervisor:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert (pipes.supervisor.absence() is None) == ignored
+        assert signal.getsignal(signal.SIGHUP) == (signal.SIG_IGN if ignored else signal.default_int_handler)
+    finally:
+        signal.signal(signal.SIGHUP, before)
