@@ -28,8 +28,8 @@ from ftcalib import CalibrationResult
 from tests.benchmarks.hazard_rows import BEFOREHAND, FAULTS, UNSEEN, Beforehand, Fault, Json
 from tests.benchmarks.hazard_sessions import QUIET, Observed, begin, disturb, undisturbed
 
-BRAKING_S: Final = 0.35
-"""From 60 deg/s with 4 rad/s2: 0.26 s; two looks of the guards, and the way of the command."""
+BRAKING_S: Final = 0.29
+"""From 60 deg/s with 300 deg/s2: 0.2 s; two looks of the guards, and the way of the command."""
 AT_DEG: Final = 0.1
 ATTEMPTS: Final = 3
 """On a busy machine a session may be stopped before the fault comes: that says nothing about the fault."""

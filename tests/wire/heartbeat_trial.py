@@ -14,7 +14,7 @@ from ftdrive.cell.emulated_clock import EmulatedClock
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import DeviceError
 from ftdrivers.ur.arm import UrArm
-from ftdrivers.ur.control_child import DECELERATION_RAD_S2
+from ftdrivers.ur.control import STOP_RAD_S2
 from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import Station
 
@@ -90,6 +90,6 @@ def trial(station: Station, kind: str, delay_s: float, *, real_clock: bool) -> f
             os.kill(process.pid, signal.SIGKILL)
         process.join()
         station.ask("silence-arm", on=False)
-    braking_s = SPEED_RAD_S / DECELERATION_RAD_S2
+    braking_s = SPEED_RAD_S / STOP_RAD_S2
     decelerates_s = (stood["t_host_ns"] - cut_ns) / 1e9 - braking_s
     return None if decelerates_s < 0 else decelerates_s + PERIOD_S

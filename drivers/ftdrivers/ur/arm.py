@@ -30,8 +30,7 @@ from ftdrivers.interfaces import (
     Guard,
     RobotArm,
 )
-from ftdrivers.ur.control import CONTROL_SETTINGS, Control, ControlSetting
-from ftdrivers.ur.control_child import DECELERATION_RAD_S2
+from ftdrivers.ur.control import CONTROL_SETTINGS, STOP_RAD_S2, Control, ControlSetting
 from ftdrivers.ur.controller_settings import checked_gravity, checked_payload, read_controller_settings
 from ftdrivers.ur.kinematics import MODELS, model_named
 from ftdrivers.ur.opening import SIMULATORS, Opening, path_for
@@ -60,6 +59,8 @@ class UrArm(RobotArm):
         Such as "UR5e", to compare poses with nominal kinematics; None takes the model that the controller reports.
     speed_rad_s, acceleration_rad_s2
         Defaults of the leading joint in `move_to`. The speed slider of the pendant scales them down further.
+    stop_rad_s2
+        Deceleration of the fastest joint in a stop, on every control path.
     control
         The control path: "ur-rtde", "script", or "auto", which takes ur_rtde where it is installed and the controller
         has a dashboard server.
@@ -71,19 +72,24 @@ class UrArm(RobotArm):
         Every time limit; by default those of the cell that `clock` times.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - one for each setting of the arm
         self,
         host: str,
         *,
         model: str | None = None,
         speed_rad_s: float = radians(30),
         acceleration_rad_s2: float = radians(40),
+        stop_rad_s2: float = STOP_RAD_S2,
         control: ControlSetting = "auto",
         api_port: int = API_PORT,
         clock: Clock = REAL,
         timing: UrTiming = STRICT,
     ) -> None:
         _check_speed(speed_rad_s, acceleration_rad_s2)
+        if not radians(60) <= stop_rad_s2 <= radians(300):
+            raise ValueError(
+                f"stop_rad_s2 is {stop_rad_s2}; choose 1.05 to 5.23 (60 to 300 degrees per second squared)."
+            )
         if control not in CONTROL_SETTINGS:
             raise ValueError(f"control is {control!r}; choose one of {', '.join(CONTROL_SETTINGS)}.")
         if model is not None and model_named(model, 0) is None:
@@ -92,6 +98,7 @@ class UrArm(RobotArm):
         self._model = None if model is None else model_named(model, 0)
         self._speed_rad_s = float(speed_rad_s)
         self._acceleration_rad_s2 = float(acceleration_rad_s2)
+        self._stop_rad_s2 = float(stop_rad_s2)
         self._clock = clock
         self._timing = timing
         self._moves_at_rad_s = self._speed_rad_s
@@ -154,7 +161,7 @@ class UrArm(RobotArm):
         return Reader(self._host, self._model, clock=self._clock, timing=self._timing, api_port=self._api_port, **rate)
 
     def _opening(self, reader: Reader) -> Opening:
-        return Opening(self._host, self._setting, reader, self._program, self._clock, self._timing)
+        return Opening(self._host, self._setting, reader, self._program, self._stop_rad_s2, self._clock, self._timing)
 
     def close(self) -> None:
         """Stop the arm and its control script, then disconnect. Idempotent; takes 1.5 s at most."""
@@ -500,7 +507,7 @@ class UrArm(RobotArm):
             look = self._reading().look(limit_s=glance_s)
             if not control.alive or look.safety_fault() or look.program_fault():
                 return False
-            limit_s = self._timing.braking_s + self._moves_at_rad_s / DECELERATION_RAD_S2
+            limit_s = self._timing.braking_s + self._moves_at_rad_s / self._stop_rad_s2
             control.call("stop", timeout_s=limit_s, look_out=self._look_out)
             for _ in range(10):  # ur_rtde does not report success
                 if max(map(abs, self._reading().look(limit_s=glance_s).target_qd_rad_s)) <= _STANDING_RAD_S:

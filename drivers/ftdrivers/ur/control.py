@@ -3,6 +3,7 @@
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from math import radians
 from typing import Any, Final, Literal
 
 from ftdrivers.errors import ConnectError, DeviceError
@@ -12,6 +13,9 @@ log = logging.getLogger(__name__)
 ControlPath = Literal["ur-rtde", "script"]
 ControlSetting = Literal["auto", "ur-rtde", "script"]
 CONTROL_SETTINGS: Final[tuple[ControlSetting, ...]] = ("auto", "ur-rtde", "script")
+
+STOP_RAD_S2: Final = radians(300)
+"""Default deceleration of a stop: the most that UR's staff recommend for joints. UR's own programs stop with 2 to 4."""
 
 LookOut = Callable[[], object]
 """Called about 20 times a second during a wait; may raise."""

@@ -4,8 +4,8 @@ Requests and replies are lines of JSON on stdin and stdout. When stdin ends, thi
 control script and exits. SIGALRM ends it when ur_rtde hangs. It also stops the arm when the parent, suspended or
 hanging, sends no request for too long during a move.
 
-Arguments: host, frequency in Hz, and three limits in seconds of `UrTiming`: `child_starting_s`, `child_leaving_s` and
-`unwatched_s`.
+Arguments: host, frequency in Hz, deceleration of a stop in rad/s², and three limits in seconds of `UrTiming`:
+`child_starting_s`, `child_leaving_s` and `unwatched_s`.
 
 Ref: ur_rtde 1.6.5, API reference of `RTDEControlInterface`.
 Checked on hardware: no.
@@ -21,9 +21,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 from queue import Empty, SimpleQueue
-from typing import Final, Protocol, cast
-
-DECELERATION_RAD_S2: Final = 4.0  # UR's own external-control program stops with this
+from typing import Protocol, cast
 
 
 class _Progress(Protocol):
@@ -59,8 +57,9 @@ class _Control(Protocol):
 class Calls:
     """The calls of the parent."""
 
-    def __init__(self, control: _Control) -> None:
+    def __init__(self, control: _Control, stop_rad_s2: float) -> None:
         self._control = control
+        self._stop_rad_s2 = stop_rad_s2
         self._before = 0
         self._unwatched = False
         self.moving = False
@@ -96,7 +95,7 @@ class Calls:
         The asynchronous stop would decelerate the tool instead of the joints, which fails at a singularity.
         """
         self.moving = False
-        self._control.stopJ(DECELERATION_RAD_S2)
+        self._control.stopJ(self._stop_rad_s2)
 
     def within_safety_limits(self, q_rad: list[float]) -> bool:
         """Return whether the controller accepts these joint angles."""
@@ -130,7 +129,7 @@ class Calls:
 def main() -> None:
     """Serve until stdin ends."""
     host = sys.argv[1]
-    frequency_Hz, starting_s, leaving_s, unwatched_s = map(float, sys.argv[2:])
+    frequency_Hz, stop_rad_s2, starting_s, leaving_s, unwatched_s = map(float, sys.argv[2:])
     replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # the output of the C++ library must not mix with the replies
 
@@ -150,7 +149,7 @@ def main() -> None:
         reply(id=0, error=str(error))
         os._exit(1)
     signal.setitimer(signal.ITIMER_REAL, 0)
-    calls = Calls(control)
+    calls = Calls(control, stop_rad_s2)
     reply(id=0, value=None)
 
     requests: SimpleQueue[str | None] = SimpleQueue()

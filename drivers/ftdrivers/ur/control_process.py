@@ -34,16 +34,16 @@ _FREQUENCY_HZ: Final = 125.0
 class ControlProcess(Control):
     """A disposable process with ur_rtde's control interface."""
 
-    def __init__(self, host: str, *, clock: Clock, timing: UrTiming) -> None:
+    def __init__(self, host: str, stop_rad_s2: float, *, clock: Clock, timing: UrTiming) -> None:
         """Start the process; call `wait_until_ready` before `call`."""
         self._host = host
         self._clock = clock
         self._timing = timing
-        limits = (timing.child_starting_s, timing.child_leaving_s, timing.unwatched_s)
+        arguments = (_FREQUENCY_HZ, stop_rad_s2, timing.child_starting_s, timing.child_leaving_s, timing.unwatched_s)
         # Started by path, so that no code of the application runs in it. In its own session, so that Ctrl-C or a closed
         # terminal cannot end it before it has stopped the arm.
         self._process = subprocess.Popen(
-            [sys.executable, "-P", control_child.__file__, host, *map(str, (_FREQUENCY_HZ, *limits))],
+            [sys.executable, "-P", control_child.__file__, host, *map(str, arguments)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

@@ -12,8 +12,6 @@ from importlib.resources import files
 from types import MappingProxyType
 from typing import Any, Final, Self
 
-from ftdrivers.ur.control_child import DECELERATION_RAD_S2
-
 NAME: Final = "ftdrive_control"
 """Of the program on the controller."""
 INPUTS: Final = MappingProxyType(
@@ -77,14 +75,14 @@ class Report:
         return self.state == _NO_HEARTBEAT
 
 
-def program_text(token: int, version: Sequence[int]) -> str:
-    """Return the program for one session on a controller of this version."""
+def program_text(token: int, version: Sequence[int], stop_rad_s2: float) -> str:
+    """Return the program for one session on a controller of this version, with the deceleration of its stops."""
     com, inertia = (", ".join(f"ft_number({k})" for k in numbers) for numbers in (range(1, 4), range(4, 10)))
     payload = f"set_payload(ft_number(0), [{com}])"
     if tuple(version[:2]) >= (5, 10):
         payload = f"set_target_payload(ft_number(0), [{com}], [{inertia}])"
     text = files("ftdrivers.ur").joinpath("program.script").read_text("ascii")
-    fields = {"$TOKEN": str(token), "$DECELERATION": str(DECELERATION_RAD_S2), "$SET_PAYLOAD": payload}
+    fields = {"$TOKEN": str(token), "$DECELERATION": f"{stop_rad_s2:.4f}", "$SET_PAYLOAD": payload}
     for field, value in fields.items():
         text = text.replace(field, value)
     return text

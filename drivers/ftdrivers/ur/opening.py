@@ -54,6 +54,7 @@ class Opening:
     setting: ControlSetting
     reader: Reader
     program: OwnProgram
+    stop_rad_s2: float
     clock: Clock
     timing: UrTiming
 
@@ -108,7 +109,7 @@ class Opening:
 
         path, why = path_for(self.setting, self.reader.version)
         stops = (
-            "; its program stops the arm within 0.3 s when computer or network fail"
+            "; its program begins to brake within 0.3 s when computer or network fail"
             if path == "script"
             else "; if computer and network fail, the arm ends its present move"
         )
@@ -168,8 +169,8 @@ class Opening:
 
     def _start(self, path: ControlPath) -> Control:
         if path == "script":
-            return ScriptControl(self.host, self.reader.version, clock=self.clock, timing=self.timing)
-        return ControlProcess(self.host, clock=self.clock, timing=self.timing)
+            return ScriptControl(self.host, self.reader.version, self.stop_rad_s2, clock=self.clock, timing=self.timing)
+        return ControlProcess(self.host, self.stop_rad_s2, clock=self.clock, timing=self.timing)
 
     def _look_out(self) -> None:
         if fault := self.reader.look().safety_fault():

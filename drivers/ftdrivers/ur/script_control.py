@@ -39,12 +39,14 @@ class ScriptControl(Control):
 
     stops_itself = True
 
-    def __init__(self, host: str, version: Sequence[int], *, clock: Clock, timing: UrTiming) -> None:
+    def __init__(
+        self, host: str, version: Sequence[int], stop_rad_s2: float, *, clock: Clock, timing: UrTiming
+    ) -> None:
         self._host = host
         self._clock = clock
         self._timing = timing
         self._token = 1 + secrets.randbelow(_LARGEST - 1)
-        self._program = program_text(self._token, version)
+        self._program = program_text(self._token, version, stop_rad_s2)
         self._changed = threading.Condition(threading.RLock())
         self._calling = threading.RLock()  # re-entrant: a signal handler may stop the arm during a call
         self._beat = secrets.randbelow(_LARGEST)
@@ -125,7 +127,7 @@ class ScriptControl(Control):
             return bool(report.answer)
 
     def kill(self) -> None:
-        """Request the end of the program once more, then fall silent; the arm stops within 0.3 s. Idempotent.
+        """Request the end of the program once more, then fall silent; the arm brakes within 0.3 s. Idempotent.
 
         A program that is paused finds the request in the registers when it is resumed, and does not move.
         """
@@ -148,7 +150,7 @@ class ScriptControl(Control):
     def explained(self, error: DeviceError) -> DeviceError:
         """Return the error of a lost controller: its program stops the arm."""
         return type(error)(
-            f"{error.found}, so the control program stops the arm by itself within {STOPS_ITSELF_S} s",
+            f"{error.found}, so the control program begins to stop the arm by itself within {STOPS_ITSELF_S} s",
             "check the robot and the cable, then open the arm again",
         )
 

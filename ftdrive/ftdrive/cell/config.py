@@ -47,13 +47,19 @@ class RobotConfig:
         "of the fastest joint; the first run of a plan is slower", 60.0, "deg/s", (0.5, 60), option="--speed"
     )
     acceleration_deg_s2: float = entry("of the fastest joint", 80.0, "deg/s²", (1, 300))
+    stop_deceleration_deg_s2: float = entry(
+        "of the fastest joint in a stop; lower it if the arm with a heavy tool ends a stop in a protective stop",
+        300.0,
+        "deg/s²",
+        (60, 300),
+    )
     tip_speed_mm_s: float = entry(
         "of the tool's farthest point; 250 is the reduced speed of ISO 10218-1", 250.0, "mm/s", (1, 250)
     )
     driver: str = entry("ur, or the entry point of an arm of another package", "ur", reject=rules.reject_empty)
     control: str = entry(
         "auto, ur-rtde or script: what moves the arm; auto takes ur-rtde where it is installed and the controller has "
-        "what it needs; script stops the arm within 0.3 s when this computer or the network fails",
+        "what it needs; script begins to brake within 0.3 s when this computer or the network fails",
         "auto",
         reject=rules.reject_control,
     )

@@ -25,7 +25,8 @@ def build_arm(cell: CellConfig) -> RobotArm:
     more: dict[str, Any] = {"clock": cell.clock} if cell.is_emulated else {}
     if robot.driver == "ur":
         timing = UrTiming.emulated() if cell.is_emulated else STRICT
-        more |= {"control": robot.control, "api_port": robot.api_port, "timing": timing}
+        stop_rad_s2 = radians(robot.stop_deceleration_deg_s2)
+        more |= {"control": robot.control, "stop_rad_s2": stop_rad_s2, "api_port": robot.api_port, "timing": timing}
     arm = build(
         robot.host,
         model=robot.model,

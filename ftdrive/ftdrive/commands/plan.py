@@ -151,9 +151,9 @@ def plan(
     if as_json:
         write_json({"schema_version": 1} | made.to_dict())
     else:
-        from ftdrive.planning.show.words import plan_in_words
+        from ftdrive.planning.show.words import plan_in_words, stop_in_words
 
-        talk.print(plan_in_words(made))
+        talk.print("\n".join(filter(None, (plan_in_words(made), stop_in_words(made, cell.robot)))))
     if view:
         _look(made, certifier)
 

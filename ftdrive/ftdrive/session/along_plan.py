@@ -19,7 +19,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.constant_tour import constant_tour
-from ftdrive.planning.show.words import way_in_words
+from ftdrive.planning.show.words import stop_in_words, way_in_words
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
 from ftdrive.session.completed_plans import has_completed, remember_completed
@@ -243,7 +243,9 @@ def show_plan(before: Before, options: SessionOptions) -> None:
     words = "The arm stands at the first pose."
     if len(way):
         words = f"Approach to the first pose: {way_in_words(way, before.approach.clearance_m)}."
-    cell.journal.show(Planned(plan=plan, way_rad=way, way_words=words))
+    cell.journal.show(
+        Planned(plan=plan, way_rad=way, way_words=words, stop_words=stop_in_words(plan, before.config.robot))
+    )
     if options.output is not None:
         plan.save(options.output)
         cell.note(f"plan saved as {options.output}")

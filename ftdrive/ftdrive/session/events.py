@@ -90,6 +90,8 @@ class Planned(Event):
     way_rad: Array
     """(k + 1, 6) joint vectors from where the arm stands to the first pose; (0, 6) if it stands there."""
     way_words: str
+    stop_words: str = ""
+    """How far the arm goes on in a stop; empty for an arm of another package."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `--json` writes, with the plan as in its file."""

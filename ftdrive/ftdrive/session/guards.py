@@ -73,7 +73,7 @@ class Limits:
     hung_s: float = 1.0
     """Guards that have not looked for this time count as hung."""
     slow_stop_s: float = 0.2
-    """A stop that takes longer is reported before it ends. An arm that answers brakes from 60 deg/s in 0.26 s."""
+    """A stop that takes longer is reported before it ends. An arm that answers brakes from 60 deg/s in 0.2 s."""
     link_usual_s: float = 0.02
     """Usual time until the arm answers. The wait for the next sample takes 8 ms of it."""
     link_asked_s: float = 0.04

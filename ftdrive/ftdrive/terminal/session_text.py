@@ -87,7 +87,11 @@ class SessionText:
     def _body(self, event: Event) -> list[TextLine]:
         match event:
             case Planned() if not self._verbose:
-                return [TextLine("   ", words) for words in (*plan_in_brief(event.plan), event.way_words)]
+                return [
+                    TextLine("   ", words)
+                    for words in (*plan_in_brief(event.plan), event.stop_words, event.way_words)
+                    if words
+                ]
             case RunOpened() | PoseTaken() | Compared() if not self._poses:
                 return []
             case Estimated(hint="") if not self._verbose:
@@ -138,7 +142,7 @@ def head_and_words(event: Event) -> tuple[str, str]:
         case Checked():
             return "✔ " if event.passed else "✘ ", f"{event.name}: {event.words}"
         case Planned():
-            return "", f"{plan_in_words(event.plan)}\n{event.way_words}"
+            return "", "\n".join(filter(None, (plan_in_words(event.plan), event.stop_words, event.way_words)))
         case Noted():
             return "! " if event.warning else "", event.words
         case PoseTaken():

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ftdrive.cell.config import RobotConfig
 from ftdrive.planning.approach import STILL_RAD, arm_moves
 from ftdrive.planning.plan import Plan
 from ftdrivers.ur.kinematics import Array
@@ -18,6 +19,17 @@ def plan_in_words(plan: Plan) -> str:
     still = ", ".join(f"{angle:.0f}" for angle in np.degrees(plan.steps[0].q_rad[:3]))
     rest = [f"Base, shoulder and elbow stay at {still} degrees."] if plan.arm_rests else []
     return "\n".join([*plan.why, *rest, *_table(plan), "", *_summary(plan)])
+
+
+def stop_in_words(plan: Plan, robot: RobotConfig) -> str:
+    """Return time and angle from the begin of braking to rest, at the plan's highest speed; empty for other drivers."""
+    if robot.driver != "ur":
+        return ""
+    speed_deg_s, stop_deg_s2 = np.degrees(max(step.speed_rad_s for step in plan.steps)), robot.stop_deceleration_deg_s2
+    return (
+        f"A stop from {speed_deg_s:.0f} °/s brakes with {stop_deg_s2:.0f} °/s²: at rest after "
+        f"{speed_deg_s / stop_deg_s2:.2f} s and {speed_deg_s**2 / (2 * stop_deg_s2):.1f}°."
+    )
 
 
 def room_in_words(plan: Plan) -> str:

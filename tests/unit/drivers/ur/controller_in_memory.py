@@ -23,6 +23,7 @@ from ftdrivers.errors import NoDashboard
 from ftdrivers.ur import arm as arm_module
 from ftdrivers.ur import control_child, opening, reading
 from ftdrivers.ur.arm import UrArm
+from ftdrivers.ur.control import STOP_RAD_S2
 from ftdrivers.ur.control_process import ControlProcess
 from ftdrivers.ur.kinematics import MODELS, Pose, forward
 from ftdrivers.ur.reading import Reader
@@ -80,6 +81,7 @@ class Controller:
         self.hanging: set[str] = set()
         """Calls to which the control process never answers."""
         self.did: list[str] = []
+        self.stopped_at_rad_s2: list[float] = []
         """What it was asked to do."""
         self.dashboard_limits_s: list[float] = []
         self.stopping_works = self.takes_settings = True
@@ -226,7 +228,7 @@ class Controller:
         return self.goal_rad is not None
 
     def stopJ(self, deceleration: float, /) -> None:
-        assert deceleration > 0
+        self.stopped_at_rad_s2.append(deceleration)
         self.did.append("stop softly")
         if self.stopping_works:
             self.goal_rad = None
@@ -293,10 +295,10 @@ class ControlInMemory(ControlProcess):
 
     def __init__(self, controller: Controller, timing: UrTiming) -> None:
         self._far = controller
-        self._calls = control_child.Calls(controller)
+        self._calls = control_child.Calls(controller, STOP_RAD_S2)
         self._asked = 0
         self._hangs = False
-        super().__init__(HOST, clock=controller.clock, timing=timing)
+        super().__init__(HOST, STOP_RAD_S2, clock=controller.clock, timing=timing)
         assert isinstance(self._process, ProcessInMemory)
         self._process.take = self._take
         controller.clock.at(controller.starts_in_s, self._start)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ftdrivers.errors import StreamBroken
 from ftdrivers.ur import opening, script_control
+from ftdrivers.ur.control import STOP_RAD_S2
 from ftdrivers.ur.control_program import OUTPUTS
 from ftdrivers.ur.primary import Message
 from ftdrivers.ur.script_control import ScriptControl
@@ -153,7 +154,7 @@ class ScriptInMemory(ScriptControl):
 
     def __init__(self, link: Link, timing: UrTiming) -> None:
         self.link = link
-        super().__init__(HOST, link.registers.far.version, clock=link.registers.far.clock, timing=timing)
+        super().__init__(HOST, link.registers.far.version, STOP_RAD_S2, clock=link.registers.far.clock, timing=timing)
         self._stream = stream = self._connect()
 
         def cycle() -> None:

@@ -77,6 +77,8 @@ def test_absurd_speeds_and_accelerations_are_refused(speed: float, arm: UrArm, c
         UrArm(HOST, speed_rad_s=speed)
     with pytest.raises(ValueError, match="acceleration_rad_s2"):
         UrArm(HOST, acceleration_rad_s2=speed)
+    with pytest.raises(ValueError, match="stop_rad_s2"):
+        UrArm(HOST, stop_rad_s2=speed)
     with pytest.raises(ValueError, match="speed_rad_s"):
         arm.move_to(q, timeout_s=5, guard=no_guard, speed_rad_s=speed)
     with pytest.raises(ValueError, match="acceleration_rad_s2"):
@@ -311,7 +313,7 @@ def test_a_silent_controller_is_found_in_a_fifth_of_a_second(
     """Reported after 0.2 s and one short attempt at the dashboard server; the soft stop is not tried."""
     controller.dashboard_answers = False
     provoke = After(clock, 0.3, setting(controller, silent=True))
-    says = "press the emergency stop" if path == "ur-rtde" else "stops the arm by itself"
+    says = "press the emergency stop" if path == "ur-rtde" else "stop the arm by itself"
     with pytest.raises(DeviceTimeout, match=says):
         move(arm, controller, provoke)
     assert 0.2 < provoke.ago_s() < 0.2 + 0.15 + 0.02

@@ -49,7 +49,7 @@ def served(controller: Controller, requests: list[tuple[float, str]]) -> list[An
     answers: list[dict[str, Any]] = []
     serve: Callable[..., None] = control_child.serve
     serve(
-        control_child.Calls(controller),
+        control_child.Calls(controller, 2.5),
         Requests(controller.clock, requests),
         lambda **answer: answers.append(answer),
         UNWATCHED_S,
@@ -70,6 +70,7 @@ def test_without_a_move_nobody_has_to_ask(controller: Controller) -> None:
     values = served(controller, times)
     assert values[-1] == (False, False)
     assert controller.did == ["move", "stop softly", "move"]
+    assert controller.stopped_at_rad_s2 == [2.5]
 
 
 def test_a_move_that_had_ended_before_anybody_could_ask_was_not_stopped(controller: Controller) -> None:
@@ -87,9 +88,9 @@ def test_what_the_library_says_comes_with_a_cure(tmp_path: Path, monkeypatch: py
         '    print(json.dumps({"id": json.loads(line)["id"], "error": "the connection was lost"}), flush=True)\n'
     )
     monkeypatch.setattr(control_child, "__file__", str(child))
-    control = ControlProcess("10.0.0.1", clock=REAL, timing=UrTiming.emulated())
+    control = ControlProcess("10.0.0.1", 2.5, clock=REAL, timing=UrTiming.emulated())
     try:
-        control.wait_until_ready(lambda: None)
+        assert control._answer(0, 30.0, lambda: None)[2] == "2.5"  # host, rate, deceleration, limits
         with pytest.raises(StreamBroken, match="was lost") as error:
             control.call("progress")
         assert error.value.fix
@@ -124,7 +125,7 @@ def test_a_library_that_hangs_does_not_keep_its_process(
 ) -> None:
     (tmp_path / "rtde_control.py").write_text(LIBRARY)
     with subprocess.Popen(
-        [sys.executable, "-P", control_child.__file__, host, "125", starting_s, leaving_s, "0.5"],
+        [sys.executable, "-P", control_child.__file__, host, "125", "5", starting_s, leaving_s, "0.5"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": str(tmp_path)},

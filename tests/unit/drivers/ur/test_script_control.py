@@ -10,7 +10,6 @@ from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBro
 from ftdrivers.ur import control_program
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import ControlSetting
-from ftdrivers.ur.control_child import DECELERATION_RAD_S2
 from ftdrivers.ur.control_program import OUTPUTS, program_text
 from ftdrivers.ur.primary import Code, Failed, Note, Stopped
 from ftdrivers.ur.script_control import STOPS_ITSELF_S
@@ -34,11 +33,11 @@ def control_of(arm: UrArm) -> ScriptInMemory:
 
 @pytest.mark.parametrize("version", [(3, 15), (5, 9), (5, 15), (10, 11)])
 def test_the_program_is_complete(version: tuple[int, int]) -> None:
-    text = program_text(123456, version)
+    text = program_text(123456, version, 2.5)
     code = [line.split("#")[0].strip() for line in text.splitlines()]
     assert "$" not in "".join(code)
     assert "ft_token = 123456" in code[[line.startswith("def ") for line in code].index(True) + 1]
-    assert f"ft_deceleration = {DECELERATION_RAD_S2}" in text
+    assert "ft_deceleration = 2.5000" in text
     assert ("set_target_payload(" in text) == (version >= (5, 10))
     opened = sum(bool(re.match(r"(def|thread|if|while)\b.*:$", line)) for line in code)
     assert opened == code.count("end")
@@ -46,7 +45,7 @@ def test_the_program_is_complete(version: tuple[int, int]) -> None:
 
 
 def test_program_and_driver_agree_on_registers_and_commands() -> None:
-    text = program_text(1, (5, 15))
+    text = program_text(1, (5, 15), 5.0)
     assert {int(k) for k in re.findall(r"read_input_integer_register\((\d+)\)", text)} == {32, 33, 34, 35}
     written = {int(k) for k in re.findall(r"write_output_integer_register\((\d+),", text)}
     assert written == {32, 33, 34, 35}
@@ -157,7 +156,7 @@ def test_a_lost_controller_is_reported_with_what_the_arm_does(
 ) -> None:
     controller.dashboard_answers = False
     clock.at(0.3, lambda: setattr(controller, "silent", True))
-    with pytest.raises(DeviceTimeout, match=r"stood still .*stops the arm by itself within 0\.3 s"):
+    with pytest.raises(DeviceTimeout, match=r"stood still .*begins to stop the arm by itself within 0\.3 s"):
         arm.move_to(away(controller), timeout_s=5, guard=no_guard)
 
 

@@ -33,7 +33,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key
-from ftdrive.terminal.session_text import in_words
+from ftdrive.terminal.session_text import SessionText, in_words
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from tests.unit.ftdrive.fake_cell import MODEL, Lab
@@ -413,3 +413,12 @@ def test_step_mode_says_whether_enter_may_move_the_arm_to_the_first_pose(lab: La
         lab.calibrate(mode="step", yes=yes)
         first = next(question.text for question in lab.operator.asked if question.text.startswith("Pose 1"))
         assert words in first
+
+
+def test_the_plan_shows_how_the_arm_stops(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, stop_deceleration_deg_s2=150.0))
+    lab.calibrate(dry_run=True)
+    (planned,) = lab.operator.of(Planned)
+    assert "150 °/s²" in planned.stop_words
+    assert planned.stop_words in in_words(planned)
+    assert any(planned.stop_words in line.words for line in SessionText().lines(planned))

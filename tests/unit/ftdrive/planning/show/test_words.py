@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from syrupy.assertion import SnapshotAssertion
 
+from ftdrive.cell.config import RobotConfig
 from ftdrive.planning.approach import arm_moves
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
@@ -13,7 +14,7 @@ from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
-from ftdrive.planning.show.words import plan_in_words, room_in_words, turns_in_words, way_in_words
+from ftdrive.planning.show.words import plan_in_words, room_in_words, stop_in_words, turns_in_words, way_in_words
 
 
 @pytest.fixture(scope="module")
@@ -73,3 +74,11 @@ def test_a_way_names_the_joints_and_the_range_each_turns_over(snapshot: Snapshot
     assert not arm_moves(wrist)
     assert way_in_words(wrist, 0.042) == snapshot
     assert not arm_moves(np.zeros((0, 6)))
+
+
+def test_the_way_of_a_stop_follows_from_speed_and_deceleration(plan: Plan) -> None:
+    assert max(step.speed_rad_s for step in plan.steps) == pytest.approx(np.radians(60))
+    assert "from 60 °/s brakes with 300 °/s²: at rest after 0.20 s and 6.0°" in stop_in_words(plan, RobotConfig("ur"))
+    soft = RobotConfig("ur", stop_deceleration_deg_s2=100.0)
+    assert "with 100 °/s²: at rest after 0.60 s and 18.0°" in stop_in_words(plan, soft)
+    assert not stop_in_words(plan, RobotConfig("ur", driver="another"))
