@@ -145,6 +145,13 @@ def end_of(process: subprocess.Popen[str], typed: str = "") -> tuple[int, str]:
     return process.returncode, said
 
 
+def left_at_a_hold(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Let the input end at the question of a hold; return the exit code and what was printed for people since."""
+    said = listen_for(process, "resume: ")
+    _, more = process.communicate(timeout=_LONG_S)
+    return process.returncode, said + more
+
+
 def assert_found(errors_in_sigma: Mapping[str, Any]) -> None:
     """Each parameter within six of its sigmas.
 

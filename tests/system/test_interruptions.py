@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from ftdrive.cell.emulated import Station
-from tests.system.command_line import CommandLine, end_of, say
+from tests.system.command_line import CommandLine, end_of, left_at_a_hold, say
 
 ANSWERS = "yes\nyes\nyes\nMOVE\nyes\n"
 """Tool free, ball free, emergency stop in reach; the first motion; the tour."""
@@ -51,7 +51,7 @@ def test_unplugged_sensor_stops_the_arm_and_keeps_the_poses(
     station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine
 ) -> None:
     station.control(do="unplug", device="sensor")
-    code, talk = end_of(tour)
+    code, talk = left_at_a_hold(tour)
     assert code == 4, talk
     assert "Traceback" not in talk
     assert not station.control(do="state")["moving"]
@@ -61,7 +61,7 @@ def test_unplugged_sensor_stops_the_arm_and_keeps_the_poses(
 @pytest.mark.slow
 def test_protective_stop_is_a_device_fault(station: Station, tour: subprocess.Popen[str]) -> None:
     station.control(do="protective-stop")
-    code, talk = end_of(tour)
+    code, talk = left_at_a_hold(tour)
     assert code == 5, talk
     assert "protective" in talk
 
@@ -69,7 +69,7 @@ def test_protective_stop_is_a_device_fault(station: Station, tour: subprocess.Po
 @pytest.mark.slow
 def test_killed_station_is_a_lost_stream(station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine) -> None:
     os.kill(station.pid, signal.SIGKILL)
-    code, talk = end_of(tour)
+    code, talk = left_at_a_hold(tour)
     assert code == 4, talk
     assert "Traceback" not in talk
     assert len(ftdrive.poses()) >= 2
