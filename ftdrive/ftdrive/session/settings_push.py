@@ -247,8 +247,8 @@ EFFECTS: Final = {
 def _set(arm: RobotArm, new: ControllerSettings, guard: Guard) -> None:
     if new.mass_kg is not None and new.p_flange_com_m is not None:
         arm.set_payload(new.mass_kg, new.p_flange_com_m, new.inertia_kg_m2 or (0.0,) * 6)
-        guard()
     if new.up_base_m_s2 is not None:
+        guard()
         arm.set_gravity(new.up_base_m_s2)
 
 

@@ -80,7 +80,10 @@ class Keyboard:
         import termios
         import tty
 
-        self._before = termios.tcgetattr(self._fd)
+        try:
+            self._before = termios.tcgetattr(self._fd)
+        except termios.error:  # a terminal that was closed has no keys
+            return
         atexit.register(self._restore)
         tty.setcbreak(self._fd, termios.TCSANOW)
         wake, self._wake = os.pipe()

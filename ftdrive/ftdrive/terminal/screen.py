@@ -437,11 +437,13 @@ class Screen:
 
     def ask(self, question: Question) -> str:
         """Ask below the frame, which is not redrawn until the answer is there."""
-        self._print(self._text.pending())
-        self._view.keys = "asking"
-        self._live.stop()
-        with self._keyboard.suspended() if self._keyboard is not None else nullcontext():
-            answer = self._answer(question)
+        suspended = self._keyboard.suspended() if self._keyboard is not None else nullcontext()
+        with self.supervisor.writing():
+            self._print(self._text.pending())
+            self._view.keys = "asking"
+            self._live.stop()
+            with suspended:
+                answer = self._answer(question)
         self._view.keys = "live"
         self._live = self._new_live()  # the old one would erase the lines of its last frame
         self._live.start(refresh=True)

@@ -5,13 +5,18 @@ import os
 import pty
 import signal
 import socket
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, TextIO
 
 import pytest
+from rich.console import Console
 
 from ftdrive.errors import Declined, SupervisorGone
+from ftdrive.session.operator import Question
+from ftdrive.terminal.keyboard import Keyboard
+from ftdrive.terminal.screen import Screen
 from ftdrive.terminal.supervisor import Supervisor
 
 
@@ -157,3 +162,20 @@ def test_a_hang_up_is_noticed_unless_it_is_ignored(ignored: bool, pipes: Pipes) 
         assert signal.getsignal(signal.SIGHUP) == (signal.SIG_IGN if ignored else signal.default_int_handler)
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_screen_whose_terminal_closes_at_a_question_reports_it() -> None:
+    person, program = pty.openpty()
+
+    def close_at_the_question() -> None:
+        said = b""
+        while b"Go on?" not in said:
+            said += os.read(person, 4096)
+        os.close(person)
+
+    with os.fdopen(program, "r+b", buffering=0) as device:
+        terminal = io.TextIOWrapper(device, write_through=True)
+        screen = Screen(Console(file=terminal, force_terminal=True, width=80), Keyboard(program), stdin=terminal)
+        threading.Thread(target=close_at_the_question).start()
+        with pytest.raises(SupervisorGone, match="terminal"), screen:
+            screen.ask(Question("Go on?"))
