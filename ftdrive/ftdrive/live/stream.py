@@ -73,7 +73,7 @@ class CompensatedStream(ProcessedStream):
     stages : Stages
         May be set at any time.
     false_alarm_rate : float
-        Share of readings of a free tool that count as contact.
+        Share of readings of a free tool beyond the limit; four of five begin a contact.
     devices : ForceTorqueSensor and RobotArm, optional
         Used in place of those that the cell names.
 

@@ -296,7 +296,7 @@ def _contact(view: View) -> Line:
         return Line()
     if np.isnan(reading.chi2):
         return Line("noise not known yet", FAINT)
-    rate = f"1 in {1 / status.false_alarm_rate:.0f}" if status.false_alarm_rate else ""
+    rate = f"p {status.false_alarm_rate:.0e}".replace("e-0", "e-")
     sign = ">" if reading.chi2 > status.contact_limit else "<"
     test = f"χ² {reading.chi2:.0f} {sign} {status.contact_limit:.1f}, {rate}"
     if reading.in_contact:
