@@ -23,6 +23,8 @@ _GAIN = 0.1
 """Share of the difference that one step takes away: the offset follows within 2 s."""
 _DRIFT = np.repeat([TARE_DRIFT_N, TARE_DRIFT_NM], 3)
 """The offset follows no farther than this beyond three sigmas of the prediction."""
+_INEXACT = 1.5
+"""The wrench of a motion may be larger than that by poses 20 ms apart."""
 _OF_LAST, _ENOUGH = 5, 4
 """So many of the last readings begin or end a contact."""
 
@@ -99,7 +101,7 @@ class ContactTest:
             if (known := noise.of(state)) is not None:
                 W = self._whiten(known)
                 distance = np.linalg.norm((readings[part] - self._offset) @ W.T, axis=1)
-                distance -= np.linalg.norm(wrenches[:, part] @ W.T, axis=2).sum(axis=0)
+                distance -= _INEXACT * np.linalg.norm(wrenches[:, part] @ W.T, axis=2).sum(axis=0)
                 chi2[part] = np.square(np.maximum(distance, 0.0))
                 beyond[part] = chi2[part] > self.limit
                 self._follow_offset(residual[part], state, is_free=not beyond[part].any())

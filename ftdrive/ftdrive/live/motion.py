@@ -13,7 +13,7 @@ READING_S = 0.02
 
 _STILL_RAD, _STILL_M = 1e-4, 1e-4
 """Largest motion of the flange between two readings at rest."""
-_BEGINS = 0.2
+_BEGINS = 0.1
 """Share of it from which the wrench of a motion counts, which is felt before the motion is seen."""
 _HOLD_S = 0.3
 """A stopped arm rings so long."""
