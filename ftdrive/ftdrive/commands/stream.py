@@ -40,6 +40,8 @@ RECOVER_S = 10.0
 @FRAME
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve at. Another one is unprotected.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Port; 0 is a free one.")
+@click.option("--allow-origin", "origins", metavar="URL", multiple=True, help="Also serve pages of this origin.")
+@click.option("--allow-control", is_flag=True, help="Pages may tare and change frame and stages; programs always may.")
 @click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
 def stream(
     path: Path | None,
@@ -53,13 +55,15 @@ def stream(
     about: str,
     host: str,
     port: int,
+    origins: tuple[str, ...],
+    allow_control: bool,
     udp: str | None,
 ) -> None:
     """Serve the raw and the compensated wrench to viewers.
 
     Foxglove, Lichtblick and PlotJuggler from 3.16 connect to one WebSocket server. They receive every sample of the
-    sensor, poses, joint angles, frames, arrows and events, and can tare and change frame and stages. The arm is only
-    read, never moved. Ctrl-C ends.
+    sensor, poses, joint angles, frames, arrows and events. Programs can tare and change frame and stages. A page in a
+    browser is served if it is of Foxglove or Lichtblick. The arm is only read, never moved. Ctrl-C ends.
     """
     from ftdrive.servers.foxglove import FoxgloveServer
 
@@ -70,7 +74,9 @@ def stream(
         source = open_source(
             path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
         )
-        server = stack.enter_context(closing(FoxgloveServer(source, host, port)))
+        server = stack.enter_context(
+            closing(FoxgloveServer(source, host, port, origins=origins, allow_control=allow_control))
+        )
         sinks: list[FoxgloveServer | UdpSender] = [server]
         if udp_address is not None:
             sinks.append(stack.enter_context(closing(UdpSender(source.info, *udp_address))))
@@ -122,7 +128,7 @@ def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp
         talk.print(f"  In a browser:          {server.app_url}")
     else:
         talk.print(
-            f"Unprotected: any computer that reaches port {server.port} can read the stream, tare it and change its "
-            "frame and stages. There is no password and no encryption."
+            f"Unprotected: a program on any computer that reaches port {server.port} can read the stream, tare it and "
+            "change its frame and stages. There is no password and no encryption."
         )
     talk.print("Ctrl-C ends.")

@@ -340,7 +340,7 @@ def test_without_a_client_nothing_is_packed(server: FoxgloveServer, monkeypatch:
 
 def test_a_port_in_use_is_named(server: FoxgloveServer, stream: FakeStream) -> None:
     with pytest.raises(
-        ConfigError, match=rf"cannot listen on 127\.0\.0\.1:{server.port} .*Address already in use .*choose"
+        ConfigError, match=rf"cannot listen on 127\.0\.0\.1:{server.port} \(Address already in use\): choose"
     ):
         FoxgloveServer(cast(Any, stream), port=server.port)
 
