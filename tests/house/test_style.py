@@ -10,6 +10,7 @@ from types import ModuleType
 import pytest
 
 from tests.house import codes_page, commands_page
+from tests.house.printing import prints_in
 from tests.house.sentences import sentences_in
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -99,3 +100,28 @@ def test_help_imports_nothing_heavy_and_opens_nothing() -> None:
     outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert outcome.returncode == 0, outcome.stderr
     assert "demo" in outcome.stdout
+
+
+def test_whatever_is_printed_cannot_command_the_terminal() -> None:
+    assert prints_in(ROOT / "ftdrive/ftdrive") == []
+
+
+@pytest.mark.parametrize(
+    ("code", "is_hit"),
+    [
+        ("print(name)", True),
+        ("click.echo(run.tool)", True),
+        ("self._stdout.write(line)", True),
+        ("sys.stderr.write(str(error))", True),
+        ("Console().print(table)", True),
+        ("handlers = [logging.StreamHandler()]", True),
+        ("self._stderr.write(in_whole_words(text, file))", False),
+        ("click.prompt(visible(shown))", False),
+        ("echo(run.tool)", False),
+        ("talk.print(run.tool)", False),
+        ("file.write(text)", False),
+    ],
+)
+def test_unsafe_prints_are_recognised(code: str, is_hit: bool, tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text(code, encoding="utf-8")
+    assert bool(prints_in(tmp_path)) == is_hit

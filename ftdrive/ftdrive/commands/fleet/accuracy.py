@@ -12,6 +12,7 @@ import click
 from ftdrive import __version__
 from ftdrive.commands.common import FOLDER, JSON, STORE, write_json
 from ftdrive.commands.fleet.engine import ENGINE, open_workers, runs_to_solve, with_progress
+from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftdrive.fleet.accuracy import Accuracy, Group
@@ -93,16 +94,16 @@ def _print(run: Path, found: "Accuracy | str") -> None:
     from ftdrive.terminal.table import print_table
 
     if isinstance(found, str):
-        click.echo(f"failed: {run}: {found}")
+        echo(f"failed: {run}: {found}")
         return
     noise = ", ".join(["the measured noise", *(f"{name} {size:.2g}" for name, size in found.components.items())])
-    click.echo(f"{run}: {found.draws} draws of {found.poses} poses with {noise}")
+    echo(f"{run}: {found.draws} draws of {found.poses} poses with {noise}")
     if found.groups:
         print_table(_TITLES, [_row(group) for group in found.groups], folding=())
-        click.echo(f"chi2 / 15: {found.chi2_per_dof:.3f}")
-    click.echo(f"{found.rejected} draws were rejected, {found.not_observable} were not observable.")
+        echo(f"chi2 / 15: {found.chi2_per_dof:.3f}")
+    echo(f"{found.rejected} draws were rejected, {found.not_observable} were not observable.")
     for words in _in_words(found):
-        click.echo(words)
+        echo(words)
 
 
 def _row(group: "Group") -> tuple[str, ...]:

@@ -7,10 +7,12 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from rich.cells import cell_len, set_cell_size
+from rich.text import Text
 
 from ftdrive.checks.check import Check
 from ftdrive.live.samples import Stages, StreamInfo, StreamStatus, WrenchFrame
 from ftdrive.terminal.live.history import Columns
+from ftdrive.terminal.text import visible
 from ftdrivers.interfaces import Array
 
 BAD, WARNING, GOOD = "red bold", "bold black on yellow", "green"
@@ -36,6 +38,7 @@ class Line:
 
     def add(self, text: str, style: str = "", key: str = "") -> Self:
         """Append text."""
+        text = visible(text)
         self.width += cell_len(text)
         if self.parts and self.parts[-1][1:] == (style, key):
             self.parts[-1] = Part(self.parts[-1].text + text, style, key)
@@ -75,6 +78,10 @@ class Line:
             line.add("".join(text[start:end]), style)
             start = end
         return line
+
+    def as_text(self) -> Text:
+        """Return this line for rich."""
+        return Text.assemble(*((part.text, part.style) for part in self.parts), no_wrap=True)
 
     def __str__(self) -> str:
         return "".join(part.text for part in self.parts)
