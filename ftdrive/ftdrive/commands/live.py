@@ -44,6 +44,8 @@ from ftdrive.terminal.text import echo
 from ftdrivers.clock import Clock
 from ftdrivers.interfaces import Array
 
+_PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
+"""N and N·m, sensor axes, on the tool of an emulated cell."""
 _RECOVER_S = 10.0
 """So long a stream with an interruption may take to deliver again."""
 
@@ -82,7 +84,8 @@ def live(
     """Show the raw and the compensated wrench, refreshed ten times a second.
 
     The compensated wrench is the contact wrench: measured minus bias and gravity, along the chosen axes and about the
-    chosen point. The arm is only read, never moved. With --json, one object per line.
+    chosen point. The arm is only read, never moved. With --json, one object per line. With --simulate, the key f pushes
+    the tool.
     """
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
     if speed is not None and replay is None:
@@ -94,6 +97,7 @@ def live(
         stream: CompensatedStream | ReplayedStream
         checks = list[Check]()
         recorder: Callable[[Path], Recorder] | None = None
+        push: Callable[[], object] | None = None
         if replay is not None:
             stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed)
         else:
@@ -101,6 +105,8 @@ def live(
                 path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
             )
             checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, stream.cell.sensor.mass_kg)]
+            if simulate:
+                push = partial(stream.station.control, do="push", wrench=_PUSH, seconds=1.0)
             recorder = partial(_recorder, stream.info, stream.cell.to_dict())
         if once or as_json or not sys.stdout.isatty():
             _print(stream, stream.clock, once=once, as_json=as_json)
@@ -109,7 +115,7 @@ def live(
         else:
             from ftdrive.terminal.live_screen import run_live
 
-            run_live(stream, recorder=recorder, checks=checks)
+            run_live(stream, recorder=recorder, push=push, checks=checks)
 
 
 def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, speed: float) -> ReplayedStream:

@@ -23,7 +23,7 @@ from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.samples import Axes
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.servers.udp import UdpSender
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import print_address, talk
 from ftdrivers.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -120,12 +120,12 @@ def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     url = f"ws://{f'[{name}]' if ':' in name else name}:{server.port}"
     talk.print(f"Serving the wrench in {source.frame}; {source.info.calibration_name}.")
-    talk.print(f"  Foxglove, Lichtblick:  Open connection > Foxglove WebSocket > {url}")
-    talk.print(f"  PlotJuggler from 3.16: Streaming > Foxglove Bridge > {url}")
+    print_address("  Foxglove, Lichtblick:  Open connection > Foxglove WebSocket > ", url)
+    print_address("  PlotJuggler from 3.16: Streaming > Foxglove Bridge > ", url)
     if udp is not None:
         talk.print(f"  PlotJuggler before:    Streaming > UDP Server > port {udp[1]}, JSON, use the timestamp")
     if is_loopback(host):
-        talk.print(f"  In a browser:          {server.app_url}")
+        print_address("  In a browser:          ", server.app_url)
     else:
         talk.print(
             f"Unprotected: a program on any computer that reaches port {server.port} can read the stream, tare it and "

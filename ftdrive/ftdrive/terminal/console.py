@@ -8,6 +8,7 @@ from typing import TextIO
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.style import Style
 from rich.text import Text
 
 from ftdrive.terminal.text import visible
@@ -37,6 +38,11 @@ talk = Talk(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=n
 def printer() -> Console:
     """Return a console for stdout: results as text. It prints brackets and colons as they are."""
     return _Console(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+
+
+def print_address(words: str, address: str) -> None:
+    """Print an address behind words: on one line, however narrow the terminal is, and as a link where it can."""
+    talk.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
 
 
 _NARROWEST = 20

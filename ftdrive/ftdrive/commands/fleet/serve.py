@@ -45,7 +45,7 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
     from ftdrive.fleet.metrics import MetricsServer
     from ftdrive.fleet.serve import serve as serve_fleet
     from ftdrive.fleet.status import fleet_state
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import print_address, talk
     from ftdrivers.clock import REAL
 
     host, port = host_and_port("--metrics", address, f"127.0.0.1:{PORT}", lowest=0)
@@ -54,7 +54,9 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
     with ExitStack() as stack:
         metrics = stack.enter_context(closing(MetricsServer(host, port)))
         sinks: list[Sink] = [metrics]
-        talk.print(f"Serving {found.name} at http://{f'[{host}]' if ':' in host else host}:{metrics.port}/metrics")
+        print_address(
+            f"Serving {found.name} at ", f"http://{f'[{host}]' if ':' in host else host}:{metrics.port}/metrics"
+        )
         if not is_loopback(host):
             talk.print(f"Unprotected: any computer that reaches port {metrics.port} can read the state of all cells.")
         if broker_url is not None:

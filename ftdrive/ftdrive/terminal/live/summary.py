@@ -102,6 +102,7 @@ class Summary:
             columns=self._columns,
             recording_s=recording_s,
             is_frozen=self.is_frozen,
+            can_push=feed.push is not None,
             calibrated=self._calibrated,
             replay=_replay(feed.stream),
         )

@@ -57,17 +57,20 @@ class Line:
         return self
 
     def fit(self, width: int) -> "Line":
-        """Return this line padded to `width` cells, or a cut one that ends in an ellipsis."""
+        """Return this line padded to `width` cells, or the words that fit and an ellipsis."""
         if self.width <= width:
             return self.to(width)
         fitted = Line()
         for part in self.parts:
             room = width - 1 - fitted.width
             if cell_len(part.text) > room:
-                fitted.add(set_cell_size(part.text, max(room, 0)), part.style, part.key)
+                text = set_cell_size(part.text, max(room, 0))
+                if not part.text.startswith(" ", len(text)):  # a whole word or none of it
+                    text = text[: text.rfind(" ") + 1]
+                fitted.add(text, part.style, part.key)
                 break
             fitted.add(*part)
-        return fitted.add("…"[:width])
+        return fitted.add("…"[:width]).to(width)
 
     @classmethod
     def of_cells(cls, text: Sequence[str], styles: Sequence[str]) -> Self:
@@ -171,6 +174,8 @@ class View:
     recording_s: float | None
     """Duration of the recording; None without one."""
     is_frozen: bool = False
+    can_push: bool = False
+    """Whether the tool is emulated, so that a key can push it."""
     replay: Replay | None = None
     calibrated: Array | None = None
     """(n, 3) directions of gravity in flange axes at the calibrated orientations, as unit vectors; None: unknown."""

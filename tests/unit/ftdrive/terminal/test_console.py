@@ -23,6 +23,7 @@ from ftdrive.errors import Declined
 from ftdrive.session import session
 from ftdrive.session.events import Noted
 from ftdrive.session.operator import Question
+from ftdrive.terminal import console
 from ftdrive.terminal.console import hanging, in_whole_words, printer, talk
 from ftdrive.terminal.live.view import Line
 from ftdrive.terminal.operators import PlainOperator
@@ -111,6 +112,22 @@ def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path, 
     assert in_a_sentence(OSError(ENOSPC, "No space left on device")) == snapshot
     own = FileExistsError("it is there: choose another name")
     assert in_a_sentence(own) == str(own)
+
+
+def test_an_address_stays_on_one_line_and_is_a_link_where_the_terminal_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    url = "https://app.foxglove.dev?ds=foxglove-websocket&ds.url=ws%3A%2F%2F127.0.0.1%3A34567"
+    for is_terminal in (True, False):
+        file = io.StringIO()
+        monkeypatch.setattr(
+            console,
+            "talk",
+            Console(file=file, width=40, force_terminal=is_terminal, color_system="standard" if is_terminal else None),
+        )
+        console.print_address("  In a browser:          ", url)
+        shown = file.getvalue()
+        assert url in shown
+        assert shown.count("\n") == 1
+        assert (f";{url}\x1b\\" in shown) is is_terminal
 
 
 NAME = "\x1b]0;owned\x07 gripper\x9b2J \u202epilf\r0\udcff\ttab\nline\r\n"
