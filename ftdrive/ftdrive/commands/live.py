@@ -27,7 +27,6 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.live_source import open_source
 from ftdrive.errors import ConfigError
-from ftdrive.live.frames import FrameTransform
 from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Axes, StreamInfo, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
@@ -205,7 +204,7 @@ def _reading(view: View) -> dict[str, Any]:
         "t_s": reading.t_host_ns * 1e-9,
         "axes": reading.frame.axes,
         "about": "sensor origin" if reading.frame.about == "sensor" else reading.frame.about,
-        "raw": wrench(FrameTransform(reading.frame, view.info)(reading.raw[None], reading.R_base_flange[None])[0]),
+        "raw": wrench(reading.raw_in_frame),
         "compensated": wrench(reading.wrench),
         "sigma": wrench(reading.sigma),
         "contact": None if view.silent else reading.in_contact,

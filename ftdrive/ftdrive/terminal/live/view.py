@@ -112,6 +112,8 @@ class Reading:
     """(6,) N and N·m, in `frame`."""
     raw: Array
     """(6,) N and N·m, sensor axes, about the sensor origin."""
+    raw_in_frame: Array
+    """(6,) the same in `frame`."""
     sigma: Array
     """(6,) of `wrench`: noise and calibration; NaN until the noise is known."""
     sample_sigma: Array

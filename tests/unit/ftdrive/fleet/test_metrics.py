@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
@@ -22,6 +23,13 @@ Samples = dict[tuple[str, str], float]
 def server() -> Iterator[MetricsServer]:
     with closing(MetricsServer("127.0.0.1", 0)) as server:
         yield server
+
+
+def test_pages_of_others_cannot_read_the_state(server: MetricsServer) -> None:
+    for name, value in (("Origin", "https://evil.example"), ("Host", "evil.example")):
+        foreign = urllib.request.Request(f"http://127.0.0.1:{server.port}/metrics", headers={name: value})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(foreign, timeout=30)
 
 
 def scraped(server: MetricsServer) -> str:
