@@ -56,16 +56,12 @@ _CLOSED_PIPE = 128 + 13
 """As a shell reports a program that SIGPIPE ended."""
 
 
-class _ClosedPipeError(Exception):
-    """The program that reads our output has ended."""
-
-
 @contextmanager
 def _closed_pipe() -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:  # click would end with 1
-        raise _ClosedPipeError from None
+        raise click.exceptions.Exit(_CLOSED_PIPE) from None
 
 
 class _LazyGroup(click.Group):
@@ -164,8 +160,6 @@ def run(arguments: Sequence[str]) -> int:
     except (click.Abort, KeyboardInterrupt):
         echo("interrupted", err=True)
         return 130
-    except _ClosedPipeError:
-        return _CLOSED_PIPE
     except Exception as error:
         code = exit_code(error)
         if code is None:
