@@ -1,7 +1,7 @@
 """`ftdrive live`: raw and compensated wrench, ten times a second."""
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
@@ -110,7 +110,7 @@ def live(
         if once or as_json or not sys.stdout.isatty():
             _print(stream, stream.clock, once=once, as_json=as_json)
         elif plain or not (talk.is_terminal and sys.stdin.isatty()):
-            _show_table(stream, stream.clock)
+            _show_table(stream, stream.clock, checks)
         else:
             from ftdrive.terminal.live_screen import run_live
 
@@ -147,22 +147,22 @@ def _print(stream: Stream, clock: Clock, *, once: bool = False, as_json: bool = 
             break
 
 
-def _show_table(stream: Stream, clock: Clock) -> None:
+def _show_table(stream: Stream, clock: Clock, checks: Sequence[Check]) -> None:
     shown, console = Group(), printer()
     with (
         Keyboard(0) if Keyboard.usable(0) else nullcontext(),  # Enter would break the screen
         Live(console=console, refresh_per_second=10) as screen,
     ):
-        for view in _views(stream, clock):
+        for view in _views(stream, clock, checks):
             shown = Group(*(line.as_text() for line in plain_lines(view, console.width)))
             screen.update(Group(shown, "Ctrl-C ends"))
         screen.update(Group(shown, "The recording has ended."))
 
 
-def _views(stream: Stream, clock: Clock, *, raises: bool = False) -> Iterator[View]:
+def _views(stream: Stream, clock: Clock, checks: Sequence[Check] = (), *, raises: bool = False) -> Iterator[View]:
     """Yield the state each `MEAN_S` from when the noise is known; raise a failure at once or when it lasts."""
     feed = Feed(stream)
-    summary = Summary(feed)
+    summary = Summary(feed, checks)
     begin_ns: int | None = None
     is_known, ended = False, False
     failing_since_s: float | None = None

@@ -16,6 +16,7 @@ from rich.console import Console
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, solve
 from ftcalib.model import predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftdrive.checks.check import Check
 from ftdrive.commands import live
 from ftdrive.live.processing import Processor
 from ftdrive.live.replay import ReplayedStream
@@ -128,7 +129,7 @@ class Quiet:
 def shown_table(monkeypatch: pytest.MonkeyPatch, stream: Any, width: int = 80) -> str:
     console = Console(width=width, file=io.StringIO(), color_system=None, force_terminal=False)
     monkeypatch.setattr(live, "printer", lambda: console)
-    live._show_table(stream, stream.clock)
+    live._show_table(stream, stream.clock, [Check("robot.payload", "ok", "robot 1.44 kg")])
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
@@ -143,6 +144,7 @@ def test_the_table_ends_with_the_recording_and_breaks_no_word(monkeypatch: pytes
     (force,) = [line for line in lines if line.startswith(" Fx")]
     assert re.match(r" Fx +\+1\.\d+ +0\.\d+ ", force)
     assert any("▲ CONTACT" in line for line in lines)
+    assert "robot 1.44 kg" in lines[-2]
     assert Quiet.used == ["echo off", "as before"]
 
 
