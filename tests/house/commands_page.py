@@ -1,4 +1,4 @@
-"""Write `docs/ftdrive/commands.md` from the commands: `uv run python tests/house/commands_page.py`."""
+"""Write `docs/reference/commands.md` from the commands: `uv run python tests/house/commands_page.py`."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,14 +7,14 @@ import click
 
 from ftdrive.cli import cli
 
-PAGE = Path(__file__).parents[2] / "docs/ftdrive/commands.md"
+PAGE = Path(__file__).parents[2] / "docs/reference/commands.md"
 
 _HEAD = """\
 # Commands
 
 This page is generated: run `uv run python tests/house/commands_page.py` after a change of an option. A module here
 reads the options of one command, makes one call and prints text or JSON. Configuration, exit codes and file formats are
-described in [../README.md](../../ftdrive/README.md).
+described in [files.md](files.md).
 """
 
 

@@ -9,7 +9,7 @@ from ftdrive.session.hazards import Hazard
 
 
 def test_the_table_has_a_row_for_each_hazard() -> None:
-    readme = (Path(__file__).parents[4] / "docs/ftdrive/session.md").read_text(encoding="utf-8")
+    readme = (Path(__file__).parents[4] / "docs/explanation/safety.md").read_text(encoding="utf-8")
     assert [int(row) for row in re.findall(r"^\| (\d+) \|", readme, re.MULTILINE)] == list(Hazard)
 
 
