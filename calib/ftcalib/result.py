@@ -73,7 +73,7 @@ class DriftResult:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """Estimates with their covariance; arrays are read-only. Frames and signs: docs/explanation/methods.md."""
+    """Estimates with their covariance; arrays are read-only. Frames and signs: docs/explanation/model.md."""
 
     parameters: Parameters
     covariance: Array
