@@ -6,11 +6,13 @@ import sys
 from importlib.metadata import distribution
 from pathlib import Path
 
+import click
 import pytest
 
-from tests.house import commands_page
+from ftdrive.cli import cli
 
 ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = ("ftdrive", "calib", "drivers", "mocks", "tests")
 
 
 @pytest.mark.timeout(600)  # mypy without a cache takes 45 s of computing time
@@ -30,18 +32,35 @@ def test_checker_is_content(command: list[str]) -> None:
     assert outcome.returncode == 0, outcome.stdout + outcome.stderr
 
 
-def test_the_page_of_commands_is_up_to_date() -> None:
-    assert commands_page.PAGE.read_text(encoding="utf-8") == commands_page.page(), (
-        "an option has changed: uv run python tests/house/commands_page.py"
-    )
+def test_the_page_of_commands_has_every_command() -> None:
+    page = (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r":prog: ftdrive (\w+)", page)) == sorted(cli.list_commands(click.Context(cli)))
 
 
-def test_the_readme_is_short_and_its_links_exist() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 150
+@pytest.mark.parametrize(
+    ("page", "lines"),
+    [
+        ("README.md", 150),
+        ("CONTRIBUTING.md", 150),
+        *(
+            (f"{folder}/README.md", 60)
+            for folder in ("ftdrive", "calib", "drivers", "mocks", "tests", "tests/benchmarks")
+        ),
+    ],
+)
+def test_a_page_is_short_and_its_links_exist(page: str, lines: int) -> None:
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= lines
     links = re.findall(r"\]\((?!https?:)([^)#]+)", text)
-    assert len(links) > 5
-    assert [link for link in links if not (ROOT / link).exists()] == []
+    assert links
+    assert [link for link in links if not (ROOT / page).parent.joinpath(link).exists()] == []
+
+
+def test_every_page_that_the_code_names_exists() -> None:
+    code = [file for folder in FOLDERS for file in (ROOT / folder).rglob("*.py")]
+    named = {page for file in code for page in re.findall(r"docs/[\w/-]+\.md", file.read_text(encoding="utf-8"))}
+    assert len(named) > 5
+    assert [page for page in named if not (ROOT / page).exists()] == []
 
 
 def test_no_merge_was_left_half_done() -> None:
