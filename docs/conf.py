@@ -6,6 +6,8 @@ from importlib.metadata import version as installed
 import click
 from sphinx.application import Sphinx
 
+import ftdrive
+
 project = "ftdrive"
 copyright = "the ftdrive authors"
 version = release = installed("ftdrive")
@@ -22,9 +24,7 @@ extensions = [
 exclude_patterns = ["_build"]
 default_role = "code"  # `name` in docstrings and in help texts, as in Markdown
 smartquotes = False  # they turn --option into –option
-suppress_warnings = ["myst.strikethrough"]
 
-myst_enable_extensions = ["deflist", "dollarmath"]
 myst_heading_anchors = 3  # links to headings, as repositories make them
 
 autodoc_member_order = "bysource"
@@ -58,7 +58,25 @@ def _arguments(_: Sphinx, __: click.Context, lines: list[str]) -> None:
     lines.clear()
 
 
+def _elsewhere(app: Sphinx, what: str, name: str, value: object, *_: object) -> bool | None:
+    """Skip a name that another page of the API describes: that of ftdrivers for drivers, else that of ftdrive."""
+    page = app.env.docname.rpartition("/")[2]
+    if str(getattr(value, "__module__", "")).startswith("ftdrivers."):
+        home = "ftdrivers"
+    else:
+        home = "ftdrive" if name in getattr(ftdrive, "__all__", ()) else page
+    return True if what == "module" and page != home else None
+
+
+def _module_text(_: Sphinx, what: str, __: str, ___: object, ____: object, lines: list[str]) -> None:
+    """Leave out the text of a module: it is written for readers of the code, and the page has its own."""
+    if what == "module":
+        lines.clear()
+
+
 def setup(app: Sphinx) -> None:
-    """Connect both."""
+    """Connect them."""
+    app.connect("autodoc-skip-member", _elsewhere)
+    app.connect("autodoc-process-docstring", _module_text, priority=1000)  # after numpydoc
     app.connect("sphinx-click-process-options", _options)
     app.connect("sphinx-click-process-arguments", _arguments)
