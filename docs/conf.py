@@ -29,6 +29,7 @@ myst_heading_anchors = 3  # links to headings, as repositories make them
 
 autodoc_member_order = "bysource"
 autodoc_typehints = "none"  # docstrings name units and shapes; NDArray[float64] fills a line and says neither
+doctest_test_doctest_blocks = ""  # pytest runs the examples of docstrings, in a folder with their files
 numpydoc_show_class_members = False  # the members follow anyway
 nitpick_ignore_regex = [(r"py:.*", r"(?!ft(calib|drive|drivers)\b).*")]  # only our own names are checked
 
