@@ -1,26 +1,57 @@
-"""The solver core: from poses and wrenches to a calibration. Pure: numpy and scipy, no device."""
+"""The solver core: from poses and wrenches to a calibration. Pure: numpy and scipy, no device.
 
-from ftcalib.data.dataset import CalibrationDataset, read_csv
-from ftcalib.data.dwell_mean import PoseMean, is_stationary, mean_and_covariance
-from ftcalib.errors import BadCalibration, BadDataset, CalibError, NotObservable
-from ftcalib.known import Known
-from ftcalib.model import PARAMETER_NAMES, Parameters
-from ftcalib.result import CalibrationResult
-from ftcalib.solver import solve
+The names are imported at their first use, so that `import ftcalib.errors` needs neither numpy nor scipy.
+"""
+
+from importlib import import_module
+
+TYPE_CHECKING = False  # type checkers take it for that of `typing`
+if TYPE_CHECKING:
+    from ftcalib.data.dataset import CalibrationDataset, read_csv
+    from ftcalib.data.dwell_mean import PoseMean, is_stationary, mean_and_covariance
+    from ftcalib.errors import BadCalibration, BadDataset, NotObservable
+    from ftcalib.findings import Finding
+    from ftcalib.known import Known
+    from ftcalib.model import PARAMETER_NAMES, Parameters
+    from ftcalib.result import CalibrationResult
+    from ftcalib.setup import Setup
+    from ftcalib.solver import solve
 
 __all__ = [
     "PARAMETER_NAMES",
     "BadCalibration",
     "BadDataset",
-    "CalibError",
     "CalibrationDataset",
     "CalibrationResult",
+    "Finding",
     "Known",
     "NotObservable",
     "Parameters",
     "PoseMean",
+    "Setup",
     "is_stationary",
     "mean_and_covariance",
     "read_csv",
     "solve",
 ]
+
+_MODULES = {
+    "ftcalib.data.dataset": ("CalibrationDataset", "read_csv"),
+    "ftcalib.data.dwell_mean": ("PoseMean", "is_stationary", "mean_and_covariance"),
+    "ftcalib.errors": ("BadCalibration", "BadDataset", "NotObservable"),
+    "ftcalib.findings": ("Finding",),
+    "ftcalib.known": ("Known",),
+    "ftcalib.model": ("PARAMETER_NAMES", "Parameters"),
+    "ftcalib.result": ("CalibrationResult",),
+    "ftcalib.setup": ("Setup",),
+    "ftcalib.solver": ("solve",),
+}
+
+if not TYPE_CHECKING:  # a type checker would accept any name
+
+    def __getattr__(name: str) -> object:
+        for module, names in _MODULES.items():
+            if name in names:
+                value = globals()[name] = getattr(import_module(module), name)
+                return value
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

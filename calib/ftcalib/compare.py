@@ -5,16 +5,17 @@ from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ftcalib.data.dataset import CalibrationDataset
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.files import JSON
 from ftcalib.known import Known
 from ftcalib.likelihood.session import Drift
-from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, predict
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, angle_between, predict
 from ftcalib.published.methods import PUBLISHED
 from ftcalib.result import CalibrationResult, Method
+from ftcalib.setup import NOTHING, Setup
 from ftcalib.solver import estimator_of, solve
 
 _MOST_FOLDS = 50
@@ -63,31 +64,38 @@ def compare(
     drift: Drift = "auto",
     known: Known | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
-    up_in_base: ArrayLike = UP_IN_BASE,
+    setup: Setup = NOTHING,
 ) -> list[Compared]:
     """Run all methods; a method that cannot use these data gives a reason instead.
 
     Parameters
     ----------
     dataset : CalibrationDataset
-    drift, known, g_m_s2, up_in_base
+    drift, known, g_m_s2, setup
         As for `solve`. The published methods that need gravity take it from `known`, or assume a level base.
 
     Raises
     ------
     NotObservable
         The default method cannot use these data.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> compared = ftdrive.compare(ftdrive.read_dataset("poses.csv"))
+    >>> compared[0].method, round(compared[0].mass_kg, 3)
+    ('ml', 1.235)
     """
-    default = solve(dataset, "ml", drift=drift, known=known, g_m_s2=g_m_s2)
+    default = solve(dataset, "ml", drift=drift, known=known, g_m_s2=g_m_s2, setup=setup)
     compared = []
     for method in get_args(Method):
         try:
             if method == "ml":
                 found = _fitted(default)
             elif method in PUBLISHED:
-                found = _published(dataset, method, known, g_m_s2, up_in_base)
+                found = _published(dataset, method, known, g_m_s2, setup)
             else:
-                found = _fitted(solve(dataset, method, drift=drift, known=known, g_m_s2=g_m_s2))
+                found = _fitted(solve(dataset, method, drift=drift, known=known, g_m_s2=g_m_s2, setup=setup))
         except (NotObservable, BadDataset) as error:
             compared.append(Compared(method, str(error)))
             continue
@@ -104,14 +112,14 @@ def _fitted(result: CalibrationResult) -> tuple[Parameters, float, float]:
 
 
 def _published(
-    dataset: CalibrationDataset, method: Method, known: Known | None, g_m_s2: float, up_in_base: ArrayLike
+    dataset: CalibrationDataset, method: Method, known: Known | None, g_m_s2: float, setup: Setup
 ) -> tuple[Parameters, float, float]:
     R_base_flange, wrench = dataset.R_base_flange, dataset.wrench
-    parameters = estimator_of(method, R_base_flange, known, g_m_s2, up_in_base)(wrench)
+    parameters = estimator_of(method, R_base_flange, known, g_m_s2, setup)(wrench)
     left_out = np.empty_like(wrench)
     try:
         for out in _folds(len(wrench)):
-            without = estimator_of(method, R_base_flange[~out], known, g_m_s2, up_in_base)(wrench[~out])
+            without = estimator_of(method, R_base_flange[~out], known, g_m_s2, setup)(wrench[~out])
             left_out[out] = wrench[out] - predict(without, R_base_flange[out])
     except NotObservable:
         return parameters, np.nan, np.nan

@@ -10,10 +10,10 @@ which is `wrench - predict(parameters, R_base_flange)` of `ftcalib.model` with e
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ftcalib.likelihood.gain_and_cross_talk import Response
-from ftcalib.model import Parameters, skew
+from ftcalib.model import Parameters, Rotations, matrices_of, skew
 
 Reals = NDArray[np.floating[Any]]
 
@@ -43,6 +43,15 @@ class Compensator:
     Notes
     -----
     Nothing is written after construction: threads may share an instance.
+
+    Examples
+    --------
+    >>> import ftdrive, numpy as np
+    >>> calibration = ftdrive.solve(ftdrive.read_dataset("poses.csv"))
+    >>> compensate = ftdrive.Compensator(calibration.parameters, response=calibration.response)
+    >>> free = ftdrive.predict(calibration.parameters, np.eye(3))
+    >>> bool(np.abs(compensate(free, np.eye(3))).max() < 0.01)
+    True
     """
 
     def __init__(
@@ -66,21 +75,21 @@ class Compensator:
         self._operand: Reals = np.zeros(16, self.dtype)
         self._operand[15] = 1
 
-    def __call__(self, wrench: Reals, R_base_flange: Reals) -> Reals:
+    def __call__(self, wrench: ArrayLike, R_base_flange: Rotations) -> Reals:
         """Compensate one sample or many, with all checks; `sample` and `batch` are quicker.
 
         Parameters
         ----------
         wrench : array, shape (6,) or (n, 6)
             As measured, N and N·m, in the sensor frame.
-        R_base_flange : array, shape (3, 3) or (n, 3, 3)
+        R_base_flange : array, shape (3, 3) or (n, 3, 3), or Rotation
 
         Returns
         -------
         array, same shape as `wrench`
             Contact wrench on the sensor, in the sensor frame, about the sensor origin.
         """
-        wrench, R_base_flange = np.asarray(wrench), np.asarray(R_base_flange)
+        wrench, R_base_flange = np.asarray(wrench), matrices_of(R_base_flange)
         _check_shapes(wrench, R_base_flange)
         return self.sample(wrench, R_base_flange) if wrench.ndim == 1 else self.batch(wrench, R_base_flange)
 

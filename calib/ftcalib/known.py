@@ -17,6 +17,15 @@ class Known:
     ------
     ValueError
         An invalid rotation, a direction of length zero, a mass that is not positive, or a negative tolerance.
+
+    Examples
+    --------
+    The tool was weighed on a scale:
+
+    >>> import ftdrive
+    >>> result = ftdrive.solve(ftdrive.read_dataset("poses.csv"), known=ftdrive.Known(mass_kg=1.235))
+    >>> round(result.mass_kg, 6)
+    1.235
     """
 
     R_flange_sensor: ArrayLike | None = None

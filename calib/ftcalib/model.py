@@ -7,14 +7,18 @@ Source: Yu, Shi, Lou 2021, eqs 12-13, with e_bR = R_base_flange.T and s_eR = R_f
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Any, Self, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
+
+Rotations: TypeAlias = Rotation | Sequence[Rotation] | ArrayLike
+"""Rotations as a user has them; `matrices_of` returns their matrices."""
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 ROUNDING = 2e-3  # rounding to three decimals moves an entry of R^T R by at most 1.8e-3
@@ -33,7 +37,15 @@ BIASES = np.r_[6:9, 12:15]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameters:
-    """The estimated quantities."""
+    """The estimated quantities.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> parameters = ftdrive.solve(ftdrive.read_dataset("poses.csv")).parameters
+    >>> parameters.p_sensor_com_m.round(3)
+    array([0.004, 0.002, 0.061])
+    """
 
     R_flange_sensor: Array
     """(3, 3) maps sensor coordinates to flange coordinates."""
@@ -103,19 +115,37 @@ def gravity_wrench(parameters: Parameters, R_base_flange: Array) -> Array:
     return np.asarray(np.concatenate([force_N, torque_Nm], axis=-1))
 
 
-def predict(parameters: Parameters, R_base_flange: Array) -> Array:
+def predict(parameters: Parameters, R_base_flange: Rotations) -> Array:
     """Wrench that the sensor reads without contact: weight and bias, Yu eqs 12-13.
 
     Parameters
     ----------
     parameters : Parameters
-    R_base_flange : array, shape (..., 3, 3)
+    R_base_flange : array, shape (..., 3, 3), or Rotation
+        Maps flange coordinates to base coordinates.
 
     Returns
     -------
     array, shape (..., 6)
         N and N·m, in the sensor frame, about its origin.
+
+    Examples
+    --------
+    1 kg below a sensor whose z axis points down:
+
+    >>> import ftdrive
+    >>> from scipy.spatial.transform import Rotation
+    >>> parameters = ftdrive.Parameters(
+    ...     R_flange_sensor=[[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    ...     gravity_force_base_N=[0, 0, -9.80665],
+    ...     force_bias_N=[0, 0, 0],
+    ...     p_sensor_com_m=[0, 0, 0.05],
+    ...     torque_bias_Nm=[0, 0, 0],
+    ... )
+    >>> ftdrive.predict(parameters, Rotation.from_euler("x", 180, degrees=True)).round(3) + 0.0
+    array([0.   , 0.   , 9.807, 0.   , 0.   , 0.   ])
     """
+    R_base_flange = matrices_of(R_base_flange)
     bias = np.concatenate([parameters.force_bias_N, parameters.torque_bias_Nm])
     return np.asarray(gravity_wrench(parameters, R_base_flange) + bias)
 
@@ -147,6 +177,15 @@ def jacobian(parameters: Parameters, R_base_flange: Array) -> Array:
     J[..., 3:, 9:12] = -skew(gravity_flange_N @ parameters.R_flange_sensor)
     J[..., 3:, 12:15] = np.eye(3)
     return J
+
+
+def matrices_of(rotations: Rotations) -> NDArray[Any]:
+    """Return the matrices (..., 3, 3) of rotations."""
+    if isinstance(rotations, Rotation):
+        return rotations.as_matrix()
+    if isinstance(rotations, Sequence) and rotations and isinstance(rotations[0], Rotation):
+        return np.stack([one.as_matrix() for one in cast("Sequence[Rotation]", rotations)])
+    return np.asarray(rotations)
 
 
 def skew(v: Array) -> Array:

@@ -5,9 +5,8 @@ from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ftcalib.assessment.contradictions import contradictions, other_unit
+from ftcalib.assessment.contradictions import contradictions
 from ftcalib.assessment.cross_validation import AssessedFit, IndependentFit
 from ftcalib.assessment.faults import faults, other_poses
 from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
@@ -15,13 +14,15 @@ from ftcalib.assessment.verdict import SIGNIFICANT_SIGMAS, judge
 from ftcalib.data.dataset import CalibrationDataset
 from ftcalib.data.pooling import pooled_covariance
 from ftcalib.errors import NotObservable
+from ftcalib.findings import Finding
 from ftcalib.known import Known
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
-from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, predict
+from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters, predict
 from ftcalib.published.methods import PUBLISHED, Estimator, published
 from ftcalib.result import CalibrationResult, DriftResult, Method
+from ftcalib.setup import NOTHING, Setup
 
 SIMULATIONS = 400
 UNRESOLVED_N = 1e-12
@@ -38,8 +39,7 @@ def solve(
     drift: Drift = "auto",
     known: Known | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
-    up_in_base: ArrayLike = UP_IN_BASE,
-    payload_kg: float | None = None,
+    setup: Setup = NOTHING,
     provenance: Mapping[str, Any] | None = None,
 ) -> CalibrationResult:
     """Calibrate from a dataset.
@@ -58,12 +58,9 @@ def solve(
         Known mounting, direction of gravity and mass. Of the published methods, only those that need gravity use it.
     g_m_s2 : float
         Gravity; mass is weight divided by it.
-    up_in_base : array_like, shape (3,)
-        Expected up direction in base: +z for a robot on a table. For the verdict, and for the published methods that
-        need gravity.
-    payload_kg : float, optional
-        Set in the controller, without the sensor if its mass is known. For the verdict: forces in lbf or kgf make a
-        load that is lighter than the payload by such a factor.
+    setup : Setup
+        The described cell, for the verdict. Its up direction serves the published methods that need gravity. A known
+        direction of gravity declares one too.
     provenance : mapping, optional
         Stored with the result, beside the hash of the dataset. Must be valid JSON.
 
@@ -71,6 +68,17 @@ def solve(
     ------
     NotObservable
         The poses do not determine the parameters; the message names what is missing and what to add.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> dataset = ftdrive.read_dataset("poses.csv")
+    >>> result = ftdrive.solve(dataset)
+    >>> result.verdict, result.n_poses
+    ('good', 24)
+    >>> contact = result.compensate(dataset.wrench, dataset.R_base_flange)
+    >>> contact.shape
+    (24, 6)
     """
     for name, value, choices in (("method", method, get_args(Method)), ("drift", drift, get_args(Drift))):
         if value not in choices:
@@ -80,20 +88,16 @@ def solve(
     if method in PUBLISHED and method not in _NEED_GRAVITY and known is not None:
         raise ValueError(f"{method} cannot use known values: use 'ml'")
     known = _constrained(method, known)
+    if setup.up_in_base is None and known is not None and known.gravity_direction_base is not None:
+        setup = replace(setup, up_in_base=(-np.asarray(known.gravity_direction_base)).tolist())
     require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
     if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNRESOLVED_N:
         raise NotObservable("the force is the same in all poses: check that the sensor works and carries a load.")
 
-    estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, up_in_base) if method in PUBLISHED else None
+    estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, setup) if method in PUBLISHED else None
     wrench_cov = dataset.wrench_cov
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
-
-    def contradicted(unconstrained: Fit | None) -> list[str]:
-        if known is None or unconstrained is None:
-            return []
-        found = unconstrained.parameters, unconstrained.covariance
-        return contradictions(known, *found, g_m_s2, SIGNIFICANT_SIGMAS, up_in_base)
 
     # Published methods use this fit too: for observability, and for the noise if it was not measured.
     try:
@@ -108,12 +112,8 @@ def solve(
         )
         _require_determined(dataset.R_base_flange, best, known)
     except NotObservable as exc:
-        poses = dataset.R_base_flange, dataset.wrench
-        named = faults(*poses, up_in_base) or other_poses(*poses)
-        if not named and known is not None:  # wrong ones can leave no weight, and so no centre of mass
-            named = contradicted(_unconstrained(dataset, wrench_cov, drift))
-        if named:
-            raise NotObservable(f"{named[0]}.") from exc
+        if named := _mistakes(dataset, wrench_cov, drift, known, g_m_s2, setup):
+            raise NotObservable(f"{named[0].words}.", named[0]) from exc
         raise
     assessed: AssessedFit = best
     if estimator:
@@ -139,10 +139,10 @@ def solve(
         assessed,
         t_s=dataset.t_s,
         measured_sigma=measured_sigma,
-        up_in_base=up_in_base,
+        setup=setup,
+        known=known,
         unconstrained=unconstrained,
-        contradicted=contradicted(unconstrained),
-        other_unit=[] if payload_kg is None else other_unit(assessed.parameters, payload_kg, g_m_s2),
+        g_m_s2=g_m_s2,
     )
     chi2 = assessed.chi2 if wrench_cov is None else assessed.measured_chi2
     drifted = best.drift if estimator is None else None
@@ -155,8 +155,7 @@ def solve(
         noise_source="residuals" if wrench_cov is None else "measured",
         g_m_s2=g_m_s2,
         method=method,
-        verdict=quality.verdict,
-        reasons=quality.reasons,
+        findings=quality.findings,
         provenance={**(provenance or {}), "dataset_sha256": dataset.sha256()},
         p_value=quality.chi2_p,
         measured_sigma=measured_sigma,
@@ -196,12 +195,25 @@ def _unconstrained(dataset: CalibrationDataset, wrench_cov: Array | None, drift:
     return found
 
 
-def estimator_of(
-    method: Method, R_base_flange: Array, known: Known | None, g_m_s2: float, up_in_base: ArrayLike
-) -> Estimator:
+def _mistakes(
+    dataset: CalibrationDataset,
+    wrench_cov: Array | None,
+    drift: Drift,
+    known: Known | None,
+    g_m_s2: float,
+    setup: Setup,
+) -> list[Finding]:
+    """Find what explains that poses do not determine the parameters: wrong known values can leave no weight."""
+    poses = dataset.R_base_flange, dataset.wrench
+    found = faults(*poses, setup.up) or other_poses(*poses)
+    if not found and known is not None and (free := _unconstrained(dataset, wrench_cov, drift)) is not None:
+        found = contradictions(known, free.parameters, free.covariance, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
+    return found
+
+
+def estimator_of(method: Method, R_base_flange: Array, known: Known | None, g_m_s2: float, setup: Setup) -> Estimator:
     """Prepare a published method, with gravity from `known` if the method needs it. Raises `NotObservable`."""
-    level = -np.asarray(up_in_base, dtype=np.float64)
-    direction = level if known is None or known.gravity_direction_base is None else known.gravity_direction_base
+    direction = -setup.up if known is None or known.gravity_direction_base is None else known.gravity_direction_base
     weight_N = None if known is None or known.mass_kg is None else known.mass_kg * g_m_s2
     return published(method, R_base_flange, gravity_direction_base=np.asarray(direction), weight_N=weight_N)
 

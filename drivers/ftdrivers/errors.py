@@ -1,33 +1,48 @@
-"""What can go wrong with a device; `DriverError` is the base of all.
+"""What can go wrong with a device. All are a `DeviceError` with `found` and `fix`, but an address that cannot be used.
 
-`found` is what happened, with the value. `fix` starts with a verb and is what to do next, where the driver knows it.
-The text of an error is "found; fix", without capital and full stop. A conversion to another class keeps the fix.
+DeviceError
+├── ConnectError      the device could not be opened, or is not what it should be
+│   ├── PortInUse
+│   ├── Unreachable
+│   ├── ModelUnknown
+│   └── NoDashboard
+├── StreamBroken
+├── DeviceTimeout
+├── ProtocolError
+└── DeviceFault       the device reports a fault of its own
+    └── Frozen
+UsageError
+└── BadUrl
+DataError
+└── BadTranscript
 """
 
 from typing import Final
+
+from ftcalib.errors import DataError, DeviceError, UsageError
+
+__all__ = [
+    "UNUSABLE",
+    "BadTranscript",
+    "BadUrl",
+    "ConnectError",
+    "DeviceError",
+    "DeviceFault",
+    "DeviceTimeout",
+    "Frozen",
+    "ModelUnknown",
+    "NoDashboard",
+    "PortInUse",
+    "ProtocolError",
+    "StreamBroken",
+    "Unreachable",
+]
 
 UNUSABLE: Final = "discard its data, check load, supply and cable, then power it off and on"
 """The fix for a critical status."""
 
 
-class DriverError(Exception):
-    """Base of all device errors.
-
-    Parameters
-    ----------
-    found
-        What happened, with the value.
-    fix
-        What to do next; empty where the driver does not know.
-    """
-
-    def __init__(self, found: str, fix: str = "") -> None:
-        super().__init__(f"{found}; {fix}" if fix else found)  # one argument: two would be those of an `OSError`
-        self.found = found
-        self.fix = fix
-
-
-class ConnectError(DriverError):
+class ConnectError(DeviceError):
     """The device could not be opened, or is not what it should be."""
 
 
@@ -47,21 +62,29 @@ class NoDashboard(ConnectError):
     """The dashboard server of an arm, or its Robot API, does not answer or refuses."""
 
 
-class StreamBroken(DriverError):
+class StreamBroken(DeviceError):
     """The connection was lost after it had worked."""
 
 
-class DeviceTimeout(DriverError, TimeoutError):
-    """Nothing arrived in time; also a `TimeoutError`."""
+class DeviceTimeout(DeviceError):
+    """Nothing arrived in time."""
 
 
-class ProtocolError(DriverError):
+class ProtocolError(DeviceError):
     """Bytes arrived that the device's document does not allow."""
 
 
-class DeviceFault(DriverError):
+class DeviceFault(DeviceError):
     """The device reports a fault of its own."""
 
 
 class Frozen(DeviceFault):
     """A sensor repeats one reading, although a sensor that measures has noise."""
+
+
+class BadUrl(UsageError):
+    """An address that no driver understands: an error in the configuration, not in the device."""
+
+
+class BadTranscript(DataError):
+    """A file is not a transcript that this version can play."""

@@ -38,7 +38,14 @@ class Fact:
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What a device reports about itself, and what is known about it otherwise."""
+    """What a device reports about itself, and what is known about it otherwise.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> ftdrive.DeviceInfo("Acme FT", "A1", "1.0").serial
+    'A1'
+    """
 
     model: str
     serial: str
@@ -80,6 +87,13 @@ class FtSamples(_Columns):
     """n consecutive samples of one sensor, one row each, as measured: no bias, tare or filter applied.
 
     The wrench is exerted on the sensor by what hangs on it or pushes on it, in the sensor frame, about its origin.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> samples = ftdrive.FtSamples.of(t_host_ns=[0, 10**6], seq=[0, 1], wrench=[[0, 0, 9.8, 0, 0, 0]] * 2)
+    >>> len(samples), samples.wrench[:, 2]
+    (2, array([9.8, 9.8]))
     """
 
     t_host_ns: NDArray[np.int64]
@@ -148,7 +162,20 @@ class Health:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmState:
-    """One sample of the arm. The flange is the mechanical flange, whatever TCP is active."""
+    """One sample of the arm. The flange is the mechanical flange, whatever TCP is active.
+
+    Examples
+    --------
+    >>> import ftdrive, time, numpy as np
+    >>> state = ftdrive.ArmState(
+    ...     t_host_ns=time.monotonic_ns(),
+    ...     t_device_s=0.0,
+    ...     q_rad=np.zeros(6),
+    ...     qd_rad_s=np.zeros(6),
+    ...     R_base_flange=np.eye(3),
+    ...     p_base_flange_m=np.zeros(3),
+    ... )
+    """
 
     t_host_ns: int
     t_device_s: float
@@ -225,7 +252,7 @@ class ControllerSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Diagnosis:
     """A check that a driver makes of its own device, beyond what every device of its kind reports."""
 
     name: str
@@ -237,6 +264,10 @@ class Finding:
 
 class _Device(ABC):
     @abstractmethod
+    def open(self) -> None:
+        """Connect. Idempotent. Raises `ConnectError`."""
+
+    @abstractmethod
     def close(self) -> None:
         """Disconnect. Idempotent; never raises on a lost device."""
 
@@ -244,9 +275,27 @@ class _Device(ABC):
     def identify(self) -> DeviceInfo:
         """Return model, serial number and firmware, as read when the device was opened."""
 
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
 
 class ForceTorqueSensor(_Device):
-    """A streaming six-axis force/torque sensor."""
+    """A streaming six-axis force/torque sensor. `StreamingSensor` is the base of a driver.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> with ftdrive.open_sensor("emulated://") as sensor:
+    ...     newest = sensor.latest(timeout_s=1.0)
+    ...     with sensor.follow() as follow:
+    ...         samples = follow.read(timeout_s=1.0)  # every sample since the last read
+    >>> newest.wrench.shape
+    (1, 6)
+    """
 
     @abstractmethod
     def open(self) -> None:
@@ -286,16 +335,17 @@ class ForceTorqueSensor(_Device):
         """Return the sensor's temperature, as it came with its newest sample; None where a sensor reports none."""
         return None
 
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 class RobotArm(_Device):
-    """A six-joint arm."""
+    """A six-joint arm. `with arm:` opens it for reading. `ReadOnlyArm` is the base of a driver that only reads.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> with ftdrive.open_arm("emulated://") as arm:
+    ...     arm.status().safety_mode
+    'normal'
+    """
 
     @abstractmethod
     def open(self, *, control: bool = False) -> None:
@@ -360,7 +410,7 @@ class RobotArm(_Device):
         """Return the program that runs, as the controller reports it; None where it does not."""
         return None
 
-    def diagnose(self) -> list[Finding]:
+    def diagnose(self) -> list[Diagnosis]:
         """Check what only this kind of controller has and a program needs, such as its ports.
 
         Only reads. Errors become findings. The default has nothing to check.

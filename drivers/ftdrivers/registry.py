@@ -18,6 +18,7 @@ from typing import Any, cast
 from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
 from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import Fact, ForceTorqueSensor, RobotArm
 from ftdrivers.streaming.sensor import StreamingSensor
 
@@ -43,10 +44,6 @@ _EXAMPLES = (
     "ati-can:///dev/ttyACM0?interface=slcan",
     "ati-serial:///dev/serial/by-id/NAME?calibration=1",
 )
-
-
-class BadUrl(ValueError):
-    """An address that no driver understands: an error in the configuration, not in the device."""
 
 
 class Options:

@@ -1,3 +1,116 @@
-"""ftdrive: calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force."""
+"""ftdrive: calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force.
+
+The names below are the library. Each is imported at its first use, so that `import ftdrive` takes a few milliseconds.
+Modules behind them may move; these names stay.
+
+| task | names |
+|---|---|
+| calibrate from data | `read_dataset`, `CalibrationDataset`, `Known`, `Setup`, `solve`, `compare` |
+| judge a result | `CalibrationResult`, `Finding` |
+| keep and read results | `read_calibration`, `Run`, `read_recording`, `write_recording` |
+| compensate | `CalibrationResult.compensate`, `Compensator`, `predict`, `Parameters` |
+| live | `open_stream`, `WrenchFrame`, `Stages`, `Contact` |
+| devices | `open_sensor`, `open_arm`, `ForceTorqueSensor`, `RobotArm`, `FtSamples`, `ArmState`, `DeviceInfo` |
+| own drivers | `StreamingSensor`, `ReadOnlyArm` |
+| plan | `plan_tour` |
+| errors | `FtdriveError`, `UsageError`, `DeviceError`, `DataError`, `AcceptanceError` |
+"""
+
+from importlib import import_module
+
+TYPE_CHECKING = False  # type checkers take it for that of `typing`, whose import would take most of the time
+if TYPE_CHECKING:
+    from ftcalib.compare import compare
+    from ftcalib.compensation import Compensator
+    from ftcalib.data.dataset import CalibrationDataset
+    from ftcalib.errors import AcceptanceError, DataError, DeviceError, FtdriveError, UsageError
+    from ftcalib.findings import Finding
+    from ftcalib.known import Known
+    from ftcalib.model import Parameters, predict
+    from ftcalib.result import CalibrationResult
+    from ftcalib.setup import Setup
+    from ftcalib.solver import solve
+    from ftdrive.library import open_arm, open_sensor, open_stream, plan_tour
+    from ftdrive.live.contact import Contact
+    from ftdrive.live.samples import Stages, WrenchFrame
+    from ftdrive.recording.files import read_recording, write_recording
+    from ftdrive.runs.run import Run
+    from ftdrive.runs.source import read_calibration, read_dataset
+    from ftdrivers.interfaces import ArmState, DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
+    from ftdrivers.read_only_arm import ReadOnlyArm
+    from ftdrivers.streaming.sensor import StreamingSensor
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "AcceptanceError",
+    "ArmState",
+    "CalibrationDataset",
+    "CalibrationResult",
+    "Compensator",
+    "Contact",
+    "DataError",
+    "DeviceError",
+    "DeviceInfo",
+    "Finding",
+    "ForceTorqueSensor",
+    "FtSamples",
+    "FtdriveError",
+    "Known",
+    "Parameters",
+    "ReadOnlyArm",
+    "RobotArm",
+    "Run",
+    "Setup",
+    "Stages",
+    "StreamingSensor",
+    "UsageError",
+    "WrenchFrame",
+    "compare",
+    "open_arm",
+    "open_sensor",
+    "open_stream",
+    "plan_tour",
+    "predict",
+    "read_calibration",
+    "read_dataset",
+    "read_recording",
+    "solve",
+    "write_recording",
+]
+
+_MODULES = {
+    "ftcalib.compare": ("compare",),
+    "ftcalib.compensation": ("Compensator",),
+    "ftcalib.data.dataset": ("CalibrationDataset",),
+    "ftcalib.errors": ("AcceptanceError", "DataError", "DeviceError", "FtdriveError", "UsageError"),
+    "ftcalib.findings": ("Finding",),
+    "ftcalib.known": ("Known",),
+    "ftcalib.model": ("Parameters", "predict"),
+    "ftcalib.result": ("CalibrationResult",),
+    "ftcalib.setup": ("Setup",),
+    "ftcalib.solver": ("solve",),
+    "ftdrive.library": ("open_arm", "open_sensor", "open_stream", "plan_tour"),
+    "ftdrive.live.contact": ("Contact",),
+    "ftdrive.live.samples": ("Stages", "WrenchFrame"),
+    "ftdrive.recording.files": ("read_recording", "write_recording"),
+    "ftdrive.runs.run": ("Run",),
+    "ftdrive.runs.source": ("read_calibration", "read_dataset"),
+    "ftdrivers.interfaces": ("ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "RobotArm"),
+    "ftdrivers.read_only_arm": ("ReadOnlyArm",),
+    "ftdrivers.streaming.sensor": ("StreamingSensor",),
+}
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+if not TYPE_CHECKING:  # a type checker would accept any name
+
+    def __getattr__(name: str) -> object:
+        for module, names in _MODULES.items():
+            if name in names:
+                value = globals()[name] = getattr(import_module(module), name)
+                return value
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

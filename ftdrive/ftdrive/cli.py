@@ -1,7 +1,8 @@
-"""The command line: one group, lazy commands, and the one place where an exception becomes an exit code."""
+"""The command line: one group, lazy commands, and the words of an error."""
 
 import importlib
 import logging
+import os
 import platform
 import signal
 import sys
@@ -12,6 +13,7 @@ from io import StringIO
 import click
 
 from ftdrive import __version__
+from ftdrive.errors import exit_code
 
 # A command, its module, its line in the help. The module is imported only when the command is called: help is fast.
 _COMMANDS = {
@@ -24,7 +26,7 @@ _COMMANDS = {
     "doctor": ("ftdrive.commands.doctor", "Check robot, sensor and computer. Moves nothing."),
     "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
     "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
-    "report": ("ftdrive.commands.report", "Report a calibration in one file: verdict, reasons, figures."),
+    "report": ("ftdrive.commands.report", "Report a calibration in one file: verdict, findings, figures."),
     "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
     "push": ("ftdrive.commands.push", "Set payload or gravity in the controller as calibrated."),
     "record": ("ftdrive.commands.record", "Record raw and compensated wrench with pose and events."),
@@ -88,41 +90,6 @@ class _TalkHandler(logging.Handler):
         talk.print(self.format(record))
 
 
-def exit_code(error: BaseException) -> int | None:
-    """Return the exit code of an error that a user can fix; None for a defect of ftdrive."""
-    if _not_on_this_system(error):
-        return 2
-    from ftcalib.errors import BadCalibration, BadDataset, CalibError, TooFewSamples
-    from ftdrive.errors import (
-        BadBundle,
-        BadPlan,
-        BadRecording,
-        BadStore,
-        ConfigError,
-        NotAccepted,
-        RecordingHasGaps,
-    )
-    from ftdrivers.errors import ConnectError, DeviceFault, DriverError
-    from ftdrivers.transcript.recorder import BadTranscript
-
-    codes: list[tuple[int, tuple[type[BaseException], ...]]] = [
-        (2, (ConfigError,)),
-        (3, (ConnectError,)),
-        (5, (DeviceFault,)),
-        (4, (DriverError, TooFewSamples)),
-        (6, (BadDataset, BadCalibration, BadTranscript, BadPlan, BadRecording, BadStore, BadBundle)),
-        (7, (CalibError, NotAccepted)),
-        (8, (RecordingHasGaps,)),
-        (6, (OSError,)),
-    ]
-    return next((code for code, kinds in codes if isinstance(error, kinds)), None)
-
-
-def _not_on_this_system(error: BaseException) -> bool:
-    """Whether a module of the standard library is missing, as `termios` is on Windows."""
-    return isinstance(error, ModuleNotFoundError) and error.name in sys.stdlib_module_names
-
-
 def in_a_sentence(error: BaseException) -> str:
     """Return the message of an error; for an error of the system also its file and what to check."""
     if isinstance(error, ModuleNotFoundError):
@@ -141,7 +108,15 @@ def main() -> int:
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.default_int_handler)
+    _open_closed_streams()
     return run(sys.argv[1:])
+
+
+def _open_closed_streams() -> None:
+    """Connect standard streams that the caller has closed to nothing, so that no other file gets their numbers."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
 
 
 def run(arguments: Sequence[str]) -> int:

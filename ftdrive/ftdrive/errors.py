@@ -1,37 +1,75 @@
-"""Errors of the application itself."""
+"""Errors of the application itself, below those of `ftcalib.errors`, and the exit code of each error."""
+
+import sys
+from pathlib import Path
+
+from ftcalib.errors import AcceptanceError, DataError, DeviceError, FtdriveError, TooFewSamples, UsageError
+from ftdrivers.errors import ConnectError, DeviceFault
 
 
-class ConfigError(Exception):
+class ConfigError(UsageError):
     """The configuration or the combination of options cannot be used."""
 
 
-class NotAccepted(Exception):
-    """A check failed, or a result is rejected or differs from the one it must equal."""
-
-
-class BadPlan(Exception):
+class BadPlan(DataError):
     """A file does not contain a valid plan."""
 
 
-class BadRecording(Exception):
-    """A file does not contain a recording that this version can read."""
+class BadRecording(DataError):
+    """A file does not contain a recording that this version can read.
+
+    Parameters
+    ----------
+    problem : str
+    path : Path, optional
+        Of the file; it stands before the problem.
+    """
+
+    def __init__(self, problem: str, path: Path | None = None) -> None:
+        super().__init__(problem if path is None else f"{path}: {problem}")
+        self.problem = problem
 
 
-class BadStore(Exception):
+class BadStore(DataError):
     """The store of results cannot be read or written."""
 
 
-class BadBundle(Exception):
+class BadBundle(DataError):
     """A file is not a bundle that this version can read."""
 
 
-class RecordingHasGaps(Exception):
+class RecordingHasGaps(DataError):
     """Samples are missing in a recording that is otherwise complete."""
+
+
+class NotAccepted(AcceptanceError):
+    """A check failed, or a result is rejected or differs from the one it must equal."""
 
 
 class PlanRefused(NotAccepted):
     """No motion is proven clear, or a plan was made for another cell."""
 
 
-class Declined(Exception):
+class Declined(FtdriveError):
     """The operator answered no, or the input ended before an answer."""
+
+
+_EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
+    (UsageError, 2),
+    (ConnectError, 3),
+    (DeviceFault, 5),
+    (DeviceError, 4),
+    (RecordingHasGaps, 8),
+    (DataError, 6),
+    (OSError, 6),
+    (TooFewSamples, 4),
+    (AcceptanceError, 7),
+)
+"""The first kind that fits counts."""
+
+
+def exit_code(error: BaseException) -> int | None:
+    """Return the exit code of an error that a user can fix; None for a defect of ftdrive."""
+    if isinstance(error, ModuleNotFoundError) and error.name in sys.stdlib_module_names:
+        return 2  # not on this system, as `termios` on Windows
+    return next((code for kind, code in _EXIT_CODES if isinstance(error, kind)), None)

@@ -1,6 +1,6 @@
 """Random bytes and damaged golden frames into all that decodes: only documented exceptions, no hang, no growing memory.
 
-    python tests/benchmarks/fuzz.py [--inputs 1000000] [--only matrix]
+    python -m tests.benchmarks.fuzz [--inputs 1000000] [--only matrix]
 
 Half of the inputs of each codec are random bytes, half are frames from the vendors' documents with some bytes changed,
 added or missing. Prints for each codec how many inputs were refused, the longest time one took and how much memory
@@ -28,12 +28,12 @@ from ftdrivers.ati import codec as ati
 from ftdrivers.ati import modbus
 from ftdrivers.ati.netft import range_in
 from ftdrivers.bota import codec as bota
-from ftdrivers.errors import ProtocolError
-from ftdrivers.registry import SENSORS, BadUrl, sensor_from_url
+from ftdrivers.errors import BadTranscript, BadUrl, ProtocolError
+from ftdrivers.registry import SENSORS, sensor_from_url
 from ftdrivers.robotiq import codec as robotiq
 from ftdrivers.robotous import codec as robotous
 from ftdrivers.robotous.halves import Halves
-from ftdrivers.transcript.recorder import FORMAT, BadTranscript, Transcript
+from ftdrivers.transcript.recorder import FORMAT, Transcript
 from ftdrivers.ur import rtde
 from ftdrivers.wires.crc import crc16_modbus, crc16_x25
 

@@ -1,7 +1,7 @@
 """How soon the arm decelerates when the computer that moves it fails, by the script path; and false stops.
 
-    python tests/benchmarks/heartbeat.py [--trials 100] [--only power] [--seed 1]
-    python tests/benchmarks/heartbeat.py --minutes 10
+    python -m tests.benchmarks.heartbeat [--trials 100] [--only power] [--seed 1]
+    python -m tests.benchmarks.heartbeat --minutes 10
 
 An emulated UR5e at real speed turns a joint at 0.5 rad/s. In mid-move our process is killed, is suspended, loses its
 network in both directions, or loses its power, so that the controller sees no end of the connection. The time runs
@@ -22,7 +22,7 @@ from contextlib import closing
 import numpy as np
 
 from ftdrivers.clock import REAL
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import Station
 from tests.wire.heartbeat_trial import KINDS, WITHIN_S, trial
@@ -71,7 +71,7 @@ def endure(minutes: float) -> bool:
                 q[5] += 0.2 if q[5] < 0 else -0.2
                 arm.move_to(q, timeout_s=30, guard=lambda: None)
                 moves += 1
-            except DriverError as error:
+            except DeviceError as error:
                 by_program = "no heartbeat" in error.found or "connection to the control program" in error.found
                 stops["by the heartbeat" if by_program else "by the reader"] += 1
     say(f"{moves} moves in {minutes:g} minutes; false stops: {dict(stops) or 'none'}")

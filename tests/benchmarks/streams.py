@@ -1,6 +1,6 @@
 """What the streams carry, against emulated sensors in processes of their own.
 
-    python tests/benchmarks/streams.py [--seconds 60] [--samples 0] [--only bota]
+    python -m tests.benchmarks.streams [--seconds 60] [--samples 0] [--only bota]
 
 Prints one line per figure: the figure, the target, pass or FAIL. The 7 kHz stream of an ATI serial sensor and the
 500 Hz of an arm are each followed alone. Then the serial stream runs beside the wrist sensor of an arm, 500 samples a
@@ -33,10 +33,11 @@ import serial
 
 from ftdrivers.ati import modbus
 from ftdrivers.clock import REAL
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 from ftdrivers.ur.arm import UrArm
 from tests.wire.conftest import Station
+from tests.wire.laboratory import Laboratory, numbers_in
 from tests.wire.test_sensor_faults import (
     CYCLES,
     HEALTHY,
@@ -44,11 +45,9 @@ from tests.wire.test_sensor_faults import (
     SCRIPT,
     UNASKED,
     Emulator,
-    Laboratory,
     Watched,
     applies,
     chances,
-    numbers_in,
     starts,
     suffer,
 )
@@ -272,7 +271,7 @@ def endure(emulator: Emulator, fault: str, samples: int) -> Counter[str]:
         sensor = emulator.sensor()
         try:
             sensor.open()
-        except DriverError as error:  # a busy computer
+        except DeviceError as error:  # a busy computer
             count[type(error).__name__] += 1
             continue
         with closing(sensor):
@@ -295,7 +294,7 @@ def repeat(emulator: Emulator, fault: str, samples: int, cycles: int) -> Counter
             for watched in CYCLES[fault](emulator, PIECE_S):
                 count["received"] += len(watched.samples())
                 count["wrong"] += watched.wrong()
-        except DriverError as error:  # a busy computer
+        except DeviceError as error:  # a busy computer
             count[type(error).__name__] += 1
         except (AssertionError, pytest.fail.Exception) as error:
             sys.stderr.write(f"{emulator.kind.scheme}, {fault}: {error}\n")

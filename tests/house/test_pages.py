@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 import pytest
 
+import ftdrive
 from ftdrive.cli import cli
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -17,6 +18,11 @@ PACKAGES = ("ftdrive", "calib", "drivers", "mocks", "tests")
 def test_the_page_of_commands_has_every_command() -> None:
     page = (ROOT / "docs/reference/commands.md").read_text(encoding="utf-8")
     assert sorted(re.findall(r":prog: ftdrive (\w+)", page)) == sorted(cli.list_commands(click.Context(cli)))
+
+
+def test_the_page_of_the_api_has_every_name() -> None:
+    page = (ROOT / "docs/reference/api/ftdrive.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"\{py:obj\}`~[\w.]*\.(\w+)`", page)) == sorted(ftdrive.__all__)
 
 
 def _command_lines() -> list[str]:

@@ -3,17 +3,16 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording import Recorder
+from tests.house.uv import run_uv
 from tests.unit.ftdrive.recorded import block, calibration, dataset, info
 from tests.unit.ftdrive.store.run_folders import new_run
 
@@ -26,8 +25,6 @@ LINUX, JETSON, MACOS, WINDOWS = (
     "aarch64-apple-darwin",
     "x86_64-pc-windows-msvc",
 )
-UNREACHABLE = "error sending request"
-Compiled = Callable[[str, str], str]
 
 
 def test_the_classifiers_begin_with_the_oldest_python() -> None:
@@ -35,31 +32,17 @@ def test_the_classifiers_begin_with_the_oldest_python() -> None:
     assert PROJECT["requires-python"] == f">={PYTHONS[0]}"
 
 
-@pytest.fixture(scope="module")
-def compiled() -> Compiled:
+def compiled(python: str, system: str) -> str:
     """Resolve the default install, all extras and the tests from wheels alone; return the pinned requirements."""
-    uv = os.environ.get("UV") or shutil.which("uv")
-    if uv is None:
-        pytest.skip("uv is not installed")
-
-    def compile_for(python: str, system: str) -> str:
-        command = [uv, "pip", "compile", "pyproject.toml", "--all-extras", "--group", "dev", "--only-binary", ":all:"]
-        command += ["--python", sys.executable, "--python-version", python, "--python-platform", system, "--no-header"]
-        for more in (["--offline"], []):  # the cache first, because 16 resolutions would ask the index 1200 times
-            outcome = subprocess.run([*command, *more], cwd=ROOT, capture_output=True, text=True, check=False)
-            if outcome.returncode == 0:
-                return outcome.stdout
-        if "No solution found" not in outcome.stderr and UNREACHABLE in outcome.stderr:
-            pytest.skip(f"the package index cannot be reached: {outcome.stderr.strip()}")
-        pytest.fail(f"Python {python} on {system}: {outcome.stderr}")
-
-    return compile_for
+    command = ["pip", "compile", "pyproject.toml", "--all-extras", "--group", "dev", "--only-binary", ":all:"]
+    command += ["--python", sys.executable, "--python-version", python, "--python-platform", system, "--no-header"]
+    return run_uv(*command, cwd=ROOT)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("system", [LINUX, JETSON, MACOS, WINDOWS])
 @pytest.mark.parametrize("python", PYTHONS)
-def test_all_dependencies_have_wheels(python: str, system: str, compiled: Compiled) -> None:
+def test_all_dependencies_have_wheels(python: str, system: str) -> None:
     pinned = compiled(python, system)
     assert "numpy==" in pinned
     assert ("ur-rtde==" in pinned) == (system == LINUX and python in {"3.11", "3.12"})

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.house import codes_page
+from tests.house.sentences import sentences_in
+
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -25,6 +28,38 @@ def test_checker_is_content(command: list[str]) -> None:
     tool = Path(sys.executable).with_name(command[0])
     outcome = subprocess.run([tool, *command[1:]], cwd=ROOT, capture_output=True, text=True, check=False)
     assert outcome.returncode == 0, outcome.stdout + outcome.stderr
+
+
+def test_the_page_of_finding_codes_is_up_to_date() -> None:
+    assert codes_page.PAGE.read_text(encoding="utf-8") == codes_page.page(), f"uv run python {codes_page.__file__}"
+
+
+def test_no_code_tests_or_edits_a_sentence() -> None:
+    """A program that has to know what was found takes it as data, such as `ftcalib.Finding` or a class of errors."""
+    folders = ("ftdrive/ftdrive", "calib/ftcalib", "drivers/ftdrivers", "mocks/ftmocks")
+    assert sentences_in([ROOT / folder for folder in folders]) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "is_hit"),
+    [
+        ("causes = [one for one in causes if one in result.reasons]", True),
+        ('if view.note.startswith("STOP"): pass', True),
+        ('words = direction_in_words(x).replace("base", "flange")', True),
+        ('found, _, fix = str(error).rpartition(": ")', True),
+        ('if "already in use" in error.found: pass', True),
+        ('if text == "the arm has stopped": pass', True),
+        ('if re.search("remote control", str(exc).lower()): pass', True),
+        ('if finding.code == "drift": pass', False),
+        ('if not event.words or event.words == "": pass', False),
+        ('KINDS = {"centre of mass": 1}\nif kind == "centre of mass": pass', False),
+        ('print(f"{finding.found}: {finding.fix}")', False),
+        ('name = path.name.removesuffix(".partial")', False),
+    ],
+)
+def test_tests_of_a_sentence_are_recognised(code: str, is_hit: bool, tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text(code, encoding="utf-8")
+    assert bool(sentences_in([tmp_path])) == is_hit
 
 
 def test_every_dependency_is_bounded_and_has_its_reason() -> None:

@@ -27,15 +27,18 @@ def lack() -> None:
     for module, names in ((os, OF_OS), (signal, OF_SIGNAL)):
         for name in names:
             delattr(module, name)
-    warnings.filterwarnings("error", category=EncodingWarning, module=r"(calib|drivers|ftdrive)\.")
+    warnings.filterwarnings("error", category=EncodingWarning, module=r"ft(calib|drivers|drive)\.")
 
 
 if __name__ == "__main__":
     lack()
+    import ftdrive
     from ftdrive import cli
 
     for arguments in json.loads(sys.argv[1]):
         if code := cli.run(arguments):
             sys.exit(f"ftdrive {' '.join(arguments)}: exit code {code}")
+    for name in ftdrive.__all__:
+        getattr(ftdrive, name)
     importlib.import_module("ftdrive.terminal.live_screen")  # needs a terminal to run
     sys.exit(0 if cli.run(["transcript", "play", "--simulate"]) == 2 else "the player found a pseudo-terminal")

@@ -9,7 +9,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from ftdrive.cell.config import load, settings
-from ftdrive.cli import cli, exit_code
+from ftdrive.cli import cli
+from ftdrive.errors import exit_code
 
 CELL = """format = "ftdrive.config/1"
 [robot]

@@ -15,7 +15,8 @@ from ftdrive.errors import Declined
 from ftdrive.runs.outcome import Outcome
 from ftdrive.session.events import Event, GuardTripped, PoseTaken, State, StateChanged
 from ftdrive.session.operator import Question
-from ftdrive.session.session import Options, calibrate
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.session import calibrate
 from ftdrive.terminal.report import errors_in_sigma, print_result
 from tests.system.command_line import assert_found
 
@@ -69,7 +70,7 @@ def tour(station: Station, tmp_path: Path) -> Tour:
     def run(happening: Happening, average_s: float = 0.2) -> tuple[Outcome, Unattended]:
         operator = Unattended(happening)
         cell = replace(station.cell, sampling=Sampling(average_s=average_s, noise_record_s=0.0))
-        outcome = calibrate(cell, operator, Options(tmp_path, poses=POSES, real=False, questions=False))
+        outcome = calibrate(cell, operator, SessionOptions(tmp_path, poses=POSES, real=False, questions=False))
         assert outcome is not None
         assert len(outcome.run.stops()) == POSES + 1
         assert CONTACT not in [event.hazard for event in operator.shown if isinstance(event, GuardTripped)]

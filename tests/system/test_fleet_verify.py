@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from ftdrive.cell.emulated import Station
-from ftdrive.live.stream import load_calibration
+from ftdrive.runs.source import read_calibration
 from tests.system.command_line import CommandLine
 
 _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -91,7 +91,7 @@ def in_terminal(ftdrive: CommandLine, *arguments: str) -> Iterator[InTerminal]:
 def test_an_operator_skips_a_cell_or_verifies_it(demo: dict[str, Any], ftdrive: CommandLine) -> None:
     runs = ftdrive.folder / "press" / "runs"
     calibrated = Path(shutil.copytree(demo["run"], runs / "calibrated"))
-    with Station.of(load_calibration(calibrated).provenance["station"]) as station:
+    with Station.of(read_calibration(calibrated).provenance["station"]) as station:
         config = ftdrive.connect(station)
         config.write_text(config.read_text().replace("[tool]", f'[tool]\nname = "{station.cell.tool.name}"'))
         (ftdrive.folder / "cells.toml").write_text(

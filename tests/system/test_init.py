@@ -20,8 +20,8 @@ from click.testing import CliRunner, Result
 
 from ftdrive.cell.config import load
 from ftdrive.cell.emulated import Station
-from ftdrive.cli import cli, exit_code
-from ftdrive.errors import ConfigError
+from ftdrive.cli import cli
+from ftdrive.errors import ConfigError, exit_code
 from ftdrivers.errors import ConnectError
 
 COLUMNS = 80

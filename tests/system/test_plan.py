@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from ftdrive.cli import cli, exit_code
-from ftdrive.errors import ConfigError
+from ftdrive.cli import cli
+from ftdrive.errors import ConfigError, exit_code
 from ftdrive.planning.plan import Plan
 
 UR5E = ["plan", "--model", "ur5e", "--tool", "0:200:100"]

@@ -95,11 +95,11 @@ def test_step_mode_moves_at_each_enter_and_a_completed_plan_may_run_by_itself(
     assert moves_of(station) == 7
     assert answer["drift_check"]["elapsed_s"] > 1
     assert len(answer["drift_check"]["change"]) == len(answer["drift_check"]["sigma"]) == 6
-    (lean,) = answer["hints"]
-    assert answer["verdict"] == "usable"
-    assert "a payload of 1.50 kg, but 0.64 kg hang" in answer["reasons"][0]
-    assert "leans 1.6" in lean  # 1.63° in truth, ± 0.01°
-    assert "towards its +y" in lean  # gravity has a share along +y: alpha is 1.59°
+    payload, lean = (one["values"] for one in answer["findings"])
+    assert (answer["verdict"], answer["hints"]) == ("usable", [])
+    assert (payload["payload_kg"], payload["load_kg"]) == (1.5, pytest.approx(0.64, abs=0.01))
+    assert lean["lean_deg"] == pytest.approx(1.63, abs=0.03)
+    assert lean["side"] == "+y"  # gravity has a share along +y: alpha is 1.59°
     # The same posture gives the same plan, which has run to its end now.
     again = ftdrive.json("calibrate", "--config", config, "--minimal", "--fast", "--yes")
     assert again["mass_kg"] == pytest.approx(answer["mass_kg"], abs=0.01)

@@ -67,7 +67,7 @@ def test_json_has_the_documented_keys_and_talk_stays_off_stdout(solve: Solve, tm
         *("mass_kg", "weight_N", "gravity_force_base_N", "R_flange_sensor", "force_bias_N", "torque_bias_Nm"),
         *("p_sensor_com_m", "tilt_alpha_rad", "tilt_beta_rad"),
     }
-    assert {"schema_version", "method", "verdict", "reasons", "n_poses", "sigma"} | estimates <= result.keys()
+    assert {"schema_version", "method", "verdict", "findings", "n_poses", "sigma"} | estimates <= result.keys()
     assert estimates <= result["sigma"].keys()
     assert set(result["residual"]) == {"force_rms_N", "force_max_N", "torque_rms_Nm", "torque_max_Nm"}
     assert result["mass_kg"] == pytest.approx(1.2, abs=0.001)

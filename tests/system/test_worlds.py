@@ -25,7 +25,8 @@ def test_odd_cells_are_recovered_within_their_sigmas(world: str, ftdrive: Comman
         config = ftdrive.connect(station)
         answer = ftdrive.json("calibrate", "--config", config, "--quick", typed="yes\nyes\nyes\nMOVE\nyes\n")
         level = ftdrive.json("solve", ftdrive.folder / answer["run"], "--level-deg", "5")  # level as it is mounted
-    assert answer["verdict"] == verdict, answer["reasons"]
+    assert answer["verdict"] == verdict, answer["findings"]
     result = CalibrationResult.load(ftdrive.folder / answer["run"] / "calibration.json")
     assert_found(errors_in_sigma(result, station.truth))
-    assert (level["verdict"], level["reasons"]) == (verdict, answer["reasons"])
+    codes = [[one["code"] for one in found["findings"]] for found in (level, answer)]
+    assert (level["verdict"], codes[0]) == (verdict, codes[1])

@@ -12,7 +12,7 @@ from typing import Final
 
 from ftdrive.cell.emulated_clock import EmulatedClock
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control_child import DECELERATION_RAD_S2
 from ftdrivers.ur.timing import UrTiming
@@ -42,7 +42,7 @@ def victim(host: str, page: str | None, ready: Connection) -> None:
     clock: Clock = REAL if page is None else EmulatedClock(page)
     timing = UrTiming() if page is None else UrTiming.emulated()
     arm = UrArm(host, speed_rad_s=SPEED_RAD_S, acceleration_rad_s2=4.0, control="script", clock=clock, timing=timing)
-    with suppress(DriverError):
+    with suppress(DeviceError):
         arm.open(control=True)
         q = arm.state().q_rad.tolist()
         q[5] += STEP_RAD if q[5] < 0 else -STEP_RAD

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from ftdrivers.registry import BadUrl, sensor_from_url
+from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.registry import sensor_from_url
 from ftdrivers.streaming.sensor import StreamingSensor
 
 WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])  # what the emulators of conftest.py measure, with

@@ -1,14 +1,15 @@
 """Mistakes in the data of a bad fit: orientations, pairs, axes, units. Named only if undoing one helps."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ftcalib.assessment.observability import RECOMMENDED_POSES
+from ftcalib.findings import Finding
 from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
 from ftcalib.model import UP_IN_BASE, Array
 from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
@@ -30,24 +31,6 @@ IN_BASE_RAD = np.deg2rad(10.0)
 """A constant force that points down this exactly is a weight in base axes."""
 STEADY = 0.05
 """A force that varies by less than this share of it is constant."""
-SAME_UNIT = 0.04
-"""A ratio this close to that of two units is one."""
-USUAL_COM_M = (0.02, 0.2)
-FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665, "mN": 1e-3, "kN": 1e3}
-TORQUE_UNITS_NM = {
-    "N·m": 1.0,
-    "N·mm": 1e-3,
-    "lbf·in": 0.11298483,
-    "lbf·ft": 1.3558179,
-    "kgf·cm": 0.0980665,
-    "kgf·m": 9.80665,
-    "kN·m": 1e3,
-}
-UNITS = (
-    *(("N", "N·mm"), ("N", "lbf·in"), ("lbf", "N·m"), ("kgf", "N·m"), ("mN", "N·m"), ("kN", "N·m")),
-    *(("lbf", "lbf·in"), ("lbf", "lbf·ft"), ("kgf", "kgf·cm"), ("kgf", "kgf·m"), ("mN", "N·mm"), ("kN", "kN·m")),
-)
-"""Units that are taken for N and N·m, the simplest mistake first."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +67,7 @@ class _Rough:
         return float(np.log(self.force_rms_N * self.torque_rms_Nm)) + IMPLAUSIBLE * implausible
 
 
-def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
+def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:
     """Find the mistake that explains a bad fit: form of orientations, pairing of wrenches and poses, or axes.
 
     Reversing all three axes of torque or of force only moves the centre of mass to the other side of the sensor.
@@ -104,22 +87,19 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
     up = np.asarray(up_in_base, dtype=np.float64)
     as_read = _Rough.of(R_base_flange, wrench)
     found = []
-    for words, R, y in _readings(R_base_flange, wrench):
+    for code, values, R, y in _readings(R_base_flange, wrench):
         trial = _Rough.of(R, y)
         if trial.force_rms_N < COLLAPSE * as_read.force_rms_N and (
             trial.torque_rms_Nm < NO_WORSE * as_read.torque_rms_Nm
         ):
-            found.append((trial.score(up), words, trial))
+            found.append((trial.score(up), code, values, trial.force_rms_N))
     if found:
-        _, (what, advice), best = min(found, key=lambda each: each[0])
-        return [
-            f"{what}. Corrected, the force residual drops from {as_read.force_rms_N:.2g} to "
-            f"{best.force_rms_N:.2g} N: {advice}"
-        ]
+        _, code, values, corrected_N = min(found, key=lambda each: each[0])
+        return [Finding.of(code, **values, residual_N=as_read.force_rms_N, corrected_N=corrected_N)]
     return _axes(as_read, wrench[:, 3:], up)
 
 
-def other_poses(R_base_flange: Array, wrench: Array) -> list[str]:
+def other_poses(R_base_flange: Array, wrench: Array) -> list[Finding]:
     """Recognise the wrenches of a weight in other poses than given: forces on a sphere, torques that belong to them.
 
     A sphere does not depend on the orientations, so it also shows an order or a form of them that `faults` cannot undo.
@@ -137,42 +117,35 @@ def other_poses(R_base_flange: Array, wrench: Array) -> list[str]:
     elsewhere = as_read.force_rms_N > OTHER_POSES * weight_N and radial_rms_N < OF_A_WEIGHT * as_read.force_rms_N
     if not elsewhere or torque_rms_Nm > COLLAPSE * as_read.torque_rms_Nm:
         return []
-    return [
-        f"the forces are those of a weight of {weight_N:.3g} N to {radial_rms_N:.2g} N, but in these orientations only "
-        f"to {as_read.force_rms_N:.2g} N: the wrenches are paired with other poses, or the orientations have another "
-        "form (Euler angles, degrees, another order): check both"
-    ]
+    residual_N = as_read.force_rms_N
+    return [Finding.of("pairing_or_rotations", weight_N=weight_N, radial_N=radial_rms_N, residual_N=residual_N)]
 
 
-def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
+def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:
     """Recognise a weight in base axes that was recorded without bias: the force is the same in all poses."""
     mean, up = wrench[:, :3].mean(axis=0), np.asarray(up_in_base, dtype=np.float64)
     size_N = float(np.linalg.norm(mean))
     downwards = float(-mean @ up) > np.cos(IN_BASE_RAD) * size_N * float(np.linalg.norm(up))
     if not downwards or float(wrench[:, :3].std(axis=0).max()) > STEADY * size_N:
         return []
-    return [
-        f"the force is ({', '.join(f'{x:.2g}' for x in mean)}) N in all poses: the wrench looks given in base axes, "
-        "record it in the axes of the sensor"
-    ]
+    return [Finding.of("constant_force", force_N=mean)]
 
 
-def _readings(R: Array, wrench: Array) -> Iterator[tuple[tuple[str, str], Array, Array]]:
-    """Each mistake in words, with the data as they are without it."""
-    yield ("the orientations look inverted", "state that they map base to flange"), np.swapaxes(R, 1, 2), wrench
+def _readings(R: Array, wrench: Array) -> Iterator[tuple[str, Mapping[str, Any], Array, Array]]:
+    """Yield each mistake as code and values, with the data as they are without it."""
+    yield "orientations_inverted", {}, np.swapaxes(R, 1, 2), wrench
     quaternions = Rotation.from_matrix(R).as_quat()
-    for shift, given, read in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
-        words = f"the quaternions look like ({given}) that were read as ({read})", f"read them as ({given})"
-        yield words, Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(), wrench
+    for shift, order, read_as in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
+        values = {"order": order, "read_as": read_as}
+        yield "quaternion_order", values, Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(), wrench
     in_flange = np.concatenate([np.einsum("nji,nj->ni", R, part) for part in (wrench[:, :3], wrench[:, 3:])], axis=1)
-    yield ("the wrench looks given in base axes", "record it in the axes of the sensor"), R, in_flange
-    for place, own, other in (("before", slice(None, -1), slice(1, None)), ("after", slice(1, None), slice(None, -1))):
-        advice = "pair each wrench with the pose at which it was measured"
-        yield (f"each wrench looks like that of the pose {place} it", advice), R[own], wrench[other]
+    yield "wrench_in_base", {}, R, in_flange
+    for side, own, other in (("before", slice(None, -1), slice(1, None)), ("after", slice(1, None), slice(None, -1))):
+        yield "pairing_shifted", {"neighbour": side}, R[own], wrench[other]
 
 
-def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[str]:
-    """Torque axes that disagree with the force axes."""
+def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
+    """Find torque axes that disagree with the force axes."""
     fits = []
     for Q in SPECIAL_R_flange_base:
         P, T0 = com_and_torque_bias(as_read.weight_sensor_N, torque_Nm @ Q.T)
@@ -185,23 +158,17 @@ def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[str]:
     if rms >= COLLAPSE * as_read.torque_rms_Nm:
         return []
     upwards, mirrored = bool(as_read.F_b @ up > 0), bool(np.linalg.det(Q) < 0)
-    if upwards and mirrored:  # a mirrored force reads like a weight that pulls upwards
-        undone = f"with force {axis_order(Q.T)}"
-    else:
-        other = f" (or force {axis_order(Q.T).removesuffix(' reversed')})" if not mirrored and not upwards else ""
-        undone = f"with torque {axis_order(Q)}{other}"
-    return [
-        f"force and torque axes disagree, {undone} the torque residual drops from {as_read.torque_rms_Nm:.2g} to "
-        f"{rms:.2g} N·m: check the wiring of the axes or the sensor's matrix"
-    ]
+    by_force, by_torque = ("force", channels(Q.T)), ("torque", channels(Q))
+    corrections = [by_torque] if mirrored or upwards else [by_torque, by_force]
+    if mirrored and upwards:  # a mirrored force reads like a weight that pulls upwards
+        corrections = [by_force]
+    residual_Nm = as_read.torque_rms_Nm
+    return [Finding.of("axes_disagree", corrections=corrections, residual_Nm=residual_Nm, corrected_Nm=rms)]
 
 
-def axis_order(Q: Array) -> str:
-    """Name the channels from which the axes of the wrench should be taken, given the signed permutation (3, 3)."""
-    if np.abs(np.diag(Q)).min() > 0.5:
-        return " and ".join("xyz"[k] for k in range(3) if Q[k, k] < 0) + " reversed"
-    channels = ", ".join(("-" if row[k] < 0 else "") + "xyz"[k] for row in Q for k in [int(np.abs(row).argmax())])
-    return f"x, y, z taken from ({channels})"
+def channels(Q: Array) -> Sequence[str]:
+    """Name the channels from which the axes of a wrench should be taken, given the signed permutation (3, 3)."""
+    return [("-" if row[k] < 0 else "") + "xyz"[k] for row in Q for k in [int(np.abs(row).argmax())]]
 
 
 def _torque_rms(weight_sensor_N: Array, torque_Nm: Array, P: Array, T0: Array) -> float:
@@ -209,30 +176,18 @@ def _torque_rms(weight_sensor_N: Array, torque_Nm: Array, P: Array, T0: Array) -
     return float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) + ROUNDING * float(np.abs(torque_Nm).max())
 
 
-def units(com_m: float, forces: Collection[str] = tuple(FORCE_UNITS_N)) -> list[str]:
-    """Name the wrong units, with one of these units of force, that make a usual distance of the centre of mass."""
-    low, high = USUAL_COM_M
-    return [
-        " and ".join([f"forces in {force}"] * (force != "N") + [f"torques in {torque}"] * (torque != "N·m"))
-        for force, torque in UNITS
-        if force in forces and low <= com_m * TORQUE_UNITS_NM[torque] / FORCE_UNITS_N[force] <= high
-    ]
-
-
-def broken_channels(wrench: Array, R_base_flange: Array) -> list[str]:
+def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
     """Find channels that do not move and rows that were copied."""
     names = ("fx", "fy", "fz", "tx", "ty", "tz")
     spread = np.ptp(wrench, axis=0)
     group = np.repeat([spread[:3].max(), spread[3:].max()], 3)
     stuck = [name for name, own, all_ in zip(names, spread, group, strict=True) if own == 0 < all_]
-    found = [f"{', '.join(stuck)} reads the same in all poses: the channel is stuck. Check it"] if stuck else []
+    found = [Finding.of("stuck_channels", channels=stuck)] if stuck else []
     if len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench):
         return found
     _, first, count = np.unique(wrench, axis=0, return_index=True, return_counts=True)
     copied = [np.flatnonzero((wrench == wrench[row]).all(axis=1)) for row in np.sort(first[count > 1])]
     for rows in copied:
         same = bool(np.ptp(R_base_flange[rows], axis=0).max() == 0)
-        listed = ", ".join(str(row + 1) for row in rows)
-        what = "and orientations: keep one of the copies" if same else "in different orientations: repeat these poses"
-        found.append(f"poses {listed} have identical wrenches {what}")
+        found.append(Finding.of("repeated_poses" if same else "repeated_wrenches", poses=rows + 1))
     return found

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ftcalib.findings import Finding, Severity
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.gain_and_cross_talk import response_columns
 from ftcalib.likelihood.session_noise import summed_products
@@ -39,21 +40,21 @@ class Change:
         """Whether the poses before and after have no calibration in common, whatever the bias does."""
         return self.what in {"centre of mass", "load"}
 
-    def in_words(self, since: str) -> str:
-        """State what changed from a pose on, and what to do."""
+    def finding(self, pose: int, severity: Severity) -> Finding:
+        """Return what changed from a pose on, given by its row from 1."""
         step, size = self.step, float(np.linalg.norm(self.step))
-        tared = "was the sensor tared, or does a cable pull? Check it"
-        what = {
-            "centre of mass": f"the centre of mass is {1e3 * size:.2g} mm off: did the load shift? Fix it",
-            "load": f"the load weighs {abs(step[0]):.2g} N {'less' if step[0] < 0 else 'more'}: was something lost or "
-            "picked up? Check the tool",
-            "force": f"the force reads {size:.2g} N differently: {tared}",
-            "torque": f"the torque reads {size:.2g} N·m differently: {tared}",
-            "force and torque": f"force and torque read {np.linalg.norm(step[:3]):.2g} N and "
-            f"{np.linalg.norm(step[3:]):.2g} N·m differently: {tared}",
-            "mounting": f"the sensor is turned by {np.degrees(size):.2g}°: is a screw loose? Fasten it",
+        code, values = {
+            "centre of mass": ("com_shifted", {"shift_mm": 1e3 * size}),
+            "load": ("load_changed", {"change_N": step[0]}),
+            "force": ("bias_stepped", {"force_N": size, "torque_Nm": 0.0}),
+            "torque": ("bias_stepped", {"force_N": 0.0, "torque_Nm": size}),
+            "force and torque": (
+                "bias_stepped",
+                {"force_N": np.linalg.norm(step[:3]), "torque_Nm": np.linalg.norm(step[3:])},
+            ),
+            "mounting": ("sensor_turned", {"turn_deg": np.degrees(size)}),
         }[self.what]
-        return f"from {since} on {what} and calibrate again"
+        return Finding.of(code, severity, pose=pose, **values)
 
 
 def lasting_change(

@@ -1,29 +1,29 @@
-"""The verdict on a fit, with reasons: how well it predicts, whether it is plausible, and which signs look reversed."""
+"""All findings about a fit, which give its verdict: how well it predicts, and whether it is plausible."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtr as normal_cdf
 
+from ftcalib.assessment import described_cell, units
+from ftcalib.assessment.contradictions import contradictions
 from ftcalib.assessment.cross_validation import AssessedFit, standardized
-from ftcalib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, other_poses, units
+from ftcalib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, other_poses
 from ftcalib.assessment.load_shift import lasting_change
 from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
+from ftcalib.findings import Finding, Severity, Verdict, ordered, verdict_of
+from ftcalib.known import Known
 from ftcalib.likelihood.fit import DriftEstimate
 from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
-from ftcalib.model import PARAMETER_NAMES, UP_IN_BASE, Array, Parameters
+from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters
 from ftcalib.published.yu import SPECIAL_R_flange_base
-
-Verdict = Literal["good", "usable", "rejected"]
+from ftcalib.setup import NOTHING, Setup
 
 SIGNIFICANT_SIGMAS = 5.0
-FARTHEST_COM_M = 0.5
 NEAREST_COM_M = 5e-4
 LIGHTEST_N, HEAVIEST_N = 0.05, 2000.0
 """Weights beyond these look like forces in another unit: 5 g, and far more than any UR arm carries."""
@@ -35,9 +35,6 @@ NOISY_SHARE = 0.01
 """Largest error of a good result whose residuals exceed the measured noise."""
 USUAL_LEVER_M = 0.1
 """Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther."""
-NOTED_TILT_DEG, REVERSED_TILT_DEG = 10.0, 135.0
-INSIDE_M = 0.01
-"""A centre of mass may lie this far on the robot's side of the sensor origin, because adapter plates do."""
 NOISELESS = 1e-6
 """Below this chi2 per degree of freedom the data are simulated without noise, and equal readings are no copies."""
 CORRELATED = 0.9
@@ -52,9 +49,8 @@ SURE = 1e-3
 class Quality:
     """The judgement on a fit."""
 
-    verdict: Verdict
-    reasons: tuple[str, ...]
-    """Reasons for a verdict below good, most important first, then notes."""
+    findings: tuple[Finding, ...]
+    """The first one to be fixed first; notes come last."""
     chi2_p: float | None
     """Probability of a larger chi2 if there is only the measured noise; None if the noise was not measured."""
     noise_factor: float | None
@@ -71,16 +67,21 @@ class Quality:
     correlations: tuple[tuple[str, str, float], ...]
     """Pairs of parameters that are correlated by more than 0.9, strongest first."""
 
+    @property
+    def verdict(self) -> Verdict:
+        """That of the worst finding."""
+        return verdict_of(self.findings)
+
 
 def judge(
     fit: AssessedFit,
     *,
     t_s: Array | None = None,
     measured_sigma: Array | None = None,
-    up_in_base: ArrayLike = UP_IN_BASE,
+    setup: Setup = NOTHING,
+    known: Known | None = None,
     unconstrained: AssessedFit | None = None,
-    contradicted: Sequence[str] = (),
-    other_unit: Sequence[str] = (),
+    g_m_s2: float = STANDARD_GRAVITY_M_S2,
 ) -> Quality:
     """Judge a fit.
 
@@ -95,71 +96,52 @@ def judge(
         When each pose was measured; the order of rows counts if it is missing or not finite.
     measured_sigma : array, shape (6,), optional
         Measured noise of a pose. With it, a load that shifted during the tour is detected.
-    up_in_base : array_like, shape (3,)
-        Expected up direction in base: +z for a robot on a table.
+    setup : Setup
+        The described cell.
+    known : Known, optional
+        That `fit` used.
     unconstrained : AssessedFit, optional
         The best fit to the same poses without known values, if `fit` used some.
-    contradicted : sequence of str
-        That the unconstrained fit contradicts known values, from `ftcalib.assessment.contradictions`.
-    other_unit : sequence of str
-        That the controller's payload agrees with forces in another unit, from the same module.
+    g_m_s2 : float
     """
     at = _statistics(fit, t_s)
-    parameters, weight_N, n = fit.parameters, at.weight_N, int(at.used.sum())
-    few_rejected = n >= (1 - FEW_LEFT_OUT) * len(at.used)
-    inexact = [words for words, share in at.shares if share > USABLE_SHARE]
-    suspect = inexact or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
-    explanation = _faults(fit, at.used, t_s, up_in_base) if suspect else []
-    plausible = not explanation and at.largest_share < SENSELESS_SHARE
-    com_too_far = _com_too_far(parameters)
-    noise, left_out = _noise_reasons(fit, at), _left_out_reasons(at.used)
-    noise_is_minor = (at.noise_factor or 0) <= NOISE_FACTOR and at.largest_share <= NOISY_SHARE
-    changed = _change_reasons(fit, at, measured_sigma, t_s)
-    drifted = _drift_reasons(fit.drift)
-
+    parameters, weight_N = fit.parameters, at.weight_N
+    few_rejected = at.used.sum() >= (1 - FEW_LEFT_OUT) * len(at.used)
+    suspect = at.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
     broken = broken_channels(fit.wrench, fit.R_base_flange) if fit.chi2 > NOISELESS * fit.dof else []
+    mistakes = _mistakes(fit, at.used, t_s, setup) if suspect else []
+    changed = _change(fit, at, measured_sigma, t_s)
+    contradicted: list[Finding] = []
+    if known is not None and unconstrained is not None:
+        at_its_best = unconstrained.parameters, unconstrained.covariance
+        contradicted = contradictions(known, *at_its_best, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
 
-    rejected = [
+    found = [
         *broken,
-        *explanation,
-        *_weight_reasons(fit, weight_N, up_in_base),
-        *_second_solution_reasons(fit),
-        *(_force_unit(parameters) if weight_N > HEAVIEST_N else []),
-        *com_too_far,
-        *(inexact if at.largest_share > REJECTED_SHARE else []),
+        *mistakes,
         *changed,
+        *at.errors,
+        *_weight(fit, weight_N, setup),
+        *_second_solution(fit),
+        *_implausible_units(parameters, weight_N),
+        *([] if contradicted or at.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
+        *_noise(fit, at),
+        *_poses(fit, at, "note" if few_rejected else "limit"),
+        *_drift(fit.drift, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
+        *_response(fit.response),
     ]
-    usable = [
-        *(_force_unit(parameters) if weight_N < LIGHTEST_N else []),
-        *([] if com_too_far else _com_too_near(parameters)),
-        *(inexact if at.largest_share <= REJECTED_SHARE else []),
-        *([] if contradicted or at.largest_share <= NOISY_SHARE else _contradiction_reasons(fit, unconstrained)),
-        *(reversed_signs(parameters, fit.covariance, up_in_base) if plausible else []),
-        *([] if noise_is_minor else noise),
-        *([] if few_rejected else left_out),
-        *([] if n >= RECOMMENDED_POSES else [f"there are only {n} poses: take {RECOMMENDED_POSES} or more"]),
-        *_unchecked_pose_reasons(fit, at.used, weight_N),
-    ]
-    notes = [
-        *(noise if noise_is_minor else []),
-        *(left_out if few_rejected else []),
-        *([f"{fit.response.in_words()}: the calibration corrects this for its own weight"] if fit.response else []),
-        *_pose_notes(at),
-        *(_tilt_notes(parameters, up_in_base) if plausible else []),
-        *([] if at.chi2_p is not None else ["the noise was estimated from the residuals: chi2 does not test the fit"]),
-    ]
-    drift_matters = fit.drift is not None and _drift_share(fit.drift.change, weight_N) > USABLE_SHARE
-    if drift_matters and not (broken or explanation or changed):
-        (rejected or usable)[:0] = drifted  # before its consequences
-    else:
-        notes += drifted
-    if other_unit and plausible and not broken:
-        (rejected or usable)[:0] = other_unit  # before its consequences
-    if not (broken or explanation or at.fits_measured_noise):
-        (rejected or usable or notes)[:0] = contradicted  # before its consequences
+    payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
+    if not mistakes and at.largest_share < SENSELESS_SHARE:
+        found += described_cell.directions(parameters, fit.covariance, setup)
+        found += [one for one in payload if one.code == "payload_units" and not broken]
+    if verdict_of(found) != "rejected":  # its contradictions would be consequences
+        found += [one for one in payload if one not in found]
+        found += described_cell.tool(parameters, fit.covariance, setup, g_m_s2)
+    if not (broken or mistakes or at.fits_measured_noise):
+        harmless = verdict_of(found) == "good"
+        found += [replace(one, severity="note") if harmless else one for one in contradicted]
     return Quality(
-        verdict="rejected" if rejected else "usable" if usable else "good",
-        reasons=(*rejected, *usable, *notes),
+        findings=ordered(found),
         chi2_p=at.chi2_p,
         noise_factor=at.noise_factor,
         loo_force_rms_N=at.loo_force_rms_N,
@@ -173,7 +155,7 @@ def judge(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Statistics:
-    """The numbers that the reasons rest on; those with the names of `Quality` have its meaning."""
+    """The numbers that the findings rest on; those with the names of `Quality` have its meaning."""
 
     used: NDArray[np.bool_]
     weight_N: float
@@ -182,16 +164,14 @@ class _Statistics:
     lag1: float
     lag1_p: float
     """Probability of a larger correlation by chance."""
-    shares: list[tuple[str, float]]
-    """Errors relative to the weight, each with its sentence, largest first."""
+    largest_share: float
+    """Largest error relative to the weight."""
+    errors: list[Finding]
+    """Of force and torque, if they are too large."""
     loo_force_rms_N: float
     loo_torque_rms_Nm: float
     noise_factor: float | None
     chi2_p: float | None
-
-    @property
-    def largest_share(self) -> float:
-        return self.shares[0][1]
 
     @property
     def fits_measured_noise(self) -> bool:
@@ -203,7 +183,7 @@ def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
     weight_N = float(np.linalg.norm(fit.parameters.gravity_force_base_N))
     residuals = standardized(fit.left_out_residuals, fit.left_out_cov)
     residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
-    shares, left_out_rms = _shares(fit, used, weight_N)
+    largest_share, errors, left_out_rms = _errors(fit, used, weight_N)
     measured = bool(np.isfinite(fit.measured_chi2))
     return _Statistics(
         used,
@@ -211,25 +191,26 @@ def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
         residual_sigma,
         int(np.argmax(np.where(used, residual_sigma, -1.0))),
         *successive_correlation(residuals[used], None if t_s is None else t_s[used]),
-        shares,
+        largest_share,
+        errors,
         *left_out_rms,
         noise_factor=float(np.sqrt(fit.measured_chi2 / fit.dof)) if measured else None,
         chi2_p=float(chi2_sf(fit.dof, fit.measured_chi2)) if measured else None,
     )
 
 
-def _faults(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, up_in_base: ArrayLike) -> list[str]:
-    """Look for faults in all poses, or of many in evenly spread runs, and if there are none, in the used poses.
+def _mistakes(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, setup: Setup) -> list[Finding]:
+    """Look for mistakes in all poses, or of many in evenly spread runs, and if there are none, in the used poses.
 
     A wrong pose or two were rejected; only the used poses show whether most of them are wrong.
     """
     n = len(used)
     order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
     order = order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0]
-    found = faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
+    found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
     order = order[used[order]]
     if not found and not used.all():
-        found = faults(fit.R_base_flange[order], fit.wrench[order], up_in_base)
+        found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
     return found or other_poses(fit.R_base_flange[order], fit.wrench[order])
 
 
@@ -270,103 +251,149 @@ def expected_error(parameters: Parameters, covariance: Array, response: Response
     return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
-def reversed_signs(parameters: Parameters, covariance: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[str]:
-    """Explain a weight that pulls upwards, and a centre of mass on the robot's side of the sensor."""
-    angle_deg, inside_m = _tilt_deg(parameters, up_in_base), _inside_m(parameters, covariance)
-    if angle_deg < REVERSED_TILT_DEG:
-        if not 0 < inside_m <= FARTHEST_COM_M:
-            return []
-        return [
-            f"the centre of mass lies {1e3 * inside_m:.0f} mm on the robot's side of the sensor: the torques are "
-            "reversed, unless the tool reaches back that far"
-        ]
-    if inside_m:
-        return [
-            f"the weight pulls upwards ({angle_deg:.0f}° from down) and the centre of mass lies on the robot's side of "
-            "the sensor: the forces are reversed and the torques are not, or the orientations are mirrored "
-            "(left-handed axes)"
-        ]
-    return [
-        f"the weight pulls upwards ({angle_deg:.0f}° from down): the sensor reports the reaction (set sign = -1), or "
-        "one axis is reversed or two are swapped in forces and torques alike, or the robot hangs from the ceiling"
-    ]
+def _errors(
+    fit: AssessedFit, used: NDArray[np.bool_], weight_N: float
+) -> tuple[float, list[Finding], tuple[float, float]]:
+    """Return the largest error relative to the weight, errors that are too large, and the cross-validated rms.
+
+    Of residual, cross-validated and expected error the first is named that exceeds the highest limit.
+    """
+    lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
+    left_out = _rms(fit.left_out_residuals[used, :3]), _rms(fit.left_out_residuals[used, 3:])
+    expected = expected_error(fit.parameters, fit.covariance, fit.response)
+    largest, found = 0.0, []
+    for k, scale, unit in ((0, weight_N, "N"), (1, weight_N * lever_m, "Nm")):
+        errors = (
+            ("residuals", _rms(fit.residuals[used, 3 * k : 3 * k + 3])),
+            ("cross-validation", left_out[k]),
+            ("uncertainty over all orientations", expected[k]),
+        )
+        limits = [sum(error > limit * scale for limit in (USABLE_SHARE, REJECTED_SHARE)) for _, error in errors]
+        source, error = errors[int(np.argmax(limits))] if max(limits) else max(errors, key=lambda pair: pair[1])
+        share = error / scale if scale else float("inf")
+        largest = max(largest, share)
+        if share > USABLE_SHARE:
+            severity: Severity = "reject" if share > REJECTED_SHARE else "limit"
+            limit_percent = 100 * (REJECTED_SHARE if severity == "reject" else USABLE_SHARE)
+            values = {f"error_{unit}": error, "share_percent": 100 * share, "limit_percent": limit_percent}
+            code = ("force_error", "torque_error")[k]
+            found.append(Finding.of(code, severity, source=source, **values, **({"lever_m": lever_m} if k else {})))
+    return largest, found, left_out
 
 
-def _tilt_notes(parameters: Parameters, up_in_base: ArrayLike) -> list[str]:
-    angle_deg = _tilt_deg(parameters, up_in_base)
-    if not NOTED_TILT_DEG < angle_deg < REVERSED_TILT_DEG:
-        return []
-    x, y, z = parameters.gravity_force_base_N / np.linalg.norm(parameters.gravity_force_base_N)
-    return [
-        f"gravity is {angle_deg:.0f}° off, along ({x:.2f}, {y:.2f}, {z:.2f}) in base: right for a robot on a "
-        "wall or a slope, otherwise check the base frame and the orientations"
-    ]
-
-
-def _drift_share(change: Array, weight_N: float) -> float:
-    """Drift of the force relative to the weight, or of the torque to the weight at the usual lever."""
-    return _drift_size_N(change) / weight_N if weight_N else float("inf")
-
-
-def _drift_size_N(change: Array) -> float:
-    return float(max(np.linalg.norm(change[:3]), np.linalg.norm(change[3:]) / USUAL_LEVER_M))
-
-
-def _drift_reasons(drift: DriftEstimate | None) -> list[str]:
-    if drift is None:
-        return []
-    rounding = 1e-9 * _drift_size_N(drift.change)  # of a group without drift, whose sigma is as small
-    found = [
-        f"{np.linalg.norm(drift.change[part]):.2g} {unit}"
-        for unit, part in (("N", slice(0, 3)), ("N·m", slice(3, 6)))
-        if (np.abs(drift.change[part]) > np.maximum(3 * drift.sigma[part], rounding)).any()
-    ]
-    return [
-        f"the bias drifted by {' and '.join(found)} from the first pose to the last: let the sensor warm up and "
-        "calibrate again"
-    ] * bool(found)
-
-
-def _tilt_deg(parameters: Parameters, up_in_base: ArrayLike) -> float:
-    """Angle between the weight and the expected down direction."""
-    up, F_b = np.asarray(up_in_base, dtype=np.float64), parameters.gravity_force_base_N
-    cosine = -float(F_b @ up) / float(np.linalg.norm(F_b) * np.linalg.norm(up) or 1.0)
-    return float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))))
-
-
-def _inside_m(parameters: Parameters, covariance: Array) -> float:
-    """Distance of the centre of mass behind the sensor, towards the robot; 0 if it is not significant."""
-    outwards = parameters.R_flange_sensor[2]  # flange z in the sensor frame
-    inside_m = -float(outwards @ parameters.p_sensor_com_m)
-    sigma_m = float(np.sqrt(outwards @ covariance[9:12, 9:12] @ outwards))
-    return inside_m if inside_m > max(INSIDE_M, 3 * sigma_m) else 0.0
-
-
-def _weight_reasons(fit: AssessedFit, weight_N: float, up_in_base: ArrayLike) -> list[str]:
+def _weight(fit: AssessedFit, weight_N: float, setup: Setup) -> list[Finding]:
     along = fit.parameters.gravity_force_base_N / (weight_N or 1.0)
     variance = float(along @ fit.covariance[3:6, 3:6] @ along)
     sigma_N = np.sqrt(max(variance, 0.0))  # below 0 only by rounding, if the weight is exactly known
     if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
         return []
-    if given_in_base := constant_weight(fit.wrench, up_in_base):
+    if given_in_base := constant_weight(fit.wrench, setup.up):
         return given_in_base
-    return [
-        f"the weight, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty of {sigma_N:.2g} N: "
-        "hang something heavier on the sensor, or record longer and in more orientations"
-    ]
+    values = {"weight_N": weight_N, "sigma_N": sigma_N, "least_sigmas": SIGNIFICANT_SIGMAS}
+    return [Finding.of("weight_insignificant", **values)]
 
 
-def _second_solution_reasons(fit: AssessedFit) -> list[str]:
+def _second_solution(fit: AssessedFit) -> list[Finding]:
     if fit.second_basin_chi2 is None:
         return []
     delta = fit.second_basin_chi2 / max(1.0, fit.chi2 / fit.dof)
     if delta >= ACCEPTED_DELTA_CHI2:
         return []
-    odds = 100 * wrong_basin_probability(max(delta, 0.0))
+    return [Finding.of("second_solution", probability_percent=100 * wrong_basin_probability(max(delta, 0.0)))]
+
+
+def _implausible_units(parameters: Parameters, weight_N: float) -> list[Finding]:
+    """Name the units that make an implausible weight or centre of mass usual."""
+    com_m, found = float(np.linalg.norm(parameters.p_sensor_com_m)), []
+    if not LIGHTEST_N <= weight_N <= HEAVIEST_N:
+        heavy = weight_N > HEAVIEST_N
+        suspects = units.suspects(parameters, ("mN" if heavy else "kN",))
+        found.append(
+            Finding.of("weight_implausible", "reject" if heavy else "limit", weight_N=weight_N, units=suspects)
+        )
+    if com_m > described_cell.FARTHEST_COM_M:
+        values = {"distance_m": com_m, "most_m": described_cell.FARTHEST_COM_M}
+        found.append(Finding.of("com_too_far", **values, units=units.by_com(com_m)))
+    if com_m < NEAREST_COM_M:
+        found.append(Finding.of("com_too_near", distance_mm=1e3 * com_m))
+    return found
+
+
+def _misfit_of_known_values(fit: AssessedFit, unconstrained: AssessedFit | None) -> list[Finding]:
+    if unconstrained is None:
+        return []
+    used = unconstrained.weights > 0.5
     return [
-        f"a very different mounting of the sensor explains the data almost as well (probability {odds:.2g} %): "
-        "add poses with another angle between the tool and the vertical"
+        Finding.of(f"known_values_misfit_{kind}", **{f"residual_{unit}": ours, f"free_{unit}": best})
+        for kind, unit, columns in (("force", "N", slice(0, 3)), ("torque", "Nm", slice(3, 6)))
+        for ours, best in [(_rms(fit.residuals[used, columns]), _rms(unconstrained.residuals[used, columns]))]
+        if best < COLLAPSE * ours
+    ][:1]
+
+
+def _noise(fit: AssessedFit, at: _Statistics) -> list[Finding]:
+    if at.chi2_p is None or at.noise_factor is None:
+        return [Finding.of("noise_unknown")]
+    if at.fits_measured_noise:
+        return []
+    minor = at.noise_factor <= NOISE_FACTOR and at.largest_share <= NOISY_SHARE
+    components = {name: value for name, value in fit.components.items() if value > 0}
+    return [Finding.of("noise_exceeded", "note" if minor else "limit", factor=at.noise_factor, components=components)]
+
+
+def _poses(fit: AssessedFit, at: _Statistics, severity_of_rejected: Severity) -> list[Finding]:
+    """Name poses that were rejected, that nothing checks, or that deviate most, and drift from pose to pose."""
+    found, n = list[Finding](), int(at.used.sum())
+    if not at.used.all():
+        rows = np.flatnonzero(~at.used) + 1
+        values = {"count": len(rows), "n_poses": len(at.used), "poses": rows}
+        found.append(Finding.of("poses_rejected", severity_of_rejected, **values))
+    if n < RECOMMENDED_POSES:
+        found.append(Finding.of("few_poses", n_poses=n, recommended=RECOMMENDED_POSES))
+    uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > at.weight_N**2
+    rows = np.flatnonzero(uncertain & at.used) + 1
+    if 0 < rows.size <= n / 2:
+        found.append(Finding.of("poses_unchecked", poses=rows))
+    if at.lag1_p < SURE:
+        found.append(Finding.of("residuals_alike", correlation=at.lag1))
+    worst, typical = float(at.residual_sigma[at.worst_pose]), float(np.median(at.residual_sigma[at.used] ** 2))
+    if n >= RECOMMENDED_POSES and worst**2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
+        found.append(Finding.of("pose_deviates", pose=at.worst_pose + 1, sigmas=worst))
+    return found
+
+
+def _drift(drift: DriftEstimate | None, weight_N: float, *, is_cause: bool) -> list[Finding]:
+    """Name a significant drift, 0 where it is not; it limits the result if it is large and no consequence."""
+    if drift is None:
+        return []
+    force_N, torque_Nm = (float(np.linalg.norm(drift.change[part])) for part in (slice(0, 3), slice(3, 6)))
+    size_N = max(force_N, torque_Nm / USUAL_LEVER_M)
+    rounding = 1e-9 * size_N  # of a group without drift, whose sigma is as small
+    channels = np.abs(drift.change) > np.maximum(3 * drift.sigma, rounding)
+    significant = np.array([channels[:3].any(), channels[3:].any()])
+    if not significant.any():
+        return []
+    matters = is_cause and size_N > USABLE_SHARE * weight_N
+    values = {"force_N": force_N * significant[0], "torque_Nm": torque_Nm * significant[1]}
+    return [Finding.of("drift", "limit" if matters else "note", **values)]
+
+
+def _response(response: Response | None) -> list[Finding]:
+    """Name the axes along which the sensor reads high or low, and how much force leaks into torque."""
+    if response is None:
+        return []
+    gain, cross_talk, sigma = response.force_gain, response.cross_talk_m, response.sigma
+    certain = np.abs(gain) > 3 * sigma["force_gain"]
+    certain &= sigma["force_gain"] > 0
+    found = [Finding.of(f"gain_{axis}", gain_percent=100 * gain[k, k]) for k, axis in enumerate("xyz") if certain[k, k]]
+    found += [
+        Finding.of("axes_mixed", axes=f"{'xyz'[i]} and {'xyz'[j]}", share_percent=100 * abs(gain[i, j]))
+        for i, j in combinations(range(3), 2)
+        if certain[i, j]
     ]
+    if (np.abs(cross_talk) > 3 * sigma["cross_talk_m"]).any():
+        found.append(Finding.of("cross_talk", torque_mNm=1e3 * np.abs(cross_talk).max()))
+    return found or [Finding.of("response_small")]
 
 
 def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
@@ -376,10 +403,10 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
     return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
 
 
-def _change_reasons(fit: AssessedFit, at: _Statistics, measured_sigma: Array | None, t_s: Array | None) -> list[str]:
-    """Report poses of two different loads, which no white noise explains: all poses after the change deviate alike.
+def _change(fit: AssessedFit, at: _Statistics, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
+    """Name a lasting change between two poses, which no white noise explains: all poses after it deviate alike.
 
-    If all poses before the change were rejected, the others describe the present load, and nothing is reported.
+    Poses of two different loads have no result in common, unless all poses before the change were rejected.
     """
     if measured_sigma is None or at.chi2_p is None or (at.fits_measured_noise and at.used.all()):
         return []
@@ -394,127 +421,10 @@ def _change_reasons(fit: AssessedFit, at: _Statistics, measured_sigma: Array | N
         times[order],
         np.flatnonzero(np.isin(order, out_of_line(at.residual_sigma, at.used))).tolist(),
     )
-    if change is None or not change.of_the_tool or not at.used[order[: change.position]].any():
+    if change is None:
         return []
-    return [f"the poses do not belong to one tool: {change.in_words(f'pose {order[change.position] + 1}')}"]
-
-
-def _left_out_reasons(used: NDArray[np.bool_]) -> list[str]:
-    if used.all():
-        return []
-    listed = ", ".join(str(k + 1) for k in np.flatnonzero(~used))
-    return [
-        f"{np.count_nonzero(~used)} of {len(used)} poses were rejected because they do not fit the others: "
-        f"repeat {listed}"
-    ]
-
-
-def _pose_notes(at: _Statistics) -> list[str]:
-    """Name drift from pose to pose, and the pose that deviates most from the others."""
-    notes = []
-    if at.lag1_p < SURE:
-        notes.append(
-            f"successive poses have similar residuals (correlation {at.lag1:.2f}): most likely the bias drifted, so "
-            "let the sensor warm up and mix the order of the poses"
-        )
-    n, worst = int(at.used.sum()), float(at.residual_sigma[at.worst_pose])
-    typical = float(np.median(at.residual_sigma[at.used] ** 2))
-    if n >= RECOMMENDED_POSES and worst**2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
-        notes.append(f"pose {at.worst_pose + 1} deviates from the others by {worst:.1f} sigma: consider repeating it")
-    return notes
-
-
-def _force_unit(parameters: Parameters) -> list[str]:
-    """Name the unit of force that makes an implausible weight usual."""
-    weight_N, com_m = (float(np.linalg.norm(v)) for v in (parameters.gravity_force_base_N, parameters.p_sensor_com_m))
-    unit = "mN" if weight_N > HEAVIEST_N else "kN"
-    like = " or ".join(units(com_m, (unit,)) or [f"forces in {unit}"])
-    return [f"the weight is {weight_N:.5g} N, as with {like}: check the units of force and torque"]
-
-
-def _com_too_far(parameters: Parameters) -> list[str]:
-    com_m = float(np.linalg.norm(parameters.p_sensor_com_m))
-    if com_m <= FARTHEST_COM_M:
-        return []
-    like = f", as with {', or '.join(found)}" if (found := units(com_m)) else ""
-    return [
-        f"the centre of mass is {com_m:.2f} m from the sensor, farther than {FARTHEST_COM_M:g} m{like}: "
-        "check the units of force and torque"
-    ]
-
-
-def _com_too_near(parameters: Parameters) -> list[str]:
-    com_m = float(np.linalg.norm(parameters.p_sensor_com_m))
-    if com_m >= NEAREST_COM_M:
-        return []
-    return [
-        f"the centre of mass is only {1e3 * com_m:.2g} mm from the sensor, as if torques were 1000 times too small or "
-        "forces were in mN: check the units"
-    ]
-
-
-def _shares(
-    fit: AssessedFit, used: NDArray[np.bool_], weight_N: float
-) -> tuple[list[tuple[str, float]], tuple[float, float]]:
-    """Errors relative to the weight, each with a sentence, largest first, and the cross-validated rms.
-
-    Of residual, cross-validated and expected error the sentence names the first that exceeds the highest limit.
-    """
-    lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
-    left_out = _rms(fit.left_out_residuals[used, :3]), _rms(fit.left_out_residuals[used, 3:])
-    expected = expected_error(fit.parameters, fit.covariance, fit.response)
-    kinds = (
-        ("force", 0, weight_N, "N", "the weight"),
-        ("torque", 1, weight_N * lever_m, "N·m", f"the weight at {lever_m:.2g} m"),
-    )
-    shares = []
-    for kind, k, scale, unit, of in kinds:
-        errors = (
-            (f"the {kind} residual", _rms(fit.residuals[used, 3 * k : 3 * k + 3])),
-            (f"the cross-validated {kind} error", left_out[k]),
-            (f"the expected {kind} error over all orientations", expected[k]),
-        )
-        limits = [sum(error > limit * scale for limit in (USABLE_SHARE, REJECTED_SHARE)) for _, error in errors]
-        what, error = errors[int(np.argmax(limits))] if max(limits) else max(errors, key=lambda pair: pair[1])
-        share = error / scale if scale else float("inf")
-        limit = REJECTED_SHARE if share > REJECTED_SHARE else USABLE_SHARE
-        shares.append(
-            (f"{what} is {100 * share:.1f} % of {of} ({error:.2g} {unit}), more than {100 * limit:g} %", share)
-        )
-    return sorted(shares, key=lambda pair: -pair[1]), left_out
-
-
-def _contradiction_reasons(fit: AssessedFit, unconstrained: AssessedFit | None) -> list[str]:
-    if unconstrained is None:
-        return []
-    used = unconstrained.weights > 0.5
-    return [
-        f"without known values the {kind}s fit to {best:.2g} {unit} instead of {ours:.2g} {unit} (method ml): "
-        "check the known mass and the assumption of a level base"
-        for kind, unit, columns in (("force", "N", slice(0, 3)), ("torque", "N·m", slice(3, 6)))
-        for ours, best in [(_rms(fit.residuals[used, columns]), _rms(unconstrained.residuals[used, columns]))]
-        if best < COLLAPSE * ours
-    ][:1]
-
-
-def _noise_reasons(fit: AssessedFit, at: _Statistics) -> list[str]:
-    if at.chi2_p is None or at.fits_measured_noise:
-        return []
-    found = ", ".join(f"{name} {value:.2g}" for name, value in fit.components.items() if value > 0)
-    included = f": found {found}" if found else ", and the stated uncertainties do not include them"
-    return [
-        f"residuals are {at.noise_factor:.1f} times the measured noise: drift, cables, contact or inexact orientations "
-        f"add to it{included}"
-    ]
-
-
-def _unchecked_pose_reasons(fit: AssessedFit, used: NDArray[np.bool_], weight_N: float) -> list[str]:
-    uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > weight_N**2
-    rows = np.flatnonzero(uncertain & used)
-    if not 0 < rows.size <= used.sum() / 2:
-        return []
-    listed = ", ".join(str(k + 1) for k in rows)
-    return [f"pose {listed} cannot be checked because the others do not determine all parameters: add similar poses"]
+    two_loads = change.of_the_tool and at.used[order[: change.position]].any()
+    return [change.finding(int(order[change.position]) + 1, "reject" if two_loads else "note")]
 
 
 def _rms(vectors: Array) -> float:

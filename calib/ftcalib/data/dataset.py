@@ -3,29 +3,38 @@
 import csv
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
-from ftcalib.files import JSON, check_format, read_object, write_new
-from ftcalib.model import ROUNDING, Array, nearest_rotation, read_only
+from ftcalib.files import JSON, check_format, read_object, write_object
+from ftcalib.model import ROUNDING, Array, Rotations, matrices_of, nearest_rotation, read_only
 
 FORMAT = "ftdrive.dataset/1"
+
+Orientation = Literal["R_base_flange", "R_flange_base"]
+"""Whether rotations map flange to base coordinates, like a robot pose, or base to flange coordinates, like e_bR in the
+papers."""
 
 LARGEST = 1e9  # N, N·m or their squares: no sensor measures more, and powers of it must not overflow
 LEAST_VARIANCE = 1e-18  # N² or (N·m)²: sigma 1 nN; with much less, products of inverses lose all digits
 SIGMA_COLUMNS = tuple(f"sigma_{name}" for name in CHANNELS)
 MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
+QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 VECTOR_COLUMNS = ("rx", "ry", "rz")
-LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
+ORIENTATION_FORMS = "r11..r33, qx, qy, qz, qw or rx, ry, rz"
+"""What a table may hold: rotation matrix row by row, quaternion, rotation vector in rad."""
+_LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
+_ROUNDED_LENGTH = 0.01
+"""Of a quaternion: it differs from 1 by no more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +47,15 @@ class CalibrationDataset:
     ------
     BadDataset
         The message names the row, counted from 1, and the fault.
+
+    Examples
+    --------
+    >>> import ftdrive, numpy as np
+    >>> from scipy.spatial.transform import Rotation
+    >>> poses = [Rotation.from_rotvec([0, 0, 0]), Rotation.from_rotvec([np.pi / 2, 0, 0])]
+    >>> dataset = ftdrive.CalibrationDataset.of(poses, np.zeros((2, 6)))
+    >>> len(dataset), dataset.R_base_flange.shape
+    (2, (2, 3, 3))
     """
 
     R_base_flange: Array
@@ -80,6 +98,47 @@ class CalibrationDataset:
             raise BadDataset(f"meta cannot be written as JSON ({exc}): use text, numbers, lists and mappings.") from exc
         object.__setattr__(self, "meta", MappingProxyType(meta))
 
+    @classmethod
+    def of(
+        cls,
+        R_base_flange: Rotations,
+        wrench: ArrayLike,
+        *,
+        wrench_cov: ArrayLike | None = None,
+        n_samples: ArrayLike = 0,
+        t_s: ArrayLike = np.nan,
+        meta: Mapping[str, JSON] | None = None,
+    ) -> Self:
+        """Build from rotations, such as a list of scipy's, and mean wrenches; what is unknown may be left out.
+
+        Parameters
+        ----------
+        R_base_flange : array, shape (n, 3, 3), or n Rotations
+        wrench : array_like, shape (n, 6)
+        wrench_cov : array_like, shape (n, 6, 6) or (6, 6), optional
+        n_samples, t_s : array_like, shape (n,) or one number for all
+        meta : mapping, optional
+
+        Raises
+        ------
+        BadDataset
+        """
+        wrench = np.asarray(wrench)
+        n = len(np.atleast_1d(wrench))
+
+        def of_each(value: ArrayLike, ndim: int) -> Any:
+            array = np.asarray(value)
+            return array if array.ndim > ndim else np.broadcast_to(array, (n, *array.shape))
+
+        return cls(
+            R_base_flange=matrices_of(R_base_flange),
+            wrench=wrench,
+            wrench_cov=None if wrench_cov is None else of_each(wrench_cov, 2),
+            n_samples=of_each(n_samples, 0),
+            t_s=of_each(t_s, 0),
+            meta=meta or {},
+        )
+
     def __len__(self) -> int:
         """Count the poses."""
         return len(self.wrench)
@@ -113,17 +172,17 @@ class CalibrationDataset:
             meta=meta,
         )
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write a new file; raises `FileExistsError` if it exists."""
-        write_new(path, json.dumps(self.to_dict(), allow_nan=False) + "\n")
+        write_object(path, self.to_dict(), indent=None)
 
     @classmethod
-    def load(cls, path: Path) -> Self:
+    def load(cls, path: str | Path) -> Self:
         """Read a dataset file. Raises `BadDataset` or `OSError`."""
         try:
             return cls.from_dict(read_object(path, BadDataset))
         except BadDataset as exc:
-            raise BadDataset(f"{path.name}: {exc}") from exc
+            raise BadDataset(f"{Path(path).name}: {exc}") from exc
 
     def sha256(self) -> str:
         """Hash the content, independent of spacing and order of fields in the file.
@@ -139,29 +198,25 @@ class CalibrationDataset:
         return digest.hexdigest()
 
 
-def read_csv(
-    path: Path, orientation: Literal["R_base_flange", "R_flange_base"] = "R_base_flange"
-) -> CalibrationDataset:
+def read_csv(path: str | Path, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
     """Read poses from a comma-separated table with one header row.
 
-    Columns: r11..r33 (rotation matrix, row by row) or rx, ry, rz (rotation vector in rad), fx, fy, fz (N), tx, ty, tz
-    (N·m), and optionally t (s) and sigma_fx .. sigma_tz, the standard error of each pose's mean. If both are
-    present, the matrix is used. Other columns are ignored.
+    Columns: the orientation as `orientation_columns` finds it, fx, fy, fz (N), tx, ty, tz (N·m), and optionally t (s)
+    and sigma_fx .. sigma_tz, the standard error of each pose's mean. Other columns are ignored.
 
     Parameters
     ----------
-    path : Path
-    orientation : {"R_base_flange", "R_flange_base"}
-        Whether the rotation maps flange to base coordinates, like a robot pose, or base to flange coordinates, like
-        e_bR in the papers.
+    path : str or Path
+    orientation : Orientation
 
     Raises
     ------
     BadDataset
         The message names the column or the row, counted from 1 below the header, and the reason.
     """
-    if orientation not in ("R_base_flange", "R_flange_base"):
-        raise ValueError(f"orientation is '{orientation}', expected 'R_base_flange' or 'R_flange_base'")
+    path = Path(path)
+    if orientation not in get_args(Orientation):
+        raise ValueError(f"orientation is '{orientation}', expected one of {', '.join(get_args(Orientation))}")
     try:
         return _read_csv(path, orientation)
     except BadDataset as exc:
@@ -171,15 +226,14 @@ def read_csv(
 def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
     header, *rows = _table(path)
     names = [name.strip() for name in header]
-    vector = any(c in names for c in VECTOR_COLUMNS) and not any(c in names for c in MATRIX_COLUMNS)
-    rotation_columns = VECTOR_COLUMNS if vector else MATRIX_COLUMNS
+    rotation_columns = orientation_columns(names)
     sigmas = SIGMA_COLUMNS if any(c in names for c in SIGMA_COLUMNS) else ()
     wanted = [*rotation_columns, *CHANNELS, *sigmas, *(["t"] if "t" in names else [])]
     missing = [name for name in wanted if name not in names]
     if missing:
         raise BadDataset(
-            f"missing column {', '.join(missing)}: the first row must name r11..r33 or rx, ry, rz, and fx, fy, fz, "
-            f"tx, ty, tz; it names {', '.join(names)}."
+            f"missing column {', '.join(missing)}: the first row must name {ORIENTATION_FORMS}, and "
+            f"fx, fy, fz, tx, ty, tz; it names {', '.join(names)}."
         )
     repeated = [name for name in wanted if names.count(name) > 1]
     if repeated:
@@ -205,12 +259,7 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
     if sigma is not None:
         for i, j in np.argwhere(sigma <= 0):
             raise BadDataset(f"row {i + 1}: {SIGMA_COLUMNS[j]} is {sigma[i, j]:g}, a standard error is above 0.")
-    if vector and (longest := float(np.linalg.norm(table[:, :k], axis=1).max())) > LONGEST_VECTOR_RAD:
-        raise BadDataset(
-            f"{path.name}: a rotation vector is {longest:.0f} rad long, more than 2π: rx, ry, rz look like degrees, "
-            "convert them to rad"
-        )
-    R = Rotation.from_rotvec(table[:, :k]).as_matrix() if vector else table[:, :k].reshape(-1, 3, 3)
+    R = rotations_of(rotation_columns, table[:, :k])
     return CalibrationDataset(
         R_base_flange=np.swapaxes(R, 1, 2) if orientation == "R_flange_base" else R,
         wrench=table[:, k : k + 6],
@@ -219,6 +268,36 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
         t_s=table[:, -1] - table[0, -1] if "t" in names else np.full(len(rows), np.nan),
         meta={"source": path.name, "orientation": orientation},
     )
+
+
+def orientation_columns(names: Collection[str]) -> tuple[str, ...]:
+    """Return the columns of the orientation in a table.
+
+    They are the first complete ones of `ORIENTATION_FORMS`, or the first incomplete ones.
+    """
+    forms = MATRIX_COLUMNS, QUATERNION_COLUMNS, VECTOR_COLUMNS
+    complete = [form for form in forms if set(form) <= set(names)]
+    begun = [form for form in forms if not set(form).isdisjoint(names)]
+    return (complete + begun + [MATRIX_COLUMNS])[0]
+
+
+def rotations_of(columns: Sequence[str], table: Array) -> Array:
+    """Return the rotations (n, 3, 3) in these columns (n, k); raises `BadDataset` naming the row."""
+    if columns == MATRIX_COLUMNS:
+        return _rotations(table.reshape(-1, 3, 3))
+    length = np.linalg.norm(table, axis=1)
+    if columns == QUATERNION_COLUMNS:
+        for i in np.flatnonzero(np.abs(length - 1) > _ROUNDED_LENGTH):
+            raise BadDataset(
+                f"row {i + 1}: the quaternion has length {length[i]:.3g}, not 1: check {', '.join(columns)}."
+            )
+        return Rotation.from_quat(table).as_matrix()
+    if length.max() > _LONGEST_VECTOR_RAD:
+        raise BadDataset(
+            f"row {length.argmax() + 1}: the rotation vector is {length.max():.0f} rad long, more than 2π: rx, ry, rz "
+            "look like degrees, convert them to rad."
+        )
+    return Rotation.from_rotvec(table).as_matrix()
 
 
 def _table(path: Path) -> list[list[str]]:

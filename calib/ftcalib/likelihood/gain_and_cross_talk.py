@@ -92,23 +92,6 @@ class Response:
             "covariance": self.covariance.tolist(),
         }
 
-    def in_words(self) -> str:
-        """Say along which axes the sensor reads high or low, and how much force leaks into torque."""
-        gain, cross_talk, sigma = self.force_gain, self.cross_talk_m, self.sigma
-        found = [
-            f"reads {100 * abs(gain[k, k]):.1f} % {'high' if gain[k, k] > 0 else 'low'} along {axis}"
-            for k, axis in enumerate("xyz")
-            if abs(gain[k, k]) > 3 * sigma["force_gain"][k, k] > 0
-        ]
-        found += [
-            f"mixes force {'xyz'[i]} with {'xyz'[j]} by {100 * abs(gain[i, j]):.1f} %"
-            for i, j in _PAIRS
-            if abs(gain[i, j]) > 3 * sigma["force_gain"][i, j] > 0
-        ]
-        if (np.abs(cross_talk) > 3 * sigma["cross_talk_m"]).any():
-            found.append(f"reads up to {1e3 * np.abs(cross_talk).max():.2g} mN·m of torque for 1 N of force")
-        return "the sensor " + (", ".join(found) if found else "has a small error of gain or cross-talk")
-
 
 def predicted_covariance(
     parameters: Parameters, covariance: Array, response: Response | None, R_base_flange: Array

@@ -58,7 +58,9 @@ def published(
         )
     if method == "carlson-cayley":
         if weight_N is None:
-            raise NotObservable("carlson-cayley needs the weight: give the mass on the sensor (--mass-kg).")
+            raise NotObservable(
+                "the weight is unknown, and the method needs it: give the mass on the sensor (--mass-kg)."
+            )
         gravity_N = weight_N * gravity_direction_base / np.linalg.norm(gravity_direction_base)
         return _with_torques(partial(carlson_known.cayley, gravity_force_base_N=gravity_N), R_base_flange)
     return _with_torques(_GRAVITY_UNKNOWN[method], R_base_flange)

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from ftdrivers.clock import REAL, Clock, Follower
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.follow import Follow, Unread
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health
 from ftdrivers.streaming.plausibility import DeviceClock, Liveness, Rate
@@ -82,6 +82,24 @@ class StreamingSensor(ForceTorqueSensor):
     recover : bool
         Reconnect after an interruption or silence, for up to `recover_s`, instead of ending the stream. Calls made
         meanwhile still fail, and so does a `collect` with an interruption inside. May be set until `open`.
+
+    Examples
+    --------
+    >>> import ftdrive, time, numpy as np
+    >>> class Acme(ftdrive.StreamingSensor):
+    ...     def _connect(self):
+    ...         self._seq = 0
+    ...         return ftdrive.DeviceInfo("Acme", "A1", "1.0")
+    ...
+    ...     def _read_block(self):
+    ...         time.sleep(0.002)
+    ...         self._seq += 1
+    ...         return ftdrive.FtSamples.of(time.monotonic_ns(), self._seq, np.random.normal(0, 0.1, (1, 6)))
+    ...
+    ...     def _disconnect(self): ...
+    >>> with Acme("Acme on /dev/acme0") as sensor:
+    ...     sensor.latest(timeout_s=10.0).wrench.shape
+    (1, 6)
     """
 
     def __init__(
@@ -111,7 +129,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._news = threading.Condition()
         self._info: DeviceInfo | None = None
         self._failure: Exception | None = None
-        self._interruption: tuple[DriverError, float] | None = None
+        self._interruption: tuple[DeviceError, float] | None = None
         """While it reconnects: the first error, and when to give up."""
         self._taps: list[Unread[FtSamples]] = []
         self._arrivals: deque[tuple[int, int]] = deque()
@@ -165,7 +183,7 @@ class StreamingSensor(ForceTorqueSensor):
                 self._info = self._connect_and_identify()
             except BaseException as exc:
                 self._let_go()
-                if isinstance(exc, DriverError) and not isinstance(exc, ConnectError | DeviceFault):
+                if isinstance(exc, DeviceError) and not isinstance(exc, ConnectError | DeviceFault):
                     raise self._not_opened(exc) from exc
                 raise
             self._opened_ns = self._clock.now_ns()
@@ -396,7 +414,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._liveness.forget()
             self._rate.forget()
 
-    def _reconnect(self, error: DriverError) -> None:
+    def _reconnect(self, error: DeviceError) -> None:
         """Reconnect to the same device; the first sample then ends the failure."""
         if self._interruption is None:  # else no sample has arrived since: it is not over yet
             self._interruption = error, self._clock.now_s() + self._limits.recover_s
@@ -416,7 +434,7 @@ class StreamingSensor(ForceTorqueSensor):
                 break
             except DeviceFault:
                 raise
-            except DriverError as exc:
+            except DeviceError as exc:
                 error = exc
                 self._clock.sleep(self._limits.retry_s)
         if not self._is_mine():
@@ -503,7 +521,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._earlier_lost += int((~fresh).sum())
         return block.rows(fresh)
 
-    def _not_opened(self, error: DriverError) -> ConnectError:
+    def _not_opened(self, error: DeviceError) -> ConnectError:
         """Put the device's name before the error of a codec."""
         found = error.found if error.found.startswith(self.name) else f"{self.name}: {error.found}"
         return ConnectError(found, error.fix)
@@ -523,7 +541,7 @@ class StreamingSensor(ForceTorqueSensor):
             failure = self._failure
             if self._received and not isinstance(failure, DeviceFault):
                 return
-            if isinstance(failure, DriverError) and not isinstance(failure, DeviceFault):
+            if isinstance(failure, DeviceError) and not isinstance(failure, DeviceFault):
                 raise self._not_opened(failure) from failure
             self._raise_failure()
             raise ConnectError(

@@ -17,7 +17,7 @@ from math import radians
 from typing import Final, Literal
 
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, ProtocolError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import (
     ArmState,
@@ -25,8 +25,8 @@ from ftdrivers.interfaces import (
     ArmStatus,
     ControllerSettings,
     DeviceInfo,
+    Diagnosis,
     Fact,
-    Finding,
     Guard,
     RobotArm,
 )
@@ -39,7 +39,7 @@ from ftdrivers.ur.own_program import OwnProgram
 from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.robot_api import PORT as API_PORT
 from ftdrivers.ur.sample import PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Sample
-from ftdrivers.ur.timing import UrTiming
+from ftdrivers.ur.timing import STRICT, UrTiming
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +81,7 @@ class UrArm(RobotArm):
         control: ControlSetting = "auto",
         api_port: int = API_PORT,
         clock: Clock = REAL,
-        timing: UrTiming | None = None,
+        timing: UrTiming = STRICT,
     ) -> None:
         _check_speed(speed_rad_s, acceleration_rad_s2)
         if control not in CONTROL_SETTINGS:
@@ -93,7 +93,7 @@ class UrArm(RobotArm):
         self._speed_rad_s = float(speed_rad_s)
         self._acceleration_rad_s2 = float(acceleration_rad_s2)
         self._clock = clock
-        self._timing = timing or UrTiming.of(clock)
+        self._timing = timing
         self._moves_at_rad_s = self._speed_rad_s
         self._setting = control
         self._api_port = api_port
@@ -128,7 +128,7 @@ class UrArm(RobotArm):
             return
         try:
             look = self._reader.look()
-        except DriverError as error:
+        except DeviceError as error:
             log.info("%s is reopened: %s", self._host, error)
             self.close()
             return
@@ -180,7 +180,7 @@ class UrArm(RobotArm):
                         self._program.is_gone()
                 elif not self._program.left_behind:
                     log.warning("%s runs another program; it is not stopped", self._host)
-        except DriverError as error:
+        except DeviceError as error:
             log.info("%s: %s", self._host, error)
         finally:
             control.kill()
@@ -255,7 +255,7 @@ class UrArm(RobotArm):
         """
         return self._reading().reported_program()
 
-    def diagnose(self) -> list[Finding]:
+    def diagnose(self) -> list[Diagnosis]:
         """Check what control needs: a control path, the version, free RTDE registers, an open port for programs."""
         return self._opening(self._reading()).diagnose()
 
@@ -271,7 +271,7 @@ class UrArm(RobotArm):
         control = self._in_control()
         try:
             return bool(control.call("within_safety_limits", q, look_out=self._look_out))
-        except DriverError as error:
+        except DeviceError as error:
             if fault := self._fault():
                 raise fault from error
             raise
@@ -305,7 +305,7 @@ class UrArm(RobotArm):
         self._check_ours(control)
         try:
             taken = control.call(f"set_{what}", *values, look_out=self._look_out)
-        except DriverError as error:
+        except DeviceError as error:
             if fault := self._fault():
                 raise fault from error
             raise
@@ -431,7 +431,7 @@ class UrArm(RobotArm):
         """Report any failure after `stop` in another thread as that stop."""
         try:
             yield
-        except DriverError as error:
+        except DeviceError as error:
             if self._stop_requested.is_set():
                 raise _stopped() from error
             raise
@@ -454,7 +454,7 @@ class UrArm(RobotArm):
         with self._reporting_stop():
             return self._look_out()
 
-    def _fault(self, look: Sample | None = None) -> DriverError | None:
+    def _fault(self, look: Sample | None = None) -> DeviceError | None:
         """Return why the arm does not move, if the controller reports a reason."""
         reader = self._reading()
         look = look or reader.look()
@@ -505,7 +505,7 @@ class UrArm(RobotArm):
             for _ in range(10):  # ur_rtde does not report success
                 if max(map(abs, self._reading().look(limit_s=glance_s).target_qd_rad_s)) <= _STANDING_RAD_S:
                     return True
-        except DriverError as error:
+        except DeviceError as error:
             log.info("%s: stopJ failed: %s", self._host, error)
         return False
 
@@ -531,7 +531,7 @@ class UrArm(RobotArm):
             log.info("%s: the control program does not answer: %s", self._host, error)
             self._program.is_gone()  # another program has probably replaced it
             return False
-        except DriverError as error:
+        except DeviceError as error:
             log.info("%s: the control program cannot be asked: %s", self._host, error)
             return False
         return True

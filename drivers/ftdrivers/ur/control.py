@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, Final, Literal
 
-from ftdrivers.errors import ConnectError, DriverError
+from ftdrivers.errors import ConnectError, DeviceError
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +56,7 @@ class Control(ABC):
         """Stop the arm, end our program and the link; return whether that was confirmed in time."""
         try:
             self.call("quit", timeout_s=timeout_s)
-        except DriverError as error:
+        except DeviceError as error:
             log.debug("our program did not end by itself: %s", error)
             return False
         finally:
@@ -67,10 +67,10 @@ class Control(ABC):
     def kill(self) -> None:
         """End the link at once, whatever the program does. Idempotent."""
 
-    def end_reason(self) -> DriverError | None:
+    def end_reason(self) -> DeviceError | None:
         """Return why our program has ended, if that is known."""
         return None
 
-    def explained(self, error: DriverError) -> DriverError:
+    def explained(self, error: DeviceError) -> DeviceError:
         """Return the error of a lost controller, with what the arm does about it."""
         return error

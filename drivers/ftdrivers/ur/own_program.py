@@ -3,7 +3,7 @@
 import logging
 import threading
 
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.ur.services import Services, ServicesOf
 from ftdrivers.ur.timing import UrTiming
 
@@ -44,7 +44,7 @@ class OwnProgram:
         self._stop_wanted.clear()
 
     def stop(self, *, silent: bool = False) -> None:
-        """End it; an attempt that takes longer than its limit goes on in the background. Never raises `DriverError`."""
+        """End it; an attempt that takes longer than its limit goes on in the background. Never raises `DeviceError`."""
 
         def stop(services: Services) -> None:
             if self._stop_wanted.is_set():
@@ -57,7 +57,7 @@ class OwnProgram:
         try:
             self._services.ask(stop, timeout_s=limit_s, connect_s=self._timing.reach_s)
             self.left_behind = self._starting
-        except DriverError as error:
+        except DeviceError as error:
             if self._stops_itself:
                 log.info("the control program stops the arm by itself: %s", error)
             else:

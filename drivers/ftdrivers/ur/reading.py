@@ -25,9 +25,9 @@ import numpy as np
 from ftdrivers.clock import Clock, Follower
 from ftdrivers.errors import (
     ConnectError,
+    DeviceError,
     DeviceFault,
     DeviceTimeout,
-    DriverError,
     ModelUnknown,
     NoDashboard,
     StreamBroken,
@@ -87,7 +87,7 @@ class Reader:
         self._t_device_s = math.nan
         self._lateness, self._late_s = Lateness(), 0.0
         self._followers: list[Unread[Received]] = []
-        self._failure: DriverError | None = None
+        self._failure: DeviceError | None = None
         self.silent = False
         """Whether no sample has arrived since `DeviceTimeout` was raised."""
         self._stream = Subscription(host, OUTPUTS, rate_Hz, timeout_s=timing.connect_s, clock=clock)
@@ -225,7 +225,7 @@ class Reader:
         """Ask the controller for the program's state and name; None where it does not answer."""
         try:
             return self.services.ask(lambda services: services.program(), timeout_s=self._timing.connect_s)
-        except DriverError as error:
+        except DeviceError as error:
             log.info("%s does not report its program: %s", self._host, error)
             return None
 
@@ -311,11 +311,11 @@ class Reader:
             self._turn_s = self._clock.awake_s()
             return True
         except (OSError, StreamBroken) as error:
-            failure: DriverError = StreamBroken(
+            failure: DeviceError = StreamBroken(
                 f"the RTDE connection to {self._host} was lost ({error})",
                 "check the robot and the cable, then open the arm again",
             )
-        except DriverError as error:
+        except DeviceError as error:
             failure = error
         else:
             self._turn_s = self._read_s = self._clock.awake_s()
@@ -338,7 +338,7 @@ class Reader:
         self._end(failure)
         return False
 
-    def _end(self, failure: DriverError) -> None:
+    def _end(self, failure: DeviceError) -> None:
         """Let every later call raise this failure; the first one counts."""
         with self._changed:
             self._failure = self._failure or failure

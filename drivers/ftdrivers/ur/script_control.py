@@ -18,7 +18,7 @@ from functools import partial
 from typing import Any, Final
 
 from ftdrivers.clock import Clock, Follower
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.ur.control import Control, LookOut, ProgramRefused
 from ftdrivers.ur.control_program import COMMANDS, INPUTS, NAME, NUMBERS, OUTPUTS, Report, program_text
 from ftdrivers.ur.primary import Code, Failed, Primary, RobotType, Stopped
@@ -52,10 +52,10 @@ class ScriptControl(Control):
         """Sequence number, command, numbers."""
         self._report = Report()
         self._beats = 0
-        self._failure: DriverError | None = None
+        self._failure: DeviceError | None = None
         self._error: DeviceFault | None = None
         """The last program error on the controller, of whatever program."""
-        self._end_reason: DriverError | None = None
+        self._end_reason: DeviceError | None = None
         self._refusal: ProgramRefused | None = None
         self._killed = False
         self._moving = self._unwatched = False
@@ -141,11 +141,11 @@ class ScriptControl(Control):
         if self._primary is not None:
             self._primary.close()
 
-    def end_reason(self) -> DriverError | None:
+    def end_reason(self) -> DeviceError | None:
         """Return why the program has ended: a runtime error, no heartbeat, or a lost link."""
         return copy(self._end_reason or self._failure)
 
-    def explained(self, error: DriverError) -> DriverError:
+    def explained(self, error: DeviceError) -> DeviceError:
         """Return the error of a lost controller: its program stops the arm."""
         return type(error)(
             f"{error.found}, so the control program stops the arm by itself within {STOPS_ITSELF_S} s",
@@ -181,7 +181,7 @@ class ScriptControl(Control):
                 look_out()
                 looked_s = self._clock.now_s()
 
-    def _loss(self) -> DriverError:
+    def _loss(self) -> DeviceError:
         return copy(self._failure) or StreamBroken(f"the control of {self._host} was ended", "open the arm again")
 
     # ------------------------------------------------------------------ the heartbeat
@@ -190,7 +190,7 @@ class ScriptControl(Control):
         try:
             with self._clock.away():
                 stream = self._connect()
-        except DriverError as error:
+        except DeviceError as error:
             self._refuse(error)
             return
         with self._changed:
@@ -211,7 +211,7 @@ class ScriptControl(Control):
             outputs = stream.decode(stream.read(self._clock.poll_s)[-1:])
         except TimeoutError:
             return self._pause()
-        except DriverError as error:
+        except DeviceError as error:
             return self._fail(error.found)
         except OSError as error:
             return self._fail(str(error))
@@ -288,7 +288,7 @@ class ScriptControl(Control):
             log.info("%s closed the primary interface", self._host)
             self._refuse(self._read_only("the controller closed the connection"))
 
-    def _refuse(self, error: DriverError) -> None:
+    def _refuse(self, error: DeviceError) -> None:
         """Note why the program does not start, if it has not."""
         with self._changed:
             if self._report.token != self._token and self._refusal is None:

@@ -19,7 +19,7 @@ from ftdrivers.errors import ConnectError, ProtocolError, StreamBroken
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.ur.rtde import Subscription
-from ftdrivers.ur.timing import UrTiming
+from ftdrivers.ur.timing import STRICT
 
 if TYPE_CHECKING:
     from ftdrivers.registry import Options
@@ -69,7 +69,7 @@ class UrWristSensor(StreamingSensor):
 
     def _connect(self) -> DeviceInfo:
         outputs = {"timestamp": "DOUBLE", "ft_raw_wrench": "VECTOR6D"}
-        connect_s = UrTiming.of(self._clock).connect_s
+        connect_s = self._clock.patience_s(STRICT.connect_s)
         self._stream = Subscription(self._host, outputs, _RATE_Hz, timeout_s=connect_s, clock=self._clock)
         version = ".".join(map(str, self._stream.version))
         if self._stream.missing:

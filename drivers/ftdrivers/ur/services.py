@@ -101,4 +101,4 @@ class ServicesOf:
         try:
             return future.result()
         except (RuntimeError, OSError) as error:
-            raise NoDashboard(f"the {self.name} of {self.host} reports: {str(error).rstrip('.')}", fix) from error
+            raise NoDashboard(f"the {self.name} of {self.host} reports: {error}", fix) from error

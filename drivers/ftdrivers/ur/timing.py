@@ -68,11 +68,6 @@ class UrTiming:
     """The same for its exit after the parent has gone."""
 
     @classmethod
-    def of(cls, clock: Clock) -> Self:
-        """Return the limits of the cell that a clock times."""
-        return cls.emulated() if clock.emulated else cls()
-
-    @classmethod
     def emulated(cls) -> Self:
         """Return the limits of an emulated cell, whose processes may be starved."""
         return cls(

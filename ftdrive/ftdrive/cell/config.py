@@ -127,9 +127,10 @@ class ToolConfig:
 class WorkcellConfig:
     """Base and surroundings, in base axes, mm from the centre of the base. PLACEHOLDERS until measured."""
 
-    mounting: str = entry(
-        "floor, wall, ceiling, or degrees the base leans towards its -x; 90 is wall",
-        "floor",
+    mounting: str | None = entry(
+        "floor, wall, ceiling, or degrees the base leans towards its -x, 90 is wall; a floor where it is not set, but "
+        "then no result is good whose gravity points elsewhere",
+        None,
         option="--mounting",
         reject=rules.reject_mounting,
     )
@@ -201,6 +202,11 @@ class CellConfig:
     store: StoreConfig = field(default_factory=StoreConfig)
     clock: Clock = field(default=REAL, compare=False, repr=False)
     """Times everything in the cell; an emulated cell has its own. It is in no file."""
+
+    @property
+    def is_emulated(self) -> bool:
+        """Whether the cell has a time of its own."""
+        return self.clock is not REAL
 
     def to_dict(self) -> dict[str, Any]:
         """Return the sections as files have them; a password in the store's address is left out."""

@@ -169,8 +169,13 @@ def sensor_reached(url: str, clock: Clock = REAL) -> tuple[str, Clock]:
     """
     if not url.startswith(EMULATED):
         return url, clock
-    cell = _emulated_alone(sensor_name(url))
+    cell = emulated_cell(url)
     return cell.sensor.url, cell.clock
+
+
+def emulated_cell(url: str) -> CellConfig:
+    """Return the cell of emulated://NAME, which lives as long as this process. Raises `ConfigError`."""
+    return _emulated_alone(sensor_name(url))
 
 
 def sensor_name(url: str | None) -> str:
@@ -184,7 +189,7 @@ def sensor_name(url: str | None) -> str:
 
 @cache
 def _emulated_alone(name: str) -> CellConfig:
-    """Start a sensor without an arm for the life of this process."""
+    """Start a cell whose arm rests, for the life of this process."""
     station = Station(name, ["--time-scale", "1"])
     atexit.register(station.__exit__)
     return station.__enter__().cell

@@ -19,7 +19,7 @@ from urllib.parse import parse_qsl, urlencode
 from ftdrive.cell.config import CellConfig
 from ftdrive.checks.check import Check, State
 from ftdrive.errors import ConfigError
-from ftdrivers.registry import BadUrl, in_url, split_url
+from ftdrivers.registry import in_url, split_url
 
 SYS = Path("/sys")
 DEV = Path("/dev")
@@ -41,11 +41,8 @@ class SensorAddress:
 
     @classmethod
     def of(cls, url: str) -> "SensorAddress":
-        """Split a sensor's address. Raises `ConfigError` where it is not one."""
-        try:
-            parts = split_url(url)
-        except BadUrl as error:
-            raise ConfigError(str(error)) from error
+        """Split a sensor's address. Raises `BadUrl`."""
+        parts = split_url(url)
         return cls(parts.scheme, parts.address, dict(parse_qsl(parts.query)))
 
     @property
@@ -112,8 +109,7 @@ def check_workcell(cell: CellConfig, model: str | None) -> Check:
     try:
         require_possible(cell, model)
     except ConfigError as error:
-        found, _, fix = str(error).rpartition(": ")
-        return Check(name, "failed", found, fix)
+        return Check(name, "failed", str(error))
     if not cell.workcell.measured:
         fix = "measure tool, planes and boxes, then set measured = true in [workcell] of ftdrive.toml"
         return Check(name, "failed", "tool and surroundings are placeholders", fix)

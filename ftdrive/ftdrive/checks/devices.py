@@ -11,24 +11,34 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ftcalib import CalibrationDataset, CalibrationResult
+from ftcalib.assessment import described_cell
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from ftcalib.poses.information import Guess, predicted_sigma, special
 from ftdrive.cell.config import CellConfig, RobotConfig, ToolConfig
 from ftdrive.checks.check import Check, State
 from ftdrive.checks.computer import SensorAddress, latency_command
-from ftdrive.checks.controller_settings import PAYLOAD_KG, PAYLOAD_SHARE, payload_in_words
 from ftdrivers.clock import Clock
 from ftdrivers.errors import (
     ConnectError,
+    DeviceError,
     DeviceFault,
     DeviceTimeout,
-    DriverError,
     ModelUnknown,
     PortInUse,
     ProtocolError,
     StreamBroken,
 )
-from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, Array, DeviceInfo, Fact, Finding, FtSamples, Health, RobotArm
+from ftdrivers.interfaces import (
+    NOT_REPORTED,
+    ArmStatus,
+    Array,
+    DeviceInfo,
+    Diagnosis,
+    Fact,
+    FtSamples,
+    Health,
+    RobotArm,
+)
 from ftdrivers.ur.kinematics import MODELS
 
 _PUSH_N = 2.0
@@ -116,13 +126,13 @@ def check_load(limits: ArrayLike | None, cell: CellConfig) -> Check:
     return Check(name, "ok", found) if share <= _LOAD else Check(name, "failed", found, "take a larger sensor")
 
 
-def check_sensor_error(name: str, error: DriverError, address: SensorAddress, permissions: Sequence[Check]) -> Check:
+def check_sensor_error(name: str, error: DeviceError, address: SensorAddress, permissions: Sequence[Check]) -> Check:
     """Return an error of a sensor's driver, and what to do about it.
 
     The error's own fix comes first. If the sensor was not reached and a permission is missing, that is the fix. If
     neither names one, it is the usual fix for errors of this kind.
     """
-    kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DriverError) else error
+    kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DeviceError) else error
     fix = error.fix
     permission = next((check.fix for check in permissions if check.state == "failed"), None)
     if permission is not None and not isinstance(kind, PortInUse | DeviceFault) and (_not_reached(kind) or not fix):
@@ -198,9 +208,8 @@ def _check_lost(health: Health, address: SensorAddress) -> Check:
 
 
 def _check_status(status: NDArray[np.uint32]) -> Check:
-    words = [f"0x{int(word):x}" for word in np.unique(status)]
-    found = f"status {', '.join(words)}"
-    if words == ["0x0"]:
+    found = f"status {', '.join(f'0x{int(word):x}' for word in np.unique(status))}"
+    if not status.any():
         return Check("sensor.status", "ok", found)
     return Check("sensor.status", "warning", found, "look the bits up in the sensor's manual; the driver continues")
 
@@ -276,7 +285,7 @@ def check_level(wrench: Array) -> Check:
 # ------------------------------------------------------------------------------------------------------------- the arm
 
 
-def check_unreachable(error: DriverError, host: str) -> Check:
+def check_unreachable(error: DeviceError, host: str) -> Check:
     """Return why an arm could not be opened, and what to do about it."""
     fix = error.fix or f"ping {host}"
     if isinstance(error, ModelUnknown):
@@ -295,10 +304,10 @@ def check_arm(info: DeviceInfo, robot: RobotConfig) -> Check:
     return Check(name, "ok", who(info))
 
 
-def check_finding(finding: Finding) -> Check:
+def check_diagnosis(diagnosis: Diagnosis) -> Check:
     """Return what an arm's driver found when it checked its own device."""
-    state: State = "ok" if finding.passed else "failed"
-    return Check(f"robot.{finding.name}", state, finding.found, finding.fix or None)
+    state: State = "ok" if diagnosis.passed else "failed"
+    return Check(f"robot.{diagnosis.name}", state, diagnosis.found, diagnosis.fix or None)
 
 
 def check_remote(arm: RobotArm) -> Check:
@@ -306,7 +315,7 @@ def check_remote(arm: RobotArm) -> Check:
     name = "robot.remote"
     try:
         remote = arm.in_remote_control()
-    except DriverError as error:
+    except DeviceError as error:
         return Check(name, "failed", error.found, error.fix or None)
     if remote is None:
         return Check(name, "skipped", "this controller does not report whether it accepts programs from the network")
@@ -345,7 +354,7 @@ def check_speed(status: ArmStatus) -> Check:
 def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) -> Check:
     """Check the payload configured in the controller, and compare it with tool and sensor as far as they are described.
 
-    The mass may differ by the larger of `PAYLOAD_KG` and `PAYLOAD_SHARE`; the centre must be at the tool.
+    The mass may differ by the larger of `described_cell.PAYLOAD_KG` and its share; the centre must be at the tool.
     """
     name, payload_kg, p_m = "robot.payload", status.payload_kg, status.p_flange_payload_m
     if payload_kg is None:
@@ -364,7 +373,7 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
     if tool.mass_kg is not None:
         expected_kg = tool.mass_kg + (sensor_kg or 0.0)
         found += f", sensor and tool are {expected_kg:.2f} kg"
-        if abs(payload_kg - expected_kg) > max(PAYLOAD_KG, PAYLOAD_SHARE * expected_kg):
+        if abs(payload_kg - expected_kg) > max(described_cell.PAYLOAD_KG, described_cell.PAYLOAD_SHARE * expected_kg):
             return Check(name, "failed", found, "correct the payload at the pendant, or the masses in [tool], [sensor]")
     if p_m is not None and not any(p_m):
         fix = "set the centre of gravity at the pendant: Installation, Payload"
@@ -386,9 +395,8 @@ def check_weighed_payload(payload_kg: float | None, result: CalibrationResult, s
     name = "robot.payload"
     if payload_kg is None:
         return Check(name, "skipped", "this controller does not report its payload")
-    if words := payload_in_words(payload_kg, result.mass_kg, sensor_kg):
-        found, _, fix = words.partition(": ")
-        return Check(name, "warning", found, fix)
+    for finding in described_cell.payload(payload_kg, result.mass_kg, sensor_kg):
+        return Check(name, "warning", finding.found, finding.fix)
     known = "sensor" if sensor_kg is None else f"{sensor_kg:.2f} kg sensor"
     return Check(name, "ok", f"robot {payload_kg:.2f} kg; weighed {result.mass_kg:.2f} kg + {known}")
 
@@ -415,7 +423,7 @@ def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> 
         try:
             with clock.keeping_up():
                 took_s = _answers_s(arm, clock)
-        except DriverError as error:
+        except DeviceError as error:
             return Check(name, "failed", error.found, error.fix or "check the robot and the network")
         median_s = float(np.median(took_s))
         found = f"the arm answers within {1e3 * median_s:.0f} ms, at worst {1e3 * max(took_s):.0f} ms"

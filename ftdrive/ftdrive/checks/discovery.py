@@ -29,7 +29,7 @@ _SLCAN = "slcan:///dev/ttyACM0?bitrate=250000"
 
 
 def identify_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[str, str]:
-    """Return the model of the arm at an address, and in words what it reports; raises `DriverError`."""
+    """Return the model of the arm at an address, and in words what it reports; raises `DeviceError`."""
     with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
         arm.open()
         info, remote = arm.identify(), arm.in_remote_control()
@@ -38,7 +38,7 @@ def identify_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[s
 
 
 def identify_sensor(url: str, clock: Clock = REAL) -> str:
-    """Return in words which sensor is at an address, and its rate; raises `DriverError` or `ConfigError`."""
+    """Return in words which sensor is at an address, and its rate; raises `DeviceError` or `UsageError`."""
     with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url), clock=clock)) as sensor:
         info = sensor.identify()
         rate_Hz = len(sensor.collect(_LOOK_S).t_host_ns) / _LOOK_S
@@ -51,7 +51,7 @@ def is_place(text: str) -> bool:
 
 
 def sensor_at(place: str, clock: Clock = REAL) -> str:
-    """Probe a port or bus and return the address of its sensor; raises `ConfigError` unless exactly one answers."""
+    """Probe a port or bus and return the address of its sensor; raises `UsageError` unless exactly one answers."""
     answers = ask(place, clock)
     urls = [answer.url for answer in answers if answer.url]
     if len(urls) == 1:
@@ -76,7 +76,7 @@ def ask(place: str, clock: Clock = REAL) -> list[Answer]:
 
     Raises
     ------
-    ConfigError
+    UsageError
         The place has another form.
     ConnectError
         It does not exist, is not up, or not permitted.
@@ -91,16 +91,13 @@ def ask(place: str, clock: Clock = REAL) -> list[Answer]:
 
 
 def _ask_can(url: str, clock: Clock) -> list[Answer]:
-    try:
-        parts = split_url(url)
-        interface, channel, options = parts.scheme, parts.address, Options(url, parts.query)
-        if interface not in _CAN or not channel:
-            raise ConfigError(f"{url} cannot be probed: give a serial port, can0, or {_SLCAN}")
-        bitrate = options.integer("bitrate", 0, 0, 1_000_000) or None
-        base = options.integer("base", 0x20, 0, 0x7F)
-        options.reject_others()
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+    parts = split_url(url)
+    interface, channel, options = parts.scheme, parts.address, Options(url, parts.query)
+    if interface not in _CAN or not channel:
+        raise ConfigError(f"{url} cannot be probed: give a serial port, can0, or {_SLCAN}")
+    bitrate = options.integer("bitrate", 0, 0, 1_000_000) or None
+    base = options.integer("base", 0x20, 0, 0x7F)
+    options.reject_others()
     if interface == "socketcan":
         details = can_details(channel)
         bitrate = bitrate or details.get("bitrate")

@@ -10,14 +10,14 @@ from rich.text import Text
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
+from ftcalib.errors import UsageError
 from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import Station
 from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
-from ftdrive.errors import ConfigError
 from ftdrive.terminal.console import hanging
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 
 _PLACES = """\b
 A PLACE is
@@ -81,7 +81,7 @@ def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[s
     nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
     try:
         answers = [nothing | {"url": answer.url, "what": answer.what} for answer in ask(place, clock)]
-    except (ConfigError, DriverError, OSError) as error:
+    except (UsageError, DeviceError, OSError) as error:
         failures.append(error)
         return [nothing | {"what": "could not be probed", "error": str(error)}]
     return answers or [nothing]

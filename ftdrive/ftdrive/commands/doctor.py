@@ -36,10 +36,10 @@ from ftdrive.errors import NotAccepted
 from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import hanging, talk
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ArmStatus, Array, ForceTorqueSensor, RobotArm
 
-Blame = Callable[[str, DriverError], Check]
+Blame = Callable[[str, DeviceError], Check]
 """From the name of a check and the error of a sensor's driver."""
 
 _CLOCK_S = 1.0
@@ -124,13 +124,13 @@ def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], Rob
     try:
         arm.open()
         info, status = arm.identify(), arm.status()
-    except DriverError as error:
+    except DeviceError as error:
         return [devices.check_unreachable(error, host)], None
     return [
         Check("robot.reachable", "ok", f"{host} answers"),
         devices.check_arm(info, cell.robot),
         devices.check_remote(arm),
-        *map(devices.check_finding, arm.diagnose()),
+        *map(devices.check_diagnosis, arm.diagnose()),
         devices.check_safety(status),
         devices.check_program(status),
         devices.check_speed(status),
@@ -147,10 +147,10 @@ def _check_poses(arm: RobotArm, status: ArmStatus, clock: Clock) -> list[Check]:
         return [Check(name, "skipped", found)]
     try:
         p_mm = 1e3 * arm.state().p_base_flange_m
-    except DriverError as error:
+    except DeviceError as error:
         return [Check(name, "failed", error.found, error.fix or "check the robot and the network")]
     where = ", ".join(f"{value:.0f}" for value in p_mm)
-    limits = Limits.emulated() if clock.emulated else Limits()
+    limits = Limits.of(clock)
     return [
         Check(name, "ok", f"TCP offset read; flange at ({where}) mm in base"),
         devices.check_link(arm, clock, usual_s=limits.link_usual_s, gap_s=limits.link_gap_s),
@@ -167,7 +167,7 @@ def _check_clock(arm: RobotArm, clock: Clock) -> Check:
                 status = arm.status()
                 host_ns.append(status.t_host_ns)
                 device_s.append(status.t_device_s)
-    except DriverError as error:
+    except DeviceError as error:
         return Check("clock.pace", "failed", error.found, error.fix or "check the robot and the network")
     return devices.check_clock(host_ns, device_s)
 
@@ -185,7 +185,7 @@ def _examine_sensor(
         name = "sensor.stream"
         samples = device.collect(_LOOK_S)
         health = device.health()
-    except DriverError as error:
+    except DeviceError as error:
         return [*found, blame(name, error)], False
     limits = info.facts.get("range")
     return [
@@ -208,7 +208,7 @@ def _examine_push(
         return Check("push.sign", "skipped", "the sensor does not measure"), None
     try:
         R_base_flange = None if arm is None else arm.state().R_base_flange
-    except DriverError:
+    except DeviceError:
         R_base_flange = None  # robot.flange reports it
     try:
         before = device.collect(1.0).wrench[:, :3].mean(axis=0)
@@ -225,7 +225,7 @@ def _examine_push(
             windows = round((_PUSH_S if station is None else _SIMULATED_PUSH_S) / _PUSH_WINDOW_S)
             pieces = (device.collect(_PUSH_WINDOW_S).wrench[:, :3] for _ in range(windows))
             changes = [force_N.mean(axis=0) - before for force_N in pieces]
-    except DriverError as error:
+    except DeviceError as error:
         return blame("push.sign", error), None
     largest = max(changes, key=lambda change: float(np.linalg.norm(change)))
     return devices.check_push(largest, R_base_flange, R_flange_sensor, sign)

@@ -118,7 +118,12 @@ def init(
         ask.number("Tool, kg, about (Enter: unknown)", "tool.mass_kg", tool_mass, ""),
     )
     workcell = WorkcellConfig(
-        ask.text("Mounting: floor, wall, ceiling or degrees", "workcell.mounting", mounting),
+        ask.text(
+            "Mounting: floor, wall, ceiling or degrees",
+            "workcell.mounting",
+            mounting,
+            ask.defaults["workcell.mounting"] or "floor",
+        ),
         ask.rows(
             "First wall or table, NX:NY:NZ:MM; -1:0:0:-800 is 800 mm away towards +x",
             "workcell.planes_mm",
@@ -253,7 +258,7 @@ def _checked(key: str, value: Any) -> Any:
 def _robot(ask: Questions, given: str | None, model: str | None, clock: Clock) -> tuple[str, str | None, str]:
     """Return host, model, and what the arm reports; the operator may keep an address that does not answer."""
     from ftdrive.checks.discovery import identify_robot
-    from ftdrivers.errors import DriverError
+    from ftdrivers.errors import DeviceError
 
     if model is not None:
         _checked("robot.model", model)
@@ -261,7 +266,7 @@ def _robot(ask: Questions, given: str | None, model: str | None, clock: Clock) -
     while True:
         try:
             found, words = identify_robot(host, model, clock)
-        except DriverError as error:
+        except DeviceError as error:
             if not ask.interactive:
                 raise
             _say(str(error), "  ✘ ")
@@ -278,9 +283,9 @@ def _robot(ask: Questions, given: str | None, model: str | None, clock: Clock) -
 
 def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
     """Return address and what the sensor reports; the operator may keep an address that does not answer."""
+    from ftcalib.errors import UsageError
     from ftdrive.checks.discovery import identify_sensor, is_place, places, sensor_at
-    from ftdrive.errors import ConfigError
-    from ftdrivers.errors import DriverError
+    from ftdrivers.errors import DeviceError
 
     found = [] if given or not ask.interactive else places()
     for number, place in enumerate(found, start=1):
@@ -299,11 +304,11 @@ def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
         try:
             url = sensor_at(url, clock) if is_place(url) else url
             report = identify_sensor(url, clock)
-        except (DriverError, ConfigError) as error:
+        except (DeviceError, UsageError) as error:
             if not ask.interactive:
                 raise
             _say(str(error), "  ✘ ")
-            failed = url if isinstance(error, DriverError) and not is_place(url) else None
+            failed = url if isinstance(error, DeviceError) and not is_place(url) else None
             keep = ", or Enter to keep it" if failed else ""
             text = ask.text(f"Another address{keep}", "sensor.url", None, failed)
             continue

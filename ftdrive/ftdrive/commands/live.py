@@ -28,23 +28,22 @@ from ftdrive.commands.common import (
     simulate,
     write_json,
 )
-from ftdrive.commands.live_source import open_source
+from ftdrive.commands.live_source import RECOVER_S, open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Axes, Block, StreamInfo, WrenchFrame
-from ftdrive.live.stream import CompensatedStream, load_calibration
+from ftdrive.live.stream import CompensatedStream
 from ftdrive.recording import Recorder, read_recording
 from ftdrive.runs.run import Run
+from ftdrive.runs.source import read_calibration
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import Array
 
 _PERIOD_S = 0.1
-_RECOVER_S = 10.0
-"""So long a stream with an interruption may take to deliver again."""
 
 
 @click.command()
@@ -86,21 +85,21 @@ def live(
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
     if speed is not None and replay is None:
         raise ConfigError("--speed goes only with --replay: add it, or leave --speed out")
-    if replay is not None and (tool or force):
-        raise ConfigError(f"{'--tool' if tool else '--force'} does not go with --replay: leave one of the two out")
+    if replay is not None and tool:
+        raise ConfigError("--tool does not go with --replay: leave one of the two out")
     frame = read_frame(axes, about)
     with ExitStack() as stack:
         stream: CompensatedStream | ReplayedStream
         checks = list[Check]()
         recorder: Callable[[Path], Recorder] | None = None
         if replay is not None:
-            stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed)
+            stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed, force=force)
         else:
-            stream, cell = open_source(
+            stream = open_source(
                 path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
             )
-            checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, cell.sensor.mass_kg)]
-            recorder = partial(_recorder, stream.info, cell.to_dict())
+            checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, stream.cell.sensor.mass_kg)]
+            recorder = partial(_recorder, stream.info, stream.cell.to_dict())
         if once or as_json:
             _print(stream, once=once, as_json=as_json)
         elif talk.is_terminal and sys.stdout.isatty() and sys.stdin.isatty() and not plain:
@@ -111,15 +110,16 @@ def live(
             _show_table(stream)
 
 
-def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, speed: float) -> ReplayedStream:
+def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> ReplayedStream:
     """Replay a run folder, or a recording with its own calibration unless another one is given."""
+    loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     if path.is_dir() and path.suffix != ".partial":
-        if calibration is None:
+        if loaded is None:
             raise ConfigError("no calibration: give --calibration PATH")
-        return replay_run(Run(path), load_calibration(calibration), str(calibration), frame=frame, speed=speed)
+        return replay_run(Run(path), loaded, str(calibration), frame=frame, speed=speed)
     recording = read_recording(path)
-    if calibration is not None:
-        recording = recording.with_calibration(load_calibration(calibration), str(calibration))
+    if loaded is not None:
+        recording = recording.with_calibration(loaded, str(calibration))
     return ReplayedStream(recording.header.info, recording.paired(), frame=frame, speed=speed)
 
 
@@ -175,10 +175,10 @@ def _looks(stream: CompensatedStream | ReplayedStream, *, raises: bool = False) 
     while not ended:
         try:
             block = stream.read()
-        except DriverError as error:
+        except DeviceError as error:
             now_s = stream.clock.now_s()
             failing_since_s = now_s if failing_since_s is None else failing_since_s
-            if raises or look is None or now_s - failing_since_s > _RECOVER_S:
+            if raises or look is None or now_s - failing_since_s > RECOVER_S:
                 raise
             blocks.clear()
             yield replace(look, stale=str(error))
@@ -239,6 +239,7 @@ def _reading(look: Look, stream: ProcessedStream) -> dict[str, Any]:
         "calibration": calibration.provenance.get("created_utc"),
         "calibration_id": calibration.id,
         "verdict": calibration.verdict,
+        "marks": list(stream.info.marks),
         "verification": None if verification is None else verification.to_dict(),
     }
 

@@ -2,17 +2,20 @@
 
 from contextlib import ExitStack
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig
-from ftdrive.cell.emulated import Station, sensor_name
-from ftdrive.commands.common import check_simulate, read_cell, stop_unless_accepted
-from ftdrive.commands.emulated_run import rehearse
+from ftdrive.cell.emulated import Station
+from ftdrive.commands.common import check_simulate, read_cell
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import WrenchFrame
-from ftdrive.live.stream import CompensatedStream, load_calibration
+from ftdrive.live.stream import CompensatedStream
+from ftdrive.runs.source import read_calibration
+from ftdrive.session.rehearsal import short_calibration, station_of
 from ftdrive.terminal.console import talk
+from ftdrive.terminal.screen import open_operator
+
+RECOVER_S = 10.0
+"""So long a stream with an interruption may take to deliver again; then the command ends."""
 
 
 def open_source(
@@ -26,7 +29,7 @@ def open_source(
     simulate: bool,
     frame: WrenchFrame,
     stack: ExitStack,
-) -> tuple[CompensatedStream, CellConfig]:
+) -> CompensatedStream:
     """Open the stream of a real or an emulated cell; `stack` closes it.
 
     The state of the calibration and warnings are printed.
@@ -40,14 +43,18 @@ def open_source(
     config, robot, sensor
         As `read_cell` takes them.
     force : bool
-        Apply a calibration of another arm, sensor or mount.
+        Apply a calibration of another arm, sensor or mount, or one that was edited by hand.
     """
     check_simulate(simulate, real={"--tool": tool})
     if path is not None and tool is not None:
         raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
-    calibration = None if path is None else load_calibration(path)
+    calibration = None if path is None else read_calibration(path, accept_edited=force)
+    cell: CellConfig | Station
     if simulate:
-        calibration, cell = _emulated(calibration, sensor, stack)
+        if calibration is None:
+            with open_operator() as operator:
+                calibration = short_calibration(operator, sensor)
+        cell = station_of(calibration, sensor)
     elif calibration is None and tool is None:
         raise ConfigError("no calibration: give --calibration PATH or --tool NAME, or --simulate")
     else:
@@ -60,17 +67,4 @@ def open_source(
     talk.print(f" {stream.info.calibration_state}")
     for words in stream.warnings:
         talk.print(f" {words}")
-    return stream, cell
-
-
-def _emulated(
-    calibration: CalibrationResult | None, sensor: str | None, stack: ExitStack
-) -> tuple[CalibrationResult, CellConfig]:
-    """Start the cell of a calibration, or calibrate a new one with six poses."""
-    if calibration is None:
-        with Station(sensor_name(sensor)) as quick, TemporaryDirectory(prefix="ftdrive-") as runs:
-            calibration = rehearse(quick, Path(runs), "simulated", poses=6, kept=False).result
-        stop_unless_accepted(calibration)
-    made_by = calibration.provenance.get("station")
-    pace = ("--time-scale", "1")  # a stream pairs by the controller's clock
-    return calibration, stack.enter_context(Station.of(made_by, sensor, pace)).cell
+    return stream

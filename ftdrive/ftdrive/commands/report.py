@@ -9,6 +9,7 @@ from typing import get_args
 import click
 from click.core import ParameterSource
 
+from ftcalib.data.dataset import Orientation
 from ftcalib.files import require_new, write_new
 from ftcalib.likelihood.session import Drift
 from ftcalib.result import Method
@@ -22,7 +23,7 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.commands.emulated_run import rehearsed_run
-from ftdrive.commands.solve import known_values
+from ftdrive.commands.solve import known_values, upward
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError
 from ftdrive.report.facts import facts_of
@@ -31,10 +32,9 @@ from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject
 from ftdrive.report.trust import trust
 from ftdrive.runs.bundle import unpacked
-from ftdrive.runs.source import Orientation
 from ftdrive.terminal.console import hanging, talk
 
-_SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg")
+_SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up")
 DEFAULT = Path("report.html")
 
 
@@ -77,13 +77,14 @@ def report(
     mass_kg: float | None,
     level_deg: float | None,
     mounting_deg: str | None,
+    up: str | None,
     simulate: bool,
     sensor: str | None,
     as_json: bool,
 ) -> None:
     """Report SOURCE: a calibration.json, a run folder, a dataset.json or a CSV file, as `ftdrive solve` takes them.
 
-    The report has verdict, reasons, next step, uncertainty, cross-validation, residuals, drift, noise, coverage,
+    The report has verdict, findings, next step, uncertainty, cross-validation, residuals, drift, noise, coverage,
     settings and provenance. An unsolved source is solved with the options of `ftdrive solve`. Rejected results are
     reported too, with exit code 0.
     """
@@ -95,9 +96,8 @@ def report(
             require_new(output := DEFAULT)
         except OSError as error:
             raise ConfigError(f"{error} with --output") from error
-    options = SolveOptions(
-        method, orientation, drift, known_values(mass_kg, level_deg, mounting_deg), _typed(click.get_current_context())
-    )
+    given = known_values(mass_kg, level_deg, mounting_deg), upward(up)
+    options = SolveOptions(method, orientation, drift, *given, _typed(click.get_current_context()))
     with unpacked(source) if source is not None else rehearsed_run(sensor) as found:
         subject = read_subject(found, options, parent)
         known = trust(subject.result, found, store_url, datetime.now(UTC))

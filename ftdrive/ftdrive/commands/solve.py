@@ -13,13 +13,12 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, CalibrationResult, Known
 from ftcalib import solve as solve_dataset
 from ftcalib.compare import compare
-from ftcalib.errors import CalibError
+from ftcalib.data.dataset import Orientation
+from ftcalib.errors import AcceptanceError, DataError
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import UP_IN_BASE
 from ftcalib.result import Method
 from ftcalib.routine import drift_check
-from ftdrive.checks.plausibility import judged
-from ftdrive.cli import exit_code
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,
@@ -33,10 +32,10 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.commands.emulated_run import rehearsed_run
-from ftdrive.errors import BadBundle, ConfigError, NotAccepted
+from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.pose_hints import hints
-from ftdrive.runs.source import Orientation, read_source
+from ftdrive.runs.source import read_source
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.report import print_comparison, print_result
 
@@ -76,6 +75,9 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
 @click.option("--mass-kg", metavar="KG", type=Number(0, min_open=True), help="Known mass below the sensor.")
 @click.option("--level-deg", metavar="DEG", type=Number(0, 180), help="The base is level within DEG (one sigma).")
 @click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange.")
+@click.option(
+    "--up", metavar="X,Y,Z", help="Up direction in base axes, such as 0,0,1 on a floor; declares the mounting."
+)
 @click.option("--output", "-o", type=NewFile(), help="Save the calibration as a new file.")
 @click.option("--force", is_flag=True, help="Save a rejected result too; it stays marked as rejected.")
 @simulate("Solve a short run of an emulated cell.")
@@ -89,6 +91,7 @@ def solve(
     mass_kg: float | None,
     level_deg: float | None,
     mounting_deg: str | None,
+    up: str | None,
     output: Path | None,
     force: bool,
     simulate: bool,
@@ -97,7 +100,7 @@ def solve(
 ) -> None:
     """Solve each DATASET: a run folder, the file of `ftdrive bundle`, a dataset.json, or a CSV file.
 
-    A CSV has a header with r11..r33 (or the rotation vector rx,ry,rz), fx,fy,fz,tx,ty,tz in N and N·m, and optionally
+    A CSV has a header with r11..r33, qx,qy,qz,qw or rx,ry,rz in rad, fx,fy,fz,tx,ty,tz in N and N·m, and optionally
     t in seconds and sigma_fx..sigma_tz, the standard error of each pose's mean. With --json, one object a line.
     """
     check_simulate(simulate, real={"DATASET": sources}, emulated={"--sensor": sensor})
@@ -105,9 +108,13 @@ def solve(
         raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
     if output is not None and (len(sources) > 1 or method == "all"):
         raise ConfigError("--output takes one result: give one dataset and one method")
-    options = {"drift": drift, "known": known_values(mass_kg, level_deg, mounting_deg)}
+    read = {
+        "orientation": orientation,
+        "known": known_values(mass_kg, level_deg, mounting_deg),
+        "up_in_base": upward(up),
+    }
     with rehearsed_run(sensor) if simulate else nullcontext() as run:
-        _solve_each(sources if run is None else [run], method, orientation, options, output, force, as_json)
+        _solve_each(sources if run is None else [run], method, drift, read, output, force, as_json)
     if output is not None and sources and sources[0].is_dir():
         index_run(sources[0])  # the result, if it was saved in the run
 
@@ -115,26 +122,24 @@ def solve(
 def _solve_each(
     sources: Sequence[Path],
     method: str,
-    orientation: Orientation,
-    options: dict[str, Any],
+    drift: Drift,
+    read: dict[str, Any],
     output: Path | None,
     force: bool,
     as_json: bool,
 ) -> None:
-    first_failure: CalibError | NotAccepted | BadBundle | None = None
+    first_failure: AcceptanceError | DataError | None = None
     for source in sources:
         try:
             with unpacked(source) as place:
-                data = read_source(place, orientation, options["known"])
-                circumstances = dict(data.circumstances)
-                payload_kg = circumstances.pop("payload_kg", None)
-                here = {**options, **circumstances}
+                data = read_source(place, **read)
                 if method == "all":
-                    _show_all(source, data.dataset, here, as_json)
+                    _show_all(source, data.dataset, {"drift": drift, **data.circumstances}, as_json)
                     continue
-                result = _solve(data.dataset, method, {**here, "payload_kg": payload_kg, "provenance": data.provenance})
+                options = {"drift": drift, **data.circumstances, "provenance": data.provenance}
+                result = _solve(data.dataset, method, options)
                 if as_json:
-                    found = list(hints(result, data.records)) if data.records else []
+                    found = [one.to_dict() for one in hints(result, data.records)]
                     write_json({"source": str(source), "hints": found, **result.to_dict()})
                 else:
                     print_result(result, drift=drift_check(data.records), records=data.records)
@@ -143,7 +148,7 @@ def _solve_each(
                 if output is not None:
                     result.save(output)
                     talk.print(f" Saved {output}")
-        except (CalibError, NotAccepted, BadBundle) as error:
+        except (AcceptanceError, DataError) as error:
             if len(sources) == 1:
                 raise
             first_failure = first_failure or error
@@ -157,7 +162,7 @@ def _solve_each(
 def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) -> CalibrationResult:
     chosen: Method = method
     try:
-        return judged(solve_dataset(dataset, chosen, **options))
+        return solve_dataset(dataset, chosen, **options)
     except ValueError as error:
         raise ConfigError(str(error)) from error
 
@@ -187,3 +192,13 @@ def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: s
         )
     except ValueError as error:
         raise ConfigError(str(error)) from error
+
+
+def upward(up: str | None) -> list[float] | None:
+    """Return the direction (3,) of `--up`; None without it. Raises `ConfigError`."""
+    if up is None:
+        return None
+    direction = numbers("--up", up, ",", (3,))
+    if not any(direction):
+        raise ConfigError(f"--up is {up}, which is no direction: give 0,0,1 for a robot on a floor")
+    return direction

@@ -13,24 +13,20 @@ from ftdrive.commands.common import (
     CELL,
     FRAME,
     check_simulate,
-    host_and_port,
-    is_loopback,
     read_frame,
     simulate,
 )
-from ftdrive.commands.live_source import open_source
+from ftdrive.commands.live_source import RECOVER_S, open_source
 from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.samples import Axes
 from ftdrive.live.stream import CompensatedStream
+from ftdrive.servers.address import host_and_port, is_loopback, with_port
 from ftdrive.servers.udp import UdpSender
 from ftdrive.terminal.console import talk
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 
 if TYPE_CHECKING:
     from ftdrive.servers.foxglove import FoxgloveServer
-
-RECOVER_S = 10.0
-"""So long a device may be silent: the viewers stay connected. Then the command ends."""
 
 
 @click.command()
@@ -67,7 +63,7 @@ def stream(
     frame = read_frame(axes, about)
     udp_address = None if udp is None else host_and_port("--udp", udp, "127.0.0.1:9870")
     with ExitStack() as stack:
-        source, _ = open_source(
+        source = open_source(
             path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
         )
         server = stack.enter_context(closing(FoxgloveServer(source, host, port)))
@@ -85,7 +81,7 @@ def serve(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender
         while True:
             try:
                 block = source.read()
-            except DriverError as error:
+            except DeviceError as error:
                 now_s = source.clock.now_s()
                 if silent_since_s is None:
                     silent_since_s = now_s
@@ -112,7 +108,7 @@ def _send_events(source: CompensatedStream, sinks: Sequence["FoxgloveServer | Ud
 def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp: tuple[str, int] | None) -> None:
     """Print what is served, and how to open it."""
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
-    url = f"ws://{f'[{name}]' if ':' in name else name}:{server.port}"
+    url = f"ws://{with_port(name, server.port)}"
     talk.print(f"Serving the wrench in {source.frame}; {source.info.calibration_name}.")
     talk.print(f"  Foxglove, Lichtblick:  Open connection > Foxglove WebSocket > {url}")
     talk.print(f"  PlotJuggler from 3.16: Streaming > Foxglove Bridge > {url}")

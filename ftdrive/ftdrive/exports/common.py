@@ -6,7 +6,7 @@ from ftdrive.errors import PlanRefused
 from ftdrive.planning.plan import Plan
 
 _FASTEST_RAD_S, _FASTEST_RAD_S2 = pi + 1e-9, radians(300) + 1e-9
-_SPELLED = {"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"}
+_SPELLED = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"})
 
 
 def require_usable(plan: Plan) -> None:
@@ -30,6 +30,4 @@ def require_usable(plan: Plan) -> None:
 
 def plain(text: str) -> str:
     """Reduce a text to printable ASCII without quotes and backslashes, because URScript strings have no escapes."""
-    for sign, words in _SPELLED.items():
-        text = text.replace(sign, words)
-    return "".join(c if " " <= c <= "~" and c not in "\"'\\" else "?" for c in text)
+    return "".join(c if " " <= c <= "~" and c not in "\"'\\" else "?" for c in text.translate(_SPELLED))

@@ -16,10 +16,10 @@ from ftdrive import __version__
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.fleet.workers import OtherVersion, Workers, answers, in_words, require_version
 from ftdrive.live.samples import WrenchFrame
-from ftdrive.live.stream import load_calibration
 from ftdrive.recording.compensation import compensated, read_with_calibration
 from ftdrive.recording.files import ENDINGS, format_of
 from ftdrive.recording.recording import frame_of
+from ftdrive.runs.source import read_calibration
 
 
 def recordings_of(paths: Iterable[Path]) -> list[Path]:
@@ -53,7 +53,7 @@ def require_own_results(recordings: Iterable[Path], folder: Path) -> None:
             raise ConfigError(f"the result of {one} would have the path of the recording: choose another folder")
 
 
-def task_of(calibration: Path | None, frame: WrenchFrame, bias: str) -> bytes:
+def task_of(calibration: Path | None, frame: WrenchFrame, bias: str, *, accept_edited: bool = False) -> bytes:
     """Return what `compensated_file` needs beside the recording, as JSON.
 
     Parameters
@@ -64,13 +64,16 @@ def task_of(calibration: Path | None, frame: WrenchFrame, bias: str) -> bytes:
         Of the results.
     bias : str
         "keep", or "estimate" from each recording.
+    accept_edited : bool
+        Of the calibration, as in `read_calibration`.
 
     Raises
     ------
     BadCalibration, OSError
         The calibration cannot be read.
     """
-    document = None if calibration is None else load_calibration(calibration).to_dict()
+    found = None if calibration is None else read_calibration(calibration, accept_edited=accept_edited)
+    document = None if found is None else found.to_dict()
     given = {"calibration": document, "calibration_name": str(calibration), "bias": bias, **frame.to_dict()}
     return json.dumps({"version": __version__, **given}).encode()
 
@@ -84,7 +87,7 @@ def compensated_file(recording: bytes, name: str, task: bytes) -> bytes:
     ------
     OtherVersion
         The task was made by another version.
-    BadRecording, ConfigError, CalibError
+    ConfigError, DataError
         The recording cannot be compensated in this way.
     OSError
         The temporary folder of the worker cannot be written.
@@ -97,8 +100,8 @@ def compensated_file(recording: bytes, name: str, task: bytes) -> bytes:
             source.write_bytes(recording)
             try:
                 numbers = _compensated(source, output, given)
-            except (BadRecording, ConfigError) as error:  # the temporary folder means nothing to a user
-                raise type(error)(str(error).removeprefix(f"{source}: ").replace(str(source), name)) from error
+            except BadRecording as error:  # the temporary folder means nothing to a user
+                raise BadRecording(error.problem) from error
             with output.open("ab") as file:
                 file.write(b"\n" + json.dumps(numbers).encode())
             return output.read_bytes()
@@ -147,6 +150,6 @@ def _saved(path: Path, answer: bytes) -> dict[str, Any] | str:
     try:
         write_new(path, content)
     except OSError as error:
-        return in_words(error)
+        return f"{path} is not written ({error.strerror or error}): make room in {path.parent}, then repeat"
     numbers: dict[str, Any] = json.loads(line)
     return numbers

@@ -5,8 +5,8 @@ solved-<version>.json   ftdrive.calibration/1, in the run folder: the result of 
 """
 
 import json
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -14,13 +14,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from ftcalib import CalibrationDataset, CalibrationResult, solve
-from ftcalib.errors import BadDataset, CalibError
+from ftcalib import CalibrationDataset, CalibrationResult, Finding, Setup, solve
+from ftcalib.errors import BadCalibration, BadDataset
 from ftcalib.extras.difference import difference
 from ftcalib.files import read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
 from ftdrive import __version__
-from ftdrive.checks.plausibility import judged
 from ftdrive.fleet.workers import OtherVersion, Workers, answers, in_words, require_version
 from ftdrive.runs.outcome import circumstances_of
 from ftdrive.runs.run import Run
@@ -62,25 +61,10 @@ def task_of(folder: Path) -> tuple[bytes, bytes]:
     own = CalibrationResult.load(run.calibration_path).provenance if run.calibration_path.is_file() else run.header()
     given = {
         "version": __version__,
-        "circumstances": {**circumstances, "up_in_base": circumstances["up_in_base"].tolist()},
+        "circumstances": {**circumstances, "setup": asdict(circumstances["setup"])},
         "provenance": {"created_utc": own.get("created_utc"), **origin},
     }
     return run.dataset_path.read_bytes(), json.dumps(given).encode()
-
-
-def solver(task: bytes) -> Callable[[CalibrationDataset], CalibrationResult]:
-    """Return what solves a dataset in the circumstances of a task.
-
-    Raises
-    ------
-    OtherVersion
-        The task was made by another version.
-    """
-    given: dict[str, Any] = json.loads(task)
-    require_version(given["version"])
-    versions = {"ftdrive": __version__, **{name: version(name) for name in ("numpy", "scipy")}}
-    provenance = {**given["provenance"], "versions": versions}
-    return lambda dataset: judged(solve(dataset, **given["circumstances"], provenance=provenance))
 
 
 def solved(dataset: bytes, task: bytes) -> bytes:
@@ -90,14 +74,18 @@ def solved(dataset: bytes, task: bytes) -> bytes:
     ------
     OtherVersion
         The task was made by another version.
-    CalibError
+    BadDataset, NotObservable
     """
-    solve_as_the_run = solver(task)
+    given: dict[str, Any] = json.loads(task)
+    require_version(given["version"])
+    versions = {"ftdrive": __version__, **{name: version(name) for name in ("numpy", "scipy")}}
     try:
         document = json.loads(dataset)
     except ValueError as error:
         raise BadDataset(f"the dataset is not valid JSON ({error}): the file is damaged") from error
-    result = solve_as_the_run(CalibrationDataset.from_dict(document))
+    provenance = {**given["provenance"], "versions": versions}
+    circumstances = given["circumstances"] | {"setup": Setup(**given["circumstances"]["setup"])}
+    result = solve(CalibrationDataset.from_dict(document), **circumstances, provenance=provenance)
     return (json.dumps(result.to_dict(), allow_nan=False, indent=1) + "\n").encode()
 
 
@@ -108,8 +96,8 @@ class Comparison:
     verdict_before: str | None
     """None: the run has no calibration of these poses, because it was rejected or not observable."""
     verdict: str
-    reason: str
-    """First reason of the new verdict; empty for a good one."""
+    finding: Finding | None
+    """The first one of the new verdict; None for a good one."""
     parameter: str
     """The one of `ftcalib.model.PARAMETER_NAMES` that changed most."""
     sigmas: float
@@ -156,11 +144,11 @@ def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
             write_new(solved_path(folder), document)
         new, path = CalibrationResult.load(solved_path(folder)), Run(folder).calibration_path
         old = CalibrationResult.load(path) if path.is_file() else None
-    except (CalibError, OSError) as error:
+    except (BadCalibration, OSError) as error:
         return in_words(error)
-    reason = "" if new.verdict == "good" else next(iter(new.reasons), "")
+    finding = None if new.verdict == "good" else new.findings[0]
     if old is None or old.provenance.get("dataset_sha256") != new.provenance["dataset_sha256"]:
-        return Comparison(None, new.verdict, reason, PARAMETER_NAMES[0], 0.0)
+        return Comparison(None, new.verdict, finding, PARAMETER_NAMES[0], 0.0)
     change = difference(old, new).in_sigmas
     most = int(np.argmax(np.abs(change)))
-    return Comparison(old.verdict, new.verdict, reason, PARAMETER_NAMES[most], float(change[most]))
+    return Comparison(old.verdict, new.verdict, finding, PARAMETER_NAMES[most], float(change[most]))

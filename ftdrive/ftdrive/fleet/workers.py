@@ -11,9 +11,9 @@ from functools import partial
 from itertools import islice
 from typing import Any, Final, TypeVar
 
-from ftcalib.errors import CalibError
+from ftcalib.errors import FtdriveError
 from ftdrive import __version__
-from ftdrive.errors import BadRecording, ConfigError
+from ftdrive.errors import ConfigError
 from ftdrivers.errors import StreamBroken, Unreachable
 
 CONNECT_S: Final = 10.0
@@ -40,7 +40,7 @@ Answer = bytes | BaseException
 """What a call returned or raised."""
 
 
-class WorkerDied(Exception):
+class WorkerDied(FtdriveError):
     """Each worker that was given this call ended without an answer."""
 
 
@@ -59,7 +59,7 @@ def require_version(version: str) -> None:
 
 def in_words(error: BaseException) -> str:
     """Return why a call failed."""
-    expected = isinstance(error, CalibError | BadRecording | ConfigError | WorkerDied | OSError)
+    expected = isinstance(error, FtdriveError | OSError)
     return str(error) if expected else f"unexpected {type(error).__name__}: {error}"
 
 
@@ -198,7 +198,7 @@ def _round(
             for item in new:
                 try:
                     calls[item] = arguments(item)
-                except (CalibError, OSError) as error:
+                except (FtdriveError, OSError) as error:
                     yield item, error
             try:
                 running[workers.submit(_each, function, list(calls.values()))] = list(calls)

@@ -1,6 +1,6 @@
 """Contact: which readings a free tool does not explain, and what touched it from when to when."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,15 +99,33 @@ def _hotelling(rate: float, dof: float) -> float:
     return float(6 * dof / (dof - 5) * fdtri(6, dof - 5, 1 - rate))
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """A contact, up to now or to its end."""
+    """A contact, up to now or to its end.
+
+    Examples
+    --------
+    `open_stream` passes it to `on_contact`:
+
+    >>> import ftdrive, numpy as np
+    >>> contact = ftdrive.Contact(begin_ns=0, last_ns=10**9, peak_N=5.0, peak=np.array([0, 0, -5.0, 0, 0, 0]))
+    >>> contact.over, contact.duration_s, contact.direction
+    (False, 1.0, array([ 0.,  0., -1.]))
+    """
 
     begin_ns: int
+    """Clock of the cell."""
     last_ns: int
+    """The newest reading beyond the limit."""
     peak_N: float
     peak: Array
     """(6,) mean over `READING_S` at the largest force, N and N·m, in `frame` of the stream."""
+    over: bool = False
+
+    @property
+    def t_s(self) -> float:
+        """When it began, as `Sample.t_s`."""
+        return self.begin_ns * 1e-9
 
     @property
     def duration_s(self) -> float:
@@ -127,35 +145,40 @@ class Contact:
 
 
 class ContactTracker:
-    """Joins readings beyond the limit to contacts."""
+    """Joins readings beyond the limit to contacts. A shorter one than `_LEAST_NS` is none."""
 
     def __init__(self) -> None:
         self.open: Contact | None = None
+        self._is_confirmed = False
 
     def follow(self, t_ns: Ns, in_contact: NDArray[np.bool_], readings: Array) -> list[Contact]:
-        """Return the contacts that have ended; `readings` (n, 6) are in the frame of the stream."""
-        ended = []
+        """Return each contact once it has lasted long enough, and again when it is over.
+
+        `readings` (n, 6) are in the frame of the stream.
+        """
+        changes = list[Contact]()
         if in_contact.any():
             edges = np.flatnonzero(np.diff(in_contact, prepend=False, append=False)).reshape(-1, 2)
             pauses = t_ns[edges[1:, 0]] - t_ns[edges[:-1, 1] - 1]
             first = np.flatnonzero(np.concatenate([[True], pauses > _LEAST_NS]))
             for start, stop in zip(edges[first, 0], edges[np.append(first[1:], len(edges)) - 1, 1], strict=True):
                 if self.open is not None and t_ns[start] - self.open.last_ns > _LEAST_NS:
-                    ended.append(self.open)
-                    self.open = None
+                    changes += self.end()
+                contact = self.open or Contact(int(t_ns[start]), 0, -1.0, readings[start])
                 force_N = np.linalg.norm(readings[start:stop, :3], axis=1)
                 k = int(np.argmax(force_N))
-                if self.open is None:
-                    self.open = Contact(int(t_ns[start]), 0, -1.0, readings[start])
-                self.open.last_ns = int(t_ns[stop - 1])
-                if force_N[k] > self.open.peak_N:
-                    self.open.peak_N, self.open.peak = float(force_N[k]), readings[start + k]
+                if force_N[k] > contact.peak_N:
+                    contact = replace(contact, peak_N=float(force_N[k]), peak=readings[start + k])
+                self.open = contact = replace(contact, last_ns=int(t_ns[stop - 1]))
+                if not self._is_confirmed and contact.last_ns - contact.begin_ns >= _LEAST_NS:
+                    self._is_confirmed = True
+                    changes.append(contact)
         if self.open is not None and len(t_ns) and t_ns[-1] - self.open.last_ns > _LEAST_NS:
-            ended.append(self.open)
-            self.open = None
-        return [contact for contact in ended if contact.last_ns - contact.begin_ns >= _LEAST_NS]
+            changes += self.end()
+        return changes
 
     def end(self) -> list[Contact]:
         """End an open contact, as at the end of a recording or when frame or bias change."""
-        contact, self.open = self.open, None
-        return [contact] if contact is not None and contact.last_ns - contact.begin_ns >= _LEAST_NS else []
+        contact, was_confirmed = self.open, self._is_confirmed
+        self.open, self._is_confirmed = None, False
+        return [replace(contact, over=True)] if contact is not None and was_confirmed else []

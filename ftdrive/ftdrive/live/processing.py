@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from threading import RLock
 
 import numpy as np
@@ -95,6 +95,7 @@ class Processor:
         self._newest_ns = 0
         self._newest_seq: int | None = None
         self._events: list[StreamEvent] = []
+        self._contacts: list[Contact] = []
         self._frame, self._transform = frame, FrameTransform(frame, info)
         self._stages, self._filter = stages, self._filter_of(stages)
 
@@ -332,8 +333,17 @@ class Processor:
             text = f"{lost} sample{'s' if lost > 1 else ''} lost before sample {int(paired.seq[i])}"
             self.note("gap", text, {"lost": lost, "seq": int(paired.seq[i])}, int(paired.t_host_ns[i]))
 
+    def take_contacts(self) -> list[Contact]:
+        """Return the contacts that have begun or ended since the last call."""
+        with self._lock:
+            contacts, self._contacts = self._contacts, []
+        return contacts
+
     def _report_contacts(self, contacts: list[Contact]) -> None:
+        self._contacts += contacts
         for contact in contacts:
+            if not contact.over:
+                continue
             values: dict[str, JSON] = {
                 "duration_s": contact.duration_s,
                 "peak_N": contact.peak_N,
@@ -404,7 +414,19 @@ class ProcessedStream(ABC):
 
     info: StreamInfo
     clock: Clock
+    on_contact: Callable[[Contact], object] | None = None
+    """Called by the thread that reads, once when a contact has lasted 60 ms and once when it is over."""
     _processor: Processor
+
+    def _process(self, paired: Paired, *, last: bool = False) -> Block:
+        block = self._processor.process(paired, last=last)
+        self._report_contacts()
+        return block
+
+    def _report_contacts(self) -> None:
+        for contact in self._processor.take_contacts():
+            if self.on_contact is not None:
+                self.on_contact(contact)
 
     @property
     def frame(self) -> WrenchFrame:

@@ -153,7 +153,7 @@ class ReplayedStream(ProcessedStream):
         end = max(self._next, int(np.searchsorted(self._seconds, t_s, "right")))
         rows = self._rows.rows(slice(self._next, end))
         self._next = end
-        return self._processor.process(rows, last=self.has_ended)
+        return self._process(rows, last=self.has_ended)
 
     def __iter__(self) -> Iterator[Sample]:
         while not self.has_ended:
@@ -227,6 +227,7 @@ def replay_run(run: Run, calibration: CalibrationResult, name: str = "", **optio
         R_flange_tcp=np.eye(3),
         p_flange_tcp_m=np.full(3, np.nan),
         versions=header.get("versions", {}),
+        emulated=header.get("station") is not None,
     )
     return ReplayedStream(info, rows, **options)
 

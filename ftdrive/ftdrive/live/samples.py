@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
 from ftcalib.files import JSON
-from ftdrive.runs.verification import VerificationRecord
+from ftdrive.runs.verification_record import VerificationRecord, marks_of
 from ftdrivers.interfaces import Array, DeviceInfo
 
 Axes = Literal["sensor", "flange", "base", "tcp"]
@@ -19,7 +19,14 @@ Ns = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class WrenchFrame:
-    """Axes and reference point of a wrench, which belong together: a torque without its point means nothing."""
+    """Axes and reference point of a wrench, which belong together: a torque without its point means nothing.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> print(ftdrive.WrenchFrame("base", "tcp"))
+    base axes, about the tcp origin
+    """
 
     axes: Axes = "sensor"
     about: Point | tuple[float, float, float] = "sensor"
@@ -39,7 +46,15 @@ class WrenchFrame:
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """What is done to the raw wrench, in this order. Raw samples are always kept beside the result."""
+    """What is done to the raw wrench, in this order. Raw samples are always kept beside the result.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> stages = ftdrive.Stages(lowpass_Hz=20.0)  # open_stream(…, stages=stages), or stream.stages = stages at any time
+    >>> stages.bias, stages.gravity, stages.inertia
+    (True, True, False)
+    """
 
     bias: bool = True
     gravity: bool = True
@@ -240,7 +255,14 @@ class StreamInfo:
     verification: VerificationRecord | None = None
     """The last one of the calibration, when the stream was opened."""
     calibration_state: str = ""
-    """Id, verdict, age and last verification of the calibration, when the stream was opened; for people."""
+    """Id, verdict, marks, age and last verification of the calibration, when the stream was opened; for people."""
+    emulated: bool = False
+    """Whether arm and sensor are emulated."""
+
+    @property
+    def marks(self) -> tuple[str, ...]:
+        """What every output says of the cell and the calibration, see `ftdrive.runs.verification.MARKS`."""
+        return marks_of(self.calibration, emulated=self.emulated)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
-from ftdrive.cell.config import CellConfig, load
+from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
+from ftdrive.cell.emulated import Station
 from ftdrive.checks.devices import belonging
 from ftdrive.errors import ConfigError
 from ftdrive.live.delay import DelayEstimator
@@ -32,12 +33,12 @@ from ftdrive.live.samples import (
     mean_rate_Hz,
     sensor_origin_m,
 )
-from ftdrive.runs.run import Run, versions
-from ftdrive.runs.verification import VerificationRecord, calibration_in_words, last_verification
+from ftdrive.runs.run import versions
+from ftdrive.runs.verification_record import VerificationRecord, calibration_in_words, marks_of, verification_near
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DeviceTimeout, DriverError
+from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
-from ftdrivers.interfaces import ArmStates, ArmStatus, DeviceInfo, FtSamples
+from ftdrivers.interfaces import ArmStates, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 
 STALE_S = 0.3
 """Without a new sample of either device for so long, `CompensatedStream.read` raises."""
@@ -59,19 +60,23 @@ class CompensatedStream(ProcessedStream):
 
     Parameters
     ----------
-    cell : CellConfig
+    cell : CellConfig or Station
+        An emulated cell is started on entry and ended with the stream.
     calibration : CalibrationResult or str
         Of these devices, or the name of a tool: its newest accepted calibration is looked up on entry.
     name : str
         Of the calibration, such as its path.
     force : bool
-        Warn instead of raising an error if the calibration is of another arm, sensor or mount.
+        Warn instead of raising an error if the calibration is of another arm, sensor or mount; of a tool, take one
+        that was edited by hand too.
     frame : WrenchFrame
         Axes and reference point; may be set at any time.
     stages : Stages
         May be set at any time.
     false_alarm_rate : float
         Share of readings of a free tool that count as contact.
+    devices : ForceTorqueSensor and RobotArm, optional
+        Used in place of those that the cell names.
 
     Raises
     ------
@@ -84,7 +89,7 @@ class CompensatedStream(ProcessedStream):
 
     def __init__(
         self,
-        cell: CellConfig,
+        cell: CellConfig | Station,
         calibration: CalibrationResult | str,
         *,
         name: str = "",
@@ -92,16 +97,17 @@ class CompensatedStream(ProcessedStream):
         frame: WrenchFrame = SENSOR_FRAME,
         stages: Stages = STANDARD,
         false_alarm_rate: float = FALSE_ALARM_RATE,
+        devices: tuple[ForceTorqueSensor | None, RobotArm | None] = (None, None),
     ) -> None:
-        self._cell = cell
-        self.clock: Clock = cell.clock
+        self._given = cell
+        self._devices = devices
         self._wanted = calibration
         self._name = name
         self._force = force
         self._begin = frame, stages, false_alarm_rate
         self._stack = ExitStack()
         self._follows: ExitStack | None = None
-        self._failure: tuple[str, DriverError] | None = None
+        self._failure: tuple[str, DeviceError] | None = None
         """The device that has failed, "sensor" or "arm", and why."""
         self._silent_since_ns: int | None = None
         self._arrivals: deque[tuple[int, int]] = deque()
@@ -111,8 +117,11 @@ class CompensatedStream(ProcessedStream):
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            self._sensor = stack.enter_context(build_sensor(self._cell))
-            self._arm = stack.enter_context(closing(build_arm(self._cell)))
+            self.cell = self._given if isinstance(self._given, CellConfig) else stack.enter_context(self._given).cell
+            self.clock: Clock = self.cell.clock
+            sensor_device, arm_device = self._devices
+            self._sensor = stack.enter_context(sensor_device or build_sensor(self.cell))
+            self._arm = stack.enter_context(closing(arm_device or build_arm(self.cell)))
             self._arm.open()
             arm, sensor = self._arm.identify(), self._sensor.identify()
             self._calibration, self._name, self.warnings = self._chosen(arm, sensor)
@@ -131,7 +140,7 @@ class CompensatedStream(ProcessedStream):
             self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, status)
             frame, stages, false_alarm_rate = self._begin
             self._processor = Processor(self.info, frame, stages, false_alarm_rate=false_alarm_rate)
-            delay_ms = self._cell.sensor.delay_ms
+            delay_ms = self.cell.sensor.delay_ms
             delay = (
                 DelayEstimator(self._calibration, self.info.p_flange_sensor_m) if delay_ms is None else delay_ms / 1e3
             )
@@ -144,14 +153,24 @@ class CompensatedStream(ProcessedStream):
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
+    @property
+    def station(self) -> Station:
+        """The emulated cell, such as `station.control(do="push", wrench=[0, 0, -5, 0, 0, 0], seconds=1)`.
+
+        docs/reference/emulated-cell.md lists the requests. Raises `ConfigError` for a real cell.
+        """
+        if not isinstance(self._given, Station):
+            raise ConfigError("this is a real cell: only a stream with simulate=True has a station")
+        return self._given
+
     def _chosen(self, arm: DeviceInfo, sensor: DeviceInfo) -> tuple[CalibrationResult, str, tuple[str, ...]]:
         """Return the calibration, its name and warnings; it belongs to the devices and their mounting."""
         calibration, name, warnings = self._wanted, self._name, tuple[str, ...]()
-        mount = self._cell.sensor.mount
+        mount = self.cell.sensor.mount
         if isinstance(calibration, str):
             from ftdrive.store.tools import calibration_of_tool
 
-            url = self._cell.store.url
+            url = self.cell.store.url
             tool = calibration_of_tool(calibration, arm, sensor, mount, url=url, force=self._force)
             calibration, name, warnings = tool.calibration, str(tool.path), tool.warnings
         belongs = belonging(calibration, {"arm": arm, "sensor": sensor}, mount)
@@ -169,23 +188,26 @@ class CompensatedStream(ProcessedStream):
             calibration_name=self._name,
             arm=arm,
             sensor=sensor,
-            tool=self._wanted if isinstance(self._wanted, str) else self._cell.tool.name,
+            tool=self._wanted if isinstance(self._wanted, str) else self.cell.tool.name,
             utc_offset_ns=time.time_ns() - self.clock.now_ns(),  # the anchor of all times in files
             sensor_rate_Hz=sensor_rate_Hz,
             arm_rate_Hz=arm_rate_Hz,
-            p_flange_sensor_m=sensor_origin_m(self._cell.sensor.height_mm),
+            p_flange_sensor_m=sensor_origin_m(self.cell.sensor.height_mm),
             R_flange_tcp=np.eye(3) if status.tcp_offset is None else Rotation.from_rotvec(tcp[3:]).as_matrix(),
             p_flange_tcp_m=tcp[:3],
             versions=versions(),
             verification=verification,
             calibration_state=state,
+            emulated=self.cell.is_emulated,
         )
 
     def _trusted(self) -> tuple[VerificationRecord | None, str]:
         """Return the last verification of the calibration, and what is said of its age and of that."""
         path = Path(self._name)
-        verification = last_verification(path) if path.name and path.exists() else None
-        return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC))
+        known = path.name and path.exists()
+        verification = verification_near(path, self._calibration.id) if known else None
+        marks = marks_of(self._calibration, emulated=self.cell.is_emulated)
+        return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC), marks)
 
     def use_tool(self, name: str) -> StreamEvent:
         """Continue with the newest accepted calibration of another tool, after a change of tools.
@@ -205,6 +227,8 @@ class CompensatedStream(ProcessedStream):
             self._wanted = before
             raise
         verification, state = self._trusted()
+        self._processor.restart()  # a contact is not continued
+        self._report_contacts()
         old, self.info = (
             self._processor,
             replace(
@@ -251,7 +275,7 @@ class CompensatedStream(ProcessedStream):
             samples = self._sensor_follow.read(0.0) if waits_for_pose else self._read_sensor(wait_s)
             role = "arm"
             states = self._arm_follow.read(wait_s if waits_for_pose else 0.0)
-        except DriverError as error:
+        except DeviceError as error:
             self._fail(role, error)
         self._count(states)
         self._pairing.add_states(states)
@@ -259,7 +283,7 @@ class CompensatedStream(ProcessedStream):
         paired = self._pairing.take()
         if paired is None:
             return None
-        block = self._processor.process(paired)
+        block = self._process(paired)
         return block if len(block) else None
 
     def _read_sensor(self, wait_s: float) -> FtSamples:
@@ -300,14 +324,14 @@ class CompensatedStream(ProcessedStream):
                 raise DeviceTimeout(f"the {device} sent {len(rows)} samples in {_RATE_S:g} s", "check cable and supply")
         return found
 
-    def _fail(self, role: str, error: DriverError) -> NoReturn:
+    def _fail(self, role: str, error: DeviceError) -> NoReturn:
         if self._silent_since_ns is None:
             self._silent_since_ns = self.clock.now_ns()
             self._processor.note("stale", f"{role}: {error}", {"device": role}, self._silent_since_ns)
         self._failure = role, error
         raise error
 
-    def _reopen(self, role: str, failure: DriverError) -> None:
+    def _reopen(self, role: str, failure: DeviceError) -> None:
         """Open what has ended again; raises the failure that remains."""
         self.clock.sleep((self._next_ns - self.clock.now_ns()) * 1e-9)
         self._next_ns = self.clock.now_ns() + round(_RETRY_S * 1e9)
@@ -317,7 +341,7 @@ class CompensatedStream(ProcessedStream):
             self._arm.open()
             self._sensor.check()
             self._follow()
-        except DriverError as error:
+        except DeviceError as error:
             self._failure = role, error
             raise
         if (arm := self._arm.identify()) != self.info.arm or self._sensor.identify() != self.info.sensor:
@@ -360,58 +384,3 @@ class CompensatedStream(ProcessedStream):
             steps = np.diff(states.t_device_s, prepend=self._arm_newest[1]) / self._arm_step_s
             self._arm_lost += int(np.maximum(np.rint(steps) - 1, 0).sum())
         self._arm_newest = t_ns, float(states.t_device_s[-1])
-
-
-def open_stream(
-    config: Path | CellConfig | None = None,
-    calibration: Path | str | CalibrationResult | None = None,
-    *,
-    tool: str | None = None,
-    frame: WrenchFrame = SENSOR_FRAME,
-    stages: Stages = STANDARD,
-    force: bool = False,
-) -> CompensatedStream:
-    """Return the stream of a cell, for use with `with`.
-
-    Parameters
-    ----------
-    config : Path or CellConfig, optional
-        A configuration file instead of ./ftdrive.toml, or the cell itself.
-    calibration : Path, str or CalibrationResult
-        A calibration.json or its run folder.
-    tool : str
-        Instead of `calibration`: the newest accepted one of this tool on the devices and mount of the cell, from the
-        store and from the run folders in ./runs. `CompensatedStream.use_tool` switches to another one.
-    frame : WrenchFrame
-    stages : Stages
-    force : bool
-        Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`.
-
-    Raises
-    ------
-    ConfigError
-        The configuration cannot be used, or there is not one of calibration and tool.
-    BadCalibration, OSError
-        The calibration cannot be read.
-
-    Examples
-    --------
-    >>> with open_stream(calibration="runs/tool") as stream:  # doctest: +SKIP
-    ...     for sample in stream:
-    ...         print(sample.t_s, sample.force_N, sample.torque_Nm, sample.frame)
-    """
-    if (calibration is None) == (tool is None):
-        found = "no calibration" if tool is None else "both a calibration and a tool"
-        raise ConfigError(f"{found}: give the path of a calibration.json or of its run folder, or the name of a tool")
-    cell = config if isinstance(config, CellConfig) else load(config)
-    if tool is not None:
-        return CompensatedStream(cell, tool, frame=frame, stages=stages, force=force)
-    if isinstance(calibration, CalibrationResult):
-        return CompensatedStream(cell, calibration, frame=frame, stages=stages, force=force)
-    path = Path(str(calibration))
-    return CompensatedStream(cell, load_calibration(path), name=str(path), frame=frame, stages=stages, force=force)
-
-
-def load_calibration(path: Path) -> CalibrationResult:
-    """Read a calibration.json, or the newest one of a run folder. Raises `BadCalibration` or `OSError`."""
-    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path)

@@ -57,7 +57,7 @@ class Plan:
     """(3,) in base; where the axes of joints 4 and 5 cross, if base, shoulder and elbow rest."""
     predicted: Mapping[str, Any]
     description: Mapping[str, Any]
-    """Model, tool, scene and speeds; `measured` says whether the operator has measured tool and scene, see `marked`."""
+    """Model, tool, scene and speeds; `measured` and `emulated` see `marked`."""
 
     @property
     def certified(self) -> bool:
@@ -74,9 +74,32 @@ class Plan:
         """Whether the operator has configured tool and scene as measured; else they may be placeholders."""
         return self.description.get("measured") is True
 
-    def marked(self, *, measured: bool) -> "Plan":
-        """Record in the description, and so in the file and its hash, whether tool and scene were measured."""
-        return replace(self, description={**self.description, "measured": measured})
+    @property
+    def emulated(self) -> bool:
+        """Whether it was made for an emulated cell."""
+        return self.description.get("emulated") is True
+
+    def marked(self, *, measured: bool, emulated: bool = False) -> "Plan":
+        """Record in the description, and so in the file and its hash, whether tool and scene were measured.
+
+        For an emulated cell the first sentence says so.
+        """
+        if not emulated:
+            return replace(self, description={**self.description, "measured": measured})
+        words = "The cell is EMULATED: no real arm may follow this plan."
+        return replace(
+            self, why=(words, *self.why), description={**self.description, "measured": measured, "emulated": True}
+        )
+
+    @property
+    def R_base_flange(self) -> Array:
+        """(n, 3, 3) orientations of the poses; maps flange coordinates to base coordinates."""
+        return np.array([step.R_base_flange for step in self.steps])
+
+    @property
+    def motion_time_s(self) -> float:
+        """Sum of the moves at the plan's speeds, the last one back included."""
+        return float(sum(step.duration_s for step in self.steps))
 
     @property
     def sha256(self) -> str:
@@ -93,7 +116,7 @@ class Plan:
             "certified": self.certified,
             "uncertified_segments": sum(not step.certified for step in self.steps),
             "max_move_deg": float(np.degrees(max(step.turn_rad for step in self.steps))),
-            "motion_time_s": float(sum(step.duration_s for step in self.steps)),
+            "motion_time_s": self.motion_time_s,
             "min_clearance_mm": 1e3 * min(step.clearance_m for step in self.steps),
             "ball_m": self.ball_m,
             "ball_centre_m": list(self.ball_centre_m),
@@ -106,12 +129,12 @@ class Plan:
         document = json.loads(json.dumps(document))  # tuples become lists, as they come back from a file
         return document | {"sha256": digest(document)}
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Write a new file."""
         write_new(path, json.dumps(self.to_dict(), indent=1) + "\n")
 
     @classmethod
-    def load(cls, path: Path) -> "Plan":
+    def load(cls, path: str | Path) -> "Plan":
         """Read a file; raises `BadPlan` if it is not a plan, `PlanRefused` if it was changed."""
         try:
             document = read_object(path, BadPlan)

@@ -1,15 +1,15 @@
 """Wrench and orientation of another program, as two CSV files on one clock, each at its own rate."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+from scipy.ndimage import minimum_filter1d
 
 from ftcalib import CalibrationResult
-from ftcalib.data.dataset import LONGEST_VECTOR_RAD, MATRIX_COLUMNS, VECTOR_COLUMNS, CalibrationDataset
+from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns, rotations_of
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
 from ftdrive.live.delay import DelayEstimator
@@ -22,7 +22,11 @@ from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtS
 
 _WHOLE = 10**6
 """Seconds: the delay is estimated from all of a recording."""
-_QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
+_NEAR = 100
+"""Samples before and after a step that show whether it is a gap."""
+_ROUNDS = 20
+_REGULAR = 0.2
+"""Largest distance of regular times from multiples of their period, in periods."""
 
 
 def read_pair(
@@ -83,13 +87,47 @@ def read_pair(
 def read_wrench(path: Path) -> FtSamples:
     """Read columns t in s, fx, fy, fz in N, tx, ty, tz in N·m. Raises `BadDataset`.
 
-    Samples are numbered by their times, so that a pause is a gap.
+    Samples are numbered by their times, see `numbers_of`.
     """
-    t_s, wrench, _ = _table(path, CHANNELS)
-    step_s = float(np.median(np.diff(t_s)))
-    steps = np.rint(np.diff(t_s) / step_s) if step_s > 0 else np.ones(len(t_s) - 1)
-    seq = np.concatenate([[0], np.cumsum(np.maximum(steps, 1))])
-    return FtSamples.of(_ns(t_s), seq, wrench)
+    t_s, wrench, _ = _table(path, lambda _: CHANNELS, ", ".join(CHANNELS))
+    return FtSamples.of(_ns(t_s), numbers_of(t_s), wrench)
+
+
+def numbers_of(t_s: Array) -> NDArray[np.int64]:
+    """Number samples by their times (n,), so that a sample that is missing is a gap and a late one is not.
+
+    Where each time is near a multiple of the period, a longer step is a gap. Elsewhere, as with times of receipt or of
+    batches, a gap is a step after which the samples stay late by a period or more, by their median and by the earliest.
+    """
+    steps_s = np.diff(t_s)
+    if (step_s := float(np.median(steps_s))) > 0:
+        steps = np.rint(steps_s / step_s)
+        if steps.min() >= 1 and np.abs(steps_s / step_s - steps).max() < _REGULAR:
+            return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+    number = np.arange(len(t_s))
+    for _ in range(_ROUNDS):  # the period is that of all samples, the missing ones included
+        before, number = number, _with_gaps(t_s, float(t_s[-1] - t_s[0]) / int(number[-1]))
+        if np.array_equal(number, before):
+            break
+    return number
+
+
+def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
+    """Number samples (n,) of a known period."""
+    number = np.arange(len(t_s))
+    if period_s == 0:
+        return number
+    steps = np.diff(t_s) / period_s
+    late = t_s / period_s - number
+    earliest = minimum_filter1d(late, _NEAR, mode="nearest", origin=(_NEAR - 1) // 2)  # of a sample and those before
+    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # and those after
+    possible = np.flatnonzero((steps > 1.5) & (following[1:] - earliest[:-1] > 0.4))
+    for last in possible[np.argsort(-steps[possible])].tolist():  # where the samples beside it are less late
+        near = slice(max(last + 1 - _NEAR, 0), last + 1), slice(last + 1, last + 1 + _NEAR)
+        before, after = (t_s[rows] / period_s - number[rows] for rows in near)
+        missing = min(np.median(after) - np.median(before), after.min() - before.min())
+        number[last + 1 :] += max(round(float(missing)), 0)
+    return number
 
 
 def read_orientation(path: Path) -> ArmStates:
@@ -97,23 +135,12 @@ def read_orientation(path: Path) -> ArmStates:
 
     The orientation is a matrix r11..r33, a quaternion qx, qy, qz, qw, or a rotation vector rx, ry, rz in rad.
     """
-    t_s, numbers, columns = _table(path, MATRIX_COLUMNS, _QUATERNION_COLUMNS, VECTOR_COLUMNS)
-    n = len(t_s)
-    length = np.linalg.norm(numbers, axis=1)
-    if columns == VECTOR_COLUMNS and length.max() > LONGEST_VECTOR_RAD:
-        raise BadDataset(f"{path.name}: a rotation vector is {length.max():.0f} rad long: convert degrees to rad")
-    if columns == _QUATERNION_COLUMNS and (wrong := np.flatnonzero(abs(length - 1) > 1e-2)).size:
-        raise BadDataset(f"{path.name}: row {wrong[0] + 1}: the quaternion has length {length[wrong[0]]:.3g}, not 1")
-    if columns == MATRIX_COLUMNS:
-        try:
-            checked = CalibrationDataset(numbers.reshape(n, 3, 3), np.zeros((n, 6)), None, np.zeros(n, np.int64), t_s)
-        except BadDataset as error:
-            raise BadDataset(f"{path.name}: {error}") from error
-        R = checked.R_base_flange
-    else:
-        is_vector = columns == VECTOR_COLUMNS
-        R = (Rotation.from_rotvec(numbers) if is_vector else Rotation.from_quat(numbers)).as_matrix()
-    unknown = np.full((n, 6), np.nan)
+    t_s, numbers, columns = _table(path, orientation_columns, ORIENTATION_FORMS)
+    try:
+        R = rotations_of(columns, numbers)
+    except BadDataset as error:
+        raise BadDataset(f"{path.name}: {error}") from error
+    unknown = np.full((len(t_s), 6), np.nan)
     return ArmStates(_ns(t_s), unknown[:, 0], unknown, unknown, R, unknown[:, :3])
 
 
@@ -121,13 +148,14 @@ def _ns(t_s: Array) -> NDArray[np.int64]:
     return np.rint(t_s * 1e9).astype(np.int64)
 
 
-def _table(path: Path, *choices: Sequence[str]) -> tuple[Array, Array, Sequence[str]]:
-    """Return times (n,), the columns of the first choice that is there (n, k), and that choice."""
+def _table(
+    path: Path, columns_of: Callable[[Sequence[str]], Sequence[str]], wanted: str
+) -> tuple[Array, Array, Sequence[str]]:
+    """Return times (n,), the columns that are chosen by the names of all (n, k), and their names."""
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
         names = [name.strip() for name in next(csv.reader(file), [])]
-        found = next((choice for choice in choices if {"t", *choice} <= set(names)), None)
-        if found is None:
-            wanted = ", or ".join(", ".join(choice) for choice in choices)
+        found = columns_of(names)
+        if not {"t", *found} <= set(names):
             raise BadDataset(f"{path.name}: the first row must name t and {wanted}; it names {', '.join(names)}")
         try:
             table = np.loadtxt(file, delimiter=",", usecols=[names.index(name) for name in ("t", *found)], ndmin=2)

@@ -19,11 +19,21 @@ _PIECE_ROWS = 7000
 class RecordingFile(Protocol):
     """A new file of one format."""
 
+    samples: int
+    """So many are in the file and remain there, whatever happens."""
+
+    @property
+    def partial(self) -> Path:
+        """Name until it is complete."""
+
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
         """Write samples of one frame, and the events since the samples before."""
 
     def complete(self) -> None:
         """Write the end, fsync the file and give it its name."""
+
+    def keep(self) -> None:
+        """End the file without completing it; what was written remains in `partial`."""
 
     def discard(self) -> None:
         """Delete what was written."""
@@ -67,12 +77,12 @@ def require_new_recordings(paths: Sequence[Path]) -> None:
         raise ConfigError("two outputs name the same file: leave one out")
 
 
-def read_recording(path: Path, columns: Collection[str] = ROW.names or ()) -> Recording:
+def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
     """Read a recording, also the `.partial` of one that was interrupted.
 
     Parameters
     ----------
-    path : Path
+    path : str or Path
         Its ending names the format: .mcap, .csv or .parquet.
     columns : collection of str
         Fields of `Recording.rows` that are needed. Others may be missing, which makes reading Parquet faster.
@@ -85,19 +95,50 @@ def read_recording(path: Path, columns: Collection[str] = ROW.names or ()) -> Re
         Damaged, without a sample, or of another program. A file that was cut is read up to there; `cut` says so.
     OSError
         The file does not exist or cannot be read.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> recording = ftdrive.read_recording("peg.csv")
+    >>> table = recording.table  # a DataFrame: pandas.DataFrame(table)
+    >>> table["fz"].shape, table["raw_fz"].shape
+    ((3000,), (3000,))
     """
+    path = Path(path)
     file_format = format_of(path)
     try:
         recording = file_format.read(path, columns)
     except BadRecording as error:
-        raise BadRecording(f"{path}: {error}") from error
+        raise BadRecording(error.problem, path) from error
     if not len(recording.rows):
-        raise BadRecording(f"{path}: it contains no sample: the file was cut, or the stream ended at once")
+        raise BadRecording("it contains no sample: the file was cut, or the stream ended at once", path)
     return recording
 
 
-def write_recording(path: Path, recording: Recording) -> None:
-    """Write a new file with all of a recording, or none. Raises `ConfigError` or `OSError`."""
+def write_recording(path: str | Path, recording: Recording) -> None:
+    """Write a new file with all of a recording, or none.
+
+    Parameters
+    ----------
+    path : str or Path
+        Its ending names the format: .mcap, .csv or .parquet.
+    recording : Recording
+
+    Raises
+    ------
+    ConfigError
+        Another ending, or the package for the format is missing.
+    OSError
+        The file exists or cannot be written.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> ftdrive.write_recording("peg.parquet", ftdrive.read_recording("peg.csv"))
+    >>> len(ftdrive.read_recording("peg.parquet").rows)
+    3000
+    """
+    path = Path(path)
     file = format_of(path).new(path, recording.header)
     try:
         for rows, events, _ in recording.pieces(_PIECE_ROWS):

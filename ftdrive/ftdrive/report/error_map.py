@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
 from ftcalib.model import Array
-from ftdrive.checks.controller_settings import axes_along
+from ftcalib.sphere import axes_along
 
 STEP_DEG = 10
 """Grid of elevation and azimuth."""
@@ -23,7 +23,7 @@ def error_map(result: CalibrationResult) -> dict[str, Any]:
     dict
         `elevation_deg` (n,) and `azimuth_deg` (m,) of flange z in base axes; `force_N` and `torque_Nm`, each a dict of
         `map` (n, m): largest error over the turns of the tool about its axis, `largest`, `rms` over all orientations,
-        `worst_direction` (3,) of flange z in base, and that direction in `words`.
+        `worst_direction` (3,) of flange z in base, and that direction as `axes` and in `words`.
     """
     elevation = np.radians(np.arange(-90, 91, STEP_DEG))
     azimuth = np.radians(np.arange(-180, 181, STEP_DEG))
@@ -42,7 +42,8 @@ def error_map(result: CalibrationResult) -> dict[str, Any]:
             "largest": float(error.max()),
             "rms": result.predicted_error()[k],
             "worst_direction": direction.tolist(),
-            "words": direction_in_words(direction),
+            "axes": along_axes(direction),
+            "words": direction_in_words(direction, "base"),
         }
     return document
 
@@ -63,7 +64,12 @@ def orientations(elevation_rad: Array, azimuth_rad: Array) -> Array:
     return np.asarray(point[:, None] @ spin).reshape(*tip.shape, TURNS, 3, 3)
 
 
-def direction_in_words(direction: Array) -> str:
-    """Name a unit vector (3,) in base axes: along an axis, or between two or three."""
+def along_axes(direction: Array) -> str:
+    """Name the axis along which a unit vector (3,) points, or the two or three between which it does."""
     names = axes_along(direction)
-    return f"along {names[0]} of the base" if len(names) == 1 else f"between {' and '.join(names)} of the base"
+    return f"along {names[0]}" if len(names) == 1 else f"between {' and '.join(names)}"
+
+
+def direction_in_words(direction: Array, frame: str) -> str:
+    """Name the direction of a unit vector (3,) in a frame."""
+    return f"{along_axes(direction)} of the {frame}"

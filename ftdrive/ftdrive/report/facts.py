@@ -9,10 +9,10 @@ import numpy as np
 from ftcalib.assessment.observability import assess
 from ftcalib.assessment.verdict import strong_correlations
 from ftcalib.compare import compare
-from ftcalib.errors import CalibError
+from ftcalib.errors import NotObservable
 from ftcalib.model import PARAMETER_NAMES, Array
-from ftcalib.poses.sphere import largest_gap
 from ftcalib.routine import drift_check
+from ftcalib.sphere import largest_gap
 from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.plan import Plan
 from ftdrive.report.comparison import compared
@@ -20,18 +20,18 @@ from ftdrive.report.error_map import direction_in_words, error_map
 from ftdrive.report.subject import Subject
 from ftdrive.runs.pose_hints import hints, names_of
 from ftdrive.runs.run import Run
+from ftdrive.runs.verification_record import MARKS, marks_of
 from ftdrive.terminal.report import drift_in_words, error_in_words
 
 FORMAT = "ftdrive.report/1"
 NEXT_STEP = {
     "good": "Use it, and verify it on new poses with `ftdrive verify`, now and from time to time.",
     "usable": (
-        "Compensate with it if the error below is small enough. To improve it, work through the reasons in their "
+        "Compensate with it if the error below is small enough. To improve it, work through the findings in their "
         "order, then calibrate again."
     ),
     "rejected": (
-        "Do not compensate with it. Fix the first reason, then calibrate again: later reasons are often its "
-        "consequences."
+        "Do not compensate with it. Fix the first finding, then calibrate again: later ones are often its consequences."
     ),
     "failed": (
         "Its last verification failed. Run `ftdrive verify` again and accept the update that it proposes, or "
@@ -59,11 +59,17 @@ def facts_of(subject: Subject) -> dict[str, Any]:
         "source": str(subject.source),
         "id": result.id,
         "verdict": result.verdict,
-        "reasons": list(result.reasons),
-        "hints": list(hints(result, subject.records)) if subject.records else [],
+        "marks": {mark: MARKS[mark] for mark in marks_of(result)},
+        "findings": [one.to_dict() for one in result.findings],
+        "hints": [one.to_dict() for one in hints(result, subject.records)],
         "trust": subject.trust,
         "next_step": NEXT_STEP["failed" if failed else result.verdict],
-        "error": {"words": error_in_words(result), "force_N": force_N, "torque_Nm": torque_Nm},
+        "error": {
+            "words": error_in_words(result),
+            "force_N": force_N,
+            "torque_Nm": torque_Nm,
+            "cross_validated": not result.noise_explains,
+        },
         "error_map": error_map(result),
         "correlation": _correlation(result.covariance),
         "cross_validation": _cross_validation(subject),
@@ -96,7 +102,7 @@ def _cross_validation(subject: Subject) -> dict[str, Any]:
     if subject.dataset is not None:
         try:
             methods, reason = [one.to_dict() for one in compare(subject.dataset, **subject.solved_with)], ""
-        except CalibError as error:
+        except NotObservable as error:
             reason = str(error)
     return {
         "force_N": quality.get("loo_force_rms_N"),
@@ -166,7 +172,7 @@ def _coverage(subject: Subject, R_base_flange: Array) -> dict[str, Any]:
         "tool_in_base": tool.tolist(),
         "largest_gap_rad": gap_rad,
         "gap_towards": towards.tolist(),
-        "gap_words": direction_in_words(towards).replace("base", "flange"),
+        "gap_words": direction_in_words(towards, "flange"),
     }
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ftdrive.report.document import Figure, Section, Table
-from ftdrive.report.words import in_words, label_of, rounded, shown_poses
+from ftdrive.report.words import capital, in_words, label_of, rounded, shown_poses
 from ftdrive.terminal.report import QUANTITIES, decimals, values_of
 
 Facts = Mapping[str, Any]
@@ -76,7 +76,7 @@ def error(facts: Facts) -> Section:
     ]
     trust = (
         "The map shows the stated uncertainty only: the cross-validated error above is larger."
-        if "cross-validated" in facts["error"]["words"]
+        if facts["error"]["cross_validated"]
         else "The measured noise explains the residuals, so the map can be trusted."
     )
     figures = [
@@ -91,7 +91,7 @@ def error(facts: Facts) -> Section:
         for kind, one, unit in (("force", force, "N"), ("torque", torque, "N·m"))
     ]
     rows = [
-        (name, rounded(one["rms"]), rounded(one["largest"]), one["words"].removesuffix(" of the base"))
+        (name, rounded(one["rms"]), rounded(one["largest"]), one["axes"])
         for name, one in (("force, N", force), ("torque, N·m", torque))
     ]
     caption = "Predicted error, one sigma: rms over all orientations, and largest"
@@ -208,7 +208,7 @@ def drift(facts: Facts) -> Section:
     found, again = seen["in_fit"], seen["first_pose_again"]
     text = []
     if again is not None:
-        text.append(f"{again['words'][0].upper()}{again['words'][1:]}.")
+        text.append(f"{capital(again['words'])}.")
     if seen["lag1"] is not None:
         text.append(
             f"Residuals of successive poses are correlated by {seen['lag1']:.2f}. Good: near 0. Drift makes it larger."
@@ -272,7 +272,7 @@ def coverage(facts: Facts) -> Section:
         return Section("coverage", title, ["The calibration file holds no orientations: report its run folder."])
     gap_deg = math.degrees(found["largest_gap_rad"])
     text = [
-        f"{found['words'][0].upper()}{found['words'][1:]}",
+        capital(found["words"]),
         f"{found['orientations']} different orientations (24 or more count as 24) determine {found['rank']} of 15 "
         "parameters.",
         f"Largest gap: {gap_deg:.0f}° around the direction {found['gap_words']}.",

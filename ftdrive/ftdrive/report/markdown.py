@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from ftdrive.report.document import Section, Table
+from ftdrive.report.words import capital
 
 
 def markdown(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
@@ -13,12 +14,12 @@ def markdown(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
 
 
 def _lines(facts: Mapping[str, Any], sections: Sequence[Section]) -> Iterator[str]:
-    yield f"# Calibration {facts['id']}: {facts['verdict'].upper()}\n"
+    yield f"# Calibration {facts['id']}: {', '.join([facts['verdict'].upper(), *facts['marks']])}\n"
     yield f"Compensation error {_escaped(facts['error']['words'])}.\n"
     if facts["trust"]:
-        words = facts["trust"]["words"]
-        yield f"{_escaped(words[:1].upper() + words[1:])}.\n"
-    yield from (f"* {_escaped(one[:1].upper() + one[1:])}" for one in [*facts["reasons"], *facts["hints"]])
+        yield f"{_escaped(capital(facts['trust']['words']))}.\n"
+    remarks = [*facts["marks"].values(), *(one["words"] for one in [*facts["findings"], *facts["hints"]])]
+    yield from (f"* {_escaped(capital(one))}" for one in remarks)
     yield f"\n**Next:** {_escaped(facts['next_step'])}\n"
     for section in sections:
         yield f"## {section.title}\n"

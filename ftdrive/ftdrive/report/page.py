@@ -8,6 +8,7 @@ from ftdrive import __version__
 from ftdrive.errors import ConfigError
 from ftdrive.report.document import Section
 from ftdrive.report.figures import draw
+from ftdrive.report.words import capital
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -19,7 +20,7 @@ def page(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
     environment = templates("ftdrive.report", "a report in HTML", "pip install 'ftdrive[report]', or --format md")
     from markupsafe import Markup
 
-    environment.filters["sentence"] = lambda text: with_code(text[:1].upper() + text[1:])
+    environment.filters["sentence"] = lambda text: with_code(capital(text))
     drawn = {one.name: Markup(draw(one.name, facts)) for section in sections for one in section.figures}
     template = environment.get_template("report.html.j2")
     return template.render(facts=facts, sections=sections, drawn=drawn, version=__version__)

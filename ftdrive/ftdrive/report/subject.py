@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, solve
+from ftcalib.data.dataset import Orientation
 from ftcalib.errors import BadCalibration
 from ftcalib.files import read_object
 from ftcalib.likelihood.session import Drift
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord
-from ftdrive.checks.plausibility import judged
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
-from ftdrive.runs.source import Orientation, read_source
+from ftdrive.runs.source import read_source
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +26,7 @@ class SolveOptions:
     orientation: Orientation = "R_base_flange"
     drift: Drift = "auto"
     known: Known | None = None
+    up_in_base: Sequence[float] | None = None
     words: tuple[str, ...] = ()
     """The same as typed, quoted for a shell."""
 
@@ -65,7 +66,7 @@ def read_subject(source: Path, options: SolveOptions, parent: Path | None = None
 
     Raises
     ------
-    BadCalibration, BadDataset, CalibError, ConfigError, OSError
+    ConfigError, DataError, NotObservable, OSError
     """
     if is_calibration(source):
         if options != SolveOptions():
@@ -82,7 +83,9 @@ def is_calibration(source: Path) -> bool:
     if source.is_dir() or source.suffix != ".json":
         return False
     try:
-        return str(read_object(source, BadCalibration).get("format", "")).startswith("ftdrive.calibration/")
+        return str(read_object(source, BadCalibration, accept_changed=True).get("format", "")).startswith(
+            "ftdrive.calibration/"
+        )
     except BadCalibration:
         return False
 
@@ -93,29 +96,21 @@ def _of_result(source: Path, result: CalibrationResult) -> Subject:
         data = read_source(folder, "R_base_flange")
         if data.dataset.sha256() == result.provenance.get("dataset_sha256"):
             run = Run(folder)
-            solved_with = _for_compare(data.circumstances, SolveOptions())
-            return Subject(source, result, run.solve_command, data.dataset, run, data.records, solved_with)
+            return Subject(source, result, run.solve_command, data.dataset, run, data.records, data.circumstances)
     return Subject(source, result, "")
 
 
 def _of_data(source: Path, options: SolveOptions) -> Subject:
-    data = read_source(source, options.orientation, options.known)
+    data = read_source(source, options.orientation, options.known, options.up_in_base)
+    solved_with = {"drift": options.drift, **data.circumstances}
     run = Run(source) if source.is_dir() else None
     result = None
     if run is not None and options == SolveOptions() and run.calibration_path.is_file():
         result = CalibrationResult.load(run.calibration_path)
     if result is None or result.provenance.get("dataset_sha256") != data.dataset.sha256():
-        solved = solve(
-            data.dataset, options.method, drift=options.drift, **data.circumstances, provenance=data.provenance
-        )
-        result = judged(solved)
+        result = solve(data.dataset, options.method, **solved_with, provenance=data.provenance)
     command = " ".join(["ftdrive solve", shlex.quote(str(source)), *options.words])
-    solved_with = _for_compare(data.circumstances, options)
     return Subject(source, result, command, data.dataset, run, data.records, solved_with)
-
-
-def _for_compare(circumstances: Mapping[str, Any], options: SolveOptions) -> dict[str, Any]:
-    return {"drift": options.drift} | {name: value for name, value in circumstances.items() if name != "payload_kg"}
 
 
 def _parent(result: CalibrationResult, source: Path, given: Path | None) -> tuple[CalibrationResult | None, str]:

@@ -31,6 +31,11 @@ def rounded(value: float | None, digits: int = 3) -> str:
     return f"{value:.{min(places, 9)}f}"
 
 
+def capital(words: str) -> str:
+    """Begin a sentence with a capital letter."""
+    return words[:1].upper() + words[1:]
+
+
 def in_words(p_value: float) -> str:
     """Write a probability."""
     return "< 0.0001" if p_value < 1e-4 else f"{p_value:.2g}"

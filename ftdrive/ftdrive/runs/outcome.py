@@ -4,9 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ftcalib import CalibrationDataset, CalibrationResult, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Setup, solve
 from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
-from ftdrive.checks.plausibility import judged
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.run import Run, made_now
 
@@ -22,25 +21,32 @@ class Outcome:
 
 
 def solve_and_save(run: Run) -> Outcome:
-    """Solve a run from its files, so that the files suffice to repeat it."""
+    """Solve a run from its files, so that the files suffice to repeat it. Raises `OSError` if they cannot be saved."""
     outcome = solve_records(run, run.records())
-    outcome.dataset.save(run.new_path("dataset"))
-    if outcome.result.verdict != "rejected":
-        outcome.result.save(run.new_path("calibration"))
+    try:
+        outcome.dataset.save(run.new_path("dataset"))
+        if outcome.result.verdict != "rejected":
+            outcome.result.save(run.new_path("calibration"))
+    except OSError as error:
+        raise OSError(
+            f"{error.strerror or error}: the result is not saved, but all poses are. Make room in {run.folder}, then "
+            f"{run.solve_command} --output FILE"
+        ) from error
     return outcome
 
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
     dataset, circumstances, provenance = dataset_of(run, records)
-    result = judged(solve(dataset, **circumstances, provenance=provenance))
+    result = solve(dataset, **circumstances, provenance=provenance)
     return Outcome(run, dataset, result, drift_check(records))
 
 
 def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
     """Return a run's records as a dataset, the circumstances as `solve` takes them, and the provenance."""
     circumstances, origin = circumstances_of(run)
-    dataset = dataset_from(records, {"run": run.folder.name, "devices": origin["devices"]})
+    emulated = {"emulated": True} if origin["station"] is not None else {}
+    dataset = dataset_from(records, {"run": run.folder.name, "devices": origin["devices"], **emulated})
     return dataset, circumstances, {**made_now(), **origin}
 
 
@@ -48,7 +54,8 @@ def circumstances_of(run: Run) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return what `solve` takes beside the dataset of a run, and where the dataset comes from, without its poses."""
     header = run.header()
     config = header["config"]
-    setup = _setup(run, config)
+    setup = _described(run, config)
+    mounting, height_mm = setup["mounting"], setup["height_mm"]
     origin: dict[str, Any] = {
         "devices": header.get("devices", {}),
         "run": run.folder.name,
@@ -58,13 +65,19 @@ def circumstances_of(run: Run) -> tuple[dict[str, Any], dict[str, Any]]:
     }
     circumstances = {
         "g_m_s2": float(config["site"]["g_m_s2"]),
-        "up_in_base": -down_of(config.get("workcell", {}).get("mounting", "floor")),
-        "payload_kg": None if setup["payload_kg"] is None else setup["payload_kg"] - (setup["sensor_mass_kg"] or 0.0),
+        "setup": Setup(
+            up_in_base=None if mounting is None else (-down_of(mounting)).tolist(),
+            tool_mass_kg=setup["tool_mass_kg"],
+            cylinders_m=[[value / 1e3 for value in row] for row in setup["cylinders_mm"]],
+            sensor_height_m=None if height_mm is None else height_mm / 1e3,
+            sensor_mass_kg=setup["sensor_mass_kg"],
+            payload_kg=setup["payload_kg"],
+        ),
     }
     return circumstances, origin
 
 
-def _setup(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
+def _described(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a result is bound to or compared with: payload last reported, tool, mount label and mounting."""
     payload_kg = p_flange_payload_m = None
     for event in run.events():

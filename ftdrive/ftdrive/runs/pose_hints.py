@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ftcalib import CalibrationResult
-from ftcalib.assessment.load_shift import Change, lasting_change
+from ftcalib import CalibrationResult, Finding
 from ftcalib.assessment.verdict import out_of_line
 from ftcalib.model import Array
 from ftcalib.routine import MOVED_RAD, DriftCheck, PoseRecord, drift_check, is_return, turned_rad
-from ftdrive.checks.controller_settings import mismatches
 
 _SIGNIFICANT = 4.0
+_CHANGES = {"com_shifted", "load_changed", "bias_stepped", "sensor_turned"}
+"""Findings of a result that changed between two poses."""
 
 
 def names_of(records: Sequence[PoseRecord]) -> tuple[str, ...]:
@@ -19,10 +19,8 @@ def names_of(records: Sequence[PoseRecord]) -> tuple[str, ...]:
     return tuple(f"R{record.pose.number:02d}" for record in _in_dataset(records))
 
 
-def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str, ...]:
-    """Explain outlying poses, most important first, then controller settings that differ from the result.
-
-    Empty for a quiet run of a level arm whose controller has the right payload.
+def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Finding, ...]:
+    """Explain outlying poses, most important first; empty for a quiet run, and without records.
 
     Parameters
     ----------
@@ -31,40 +29,29 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[str
     records : sequence of PoseRecord
         In the order of the tour.
     """
+    if not records:
+        return ()
     again = drift_check(records)
     records = _in_dataset(records)
     if len(records) != result.n_poses:
         raise ValueError(f"{len(records)} records do not belong to a result of {result.n_poses} poses")
-    names = names_of(records)
-    out = _out_of_line(result)
-    change = _lasting_change(result, records)
-    if change is not None:
-        what, row = change
-        return (what.in_words(names[row]), *moved(records), *mismatches(result))
-    words = moved(records)
-    odd = [row for row in out if _steady(records[row])]
+    names, found = names_of(records), moved(records)
+    if any(one.code in _CHANGES for one in result.findings):  # which explains the rest
+        return tuple(found)
+    odd = [row for row in _out_of_line(result) if _steady(records[row])]
     pulled = [row for row in odd if _pulled(result, row)]
     for row in odd:
         force_N, torque_Nm = np.linalg.norm(result.residuals[row, :3]), np.linalg.norm(result.residuals[row, 3:])
-        off = f"{names[row]} is off by {force_N:.2g} N and {torque_Nm:.2g} N·m"
-        if row not in pulled:
-            words.append(f"{off}, torque without force: did the load tilt or swing?")
-        elif len(pulled) == 1:
-            words.append(f"{off}: touched, bumped or pulled by a cable? Repeat it")
-        else:
-            words.append(off)
+        code = "load_swings" if row not in pulled else "pose_touched" if len(pulled) == 1 else "pose_off"
+        found.append(Finding.of(code, pose=names[row], force_N=force_N, torque_Nm=torque_Nm))
     if len(pulled) > 1:
-        together = ", ".join(names[row] for row in pulled)
-        words.append(f"something pulls in {together}: a cable that is too short there? Give it slack, repeat these")
+        found.append(Finding.of("cable_pulls", poses=[names[row] for row in pulled]))
     if again is not None and np.abs(again.change / again.sigma).max() > _SIGNIFICANT:
         if _drifts_alike(result, again):
-            words.append("the sensor drifts: let it warm up for 15 to 30 min, then calibrate again")
+            found.append(Finding.of("sensor_drifts"))
         elif np.abs(again.change / _sigma(result)).max() > np.sqrt(2) * _SIGNIFICANT:
-            words.append(
-                f"{names[0]} reads otherwise at the end, and the poses between do not drift: was it touched then? "
-                "Repeat the last stop"
-            )
-    return (*words, *mismatches(result))
+            found.append(Finding.of("return_differs", pose=names[0]))
+    return tuple(found)
 
 
 def _in_dataset(records: Sequence[PoseRecord]) -> list[PoseRecord]:
@@ -75,16 +62,16 @@ def _steady(record: PoseRecord) -> bool:
     return record.steady and turned_rad(record.before, record.after) < MOVED_RAD
 
 
-def moved(records: Sequence[PoseRecord]) -> list[str]:
+def moved(records: Sequence[PoseRecord]) -> list[Finding]:
     """Name the poses that were not steady; each row of a dataset has one record."""
-    words = []
+    found = []
     for record, name in zip(records, names_of(records), strict=True):
         turn_rad = turned_rad(record.before, record.after)
         if turn_rad >= MOVED_RAD:
-            words.append(f"{name} turned by {np.degrees(turn_rad):.2f}° while it was averaged: repeat it")
+            found.append(Finding.of("pose_turned", pose=name, turn_deg=np.degrees(turn_rad)))
         elif not record.steady:
-            words.append(f"{name} was not steady while it was averaged: something swung or was touched, repeat it")
-    return words
+            found.append(Finding.of("pose_unsteady", pose=name))
+    return found
 
 
 def _out_of_line(result: CalibrationResult) -> list[int]:
@@ -109,20 +96,3 @@ def _drifts_alike(result: CalibrationResult, again: DriftCheck) -> bool:
         return False
     k = np.abs(again.change / again.sigma).argmax()
     return bool(result.drift.change[k] / again.change[k] > 0.5)
-
-
-def _lasting_change(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Change, int] | None:
-    """Find a lasting change, and the row of the first pose after it, in the order of taking."""
-    if result.measured_sigma is None:
-        return None
-    t_ns = np.array([record.t_mid_ns for record in records])
-    order = np.argsort(t_ns, kind="stable")
-    change = lasting_change(
-        result.parameters,
-        np.array([record.before.R_base_flange for record in records])[order],
-        result.residuals[order],
-        result.measured_sigma,
-        (t_ns[order] - t_ns.min()) * 1e-9,
-        np.flatnonzero(np.isin(order, _out_of_line(result))).tolist(),
-    )
-    return None if change is None else (change, int(order[change.position]))

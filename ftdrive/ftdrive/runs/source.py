@@ -1,17 +1,16 @@
-"""Data of a calibration from any place that `solve` and `report` accept: a run folder, a dataset or a CSV file."""
+"""Datasets and calibrations from any place that commands accept: run folders and single files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from ftcalib import CalibrationDataset, Known, read_csv
-from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE
+from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, read_csv
+from ftcalib.data.dataset import Orientation
+from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.routine import PoseRecord
 from ftdrive.runs.outcome import dataset_of
 from ftdrive.runs.run import Run, versions
-
-Orientation = Literal["R_base_flange", "R_flange_base"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,13 +19,15 @@ class Source:
 
     dataset: CalibrationDataset
     circumstances: dict[str, Any]
-    """What else `ftcalib.solve` takes; `payload_kg` only for a run."""
+    """What else `ftcalib.solve` takes: gravity, known values and the described cell."""
     provenance: dict[str, Any]
     records: Sequence[PoseRecord] = ()
     """Only of a run."""
 
 
-def read_source(source: Path, orientation: Orientation, known: Known | None = None) -> Source:
+def read_source(
+    source: Path, orientation: Orientation, known: Known | None = None, up_in_base: Sequence[float] | None = None
+) -> Source:
     """Read the data of a place.
 
     Parameters
@@ -37,10 +38,12 @@ def read_source(source: Path, orientation: Orientation, known: Known | None = No
         Of the rotations in a CSV file.
     known : Known, optional
         A known direction of gravity means a base that is level with respect to the mounting.
+    up_in_base : sequence of float, optional
+        (3,) declared up direction, instead of that of a run's mounting.
 
     Raises
     ------
-    BadDataset, CalibError
+    BadDataset, OSError
     """
     if source.is_dir():
         run = Run(source)
@@ -49,8 +52,66 @@ def read_source(source: Path, orientation: Orientation, known: Known | None = No
     else:
         records = []
         dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
-        circumstances = {"g_m_s2": STANDARD_GRAVITY_M_S2, "up_in_base": UP_IN_BASE}
+        circumstances = {"g_m_s2": STANDARD_GRAVITY_M_S2, "setup": Setup()}
         provenance = {"source": source.name, "versions": versions()}
+    if up_in_base is not None:
+        circumstances["setup"] = replace(circumstances["setup"], up_in_base=up_in_base)
+        provenance["up_in_base"] = list(up_in_base)
     if known is not None and known.gravity_direction_base is not None:
-        known = replace(known, gravity_direction_base=-circumstances["up_in_base"])
+        known = replace(known, gravity_direction_base=-circumstances["setup"].up)
     return Source(dataset, {**circumstances, "known": known}, provenance, records)
+
+
+def read_dataset(path: str | Path, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
+    """Read the poses of a calibration; `CalibrationDataset.save` writes them.
+
+    Parameters
+    ----------
+    path : str or Path
+        A run folder, a dataset.json or a CSV file, whose columns are those of `ftcalib.read_csv`.
+    orientation : {"R_base_flange", "R_flange_base"}
+        Of the rotations in a CSV file: flange to base coordinates, like a robot pose, or the inverse.
+
+    Raises
+    ------
+    DataError
+        The message names the file, and the row or the field.
+    OSError
+        It cannot be read.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> dataset = ftdrive.read_dataset("poses.csv")
+    >>> dataset.wrench.shape
+    (24, 6)
+    """
+    return read_source(Path(path), orientation).dataset
+
+
+def read_calibration(path: str | Path, *, accept_edited: bool = False) -> CalibrationResult:
+    """Read a calibration; `CalibrationResult.save` writes it.
+
+    Parameters
+    ----------
+    path : str or Path
+        A calibration.json, or a run folder: its newest calibration.
+    accept_edited : bool
+        Accept a file that was edited by hand; the result is then `is_edited`.
+
+    Raises
+    ------
+    DataError
+        The file is not a calibration that this version can read, is damaged or was edited.
+    OSError
+        It cannot be read.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> ftdrive.solve(ftdrive.read_dataset("poses.csv")).save("calibration.json")
+    >>> ftdrive.read_calibration("calibration.json").verdict
+    'good'
+    """
+    path = Path(path)
+    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path, accept_edited=accept_edited)

@@ -108,9 +108,8 @@ class FoxgloveServer:
             )
         except RuntimeError as error:
             self._slow_clients.close()
-            reason = str(error).rpartition("port: ")[2]
             raise ConfigError(
-                f"the server cannot listen on {host}:{port}: {reason}: choose another --port or --host"
+                f"the server cannot listen on {host}:{port} ({error}): choose another --port or --host"
             ) from error
         _send_at_once(self._server.port)
 
@@ -168,6 +167,7 @@ class FoxgloveServer:
             "stages": asdict(self._stream.stages),
             "calibration": self._info.calibration_name,
             "verdict": calibration.verdict,
+            "marks": list(self._info.marks),
             "status": asdict(self._stream.status()),
             "sent": self._sent,
         }
@@ -219,8 +219,7 @@ class _SlowClients(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log a report."""
-        address = record.getMessage().removeprefix("outbox for client ").removesuffix(" full")
-        _log.warning("the client %s reads too slowly: its oldest messages are dropped", address)
+        _log.warning("a client reads too slowly, so its oldest messages are dropped (%s)", record.getMessage())
 
     def close(self) -> None:
         """Stop."""

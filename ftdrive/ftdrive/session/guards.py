@@ -16,7 +16,8 @@ from ftcalib.model import Array
 from ftdrive.checks.devices import AXES
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.hazards import Hazard
-from ftdrivers.errors import DeviceFault, DeviceTimeout, DriverError
+from ftdrivers.clock import Clock
+from ftdrivers.errors import DeviceError, DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ArmState, ArmStatus
 
 G_M_S2: Final = 9.81
@@ -83,13 +84,14 @@ class Limits:
     """The program of a killed session ends by itself within 0.5 s."""
 
     @classmethod
-    def emulated(cls) -> Self:
-        """Limits of an emulated cell, whose clock leads each follower by 10 ms and waits for no control process."""
-        return cls(link_usual_s=0.05, stalled_s=60.0)
+    def of(cls, clock: Clock) -> Self:
+        """Limits of a cell: the clock of an emulated one may lead its arm, whose control process may starve."""
+        usual = cls()
+        return cls(link_usual_s=usual.link_usual_s + clock.lead_s, stalled_s=clock.patience_s(usual.stalled_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class ExpectedMotion:
     """The expected motion: a straight move in joint space, or standing."""
 
     start_rad: Array
@@ -105,7 +107,7 @@ class Seen:
     """Of the guards' own clock."""
     dt_s: float
     """Since the previous look; at most `Limits.counted_s`."""
-    motion: Motion
+    motion: ExpectedMotion
     state: ArmState
     status: ArmStatus
     wrench: Array
@@ -412,7 +414,7 @@ class ContactGuard(Guard):
             )
 
 
-def arm_lost(error: DriverError, *, moving: bool) -> Tripped:
+def arm_lost(error: DeviceError, *, moving: bool) -> Tripped:
     """Row 16: the arm reports no state. An arm in a move may not receive the stop either."""
     if not moving:
         return Tripped(Hazard.CONTROLLER_LOST, error)

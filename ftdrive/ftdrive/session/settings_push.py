@@ -12,10 +12,10 @@ from typing import Any, Final
 import numpy as np
 
 from ftcalib import CalibrationResult
+from ftcalib.assessment.described_cell import Lean, lean_from
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.checks import computer, devices
-from ftdrive.checks.controller_settings import Lean, lean_from
 from ftdrive.checks.flange_load import FlangeLoad, flange_load
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.planning.geometry.scene import down_of
@@ -71,18 +71,7 @@ def propose(
     gravity: bool,
     name: str,
 ) -> Push:
-    """Compare a calibration with what the controller assumes; nothing is changed.
-
-    Parameters
-    ----------
-    cell : CellConfig
-    arm, sensor
-        Open.
-    result : CalibrationResult
-    payload, gravity : bool
-        Which settings to push.
-    name : str
-        Path of the calibration.
+    """Compare a calibration, from the path `name`, with what the controller assumes; nothing is changed.
 
     Raises
     ------
@@ -197,14 +186,9 @@ def _unit(vector: Any) -> Array:
 
 
 def send(arm: RobotArm, push: Push, folder: Path, ask: Ask) -> tuple[Path, ControllerSettings]:
-    """Ask for a word for each setting, send them, read them back, and write the receipt.
+    """Ask for a word for each setting, send them, and read them back.
 
-    Returns
-    -------
-    path : Path
-        Of the receipt, a new file in `folder`.
-    read_back : ControllerSettings
-        What the controller keeps.
+    Returns the path of the receipt, a new file in `folder`, and what the controller keeps.
 
     Raises
     ------
@@ -212,7 +196,7 @@ def send(arm: RobotArm, push: Push, folder: Path, ask: Ask) -> tuple[Path, Contr
         The controller's values have changed since they were shown, or it reports others than were sent.
     Declined
         The word was not typed; nothing was sent.
-    DriverError
+    DeviceError
         The arm failed. If something may have been sent, there is a receipt.
     """
     disk = computer.check_disk(folder)

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ftcalib import CalibrationResult
-from ftcalib.errors import BadDataset, CalibError
+from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_object
 from ftcalib.model import Array, Parameters
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import FORMAT
+from ftdrive.runs.verification_record import EMULATED, FORMAT, marks_of
 
 _NUMBERS = tuple(field.name for field in fields(Parameters))
 
@@ -56,6 +56,13 @@ class StoredResult:
     """That the controller reported during the calibration."""
     payload_com_m: list[float] | None
     """(3,) centre of mass of that payload, flange axes; None also for a run of an earlier version."""
+    emulated: bool = False
+    """Whether the cell was emulated."""
+
+    @property
+    def tool_in_words(self) -> str:
+        """Name of the tool, and whether the cell was emulated."""
+        return tool_in_words(self.tool, emulated=self.emulated)
 
     @property
     def parameters(self) -> Parameters:
@@ -96,7 +103,7 @@ class StoredVerification:
     """(6,) its standard deviation from the calibration, which all its verifications share."""
 
 
-class Check(NamedTuple):
+class BriefVerification(NamedTuple):
     """What a fleet needs of a verification: a tuple, because it reads 20,000 of them a minute."""
 
     calibration_id: str
@@ -125,6 +132,13 @@ class StoredCell:
 Record = StoredResult | StoredVerification
 
 
+def tool_in_words(tool: str | None, *, emulated: bool) -> str:
+    """Return the name of a tool, which is EMULATED in an emulated cell whose tool has no other name."""
+    if not emulated:
+        return tool or "-"
+    return EMULATED if tool in (None, "emulated") else f"{tool} {EMULATED}"
+
+
 def mass_sigma_kg(parameters: Parameters, covariance: Array, g_m_s2: float) -> float:
     """Return one standard deviation of the mass from the covariance (15, 15) alone."""
     force = parameters.gravity_force_base_N
@@ -150,7 +164,7 @@ def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
     for path in paths:
         try:
             records.append(read_record(path))
-        except (CalibError, OSError) as error:
+        except (DataError, OSError) as error:
             unreadable.append(f"{path}: {error}")
     return records, tuple(unreadable)
 
@@ -208,6 +222,7 @@ def _result(path: Path) -> StoredResult:
         temperature_C=_number(provenance.get("temperature_C")),
         payload_kg=_number(setup.get("payload_kg")),
         payload_com_m=_numbers(setup.get("p_flange_payload_m"), 3),
+        emulated=EMULATED in marks_of(result),
     )
 
 
@@ -238,7 +253,7 @@ def _header(run: Path) -> Mapping[str, Any]:
     """Return run.json, or nothing if it is damaged: the calibration file alone suffices."""
     try:
         return dict(Run(run).header())
-    except (CalibError, OSError):
+    except (DataError, OSError):
         return {}
 
 

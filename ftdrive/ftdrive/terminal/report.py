@@ -63,14 +63,13 @@ def print_result(
             f"before {_rms(raw[:, :3]):.1f} N, {_rms(raw[:, 3:]):.2f} N·m"
         )
         talk.print(hanging(" truth: ", words))
-    for reason in result.reasons:
-        talk.print(hanging("   ", reason))
+    for finding in result.findings:
+        talk.print(hanging("   ", finding.words))
     if talk.verbose or result.verdict != "good":
         _print_fit(result, names_of(records))
     _print_drift(result, drift)
-    if records and (hinted or talk.verbose):
-        for hint in hints(result, records):
-            talk.print(hanging(" ? ", hint), style="yellow")
+    for hint in hints(result, records) if hinted or talk.verbose else ():
+        talk.print(hanging(" ? ", hint.words), style="yellow")
     if saved is not None:
         talk.print(f" Saved {saved}")
 
@@ -232,7 +231,7 @@ def print_comparison(compared: Sequence[Compared]) -> None:
     talk.print(table, soft_wrap=True)
     for one in compared:
         if one.reason is not None:
-            talk.print(hanging(f" {one.method}: ", one.reason.removeprefix(f"{one.method} ")))
+            talk.print(hanging(f" {one.method}: ", one.reason))
 
 
 def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:

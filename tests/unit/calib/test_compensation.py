@@ -36,6 +36,18 @@ def test_one_sample_and_many_agree_with_the_model(seed: int) -> None:
         np.testing.assert_allclose(by_hand, expected[i], atol=1e-13)
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_rotations_of_scipy_count_as_their_matrices(dtype: DTypeLike) -> None:
+    rng = np.random.default_rng(2)
+    parameters, rotations = random_parameters(rng), Rotation.random(5, rng=rng)
+    wrench = rng.normal(size=(5, 6))
+    compensator, expected = Compensator(parameters, dtype), wrench - predict(parameters, rotations)
+    assert compensator(wrench, rotations).dtype == dtype
+    np.testing.assert_allclose(compensator(wrench, rotations), expected, atol=1e-5)
+    np.testing.assert_allclose(compensator(wrench[0].tolist(), rotations[0]), expected[0], atol=1e-5)
+    np.testing.assert_allclose(compensator(wrench, list(rotations)), expected, atol=1e-5)
+
+
 def test_a_tool_hanging_still_leaves_nothing_and_a_push_is_left() -> None:
     down = Rotation.from_euler("x", 180, degrees=True).as_matrix()
     parameters = Parameters(np.eye(3), np.array([0, 0, -9.80665]), np.zeros(3), np.array([0.1, 0, 0]), np.zeros(3))

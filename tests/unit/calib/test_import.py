@@ -1,4 +1,4 @@
-"""`import calib` is quick: every command pays for it."""
+"""Solving imports nothing slow: every command pays for it."""
 
 import subprocess
 import sys
@@ -6,6 +6,6 @@ import sys
 
 def test_nothing_slow_is_imported() -> None:
     slow = ("scipy.stats", "scipy.optimize", "scipy.interpolate", "scipy.signal")
-    script = f"import sys, calib; print([name for name in {slow} if name in sys.modules])"
+    script = f"import sys, ftcalib.compare; print([name for name in {slow} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "[]"

@@ -18,8 +18,9 @@ from ftdrivers.ati.can import AtiCanSensor
 from ftdrivers.ati.netft import NetFtSensor
 from ftdrivers.ati.serial import AtiSerialSensor
 from ftdrivers.bota.sensor import BotaSensor
+from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import Fact
-from ftdrivers.registry import BadUrl, arm_class, in_url, sensor_from_url, split_url
+from ftdrivers.registry import arm_class, in_url, sensor_from_url, split_url
 from ftdrivers.robotiq.sensor import RobotiqFt300
 from ftdrivers.robotous.can import RobotousCan
 from ftdrivers.robotous.serial import RobotousSerial
@@ -129,7 +130,7 @@ def test_mistakes_are_named(url: str, message: str) -> None:
 ACME = """
 import time
 import numpy as np
-from ftdrivers.interfaces import ArmStatus, DeviceInfo, Finding, FtSamples
+from ftdrivers.interfaces import ArmStatus, DeviceInfo, Diagnosis, FtSamples
 from ftdrivers.streaming import StreamingSensor
 from ftdrivers.ur.arm import UrArm
 
@@ -167,7 +168,7 @@ class Arm(UrArm):
         return None
 
     def diagnose(self):
-        return [Finding("brakes", False, "a brake is worn", "call Acme")]
+        return [Diagnosis("brakes", False, "a brake is worn", "call Acme")]
 
     def status(self):
         now_ns = time.monotonic_ns()

@@ -25,7 +25,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
 from ftdrive.runs.outcome import Outcome
 from ftdrive.runs.run import Run
-from ftdrive.session import session, task
+from ftdrive.session import along_plan, session, task
 from ftdrive.session.events import (
     Event,
     Noted,
@@ -33,11 +33,14 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
+from ftdrive.session.guards import Limits
+from ftdrive.session.journal import Journal
+from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key, Question
-from ftdrive.session.session import Options
+from ftdrive.session.options import SessionOptions
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
-from ftdrivers.errors import DeviceFault, DriverError
+from ftdrivers.errors import DeviceError, DeviceFault
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
 from tests.fake_clock import FakeClock
@@ -78,7 +81,7 @@ class FakeArm(RobotArm):
         """Called whenever the status is read."""
         self.forbidden: Array | None = None
         self.halted = threading.Event()
-        self.gone: DriverError | None = None
+        self.gone: DeviceError | None = None
         self.gone_status: dict[str, Any] = {}
 
     def open(self, *, control: bool = False) -> None:
@@ -174,7 +177,7 @@ class FakeSensor(ForceTorqueSensor):
         self.rng = np.random.default_rng(1)
         self.push = np.zeros(6)
         self.noise = NOISE
-        self.failure: DriverError | None = None
+        self.failure: DeviceError | None = None
         self.stuck = False
         self.heals = False
         self.warm_C: float | None = None
@@ -374,7 +377,7 @@ class Lab:
             RobotConfig("fake"),
             SensorConfig("fake://"),
             ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)),
-            WorkcellConfig(measured=True),
+            WorkcellConfig("floor", measured=True),
             Sampling(average_s=0.1, noise_record_s=0.0),
             clock=self.clock,
         )
@@ -384,7 +387,7 @@ class Lab:
         monkeypatch.setattr(session, "build_sensor", lambda _: self.sensor)
         monkeypatch.setattr(task, "plan_for", planned_once)
         monkeypatch.setattr("ftcalib.poses.information.second_minimum", second_minimum_once)
-        monkeypatch.setattr(session, "Watcher", self._watcher)
+        monkeypatch.setattr(along_plan, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
         monkeypatch.setattr("os.fsync", lambda _: None)  # the disk may be slow
 
@@ -397,8 +400,11 @@ class Lab:
         """Whether what happens now happens in a look of the guards."""
         return any(watcher.looking for watcher in self.watchers)
 
+    def open_cell(self) -> OpenCell:
+        return OpenCell(self.arm, self.sensor, self.clock, Journal(self.operator), Limits())
+
     def calibrate(self, **options: Any) -> Outcome | None:
-        return session.calibrate(self.cell, self.operator, Options(self.folder / "runs", poses=6, **options))
+        return session.calibrate(self.cell, self.operator, SessionOptions(self.folder / "runs", poses=6, **options))
 
     def run(self) -> Run:
         (folder,) = (self.folder / "runs").iterdir()

@@ -95,7 +95,8 @@ class _Report:
             sigmas = found.sigmas if isfinite(found.sigmas) else None
             self.changed.append({**here, "parameter": found.parameter, "sigmas": sigmas})
         if found.has_other_verdict:
-            verdicts = {"before": found.verdict_before, "now": found.verdict, "reason": found.reason}
+            finding = None if found.finding is None else found.finding.to_dict()
+            verdicts = {"before": found.verdict_before, "now": found.verdict, "finding": finding}
             self.other_verdict.append({**here, **verdicts})
         self.unchanged += not (found.has_changed or found.has_other_verdict)
 
@@ -118,7 +119,7 @@ class _Report:
             how = "was known and differs" if one["sigmas"] is None else f"changed by {one['sigmas']:+.1f} sigmas"
             click.echo(f"changed: {one['run']}: {one['parameter']} {how}")
         for one in self.other_verdict:
-            why = f" ({one['reason']})" if one["reason"] else ""
+            why = f" ({one['finding']['words']})" if one["finding"] else ""
             click.echo(f"verdict: {one['run']}: {one['before'] or 'no result'} before, now {one['now']}{why}")
         for one in self.failed:
             click.echo(f"failed: {one['run']}: {one['reason']}")

@@ -99,14 +99,14 @@ def _is_due(one: "StoredCell", fleet: "Fleet", now: datetime) -> bool:
 def _verify(one: "StoredCell", store: "Store", url: str | None, fleet: "Fleet") -> tuple[str, str]:
     """Ask at a cell and verify it; return the outcome and why. Raises as `verify_cell`."""
     from ftdrive.runs.verified import AcceptanceLimits
-    from ftdrive.session.session import Options
-    from ftdrive.session.verification import POSES
+    from ftdrive.session.options import SessionOptions
+    from ftdrive.session.verifying import POSES
 
     cell = _described(one)
     path = _calibration(one, cell.tool.name, store, fleet)
     if not _is_attended(one, cell):
         return "skipped", ""
-    options = Options(path.parent.parent, "verify", poses=POSES)
+    options = SessionOptions(path.parent.parent, "verify", poses=POSES)
     cell = replace(cell, store=replace(cell.store, url=url))
     verified = verify_cell(cell, path, Wanted(path, POSES, quick=False, limits=AcceptanceLimits()), options)
     return ("passed", "") if verified.passed else ("FAILED", failure_in_words(verified))
@@ -150,7 +150,8 @@ def _is_attended(one: "StoredCell", cell: "CellConfig") -> bool:
 
 def _sentence(error: Exception) -> str:
     """Return the message of an error that a user can fix; raises any other."""
-    from ftdrive.cli import exit_code, in_a_sentence
+    from ftdrive.cli import in_a_sentence
+    from ftdrive.errors import exit_code
 
     if exit_code(error) is None:
         raise error

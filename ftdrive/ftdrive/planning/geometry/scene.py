@@ -59,13 +59,14 @@ class Scene:
         return asdict(self)
 
 
-def down_of(mounting: str) -> Array:
+def down_of(mounting: str | None) -> Array:
     """Return the direction of gravity in base (3,) for a mounting."""
     return Scene(lean_rad=lean_of(mounting)).down_base
 
 
-def lean_of(mounting: str) -> float:
-    """Read a mounting: floor, wall, ceiling, or an angle in degrees."""
+def lean_of(mounting: str | None) -> float:
+    """Read a mounting: floor, wall, ceiling, or an angle in degrees; a floor if none is declared."""
+    mounting = mounting or "floor"
     if mounting in MOUNTINGS:
         return MOUNTINGS[mounting]
     try:

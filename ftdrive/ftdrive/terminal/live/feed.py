@@ -15,7 +15,7 @@ import numpy as np
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
 from ftdrive.terminal.live.view import BAD, CONTACT, GOOD, STRONG, WARNING, Note
-from ftdrivers.errors import DriverError
+from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import Array
 
 MEAN_S = 0.1
@@ -99,7 +99,7 @@ class Feed:
     status : StreamStatus
     sigma : array, shape (6,)
         Of a mean over `MEAN_S`; like the status at most 50 ms of the stream older than the newest block.
-    failure : DriverError or None
+    failure : DeviceError or None
         Why the stream gives no samples now.
     crash : BaseException or None
         What ended the thread.
@@ -117,7 +117,7 @@ class Feed:
         self.notes: deque[Note] = deque()
         self.status = stream.status()
         self.sigma = np.full(6, np.nan)
-        self.failure: DriverError | None = None
+        self.failure: DeviceError | None = None
         self.crash: BaseException | None = None
         self.newest_ns: int | None = None
         self.recording_since_ns: int | None = None
@@ -152,7 +152,7 @@ class Feed:
         while not self._requests.empty():
             try:
                 self._requests.get_nowait()()
-            except (ConfigError, DriverError, OSError) as error:
+            except (ConfigError, DeviceError, OSError) as error:
                 self.note(str(error), BAD)
         self._read()
         for event in self.stream.take_events():
@@ -199,7 +199,7 @@ class Feed:
     def _read(self) -> None:
         try:
             block = self.stream.read()
-        except DriverError as error:
+        except DeviceError as error:
             self.failure, self.status = error, self.stream.status()
             self._ended.wait(_RETRY_S)
             return

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib.assessment.contradictions import contradictions
+from ftcalib.findings import Finding
 from ftcalib.known import Known
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Parameters
 
@@ -22,7 +23,7 @@ COVARIANCE = np.diag(np.square([*[0.002] * 3, *[0.01, 0.02, 0.05], *[0.1] * 9]))
 """Sigmas: 2 mrad of the mounting, 1, 2 and 5 mrad of the direction of gravity or 0.5 % of the weight."""
 
 
-def contradicted(known: Known, sigmas: float, found: Parameters = FOUND) -> list[str]:
+def contradicted(known: Known, sigmas: float, found: Parameters = FOUND) -> list[Finding]:
     return contradictions(known, found, COVARIANCE, STANDARD_GRAVITY_M_S2, sigmas)
 
 
@@ -37,10 +38,11 @@ def test_a_mass_is_compared_in_sigmas_of_the_weight(sigmas_off: float) -> None:
 def test_a_direction_is_compared_in_sigmas_across_it(axis: int, sigma_rad: float, sigmas_off: float) -> None:
     turn = Rotation.from_rotvec(sigmas_off * sigma_rad * np.eye(3)[axis])
     known = Known(gravity_direction_base=turn.apply([0, 0, -1]))
-    words = contradicted(known, 4)
-    assert len(words) == (sigmas_off > 4)
-    if words:
-        assert f"{np.degrees(sigmas_off * sigma_rad):.2g}"[:3] in words[0]
+    found = contradicted(known, 4)
+    assert len(found) == (sigmas_off > 4)
+    if found:
+        assert found[0].values["off_deg"] == pytest.approx(np.degrees(sigmas_off * sigma_rad))
+        assert found[0].values["sigma_deg"] == pytest.approx(np.degrees(sigma_rad), rel=1e-3)
 
 
 @pytest.mark.parametrize("yaw_only", [False, True])
@@ -53,8 +55,8 @@ def test_a_mounting_is_compared_but_for_a_free_yaw(axis: int, yaw_only: bool) ->
 
 
 def test_a_unit_of_force_is_named() -> None:
-    (words,) = contradicted(Known(mass_kg=4.4482 / STANDARD_GRAVITY_M_S2 * 10), 4)
-    assert "lbf" in words
+    (finding,) = contradicted(Known(mass_kg=4.4482 / STANDARD_GRAVITY_M_S2 * 10), 4)
+    assert finding.values["units"] == [["lbf", "N·m"]]
 
 
 def test_agreement_is_no_contradiction() -> None:
@@ -69,7 +71,4 @@ def test_without_a_significant_weight_no_direction_is_compared() -> None:
     light = replace(FOUND, gravity_force_base_N=np.array([0.0, 0.0, -0.1]))
     askew = Rotation.from_rotvec([2.0, 0, 0]).as_matrix()
     known = Known(mass_kg=1.0, gravity_direction_base=(1, 0, 0), R_flange_sensor=askew)
-    (words,) = contradicted(known, 4, light)
-    assert "mass" in words
-    assert "gravity" not in words
-    assert "mounting" not in words
+    assert [one.code for one in contradicted(known, 4, light)] == ["known_mass"]

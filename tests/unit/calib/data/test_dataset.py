@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from syrupy.assertion import SnapshotAssertion
 
 from ftcalib import BadDataset, CalibrationDataset, read_csv
+from ftcalib.data.dataset import Orientation
 from ftcalib.files import write_new
 
 RNG = np.random.default_rng(3)
@@ -53,6 +54,23 @@ def test_arrays_are_copies_that_cannot_be_written_to() -> None:
             array[0] = 0
     with pytest.raises(TypeError):
         data.meta["sensor"] = "other"  # type: ignore[index]  # the point of the test
+
+
+@pytest.mark.parametrize("rotations", [R, list(R), Rotation.from_matrix(R), [Rotation.from_matrix(one) for one in R]])
+def test_of_takes_rotations_in_any_form_and_fills_in_what_is_unknown(rotations: Any) -> None:
+    data = CalibrationDataset.of(rotations, np.zeros((4, 6)).tolist(), wrench_cov=np.eye(6))
+    np.testing.assert_allclose(data.R_base_flange, R, atol=1e-15)
+    assert data.n_samples.tolist() == [0] * 4
+    assert np.isnan(data.t_s).all()
+    assert data.wrench_cov is not None
+    np.testing.assert_array_equal(data.wrench_cov, [np.eye(6)] * 4)
+
+
+def test_of_names_what_does_not_fit() -> None:
+    with pytest.raises(BadDataset, match=r"wrench has shape \(3, 6\), expected \(4, 6\)"):
+        CalibrationDataset.of(R, np.zeros((3, 6)))
+    with pytest.raises(BadDataset, match=r"t_s has shape \(3,\), expected \(4,\)"):
+        CalibrationDataset.of(R, np.zeros((4, 6)), t_s=[1, 2, 3])
 
 
 NOT_SYMMETRIC = np.tile(np.eye(6), (4, 1, 1))
@@ -228,6 +246,23 @@ def test_csv_rotation_vector_time_extra_columns_and_any_order(tmp_path: Path) ->
     np.testing.assert_array_equal(data.t_s, [0, 2.5])
 
 
+@pytest.mark.parametrize("orientation", ["R_base_flange", "R_flange_base"])
+def test_csv_quaternion_and_vector_are_those_of_the_matrix(tmp_path: Path, orientation: Orientation) -> None:
+    header, poses = MATRIX_HEADER.partition(",f")[0], Rotation.random(5, rng=1)
+    forms = {header: poses.as_matrix().reshape(5, 9), "qx,qy,qz,qw": poses.as_quat(), "rx,ry,rz": poses.as_rotvec()}
+    read = []
+    for columns, numbers in forms.items():
+        lines = [",".join(map(repr, [*row, 1, 2, 3, 4, 5, 6])) for row in numbers.tolist()]
+        read.append(read_csv(csv(tmp_path, f"{columns},fx,fy,fz,tx,ty,tz", *lines), orientation).R_base_flange)
+    expected = poses if orientation == "R_base_flange" else poses.inv()
+    np.testing.assert_allclose(read, [expected.as_matrix()] * 3, atol=1e-12)
+
+
+def test_csv_takes_the_first_complete_orientation(tmp_path: Path) -> None:
+    path = csv(tmp_path, "r11,rx,ry,rz,qx,qy,qz,qw,fx,fy,fz,tx,ty,tz", "7,0,0,0,0,0,1,0,1,2,3,4,5,6")
+    np.testing.assert_allclose(read_csv(path).R_base_flange[0], np.diag([-1, -1, 1]))
+
+
 def test_csv_standard_errors_become_the_covariance(tmp_path: Path) -> None:
     sigmas = "sigma_fx,sigma_fy,sigma_fz,sigma_tx,sigma_ty,sigma_tz"
     data = read_csv(csv(tmp_path, f"{sigmas},{MATRIX_HEADER},t", f".1,.2,.3,.01,.02,.03,{IDENTITY},1,2,3,4,5,6,7"))
@@ -257,12 +292,23 @@ def test_csv_standard_errors_become_the_covariance(tmp_path: Path) -> None:
         [MATRIX_HEADER, f"{IDENTITY},1,2,1e999,4,5,6"],
         [MATRIX_HEADER, f"{IDENTITY},1,2,3,4,5,6", "1,0,0,0,1,0,0,0,2,1,2,3,4,5,6"],
         [MATRIX_HEADER, "1,0,0,0,1,0,0,0,-1,1,2,3,4,5,6"],
+        ["qx,qy,qz,fx,fy,fz,tx,ty,tz", "0,0,0,1,2,3,4,5,6"],
+        ["qx,qy,qz,qw,fx,fy,fz,tx,ty,tz", "0,0,0,1,1,2,3,4,5,6", "0,0,0,2,1,2,3,4,5,6"],
+        ["rx,ry,rz,fx,fy,fz,tx,ty,tz", "0,90,0,1,2,3,4,5,6"],
     ],
 )
 def test_csv_errors_name_column_or_row(tmp_path: Path, lines: list[str], snapshot: SnapshotAssertion) -> None:
     with pytest.raises(BadDataset) as caught:
         read_csv(csv(tmp_path, *lines))
     assert wording(caught.value) == snapshot
+
+
+def test_a_path_may_be_text(tmp_path: Path) -> None:
+    path = str(tmp_path / "dataset.json")
+    dataset().save(path)
+    assert CalibrationDataset.load(path).sha256() == dataset().sha256()
+    with pytest.raises(BadDataset, match=r"^dataset.json: the header|^dataset.json: missing column"):
+        read_csv(path)
 
 
 def test_csv_that_is_not_text(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from ftdrivers.ati.can import AtiCanSensor
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, DriverError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import Fact
 from tests.unit.drivers.dialogue import CanWire, Table
 from tests.unit.drivers.in_one_thread import InOneThread
@@ -290,7 +290,7 @@ def test_a_reply_of_the_start_up_has_a_tenth_of_a_second_and_is_asked_again(
         ("200 00010064012C01F4", StreamBroken, "reset itself"),
     ],
 )
-def test_status_that_ends_the_stream(talk: Talk, first_half: str, error: type[DriverError], message: str) -> None:
+def test_status_that_ends_the_stream(talk: Talk, first_half: str, error: type[DeviceError], message: str) -> None:
     with opened(talk(polls=[GAUGES] * 5, last=[first_half, GAUGES[1]])) as sensor, pytest.raises(error, match=message):
         sensor.collect(1.0)
 

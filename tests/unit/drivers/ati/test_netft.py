@@ -22,9 +22,9 @@ from ftdrivers.ati.netft import (
     range_in,
     text_in,
 )
-from ftdrivers.errors import ConnectError, DeviceFault, StreamBroken
+from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, StreamBroken
 from ftdrivers.interfaces import Fact, Health
-from ftdrivers.registry import BadUrl, sensor_from_url
+from ftdrivers.registry import sensor_from_url
 from ftdrivers.wires.status_word import describe_status
 from tests.cell_time import CellTime
 

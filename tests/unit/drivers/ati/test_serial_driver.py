@@ -12,7 +12,7 @@ import pytest
 
 from ftdrivers.ati.serial import AtiSerialSensor
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceFault, DriverError, ProtocolError, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, ProtocolError, StreamBroken
 from ftdrivers.interfaces import Fact
 from tests.unit.drivers.dialogue import Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread
@@ -229,7 +229,7 @@ def test_stream_that_never_makes_sense_ends(table: Table) -> None:
     ],
 )
 def test_error_bit_ends_the_stream_with_the_status_in_words(
-    table: Table, status: bytes, error: type[DriverError], says: str
+    table: Table, status: bytes, error: type[DeviceError], says: str
 ) -> None:
     look = [(JAM, b""), (STATUS, read_reply(status))]
     with table.serial(start_up(None, FINE, *look)) as wire, Sensor(wire.clock) as sensor:

@@ -147,20 +147,6 @@ def test_an_unknown_control_path_is_refused() -> None:
         UrArm(HOST, control="urscript")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(
-    ("words", "found", "fix"),
-    [
-        ("ur_rtde: One of the RTDE input registers are already in use! Currently", "another client", "end it"),
-        ("ur_rtde: Please enable remote control on the robot!", "remote control", "press Local"),
-        ("Failed to start control script, before timeout of 5 seconds", "Failed to start", "pendant"),
-    ],
-)
-def test_the_librarys_words_become_advice(words: str, found: str, fix: str) -> None:
-    error = opening._refusal(HOST, "ur-rtde", StreamBroken(words))
-    assert found in error.found
-    assert fix in error.fix
-
-
 # ---------------------------------------------------------------------- opening
 
 

@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, StreamBroken
+from ftdrivers.errors import BadUrl, ConnectError, StreamBroken
 from ftdrivers.interfaces import Fact
-from ftdrivers.registry import BadUrl, sensor_from_url
+from ftdrivers.registry import sensor_from_url
 from ftdrivers.ur import sensor as sensor_module
 from ftdrivers.ur.sensor import UrWristSensor
 from tests.fake_clock import FakeClock

@@ -17,9 +17,9 @@ from ftdrive.checks.check import Check
 from ftdrive.checks.computer import SensorAddress
 from ftdrivers.errors import (
     ConnectError,
+    DeviceError,
     DeviceFault,
     DeviceTimeout,
-    DriverError,
     Frozen,
     NoDashboard,
     PortInUse,
@@ -307,7 +307,9 @@ def test_the_payload_is_compared_with_the_weighed_load(
     check = diagnosis.check_weighed_payload(payload_kg, calibration, sensor_kg)
     assert (check.name, check.state) == ("robot.payload", state)
     assert words in check.found
-    assert (state == "warning") == bool(check.fix and check.fix.startswith("set the payload in PolyScope"))
+    assert (state == "warning") == bool(
+        check.fix and check.fix.startswith("set the payload in the controller to 1.74 kg")
+    )
 
 
 @pytest.mark.parametrize(
@@ -379,7 +381,7 @@ ALLOWED = Check("permissions.port", "ok", "may be read and written")
 FORBIDDEN = Check("permissions.port", "failed", "may not", "sudo usermod")
 
 
-def wrapped(error: DriverError) -> ConnectError:
+def wrapped(error: DeviceError) -> ConnectError:
     """As a driver raises an error that occurred while it was opened."""
     outer = ConnectError(error.found, error.fix)
     outer.__cause__ = error
@@ -406,7 +408,7 @@ def not_opened(found: str, cure: str = "") -> ConnectError:
     ],
 )
 @pytest.mark.parametrize("address", [PORT, BY_NETWORK, BY_PCAN])
-def test_the_cure_that_a_message_names_is_the_one_shown(error: DriverError, address: SensorAddress) -> None:
+def test_the_cure_that_a_message_names_is_the_one_shown(error: DeviceError, address: SensorAddress) -> None:
     check = diagnosis.check_sensor_error("sensor.stream", error, address, [ALLOWED])
     assert check == Check("sensor.stream", "failed", error.found, error.fix)
 
@@ -442,7 +444,7 @@ def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: Sensor
     ],
 )
 def test_another_cure_is_shown_where_the_way_to_a_sensor_is_wrong_or_its_message_names_none(
-    error: DriverError, address: SensorAddress, permission: Check, cure: str
+    error: DeviceError, address: SensorAddress, permission: Check, cure: str
 ) -> None:
     found = diagnosis.check_sensor_error("sensor.stream", error, address, [permission])
     assert (found.name, found.state, found.found) == ("sensor.stream", "failed", error.found)

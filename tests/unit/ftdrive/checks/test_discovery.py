@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from ftcalib.errors import UsageError
 from ftdrive.checks import computer, discovery
 from ftdrive.checks.discovery import ask, is_place, places, sensor_at
-from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError
 from ftdrivers.probe.serial_line import Answer
@@ -96,7 +96,7 @@ def test_a_port_without_more_is_a_serial_sensor(asked: list[Any], tmp_path: Path
     ],
 )
 def test_a_place_that_is_not_written_well(place: str, words: str, asked: list[Any]) -> None:
-    with pytest.raises(ConfigError, match=words):
+    with pytest.raises(UsageError, match=words):
         ask(place)
     assert asked == []
 
@@ -134,5 +134,5 @@ def test_an_interface_that_cannot_be_asked(can0: Path, asked: list[Any]) -> None
 )
 def test_only_one_sensor_is_the_sensor(answers: list[Answer], words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discovery, "probe_can", lambda *_, **__: answers)
-    with pytest.raises(ConfigError, match=words):
+    with pytest.raises(UsageError, match=words):
         sensor_at("can0")

@@ -26,7 +26,7 @@ def calibrated(
     parameters = Parameters(R_flange_sensor, weight, np.zeros(3), np.array(p_sensor_com_m), np.zeros(3))
     covariance = np.zeros((15, 15)) if covariance is None else covariance
     return CalibrationResult(
-        parameters, covariance, np.zeros((6, 6)), 1.0, 21, "measured", G_M_S2, "ml", "good", (), gain_sigma=gain_sigma
+        parameters, covariance, np.zeros((6, 6)), 1.0, 21, "measured", G_M_S2, "ml", (), gain_sigma=gain_sigma
     )
 
 
@@ -58,9 +58,7 @@ def test_sigma_agrees_with_numerical_derivatives() -> None:
     result = calibrated(1.3, R, (0.02, -0.03, 0.05), covariance, up_base=(0.6, 0.0, 0.8))
 
     def summed(parameters: Parameters) -> Array:
-        moved = CalibrationResult(
-            parameters, covariance, np.zeros((6, 6)), 1.0, 21, "measured", G_M_S2, "ml", "good", ()
-        )
+        moved = CalibrationResult(parameters, covariance, np.zeros((6, 6)), 1.0, 21, "measured", G_M_S2, "ml", ())
         load = flange_load(moved, 0.3, 0.04)
         return np.array([load.mass_kg, *load.p_flange_com_m])
 

@@ -11,6 +11,7 @@ from click.testing import CliRunner
 
 from ftdrive.commands import demo, emulated_run
 from ftdrive.runs.run import Run
+from ftdrive.session import rehearsal
 from ftdrive.session.events import Event, Noted, RunOpened
 
 STATION: Any = SimpleNamespace(sensor="can", options=(), control_path="auto", truth={"mass_kg": 0.5}, cell=None)
@@ -42,7 +43,7 @@ def test_of_a_run_that_is_not_kept_nobody_is_told_where_it_is(
         return SimpleNamespace()
 
     monkeypatch.setattr(emulated_run, "open_operator", open_operator)
-    monkeypatch.setattr(emulated_run, "calibrate", calibrate)
+    monkeypatch.setattr(rehearsal, "calibrate", calibrate)
     emulated_run.rehearse(STATION, tmp_path, "simulated", kept=kept)
     assert [type(event) for event in person.events] == expected
 

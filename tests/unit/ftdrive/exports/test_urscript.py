@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from ftdrive.cli import cli, exit_code
-from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.cli import cli
+from ftdrive.errors import ConfigError, PlanRefused, exit_code
 from ftdrive.exports import targets_csv, urscript
 from ftdrive.planning.plan import Plan
 
@@ -105,6 +105,19 @@ def plan(path: Path) -> Plan:
 
 def export(path: Path, *arguments: str) -> Result:
     return CliRunner().invoke(cli, ["export", "plan", str(path), *arguments])
+
+
+def test_a_plan_of_an_emulated_cell_says_so_before_it_moves(plan: Plan, tmp_path: Path) -> None:
+    emulated = plan.marked(measured=True, emulated=True)
+    assert emulated.why[0] == "The cell is EMULATED: no real arm may follow this plan."
+    emulated.save(tmp_path / "plan.json")
+    assert Plan.load(tmp_path / "plan.json").emulated
+    pendant = Pendant(list(plan.steps[0].q_rad))
+    pendant.run(urscript.program(emulated, dwell_s=1.0))
+    assert any(words.startswith("EMULATED CELL: no real arm may follow this plan.") for words in pendant.said)
+    assert "EMULATED" in targets_csv.table(emulated).splitlines()[0]
+    assert not plan.emulated
+    assert "EMULATED" not in urscript.program(plan, dwell_s=1.0)
 
 
 def test_the_program_visits_what_was_planned_as_it_was_planned(plan: Plan) -> None:

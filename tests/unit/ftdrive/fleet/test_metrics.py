@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.metrics import NAMES, MetricsServer
-from ftdrive.fleet.state import Finding
+from ftdrive.fleet.state import FleetFinding
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
 
 Samples = dict[tuple[str, str], float]
@@ -39,7 +39,7 @@ def samples(server: MetricsServer) -> Samples:
 def test_every_field_of_a_cell_is_a_metric_and_what_is_unknown_is_absent(server: MetricsServer) -> None:
     warm = cell("A", passed=False, drift=DRIFTING, temperature_C=31.5)
     silent = cell("B", drift=None, verified=None, passed=None)
-    base = Finding("base", ("B",), "…")
+    base = FleetFinding("base", ("B",), "…")
     server.update(reading(warm, silent, never_calibrated("C"), findings=(base, base), store_up=False))
     assert samples(server) == {
         ("ftdrive_store_up", ""): 0,

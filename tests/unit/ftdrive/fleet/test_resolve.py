@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftcalib import CalibrationResult
+from ftcalib import CalibrationResult, Finding
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.resolve import (
     Comparison,
@@ -38,6 +38,9 @@ def again(*folders: Path, submit: Any = at_once) -> dict[Path, Comparison | str]
     return dict(solve_again(folders, Workers(1, submit, BrokenExecutor)))
 
 
+WORN = Finding.of("few_poses", n_poses=5, recommended=6)
+
+
 def rewrite(path: Path, **changes: Any) -> None:
     """Change the calibration of a run."""
     result = replace(CalibrationResult.load(path), **changes)
@@ -48,7 +51,7 @@ def rewrite(path: Path, **changes: Any) -> None:
 def test_the_result_is_that_of_the_run_and_replaces_nothing(tmp_path: Path) -> None:
     folder = calibrated_run(tmp_path, "run")
     before = (folder / "calibration.json").read_bytes()
-    assert again(folder) == {folder: Comparison("good", "good", "", "R_flange_sensor.x", 0.0)}
+    assert again(folder) == {folder: Comparison("good", "good", None, "R_flange_sensor.x", 0.0)}
     own, new = CalibrationResult.load(folder / "calibration.json"), CalibrationResult.load(solved_path(folder))
     assert new.id == own.id
     assert new.provenance == {**own.provenance, "created_utc": FIRST.isoformat(), "run": "run"}
@@ -65,7 +68,7 @@ def test_a_run_that_has_the_result_is_not_solved_again(tmp_path: Path) -> None:
     def never(*_: Any) -> "Future[bytes]":
         raise AssertionError("solved twice")
 
-    assert again(folder, submit=never) == {folder: Comparison("good", "good", "", "R_flange_sensor.x", 0.0)}
+    assert again(folder, submit=never) == {folder: Comparison("good", "good", None, "R_flange_sensor.x", 0.0)}
     assert solved_path(folder).stat() == first
 
 
@@ -74,7 +77,7 @@ def test_changes_are_named_with_their_sigmas(tmp_path: Path) -> None:
     path = folder / "calibration.json"
     own = CalibrationResult.load(path)
     sigma = np.sqrt(own.covariance[7, 7])
-    rewrite(path, parameters=own.parameters.moved(-8 * sigma * np.eye(15)[7]), verdict="usable", reasons=("worn",))
+    rewrite(path, parameters=own.parameters.moved(-8 * sigma * np.eye(15)[7]), findings=(WORN,))
     found = again(folder)[folder]
     assert isinstance(found, Comparison)
     assert (found.parameter, found.verdict_before, found.verdict) == ("force_bias_N.y", "usable", "good")

@@ -279,6 +279,24 @@ def test_a_contact_is_one_event_with_its_line_of_force() -> None:
     assert not block.in_contact[2130:].any()
 
 
+def test_a_contact_is_reported_after_60_ms_and_at_its_end_and_a_shorter_touch_is_not() -> None:
+    push = np.zeros((4000, 6))
+    for start, stop in ((1500, 2100), (3000, 3030)):
+        push[start:stop, 2] = 8.0
+    rows, processor = paired(still(4.0), push=push), Processor(info(calibrated()))
+    changes = []
+    for i in range(0, len(rows), 10):
+        block = processor.process(rows.rows(slice(i, i + 10)))
+        changes += [(contact, int(block.t_host_ns[-1])) for contact in processor.take_contacts()]
+    (begun, begun_ns), (ended, ended_ns) = changes
+    assert (begun.over, ended.over) == (False, True)
+    assert begun.begin_ns == ended.begin_ns == pytest.approx(T0_NS + 1500e6, abs=20e6)
+    assert 60e6 <= begun_ns - begun.begin_ns <= 80e6
+    assert ended.duration_s == pytest.approx(0.6, abs=0.04)
+    assert 60e6 <= ended_ns - ended.last_ns <= 80e6
+    assert ended.peak_N == pytest.approx(8.0, abs=0.1)
+
+
 def test_two_touches_with_a_short_pause_are_one_contact() -> None:
     push = np.zeros((4000, 6))
     for start in (1500, 1700, 3000):

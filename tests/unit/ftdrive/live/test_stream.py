@@ -5,7 +5,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,10 +13,13 @@ import pytest
 from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.errors import ConfigError
+from ftdrive.library import open_stream
 from ftdrive.live import stream as module
+from ftdrive.live.contact import Contact
 from ftdrive.live.samples import Stages, WrenchFrame
-from ftdrive.live.stream import CompensatedStream, load_calibration, open_stream
-from ftdrivers.errors import DeviceTimeout, DriverError
+from ftdrive.live.stream import CompensatedStream
+from ftdrive.runs.source import read_calibration
+from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmStates, DeviceInfo, FtSamples, Health
 from tests.fake_clock import FakeClock
@@ -34,7 +37,7 @@ class Link:
         self.begin_ns = clock.now_ns()
         self.sent = 0
         self.silent = False
-        self.failure: DriverError | None = None
+        self.failure: DeviceError | None = None
         self.opened = 0
         self.info = DEVICE
         self.motion = Motion(turn_rad_s=0.0, acceleration_m_s2=0.0)
@@ -92,10 +95,12 @@ class Link:
 
 
 class Sensor(Link):
+    push = np.zeros(6)
+
     def rows(self, numbers: Any, t_ns: Any) -> FtSamples:
         rng = np.random.default_rng(int(numbers[0]) if len(numbers) else 0)
         noise = rng.normal(size=(len(numbers), 6)) * NOISE
-        return FtSamples.of(t_ns, numbers, self.motion.wrench(numbers / self.rate_Hz) + noise)
+        return FtSamples.of(t_ns, numbers, self.motion.wrench(numbers / self.rate_Hz) + noise + self.push)
 
 
 class Arm(Link):
@@ -298,6 +303,34 @@ def test_frame_stages_marks_and_tare_are_events(cell: Cell) -> None:
     assert status.contact_limit > 22
 
 
+def test_a_contact_is_called_back_once_when_it_begins_and_once_when_it_ends(cell: Cell) -> None:
+    contacts: list[Contact] = []
+    with open_stream(cell.config, cell.calibration, on_contact=contacts.append) as stream:
+        until(stream, lambda: bool(np.isfinite(stream.read().sigma).all()))
+        cell.sensor.push = np.array([0, 0, -6.0, 0, 0, 0])
+        until(stream, lambda: bool(contacts))
+        assert [contact.over for contact in contacts] == [False]
+        cell.sensor.push = np.zeros(6)
+        until(stream, lambda: len(contacts) > 1)
+    assert [contact.over for contact in contacts] == [False, True]
+    assert contacts[1].t_s == contacts[0].t_s
+    np.testing.assert_allclose(contacts[1].direction, [0, 0, -1], atol=0.03)
+
+
+def test_devices_of_the_user_take_the_place_of_those_in_the_configuration(cell: Cell) -> None:
+    mine = Sensor(cell.clock, RATE_HZ), Arm(cell.clock, ARM_HZ)
+    with open_stream(cell.config, cell.calibration, sensor=cast(Any, mine[0]), arm=cast(Any, mine[1])) as stream:
+        assert len(stream.read())
+    assert [device.opened for device in (*mine, cell.sensor, cell.arm)] == [1, 1, 0, 0]
+
+
+def test_an_emulated_cell_excludes_a_real_one(cell: Cell) -> None:
+    with pytest.raises(ConfigError, match="leave config, tool, sensor and arm out"):
+        open_stream(cell.config, cell.calibration, simulate=True)
+    with cell.stream() as stream, pytest.raises(ConfigError, match="only a stream with simulate=True"):
+        _ = stream.station
+
+
 def test_without_a_height_only_the_sensor_origin_is_offered(cell: Cell) -> None:
     cell.config = replace(cell.config, sensor=SensorConfig("fake://"))
     with pytest.raises(ConfigError, match="height_mm"), cell.stream(frame=WrenchFrame("base", "tcp")):
@@ -314,6 +347,6 @@ def test_a_stream_is_opened_from_paths(cell: Cell, tmp_path: Any) -> None:
         assert stream.info.calibration.mass_kg == pytest.approx(cell.calibration.mass_kg)
         assert stream.info.tool == "gripper"
         np.testing.assert_allclose(stream.info.p_flange_sensor_m, [0, 0, 0.03])
-    assert load_calibration(tmp_path).mass_kg == pytest.approx(cell.calibration.mass_kg)  # as a run folder
+    assert read_calibration(tmp_path).mass_kg == pytest.approx(cell.calibration.mass_kg)  # as a run folder
     with pytest.raises(ConfigError, match="no calibration"):
         open_stream(cell.config)

@@ -343,7 +343,7 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
     ("name", "verdicts", "words"),
     [
         ("agimus_mini45_b", ("good", "usable"), "The bias drifted by 0.17 N"),
-        ("foamcutting_2013_06_12", ("rejected",), "The force residual is 22.4 % of the weight"),
+        ("foamcutting_2013_06_12", ("rejected",), "the force error is 22.4 % of the weight"),
     ],
 )
 def test_real_recordings_are_judged_and_explained(

@@ -3,6 +3,7 @@
 import base64
 import importlib
 import json
+import re
 import sys
 from collections.abc import Iterator
 from contextlib import closing
@@ -210,6 +211,7 @@ def test_the_status_says_what_is_shown_and_is_valid_json(server: FoxgloveServer,
     assert status["frame"] == "sensor axes, about the sensor origin"
     assert status["stages"]["lowpass_Hz"] is None
     assert status["calibration"] == "calibration.json"
+    assert status["marks"] == ["EMULATED"]
     assert status["status"]["arm"]["lost"] == 3
     assert status["status"]["drift_N_h"] is None  # NaN there
 
@@ -302,7 +304,7 @@ def test_a_client_that_never_reads_delays_nobody(
             assert [client.message()[0] for _ in range(101)] == [EVENTS, *[ros2.RAW] * 100]
             times_full += "reads too slowly" in caplog.text
         host, port = slow.socket.local_address[:2]
-        assert f"the client {host}:{port} reads too slowly: its oldest messages are dropped" in caplog.text
+        assert re.search(f"oldest messages are dropped .*{host}:{port}", caplog.text)
 
 
 def test_a_slow_client_can_count_what_it_lost(stream: FakeStream, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -339,7 +341,7 @@ def test_without_a_client_nothing_is_packed(server: FoxgloveServer, monkeypatch:
 
 def test_a_port_in_use_is_named(server: FoxgloveServer, stream: FakeStream) -> None:
     with pytest.raises(
-        ConfigError, match=rf"cannot listen on 127\.0\.0\.1:{server.port}: Address already in use .*choose"
+        ConfigError, match=rf"cannot listen on 127\.0\.0\.1:{server.port} .*Address already in use .*choose"
     ):
         FoxgloveServer(cast(Any, stream), port=server.port)
 

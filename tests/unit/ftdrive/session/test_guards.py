@@ -12,10 +12,10 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene
 from ftdrive.session.guards import (
     ContactGuard,
+    ExpectedMotion,
     Guard,
     Limits,
     ModelGuard,
-    Motion,
     PathGuard,
     RangeGuard,
     SafetyGuard,
@@ -49,7 +49,7 @@ class Looks:
 
     def __init__(self, guard: Guard, *, moving: bool = True) -> None:
         self.guard = guard
-        self.motion = Motion(START, GOAL, moving=True) if moving else Motion(GOAL, GOAL, moving=False)
+        self.motion = ExpectedMotion(START, GOAL, moving=True) if moving else ExpectedMotion(GOAL, GOAL, moving=False)
         self.t_s, self.sample = 0.0, 0
         self.rng = np.random.default_rng(0)
         guard.begin(self.seen())

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,11 @@ from ftcalib.errors import TooFewSamples
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord, Sampling, dataset_from, drift_check
 from ftdrive.session.events import Compared, Estimated, Event, Noted, PoseTaken, State, StateChanged
-from ftdrive.session.hand_guided import Recorder, collect_manually
+from ftdrive.session.guards import Limits
+from ftdrive.session.hand_guided import HandGuided
+from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key, Question
+from ftdrive.session.pose_book import PoseBook
 from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
@@ -170,7 +174,8 @@ class Person:
         self.keys = keys | {cell.end_s + 20: Key.STOP}
         self.shown: list[Event] = []
 
-    def show(self, event: Event) -> None:
+    def show(self, event: Event, *, sync: bool = False) -> None:
+        assert sync == isinstance(event, PoseTaken)
         self.shown.append(event)
 
     def ask(self, question: Question) -> str:
@@ -230,6 +235,11 @@ class Verification:
         )
 
 
+def guided(cell: Any, person: Any, run: Any, fit: Any, sampling: Sampling, *, listen: bool = False) -> HandGuided:
+    opened = OpenCell(cell, cell, cell.clock, person, Limits())
+    return HandGuided(opened, PoseBook(opened, run, fit, FLOOR), sampling, listen=listen)
+
+
 class Outcome:
     """What a collection leaves."""
 
@@ -256,15 +266,8 @@ class Outcome:
 
         def collect() -> None:
             sampling = Sampling(average_s=AVERAGE_S, attempts=3)
-            collect_manually(
-                self.cell,
-                self.cell,
-                sampling,
-                self.person,
-                Recorder(self.fit.add, self._commit, earlier),
-                down_base=FLOOR,
-                listen=listen,
-                clock=self.cell.clock,
+            guided(self.cell, self.person, self, self.fit, sampling, listen=listen).run(
+                earlier, "the coverage is green"
             )
 
         if raises is None:
@@ -273,7 +276,7 @@ class Outcome:
             with raises:
                 collect()
 
-    def _commit(self, record: PoseRecord) -> None:
+    def commit(self, record: PoseRecord) -> None:
         self.kept.append(record)
         self.person.shown.append(Noted(words=f"committed {record.stop}"))
 
@@ -630,13 +633,5 @@ def test_a_disk_that_is_full_ends_it() -> None:
         raise OSError("No space left on device")
 
     with pytest.raises(OSError, match="No space"):
-        collect_manually(
-            cell,
-            cell,
-            Sampling(average_s=AVERAGE_S),
-            person,
-            Recorder(Fit().add, commit),
-            down_base=FLOOR,
-            listen=False,
-        )
+        guided(cell, person, SimpleNamespace(commit=commit), Fit(), Sampling(average_s=AVERAGE_S)).run((), "")
     assert not any(isinstance(event, PoseTaken) for event in person.shown)

@@ -1,6 +1,5 @@
 """The fit while poses come in, what is said about what is missing, and what is said at the end about odd poses."""
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -12,15 +11,15 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ftcalib import Parameters, solve
+from ftcalib import Finding, Parameters, solve
 from ftcalib.model import predict
 from ftcalib.poses.information import T12, Prediction, TOOL_DOWN_R_base_flange, special
 from ftcalib.poses.selection import cone_candidates
 from ftcalib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from ftdrive.planning.search.constant_tour import NUMBERS
-from ftdrive.runs.pose_hints import hints
+from ftdrive.runs.pose_hints import _CHANGES, hints
 from ftdrive.session.events import Estimated
-from ftdrive.session.live_fit import Running, _light, faces
+from ftdrive.session.live_fit import RunningFit, _light, faces
 from ftdrive.terminal.report import print_result
 from tests.pose_sets import AMBIGUOUS_6
 
@@ -78,9 +77,9 @@ def tour() -> list[PoseRecord]:
     return [record(stop, R, n) for stop, (n, R) in enumerate(zip(numbers, special(numbers), strict=True), start=1)]
 
 
-def run(taken: list[PoseRecord], running: Running | None = None) -> Estimated:
+def run(taken: list[PoseRecord], running: RunningFit | None = None) -> Estimated:
     """Take all poses in and return what the last one gives, without a fit after each."""
-    running = running or Running()
+    running = running or RunningFit()
     running._records = {one.stop: one for one in taken[:-1]}
     running._refit()
     return running.add(taken[-1])
@@ -88,7 +87,7 @@ def run(taken: list[PoseRecord], running: Running | None = None) -> Estimated:
 
 @pytest.mark.slow
 def test_at_the_end_of_a_tour_the_running_fit_is_the_solvers() -> None:
-    running, taken = Running(), tour()
+    running, taken = RunningFit(), tour()
     events = [running.add(one) for one in taken]
     expected = solve(dataset_from(taken, {}))
     last = events[-1]
@@ -107,7 +106,7 @@ def test_at_the_end_of_a_tour_the_running_fit_is_the_solvers() -> None:
 
 
 def test_one_pose_is_a_start() -> None:
-    running = Running()
+    running = RunningFit()
     event = running.add(tour()[0])
     assert event.poses == 1
     assert event.values == {}
@@ -168,7 +167,7 @@ def test_six_well_conditioned_poses_with_two_solutions_are_red_and_give_no_numbe
 
 
 def test_following_the_hints_from_tool_down_leads_to_green_soon() -> None:
-    running, R, seen = Running(), TOOL_DOWN_R_base_flange, list[Estimated]()
+    running, R, seen = RunningFit(), TOOL_DOWN_R_base_flange, list[Estimated]()
     for stop in range(1, 15):
         event = running.add(record(stop, R, stop))
         seen.append(event)
@@ -200,7 +199,7 @@ def follow(words: str, R: Array) -> Array:
 
 
 def test_a_bumped_pose_stands_out_when_it_comes_and_can_be_taken_again() -> None:
-    running, taken = Running(), tour()
+    running, taken = RunningFit(), tour()
     quiet = run(taken[:14], running)
     assert quiet.residual_sigma is not None
     assert quiet.residual_sigma < 5
@@ -219,20 +218,20 @@ def test_a_bumped_pose_stands_out_when_it_comes_and_can_be_taken_again() -> None
 
 
 def test_the_first_pose_can_be_taken_again() -> None:
-    running, first = Running(), tour()[0]
+    running, first = RunningFit(), tour()[0]
     running.add(first)
     running.remove(1)
     assert running.add(first).poses == 1
 
 
 def test_a_stop_taken_twice_counts_once() -> None:
-    running, taken = Running(), tour()
+    running, taken = RunningFit(), tour()
     run(taken[:12], running)
     assert running.add(taken[4]).poses == 12
 
 
 def test_the_return_to_the_first_pose_changes_no_estimate_but_is_compared() -> None:
-    running, taken = Running(), tour()
+    running, taken = RunningFit(), tour()
     before = run(taken[:-1], running)
     after = running.add(taken[-1])
     assert after.poses == 24
@@ -243,7 +242,7 @@ def test_the_return_to_the_first_pose_changes_no_estimate_but_is_compared() -> N
 
 @pytest.mark.slow
 def test_the_prediction_waits_until_it_can_be_trusted_and_is_then_right() -> None:
-    running, taken = Running(), tour()
+    running, taken = RunningFit(), tour()
     R = special([24])[0]
     predictions = []
     for one in taken:
@@ -267,7 +266,7 @@ def test_an_arm_on_a_wall_is_seen_as_such_once_the_fit_knows() -> None:
     R = special(range(1, 25))
     event = run([record(stop, one, stop, truth=wall) for stop, one in enumerate(R, start=1)])
     assert event.faces == faces(-R[:, 1])
-    estimate = Running(down_base=(0, -1, 0)).add(record(1, R[0], 1, truth=wall))
+    estimate = RunningFit(down_base=(0, -1, 0)).add(record(1, R[0], 1, truth=wall))
     assert estimate.faces == faces(-R[:1, 1])
 
 
@@ -297,8 +296,16 @@ def disturbed(wrench_of: Disturbed, seed: int = 0) -> list[PoseRecord]:
     return taken
 
 
-def said(taken: list[PoseRecord]) -> tuple[str, ...]:
+def said(taken: list[PoseRecord]) -> tuple[Finding, ...]:
     return hints(solve(dataset_from(taken, {})), taken)
+
+
+def changed(taken: list[PoseRecord]) -> Finding:
+    """What changed between two poses, without any hint about single ones."""
+    result = solve(dataset_from(taken, {}))
+    assert hints(result, taken) == ()
+    (change,) = (one for one in result.findings if one.code in _CHANGES)
+    return change
 
 
 def name(stop: int) -> str:
@@ -321,40 +328,39 @@ def test_nothing_is_said_of_quiet_runs_and_inexact_arms_and_no_pose_is_named_whe
         for wrench_of in (lambda _, R, __: predict(TRUTH, R), rough):
             assert said(disturbed(wrench_of, seed)) == ()
         for drifts in (drifting, wandering):
-            (words,) = said(disturbed(drifts, seed))
-            assert words.startswith("the sensor drifts")
+            (hint,) = said(disturbed(drifts, seed))
+            assert hint.code == "sensor_drifts"
 
 
 def test_a_bumped_pose_is_named() -> None:
-    (words,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 8) * np.array([0.8, 0, 0, 0, 0.03, 0])))
-    assert words.startswith(f"{name(8)} is off by 0.8")
-    assert "bumped" in words
+    (hint,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 8) * np.array([0.8, 0, 0, 0, 0.03, 0])))
+    assert (hint.code, hint.values["pose"]) == ("pose_touched", name(8))
+    assert hint.values["force_N"] == pytest.approx(0.8, abs=0.05)
 
 
 def test_a_cable_that_pulls_in_three_poses_is_named_with_them() -> None:
     pull = np.array([0.3, 0.2, 0.4, 0.01, -0.03, 0.03])
-    words = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop in {5, 6, 14}) * pull))
-    assert f"something pulls in {name(5)}, {name(6)}, {name(14)}: a cable" in words[-1]
+    found = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop in {5, 6, 14}) * pull))
+    assert [one.code for one in found] == ["pose_off"] * 3 + ["cable_pulls"]
+    assert found[-1].values["poses"] == [name(5), name(6), name(14)]
 
 
 @pytest.mark.parametrize("since", [6, 12, 20])
 def test_a_load_that_shifts_is_named_with_the_pose_from_which_on(since: int) -> None:
     shifted = replace(TRUTH, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.004, 0.002, 0]))
-    (words,) = said(disturbed(lambda stop, R, _: predict(shifted if stop >= since else TRUTH, R)))
-    assert words.startswith(f"from {name(since)} on the centre of mass")
-    assert "did the load shift" in words
+    change = changed(disturbed(lambda stop, R, _: predict(shifted if stop >= since else TRUTH, R)))
+    assert (change.code, change.values["pose"]) == ("com_shifted", since)
 
 
 def test_a_tare_and_a_lost_part_in_mid_tour_are_told_apart() -> None:
     step = np.array([0.3, 0, 0.2, 0, 0, 0])
-    (words,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop >= 10) * step))
-    assert words.startswith(f"from {name(10)} on the force reads 0.3")
-    assert "was the sensor tared" in words
+    change = changed(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop >= 10) * step))
+    assert (change.code, change.values["pose"]) == ("bias_stepped", 10)
+    assert change.values["force_N"] == pytest.approx(np.linalg.norm(step), abs=0.03)
     lighter = replace(TRUTH, gravity_force_base_N=0.95 * TRUTH.gravity_force_base_N)
-    (words,) = said(disturbed(lambda stop, R, _: predict(lighter if stop >= 14 else TRUTH, R)))
-    found = re.match(rf"from {name(14)} on the load weighs ([\d.]+) N less: was something lost", words)
-    assert found is not None, words
-    assert float(found[1]) == pytest.approx(0.05 * np.linalg.norm(TRUTH.gravity_force_base_N), rel=0.1)
+    change = changed(disturbed(lambda stop, R, _: predict(lighter if stop >= 14 else TRUTH, R)))
+    assert (change.code, change.values["pose"]) == ("load_changed", 14)
+    assert change.values["change_N"] == pytest.approx(-0.05 * np.linalg.norm(TRUTH.gravity_force_base_N), rel=0.1)
 
 
 def test_a_pose_that_moved_is_named_and_not_explained_otherwise() -> None:
@@ -362,16 +368,16 @@ def test_a_pose_that_moved_is_named_and_not_explained_otherwise() -> None:
     turned = Reading(0, np.zeros(6), taken[6].before.R_base_flange @ Rotation.from_rotvec([0, 0, 0.01]).as_matrix())
     taken[6] = replace(record(7, taken[6].before.R_base_flange, TOUR[6], bump_N=1.0), after=turned, steady=False)
     taken[8] = replace(taken[8], steady=False)
-    assert [words.split(" while")[0] for words in said(taken)] == [
-        f"{name(7)} turned by 0.57°",
-        f"{name(9)} was not steady",
+    turned_by = {"pose": name(7), "turn_deg": pytest.approx(np.degrees(0.01))}
+    assert [(one.code, dict(one.values)) for one in said(taken)] == [
+        ("pose_turned", turned_by),
+        ("pose_unsteady", {"pose": name(9)}),
     ]
 
 
 def test_a_first_pose_that_is_touched_at_the_end_is_no_drift() -> None:
-    (words,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 25) * np.array([0.5, 0, 0, 0, 0, 0])))
-    assert words.startswith(f"{name(1)} reads otherwise at the end")
-    assert "touched" in words
+    (hint,) = said(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 25) * np.array([0.5, 0, 0, 0, 0, 0])))
+    assert (hint.code, hint.values["pose"]) == ("return_differs", name(1))
 
 
 def test_a_slight_drift_of_the_torque_does_not_explain_a_touch_at_the_end() -> None:
@@ -379,8 +385,8 @@ def test_a_slight_drift_of_the_torque_does_not_explain_a_touch_at_the_end() -> N
     taken = disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 25) * touch + stop / 25 * drift)
     result = solve(dataset_from(taken, {}))
     assert result.drift is not None
-    (words,) = hints(result, taken)
-    assert words.startswith(f"{name(1)} reads otherwise at the end")
+    (hint,) = hints(result, taken)
+    assert hint.code == "return_differs"
 
 
 def test_the_rate_of_a_drift_is_that_of_what_drifts(capsys: pytest.CaptureFixture[str]) -> None:
@@ -408,6 +414,6 @@ def test_the_report_names_poses_says_the_drift_and_ends_with_the_file(capsys: py
     assert "predicted by the others: 0." in text
     assert f"? {name(8)} is off by" in text
     assert "away: 0.6 N/min" in text
-    assert "the sensor drifts" in text
+    assert "let the sensor warm up for 15 to 30 min" in " ".join(text.split())
     assert " drift in the fit: " in text
     assert "1.12" in next(line for line in lines if "mass, kg" in line)

@@ -15,9 +15,8 @@ from ftdrive.checks import computer
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import SLOWEST_SLIDER, check_speed
 from ftdrive.errors import NotAccepted
-from ftdrive.session import preflight, session
+from ftdrive.session import preflight
 from ftdrive.session.events import Checked, Noted
-from ftdrive.session.guards import Limits
 from ftdrivers.errors import DeviceFault, StreamBroken
 from ftdrivers.interfaces import ArmState
 from tests.unit.ftdrive.fake_cell import Lab
@@ -91,7 +90,7 @@ def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
     range_N: float, range_Nm: float, share: int, passes: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limits = np.array([200.0, range_N, 200, 20, 20, range_Nm])
-    monkeypatch.setattr(session, "_range_of", lambda _: limits)
+    monkeypatch.setattr(preflight.Before, "sensor_range", limits)
     lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=1.5))
     words = f"twice the tool's weight is {share} % of the sensor's range"
     if passes:
@@ -252,7 +251,7 @@ def link(lab: Lab, *, old: bool, late_s: Callable[[int], float]) -> Check:
 
     right, lab.arm.answers_s = lab.arm.state, 0.0
     lab.arm.state = late  # type: ignore[method-assign]  # this arm only
-    return preflight.check_link(cast("preflight.Before", SimpleNamespace(arm=lab.arm, cell=lab.cell, limits=Limits())))
+    return preflight.check_link(cast("preflight.Before", SimpleNamespace(cell=lab.open_cell())))
 
 
 @pytest.mark.parametrize(("old", "limit_s"), [(False, 0.02), (True, 0.06)])

@@ -14,6 +14,7 @@ from ftdrive.cell.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.runs.run import Run
 from ftdrive.session import session, tour
 from ftdrive.session.events import (
     Checked,
@@ -31,6 +32,7 @@ from ftdrive.session.operator import Key
 from ftdrive.terminal.report import drift_in_words
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
+from tests.edited_files import edit
 from tests.unit.ftdrive.fake_cell import Lab
 
 
@@ -322,8 +324,8 @@ def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
     then: tuple[str, str], now: tuple[str, str], cure: str, lab: Lab
 ) -> None:
     folder = broken_off(lab)
-    header = folder / "run.json"
-    header.write_text(header.read_text().replace('"fake"', f'"{then[0]}"').replace('"S1"', f'"{then[1]}"'))
+    model, serial = then
+    edit(folder / "run.json", lambda header: header["devices"]["sensor"].update(model=model, serial=serial))
     reports(lab, *now)
     if not cure:
         assert lab.calibrate(resume=folder) is not None
@@ -331,6 +333,16 @@ def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
     with pytest.raises(PlanRefused, match=f"{then[0]}, serial {then[1]}, connected is {now[0]}.*{cure}"):
         lab.calibrate(resume=folder)
     assert lab.arm.moves == []
+
+
+def test_a_run_that_another_process_resumes_is_refused_before_anything_moves(lab: Lab) -> None:
+    folder = broken_off(lab)
+    events = (folder / "events.ndjson").read_bytes()
+    with Run(folder), pytest.raises(ConfigError, match=r"is in use by process \d+ on .* since "):
+        lab.calibrate(resume=folder)
+    assert lab.arm.moves == []
+    assert (folder / "events.ndjson").read_bytes() == events
+    assert lab.calibrate(resume=folder) is not None
 
 
 def test_an_arm_without_a_serial_number_is_the_same_where_its_model_is(lab: Lab) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftcalib import CalibrationResult, Parameters
+from ftcalib import CalibrationResult, Finding, Parameters
 from ftcalib.errors import BadDataset
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted
@@ -18,6 +18,7 @@ from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo, Guard
+from tests.edited_files import edit
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import FakeArm, FakeSensor
 
@@ -90,8 +91,7 @@ class Cell:
         bias = np.array([1.0, 2, 3, 0.1, 0.2, 0.3])
         parameters = Parameters(np.eye(3), 1.2 * 9.81 * down, bias[:3], np.array([0.01, 0, 0.06]), bias[3:])
         found = {
-            "verdict": "good",
-            "reasons": (),
+            "findings": (),
             "provenance": {
                 "devices": {"arm": {"model": "UR5e", "serial": "A1"}, "sensor": {"model": "fake", "serial": "S1"}},
                 "setup": {"payload_kg": 0.9, "sensor_mass_kg": None, "mounting": "floor"},
@@ -196,8 +196,9 @@ def test_a_calibration_of_other_devices_is_refused(cell: Cell, devices: Any, say
 
 
 def test_a_rejected_calibration_is_refused(cell: Cell) -> None:
-    with pytest.raises(NotAccepted, match=r"rejected \(too noisy\)"):
-        cell.propose(cell.result(verdict="rejected", reasons=("too noisy",)))
+    rejected = Finding.of("second_solution", probability_percent=40.0)
+    with pytest.raises(NotAccepted, match=r"rejected \(a very different mounting .* 40 %"):
+        cell.propose(cell.result(findings=(rejected,)))
 
 
 @pytest.mark.parametrize(
@@ -346,9 +347,7 @@ def test_another_mounting_is_not_set(cell: Cell) -> None:
 
 def test_a_receipt_of_another_arm_is_refused(cell: Cell) -> None:
     path, _ = cell.send(cell.propose())
-    other = json.loads(path.read_text())
-    other["devices"]["arm"]["serial"] = "A9"
-    path.write_text(json.dumps(other))
+    edit(path, lambda other: other["devices"]["arm"].update(serial="A9"))
     with pytest.raises(NotAccepted, match="serial A9, but UR5e, serial A1"):
         restore(cell.config, cell.arm, Receipt.load(path))
 
@@ -365,7 +364,7 @@ def test_a_receipt_of_another_arm_is_refused(cell: Cell) -> None:
 )
 def test_a_damaged_receipt_is_an_error_that_names_it(cell: Cell, change: dict[str, Any], says: str) -> None:
     path, _ = cell.send(cell.propose())
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    edit(path, lambda receipt: receipt.update(change))
     with pytest.raises(BadDataset, match=says) as error:
         Receipt.load(path)
     assert "push.json" in str(error.value)

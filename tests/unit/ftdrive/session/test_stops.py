@@ -16,7 +16,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Run
-from ftdrive.session import session, tour
+from ftdrive.session import tour
 from ftdrive.session.events import (
     Checked,
     Event,
@@ -27,6 +27,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Key
+from ftdrive.session.preflight import Before
 from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import FtSamples
 from tests.unit.ftdrive.fake_cell import Lab
@@ -399,7 +400,7 @@ def test_saturation_that_only_the_samples_of_a_pose_show_discards_it(lab: Lab, m
             samples.wrench[7, 5] = -3.8  # the newest ones, which the guards see, are as ever
         return samples
 
-    monkeypatch.setattr(session, "_range_of", lambda _: np.array([40.0, 40, 40, 4, 4, 4]))
+    monkeypatch.setattr(Before, "sensor_range", np.array([40.0, 40, 40, 4, 4, 4]))
     monkeypatch.setattr(lab.sensor, "collect", one_high)
     with pytest.raises(DeviceFault, match="95 % of its range"):
         lab.calibrate()
@@ -408,7 +409,7 @@ def test_saturation_that_only_the_samples_of_a_pose_show_discards_it(lab: Lab, m
 
 
 def test_saturated_samples_discard_the_pose(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "_range_of", lambda _: np.array([40.0, 40, 40, 4, 4, 4]))
+    monkeypatch.setattr(Before, "sensor_range", np.array([40.0, 40, 40, 4, 4, 4]))
     lab.arm.at_move[4] = lambda: setattr(lab.sensor, "push", np.array([0, 0, 0, 0, 0, 3.8]))
     with pytest.raises(DeviceFault, match="of its range"):
         lab.calibrate()

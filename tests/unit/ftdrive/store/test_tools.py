@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from ftcalib import Finding
 from ftdrive.errors import ConfigError
 from ftdrive.store.store import Store
 from ftdrive.store.tools import Tool, calibration_of_tool
@@ -23,7 +24,7 @@ def url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     results = {
         "gripper-old": result(0),
         "gripper-new": result(10),
-        "gripper-rejected": replace(result(20), verdict="rejected", reasons=("too few poses",)),
+        "gripper-rejected": replace(result(20), findings=(Finding.of("second_solution", probability_percent=40.0),)),
         "drill": result(30, tool="drill"),
         "gripper-elsewhere": result(40, serials=("arm-1", "ft-2")),
         "gripper-remounted": result(50, mount="adapter-b"),

@@ -20,7 +20,7 @@ from ftdrive.live.samples import (
     StreamStatus,
     WrenchFrame,
 )
-from ftdrive.runs.verification import VerificationRecord
+from ftdrive.runs.verification_record import VerificationRecord
 from ftdrivers.errors import DeviceTimeout
 from ftdrivers.interfaces import Array, DeviceInfo, Fact
 
@@ -62,8 +62,7 @@ def calibration() -> CalibrationResult:
         noise_source="measured",
         g_m_s2=9.80665,
         method="ml",
-        verdict="good",
-        reasons=(),
+        findings=(),
         provenance={
             "created_utc": "2026-11-14T08:00:00+00:00",
             "dataset_sha256": "7c1e9a" + "0" * 58,

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from syrupy.assertion import SnapshotAssertion
 
-from ftdrive import cli
-from ftdrive.errors import Declined
+from ftdrive.errors import Declined, exit_code
 from ftdrive.session.events import (
     Asked,
     Checked,
@@ -267,4 +266,4 @@ def test_a_terminal_that_cannot_discard_early_answers_gives_none(monkeypatch: py
     with pytest.raises(ModuleNotFoundError) as error:
         PlainOperator(stdin=typed, stderr=io.StringIO()).ask(Question("Type MOVE", ("MOVE",)))
     assert typed.tell() == 0
-    assert cli.exit_code(error.value) == 2
+    assert exit_code(error.value) == 2

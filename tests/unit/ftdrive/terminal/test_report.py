@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationDataset, Known, Parameters, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Finding, Known, Parameters, Setup, solve
 from ftcalib.compare import Compared, compare
 from ftcalib.errors import NotObservable
 from ftcalib.model import predict
@@ -19,7 +19,6 @@ from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftcalib.result import Method
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError
-from ftdrive.runs.pose_hints import hints
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.report import error_in_words, errors_in_sigma, print_comparison, print_result
 from tests.unit.ftdrive.fake_cell import Lab
@@ -71,8 +70,9 @@ def test_the_headline_of_a_good_calibration_is_what_its_noise_predicts() -> None
 def test_a_method_with_wrong_known_values_is_named_as_the_cause() -> None:
     result = solve(tilted(measured=False), "carlson-relaxation")
     assert result.verdict != "good"
-    assert any("without known values the forces fit to 0.00" in reason for reason in result.reasons)
-    assert not any("known values" in reason for reason in solve(tilted(), "lrom").reasons)
+    misfit = {one.code: one.values for one in result.findings}["known_values_misfit_force"]
+    assert 0 < misfit["free_N"] < 0.01
+    assert solve(tilted(), "lrom").findings == ()
 
 
 LEVEL = Known(gravity_direction_base=(0, 0, -1), mass_kg=0.5)
@@ -80,16 +80,22 @@ LEVEL = Known(gravity_direction_base=(0, 0, -1), mass_kg=0.5)
 
 @pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
-    ("known", "words"),
+    ("known", "code", "values"),
     [
-        (Known(mass_kg=0.61), r"data: mass 0\.61 kg \(data: 0\.4999\d* kg, sigma 0\.0000\d+ kg\): correct"),
-        (LEVEL, r"data: direction of gravity in base \(data: 1\.89\d*° away, sigma 0\.00\d+°\): correct"),
-        (Known(R_flange_sensor=np.eye(3)), r"data: mounting of the sensor \(data: (79\.99|80\.00)\d*° away, sigma "),
+        (Known(mass_kg=0.61), "known_mass", {"known_kg": 0.61, "mass_kg": 0.49998}),
+        (LEVEL, "known_gravity_direction", {"off_deg": 1.89}),
+        (Known(R_flange_sensor=np.eye(3)), "known_mounting", {"off_deg": 80.0}),
     ],
 )
-def test_what_was_given_wrongly_is_named_with_what_the_data_say(known: Known, words: str, measured: bool) -> None:
-    result = solve(tilted(measured=measured), known=known)
-    assert re.search(words, result.reasons[0])
+def test_what_was_given_wrongly_is_named_with_what_the_data_say(
+    known: Known, code: str, values: dict[str, float], measured: bool
+) -> None:
+    finding = solve(tilted(measured=measured), known=known).findings[0]
+    assert finding.code == code
+    for name, value in values.items():
+        assert finding.values[name] == pytest.approx(value, rel=0.003)
+    sigma = finding.values["sigma_kg" if code == "known_mass" else "sigma_deg"]
+    assert 0 < sigma < 0.02
 
 
 def test_what_was_given_and_may_be_true_is_not_blamed() -> None:
@@ -97,14 +103,18 @@ def test_what_was_given_and_may_be_true_is_not_blamed() -> None:
     loose = Known(gravity_direction_base=(0, 0, -1), direction_tolerance_rad=0.03, mass_kg=0.51, mass_tolerance_kg=0.01)
     flat = Known(yaw_only=True)
     for known in (right, loose, flat):
-        assert not any("given as known" in reason for reason in solve(tilted(), known=known).reasons)
+        assert blamed(solve(tilted(), known=known)) == []
+
+
+def blamed(result: CalibrationResult) -> list[str]:
+    return [one.code for one in result.findings if one.code.startswith("known")]
 
 
 def test_too_few_poses_to_do_without_what_is_known_blame_nothing() -> None:
     R = Rotation.from_rotvec([[0, 0, 0], [1.5, 0, 0.3], [0, 1.5, 0.7]]).as_matrix()
     few = CalibrationDataset(R, predict(TILTED, R), None, np.zeros(3, np.int64), np.full(3, np.nan))
     known = Known(TILTED.R_flange_sensor, gravity_direction_base=(0, 0, -1), mass_kg=0.61)
-    assert not any("given as known" in reason for reason in solve(few, known=known).reasons)
+    assert blamed(solve(few, known=known)) == []
 
 
 def test_beside_the_truth_the_report_says_what_a_free_tool_reads(capsys: pytest.CaptureFixture[str]) -> None:
@@ -149,6 +159,7 @@ def test_lines_of_the_report_go_on_under_their_text(
         ("--level-deg", "-1", "-1.0 is not in the range 0<=x<=180"),
         ("--mounting-deg", "nan,0,0", "--mounting-deg is 'nan,0,0': give 3 numbers"),
         ("--mass-kg", "0", "0.0 is not in the range x>0"),
+        ("--up", "0,0,0", "--up is 0,0,0, which is no direction: give 0,0,1"),
     ],
 )
 def test_an_impossible_known_value_is_reported_as_it_was_given(
@@ -160,16 +171,35 @@ def test_an_impossible_known_value_is_reported_as_it_was_given(
     assert words in str(error.value)
 
 
+def test_a_robot_on_a_wall_is_good_only_if_it_is_declared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    R_wall_floor = Rotation.from_euler("y", -90, degrees=True).as_matrix()
+    floor = tilted()
+    wall = replace(floor, R_base_flange=R_wall_floor @ floor.R_base_flange)
+    wall.save(tmp_path / "data.json")
+    found = []
+    for options in ((), ("--up", "-1,0,0")):
+        solve_command.main([str(tmp_path / "data.json"), "--json", *options], standalone_mode=False)
+        answer = json.loads(capsys.readouterr().out)
+        found.append((answer["verdict"], [one["code"] for one in answer["findings"]], answer["provenance"]))
+    assert found[0][:2] == ("usable", ["mounting_undeclared"])
+    assert found[1][:2] == ("good", ["base_leans"])
+    assert found[1][2]["up_in_base"] == [-1, 0, 0]
+
+
 @pytest.mark.parametrize("as_json", [False, True])
-def test_solve_says_of_a_run_what_calibrate_says(as_json: bool, lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrate_solve_and_library_say_the_same(as_json: bool, lab: Lab, capsys: pytest.CaptureFixture[str]) -> None:
     lab.arm.set_status(payload_kg=2.5)
     lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting="3"))
     outcome = lab.calibrate()
     assert outcome is not None
     records = outcome.run.records()
-    expected = hints(outcome.result, records)
-    assert any("the base leans" in one for one in expected)
-    assert "2.50 kg" in outcome.result.reasons[0]
+    lean = np.radians(3)
+    setup = Setup(
+        up_in_base=(np.sin(lean), 0, np.cos(lean)), cylinders_m=[(0.0, 0.2, 0.1)], payload_kg=2.5, sensor_mass_kg=None
+    )
+    result = solve(outcome.dataset, g_m_s2=outcome.result.g_m_s2, setup=setup)
+    assert [one.code for one in result.findings] == ["payload_mismatch", "base_leans"]
+    assert (result.verdict, result.findings) == (outcome.result.verdict, outcome.result.findings)
     capsys.readouterr()
     print_result(outcome.result, drift=outcome.drift, records=records)
     by_calibrate = capsys.readouterr().err
@@ -177,8 +207,10 @@ def test_solve_says_of_a_run_what_calibrate_says(as_json: bool, lab: Lab, capsys
     by_solve = capsys.readouterr()
     if as_json:
         answer = json.loads(by_solve.out)
-        assert answer["hints"] == list(expected)
-        assert answer["reasons"] == list(outcome.result.reasons)
+        assert answer["hints"] == []
+        assert answer["verdict"] == "usable"
+        assert [Finding.from_dict(one) for one in answer["findings"]] == list(result.findings)
+        assert [one["words"] for one in answer["findings"]] == list(result.reasons)
     else:
         assert by_solve.err == by_calibrate
 
@@ -230,7 +262,7 @@ def test_a_weight_known_exactly_has_an_uncertainty_of_zero(mass_kg: float) -> No
         cov = np.tile(np.diag(SIGMA**2), (12, 1, 1))
         data = CalibrationDataset(R, wrench, cov, np.zeros(12, np.int64), np.full(12, np.nan))
         result = solve(data, known=Known(mass_kg=mass_kg))  # a root of a rounding error below 0 would warn
-        assert not any("uncertainty" in reason and "nan" in reason for reason in result.reasons)
+        assert "weight_insignificant" not in {one.code for one in result.findings}
 
 
 def shown(compared: list[Compared], capsys: pytest.CaptureFixture[str]) -> list[str]:

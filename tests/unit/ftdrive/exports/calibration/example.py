@@ -5,7 +5,7 @@ from math import cos, radians, sin
 
 import numpy as np
 
-from ftcalib import CalibrationResult, Parameters
+from ftcalib import CalibrationResult, Finding, Parameters
 from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response
 from ftcalib.model import Array
 from ftdrive.exports.calibration.settings import Settings
@@ -37,8 +37,7 @@ def calibration(
         noise_source="measured",
         g_m_s2=G_M_S2,
         method="ml",
-        verdict="good",
-        reasons=(),
+        findings=(),
         provenance={"created_utc": "2026-11-14T08:00:00+00:00"},
         response=response,
     )
@@ -60,4 +59,4 @@ def responding(gain: float, cross_talk_m: float) -> CalibrationResult:
 
 def rejected() -> CalibrationResult:
     """Fits badly."""
-    return replace(calibration(), verdict="rejected", reasons=("residuals of 5 N",))
+    return replace(calibration(), findings=(Finding.of("second_solution", probability_percent=40.0),))

@@ -1,0 +1,343 @@
+"""Findings about a calibration: code, severity and values as data; their words, their order and the verdict they give.
+
+`CODES` is the table of all codes. Its order is their rank: a cause stands before its consequences. A template has its
+values in braces, and the key of a value ends with its unit, which is written with it. ``{key:?yes|no}`` writes "yes" if
+the value is there, else "no".
+"""
+
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import isfinite
+from types import MappingProxyType
+from typing import Any, Final, Literal, Self
+
+Severity = Literal["reject", "limit", "note"]
+"""Of a finding: the result is rejected, usable at best, or not worse for it."""
+Verdict = Literal["good", "usable", "rejected"]
+
+_VERDICTS: Final[Mapping[Severity, Verdict]] = {"reject": "rejected", "limit": "usable", "note": "good"}
+"""The worst first."""
+_PLACE: Final = re.compile(r"\{(\w+)(?::([^}]*))?\}")
+"""Of a value in a template, with its form."""
+_UNITS: Final = {
+    "N": " N", "Nm": " N·m", "mNm": " mN·m", "kg": " kg", "m": " m", "mm": " mm", "deg": "°", "percent": " %",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """What a code means."""
+
+    severities: Sequence[Severity]
+    """Those that a finding can have. With several, its size decides."""
+    found: str
+    """What was found: a template."""
+    fix: str = ""
+    """What to do about it: a template."""
+
+    @property
+    def values(self) -> set[str]:
+        """Names of the values that the templates need."""
+        return {place[1] for place in _PLACE.finditer(self.found + self.fix)}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One finding. A code that this version does not know, from a file of a later one, has no sentence.
+
+    Raises
+    ------
+    ValueError
+        An unknown severity, or a value that the sentence needs is missing.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> finding = ftdrive.Finding.of("few_poses", n_poses=5, recommended=6)
+    >>> finding.severity, finding.values["n_poses"]
+    ('limit', 5)
+    >>> finding.words
+    'there are only 5 poses: take 6 or more'
+    """
+
+    code: str
+    severity: Severity
+    values: Mapping[str, Any] = field(default_factory=dict)
+    """Numbers and strings, or lists of them, by names with units; None is not known."""
+
+    def __post_init__(self) -> None:
+        if self.severity not in _VERDICTS:
+            raise ValueError(f"the severity of a finding is {self.severity!r}, expected one of {', '.join(_VERDICTS)}")
+        if self.code in CODES and (missing := CODES[self.code].values - self.values.keys()):
+            raise ValueError(f"the finding {self.code} lacks {', '.join(sorted(missing))}")
+        object.__setattr__(self, "values", MappingProxyType(_plain(self.values)))
+
+    @classmethod
+    def of(cls, code: str, severity: Severity | None = None, /, **values: Any) -> Self:
+        """Return a finding of the table; `severity` only for a code that has several.
+
+        Raises
+        ------
+        KeyError
+            The table has no such code.
+        """
+        possible = CODES[code].severities
+        if severity is None:
+            (severity,) = possible
+        return cls(code, severity, values)
+
+    @property
+    def found(self) -> str:
+        """What was found, in words."""
+        if self.code in CODES:
+            return _written(CODES[self.code].found, self.values)
+        return f"{self.code} ({json.dumps(dict(self.values), ensure_ascii=False)}), which this version does not know"
+
+    @property
+    def fix(self) -> str:
+        """What to do about it, in words; empty if nothing."""
+        return _written(CODES[self.code].fix, self.values) if self.code in CODES else ""
+
+    @property
+    def words(self) -> str:
+        """The sentence: what was found, and what to do about it."""
+        return f"{self.found}: {self.fix}" if self.fix else self.found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what files and `--json` have of it."""
+        return {"code": self.code, "severity": self.severity, "values": dict(self.values), "words": self.words}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Build from `to_dict`. Raises `ValueError` if it is damaged."""
+        try:
+            finding = cls(document["code"], document["severity"], document["values"])
+            _ = finding.words  # which values of another type do not have
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"finding {json.dumps(document)}: {error}") from error
+        return finding
+
+
+def ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Return findings by rank, the first one to be fixed first; notes come last."""
+    rank = {code: place for place, code in enumerate(CODES)}
+    return tuple(sorted(findings, key=lambda one: (one.severity == "note", rank.get(one.code, len(rank)))))
+
+
+def verdict_of(findings: Iterable[Finding]) -> Verdict:
+    """Return the verdict of the worst finding; good without any."""
+    severities = {one.severity for one in findings}
+    return next((verdict for severity, verdict in _VERDICTS.items() if severity in severities), "good")
+
+
+# --------------------------------------------------------------------------------------------------------------- words
+
+
+def _written(template: str, values: Mapping[str, Any]) -> str:
+    return _PLACE.sub(lambda place: _value(place[1], values[place[1]], place[2] or ""), template)
+
+
+def _value(name: str, value: Any, form: str) -> str:
+    if form[:1] == "?":
+        present, _, absent = form[1:].partition("|")
+        return absent if value is None or value in ("", [], {}) else present
+    if form in _FORMS:
+        return _FORMS[form](value)
+    if value is None:
+        return "unknown"
+    unit = _UNITS.get(name.rpartition("_")[2], "")
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {format(one, form)}" for key, one in value.items())
+    if isinstance(value, list):
+        listed = ", ".join(format(one, form) for one in value)
+        return f"({listed}){unit}" if form else listed
+    return f"{format(value, form)}{unit}"
+
+
+def _poses(value: Any) -> str:
+    """Write rows, from 1, as "pose 5" or "poses 5, 7", and names such as R05 as they are."""
+    rows = value if isinstance(value, list) else [value]
+    listed = ", ".join(map(str, rows))
+    return listed if isinstance(rows[0], str) else f"pose{'s' if len(rows) > 1 else ''} {listed}"
+
+
+def _units(pairs: Sequence[Sequence[str]]) -> str:
+    """Write suspected units of force and torque, such as [["lbf", "N·m"]]."""
+    each = (
+        " and ".join([f"forces in {force}"] * (force != "N") + [f"torques in {torque}"] * (torque != "N·m"))
+        for force, torque in pairs
+    )
+    return f", as with {', or '.join(each)}" if pairs else ""
+
+
+def _axes(corrections: Sequence[Sequence[Any]]) -> str:
+    """Write from which channels axes should be taken, such as [["force", ["-x", "y", "z"]]]."""
+    return ", or ".join(f"{group} {_order(channels)}" for group, channels in corrections)
+
+
+def _order(channels: Sequence[str]) -> str:
+    if [one[-1] for one in channels] == list("xyz"):
+        return f"{' and '.join(one[1:] for one in channels if len(one) > 1)} reversed"
+    return f"x, y, z taken from ({', '.join(channels)})"
+
+
+_FORMS: Final[Mapping[str, Callable[[Any], str]]] = {"poses": _poses, "units": _units, "axes": _axes}
+
+
+def _plain(value: Any) -> Any:
+    """Return arrays and numpy's numbers as JSON has them; None for what is not finite."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return None if isinstance(value, float) and not isfinite(value) else value
+
+
+# --------------------------------------------------------------------------------------------------------------- codes
+
+_REJECT: Final = ("reject",)
+_LIMIT: Final = ("limit",)
+_NOTE: Final = ("note",)
+_REJECT_OR_LIMIT: Final = ("reject", "limit")
+_REJECT_OR_NOTE: Final = ("reject", "note")
+_LIMIT_OR_NOTE: Final = ("limit", "note")
+
+# fmt: off
+CODES: Final[Mapping[str, Code]] = {
+    # Data that cannot be right
+    "stuck_channels": Code(_REJECT, "the reading of {channels} is the same in all poses",
+        "check the sensor for a channel that is stuck"),
+    "repeated_poses": Code(_REJECT, "{poses:poses} have identical wrenches and orientations", "keep one of the copies"),
+    "repeated_wrenches": Code(_REJECT, "{poses:poses} have identical wrenches in different orientations",
+        "repeat these poses"),
+    "constant_force": Code(_REJECT, "the force is {force_N:.2g} in all poses, as if the wrench were given in base axes",
+        "record it in the axes of the sensor"),
+    "wrench_in_base": Code(_REJECT, "the wrench looks given in base axes (force residual {residual_N:.2g}, corrected "
+        "{corrected_N:.2g})", "record it in the axes of the sensor"),
+    "orientations_inverted": Code(_REJECT, "the orientations look inverted (force residual {residual_N:.2g}, "
+        "corrected {corrected_N:.2g})", "state that they map base to flange"),
+    "quaternion_order": Code(_REJECT, "the quaternions look like ({order}), but were read as ({read_as}) (force "
+        "residual {residual_N:.2g}, corrected {corrected_N:.2g})", "read them as ({order})"),
+    "pairing_shifted": Code(_REJECT, "each wrench looks like that of the pose {neighbour} it (force residual "
+        "{residual_N:.2g}, corrected {corrected_N:.2g})", "pair each wrench with the pose at which it was measured"),
+    "pairing_or_rotations": Code(_REJECT, "the forces are those of a weight of {weight_N:.3g} to {radial_N:.2g}, but "
+        "in these orientations only to {residual_N:.2g}, so wrenches are paired with other poses, or the "
+        "orientations have another form", "check the pairing, and look for Euler angles, degrees or another order"),
+    "axes_disagree": Code(_REJECT, "force and torque axes disagree, because with {corrections:axes} the torque "
+        "residual is {corrected_Nm:.2g} instead of {residual_Nm:.2g}",
+        "check the wiring of the axes, or the sensor's matrix"),
+    # Known values that the data contradict
+    "known_mass": Code(_LIMIT_OR_NOTE, "the known mass of {known_kg:g} contradicts the data, which give {mass_kg:.5g} "
+        "(sigma {sigma_kg:.2g}){units:units}", "correct the data or the known value"),
+    "known_gravity_direction": Code(_LIMIT_OR_NOTE, "the known direction of gravity contradicts the data, which give "
+        "one {off_deg:.3g} away (sigma {sigma_deg:.2g})", "correct the data or the known value"),
+    "known_mounting": Code(_LIMIT_OR_NOTE, "the known mounting of the sensor contradicts the data, which give one "
+        "{off_deg:.3g} away (sigma {sigma_deg:.2g}){corrections:?, as with |}{corrections:axes}",
+        "correct the data or the known value"),
+    # Units, drift and changes of one session
+    "payload_units": Code(_LIMIT, "the load is {load_kg:.2f}, but {expected_kg:.2f} by the payload in the "
+        "controller{units:units}", "check the units of the sensor before you correct the payload"),
+    "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
+        "last", "let the sensor warm up and calibrate again"),
+    "com_shifted": Code(_REJECT_OR_NOTE, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
+        "load had shifted", "fix the load and calibrate again"),
+    "load_changed": Code(_REJECT_OR_NOTE, "from {pose:poses} on the weight has changed by {change_N:+.2g}",
+        "check whether something was lost or picked up, and calibrate again"),
+    "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
+        "of {sigma_N:.2g}", "hang something heavier on the sensor, or record longer and in more orientations"),
+    "second_solution": Code(_REJECT, "a very different mounting of the sensor explains the data almost as well "
+        "(probability {probability_percent:.2g})", "add poses with another angle between the tool and the vertical"),
+    "weight_implausible": Code(_REJECT_OR_LIMIT, "the weight is {weight_N:.5g}{units:units}",
+        "check the units of force and torque"),
+    "com_too_far": Code(_REJECT, "the centre of mass is {distance_m:.2f} from the sensor, farther than "
+        "{most_m:g}{units:units}", "check the units of force and torque"),
+    "com_too_near": Code(_LIMIT, "the centre of mass is only {distance_mm:.2g} from the sensor, as if torques were "
+        "1000 times too small or forces were in mN", "check the units of force and torque"),
+    # Directions and signs
+    "gravity_off_mounting": Code(_LIMIT, "gravity is {off_deg:.0f} off the direction of the declared mounting",
+        "correct the mounting ([workcell] mounting, --up), here and in the controller, or check the order and the "
+        "direction of the rotations"),
+    "mounting_undeclared": Code(_LIMIT, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot "
+        "on a wall, but no mounting is declared",
+        "declare the mounting ([workcell] mounting, --up), or check the order and the direction of the rotations"),
+    "weight_upwards": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down)",
+        "set sign = -1 if the sensor reports the reaction, or correct axes that are reversed or swapped in forces "
+        "and torques alike. If the robot hangs so, declare its mounting ([workcell] mounting, --up). Otherwise check "
+        "the order and the direction of the rotations"),
+    "forces_reversed": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down) and the centre of mass lies "
+        "on the robot's side of the sensor, as if the forces were reversed and the torques not, or the orientations "
+        "mirrored", "reverse the forces, or give the orientations in right-handed axes"),
+    "torques_reversed": Code(_LIMIT, "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor",
+        "reverse the torques, unless the tool reaches back that far"),
+    # The described cell
+    "tool_mass_mismatch": Code(_LIMIT, "{load_kg:.3g} hang on the sensor, but the described tool has "
+        "{tool_kg:.3g}{units:units}", "check the sensor's units and what is mounted, or correct [tool] mass_kg"),
+    "payload_mismatch": Code(_LIMIT, "the controller has a payload of {payload_kg:.2f}, but {load_kg:.2f} hang on the "
+        "sensor{sensor_kg:?|, whose own mass is not configured}",
+        "set the payload in the controller to {set_kg:.2f}{sensor_kg:?, with sensor and adapter| plus the mass of "
+        "sensor and adapter ([sensor] mass_kg)}"),
+    "com_outside_tool": Code(_REJECT_OR_LIMIT, "the centre of mass, at {com_mm:.0f} from the {origin} in flange axes, "
+        "lies {outside_mm:.0f} outside the described tool{units:units}",
+        "check signs and units of forces and torques, then [tool] cylinders_mm"),
+    # How well the data fit
+    "force_error": Code(_REJECT_OR_LIMIT, "judged by the {source}, the force error is {share_percent:.1f} of the "
+        "weight ({error_N:.2g}), more than {limit_percent:g}",
+        "check cables, contact and orientations, and take more poses"),
+    "torque_error": Code(_REJECT_OR_LIMIT, "judged by the {source}, the torque error is {share_percent:.1f} of the "
+        "weight at {lever_m:.2g} ({error_Nm:.2g}), more than {limit_percent:g}",
+        "check cables, contact and orientations, and take more poses"),
+    "known_values_misfit_force": Code(_LIMIT, "without known values the forces fit to {free_N:.2g} instead of "
+        "{residual_N:.2g} (method ml)", "check the known mass and the assumption of a level base"),
+    "known_values_misfit_torque": Code(_LIMIT, "without known values the torques fit to {free_Nm:.2g} instead of "
+        "{residual_Nm:.2g} (method ml)", "check the known mass and the assumption of a level base"),
+    "noise_exceeded": Code(_LIMIT_OR_NOTE, "the residuals are {factor:.1f} times the measured noise "
+        "({components:?found: |the stated uncertainties do not include this}{components:.2g})",
+        "look for drift, cables, contact and inexact orientations"),
+    "poses_rejected": Code(_LIMIT_OR_NOTE, "{count} of {n_poses} poses were rejected because they do not fit the "
+        "others", "repeat {poses:poses}"),
+    "few_poses": Code(_LIMIT, "there are only {n_poses} poses", "take {recommended} or more"),
+    "poses_unchecked": Code(_LIMIT, "{poses:poses} cannot be checked because the others do not determine all "
+        "parameters", "add similar poses"),
+    # Notes
+    **{f"gain_{axis}": Code(_NOTE, f"the gain of the sensor along {axis} is {{gain_percent:+.1f}} off, corrected for "
+        "this load") for axis in "xyz"},
+    "axes_mixed": Code(_NOTE, "the sensor mixes forces along {axes} by {share_percent:.1f}, corrected for this load"),
+    "cross_talk": Code(_NOTE, "the sensor reads up to {torque_mNm:.2g} of torque for 1 N of force, corrected for this "
+        "load"),
+    "response_small": Code(_NOTE, "the sensor has a small error of gain or cross-talk, corrected for this load"),
+    "residuals_alike": Code(_NOTE, "successive poses have similar residuals (correlation {correlation:.2f}), most "
+        "likely from drift", "let the sensor warm up and mix the order of the poses"),
+    "pose_deviates": Code(_NOTE, "{pose:poses} deviates from the others by {sigmas:.1f} sigma",
+        "consider repeating it"),
+    "bias_stepped": Code(_NOTE, "from {pose:poses} on the bias differs by {force_N:.2g} and {torque_Nm:.2g}",
+        "check whether the sensor was tared or a cable pulls, and calibrate again"),
+    "sensor_turned": Code(_NOTE, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
+        "fasten its screws and calibrate again"),
+    "gravity_tilted": Code(_NOTE, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot on a "
+        "slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
+    "base_leans": Code(_NOTE, "the base leans {lean_deg:.2f} (sigma {sigma_deg:.2f}) towards its {side}, compared "
+        "with the declared mounting", "level the base, or set its mounting in the controller"),
+    "noise_unknown": Code(_NOTE, "the noise was estimated from the residuals, so chi2 does not test the fit",
+        "state the noise of each pose to test it"),
+    "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),
+    # Hints about single poses, beside the result
+    "pose_turned": Code(_NOTE, "{pose:poses} turned by {turn_deg:.2f} while it was averaged", "repeat it"),
+    "pose_unsteady": Code(_NOTE, "{pose:poses} was not steady while it was averaged",
+        "look for what swings or touches, and repeat it"),
+    "pose_off": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}"),
+    "pose_touched": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}, as if touched, bumped or "
+        "pulled by a cable", "repeat it"),
+    "load_swings": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}, torque without force",
+        "check whether the load tilts or swings"),
+    "cable_pulls": Code(_NOTE, "something pulls in {poses:poses}",
+        "give slack to a cable that is too short there, and repeat these poses"),
+    "sensor_drifts": Code(_NOTE, "the first pose reads otherwise at the end, and the poses between drift alike",
+        "let the sensor warm up for 15 to 30 min, then calibrate again"),
+    "return_differs": Code(_NOTE, "{pose:poses} reads otherwise at the end, and the poses between do not drift, as if "
+        "it was touched then", "repeat the last stop"),
+}
+# fmt: on

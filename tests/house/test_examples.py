@@ -1,0 +1,44 @@
+"""The examples run as their pages show them, and the data that they read can be made again."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.house import example_data
+
+EXAMPLES = example_data.EXAMPLES
+PAGES = EXAMPLES.parent / "docs/examples"
+SLOW = {"live_contact", "monte_carlo", "plan_without_robot"}
+NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in NAMES])
+def test_an_example_prints_what_its_page_shows(name: str, tmp_path: Path) -> None:
+    environment = {**os.environ, "PYTHONIOENCODING": "utf-8"}
+    command = [sys.executable, "-W", "error", str(EXAMPLES / f"{name}.py")]
+    outcome = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, encoding="utf-8", check=False)
+    assert (outcome.returncode, outcome.stderr) == (0, "")
+    assert outcome.stdout == (EXAMPLES / f"output/{name}.txt").read_text(encoding="utf-8")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_there_are_eight_short_examples_each_with_a_page_that_the_index_names() -> None:
+    assert len(NAMES) == 8
+    assert [name for name in NAMES if not 10 <= len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= 40] == []
+    index = (PAGES / "index.md").read_text(encoding="utf-8")
+    for name in NAMES:
+        page = (PAGES / f"{name}.md").read_text(encoding="utf-8")
+        assert re.findall(r"\{literalinclude\} (.*)", page) == [
+            f"../../examples/{name}.py",
+            f"../../examples/output/{name}.txt",
+        ]
+        assert f"\n{name}\n" in index
+
+
+@pytest.mark.parametrize("name", example_data.FILES)
+def test_the_data_are_those_that_the_script_makes(name: str) -> None:
+    assert (EXAMPLES / name).read_text(encoding="utf-8") == example_data.FILES[name]()

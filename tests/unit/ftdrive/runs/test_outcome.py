@@ -1,0 +1,132 @@
+"""A session compares its result with the described cell, before the tour, during it and at the end alike."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ftcalib import CalibrationResult
+from ftcalib.assessment import described_cell
+from ftdrive.cell.config import SensorConfig, ToolConfig
+from ftdrive.runs.outcome import circumstances_of, solve_records
+from ftdrive.runs.pose_hints import hints
+from ftdrive.session.events import Noted, PoseTaken, Weighed
+from ftdrive.session.preflight import Before, check_payload
+from tests.edited_files import edit
+from tests.unit.ftdrive.fake_cell import Lab
+
+MEASURED_KG = 1.2 * 9.81 / 9.80665
+"""Of the fake cell."""
+
+
+def payload_notes(lab: Lab) -> list[str]:
+    return [event.words for event in lab.operator.of(Noted) if "payload" in event.words]
+
+
+@pytest.mark.parametrize("payload_kg", np.arange(0.1, 4.0, 0.07))
+def test_the_limit_is_that_of_the_check_before_the_tour(payload_kg: float, lab: Lab) -> None:
+    lab.cell = replace(
+        lab.cell,
+        sensor=SensorConfig("fake://", mass_kg=0.3),
+        tool=ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),), mass_kg=1.7),
+    )
+    lab.arm.set_status(payload_kg=float(payload_kg), p_flange_payload_m=None)
+    nothing: Any = None
+    before = Before(lab.open_cell(), lab.cell, *[nothing] * 7)
+    assert (check_payload(before).state == "ok") == (described_cell.payload(float(payload_kg), 1.7, 0.3) == [])
+
+
+def test_a_wrong_payload_is_noted_once_when_the_fit_knows_and_is_the_first_finding(lab: Lab) -> None:
+    lab.arm.set_status(payload_kg=2.5)
+    outcome = lab.calibrate()
+    assert outcome is not None
+    first = outcome.result.findings[0]
+    assert (outcome.result.verdict, first.code) == ("usable", "payload_mismatch")
+    assert (first.values["payload_kg"], first.values["load_kg"]) == (2.5, pytest.approx(MEASURED_KG, abs=0.001))
+    assert payload_notes(lab) == [first.words]
+    (noted,) = (event for event in lab.operator.of(Noted) if event.words == first.words)
+    before = lab.operator.shown[: lab.operator.shown.index(noted)]
+    assert [event.stop for event in before if isinstance(event, PoseTaken)] == [1, 2, 3, 4, 5, 6]
+    (weighed,) = lab.operator.of(Weighed)
+    assert weighed.mass_kg == pytest.approx(MEASURED_KG, abs=0.05)
+    assert lab.holds() == []
+    carried = lab.arm.status().p_flange_payload_m
+    assert carried is not None
+    assert outcome.result.provenance["setup"]["p_flange_payload_m"] == list(carried)
+    assert hints(outcome.result, outcome.run.records()) == ()
+
+
+def test_a_run_whose_payload_is_right_in_pounds_is_not_good(lab: Lab) -> None:
+    lab.arm.set_status(payload_kg=1.2 * 4.448)
+    outcome = lab.calibrate()
+    assert outcome is not None
+    assert (outcome.result.verdict, outcome.result.findings[0].code) == ("usable", "payload_units")
+    assert ["lbf", "N·m"] in outcome.result.findings[0].values["units"]
+
+
+@pytest.mark.parametrize(
+    ("payload_kg", "sensor_kg", "differs"), [(1.9, 0.8, False), (1.9, None, False), (2.8, 0.8, True)]
+)
+def test_the_mass_of_the_sensor_counts(payload_kg: float, sensor_kg: float | None, differs: bool, lab: Lab) -> None:
+    lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", mass_kg=sensor_kg))
+    lab.arm.set_status(payload_kg=payload_kg)
+    outcome = lab.calibrate()
+    assert outcome is not None
+    assert bool(payload_notes(lab)) is differs
+    assert [one.code for one in outcome.result.findings] == ["payload_mismatch"] * differs
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_with_the_mass_of_the_sensor_as_it_is_known_now(lab: Lab) -> None:
+    lab.arm.set_status(payload_kg=2.8)
+    lab.calibrate()
+    assert payload_notes(lab)
+    lab.operator.shown.clear()
+    lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", mass_kg=1.6))
+    lab.calibrate(resume=lab.run().folder, redo=(4,))
+    assert payload_notes(lab) == []
+
+
+def test_a_controller_that_does_not_report_its_payload_is_not_compared(lab: Lab) -> None:
+    lab.arm.set_status(payload_kg=None)
+    lab.calibrate()
+    assert lab.operator.of(Weighed) == []
+    assert payload_notes(lab) == []
+
+
+@pytest.mark.slow
+def test_a_payload_that_was_corrected_before_the_run_goes_on_is_no_longer_reported(lab: Lab) -> None:
+    lab.arm.set_status(payload_kg=2.5)
+    assert lab.calibrate() is not None
+    assert payload_notes(lab)
+    run = lab.run()
+    with (run.folder / "events.ndjson").open("a") as file:
+        file.write('{"event": "weigh')  # the power went
+    lab.operator.shown.clear()
+    lab.arm.set_status(payload_kg=1.3)
+    again = lab.calibrate(resume=run.folder, redo=(4,))
+    assert again is not None
+    assert payload_notes(lab) == []
+    assert again.result.verdict == "good"
+    saved = json.loads(run.calibration_path.read_text())
+    known = {"payload_kg": 1.3, "sensor_mass_kg": None, "mounting": "floor", "height_mm": None, "tool_mass_kg": None}
+    assert (known | {"cylinders_mm": [[0.0, 200.0, 100.0]]}).items() <= saved["provenance"]["setup"].items()
+
+
+def test_a_session_saves_no_result_as_good_whose_tool_is_elsewhere_unless_it_was_not_measured(lab: Lab) -> None:
+    lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", height_mm=180.0))
+    assert lab.calibrate() is not None
+    saved = CalibrationResult.load(lab.run().calibration_path)
+    assert (saved.verdict, saved.findings[0].code) == ("usable", "com_outside_tool")
+    edit(lab.run().folder / "run.json", lambda header: header["config"]["workcell"].update(measured=False))
+    assert solve_records(lab.run(), lab.run().records()).result.verdict == "good"
+
+
+@pytest.mark.parametrize(("mounting", "up"), [("floor", (0, 0, 1)), ("ceiling", (0, 0, -1)), (None, None)])
+def test_a_mounting_counts_as_declared_only_if_it_was_given(mounting: str | None, up: Any, lab: Lab) -> None:
+    lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting=mounting))
+    lab.calibrate()
+    found = circumstances_of(lab.run())[0]["setup"].up_in_base
+    assert found == (None if up is None else pytest.approx(up, abs=1e-12))
