@@ -67,7 +67,7 @@ def test_a_cell_that_disappears_disappears(server: MetricsServer) -> None:
     assert {name for _, name in samples(server)} == {"", "B"}
 
 
-def test_tools_of_a_cell_are_told_apart_and_any_name_is_escaped(server: MetricsServer) -> None:
+def test_tools_of_a_cell_are_distinguished_and_any_name_is_escaped(server: MetricsServer) -> None:
     name = 'Zelle "7"\\ü\n'
     server.update(reading(cell(name, "gripper"), cell(name, "drill", mass_kg=2.0)))
     families = {one.name: one for one in text_string_to_metric_families(scraped(server))}

@@ -285,7 +285,7 @@ def test_a_wrong_parameter_changes_nothing(
     assert (stream.frame, stream.stages) == (WrenchFrame(), Stages())
 
 
-def test_a_client_that_never_reads_delays_nobody(
+def test_a_client_that_never_reads_delays_no_other(
     stream: FakeStream, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Every message reaches a client that reads, until the queue of another one overflows and beyond."""
