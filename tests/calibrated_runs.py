@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters
 from ftcalib.errors import NotObservable
 from ftcalib.model import predict
-from ftdrive.fleet.draws import drawn
 from ftdrive.fleet.resolve import solved, task_of
 from ftdrive.runs.run import RUN_FORMAT
 
@@ -76,19 +74,3 @@ def _own(folder: Path, seed: int, poses: int) -> CalibrationResult:
     if (seed, poses) not in _solved:
         _solved[seed, poses] = CalibrationResult.from_dict(json.loads(solved(*task_of(folder))))
     return _solved[seed, poses]
-
-
-def white_run(runs: Path, name: str, seed: int = 1, *, poses: int = 8) -> Path:
-    """Make the folder of a calibration whose readings have the measured noise and nothing else, so it solves fast."""
-    folder = calibrated_run(runs, name, seed, poses=poses)
-    path = folder / "calibration.json"
-    plain = replace(CalibrationResult.load(path), components={})
-    rewrite_dataset(folder, drawn(dataset(seed, poses), plain, np.random.default_rng(seed)))
-    path.write_bytes(solved(*task_of(folder)))
-    return folder
-
-
-def rewrite_dataset(folder: Path, data: CalibrationDataset) -> None:
-    """Replace the dataset of a run."""
-    (folder / "dataset.json").unlink()
-    data.save(folder / "dataset.json")

@@ -73,7 +73,7 @@ class Mosquitto:
             elif message.retain:
                 found[message.topic] = message.payload.decode()
 
-        def subscribe(*_: object) -> None:
+        def subscribe(client: Client, *_: object) -> None:  # a client of the closure would be a cycle with its sockets
             client.subscribe([(topics, 0), ("end", 0)])
             client.publish("end", b"")  # the broker sends it after what it has retained
 

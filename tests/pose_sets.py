@@ -16,7 +16,7 @@ SUBSET_8 = (2, 3, 6, 8, 17, 19, 22, 23)
 AMBIGUOUS_6 = (4, 6, 9, 15, 18, 23)
 """A-optimal for the forces, but another mounting of the sensor explains them exactly (gap 0): do not use."""
 
-# Found by tests/benchmarks/design_table.py --optimise; rotation vectors in rad of R_base_flange, tool down first.
+# Found by numerical optimisation; rotation vectors in rad of R_base_flange, tool down first.
 _OPTIMISED: Mapping[int, tuple[tuple[float, float, float], ...]] = {
     6: (
         (3.141593, 0.000000, 0.000000),
@@ -58,8 +58,6 @@ def optimised(n: int) -> Array:
     They have the least mean inverse efficiency for centres of mass in all directions. The first has the tool straight
     down. A turn of the whole set about the vertical, or by one rotation of the flange, keeps its information.
     """
-    if n not in _OPTIMISED:
-        raise ValueError(f"there is no stored set of {n} poses: take {' or '.join(map(str, _OPTIMISED))}, or `choose`")
     return Rotation.from_rotvec(_OPTIMISED[n]).as_matrix()
 
 

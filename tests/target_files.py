@@ -1,11 +1,9 @@
 """What the formulas of export targets share: the context, and how a file is read."""
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -98,34 +96,11 @@ def split(values: str) -> Array:
     return np.array([float(value) for value in values.split(",") if value.strip()])
 
 
-def message(text: str) -> Mapping[str, Any]:
-    """Return a ROS message in YAML, or the one in quotes in a `ros2` or `rosservice` command."""
-    quoted = re.search(r"""(['"])(\{.*\})\1""", text, re.DOTALL)
-    return mapping(yaml.safe_load(quoted[2] if quoted else text))
-
-
 def transform_arguments(words: Sequence[str]) -> tuple[str, Array, Rotation]:
     """Return parent frame, position and rotation."""
-    if words[0].startswith("--"):
-        o = {key.removeprefix("--"): value for key, value in zip(words[::2], words[1::2], strict=True)}
-        position = [float(o.get(axis, 0)) for axis in "xyz"]
-        if {"roll", "pitch", "yaw"} & set(o):
-            rotation = Rotation.from_euler("xyz", [float(o.get(name, 0)) for name in ("roll", "pitch", "yaw")])
-        else:
-            rotation = _unit([float(o[name]) for name in ("qx", "qy", "qz", "qw")])
-        return o["frame-id"], np.array(position), rotation
-    count = 6 if _is_name(words[6]) else 7
-    values = [float(word) for word in words[:count]]
-    rotation = _unit(values[3:]) if count == 7 else Rotation.from_euler("ZYX", values[3:])
-    return words[count], np.array(values[:3]), rotation
-
-
-def _is_name(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return True
-    return False
+    o = {key.removeprefix("--"): value for key, value in zip(words[::2], words[1::2], strict=True)}
+    rotation = _unit([float(o[name]) for name in ("qx", "qy", "qz", "qw")])
+    return o["frame-id"], np.array([float(o[axis]) for axis in "xyz"]), rotation
 
 
 def _unit(xyzw: Sequence[float]) -> Rotation:

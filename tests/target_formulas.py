@@ -15,7 +15,6 @@ the result with our compensated wrench.
 | `sensor_mass_kg`, `p_flange_sensor_com_m` (3,) | sensor and adapter, for targets whose payload includes them |
 | `p_sensor_com_m`, `gravity_force_base_N` (3,) | the load, for a target that carries only the mounting |
 | `R_flange_parent` (3, 3), optional | mc_rtc: axes of the sensor's parent body at the flange; default the flange |
-| `R_flange_model_sensor` (3, 3), optional | mc_rtc: the sensor in the robot module; default as the parent body |
 
 World axes are those of the robot base, unless a file names `base_link`: UR's base turned by 180 deg about z.
 Frames named `tool0` are our flange; `flange` is ROS-Industrial's, with x out of the flange.
@@ -42,7 +41,6 @@ from tests.target_files import (
     in_sensor_axes,
     mapping,
     mass_kg,
-    message,
     mounting,
     numbers,
     six,
@@ -111,11 +109,9 @@ def ft_tools(text: str, R_base_flange: Array, wrench: Array, context: Context) -
 def ros2_message(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
     """ft_msgs/msg/FtCalibration, read by ft_tools/src/ft_parameters.cpp `from_msg`; formula as in `ft_tools`.
 
-    The vectors are geometry_msgs/Vector3. The message may stand in the field `ft_calibration` of a request of
-    `~/set_calibration` (ft_msgs/srv/SetCalibration), or in quotes in a `ros2` command.
+    The vectors are geometry_msgs/Vector3.
     """
-    fields = message(text)
-    file = mapping(fields.get("ft_calibration", fields))
+    file = mapping(yaml.safe_load(text))
     return _ft_calibration(file, xyz, (R_base_flange, wrench, context))
 
 
@@ -233,8 +229,7 @@ def mc_rtc(text: str, R_base_flange: Array, wrench: Array, context: Context) -> 
         raise ValueError("calib_data needs 13 numbers and white space after the last one")
     x = np.array([float(word) for word in words[:13]])
     R_flange_parent = np.asarray(context.get("R_flange_parent", np.eye(3)))
-    R_flange_model = np.asarray(context.get("R_flange_model_sensor", R_flange_parent))
-    R_flange_real = R_flange_model @ Rotation.from_euler("xyz", x[1:4]).as_matrix()
+    R_flange_real = R_flange_parent @ Rotation.from_euler("xyz", x[1:4]).as_matrix()
     com = R_flange_real.T @ (R_flange_parent @ x[4:7] - mounting(context)[1])
     force = np.array([0.0, 0.0, -x[0] * 9.80665]) @ (R_base_flange @ R_flange_real)
     return wrench - np.concatenate([x[10:13], x[7:10]], dtype=np.float64) - force_at(com, force)
@@ -256,8 +251,7 @@ def xarm(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Ar
 def static_transform(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
     """ros2/geometry2, tf2_ros `static_transform_publisher --x .. --qx .. --frame-id P --child-frame-id C`.
 
-    The transform is the pose of the child in the parent: it maps sensor to flange coordinates. With angles:
-    R = Rz(yaw) Ry(pitch) Rx(roll). The old positional form has yaw, pitch, roll in this order, or qx, qy, qz, qw.
+    The transform is the pose of the child in the parent: it maps sensor to flange coordinates.
     The load of the context keeps its place in the flange, so a wrong position shows as a wrong torque.
     """
     (command,) = re.findall(r"^[^#\n]*static_transform_publisher (.*)", text.replace("\\\n", " "), re.MULTILINE)
@@ -272,7 +266,7 @@ def static_transform(text: str, R_base_flange: Array, wrench: Array, context: Co
 
 
 def plain_json(text: str, R_base_flange: Array, wrench: Array, _: Context) -> Array:
-    """`ftdrive.export/1`, docs/ftdrive/exports.md; the fields are those of a calibration, calib/README.md.
+    """`ftdrive.export/1`, docs/reference/export-formats.md; the fields are those of a calibration.
 
     `u = R_flange_sensor^T R_base_flange^T gravity_force_base_N;
     raw - (force_bias_N, torque_bias_Nm) - (u, p x u) - (force_gain u, cross_talk_m u)`.

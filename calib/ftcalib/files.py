@@ -1,5 +1,9 @@
-"""Files that are complete or absent, never overwritten, and name their format."""
+"""Files that are complete or absent, never overwritten, and name their format.
 
+A JSON file also has its `checksum`, which reveals damage and edits.
+"""
+
+import hashlib
 import json
 import os
 from collections.abc import Mapping
@@ -60,10 +64,37 @@ def _refuse_existing(path: Path) -> None:
         raise FileExistsError(f"{path} exists already and is never overwritten: choose another name")
 
 
-def read_object(path: str | Path, error: type[Exception]) -> dict[str, Any]:
-    """Read a JSON file with one object; raise `error`, one sentence without the file name, if it has none."""
+def write_object(
+    path: str | Path, document: Mapping[str, JSON], *, indent: int | None = 1, allow_nan: bool = False
+) -> None:
+    """Write a new JSON file with its checksum. Raises as `write_new`."""
+    write_new(path, object_text(document, indent=indent, allow_nan=allow_nan))
+
+
+def object_text(document: Mapping[str, JSON], *, indent: int | None = 1, allow_nan: bool = False) -> str:
+    """Return the content of a JSON file: the document and its checksum."""
+    sealed = {**document, "checksum": _checksum(document)}
+    return json.dumps(sealed, indent=indent, allow_nan=allow_nan) + "\n"
+
+
+def read_object(path: str | Path, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:
+    """Read a JSON file as `object_of` takes its content. Raises `OSError` too."""
+    return object_of(Path(path).read_bytes(), error, accept_changed=accept_changed)
+
+
+def object_of(content: bytes, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:
+    """Return the object in a JSON file; raise `error`, one sentence without the file name, if it has none.
+
+    Parameters
+    ----------
+    content : bytes
+        Of the file. A document without a checksum, as people write it, is accepted.
+    error : type
+    accept_changed : bool
+        Accept a document that its checksum does not fit.
+    """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = content.decode()
     except UnicodeDecodeError as exc:
         raise error(f"this is not a text file (byte {exc.start} is not UTF-8): is it the right file?") from exc
     if not text.strip():
@@ -74,7 +105,23 @@ def read_object(path: str | Path, error: type[Exception]) -> dict[str, Any]:
         raise error(f"this is not valid JSON ({exc}): the file is damaged or of another kind.") from exc
     if not isinstance(document, dict):
         raise error(f"the file contains a JSON {type(document).__name__}, not an object: is it the right file?")
+    if not accept_changed and is_changed(document):
+        raise error(
+            "the content differs from its checksum, so the file is damaged or was edited: take it from a copy. If you "
+            "edited it yourself, delete its field 'checksum'."
+        )
     return document
+
+
+def is_changed(document: Mapping[str, JSON]) -> bool:
+    """Whether a document differs from its checksum; False if it has none."""
+    return "checksum" in document and document["checksum"] != _checksum(document)
+
+
+def _checksum(document: Mapping[str, JSON]) -> str:
+    """Return the SHA-256 of everything but the checksum, as JSON with sorted keys."""
+    content = {name: value for name, value in document.items() if name != "checksum"}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def check_format(document: Mapping[str, object], expected: str, error: type[Exception]) -> None:

@@ -111,8 +111,13 @@ class Finding:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build from `to_dict`. Raises `KeyError`, `TypeError` or `ValueError`."""
-        return cls(document["code"], document["severity"], document["values"])
+        """Build from `to_dict`. Raises `ValueError` if it is damaged."""
+        try:
+            finding = cls(document["code"], document["severity"], document["values"])
+            _ = finding.words  # which values of another type do not have
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"finding {json.dumps(document)}: {error}") from error
+        return finding
 
 
 def ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
@@ -240,8 +245,9 @@ CODES: Final[Mapping[str, Code]] = {
         "last", "let the sensor warm up and calibrate again"),
     "com_shifted": Code(_REJECT_OR_NOTE, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
         "load had shifted", "fix the load and calibrate again"),
-    "load_changed": Code(_REJECT_OR_NOTE, "from {pose:poses} on the weight has changed by {change_N:+.2g}",
-        "check whether something was lost or picked up, and calibrate again"),
+    "load_changed": Code(_REJECT_OR_NOTE, "from {pose:poses} on the weight has changed by {change_N:+.2g} and the "
+        "centre of mass by {shift_mm:.2g}", "check whether something was lost, picked up or shifted, and calibrate "
+        "again"),
     "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
         "of {sigma_N:.2g}", "hang something heavier on the sensor, or record longer and in more orientations"),
     "second_solution": Code(_REJECT, "a very different mounting of the sensor explains the data almost as well "

@@ -3,11 +3,11 @@
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,7 @@ from scipy.special import expit
 from ftcalib.assessment.verdict import SURE, expected_error
 from ftcalib.compensation import Compensator
 from ftcalib.errors import BadCalibration
-from ftcalib.files import JSON, check_format, read_object, write_new
+from ftcalib.files import JSON, check_format, is_changed, read_object, write_object
 from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from ftcalib.model import PARAMETER_NAMES, Array, Parameters, Rotations, is_rotation, read_only
@@ -62,7 +62,7 @@ class DriftResult:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """Estimates with their covariance; arrays are read-only. Frames and signs are those of calib/README.md.
+    """Estimates with their covariance; arrays are read-only. Frames and signs: docs/explanation/model.md.
 
     Examples
     --------
@@ -118,6 +118,7 @@ class CalibrationResult:
                 raise ValueError(f"{each.name} must be finite, not {value.tolist()}")
         if not is_rotation(self.R_flange_sensor):
             raise ValueError(f"R_flange_sensor must be a rotation matrix, not {self.R_flange_sensor.tolist()}")
+        _require_known_words(self)
         n = len(self.residuals)
         for name, shape in (("covariance", (15, 15)), ("residuals", (n, 6))):
             value = read_only(getattr(self, name))
@@ -151,11 +152,20 @@ class CalibrationResult:
 
         Two files with the same id compensate alike, whatever their provenance.
         """
+        return self._id(None if self.response is None else self.response.to_dict())
+
+    def _id(self, response: JSON) -> str:
+        """Return the id with these numbers of `response`, whose sigmas another computer may round otherwise."""
         numbers = [getattr(self.parameters, each.name).tolist() for each in fields(Parameters)]
         numbers += [self.covariance.tolist(), self.gain_sigma, self.g_m_s2]
-        if self.response is not None:
-            numbers.append(self.response.to_dict())
+        if response is not None:
+            numbers.append(response)
         return hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:12]
+
+    @property
+    def is_edited(self) -> bool:
+        """Whether its file was edited after it was solved, and accepted nevertheless."""
+        return bool(self.provenance.get("edited"))
 
     @property
     def verdict(self) -> Verdict:
@@ -372,30 +382,58 @@ class CalibrationResult:
         }
 
     @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build from the content of a calibration file; unknown fields are ignored. Raises `BadCalibration`."""
+    def from_dict(cls, document: Mapping[str, Any], *, accept_edited: bool = False) -> Self:
+        """Build from the content of a calibration file; unknown fields are ignored.
+
+        Parameters
+        ----------
+        document : mapping
+        accept_edited : bool
+            Accept content that its checksum, its id or its verdict does not fit; the result is then `is_edited`.
+
+        Raises
+        ------
+        BadCalibration
+        """
         check_format(document, FORMAT, BadCalibration)
         try:
-            return cls(
+            result = cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
                 **{field.name: document[field.name] for field in fields(cls) if field.name != "parameters"},
             )
+            derived = (("id", result._id(document.get("response"))), ("verdict", result.verdict))
+            edited = is_changed(document) or any(document.get(name, value) != value for name, value in derived)
         except KeyError as exc:
             raise BadCalibration(f"the calibration lacks the field {exc.args[0]}: the file is damaged.") from exc
-        except (TypeError, ValueError) as exc:
+        except (AttributeError, TypeError, ValueError) as exc:
             raise BadCalibration(f"the calibration cannot be read ({exc}): the file is damaged.") from exc
+        if not edited:
+            return result
+        if not accept_edited:
+            raise BadCalibration(
+                f"the content is not that of calibration {document.get('id')}: the file is damaged or was edited. Take "
+                "it from a copy, or apply it as it is with --force (live, record, stream, compensate, export)."
+            )
+        return replace(result, provenance={**result.provenance, "edited": True})
 
     def save(self, path: str | Path) -> None:
         """Write a new file; raises `FileExistsError` if it exists."""
-        write_new(path, json.dumps(self.to_dict(), allow_nan=False, indent=1) + "\n")
+        write_object(path, self.to_dict())
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a calibration file. Raises `BadCalibration` or `OSError`."""
+    def load(cls, path: str | Path, *, accept_edited: bool = False) -> Self:
+        """Read a calibration file, as `from_dict`. Raises `BadCalibration` or `OSError`."""
         try:
-            return cls.from_dict(read_object(path, BadCalibration))
+            document = read_object(path, BadCalibration, accept_changed=True)
+            return cls.from_dict(document, accept_edited=accept_edited)
         except BadCalibration as exc:
             raise BadCalibration(f"{Path(path).name}: {exc}") from exc
+
+
+def _require_known_words(result: CalibrationResult) -> None:
+    for name, words in (("method", Method), ("noise_source", NoiseSource)):
+        if getattr(result, name) not in get_args(words):
+            raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(get_args(words))}")
 
 
 def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:

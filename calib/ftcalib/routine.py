@@ -1,7 +1,7 @@
 """The calibration routine at one pose (wait until still, average, repeat if necessary) and the dataset of a tour.
 
-It reaches devices only through `ftcalib.ports` and prints nothing, so that a cell or a recording can drive it. Its
-decisions depend only on the readings of arm and sensor.
+Every path goes through it: a tour, poses by hand, a verification, a replay. It reaches devices only through
+`ftcalib.ports` and prints nothing. Its decisions depend only on the readings of arm and sensor.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -59,6 +59,8 @@ class PoseRecord:
     samples: WrenchSamples
     steady: bool
     """Neither flange nor mean wrench changed during the dwell."""
+    attempts: int = 1
+    """Dwells until this one, which was steady or the last."""
     clock_offset_ns: int = 0
     """From the host clock to the clock of the run, which may span a restart of the computer."""
     mean: PoseMean = field(init=False)
@@ -118,51 +120,39 @@ def take_pose(
     Raises
     ------
     TooFewSamples
-        The sensor is too slow for the averaging time.
+        The sensor is too slow even for the longest of `LONGER`.
     Exception
         Whatever the arm, the sensor or the guard raises.
     """
     guard = guard or sensor.check
-    for _ in range(sampling.attempts):
+    for attempt in range(1, sampling.attempts + 1):
         on_stage("settle")
         arm.wait_until_still(timeout_s=sampling.still_timeout_s, guard=guard)
         on_stage("sample")
         before = arm.state()
-        samples = collect_enough(sensor, sampling.average_s)
+        samples = _collect_enough(sensor, sampling.average_s)
         after = arm.state()
         guard()
         steady = turned_rad(before, after) < MOVED_RAD
         if steady:
             wrench = samples.wrench
             steady = is_stationary(wrench) if quiet_std is None else is_quiet(wrench, quiet_std)
+        record = PoseRecord(stop, pose, before, after, samples, steady, attempt)
         if steady:
             break
-    return PoseRecord(stop, pose, before, after, samples, steady)
+    return record
 
 
-def collect_enough(sensor: Sensor, average_s: float) -> WrenchSamples:
-    """Collect for `average_s` seconds; if that gives too few samples, repeat for longer.
-
-    Raises
-    ------
-    TooFewSamples
-        The longest time gave too few samples.
-    """
+def _collect_enough(sensor: Sensor, average_s: float) -> WrenchSamples:
+    """Collect for `average_s` seconds; if that gives too few samples, repeat for longer."""
     for times in LONGER:
         samples = sensor.collect(times * average_s)
         if len(samples.wrench) >= LEAST_SAMPLES:
-            break
-    require_enough(samples, times * average_s)
-    return samples
-
-
-def require_enough(samples: WrenchSamples, average_s: float) -> None:
-    """Raise `TooFewSamples` if there are too few samples to average."""
-    if len(samples.wrench) < LEAST_SAMPLES:
-        raise TooFewSamples(
-            f"the sensor sent {len(samples.wrench)} samples in {average_s} s, at least {LEAST_SAMPLES} are needed: "
-            "check its rate, or average longer"
-        )
+            return samples
+    raise TooFewSamples(
+        f"the sensor sent {len(samples.wrench)} samples in {times * average_s} s, at least {LEAST_SAMPLES} are needed: "
+        "check its rate, or average longer"
+    )
 
 
 def turned_rad(before: ArmReading, after: ArmReading) -> float:

@@ -10,7 +10,11 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from typing import Protocol
+from typing import Final, Protocol, TypeVar
+
+Heard = TypeVar("Heard")
+_OVERSLEPT_S: Final = 0.002
+"""After a wait that ends this late the computer was busy, and something may have arrived meanwhile."""
 
 
 class Waitable(Protocol):
@@ -21,19 +25,21 @@ class Waitable(Protocol):
 
 
 class Clock(ABC):
-    """A monotonic clock and the ways to wait on it. Every method may be called from any thread."""
+    """A monotonic clock and the ways to wait on it. Every method may be called from any thread.
 
-    emulated = False
-    """Whether the cell is emulated: then limits hold in the cell's time, never in that of the computer."""
+    What differs in an emulated cell is here, as limits and methods; no driver knows which clock it has.
+    """
 
-    @property
-    def poll_s(self) -> float:
-        """The longest that one read may block, in real time; the time of an emulated cell stands still meanwhile."""
-        return 0.005 if self.emulated else 0.05
+    poll_s = 0.05
+    """The longest that one read may block, in real time; the time of an emulated cell stands still meanwhile."""
+    lead_s = 0.0
+    """The most that a device may be behind this clock, as one in another process is that starves."""
+    can_be_held = False
+    """Whether time stands still in a `held` block."""
 
     def patience_s(self, limit_s: float) -> float:
-        """Return a limit on another process in real time: a long one in an emulated cell, whose far side may starve."""
-        return 30.0 if self.emulated else limit_s
+        """Return a limit on another process in real time: a long one in an emulated cell, where it may starve."""
+        return limit_s
 
     @abstractmethod
     def now_ns(self) -> int:
@@ -72,6 +78,21 @@ class Clock(ABC):
         most. A real clock waits for no thread.
         """
         return nullcontext()
+
+    def held(self) -> AbstractContextManager[object]:
+        """Mark a block in which the time of an emulated cell does not go on, so that its devices send no more."""
+        return nullcontext()
+
+    def hear(self, look: Callable[[float], Heard | None], silence_s: float) -> Heard | None:
+        """Return what `look` finds within `silence_s`, called in a `held` block; None for a silence.
+
+        A silence counts if this thread was awake to hear it. Where time stands still, nothing more arrives.
+        """
+        wait_s, begin_s = 0.0 if self.can_be_held else silence_s, self.now_s()
+        found = look(wait_s)
+        if found is None and self.now_s() - begin_s >= wait_s + _OVERSLEPT_S:
+            found = look(0.0)
+        return found
 
     def away(self) -> AbstractContextManager[object]:
         """Mark a block in which a thread that keeps up waits for something else, such as the answer of a web server.

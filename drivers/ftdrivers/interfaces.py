@@ -252,7 +252,7 @@ class ControllerSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Diagnosis:
     """A check that a driver makes of its own device, beyond what every device of its kind reports."""
 
     name: str
@@ -410,7 +410,7 @@ class RobotArm(_Device):
         """Return the program that runs, as the controller reports it; None where it does not."""
         return None
 
-    def diagnose(self) -> list[Finding]:
+    def diagnose(self) -> list[Diagnosis]:
         """Check what only this kind of controller has and a program needs, such as its ports.
 
         Only reads. Errors become findings. The default has nothing to check.

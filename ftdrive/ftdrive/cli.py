@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from errno import ENOSPC
 from io import StringIO
-from pathlib import Path
 from typing import Any
 
 import click
@@ -134,9 +133,7 @@ def main() -> int:
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.default_int_handler)
-    if sys.stdout is None or sys.stderr is None:  # closed by who started us
-        lost = Path(os.devnull).open("w")  # noqa: SIM115  up to the end
-        sys.stdout, sys.stderr = sys.stdout or lost, sys.stderr or lost
+    _open_closed_streams()
     code = run(sys.argv[1:])
     try:
         sys.stdout.flush()
@@ -145,6 +142,13 @@ def main() -> int:
     if code == _CLOSED_PIPE:  # Python writes at its end what is left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return code
+
+
+def _open_closed_streams() -> None:
+    """Connect standard streams that the caller has closed to nothing, so that no other file gets their numbers."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
 
 
 def run(arguments: Sequence[str]) -> int:

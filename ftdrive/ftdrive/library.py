@@ -124,7 +124,8 @@ def open_stream(
         Called with each `Contact` when it has lasted 60 to 80 ms, and again when it is over (`contact.over`), by the
         thread that reads. `CompensatedStream.on_contact` may be set at any time.
     force : bool
-        Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`.
+        Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`, or one that
+        was edited by hand, with a mark in `StreamInfo.marks`.
 
     Raises
     ------
@@ -141,8 +142,11 @@ def open_stream(
     >>> sample.force_N.shape, str(sample.frame)
     ((3,), 'base axes, about the sensor origin')
     """
-    name = str(calibration) if isinstance(calibration, str | Path) else ""
-    given = read_calibration(calibration) if isinstance(calibration, str | Path) else calibration
+    given: CalibrationResult | None
+    if isinstance(calibration, str | Path):
+        name, given = str(calibration), read_calibration(calibration, accept_edited=force)
+    else:
+        name, given = "", calibration
     cell: CellConfig | Station
     chosen: CalibrationResult | str
     if simulate:

@@ -87,7 +87,7 @@ class Cable:
 
 
 @dataclass(frozen=True)
-class Drift:
+class SensorDrift:
     """A zero that moves linearly by `total` (6,), N and N·m in sensor axes, in `seconds`, and stays there."""
 
     total: Array

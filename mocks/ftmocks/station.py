@@ -177,7 +177,7 @@ class Station:
         self._sensors: dict[str, Sensor] = {}
         self._ended = False
         self._line = bytearray()
-        self._verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+        self._verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any] | None]] = {
             "state": self._state,
             "delay": self._delay,
             **Workcell(self.world, self._sensors).verbs,
@@ -275,12 +275,12 @@ class Station:
     def _answer(self, line: bytes) -> dict[str, Any]:
         try:
             request = json.loads(line)
-            verb = self._verbs[request["do"].replace("_", "-")]
+            verb = self._verbs[name := request["do"].replace("_", "-")]
         except (ValueError, TypeError, KeyError, AttributeError):
             known = ", ".join(self._verbs)
             return {"error": f'not understood: {line.decode("utf-8", "replace")}; send {{"do": …}} with {known}'}
         try:
-            return verb(request)
+            return {"done": name, **(verb(request) or {})}
         except (ValueError, TypeError, KeyError, OSError) as error:
             return {"error": f"{request['do']}: {error!r}"}
 
@@ -290,7 +290,7 @@ class Station:
         given = {link: delay_ms for link, delay_ms in delays.items() if delay_ms is not None}
         return [json.dumps({"do": "delay", **given})] if given else []
 
-    def _delay(self, request: dict[str, Any]) -> dict[str, Any]:
+    def _delay(self, request: dict[str, Any]) -> None:
         """Set the time between measurement and sending."""
         given = {link: float(request[link]) for link in ("sensor_ms", "rtde_ms") if link in request}
         if not given:
@@ -303,16 +303,15 @@ class Station:
                 raise ValueError("this station has no sensor")
             for emulator in emulators:
                 emulator.faults.delay_s = 1e-3 * given["sensor_ms"]
-        self.server.delay_s = 1e-3 * given.get("rtde_ms", 1e3 * self.server.delay_s)
+        self.server.rtde.delay_s = 1e-3 * given.get("rtde_ms", 1e3 * self.server.rtde.delay_s)
         self.robot.note("network", "delay", why=json.dumps(given))
-        return {"done": "delay"}
 
     def _play(self, recording: Recording, request: dict[str, Any]) -> dict[str, Any]:
         """Continue the recording at another place, at another pace."""
         now_s = self._clock.now_s()
         at_s = float(request.get("at_s", recording.at_s(now_s)))
         recording.play(now_s, at_s, float(request.get("pace", recording.pace)))
-        return {"done": "recording", "at_s": at_s, "pace": recording.pace}
+        return {"at_s": at_s, "pace": recording.pace}
 
     def _state(self, request: dict[str, Any]) -> dict[str, Any]:
         robot, arm = self.robot, self.robot.arm
@@ -335,7 +334,7 @@ class Station:
             "speed_scaling": arm.pace,
             **({} if self._recording is None else {"recording_s": self._recording.at_s(self._clock.now_s())}),
             "true_wrench": self.world.true_wrench().tolist(),
-            "bad_inputs": self.server.bad_inputs,
+            "bad_inputs": self.server.rtde.bad_inputs,
             "t_host_ns": self._clock.now_ns(),
             "events": [event.to_json() for event in robot.events[int(request.get("since", 0)) :]],
         }

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ftmocks.arrays import Array
-from ftmocks.disturbances import FOREVER_S, Cable, Drift, Push
+from ftmocks.disturbances import FOREVER_S, Cable, Push, SensorDrift
 from ftmocks.sensors.catalogue import Sensor
 from ftmocks.wires.faults import Faults
 from ftmocks.world import World
@@ -34,7 +34,7 @@ class Workcell:
     def __init__(self, world: World, sensors: Mapping[str, Sensor]) -> None:
         self._world = world
         self._sensors = sensors
-        self.verbs: dict[str, Callable[[Request], dict[str, Any]]] = {
+        self.verbs: dict[str, Callable[[Request], dict[str, Any] | None]] = {
             "push": self._push,
             "bump": self._bump,
             "cable": self._cable,
@@ -46,27 +46,25 @@ class Workcell:
             "sensor-faults": self._sensor_faults,
             "unplug": self._unplug,
         }
-        """Requests by the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
+        """By the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
 
-    def _push(self, request: Request) -> dict[str, Any]:
+    def _push(self, request: Request) -> None:
         wrench = _numbers(request["wrench"], 6)
         push = self._contact(wrench, request, FOREVER_S)
         self._world.touch("push", push if wrench.any() else None)
-        return {"done": "push"}
 
-    def _bump(self, request: Request) -> dict[str, Any]:
+    def _bump(self, request: Request) -> None:
         wrench = _numbers(request.get("wrench", BUMP_BASE), 6)
         self._world.touch("bump", self._contact(wrench, {"axes": "base", **request}, BUMP_S))
-        return {"done": "bump"}
 
     def _contact(self, wrench: Array, request: Request, seconds: float) -> Push:
         in_sensor = {"sensor": True, "base": False}[request.get("axes", "sensor")]
         return Push(wrench, in_sensor, self._world.now_s + float(request.get("seconds", seconds)))
 
-    def _cable(self, request: Request) -> dict[str, Any]:
+    def _cable(self, request: Request) -> None:
         if not request.get("on", True):
             self._world.touch("cable", None)
-            return {"done": "cable"}
+            return
         point_m = _numbers(request.get("point_m", CABLE_POINT_M), 3)
         if "joint" in request:
             joint = int(request["joint"])
@@ -79,13 +77,11 @@ class Workcell:
             within_rad = float(np.radians(request.get("within_deg", 45.0)))
             cable = Cable(_numbers(request["force_N"], 3), point_m, towards=towards, within_rad=within_rad)
         self._world.touch("cable", cable)
-        return {"done": "cable"}
 
-    def _drift(self, request: Request) -> dict[str, Any]:
+    def _drift(self, request: Request) -> None:
         zero = [0.0] * 3
         total = [*_numbers(request.get("force_N", zero), 3), *_numbers(request.get("torque_Nm", zero), 3)]
-        self._world.drifts += (Drift(np.array(total), self._world.now_s, float(request["seconds"])),)
-        return {"done": "drift"}
+        self._world.drifts += (SensorDrift(np.array(total), self._world.now_s, float(request["seconds"])),)
 
     def _payload_shift(self, request: Request) -> dict[str, Any]:
         mass_kg = float(request["mass_kg"]) if "mass_kg" in request else None
@@ -93,27 +89,24 @@ class Workcell:
         if mass_kg is None and com_m is None:
             raise KeyError("mass_kg")
         self._world.shift_payload(mass_kg, com_m)
-        return {"done": "payload-shift", "truth": self._world.truth.to_json()}
+        return {"truth": self._world.truth.to_json()}
 
-    def _freeze_sensor(self, request: Request) -> dict[str, Any]:
+    def _freeze_sensor(self, request: Request) -> None:
         self._world.read_always(None)
         if request.get("on", True):
             self._world.read_always(self._world.measure(1)[0])
-        return {"done": "freeze-sensor"}
 
-    def _nan(self, request: Request) -> dict[str, Any]:
+    def _nan(self, request: Request) -> None:
         for sensor in self._chosen(request):
             if not sensor.carries_nan:
                 raise ValueError(f"the wire of {sensor.name} carries whole numbers only")
         self._world.read_always(NO_NUMBER if request.get("on", True) else None)
-        return {"done": "nan"}
 
-    def _saturate(self, request: Request) -> dict[str, Any]:
+    def _saturate(self, request: Request) -> None:
         for sensor in self._chosen(request):
             sensor.saturate(int(request.get("axis", 2)) if request.get("on", True) else None)
-        return {"done": "saturate"}
 
-    def _sensor_faults(self, request: Request) -> dict[str, Any]:
+    def _sensor_faults(self, request: Request) -> None:
         known = {field.name for field in fields(Faults)}
         changes = {key: value for key, value in request.items() if key not in ("do", "device")}
         if unknown := sorted(changes.keys() - known):
@@ -121,13 +114,12 @@ class Workcell:
         for sensor in self._chosen(request):
             for key, value in changes.items():
                 setattr(sensor.emulator.faults, key, type(getattr(sensor.emulator.faults, key))(value))
-        return {"done": "sensor-faults"}
 
     def _unplug(self, request: Request) -> dict[str, Any]:
         chosen = self._chosen(request)
         for sensor in chosen:
             sensor.emulator.unplug()
-        return {"done": "unplug", "devices": [sensor.name for sensor in chosen]}
+        return {"devices": [sensor.name for sensor in chosen]}
 
     def _chosen(self, request: Request) -> list[Sensor]:
         device = request.get("device", "sensor")

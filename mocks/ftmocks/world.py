@@ -15,7 +15,7 @@ import numpy as np
 
 from ftmocks.arrays import Array
 from ftmocks.clock import CellClock
-from ftmocks.disturbances import Contact, Drift
+from ftmocks.disturbances import Contact, SensorDrift
 from ftmocks.inertia import drawn_gyration, moved_load
 from ftmocks.kinematics import Dh, FlangeMotion, JointState, Vector6, cross, flange_motion, forward, rotation
 
@@ -186,7 +186,7 @@ class World:
         self.q = q
         self.contacts: dict[str, Contact] = {}
         """What touches the tool, by name."""
-        self.drifts: tuple[Drift, ...] = ()
+        self.drifts: tuple[SensorDrift, ...] = ()
         """Drifts of the zero besides the drift of the truth."""
         self._t0_s = self.now_s
         self._lock = threading.Lock()

@@ -1,7 +1,7 @@
 """Every emulated sensor, ten seeds and every command on a computer that has no time for them.
 
-uv run python tests/benchmarks/busy_demo.py              # beside three busy loops
-uv run python tests/benchmarks/busy_demo.py --loops 0    # on an idle computer, to compare
+uv run python -m tests.benchmarks.busy_demo              # beside three busy loops
+uv run python -m tests.benchmarks.busy_demo --loops 0    # on an idle computer, to compare
 
 A row passes if the exit code is 0 and, of a demo, the verdict is good. It may take as long as it likes.
 """

@@ -1,6 +1,6 @@
 """Faults in poses and wrenches: is the cause named first, does its advice lead to the truth, are sound sessions quiet?
 
-    uv run python tests/benchmarks/faults.py [--runs 100] [--sound 1000] [--only WORD] [--poses haar]
+    uv run python -m tests.benchmarks.faults [--runs 100] [--sound 1000] [--only WORD] [--poses haar]
 
 Prints for each fault, with 24 and 12 poses, with and without measured noise: how often its name came first, how often
 the verdict was good, and how often the first finding, followed by its values, led to the truth.

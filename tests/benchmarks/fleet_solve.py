@@ -1,6 +1,6 @@
 """Many runs solved again: speed-up, memory, a killed worker, identical bytes.
 
-    uv run python tests/benchmarks/fleet_solve.py [--runs 10000] [--workers N] [--dask]
+    uv run python -m tests.benchmarks.fleet_solve [--runs 10000] [--workers N] [--dask]
 
 Prints one row per figure: name, figure, target, pass or FAIL. The exit code is the number of rows that failed. The run
 folders are copies of few distinct tours of 24 poses. Free cores are those that nothing else used during the pass, but

@@ -1,6 +1,6 @@
 """Random bytes and damaged golden frames into all that decodes: only documented exceptions, no hang, no growing memory.
 
-    python tests/benchmarks/fuzz.py [--inputs 1000000] [--only matrix]
+    python -m tests.benchmarks.fuzz [--inputs 1000000] [--only matrix]
 
 Half of the inputs of each codec are random bytes, half are frames from the vendors' documents with some bytes changed,
 added or missing. Prints for each codec how many inputs were refused, the longest time one took and how much memory

@@ -1,8 +1,8 @@
 """Every row of the hazard table that software can see, injected into a tour on the emulated cell, at real speed.
 
-uv run python tests/benchmarks/hazards.py                # every row; about 30 minutes
-uv run python tests/benchmarks/hazards.py --only 14 15   # some rows
-uv run python tests/benchmarks/hazards.py --repeat 3     # each fault so often
+uv run python -m tests.benchmarks.hazards                # every row; about 30 minutes
+uv run python -m tests.benchmarks.hazards --only 14 15   # some rows
+uv run python -m tests.benchmarks.hazards --repeat 3     # each fault so often
 
 Every run that was stopped is resumed, and its calibration compared with that of an undisturbed run. Noise alone puts
 two runs of a noisy sensor 1.4 sigma of one run apart, which would hide what a fault leaves behind. So all runs but the

@@ -1,7 +1,7 @@
 """How soon the arm decelerates when the computer that moves it fails, by the script path; and false stops.
 
-    python tests/benchmarks/heartbeat.py [--trials 100] [--only power] [--seed 1]
-    python tests/benchmarks/heartbeat.py --minutes 10
+    python -m tests.benchmarks.heartbeat [--trials 100] [--only power] [--seed 1]
+    python -m tests.benchmarks.heartbeat --minutes 10
 
 An emulated UR5e at real speed turns a joint at 0.5 rad/s. In mid-move our process is killed, is suspended, loses its
 network in both directions, or loses its power, so that the controller sees no end of the connection. The time runs

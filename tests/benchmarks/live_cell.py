@@ -1,6 +1,6 @@
 """The compensated stream of an emulated cell over real wires: delay, residual of a moving arm, a push, cost.
 
-    uv run python tests/benchmarks/live_cell.py [--sensor serial] [--seconds 20]
+    uv run python -m tests.benchmarks.live_cell [--sensor serial] [--seconds 20]
 
 The arm swings with 1 rad/s, 2 rad/s² and 2 m/s², while the links delay the samples of the sensor and of the arm.
 """

@@ -1,6 +1,6 @@
 """The compensated stream against its targets: free tool at rest, false alarms, moving arm with delayed links.
 
-    uv run python tests/benchmarks/live_figures.py [--quick]
+    uv run python -m tests.benchmarks.live_figures [--quick]
 
 Everything is simulated with fixed seeds. The exit code is the number of figures that miss their target.
 """

@@ -1,6 +1,6 @@
 """A stream with all its consumers: screen, recording and one Foxglove client, from the wires of an emulated cell.
 
-    uv run python tests/benchmarks/live_soak.py [--seconds 600] [--size 160x50]
+    uv run python -m tests.benchmarks.live_soak [--seconds 600] [--size 160x50]
 
 An ATI sensor at 7 kHz and the arm at 500 Hz, in another process and in real time. Printed: samples that are missing in
 the file, CPU and growth of memory of the whole program, and latencies (median, 95 %) in ms by the clock of the cell:
@@ -11,25 +11,29 @@ its own.
 """
 
 import argparse
+import fcntl
 import json
 import os
+import pty
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import threading
 import time
 from array import array
 from collections import deque
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from ftdrive.cell.emulated import Station
 from ftdrive.live.samples import Block, StreamEvent
@@ -40,14 +44,12 @@ from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live_screen import LiveApp
 from ftdrivers.interfaces import FtSamples
-from tests.benchmarks.on_terminal import on_terminal
 from tests.benchmarks.stream_latency import EVERY
 from tests.unit.ftdrive.live.simulated import calibrated_from
 
 WARM_UP_S = 60.0
 SKIPPED = 25
 """Ages at the beginning that do not count in latencies: 2 s."""
-CLIENT = Path(__file__).with_name("stream_latency.py")
 
 
 class Both:
@@ -138,7 +140,14 @@ def run(duration_s: float) -> dict[str, object]:
         both = Both(Recorder([path := Path(folder, "soak.mcap")], stream.info, {}), server, stream)
         feed = Feed(stream, lambda _: both)
         client = subprocess.Popen(
-            [sys.executable, CLIENT, "client", str(server.port), station.endpoints["clock"]],
+            [
+                sys.executable,
+                "-m",
+                "tests.benchmarks.stream_latency",
+                "client",
+                str(server.port),
+                station.endpoints["clock"],
+            ],
             stdout=subprocess.PIPE,
             text=True,
         )
@@ -199,6 +208,25 @@ def piped(lines: int) -> list[float]:
     return percentiles(age_ns[10:])
 
 
+def on_terminal(width: int, height: int, arguments: Sequence[str]) -> Any:
+    """Run this script on a pseudo-terminal whose output is read; return the figures that it writes to `--report`."""
+    main, side = pty.openpty()
+    fcntl.ioctl(side, termios.TIOCSWINSZ, struct.pack("HHHH", height, width, 0, 0))
+    report, written = os.pipe()
+    environment = os.environ | {"TERM": "xterm-256color", "COLUMNS": str(width), "LINES": str(height)}
+    command = [sys.executable, "-m", "tests.benchmarks.live_soak", "--report", str(written), *arguments]
+    with subprocess.Popen(command, stdin=side, stdout=side, stderr=side, pass_fds=[written], env=environment) as child:
+        os.close(side)
+        os.close(written)
+        try:
+            while True:
+                os.read(main, 1 << 16)
+        except OSError:  # the child has ended
+            child.wait()
+    with os.fdopen(report) as file:
+        return json.loads(file.read())
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=600.0)
@@ -209,7 +237,7 @@ if __name__ == "__main__":
         os.write(options.report, json.dumps(run(options.seconds)).encode())
         sys.exit()
     columns, lines = map(int, options.size.split("x"))
-    figures, _ = on_terminal(__file__, columns, lines, ["--seconds", str(options.seconds)])
+    figures = on_terminal(columns, lines, ["--seconds", str(options.seconds)])
     figures["stdout_ms"] = piped(round(10 * min(options.seconds, 30)))
     for name, figure in figures.items():
         sys.stdout.write(f"{name:16} {figure}\n")

@@ -1,6 +1,6 @@
 """Print the figures of plans beside their targets, and look for collisions in random plans.
 
-Run: python tests/benchmarks/planning.py [--plans 1000]
+Run: python -m tests.benchmarks.planning [--plans 1000]
 """
 
 import argparse

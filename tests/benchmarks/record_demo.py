@@ -1,4 +1,4 @@
-"""Record `ftdrive demo` in a terminal of 80x24 as an animated SVG: `uv run python tests/benchmarks/record_demo.py`.
+"""Record `ftdrive demo` in a terminal of 80x24 as an animated SVG: `uv run python -m tests.benchmarks.record_demo`.
 
 Runs the real command in tmux, copies its screen about once a second, and draws the screens with rich.
 """

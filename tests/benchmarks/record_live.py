@@ -1,4 +1,4 @@
-"""Draw the live screen in its states as SVG for the documentation: `uv run python tests/benchmarks/record_live.py`.
+"""Draw the live screen in its states as SVG for the documentation: `uv run python -m tests.benchmarks.record_live`.
 
 A stream without devices feeds the real app. Dots of Braille become paths, because many fonts lack them.
 """
@@ -6,13 +6,10 @@ A stream without devices feeds the real app. Dots of Braille become paths, becau
 import asyncio
 import os
 import re
-import sys
 import time
 from html import unescape
 from pathlib import Path
 from typing import get_args
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from ftdrive.checks.check import Check
 from ftdrive.terminal.live.feed import Feed

@@ -1,7 +1,7 @@
 """Pictures of a report in headless Chromium: light and dark, at the width of a desk and of a phone. Run by hand.
 
     uv run ftdrive report RUN -o report.html
-    uv run python tests/benchmarks/report_pictures.py report.html --out pictures
+    uv run python -m tests.benchmarks.report_pictures report.html --out pictures
 
 Prints a line per picture. The exit code is 1 if the browser reports a message of the console, a request to anything but
 the page, or a page wider than its window. Needs the command `chromium`.

@@ -1,11 +1,10 @@
 """How well sensors of inexact calibration are predicted, and whether stated uncertainties hold on real data.
 
-    FTDRIVE_REAL_DATA=… uv run python tests/benchmarks/sensor_model.py [--quick] [--only PART]
+    FTDRIVE_REAL_DATA=… uv run python -m tests.benchmarks.sensor_model [--quick] [--only PART]
 
 Prints one row per figure: name, figure, target, pass or FAIL; the exit code is the number of rows that failed.
 """
 
-import argparse
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -27,7 +26,7 @@ from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, predict
 from ftcalib.published.yu import lrom
 from ftcalib.result import COMMON_GAIN
 from tests.benchmarks import scenarios as sim
-from tests.benchmarks.accuracy import Lab, Row, band, laboratory, most
+from tests.benchmarks.accuracy import Lab, Row, band, most, run
 
 Rows = NDArray[np.intp]
 
@@ -245,22 +244,5 @@ PARTS: dict[str, Callable[[Lab], Iterator[Row]]] = {
 }
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description="Sensors of inexact calibration.")
-    parser.add_argument("--quick", action="store_true", help="few runs")
-    parser.add_argument("--only", choices=PARTS, action="append", help="one part; may be repeated")
-    options = parser.parse_args()
-    failed = 0
-    write = partial(print, flush=True)
-    pool, lab = laboratory(quick=options.quick)
-    with pool:
-        for name in options.only or PARTS:
-            for row in PARTS[name](lab):
-                failed += not row.passed
-                mark = "pass" if row.passed else "FAIL"
-                write(f"{row.name:75} {row.figure:>16}   {row.target:16} {mark} {row.runs:6}")
-    return failed
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(PARTS, "Sensors of inexact calibration."))

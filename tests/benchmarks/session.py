@@ -1,6 +1,6 @@
 """A whole session at the pace of a real cell, questions answered at once: wall time, and the truth against its sigma.
 
-uv run python tests/benchmarks/session.py
+uv run python -m tests.benchmarks.session
 """
 
 import sys
@@ -13,7 +13,8 @@ import numpy as np
 
 from ftcalib.routine import Sampling
 from ftdrive.cell.emulated import Station
-from ftdrive.session.session import Options, calibrate
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.session import calibrate
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.report import errors_in_sigma
 
@@ -26,7 +27,7 @@ def main() -> int:
     for poses, target_s in TARGETS_S.items():
         with Station("can", ["--seed", "2", "--time-scale", "1"]) as station, tempfile.TemporaryDirectory() as folder:
             cell = replace(station.cell, sampling=Sampling())
-            options = Options(Path(folder), poses=poses, real=False, questions=False)
+            options = SessionOptions(Path(folder), poses=poses, real=False, questions=False)
             start_s = time.perf_counter()
             outcome = calibrate(cell, PlainOperator(), options)
             took_s = time.perf_counter() - start_s

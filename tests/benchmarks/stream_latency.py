@@ -1,6 +1,6 @@
 """Latency from a block to a WebSocket client, and what the server costs, at 7 kHz.
 
-    python tests/benchmarks/stream_latency.py [seconds]
+    python -m tests.benchmarks.stream_latency [seconds]
 
 Blocks of 10 ms with both wrenches of each sample, poses and joint angles at 500 Hz, frames and arrows at 60 Hz. Each
 client is a process of its own that takes every topic; it measures from the moment before the block is written. CPU is
@@ -120,7 +120,7 @@ def measure(clients: int, duration_s: float) -> bool:
     stream = FakeStream()
     stream.info = replace(INFO, utc_offset_ns=0)
     with closing(FoxgloveServer(cast(Any, stream), port=0)) as server:
-        command = [sys.executable, __file__, "client", str(server.port)]
+        command = [sys.executable, "-m", "tests.benchmarks.stream_latency", "client", str(server.port)]
         processes = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(clients)]
         for process in processes:
             assert process.stdout is not None

@@ -1,6 +1,6 @@
 """What the streams carry, against emulated sensors in processes of their own.
 
-    python tests/benchmarks/streams.py [--seconds 60] [--samples 0] [--only bota]
+    python -m tests.benchmarks.streams [--seconds 60] [--samples 0] [--only bota]
 
 Prints one line per figure: the figure, the target, pass or FAIL. The 7 kHz stream of an ATI serial sensor and the
 500 Hz of an arm are each followed alone. Then the serial stream runs beside the wrist sensor of an arm, 500 samples a
@@ -37,6 +37,7 @@ from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 from ftdrivers.ur.arm import UrArm
 from tests.wire.conftest import Station
+from tests.wire.laboratory import Laboratory, numbers_in
 from tests.wire.test_sensor_faults import (
     CYCLES,
     HEALTHY,
@@ -44,11 +45,9 @@ from tests.wire.test_sensor_faults import (
     SCRIPT,
     UNASKED,
     Emulator,
-    Laboratory,
     Watched,
     applies,
     chances,
-    numbers_in,
     starts,
     suffer,
 )

@@ -1,6 +1,6 @@
 """How soon a failure of arm, links or processes is reported, and the arm stands and works again, at real speed.
 
-    python tests/benchmarks/ur_failures.py [--repeats 3] [--only silent]
+    python -m tests.benchmarks.ur_failures [--repeats 3] [--only silent]
 
 The events are those of tests/wire/test_ur_failures.py, which shows what is raised. They befall an emulated UR5e in the
 middle of a move of 1.3 s. Three times, each the worst of the repeats: from the event until the error is raised, from
@@ -27,8 +27,24 @@ from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control_process import ControlProcess
 from tests.wire.conftest import Station
 from tests.wire.moves import STEP_RAD, away, no_guard
-from tests.wire.test_ur_failures import APPLICATION, EVENTS, Once, nothing, on, wait_until_moving
+from tests.wire.test_ur_failures import EVENTS, Once, nothing, on, wait_until_moving
 
+APPLICATION = """
+import sys
+from ftdrivers.errors import DeviceError
+from ftdrivers.ur.arm import UrArm
+arm = UrArm(sys.argv[1], speed_rad_s=float(sys.argv[2]), acceleration_rad_s2=3.0)
+arm.open(control=True)
+print(arm._control._process.pid, flush=True)
+q = arm.state().q_rad
+q[5] += -1.2 if q[5] > 0.5 else 1.2
+try:
+    arm.move_to(q.tolist(), timeout_s=20, guard=lambda: None)
+    print("arrived", abs(arm.state().q_rad[5] - q[5]) < 1e-3, flush=True)
+except DeviceError as error:
+    print(type(error).__name__, error, flush=True)
+arm.close()
+"""
 ROOT = Path(__file__).parents[2]
 FROZEN = "freeze"
 SPEED_RAD_S = radians(60)

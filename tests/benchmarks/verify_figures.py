@@ -1,6 +1,6 @@
 """False alarms of a verification, and the changes that it names, in simulation.
 
-    uv run python tests/benchmarks/verify_figures.py [--quick] [--only PART]
+    uv run python -m tests.benchmarks.verify_figures [--quick] [--only PART]
 
 Prints one row per figure: name, figure, target, pass or FAIL, runs; then the names given to each change. The exit code
 is the number of rows that failed.
@@ -10,7 +10,6 @@ samples, whose covariance is known, or estimated in the rows "dwells". The new p
 orientations.
 """
 
-import argparse
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -28,8 +27,8 @@ from ftcalib.extras.verification import SINGLE, verify
 from ftcalib.likelihood.gain_and_cross_talk import response_columns
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, predict
 from ftcalib.poses.information import SUBSET_6, T12, special
-from ftcalib.poses.verification import choose_verification_poses
-from tests.benchmarks.accuracy import Lab, Row, band, laboratory
+from ftcalib.poses.verification_poses import choose_verification_poses
+from tests.benchmarks.accuracy import Lab, Row, band, run
 from tests.benchmarks.scenarios import Rng, direction
 
 SAMPLES, NOISE = 200, np.repeat([0.05, 0.002], 3)
@@ -221,23 +220,5 @@ def names(lab: Lab) -> Iterator[Row]:
 PARTS: dict[str, Callable[[Lab], Iterator[Row]]] = {"false-alarms": false_alarms, "names": names, "beyond": beyond}
 
 
-def main() -> int:
-    """Print all rows."""
-    parser = argparse.ArgumentParser(description="Verification of a calibration.")
-    parser.add_argument("--quick", action="store_true", help="few runs")
-    parser.add_argument("--only", choices=PARTS, action="append", help="one part; may be repeated")
-    options = parser.parse_args()
-    failed = 0
-    write = partial(print, flush=True)
-    pool, lab = laboratory(quick=options.quick)
-    with pool:
-        for name in options.only or PARTS:
-            for row in PARTS[name](lab):
-                failed += not row.passed
-                mark = "pass" if row.passed else "FAIL"
-                write(f"{row.name:62} {row.figure:>10}   {row.target:16} {mark} {row.runs:6}")
-    return failed
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run(PARTS, "Verification of a calibration."))

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -20,8 +22,13 @@ from ftdrive.cli import cli
 from ftdrive.planning.search.constant_tour import NUMBERS, constant_tour
 from ftdrive.runs.run import Run
 from ftdrive.session.events import Estimated, Event, PoseTaken
-from ftdrive.session.hand_guided import Recorder, collect_manually
+from ftdrive.session.guards import Limits
+from ftdrive.session.hand_guided import HandGuided
+from ftdrive.session.journal import Journal
+from ftdrive.session.live_fit import Judge
+from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key, Question
+from ftdrive.session.pose_book import PoseBook
 from ftdrive.terminal.report import errors_in_sigma
 from ftdrivers.errors import StreamBroken
 from ftdrivers.interfaces import ArmState, ArmStatus, RobotArm
@@ -139,17 +146,11 @@ def watch(station: Station, run: Run, *, commit: Callable[[PoseRecord], None] | 
         mover = Mover(theirs, [*tour, tour[0]])
         person = Person(mover.measured)
         with mover:
-            arm = Spectator(ours, mover)
-            collect_manually(
-                arm,
-                sensor,
-                cell.sampling,
-                person,
-                Recorder(Fit().add, commit or run.commit),
-                down_base=np.array([0.0, 0.0, -1.0]),
-                listen=True,
-                clock=cell.clock,
-            )
+            arm: Any = Spectator(ours, mover)
+            opened = OpenCell(arm, sensor, cell.clock, Journal(person), Limits())
+            kept, fit = cast(Run, SimpleNamespace(commit=commit or run.commit)), cast(Judge, Fit())
+            book = PoseBook(opened, kept, fit, np.array([0.0, 0.0, -1.0]))
+            HandGuided(opened, book, cell.sampling, listen=True).run((), "the coverage is green")
             assert mover.plays  # it was we who found the end
 
 
@@ -184,7 +185,7 @@ def test_a_lost_sensor_ends_it_with_the_poses_on_disk(station: Station, tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["manual", "listen"])
-def test_somebody_in_the_emulated_cell_brings_it_to_its_end(
+def test_the_operator_of_the_emulated_cell_brings_it_to_its_end(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     request, words = emulated.MOVED_BY[mode]

@@ -90,8 +90,9 @@ admittance_controller:
     "mc-rtc": f"{10 / 9.80665}\n0 0 {math.pi / 2}\n0 0.02 0.13\n0.1 0.2 0.3\n1 2 3\n",
     "xarm": "arm.ft_sensor_cali_load([1.0, 20.0, 0.0, 100.0, 1.0, 2.0, 3.0, 0.1, 0.2, 0.3])  # kg, mm, N, N·m [SDK]\n",
     "franka": f"""
-// kg, m, kg·m2
-robot.setLoad(1.5, {{{{{COG_FLANGE[0]}, {COG_FLANGE[1]}, {COG_FLANGE[2]}}}}}, {{{{1, 0, 0, 0, 1, 0, 0, 0, 1}}}});
+mass: 1.5
+F_x_Cload: [{COG_FLANGE[0]}, {COG_FLANGE[1]}, {COG_FLANGE[2]}]
+load_inertia: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
 """,
     "kit": """
 Calibration:
@@ -113,7 +114,7 @@ offset:
   torque: [0.1, 0.2, 0.3]
 """,
     "urdf": f"""
-<link name="ft_sensor"><inertial><mass value="0.3"/></inertial></link>
+<link name="ft_sensor"/>
 <joint name="flange-ft_sensor" type="fixed">
   <parent link="tool0"/><child link="ft_sensor"/><origin xyz="0 0 0.03" rpy="0 0 {math.pi / 2}"/>
 </joint>
@@ -121,16 +122,14 @@ offset:
 <joint name="ft_sensor-tool" type="fixed"><parent link="ft_sensor"/><child link="tool"/></joint>
 """,
     "mujoco": f"""
-<body name="ft_sensor" pos="0 0 0.03" quat="{QUARTER} 0 0 {QUARTER}">
+<worldbody><body name="tool0"><body name="ft_sensor" pos="0 0 0.03" quat="{QUARTER} 0 0 {QUARTER}">
   <site name="ft_sensor"/>
   <inertial pos="0.02 0 0.1" mass="1.0" diaginertia="1e-6 1e-6 1e-6"/>
-</body>
+</body></body></worldbody>
 """,
     "ur-payload": f"""
-def set_payload_of_tool():
-  # set_target_payload(m, cog) in kg, m
-  set_target_payload(1.5, [{COG_FLANGE[0]}, {COG_FLANGE[1]}, {COG_FLANGE[2]}], [0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-end
+# m, cog in kg, m
+set_target_payload(1.5, [{COG_FLANGE[0]}, {COG_FLANGE[1]}, {COG_FLANGE[2]}], [0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 """,
     "static-transform": f"""
 # the operator's mounting
@@ -160,89 +159,15 @@ torque_bias_Nm: [0.1, 0.2, 0.3]
 response: null
 """,
 }
-SAME_TOOL = {
-    "kth, centre of mass in tool0": (
-        "kth",
-        TEXTS["kth"].replace("id: ft_sensor", "id: tool0").replace("[0.02, 0.0, 0.1,", "[0.0, 0.02, 0.13,"),
-    ),
-    "ros2-control, with a multiplier": (
-        "ros2-control",
-        TEXTS["ros2-control"].replace(
-            "    sensor_filter_chain", "    multiplier: {force: {x: 1.0}}\n    sensor_filter_chain"
-        ),
-    ),
-    "admittance, centre of mass in axes of tool0": (
-        "admittance",
-        TEXTS["admittance"].replace(
-            "frame: {id: ft_sensor}, CoG: {pos: [0.02, 0.0,", "frame: {id: tool0}, CoG: {pos: [0.0, 0.02,"
-        ),
-    ),
-    "franka, service": (
-        "franka",
-        f"mass: 1.5\ncenter_of_mass: [{COG_FLANGE[0]}, {COG_FLANGE[1]}, {COG_FLANGE[2]}]\n"
-        "load_inertia: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n",
-    ),
-    "urdf, payload at the flange": (
-        "urdf",
-        '<joint name="j" type="fixed"><parent link="tool0"/><child link="payload"/></joint>'
-        '<link name="payload"><inertial>'
-        f'<origin xyz="{COG_FLANGE[0]} {COG_FLANGE[1]} {COG_FLANGE[2]}"/><mass value="1.5"/></inertial></link>',
-    ),
-    "urdf, ROS-Industrial flange: x out": (
-        "urdf",
-        '<robot name="r"><link name="tool"><inertial><origin xyz="0.02 0 0.1"/><mass value="1.0"/></inertial></link>'
-        '<joint name="a" type="fixed"><parent link="flange"/><child link="tool0"/>'
-        f'<origin rpy="{math.pi / 2} 0 {math.pi / 2}"/></joint>'
-        '<joint name="b" type="fixed"><parent link="tool0"/><child link="tool"/>'
-        f'<origin xyz="0 0 0.03" rpy="0 0 {math.pi / 2}"/></joint></robot>',
-    ),
-    "mujoco, payload at the flange": (
-        "mujoco",
-        '<mujoco><compiler angle="radian"/><worldbody><body name="tool0" pos="1 2 3" euler="1 2 3">'
-        f'<body name="payload" pos="0 {COG_FLANGE[1]} {COG_FLANGE[2]}"><inertial pos="0 0 0" mass="1.5"/></body>'
-        "</body></worldbody></mujoco>",
-    ),
-    "mujoco, degrees, two bodies": (
-        "mujoco",
-        '<option gravity="0 0 -10"/>'
-        '<body name="ft_sensor" pos="0 0 0.03" euler="0 0 90"><inertial pos="0 0 0" mass="0.5"/>'
-        '<body name="tool" pos="0 0 0.1" axisangle="0 0 1 180"><inertial pos="-0.04 0 0.1" mass="0.5"/></body></body>',
-    ),
-    "ur-payload, keywords": (
-        "ur-payload",
-        f"set_target_payload(m=1.5, cog=[0,{COG_FLANGE[1]},{COG_FLANGE[2]}], inertia=[0,0,0,0,0,0], transition_time=1)",
-    ),
-    "ur-payload, before PolyScope 5.10": ("ur-payload", f"set_payload(1.5, [0, {COG_FLANGE[1]}, {COG_FLANGE[2]}])"),
-    "static-transform, positional: yaw first": (
-        "static-transform",
-        f"static_transform_publisher 0 0 0.03 {math.pi / 2} 0 0 tool0 ft_sensor",
-    ),
-    "static-transform, positional quaternion": (
-        "static-transform",
-        f"ros2 run tf2_ros static_transform_publisher 0 0 0.03 0 0 {QUARTER} {QUARTER} tool0 ft_sensor",
-    ),
-    "static-transform, angles": (
-        "static-transform",
-        f"static_transform_publisher --z 0.03 --yaw {math.pi / 2} --frame-id tool0 --child-frame-id ft_sensor",
-    ),
-    "ros2-message, service call": (
-        "ros2-message",
-        "ros2 service call /ft_estimation_node/set_calibration ft_msgs/srv/SetCalibration "
-        "'{ft_calibration: {mass: 1.0, "
-        "sensor_frame_to_com: {x: 0.02, y: 0.0, z: 0.1}, force_offset: {x: 1.0, y: 2.0, z: 3.0}, "
-        "torque_offset: {x: 0.1, y: 0.2, z: 0.3}}}'",
-    ),
-}
-SAME_TOOL |= {name: (name, text) for name, text in TEXTS.items()}
 
 
 def test_every_target_has_a_text() -> None:
     assert set(TEXTS) == set(TARGETS)
 
 
-@pytest.mark.parametrize(("name", "text"), SAME_TOOL.values(), ids=SAME_TOOL)
-def test_only_the_contact_is_left(name: str, text: str) -> None:
-    left = evaluate(name, text, np.array([DOWN, LEVEL]), RAW, CONTEXT)
+@pytest.mark.parametrize("name", TEXTS)
+def test_only_the_contact_is_left(name: str) -> None:
+    left = evaluate(name, TEXTS[name], np.array([DOWN, LEVEL]), RAW, CONTEXT)
     np.testing.assert_allclose(left, [CONTACT, CONTACT], atol=1e-12)
 
 
@@ -254,24 +179,12 @@ TURNED = {
     "mc-rtc": f"{10 / 9.80665} {math.pi / 2} 0 {math.pi / 2} 0.1 0.02 0.03 0.1 0.2 0.3 1 2 3\n",
     "urdf": TEXTS["urdf"].replace('rpy="0 0 1', f'rpy="{math.pi / 2} 0 1'),
     "mujoco": TEXTS["mujoco"].replace(f"{QUARTER} 0 0 {QUARTER}", "0.5 0.5 0.5 0.5"),
-    "mujoco, turning axes": '<compiler eulerseq="zxy"/>'
-    + TEXTS["mujoco"].replace(f'quat="{QUARTER} 0 0 {QUARTER}', 'euler="90 90 0'),
-    "mujoco, axes": TEXTS["mujoco"].replace(f'quat="{QUARTER} 0 0 {QUARTER}', 'xyaxes="0 2 0 0 1 1'),
     "static-transform": TEXTS["static-transform"].replace(
         f"--qx 0 --qy 0 --qz {QUARTER} --qw {QUARTER}", "--qx 0.5 --qy 0.5 --qz 0.5 --qw 0.5"
     ),
-    "static-transform, angles": "static_transform_publisher --x 0 --y 0 --z 0.03 "
-    f"--roll {math.pi / 2} --pitch 0 --yaw {math.pi / 2} --frame-id tool0 --child-frame-id ft_sensor",
-    "static-transform, yaw first": f"static_transform_publisher 0 0 0.03 {math.pi / 2} 0 {math.pi / 2} tool0 ft_sensor",
     "json": TEXTS["json"].replace(
         "[[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]", "[[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]"
     ),
-    "kth": TEXTS["kth"],
-    "kth, tool0": TEXTS["kth"].replace("id: ft_sensor", "id: tool0").replace("[0.02, 0.0, 0.1,", "[0.1, 0.02, 0.03,"),
-    "calaw": TEXTS["calaw"],
-    "ros2-control": TEXTS["ros2-control"],
-    "admittance": TEXTS["admittance"],
-    "kit": TEXTS["kit"],
     "franka": TEXTS["franka"].replace(
         f"{COG_FLANGE[0]}, {COG_FLANGE[1]}, {COG_FLANGE[2]}", f"{0.1 / 1.5}, {0.02 / 1.5}, {0.0375 / 1.5}"
     ),
@@ -280,7 +193,7 @@ TURNED = {
 
 @pytest.mark.parametrize(("name", "text"), TURNED.items(), ids=TURNED)
 def test_a_mounting_about_two_axes(name: str, text: str) -> None:
-    left = evaluate(name.partition(",")[0], text, np.array([DOWN, LEVEL]), TURNED_RAW, TURNED_CONTEXT)
+    left = evaluate(name, text, np.array([DOWN, LEVEL]), TURNED_RAW, TURNED_CONTEXT)
     np.testing.assert_allclose(left, [CONTACT, CONTACT], atol=1e-12)
 
 
@@ -314,46 +227,6 @@ def test_what_a_target_cannot_express_is_left_over(name: str) -> None:
     np.testing.assert_allclose(left, [[0.5, -6.0, -2.0, 0.6, 0.04, 0.13]], atol=1e-12)
 
 
-def test_mc_rtc_turns_the_sensor_against_its_model() -> None:
-    """The module already has the sensor turned by 90 deg: rpy is the rest, nothing here."""
-    text = TEXTS["mc-rtc"].replace(f"0 0 {math.pi / 2}", "0 0 0")
-    context = CONTEXT | {"R_flange_model_sensor": CONTEXT["R_flange_sensor"]}
-    left = evaluate("mc-rtc", text, np.array([DOWN, LEVEL]), RAW, context)
-    np.testing.assert_allclose(left, [CONTACT, CONTACT], atol=1e-12)
-
-
-MISTAKES = {
-    # The lever is 1000 times too short: the torque (0.001, 0, -0.0002) is taken off.
-    "xarm in m": ("xarm", ("20.0, 0.0, 100.0", "0.02, 0.0, 0.1"), [0.5, 0, 0, 0.999, 0, 0.0502]),
-    # The broadcaster adds the offset, so the bias counts twice.
-    "bias not negated": ("ros2-control", ("x: -1.0", "x: 1.0"), [2.5, 0, 0, 0, 0, 0.25]),
-    "force first": ("mc-rtc", ("0.1 0.2 0.3\n1 2 3", "1 2 3\n0.1 0.2 0.3"), [1.4, 1.8, 2.7, -0.9, -1.8, -2.45]),
-    # (0.02, 0, 0.1) in the flange is (0, -0.02, 0.07) in the sensor: the torque (0.7, 0, 0).
-    "centre of mass in the sensor": ("mc-rtc", ("0 0.02 0.13", "0.02 0 0.1"), [0.5, 0, 0, 0.3, 0, 0.05]),
-    # The weight is added, 9.81 N and its torque (0.981, 0, -0.1962).
-    "sign and moment of the others": (
-        "calaw",
-        (TEXTS["calaw"][: TEXTS["calaw"].index("f_bias")], "mass: 1.0\ncog: [0.02, 0.0, 0.1]\n"),
-        [0.5, -19.81, 0, 1.981, 0, -0.1462],
-    ),
-    # The tool alone: the sensor's 5 N at (0, 0, -0.015) from its origin are taken off too much.
-    "payload without sensor": (
-        "ur-payload",
-        (f"1.5, [0.0, {COG_FLANGE[1]}, {COG_FLANGE[2]}]", "1.0, [0.0, 0.02, 0.13]"),
-        [0.5, -5, 0, -0.075, 0, 0.25],
-    ),
-    # The lever is 10 mm too short.
-    "position of the sensor": ("static-transform", ("--z 0.03", "--z 0.04"), [0.5, 0, 0, 0.1, 0, 0.25]),
-}
-
-
-@pytest.mark.parametrize(("name", "change", "left"), MISTAKES.values(), ids=MISTAKES)
-def test_a_mistake_of_an_export_is_seen(name: str, change: tuple[str, str], left: list[float]) -> None:
-    text = TEXTS[name].replace(*change)
-    assert text != TEXTS[name]
-    np.testing.assert_allclose(evaluate(name, text, LEVEL[None], RAW[1:], CONTEXT), [left], atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("name", "text"),
     [
@@ -366,11 +239,10 @@ def test_a_mistake_of_an_export_is_seen(name: str, change: tuple[str, str], left
         ("kth", TEXTS["kth"].replace("mass: 1.0", "mass: -1.0")),
         ("ft-tools", TEXTS["ft-tools"].replace("force_offset", "force_bias")),
         ("kit", TEXTS["kit"].replace("isStatic: true", "isStatic: false")),
-        ("franka", TEXTS["franka"].replace("0, 0, 0, 1}", "1}")),
+        ("franka", TEXTS["franka"].replace(", 1.0]", "]")),
         ("ur-payload", TEXTS["ur-payload"].replace(", 0.0]", "]")),
         ("xarm", TEXTS["xarm"].replace(", 0.3]", "]")),
         ("static-transform", TEXTS["static-transform"].replace("--qx 0", "--qx 1")),
-        ("urdf", TEXTS["urdf"].replace("fixed", "revolute")),
         ("json", TEXTS["json"].replace("/1", "/2")),
     ],
 )

@@ -1,9 +1,5 @@
 """The emulated UR controller and the emulated sensors, as the tests of their drivers use them."""
 
-import json
-import subprocess
-import sys
-import threading
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
@@ -23,6 +19,7 @@ from ftdrivers.ur.opening import path_for
 from ftdrivers.ur.timing import UrTiming
 from tests.cell_time import CellTime
 from tests.ur_rtde import require_ur_rtde
+from tests.wire.laboratory import Laboratory
 from tests.wire.station_process import StationProcess
 
 TIME_SCALE = 10
@@ -131,48 +128,6 @@ def arm(new_arm: Callable[..., UrArm]) -> UrArm:
 WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])
 NOISE = np.array([0.03] * 3 + [0.001] * 3)
 
-PROGRAM = """
-import json, sys, threading, time
-import numpy as np
-from ftmocks.clock import CellClock
-from ftmocks.sensors.ati_can import AtiCanNode
-from ftmocks.sensors.ati_serial import AtiSerialBox
-from ftmocks.sensors.bota import BotaBox
-from ftmocks.wires.faults import Faults
-from ftmocks.sensors.netft import Calibration, NetFtBox
-from ftmocks.sensors.robotiq import RobotiqBox
-from ftmocks.sensors.robotous import Model, RobotousCanNode, RobotousSerialBox
-
-wrench, noise = np.array(json.loads(sys.argv[1])), np.array(json.loads(sys.argv[2]))
-rng = np.random.default_rng(1)
-measure = lambda n: wrench + rng.normal(size=(n, 6)) * noise
-kinds = {"ati-can": AtiCanNode, "ati-serial": AtiSerialBox, "robotous-can": RobotousCanNode, "bota": BotaBox,
-         "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox, "ati-netft": NetFtBox}
-parts = {"faults": Faults, "model": Model, "calibration": Calibration}
-devices = []
-clock = CellClock()
-def tick():
-    while True:
-        clock.now_ns()
-        time.sleep(0.001)
-threading.Thread(target=tick, daemon=True).start()
-print(json.dumps(clock.path), flush=True)
-for line in sys.stdin:
-    word, argument, options = json.loads(line)
-    if word == "start":
-        options = {key: parts[key](**value) if key in parts else tuple(value) if isinstance(value, list) else value
-                   for key, value in options.items()}
-        devices.append(kinds[argument](measure, seed=2, clock=clock, **options))
-        print(json.dumps([len(devices) - 1, devices[-1].start()]), flush=True)
-    elif word == "faults":
-        for key, value in options.items():
-            setattr(devices[argument].faults, key, value)
-        print("done", flush=True)
-    else:
-        getattr(devices[argument], word)()
-        print("done", flush=True)
-"""
-
 
 @dataclass(frozen=True)
 class Kind:
@@ -208,28 +163,6 @@ def cell_time() -> Iterator[CellTime]:
         yield cell_time
 
 
-class Laboratory:
-    """Emulated sensors in one child process, and the time of their cell."""
-
-    def __init__(self) -> None:
-        arguments = [sys.executable, "-c", PROGRAM, json.dumps(WRENCH.tolist()), json.dumps(NOISE.tolist())]
-        self.process = subprocess.Popen(arguments, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        self._lock = threading.Lock()
-        assert self.process.stdout
-        self.clock = EmulatedClock(json.loads(self.process.stdout.readline()))
-
-    def tell(self, word: str, argument: str | int, options: dict[str, Any] | None = None) -> str:
-        assert self.process.stdin
-        assert self.process.stdout
-        with self._lock:
-            self.process.stdin.write(json.dumps([word, argument, options]) + "\n")
-            self.process.stdin.flush()
-            return self.process.stdout.readline().strip()
-
-    def close(self) -> None:
-        self.process.communicate(timeout=5)
-
-
 class Emulator:
     """One emulated sensor."""
 
@@ -238,7 +171,7 @@ class Emulator:
         self.laboratory = laboratory
         self.clock = laboratory.clock
         self._sensors: list[StreamingSensor] = []
-        self._number, self.endpoint = json.loads(laboratory.tell("start", scheme, self.kind.options | options))
+        self._number, self.endpoint = laboratory.request("start", scheme, self.kind.options | options)
 
     def sensor(self, options: str = "", sign: int = 1, clock: Clock | None = None) -> StreamingSensor:
         """Make a driver of it, in the cell's time unless another clock is given; it is closed with the emulator."""
@@ -254,23 +187,23 @@ class Emulator:
         return sensor
 
     def faults(self, **options: Any) -> None:
-        assert self.laboratory.tell("faults", self._number, options) == "done"
+        self.laboratory.request("faults", self._number, options)
 
     def unplug(self) -> None:
-        assert self.laboratory.tell("unplug", self._number) == "done"
+        self.laboratory.request("unplug", self._number)
 
     def reset(self) -> None:
-        assert self.laboratory.tell("reset", self._number) == "done"
+        self.laboratory.request("reset", self._number)
 
     def stop(self) -> None:
         for sensor in self._sensors:
             sensor.close()
-        assert self.laboratory.tell("stop", self._number) == "done"
+        self.laboratory.request("stop", self._number)
 
 
 @pytest.fixture(scope="module")
 def laboratory() -> Iterator[Laboratory]:
-    laboratory = Laboratory()
+    laboratory = Laboratory(WRENCH, NOISE)
     yield laboratory
     laboratory.close()
 

@@ -37,11 +37,11 @@ class EmulatedWrist:
         measure: Callable[[int], Array],
         *,
         seed: int,
-        faults: Faults,
+        faults: Faults | None = None,
         host: str | None = None,
         clock: CellClock | None = None,
     ) -> None:
-        self.faults = faults
+        self.faults = faults or Faults()
         self._clock = clock or CellClock()
         self._measure = measure
         self._rng = random.Random(seed)

@@ -51,12 +51,6 @@ def jam(box: AtiSerialBox, port: serial.Serial) -> None:
     box.faults.corrupt = faults
 
 
-def wait_for_drops(box: AtiSerialBox) -> None:
-    """Until the terminal is full and records are lost."""
-    dropped = box.dropped_frames
-    wait_until(lambda: box.dropped_frames > dropped + 10)
-
-
 def unmarked(port: serial.Serial, count: int) -> tuple[bytes, list[bool]]:
     """So many bytes as the sensor sent them, and which of them had wrong parity, of a client that reads marks."""
     rest = b""
@@ -130,14 +124,6 @@ def test_a_client_that_asks_reads_marks(box: AtiSerialBox, port: serial.Serial) 
     assert 10 < marks < 30
 
 
-def test_asking_for_something_else_brings_no_marks(box: AtiSerialBox, port: serial.Serial) -> None:
-    ask_for_marks(port, termios.IGNPAR)
-    assert ask(port, READ_STATUS, 7) == STATUS_OK
-    assert flags(port) == termios.INPCK | termios.PARMRK | termios.IGNPAR
-    box.faults.corrupt = 1.0
-    assert all(len(ask(port, READ_STATUS, 7)) == 7 for _ in range(20))
-
-
 def test_a_wrong_byte_is_found_by_its_sum_or_by_its_mark(
     box: AtiSerialBox, port: serial.Serial, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -167,21 +153,6 @@ def test_a_wrong_byte_is_found_by_its_sum_or_by_its_mark(
     assert hidden, "the sum alone would have passed wrong records"
 
 
-def test_a_client_that_reads_late_loses_whole_records_and_no_half_mark(box: AtiSerialBox, port: serial.Serial) -> None:
-    """Full again and again, the terminal now and then ends amid a mark; the unit test makes it end everywhere."""
-    ask_for_marks(port)
-    assert ask(port, START, 5) == STARTED
-    read = 0
-    for _ in range(3):
-        wait_for_drops(box)
-        data, bad = unmarked(port, 13 * 1300 + 7)
-        assert data == (MINUS_ONE * 1302)[read % 13 :][: len(data)]
-        assert not any(bad)
-        read += len(data)
-    jam(box, port)
-    assert ask(port, READ_STATUS, 7) == STATUS_OK
-
-
 def test_opening_again_without_asking_brings_plain_bytes(box: AtiSerialBox, path: str) -> None:
     with serial.Serial(path, timeout=LIMIT_S) as port:
         ask_for_marks(port)
@@ -192,19 +163,6 @@ def test_opening_again_without_asking_brings_plain_bytes(box: AtiSerialBox, path
         assert ask(port, START, 5) == STARTED
         assert port.read(13 * 50) == MINUS_ONE * 50
         assert flags(port) == 0
-
-
-def test_asking_in_a_running_stream(box: AtiSerialBox, port: serial.Serial) -> None:
-    assert ask(port, START, 5) == STARTED
-    wait_for_drops(box)
-    ask_for_marks(port)
-    assert len(port.read(4096)) == 4096, "of either form"
-    wait_until(lambda: bool(port.read(100)) and flags(port) == termios.INPCK)
-    jam(box, port)
-    for _ in range(2):
-        assert ask(port, START, 5) == STARTED
-        assert port.read(25 * 500) == TWICE * 500
-        jam(box, port)
 
 
 def test_a_line_without_parity_has_no_marks() -> None:

@@ -13,8 +13,7 @@ from can.interfaces.slcan import slcanBus
 from numpy.typing import NDArray
 
 from ftmocks.sensors.ati_can import AtiCanNode
-from ftmocks.sensors.ati_gauges import REFERENCE
-from ftmocks.sensors.ati_serial import JAM_PAUSE_S, AtiSerialBox, calibration_block
+from ftmocks.sensors.ati_serial import JAM_PAUSE_S, AtiSerialBox
 from ftmocks.wires.modbus import with_crc
 from tests.wire.waiting import LIMIT_S, drain, read_to, wait_until
 
@@ -128,22 +127,6 @@ def test_can_transactions_of_the_document(client: CanClient, request_: str, answ
     assert client.hears_only_the_serial_number()
 
 
-def test_can_second_vector_and_status_bits(node: AtiCanNode, client: CanClient) -> None:
-    node.measure = constant(V2)
-    assert client.ask("200#", 2) == ["200#0000 00DD 0045 0926", "201#FC62 FBC2 04F2"]
-    node.status = 0xC000
-    node.measure = constant(V1)
-    assert client.ask("200#", 2) == ["200#C000 0064 012C 01F4", "201#FF38 FE70 FDA8"]
-    node.status = 0x4000
-    assert client.ask("200#", 2)[0].startswith("200#4000")
-
-
-def test_can_superfluous_byte_is_tolerated_where_no_argument_is_needed(client: CanClient) -> None:
-    assert client.ask("200#00", 2) == V1_FRAMES
-    assert client.ask("207#00", 1) == ["207#000F 4240 000F 4240"]
-    assert client.hears_only_the_serial_number()
-
-
 def test_can_everything_that_is_no_request_is_ignored(client: CanClient) -> None:
     for opcode in range(16):
         client.bus.send(can.Message(arbitration_id=0x200 + opcode, is_extended_id=True, data=b"\0"))
@@ -156,14 +139,6 @@ def test_can_everything_that_is_no_request_is_ignored(client: CanClient) -> None
     for line in ("202#06", "202#FF", "209#01", "209#06", "206#10"):
         client.bus.send(frame(line))
     assert client.hears_only_the_serial_number()
-
-
-def test_can_empty_slot_is_active_and_says_so(client: CanClient) -> None:
-    assert client.ask("206#0F", 1) == ["206#0F"]
-    assert client.ask("200#", 2)[0].startswith("200#8040")
-    assert client.ask("202#02", 3) == [f"{i}#0000 0000 0000 0000" for i in (202, 203, 204)]
-    assert client.ask("206#00", 1) == ["206#00"]
-    assert client.ask("200#", 2) == V1_FRAMES
 
 
 def test_can_reset_is_silent_then_slot_0_with_new_base_and_bit_rate(node: AtiCanNode) -> None:
@@ -196,77 +171,9 @@ def test_can_settings_may_wait_for_power_up(node: AtiCanNode) -> None:
         assert client.hears_only_the_serial_number("7F5#")
 
 
-@pytest.mark.parametrize(
-    ("firmware", "answered"),
-    [((3, 8, 0), ["207", "208", "209"]), ((3, 7, 9), ["207", "208"]), ((3, 6, 9), [])],
-)
-def test_can_firmware_levels(
-    node: AtiCanNode, client: CanClient, firmware: tuple[int, int, int], answered: list[str]
-) -> None:
-    node.firmware = firmware
-    for line in ("207#", "208#", "209#00", "20F#"):
-        client.bus.send(frame(line))
-    assert [text(message)[:3] for message in client.collect(len(answered) + 1)] == [*answered, "20F"]
-
-
-def test_can_saturation(node: AtiCanNode, client: CanClient) -> None:
-    node.measure = constant(np.array([0, 0, 900.0, 0, 0, 0]))
-    assert client.ask("200#", 2)[0] == "200#0000 7FFF 7FFF 7FFF"
-    node.measure = constant(V1)
-    node.saturated_axis = 3
-    assert client.ask("200#", 2)[1] == "201#FF38 7FFF FDA8"
-
-
 def test_can_gauge_offset(node: AtiCanNode, client: CanClient) -> None:
     node.gauge_offset = (1, 0, 0, 0, 0, -1)
     assert client.ask("200#", 2) == ["200#0000 0065 012C 01F4", "201#FF38 FE70 FDA7"]
-
-
-def test_can_lost_doubled_and_swapped_frames(node: AtiCanNode, client: CanClient) -> None:
-    node.faults.swap = 1.0
-    assert client.ask("200#", 2) == V1_FRAMES[::-1]
-    node.faults.swap, node.faults.duplicate = 0.0, 1.0
-    assert client.ask("200#", 4) == [V1_FRAMES[0], V1_FRAMES[0], V1_FRAMES[1], V1_FRAMES[1]]
-    node.faults.duplicate, node.faults.drop = 0.0, 1.0
-    client.bus.send(frame("200#"))
-    assert client.bus.recv(0.05) is None
-    readings, heard = Counted(), []
-    node.measure = readings
-    for wanted in range(50, 201, 50):
-        node.faults.drop = 0.3
-        for _ in range(50):
-            client.bus.send(frame("200#"))
-        wait_until(lambda wanted=wanted: readings.calls == wanted)  # type: ignore[misc]
-        node.faults.drop = 0.0
-        client.bus.send(frame("205#"))
-        while (message := client.collect(1)[0]).arbitration_id != 0x205:
-            heard.append(text(message))
-    assert set(heard) == set(V1_FRAMES)
-    assert 240 < len(heard) < 320, "about 280 of 400"
-
-
-def test_can_foreign_traffic_stands_between_the_halves_and_is_not_ours(node: AtiCanNode, client: CanClient) -> None:
-    node.faults.foreign = 1.0
-    for _ in range(50):
-        client.bus.send(frame("200#"))
-        foreign_1, first, foreign_2, second = client.collect(4)
-        assert [text(first), text(second)] == V1_FRAMES
-        for foreign in (foreign_1, foreign_2):
-            assert foreign.is_extended_id or foreign.arbitration_id >> 4 != 0x20
-
-
-def test_can_wrong_echo_and_silent_sensor(node: AtiCanNode, client: CanClient) -> None:
-    node.wrong_echo = 7
-    assert client.ask("206#00", 1) == ["206#07"]
-    node.faults.stall = True
-    client.bus.send(frame("205#"))
-    assert client.bus.recv(0.05) is None
-
-
-def test_can_another_bit_rate_hears_nothing(node: AtiCanNode) -> None:
-    with can_client(node.start(), bitrate=500_000) as client:
-        client.bus.send(frame("205#"))
-        assert client.bus.recv(0.05) is None
 
 
 def test_can_adapter_answers_its_own_questions(client: CanClient) -> None:
@@ -315,15 +222,6 @@ def test_unplugging_fails_the_client_and_stop_is_idempotent(make: type[AtiCanNod
             port.write(b"\r")
     device.stop()
     device.stop()
-
-
-def test_can_unplugging_fails_the_bus(node: AtiCanNode, client: CanClient) -> None:
-    assert client.hears_only_the_serial_number()
-    node.unplug()
-    with pytest.raises(can.CanOperationError):
-        client.bus.recv(LIMIT_S)
-    with pytest.raises(can.CanOperationError):
-        client.bus.send(frame("200#"))
 
 
 # ---------------------------------------------------------------- serial
@@ -398,28 +296,6 @@ def test_serial_frames_of_the_document(box: AtiSerialBox, line: SerialClient) ->
     assert line.ask(with_crc(bytes.fromhex("0A 03 00 00 00 0C")), 29)[3:-2] == WRITE_GAINS[7:-2] + WRITE_OFFSETS[7:-2]
 
 
-def test_serial_calibration_block(line: SerialClient) -> None:
-    requests = ("0A 03 00 E3 00 40 B4 B7", "0A 03 01 23 00 40 B5 77", "0A 03 01 63 00 29 74 8D")
-    sizes = (133, 133, 87)
-    replies = [line.ask(bytes.fromhex(r), size) for r, size in zip(requests, sizes, strict=True)]
-    assert all(with_crc(reply[:-2]) == reply for reply in replies)
-    assert b"".join(reply[3:-2] for reply in replies) == calibration_block(REFERENCE)
-
-
-def test_serial_gains_are_locked_until_unlocked(line: SerialClient) -> None:
-    refused = with_crc(bytes.fromhex("0A 90 04"))
-    assert line.ask(WRITE_GAINS, 5) == refused
-    assert line.ask(UNLOCK, 5) == ACCEPTED
-    assert line.ask(WRITE_GAINS, 8)[1] == 0x10
-    assert line.ask(LOCK, 5) == ACCEPTED
-    assert line.ask(WRITE_OFFSETS, 5) == refused
-
-
-def test_serial_exceptions(line: SerialClient) -> None:
-    assert line.ask(with_crc(bytes.fromhex("0A 03 00 20 00 01")), 5) == bytes.fromhex("0A 83 02 B1 33")
-    assert line.ask(with_crc(bytes.fromhex("0A 06 00 0C 00 01")), 5) == with_crc(bytes.fromhex("0A 86 01"))
-
-
 @pytest.mark.parametrize(
     "request_",
     [
@@ -446,13 +322,6 @@ def test_serial_stream_starts_after_the_reply_and_stops_when_jammed(line: Serial
         assert line.port.read(130) == V1_RECORD * 10
         line.stop()
         assert line.ask(READ_STATUS, 7) == STATUS_OK
-
-
-@pytest.mark.parametrize("jam", [b"\xaa" * 14, bytes(72)], ids=["14 x AA", "72 zeros"])
-def test_serial_any_14_bytes_stop_the_stream(box: AtiSerialBox, line: SerialClient, jam: bytes) -> None:
-    assert line.ask(START, 5) == STARTED
-    line.port.write(jam)
-    wait_until(lambda: not box.streaming)
 
 
 def test_serial_fewer_bytes_do_not_stop_it_and_a_pause_restarts_the_count(
@@ -501,18 +370,6 @@ def test_serial_gains_decide_what_the_gauges_say(box: AtiSerialBox, line: Serial
     assert gauges() == [200, -100, 300, -400, 500, -600]
 
 
-def test_serial_gains_are_volatile(box: AtiSerialBox) -> None:
-    with serial.Serial(box.start(), timeout=LIMIT_S) as port:
-        line = SerialClient(box, port)
-        line.ask(UNLOCK, 5)
-        line.ask(WRITE_GAINS, 8)
-    box.stop()
-    with serial.Serial(box.start(), timeout=LIMIT_S) as port:
-        line = SerialClient(box, port)
-        assert line.ask(with_crc(bytes.fromhex("0A 03 00 00 00 06")), 17)[3:-2] == bytes(12)
-        assert line.ask(WRITE_GAINS, 5) == with_crc(bytes.fromhex("0A 90 04")), "and the lock is back"
-
-
 def test_serial_host_that_does_not_read_loses_whole_records(box: AtiSerialBox, line: SerialClient) -> None:
     box.measure = noisy(V1)
     assert line.ask(START, 5) == STARTED
@@ -522,59 +379,3 @@ def test_serial_host_that_does_not_read_loses_whole_records(box: AtiSerialBox, l
     assert len(records) == 4000
     assert checksums_are_right(records).all()
     assert line.port.in_waiting < 20_000
-
-
-def test_serial_streaming_at_start_is_ended_by_a_jam(box: AtiSerialBox) -> None:
-    box.streaming_at_start = True
-    with serial.Serial(box.start(), timeout=LIMIT_S) as port:
-        line = SerialClient(box, port)
-        assert len(line.records(10)) == 10
-        line.stop()
-        assert line.ask(READ_STATUS, 7) == STATUS_OK
-
-
-def test_serial_status_bit_and_saturated_gauge_show_in_the_stream(box: AtiSerialBox, line: SerialClient) -> None:
-    box.status = 0x8002
-    assert line.ask(START, 5) == STARTED
-    assert line.port.read(13) == V1_RECORD[:12] + b"\xd0"
-    line.stop()
-    box.status, box.saturated_axis = 0, 4
-    assert line.ask(START, 5) == STARTED
-    assert line.port.read(6) == bytes.fromhex("00 64 01 2C 7F FF")
-
-
-def test_serial_bad_checksums(box: AtiSerialBox, line: SerialClient) -> None:
-    box.bad_checksum = 0.1
-    assert line.ask(START, 5) == STARTED
-    records = line.records(1000)
-    bad = ~checksums_are_right(records)
-    assert 60 < bad.sum() < 150
-    assert (records[:, :12] == np.frombuffer(V1_RECORD[:12], np.uint8)).all()
-
-
-def test_serial_byte_slip_shifts_the_records(box: AtiSerialBox, line: SerialClient) -> None:
-    box.measure = noisy(V2)
-    assert line.ask(START, 5) == STARTED
-    assert checksums_are_right(line.records(100)).all()
-    box.faults.byte_slip = 1.0
-    wait_until(lambda: bool((~checksums_are_right(line.records(20))).sum() > 10))
-    box.faults.byte_slip = 0.0
-    line.stop()
-    assert line.ask(START, 5) == STARTED
-    assert checksums_are_right(line.records(100)).all()
-
-
-def test_serial_refused_start_and_silent_box(box: AtiSerialBox, line: SerialClient) -> None:
-    box.refuse_start = True
-    assert line.ask(START, 5) == bytes.fromhex("0A 46 00 63 A2")
-    assert line.ask(READ_STATUS, 7) == STATUS_OK, "no stream"
-    box.faults.stall = True
-    assert line.is_silent_to(READ_STATUS)
-
-
-def test_serial_unplugging_fails_the_stream(box: AtiSerialBox, line: SerialClient) -> None:
-    assert line.ask(START, 5) == STARTED
-    assert line.port.read(130) == V1_RECORD * 10
-    box.unplug()
-    with pytest.raises(UNPLUGGED):
-        wait_until(lambda: not line.port.read(4096))

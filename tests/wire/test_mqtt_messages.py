@@ -17,7 +17,7 @@ import pytest
 
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.mqtt import Broker, Messages
-from ftdrive.fleet.state import Finding
+from ftdrive.fleet.state import FleetFinding
 from tests.mosquitto import Mosquitto
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
 from tests.wire.waiting import wait_until
@@ -53,7 +53,7 @@ def server_at(mosquitto: Mosquitto) -> dict[str, Any]:
 
 
 def test_each_cell_has_a_retained_message_and_the_server_one(tmp_path: Path) -> None:
-    base = Finding("base", ("A", "B"), "the base of A and B has tilted")
+    base = FleetFinding("base", ("A", "B"), "the base of A and B has tilted")
     gripper, drill = cell("A", drift=DRIFTING, due=NOW - timedelta(days=1)), cell("A", "drill", change="bias")
     with Mosquitto(tmp_path) as mosquitto, messages(mosquitto) as (found, said, _):
         found.update(reading(gripper, drill, never_calibrated("B"), findings=(base,), store_up=False))
@@ -72,7 +72,8 @@ def test_each_cell_has_a_retained_message_and_the_server_one(tmp_path: Path) -> 
     assert kept[A]["tools"][0]["due"] == "2026-11-21T12:00:00+00:00"
     assert kept[A]["tools"][0]["drift"] == {"level_sigmas": 6.5, "found": True, "words": DRIFTING.words}
     assert (kept[A]["tools"][1]["is_due"], kept[A]["tools"][1]["change"]) == (False, "bias")
-    assert kept[B]["tools"] == [{**dict.fromkeys(kept[A]["tools"][0]), "cell": "B", "is_due": True}]
+    uncalibrated = {"cell": "B", "is_due": True, "emulated": False}
+    assert kept[B]["tools"] == [dict.fromkeys(kept[A]["tools"][0]) | uncalibrated]
     assert kept[A]["findings"] == kept[B]["findings"] == [{"kind": "base", "words": base.words}]
 
 

@@ -1,13 +1,9 @@
 """What goes wrong on a wire, tried on every sensor: each fault has its outcome in time, and no value is ever wrong.
 
-The emulated sensors measure a number that counts their samples, coded into all six axes so that parts of two samples
-never look like one. Every sample the reader thread hands out is compared with it, also those a failed `collect` drops.
+The emulated sensors measure a number that counts their samples. Every sample the reader thread hands out is compared
+with it, also those a failed `collect` drops.
 """
 
-import json
-import subprocess
-import sys
-import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,74 +13,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftdrive.cell.emulated_clock import EmulatedClock
-from ftdrivers.clock import REAL, Clock
+from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.follow import Unread
-from ftdrivers.interfaces import Array, FtSamples
+from ftdrivers.interfaces import FtSamples
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.streaming.sensor import StreamingSensor
+from tests.wire.laboratory import STEPS, Laboratory, numbers_in
 
 pytestmark = pytest.mark.slow  # `test_sensor_drivers.py` has a share of it
-
-ROOT = Path(__file__).parents[2]
-STEPS = 400
-UNIT = np.array([0.1] * 3 + [0.01] * 3)
-"""N and N·m per step: more than any sensor's resolution, less than its range when there are 400."""
-
-PROGRAM = """
-import json, sys, threading, time
-import numpy as np
-from ftmocks.clock import CellClock
-from ftmocks.sensors.ati_can import AtiCanNode
-from ftmocks.sensors.ati_serial import AtiSerialBox
-from ftmocks.sensors.bota import BotaBox
-from ftmocks.wires.faults import Faults
-from ftmocks.sensors.netft import NetFtBox
-from ftmocks.sensors.robotiq import RobotiqBox
-from ftmocks.sensors.robotous import RobotousCanNode, RobotousSerialBox
-from tests.wire.emulated_wrist import EmulatedWrist
-
-class Counter:
-    def __init__(self):
-        self.made, self.lock = 0, threading.Lock()
-    def __call__(self, n):
-        with self.lock:
-            number = np.arange(self.made, self.made + n)
-            self.made += n
-        steps = np.column_stack([number, number // 400, number * 137 + 11, number * 173 + 29, number * 211 + 71,
-                                 number * 263 + 113]) % 400
-        return (steps - 200) * ([0.1] * 3 + [0.01] * 3)
-
-kinds = {"ati-can": AtiCanNode, "ati-serial": AtiSerialBox, "robotous-can": RobotousCanNode, "bota": BotaBox,
-         "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox, "ati-netft": NetFtBox,
-         "ur-ft": EmulatedWrist}
-devices, counters = [], []
-clock = CellClock()
-def tick():
-    while True:
-        clock.now_ns()
-        time.sleep(0.001)
-threading.Thread(target=tick, daemon=True).start()
-print(json.dumps(clock.path), flush=True)
-for line in sys.stdin:
-    word, argument, options = json.loads(line)
-    answer = None
-    if word == "start":
-        options = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
-        counters.append(Counter())
-        devices.append(kinds[argument](counters[-1], seed=len(devices), faults=Faults(), clock=clock,
-                                       **options))
-        answer = [len(devices) - 1, devices[-1].start()]
-    elif word == "faults":
-        for key, value in options.items():
-            setattr(devices[argument].faults, key, value)
-    elif word == "made":
-        answer = counters[argument].made
-    else:
-        getattr(devices[argument], word)()
-    print(json.dumps(answer), flush=True)
-"""
 
 
 @dataclass(frozen=True)
@@ -113,41 +50,6 @@ KINDS = {
 }
 
 
-def numbers_in(wrench: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Tell which sample each row (n, 6) is, modulo 160 000, and whether it is one at all."""
-    steps = wrench / UNIT + STEPS // 2
-    whole = np.rint(steps).astype(np.int64) % STEPS
-    number = whole[:, 0] + STEPS * whole[:, 1]
-    expected = np.column_stack([whole[:, 0], whole[:, 1], *(number * a + b for a, b in MIX)]) % STEPS
-    return number, np.abs(steps - expected).max(axis=1) < 0.5
-
-
-MIX = ((137, 11), (173, 29), (211, 71), (263, 113))
-
-
-class Laboratory:
-    """Emulated sensors in one child process."""
-
-    def __init__(self, program: str = PROGRAM) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT
-        )
-        self._lock = threading.Lock()
-        assert self.process.stdout
-        self.clock = EmulatedClock(json.loads(self.process.stdout.readline()))
-
-    def tell(self, word: str, argument: str | int, options: dict[str, Any] | None = None) -> Any:
-        assert self.process.stdin
-        assert self.process.stdout
-        with self._lock:
-            self.process.stdin.write(json.dumps([word, argument, options]) + "\n")
-            self.process.stdin.flush()
-            return json.loads(self.process.stdout.readline())
-
-    def close(self) -> None:
-        self.process.communicate(timeout=5)
-
-
 class Emulator:
     """One emulated sensor, behind a link that survives its being plugged in again."""
 
@@ -167,7 +69,7 @@ class Emulator:
         self.plug_in()
 
     def plug_in(self) -> None:
-        self._number, where = self._laboratory.tell("start", self.kind.scheme, self._options)
+        self._number, where = self._laboratory.request("start", self.kind.scheme, self._options)
         ports: list[str] = []
         if isinstance(where, dict):
             self._options |= where
@@ -186,16 +88,16 @@ class Emulator:
         return sensor
 
     def faults(self, **options: Any) -> None:
-        self._laboratory.tell("faults", self._number, options)
+        self._laboratory.request("faults", self._number, options)
 
     def reset(self) -> None:
-        self._laboratory.tell("reset", self._number)
+        self._laboratory.request("reset", self._number)
 
     def unplug(self) -> None:
-        self._laboratory.tell("unplug", self._number)
+        self._laboratory.request("unplug", self._number)
 
     def made(self) -> int:
-        return int(self._laboratory.tell("made", self._number))
+        return int(self._laboratory.request("made", self._number))
 
 
 @dataclass
@@ -273,7 +175,7 @@ HEALTHY = dict.fromkeys([key for fault in SCRIPT.values() for key in fault], 0.0
 
 
 def chances(scheme: str, fault: str) -> dict[str, float]:
-    """How often a fault strikes: a slip takes the ATI stream 40 ms to mend, so there it is rare."""
+    """How often a fault strikes: a slip stops the ATI stream for 40 ms, so there it is rare."""
     return {"byte_slip": 0.001} if (scheme, fault) == ("ati-serial", "byte_slip") else SCRIPT[fault]
 
 
@@ -290,43 +192,39 @@ def applies(scheme: str, fault: str) -> bool:
 
 def suffer(sensor: StreamingSensor, clock: Clock, seconds: float) -> list[DeviceError]:
     """Use a sensor for a while as a program would; return its errors."""
-    told: list[DeviceError] = []
+    errors: list[DeviceError] = []
     end_s = clock.now_s() + seconds
     while clock.now_s() < end_s:
         try:
             sensor.collect(0.2)
             sensor.latest(timeout_s=0.1)
         except DeviceError as exc:
-            told.append(exc)
+            errors.append(exc)
             if sensor._failure is not None:
                 break
             clock.sleep(0.02)
-    return told
+    return errors
 
 
-def suffering() -> list[Any]:
+def suffering() -> list[tuple[str, str]]:
     """Every fault on every wire it happens on."""
     return [
-        # samples that two neighbouring losses make are known by the time they come, and that of a starved cell is not
-        pytest.param(scheme, fault, marks=pytest.mark.realtime if (scheme, fault) == ("robotous-can", "drop") else ())
+        (scheme, fault)
         for scheme in KINDS
         for fault in SCRIPT
-        if applies(scheme, fault)
+        # samples that two neighbouring losses make are known by the time they come, and that of a starved cell is not
+        if applies(scheme, fault) and (scheme, fault) != ("robotous-can", "drop")
     ]
 
 
 @pytest.mark.parametrize(("emulator", "fault"), suffering(), indirect=["emulator"])
-def test_no_fault_of_the_wire_delivers_a_wrong_value(
-    emulator: Emulator, fault: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_fault_of_the_wire_delivers_a_wrong_value(emulator: Emulator, fault: str) -> None:
     scheme = emulator.kind.scheme
-    if request.node.get_closest_marker("realtime"):
-        monkeypatch.setattr(emulator, "clock", REAL)
     with emulator.sensor() as sensor:
         watched = Watched(sensor)
         emulator.faults(**chances(scheme, fault))
         try:
-            told = suffer(sensor, emulator.clock, 0.7)
+            errors = suffer(sensor, emulator.clock, 0.7)
             health, samples, steps = sensor.health(), watched.samples(), watched.steps()
         finally:
             emulator.faults(**HEALTHY)
@@ -338,7 +236,7 @@ def test_no_fault_of_the_wire_delivers_a_wrong_value(
         assert (steps >= 0).all()
     elif watched.wrong() == 0:
         assert (steps >= 1).all()  # nothing twice, nothing late
-    assert told == []  # these faults are survived
+    assert errors == []  # these faults are survived
     if fault in {"corrupt", "byte_slip"}:
         assert health.malformed > 0
     if fault == "duplicate" and scheme in {"bota", "ati-netft"}:
@@ -365,9 +263,9 @@ def reset(emulator: Emulator, before_s: float) -> list[Watched]:
     with emulator.sensor() as sensor:
         watched = Watched(sensor, before_s)
         emulator.reset()
-        told = suffer(sensor, emulator.clock, 0.8)
-        assert all(isinstance(exc, DeviceTimeout | StreamBroken) for exc in told)
-        assert told or sensor.health().lost or emulator.kind.scheme == "ati-netft"
+        errors = suffer(sensor, emulator.clock, 0.8)
+        assert all(isinstance(exc, DeviceTimeout | StreamBroken) for exc in errors)
+        assert errors or sensor.health().lost or emulator.kind.scheme == "ati-netft"
     return [watched]
 
 
@@ -397,8 +295,8 @@ def unplugged(emulator: Emulator, before_s: float) -> list[Watched]:
     return [first, second, third]
 
 
-def mended(emulator: Emulator, before_s: float) -> list[Watched]:
-    """Unplug in mid-stream and plug in again: told at once, and mended where that was asked for."""
+def reconnected(emulator: Emulator, before_s: float) -> list[Watched]:
+    """Unplug in mid-stream and plug in again: reported at once, and reconnected where that was configured."""
     with emulator.sensor("recover=1") as sensor:
         watched = Watched(sensor, before_s)
         emulator.unplug()
@@ -421,7 +319,7 @@ CYCLES: dict[str, Callable[[Emulator, float], list[Watched]]] = {
     "reset": reset,
     "already streaming": opened,
     "unplug": unplugged,
-    "replug": mended,
+    "replug": reconnected,
 }
 """Faults that end a stream: from opening to the outcome, `before_s` after it has begun."""
 

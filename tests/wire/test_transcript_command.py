@@ -9,35 +9,20 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from ftdrive.cell.config import CLOCK
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
-from ftdrivers.clock import REAL
 from ftdrivers.errors import BadTranscript, StreamBroken
-from ftdrivers.interfaces import ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.streaming.sensor import StreamingSensor
-from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import Writer
 from ftmocks.sensors.bota import BotaBox
 
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
 
 
-@pytest.fixture(autouse=True)
-def _cell_time(cell_time: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command knows nothing of an emulator that a test has started."""
-    clock = cell_time.of_drivers
-
-    def build(url: str, **_: object) -> ForceTorqueSensor:
-        return sensor_from_url(url, clock=clock if url.startswith("bota") else REAL)
-
-    monkeypatch.setattr(transcript, "sensor_from_url", build)
-    monkeypatch.setattr(transcript, "Writer", lambda path, header, *_: Writer(path, header, clock))
-    monkeypatch.setattr(transcript, "Player", lambda loaded, *_: Player(loaded, clock))
-
-
 @pytest.fixture
-def url(cell_time: Any) -> Iterator[str]:
+def url(cell_time: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    monkeypatch.setenv(CLOCK, cell_time.of_devices.path)  # the command knows nothing of an emulator of a test
     rng = np.random.default_rng(5)
     device = BotaBox(lambda n: WRENCH + 1e-3 * rng.normal(size=(n, 6)), seed=1, clock=cell_time.of_devices)
     yield f"bota://{device.start()}"
@@ -166,6 +151,6 @@ def test_a_driver_with_a_wire_of_its_own_is_not_recorded(tmp_path: Path, monkeyp
     monkeypatch.syspath_prepend(tmp_path / "site")
     outcome = run("record", "--sensor", "own-wire:///dev/own0", "-o", str(tmp_path / "a.jsonl"), "--duration", "0.1")
     assert isinstance(outcome.exception, ConfigError)
-    assert "pynetft" in str(outcome.exception)
+    assert "neither pyserial nor python-can" in str(outcome.exception)
     assert [path.name for path in tmp_path.iterdir()] == ["site"]
     assert "Saved" not in outcome.stderr

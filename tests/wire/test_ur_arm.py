@@ -135,7 +135,7 @@ def test_identity_and_clock(station: Station, new_arm: NewArm) -> None:
     assert info.firmware.startswith("5.15")
     begin_ns = station.clock.now_ns()
     first, second = arm.state(), arm.state()
-    assert begin_ns < first.t_host_ns < second.t_host_ns <= station.clock.now_ns()
+    assert begin_ns <= first.t_host_ns <= second.t_host_ns <= station.clock.now_ns()
     assert second.t_device_s > first.t_device_s
     assert first.q_rad == pytest.approx(station.ask("state")["q_rad"], abs=1e-6)
     threads = [thread.name for thread in threading.enumerate()]

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from ftdrive.cell.emulated_clock import EmulatedClock
 from ftmocks.clock import LEAD_NS
 from ftmocks.ur import rtde
-from ftmocks.ur.script import take_uploads
+from ftmocks.ur.uploads import take_uploads
 from ftmocks.ur.variables import INPUTS, OUTPUTS
 from tests.ur_rtde import require_ur_rtde
 from tests.wire.rtde_socket import RtdeSocket
@@ -195,7 +195,6 @@ def test_programs_are_cut_at_end_in_column_zero() -> None:
         tail.append(byte)
         found += take_uploads(tail)
     assert [(u.name, u.secondary) for u in found] == [("note", True), ("statement", False), ("rtde_control", False)]
-    assert found[2].is_control_script
     assert (found[2].register_offset("float"), found[2].register_offset("int")) == (24, 0)
 
 
@@ -363,51 +362,6 @@ def test_settings(fresh: StationProcess) -> None:
         assert out[name] is True, name
     assert out["setSpeedSlider"]
     assert out["slider_seen"]
-
-
-@pytest.mark.slow
-def test_program(fresh: StationProcess) -> None:
-    out = run_client("program", fresh)
-    assert out["version"].startswith("5.15.0.")
-    assert out["serial"] == fresh.hello["arm"]["serial_number"]
-    assert out["model"] == "UR5"
-    assert [out["remote"], out["mode"], out["safety"]] == [True, "Robotmode: RUNNING", "Safetymode: NORMAL"]
-    assert out["running_before"] is False
-    assert out["state"] == "PLAYING rtde_control"
-    assert out["stopped"] == [False, "STOPPED", True]
-    assert out["command_when_stopped"] is False
-    for name in ("reupload", "alive", "kicked", "watchdog_bites", "arm_stands", "short_of_goal", "again"):
-        assert out[name] is True, name
-    assert "already in use" in out["second"]
-    assert out["dashboard_stop"]
-
-
-@pytest.mark.slow
-def test_stops(fresh: StationProcess) -> None:
-    out = run_client("stops", fresh)
-    assert out["stop_seen"]
-    assert out["status"] == [3, 0x404, 7, 4]
-    assert out["stands"]
-    assert out["still_running_says_the_word"] is True
-    assert out["move_refused"] is False
-    assert out["play"] == "Failed to execute: play"
-    assert out["unlocked"]
-    assert out["finishes_the_interrupted_move"]
-    assert [out["trigger"], out["triggered"]] == [False, True]
-    assert out["recovered"]
-    assert out["estop_seen"]
-    assert out["estop_status"] == [7, 0x4C0, 3, 1]
-    assert out["estop_move"] is False
-    assert [out["idle"], out["running"], out["moves_again"]] == [True, True, True]
-
-
-def test_link(station: StationProcess) -> None:
-    station.ask("set-tcp", tcp=[0.0] * 6)
-    out = run_client("link", station)
-    assert out["stands"]
-    assert out["thawed"]
-    assert out["dropped"]["connections"] == 1
-    assert [out["loss_seen"], out["reconnect"], out["alive"]] == [True, True, True]
 
 
 # -- the station process ----------------------------------------------------------------------------------------------

@@ -13,12 +13,8 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-from dashboard_client import DashboardClient
 from rtde_control import RTDEControlInterface
 from rtde_receive import RTDEReceiveInterface
-
-TIME_SCALE = 20
-"""Of the station."""
 
 
 def ask(**request: Any) -> dict[str, Any]:
@@ -161,116 +157,7 @@ def settings(host: str) -> dict[str, Any]:
     return out
 
 
-def program(host: str) -> dict[str, Any]:
-    """The life of the program: dashboard, stop, upload, watchdog."""
-    d = DashboardClient(host)
-    d.connect()
-    out: dict[str, Any] = {
-        "version": d.polyscopeVersion(),
-        "serial": d.getSerialNumber(),
-        "model": d.getRobotModel(),
-        "remote": d.isInRemoteControl(),
-        "mode": d.robotmode(),
-        "safety": d.safetymode(),
-        "running_before": d.running(),
-    }
-    r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
-    out["state"] = d.programState()
-    c.stopScript()
-    out["stopped"] = [c.isProgramRunning(), d.programState().split()[0], wait_for(lambda: r.getRuntimeState() == 1)]
-    out["command_when_stopped"] = c.setPayload(1.0, [0.0, 0.0, 0.1])
-    out["reupload"] = c.reuploadScript() and wait_for(c.isProgramRunning)
-    out["alive"] = wait_for(c.isSteady)
-    c.setWatchdog(1.0)
-    begun = r.getTimestamp()
-    while r.getTimestamp() < begun + 1.5 * TIME_SCALE:  # one and a half of its periods
-        c.kickWatchdog()
-        time.sleep(0.02)
-    out["kicked"] = c.isProgramRunning()
-    q = r.getActualQ()
-    q[5] += 2.0
-    c.moveJ(q, 0.01, 2.0, True)
-    out["watchdog_bites"] = wait_for(lambda: not c.isProgramRunning())
-    out["arm_stands"] = wait_for(lambda: not any(r.getTargetQd()))
-    out["short_of_goal"] = abs(q[5] - r.getActualQ()[5]) > 0.5
-    c.reuploadScript()
-    out["again"] = wait_for(c.isProgramRunning) and c.moveJ(r.getActualQ(), 1.0, 2.0)
-    out["second"] = _failure(lambda: RTDEControlInterface(host))  # its registers are taken
-    d.stop()
-    out["dashboard_stop"] = wait_for(lambda: not c.isProgramRunning())
-    return out
-
-
-def stops(host: str) -> dict[str, Any]:
-    """Protective stop in motion and recovery, emergency stop and recovery."""
-    d = DashboardClient(host)
-    d.connect()
-    r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
-    q = r.getActualQ()
-    q[5] += 1.0
-    c.moveJ(q, 0.01, 2.0, True)
-    wait_for(lambda: abs(r.getTargetQd()[5]) > 0.008)
-    ask(do="protective-stop")
-    out: dict[str, Any] = {"stop_seen": wait_for(r.isProtectiveStopped)}
-    out["status"] = [r.getSafetyMode(), r.getSafetyStatusBits(), r.getRobotMode(), r.getRuntimeState()]
-    out["stands"] = wait_for(lambda: not any(r.getTargetQd()))
-    out["still_running_says_the_word"] = c.getAsyncOperationProgressEx().isAsyncOperationRunning()
-    out["move_refused"] = c.moveJ(q)
-    out["play"] = _failure(d.play)
-    out["unlocked"] = wait_for(lambda: _failure(d.unlockProtectiveStop) is None)
-    d.play()
-    out["finishes_the_interrupted_move"] = wait_for(lambda: arrived(r, q))
-
-    out["trigger"] = c.triggerProtectiveStop()
-    out["triggered"] = wait_for(r.isProtectiveStopped)
-    wait_for(lambda: _failure(d.unlockProtectiveStop) is None)
-    d.stop()
-    c.reuploadScript()
-    out["recovered"] = wait_for(c.isProgramRunning) and c.moveJ(q)
-
-    ask(do="emergency-stop")
-    out["estop_seen"] = wait_for(r.isEmergencyStopped)
-    out["estop_status"] = [r.getSafetyMode(), r.getSafetyStatusBits(), r.getRobotMode(), r.getRuntimeState()]
-    out["estop_move"] = c.moveJ(q)
-    ask(do="emergency-stop", on=False)
-    d.powerOn()
-    out["idle"] = wait_for(lambda: d.robotmode() == "Robotmode: IDLE")
-    d.brakeRelease()
-    out["running"] = wait_for(lambda: d.robotmode() == "Robotmode: RUNNING")
-    c.reuploadScript()
-    out["moves_again"] = wait_for(c.isProgramRunning) and c.moveJ(q)
-    c.stopScript()
-    return out
-
-
-def link(host: str) -> dict[str, Any]:
-    """A frozen controller and a dropped connection, seen by the reading client."""
-    r = RTDEReceiveInterface(host)
-    ask(do="freeze", on=True)
-    stamp: float = ask(do="state")["events"][-1]["t_robot_s"]
-    time.sleep(0.3)
-    stands = r.getTimestamp() <= stamp
-    ask(do="freeze", on=False)
-    out: dict[str, Any] = {"stands": stands, "thawed": wait_for(lambda: r.getTimestamp() > stamp + 0.1)}
-    out["dropped"] = ask(do="drop", what="rtde")
-    out["loss_seen"] = wait_for(lambda: not r.isConnected())
-    out["reconnect"] = r.reconnect()
-    last = r.getTimestamp()
-    out["alive"] = wait_for(lambda: r.getTimestamp() > last)
-    return out
-
-
-def _failure(call: Callable[[], Any]) -> str | None:
-    try:
-        call()
-    except RuntimeError as error:
-        return str(error)
-    return None
-
-
-SCENARIOS: dict[str, Callable[[str], dict[str, Any]]] = {
-    f.__name__: f for f in (receive, moves, kinematics, settings, program, stops, link)
-}
+SCENARIOS: dict[str, Callable[[str], dict[str, Any]]] = {f.__name__: f for f in (receive, moves, kinematics, settings)}
 
 if __name__ == "__main__":
     sys.stdout.write("@result " + json.dumps(SCENARIOS[sys.argv[1]](sys.argv[2])) + "\n")

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
-from ftcalib.files import JSON, check_format, read_object, write_new
+from ftcalib.files import JSON, check_format, read_object, write_object
 from ftcalib.model import ROUNDING, Array, Rotations, matrices_of, nearest_rotation, read_only
 
 FORMAT = "ftdrive.dataset/1"
@@ -174,7 +174,7 @@ class CalibrationDataset:
 
     def save(self, path: str | Path) -> None:
         """Write a new file; raises `FileExistsError` if it exists."""
-        write_new(path, json.dumps(self.to_dict(), allow_nan=False) + "\n")
+        write_object(path, self.to_dict(), indent=None)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:

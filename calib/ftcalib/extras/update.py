@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
 from ftcalib.compensation import Compensator
@@ -20,7 +19,6 @@ from ftcalib.likelihood.gain_and_cross_talk import Response, response_columns
 from ftcalib.model import BIASES, Array, Parameters, jacobian, read_only, skew
 from ftcalib.result import CalibrationResult
 
-LEAST_SPREAD = 0.025  # of the gravity directions in the sensor frame, rms; two poses 3° apart have it
 SIGNIFICANT_SIGMAS = 5.0
 SETTLED = 1e-20  # squared step in standard deviations at which the iteration ends
 MOST_STEPS = 30
@@ -149,40 +147,6 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     )
 
 
-def update_payload(
-    calibration: Calibrated, R_base_flange: Array, wrench: Array, wrench_cov: Array, *, retare: bool = False
-) -> Update:
-    """Estimate weight and centre of mass of another payload; keep mounting, tilt and (unless `retare`) biases.
-
-    Parameters
-    ----------
-    calibration : CalibrationResult or Update
-    R_base_flange : array, shape (n, 3, 3)
-        n >= 2 poses between which the tool is tilted; with `retare` n >= 3.
-    wrench : array, shape (n, 6)
-        Mean readings as measured, N and N·m, in the sensor frame.
-    wrench_cov : array, shape (n, 6, 6)
-        Covariance of those means.
-    retare : bool
-        Estimate the biases too, if the sensor has drifted since the calibration.
-
-    Raises
-    ------
-    BadDataset
-        Shapes that do not fit each other.
-    NotObservable
-        Too few poses, gravity along one line in all of them, or a weight that is not significant.
-    """
-    old, n = calibration.parameters, len(wrench)
-    R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
-    wrench_cov = finite("wrench_cov", wrench_cov, (n, 6, 6))
-    weight_N = float(np.linalg.norm(old.gravity_force_base_N))
-    if weight_N > 0:
-        _require_tilt(old.gravity_force_base_N / weight_N @ (R_base_flange @ old.R_flange_sensor), retare)
-    kind = "bias and payload" if retare else "payload"
-    return reestimate(calibration, R_base_flange, wrench, block_diag(*wrench_cov), kind)
-
-
 def updated(
     calibration: CalibrationResult, update: Update, provenance: Mapping[str, Any] | None = None
 ) -> CalibrationResult:
@@ -308,20 +272,3 @@ def _inverse(information: Array, kind: str, n: int) -> Array:
     raise NotObservable(
         f"{n} {'pose does' if n == 1 else 'poses do'} not determine {kind}: add poses with other tilts of the tool."
     )
-
-
-def _require_tilt(u: Array, retare: bool) -> None:
-    """Raise `NotObservable` if the gravity directions u (n, 3), in the sensor frame, leave a parameter free."""
-    n, least = len(u), 3 if retare else 2
-    if n < least:
-        raise NotObservable(
-            f"{n} {'pose is' if n == 1 else 'poses are'} too few, at least {least} are needed: add {least - n} or more "
-            "with other tilts of the tool."
-        )
-    spread = np.linalg.svd(u - u.mean(axis=0) if retare else u, compute_uv=False)[1] / np.sqrt(n)
-    if spread < LEAST_SPREAD:
-        found = "fewer than three clearly different directions" if retare else "nearly one line"
-        raise NotObservable(
-            f"gravity has {found} in the sensor in these {n} poses (spread {spread:.3f}, at least {LEAST_SPREAD:g} "
-            f"needed): tilt the tool {'to two sides ' if retare else ''}by 30° or more."
-        )

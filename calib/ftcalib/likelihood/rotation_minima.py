@@ -115,7 +115,7 @@ def minima(Q: Array) -> list[Minimum]:
     Notes
     -----
     Deterministic. Newton's method with limited steps from evenly spread starts, all at once; along a negative curvature
-    it goes down by the same length. `tests/benchmarks/so3_study.py` measures what other numbers of starts miss.
+    it goes down by the same length.
     """
     quartic, _ = _quartic(Q)
     q, cost, curvature = _descend(quartic, _super_fibonacci(_STARTS))

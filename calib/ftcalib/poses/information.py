@@ -40,9 +40,6 @@ class Guess:
     R_flange_sensor: ArrayLike = field(default_factory=lambda: np.eye(3))
     tilt_alpha_rad: float = 0.0
     tilt_beta_rad: float = 0.0
-    walk_force_N: float = 0.0
-    """Standard deviation of the random walk of each axis of the force bias from pose to pose."""
-    walk_torque_Nm: float = 0.0
     g_m_s2: float = STANDARD_GRAVITY_M_S2
 
     def __post_init__(self) -> None:
@@ -50,10 +47,6 @@ class Guess:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}, expected a positive number")
-        for name in ("walk_force_N", "walk_torque_Nm"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} is {value}, expected zero or more")
 
     @property
     def weight_N(self) -> float:
@@ -112,32 +105,12 @@ def whitened_jacobian(R_base_flange: Array, guess: Guess) -> Array:
     return np.asarray(jacobian(guess.parameters, R_base_flange) * guess.scale / guess.wrench_sigma[:, None])
 
 
-def information(J: Array, guess: Guess) -> Array:
-    """Fisher information (15, 15) of a whitened Jacobian (n, 6, 15) whose rows are in the order of measuring.
-
-    With a random walk of the bias, the bias parameters are those at the last pose.
-    """
-    n = len(J)
-    before_last = np.arange(n)[::-1]
-    halves = []
-    walks = guess.walk_force_N / guess.sigma_force_N, guess.walk_torque_Nm / guess.sigma_torque_Nm
-    for walk, rows in zip(walks, (J[:, :3], J[:, 3:]), strict=True):
-        flat = rows.reshape(n, 3 * J.shape[2])
-        if walk:
-            noise = np.eye(n) + walk**2 * np.minimum.outer(before_last, before_last)
-            flat = np.linalg.solve(np.linalg.cholesky(noise), flat)
-        halves.append(flat.reshape(-1, J.shape[2]))
-    stacked = np.concatenate(halves)
-    return np.asarray(stacked.T @ stacked)
-
-
 def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
     """Predict the uncertainty of a calibration from its poses (Cramér-Rao bound of the joint model).
 
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
-        In the order of measuring, which matters if the guess has a random walk of the bias.
     guess : Guess
 
     Returns
@@ -145,7 +118,8 @@ def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
     Prediction
     """
     R_base_flange = np.asarray(R_base_flange, dtype=np.float64)
-    variance = _Variance(information(whitened_jacobian(R_base_flange, guess), guess), guess.scale)
+    J = whitened_jacobian(R_base_flange, guess).reshape(-1, 15)
+    variance = _Variance(J.T @ J, guess.scale)
 
     std = np.sqrt(variance(np.eye(15)))
     weight, alpha, beta = np.sqrt(variance(_weight_and_tilt_rows(guess))).tolist()

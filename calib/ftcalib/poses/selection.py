@@ -1,11 +1,8 @@
-"""Selection of poses from those that the arm can reach: a whole set, the next pose, and their order.
+"""Selection of poses from those that the arm can reach: a whole set, or the next pose.
 
 Criteria are traces of a covariance C: a pose with whitened Jacobian J lowers trace(M C) by
 trace((1 + J C J^T)^-1 J C M C J^T), so one array operation ranks all candidates. All functions are deterministic.
 """
-
-from collections.abc import Callable
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +13,6 @@ from ftcalib.poses.information import (
     Guess,
     TOOL_DOWN_R_base_flange,
     force_rows,
-    information,
     prediction_weights,
     second_basin,
     special,
@@ -24,19 +20,18 @@ from ftcalib.poses.information import (
 )
 
 Indices = NDArray[np.intp]
-Criterion = Literal["parameters", "prediction"]
 
 PRIOR = 1e-4
 """Information about every parameter before the first pose, in the units of `Guess.scale`: almost none."""
 WEIGHT_OF_PLANE = 0.3
-"""Weight of the second term of the parameter criterion, against gravity directions in one plane."""
+"""Weight of the second term of the criterion, against gravity directions in one plane."""
 FEWEST = 4
 """Smallest number of poses that determines all parameters."""
 LEAST_GAP = 0.05
+"""To the second solution (`second_basin`); above it, that solution does not matter."""
 MOST_SWEEPS = 20
 LEAST_GAIN = 1e-6
 CLEARLY_WIDER = 1.1
-RANDOM_ORDERS = 8
 
 
 def cone_candidates(
@@ -78,16 +73,12 @@ def cone_candidates(
     return np.asarray((mounted * tilted).as_matrix() @ TOOL_DOWN_R_base_flange)
 
 
-def choose(
-    R_candidates: Array,
-    n: int,
-    guess: Guess,
-    *,
-    criterion: Criterion = "parameters",
-    R_workspace: Array | None = None,
-    least_gap: float = LEAST_GAP,
-) -> Indices:
+def choose(R_candidates: Array, n: int, guess: Guess) -> Indices:
     """Choose n poses: greedily, then exchanging one at a time as long as it helps.
+
+    They minimise the summed variances of rotation, weight and force bias, plus a term against gravity directions in one
+    plane, for LROM. Poses that contradict the second solution are added until `LEAST_GAP` is reached. If a narrow cone
+    cannot reach it, the set with the widest gap is returned.
 
     Parameters
     ----------
@@ -96,15 +87,6 @@ def choose(
     n : int
         4 or more.
     guess : Guess
-    criterion : {"parameters", "prediction"}
-        What to minimise. "parameters": the summed variances of rotation, weight and force bias, plus a term against
-        gravity directions in one plane, for LROM. "prediction": the error of force and torque compensation in
-        `R_workspace`, each in units of its noise.
-    R_workspace : array, shape (k, 3, 3), optional
-        Orientations for the compensation, all by default. Only for "prediction".
-    least_gap : float
-        Smallest gap to the second solution (`second_basin`): poses that contradict that solution are added until
-        it is reached. If a narrow cone cannot reach it, the set with the widest gap is returned.
 
     Returns
     -------
@@ -114,7 +96,9 @@ def choose(
     R_candidates = np.asarray(R_candidates, dtype=np.float64)
     if not FEWEST <= n <= len(R_candidates):
         raise ValueError(f"cannot choose {n} poses of {len(R_candidates)}: {FEWEST} or more, of at least as many")
-    terms = _terms(R_candidates, guess, criterion, R_workspace)
+    u = predict(guess.parameters, R_candidates)[:, None, :3] / guess.weight_N
+    u1 = np.concatenate([u, np.ones((len(u), 1, 1))], axis=2)
+    terms = [_Term(force_rows(R_candidates, guess), np.eye(9)), _Term(u1, WEIGHT_OF_PLANE * np.eye(4))]
     pinned: list[int] = []
     widest, best = -1.0, np.zeros(0, dtype=np.intp)
     while len(pinned) <= n // 2:
@@ -122,7 +106,7 @@ def choose(
         gap, other = second_basin(R_candidates[chosen], guess)
         if gap > CLEARLY_WIDER * widest:
             widest, best = gap, chosen
-        if gap >= least_gap or other is None:
+        if gap >= LEAST_GAP or other is None:
             break
         contradiction = _contradiction(R_candidates, guess, other)
         strong = [int(i) for i in chosen if contradiction[i] > contradiction.max() / 2]
@@ -131,15 +115,8 @@ def choose(
     return best
 
 
-def next_pose(
-    R_done: Array,
-    R_candidates: Array,
-    guess: Guess,
-    *,
-    R_workspace: Array | None = None,
-    least_gap: float = LEAST_GAP,
-) -> tuple[Indices, Array]:
-    """Rank candidates for the next pose by the improvement of force and torque compensation.
+def next_pose(R_done: Array, R_candidates: Array, guess: Guess) -> Indices:
+    """Rank candidates for the next pose by the improvement of force and torque compensation in all orientations.
 
     While the completed poses fit a second solution almost as well, the improvement is multiplied by the contradiction
     of the candidate to that solution.
@@ -150,76 +127,24 @@ def next_pose(
         Orientations R_base_flange of the completed poses; n may be 0.
     R_candidates : array, shape (m, 3, 3)
     guess : Guess
-    R_workspace : array, shape (k, 3, 3), optional
-        Orientations for the compensation, all by default.
-    least_gap : float
-        From this gap on (`second_basin`), the second solution is ignored.
 
     Returns
     -------
-    ranked : int array, shape (m,)
+    int array, shape (m,)
         Indices of candidates, the best first.
-    force_rms_N : array, shape (m,)
-        Error of force compensation in the workspace with that pose added, in the order of `ranked`; very large
-        until the poses determine the parameters.
     """
     R_done, R_candidates = np.asarray(R_done, dtype=np.float64), np.asarray(R_candidates, dtype=np.float64)
     if not len(R_candidates):
         raise ValueError("no candidates for the next pose: pass orientations that the arm can reach")
-    force, torque = prediction_weights(special(range(1, 25)) if R_workspace is None else R_workspace, guess)
     done = whitened_jacobian(R_done, guess).reshape(-1, 15)
     C = _inverse(PRIOR * np.eye(15) + done.T @ done)
-    force_gain, torque_gain = _gains(whitened_jacobian(R_candidates, guess), C, force, torque)
-    worth = force_gain + torque_gain
+    weight = sum(prediction_weights(special(range(1, 25)), guess), np.zeros((15, 15)))
+    worth = _gains(whitened_jacobian(R_candidates, guess), C, weight)
     if len(R_done) >= FEWEST - 1:
         gap, other = second_basin(R_done, guess)
-        if gap < least_gap and other is not None:
+        if gap < LEAST_GAP and other is not None:
             worth = worth * _contradiction(R_candidates, guess, other)
-    ranked = np.argsort(-worth, kind="stable")
-    variance = np.maximum(np.sum(C * force) - force_gain[ranked], 0.0)
-    return ranked, np.asarray(guess.sigma_force_N * np.sqrt(variance))
-
-
-def order(R_base_flange: Array, guess: Guess) -> Indices:
-    """Find the order of poses that best separates the random walk of the bias from the other parameters.
-
-    Pairs are exchanged while the variances of rotation and gravity force decrease, in the units of `Guess.scale`. The
-    search starts from the given order and from some random ones.
-
-    Parameters
-    ----------
-    R_base_flange : array, shape (n, 3, 3)
-        A set that determines all parameters.
-    guess : Guess
-        With `walk_force_N` or `walk_torque_Nm` above zero.
-
-    Returns
-    -------
-    int array, shape (n,)
-        The order, as indices of the given poses.
-    """
-    J = whitened_jacobian(np.asarray(R_base_flange, dtype=np.float64), guess)
-
-    def cost(arrangement: Indices) -> float:
-        return float(np.trace(np.linalg.inv(information(J[arrangement], guess))[:6, :6]))
-
-    rng = np.random.default_rng(0)
-    starts = [np.arange(len(J)), *(rng.permutation(len(J)) for _ in range(RANDOM_ORDERS))]
-    return min((_exchange_pairs(start, cost) for start in starts), key=cost)
-
-
-def _exchange_pairs(best: Indices, cost: Callable[[Indices], float]) -> Indices:
-    lowest = cost(best)
-    for _ in range(MOST_SWEEPS):
-        before = lowest
-        for i, j in zip(*np.tril_indices(len(best), -1), strict=True):
-            trial = best.copy()
-            trial[[i, j]] = trial[[j, i]]
-            if (value := cost(trial)) < lowest * (1 - LEAST_GAIN):
-                best, lowest = trial, value
-        if lowest == before:
-            break
-    return best
+    return np.argsort(-worth, kind="stable")
 
 
 class _Term:
@@ -233,18 +158,7 @@ class _Term:
     def gains(self, chosen: list[int]) -> Array:
         """(m,) decrease of the criterion by each candidate, added to the chosen poses."""
         rows = self._rows[chosen].reshape(-1, self._rows.shape[2])
-        return _gains(self._rows, _inverse(self._prior + rows.T @ rows), self._M)[0]
-
-
-def _terms(R_candidates: Array, guess: Guess, criterion: Criterion, R_workspace: Array | None) -> list[_Term]:
-    if criterion == "prediction":
-        weights = prediction_weights(special(range(1, 25)) if R_workspace is None else R_workspace, guess)
-        return [_Term(whitened_jacobian(R_candidates, guess), sum(weights, np.zeros((15, 15))))]
-    if criterion == "parameters":
-        u = predict(guess.parameters, R_candidates)[:, None, :3] / guess.weight_N
-        u1 = np.concatenate([u, np.ones((len(u), 1, 1))], axis=2)
-        return [_Term(force_rows(R_candidates, guess), np.eye(9)), _Term(u1, WEIGHT_OF_PLANE * np.eye(4))]
-    raise ValueError(f"criterion is '{criterion}', expected 'parameters' or 'prediction'")
+        return _gains(self._rows, _inverse(self._prior + rows.T @ rows), self._M)
 
 
 def _greedy_and_exchange(terms: list[_Term], n: int, pinned: list[int]) -> Indices:
@@ -277,11 +191,11 @@ def _contradiction(R_candidates: Array, guess: Guess, other: Parameters) -> Arra
     return np.asarray((difference[:, :3] ** 2).sum(axis=1))
 
 
-def _gains(rows: Array, C: Array, *weights: Array) -> list[Array]:
-    """Decrease of trace(M C) by the rows (m, r, p) of each candidate, for each of the weights M."""
+def _gains(rows: Array, C: Array, M: Array) -> Array:
+    """(m,) decrease of trace(M C) by the rows (m, r, p) of each candidate."""
     JC = rows @ C
     solved = np.linalg.solve(JC @ np.swapaxes(rows, 1, 2) + np.eye(rows.shape[1]), JC)
-    return [np.einsum("mrp,mrp->m", solved, JC @ M) for M in weights]
+    return np.asarray(np.einsum("mrp,mrp->m", solved, JC @ M))
 
 
 def _inverse(information: Array) -> Array:

@@ -25,6 +25,8 @@ from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.likelihood import rotation_minima
 from ftcalib.model import Array, nearest_rotation, skew
 
+MOST_ITERATIONS = 20_000
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceFit:
@@ -36,10 +38,6 @@ class ForceFit:
     """(3,) weight of the load on the sensor, in base axes."""
     force_bias_N: Array
     """(3,) in sensor axes; zero in the form without bias."""
-    converged: bool = True
-    """False if an iteration stopped before convergence; closed forms always converge."""
-    certificate_gap: float | None = None
-    """From `ftcalib.likelihood.rotation_minima.certificate`, which proves global optimality: complete below 1e-8."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,12 +67,9 @@ class ForceEquations:
         """(3,) N: the least-squares gravity force of a rotation (eq. 20)."""
         return np.asarray(np.linalg.lstsq(self.D, (self.f @ R_flange_sensor.T).ravel())[0], dtype=np.float64)
 
-    def fit(
-        self, R_flange_sensor: Array, gravity_N: Array, *, converged: bool = True, certificate_gap: float | None = None
-    ) -> ForceFit:
+    def fit(self, R_flange_sensor: Array, gravity_N: Array) -> ForceFit:
         """Add the bias that follows from the means."""
-        bias_N = self.f_mean - R_flange_sensor.T @ self.A_mean @ gravity_N
-        return ForceFit(R_flange_sensor, gravity_N, bias_N, converged, certificate_gap)
+        return ForceFit(R_flange_sensor, gravity_N, self.f_mean - R_flange_sensor.T @ self.A_mean @ gravity_N)
 
 
 def force_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str, min_poses: int) -> ForceEquations:
@@ -173,14 +168,7 @@ def nullspace(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     return _fit_vec(eq, _least_singular_vector(eq.D, eq.F))
 
 
-def iterative(
-    R_base_flange: Array,
-    force_N: Array,
-    *,
-    bias: bool,
-    gravity_start_base: Array | None = None,
-    max_iterations: int = 20_000,
-) -> ForceFit:
+def iterative(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     """Unknown gravity by iterative linear least squares (section 3.4, algorithm 1).
 
     Alternates between the rotation of a given gravity, projected onto SO(3), and the gravity of a given rotation. The
@@ -192,50 +180,42 @@ def iterative(
     limit is the truth in only 39 % (start at R = I) or 52 % (random gravity) of cases with 100 random orientations;
     with the negation, in all. With few poses there are still false fixed points: from a random gravity, without
     noise, 37, 12, 3 and 0.3 % of cases with 5, 8, 12 and 24 random poses (and bias) end there. From the gravity of
-    theorem 1, the default, 1 % with 5 poses and none with more. (A start at zero, which the paper recommends, is the
-    start R = I by accident of the singular value decomposition.)
+    theorem 1, which is taken here, 1 % with 5 poses and none with more.
 
     Parameters
     ----------
     R_base_flange, force_N, bias
         As in `eigen`.
-    gravity_start_base : array, shape (3,), optional
-        A direction, of any length and sign. The default is the gravity of theorem 1.
-    max_iterations : int
-        If they do not suffice, the fit has `converged=False`.
 
     Raises
     ------
     NotObservable
-        As in `eigen`.
+        As in `eigen`, or the rotation has not converged.
     """
     eq = _linear_equations(R_base_flange, force_N, bias=bias, method="the iterative method")
     rotation_of_gravity = np.linalg.lstsq(eq.F, eq.D)[0]
     gravity_of_rotation = np.linalg.lstsq(eq.D, eq.F)[0]
-    if gravity_start_base is None:
-        eigenvalues, vectors = np.linalg.eig(gravity_of_rotation @ rotation_of_gravity)
-        gravity = vectors[:, np.argmax(eigenvalues.real)].real
-    else:
-        gravity = np.array(gravity_start_base, dtype=np.float64)
+    eigenvalues, vectors = np.linalg.eig(gravity_of_rotation @ rotation_of_gravity)
+    gravity = vectors[:, np.argmax(eigenvalues.real)].real
     X = np.zeros((3, 3))
-    converged = False
-    for _ in range(max_iterations):
+    for _ in range(MOST_ITERATIONS):
         previous, X = X, _rotation_of_vec(rotation_of_gravity @ gravity)
         gravity = gravity_of_rotation @ X.T.ravel()
-        converged = bool(np.linalg.norm(X - previous) <= 1e-13)
-        if converged:
-            break
-    _require_single_null_vector(eq, gravity)
-    return eq.fit(X, gravity, converged=converged)
+        if np.linalg.norm(X - previous) <= 1e-13:
+            _require_single_null_vector(eq, gravity)
+            return eq.fit(X, gravity)
+    raise NotObservable(
+        f"the iterative method has not converged in {MOST_ITERATIONS} steps: add poses turned about other axes"
+    )
 
 
 def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
-    """Unknown gravity by polynomial optimisation (section 3.3, eq. 27), to certified global optimality.
+    """Unknown gravity by polynomial optimisation (section 3.3, eq. 27).
 
     Gravity and bias are linear given the rotation, so eq. 27 is the minimum of a quadratic form in vec(X) over SO(3):
     the least-squares solution, which for isotropic noise is the most likely one. The paper follows 2^18 homotopy
     paths in 10 minutes; the form has only 40 complex critical rotations, and `ftcalib.likelihood.rotation_minima` finds
-    all its minima in milliseconds and bounds how far the best is from the global one. (The residual in eq. 27 must be
+    all its minima in milliseconds. (The residual in eq. 27 must be
     `R_TF^S f - A g` for the paper's count of paths.)
 
     Parameters
@@ -264,7 +244,7 @@ def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
             f"two sensor orientations {apart:.0f} deg apart explain the forces about equally well: add poses, at least "
             "one with another angle between tool axis and gravity"
         )
-    return eq.fit(X, gravity, certificate_gap=rotation_minima.certificate(Q, best.R))
+    return eq.fit(X, gravity)
 
 
 def kron_identity(f: Array) -> Array:

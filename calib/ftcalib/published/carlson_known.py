@@ -46,9 +46,7 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     return eq.fit(R_sensor_flange.T, _weight(eq.f, a, R_sensor_flange) * down)
 
 
-def cayley(
-    R_base_flange: Array, force_N: Array, gravity_force_base_N: Array, *, bias: bool, total: bool = True
-) -> ForceFit:
+def cayley(R_base_flange: Array, force_N: Array, gravity_force_base_N: Array, *, bias: bool) -> ForceFit:
     """Rotation by the Cayley transform, gravity known with the weight (eqs. 6-11).
 
     The transform fails for rotations by 180 deg and is poor near them, so it is applied after each of four turns of
@@ -65,8 +63,6 @@ def cayley(
         Weight of the load on the sensor, in base axes; returned unchanged.
     bias : bool
         Whether to estimate the force bias, or to assume zero like the paper (see the module).
-    total : bool
-        Total least squares, as the paper recommends, or ordinary.
 
     Raises
     ------
@@ -79,12 +75,12 @@ def cayley(
     eq, _ = _equations(R_base_flange, force_N, gravity, 2, bias=bias, method="the Cayley transform")
     a = eq.A @ gravity
     turns = [np.diag(signs) for signs in ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))]
-    candidates = [cayley_rotation(eq.f, a @ turn, total=total) @ turn for turn in turns]
+    candidates = [cayley_rotation(eq.f, a @ turn) @ turn for turn in turns]
     R_sensor_flange = min(candidates, key=lambda R: float(np.sum((eq.f - a @ R.T) ** 2)))
     return eq.fit(R_sensor_flange.T, gravity)
 
 
-def cayley_rotation(f: Array, a: Array, *, total: bool) -> Array:
+def cayley_rotation(f: Array, a: Array) -> Array:
     """Rotation R with `f_i = R a_i` by one Cayley transform, as published (eqs. 7-11).
 
     `R = (I + <s>)^-1 (I - <s>)` makes the problem linear in s: `<f_i + a_i> s = f_i - a_i`. (Eq. 11 has the opposite
@@ -96,19 +92,13 @@ def cayley_rotation(f: Array, a: Array, *, total: bool) -> Array:
     ----------
     f, a : array, shape (n, 3)
         With a bias, both minus their means.
-    total : bool
-        Total or ordinary least squares; noise makes the latter's s too small.
 
     Returns
     -------
     array, shape (3, 3)
     """
     regressor = skew(f + a).reshape(-1, 3)
-    target = (f - a).ravel()
-    if total:
-        s = np.linalg.svd(np.column_stack([regressor, -target]), full_matrices=False)[2][-1]
-    else:
-        s = np.append(np.linalg.lstsq(regressor, target)[0], 1)
+    s = np.linalg.svd(np.column_stack([regressor, (a - f).ravel()]), full_matrices=False)[2][-1]
     return Rotation.from_quat([*-s[:3], s[3]]).as_matrix()
 
 

@@ -19,10 +19,8 @@ BITRATE = 1_000_000
 _WAIT_S = 0.05
 _HEARD_S = 0.15
 """Since the last half: shorter than `StreamLimits.stale_s`, longer than the slowest sensor's period."""
-_LATE_S = 0.03
-"""The most that an emulated sensor may be late: more than its cell's time ever runs ahead of it."""
-_OVERSLEPT_S = 0.002
-"""After a wait that ends this late the host was busy, and frames may have arrived: look once more."""
+_MOST_FRAMES = 50
+"""After so many without a silence the reader looks at its other tasks."""
 
 
 class RobotousCan(RobotousSensor):
@@ -68,7 +66,7 @@ class RobotousCan(RobotousSensor):
         self._bus.send(COMMAND, field)
 
     def _start_stream(self, rate_Hz: int) -> None:
-        self._halves = Halves(1 / rate_Hz, _LATE_S if self._clock.emulated else 0.0)
+        self._halves = Halves(1 / rate_Hz, self._clock.lead_s)
         super()._start_stream(rate_Hz)
 
     def _damaged(self) -> int:
@@ -81,35 +79,15 @@ class RobotousCan(RobotousSensor):
         return super()._silence_fix()
 
     def _receive(self) -> list[Field]:
-        if self._clock.emulated:
-            return self._receive_all()
-        overslept = False
-        for left_s in self._clock.looks(_WAIT_S):
-            begin_s = self._clock.now_s()
-            wait_s = left_s if self._halves.quiet else 0.0 if overslept else self._halves.silence_s
-            fields: list[Field] = []
-            if frame := self._bus.look(wait_s):
+        """Return the fields of a run of frames, which ends with a silence."""
+        wait_s = min(_WAIT_S, self._clock.poll_s) if self._halves.quiet else self._halves.silence_s
+        frame = self._bus.look(wait_s)
+        with self._clock.held():  # else an emulated sensor might send as fast as a starved program reads
+            for _ in range(_MOST_FRAMES):
+                if frame is None:
+                    return self._halves.silence()
                 identifier, data = frame
                 self._heard_ns = self._clock.now_ns()
                 self._halves.take(self._heard_ns, data, second=identifier == SECOND_HALF)
-                overslept = False
-            elif overslept or self._clock.now_s() - begin_s < wait_s + _OVERSLEPT_S:
-                fields = self._halves.silence()
-            else:
-                overslept = True
-            if fields:
-                return fields
+                frame = self._clock.hear(self._bus.look, self._halves.silence_s)
         return []
-
-    def _receive_all(self) -> list[Field]:
-        """Return all that an emulated sensor has sent. A starved program never sees the silence that ends a run.
-
-        The cell's time stands still meanwhile, so the loop ends.
-        """
-        frame = self._bus.look(self._clock.poll_s)
-        now_ns = self._clock.now_ns()
-        while frame:
-            self._heard_ns = now_ns
-            self._halves.take(now_ns, frame[1], second=frame[0] == SECOND_HALF)
-            frame = self._bus.look(0.0)
-        return self._halves.silence()

@@ -33,8 +33,8 @@ class Halves:
     period_s : float
         Between two samples; NaN for replies to requests.
     late_s : float
-        How late the sensor itself may be, as an emulated one is on a busy computer. A shorter deficit then counts as
-        late, so two neighbouring losses are not detected.
+        How late the sensor itself may be: `Clock.lead_s`. A shorter deficit then counts as late, so two neighbouring
+        losses are not detected.
     """
 
     def __init__(self, period_s: float = math.nan, late_s: float = 0.0) -> None:

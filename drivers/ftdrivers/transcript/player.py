@@ -1,18 +1,14 @@
 """The far side of a recorded wire: it plays a transcript to the unmodified driver."""
 
-import contextlib
+import math
 import os
 import select
-import socket
 import threading
 import tty
-from collections.abc import Callable
-from socketserver import BaseRequestHandler
-from typing import Any, Final
+from typing import Final
 
-from ftdrivers.clock import REAL, Clock
-from ftdrivers.transcript.ports import AT_ONCE, HTTP_S, LOOK_S, LOOPBACK, PageServer
-from ftdrivers.transcript.recorder import Page, Passage, Transcript, asked_for
+from ftdrivers.clock import REAL, Clock, Follower
+from ftdrivers.transcript.recorder import Passage, Transcript
 from ftdrivers.wires.parity import leave_marks_to_far_side, marks_asked_for
 
 _EARLY_S: Final = 0.05
@@ -20,24 +16,22 @@ _EARLY_S: Final = 0.05
 
 
 class Player:
-    """Replays a recorded device to one driver that opens it once, on a pseudo-terminal or on ports of this computer.
+    """Replays a recorded device on a pseudo-terminal, to one driver that opens it once.
 
     Replies have the recorded delays, and unsolicited data the recorded timing. A request that is not in the rest of the
-    recording is a divergence: silence follows. Pages may be requested at any time; repeated requests for one page get
-    the recorded replies in order.
+    recording is a divergence: silence follows.
     """
 
     def __init__(self, transcript: Transcript, clock: Clock = REAL) -> None:
         self._clock = clock
         self._passages = transcript.passages
-        self._datagrams = transcript.datagrams
-        self._far = _Ethernet(transcript.pages, self._diverge, clock) if transcript.datagrams else _Terminal(transcript)
+        self._far = _Terminal(transcript)
         self._next = 0
         self._t_ns = transcript.opened_ns  # of the recording, at `_t`
         self._t = 0.0
         self._asked = bytearray()
         self._ended = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread: Follower | None = None
         self.divergence: str | None = None
         """The request of the driver that is not in the recording."""
 
@@ -48,11 +42,11 @@ class Player:
         return (left[-1].t_ns - left[0].t_ns) / 1e9 if left else 0.0
 
     def __enter__(self) -> str:
-        """Open the far side and return the argument of `Transcript.url_at`, such as the path of a pseudo-terminal."""
-        place = self._far.open()
-        self._thread = threading.Thread(target=self._serve, name=f"player on {place}", daemon=True)
+        """Open the far side and return the path of its pseudo-terminal."""
+        path = self._far.open()
+        self._thread = Follower(self._clock, self._serve, f"player on {path}")
         self._thread.start()
-        return place
+        return path
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
@@ -62,35 +56,33 @@ class Player:
             self._far.close()
 
     def _serve(self) -> None:
-        if not self._far.wait_for_driver(self._ended):
-            return
-        with self._clock.keeping_up():
-            self._t = self._clock.now_s()
-            while not self._ended.is_set():
-                self._clock.now_ns()  # an emulated cell waits for this thread
-                wait_s = min(self._clock.poll_s, max(0.0, self._play()))
-                readable, _, _ = select.select([self._far], [], [], wait_s)
-                if readable:
-                    data = self._far.read()
-                    if data is None:
-                        return
-                    self._asked += data
-                    self._listen()
+        while not self._far.is_awaited():  # nothing is sent before the driver is ready for it
+            if self._clock.wait(self._ended, 0.001):
+                return
+        self._t = self._clock.now_s()
+        while not self._ended.is_set():
+            self._clock.now_ns()  # an emulated cell waits for this thread
+            wait_s = min(self._clock.poll_s, max(0.0, self._play()))
+            readable, _, _ = select.select([self._far], [], [], wait_s)
+            if readable:
+                data = self._far.read()
+                if data is None:
+                    return
+                self._asked += data
+                self._listen()
 
     def _play(self) -> float:
         """Send the data that is due; return the seconds until more may be."""
         if self._far.is_full:
             self._far.send(b"")
-        for _ in range(AT_ONCE):
-            if self._next == len(self._passages) or self.divergence or self._passages[self._next].sent:
-                return 0.001 if self._far.is_full else LOOK_S
+        while self._next < len(self._passages) and not self.divergence and not self._passages[self._next].sent:
             passage = self._passages[self._next]
             wait_s = self._due_in_s(passage)
             if wait_s > 0:
                 return wait_s
             self._far.send(passage.data)
             self._next += 1
-        return 0.001
+        return 0.001 if self._far.is_full else math.inf
 
     def _due_in_s(self, passage: Passage) -> float:
         return self._t + (passage.t_ns - self._t_ns) / 1e9 - self._clock.now_s()
@@ -103,15 +95,15 @@ class Player:
                 self._asked.clear()
                 return
             expected = self._passages[first].data
-            if not self._datagrams and len(expected) > len(self._asked) and expected.startswith(self._asked):
+            if len(expected) > len(self._asked) and expected.startswith(self._asked):
                 return
             found: int | None = first
-            while found is not None and not self._is_asked(self._passages[found].data):
+            while found is not None and not self._asked.startswith(self._passages[found].data):
                 found = self._request_from(found + 1)
             if found is None:
-                self._diverge(f"the driver sent {self._asked.hex(' ')}, the recording has {expected.hex(' ')}")
+                self.divergence = f"the driver sent {self._asked.hex(' ')}, the recording has {expected.hex(' ')}"
                 return
-            if found == first and not self._datagrams:  # earlier datagrams belong to a closed socket
+            if found == first:
                 for passage in self._passages[self._next : found]:
                     if self._due_in_s(passage) < _EARLY_S:
                         self._far.send(passage.data)
@@ -120,14 +112,8 @@ class Player:
             self._next = found + 1
             self._t, self._t_ns = self._clock.now_s(), request.t_ns
 
-    def _is_asked(self, request: bytes) -> bool:
-        return self._asked == request if self._datagrams else self._asked.startswith(request)
-
     def _request_from(self, start: int) -> int | None:
         return next((i for i in range(start, len(self._passages)) if self._passages[i].sent), None)
-
-    def _diverge(self, what: str) -> None:
-        self.divergence = self.divergence or what
 
 
 class _Terminal:
@@ -151,17 +137,15 @@ class _Terminal:
     def close(self) -> None:
         os.close(self._master)
 
-    def wait_for_driver(self, ended: threading.Event) -> bool:
-        """Wait until the driver has opened the port; return False when `ended` comes first."""
+    def is_awaited(self) -> bool:
+        """Whether the driver has opened the port, and asked for marks if there are any."""
         poll = select.poll()
         poll.register(self._master, 0)
-        while poll.poll(0):  # "hung up" until a driver has opened the other end
-            if ended.wait(0.005):
+        if poll.poll(0):  # "hung up" until a driver has opened the other end
+            return False
+        if self._parity_marks:
+            if not marks_asked_for(self._master):
                 return False
-        if self._parity_marks:  # nothing is sent before the driver is ready for them
-            while not marks_asked_for(self._master):
-                if ended.wait(0.001):
-                    return False
             leave_marks_to_far_side(self._master)
         return True
 
@@ -193,71 +177,3 @@ class _Terminal:
     @property
     def is_full(self) -> bool:
         return bool(self._unsent)
-
-
-class _Ethernet:
-    """A UDP port, and a second port with pages over HTTP."""
-
-    is_full = False
-
-    def __init__(self, pages: tuple[Page, ...], diverge: Callable[[str], None], clock: Clock) -> None:
-        self._pages = pages
-        self._clock = clock
-        self._diverge = diverge
-        self._driver: Any = None
-        self._opened = contextlib.ExitStack()
-
-    def open(self) -> str:
-        self._socket = self._opened.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-        self._socket.bind((LOOPBACK, 0))
-        answers = self._opened.enter_context(_PageAnswers(self._pages, self._diverge, self._clock))
-        return f"{LOOPBACK}?rdt_port={self._socket.getsockname()[1]}&http_port={answers.port}"
-
-    def close(self) -> None:
-        self._opened.close()
-
-    def wait_for_driver(self, _: threading.Event) -> bool:
-        return True
-
-    def fileno(self) -> int:
-        return self._socket.fileno()
-
-    def read(self) -> bytes | None:
-        data, self._driver = self._socket.recvfrom(65536)
-        return data
-
-    def send(self, data: bytes) -> None:
-        if self._driver is not None:
-            self._socket.sendto(data, self._driver)
-
-
-class _PageAnswers(PageServer):
-    """Replies with the recorded bytes after the recorded time."""
-
-    def __init__(self, pages: tuple[Page, ...], diverge: Callable[[str], None], clock: Clock) -> None:
-        super().__init__("player of pages", _PageAnswer)
-        self._diverge = diverge
-        self._clock = clock
-        self._left: dict[bytes, list[Page]] = {}
-        for page in pages:
-            self._left.setdefault(asked_for(page.request), []).append(page)
-
-    def answer(self, request: bytes) -> bytes:
-        asked = asked_for(request)
-        left = self._left.get(asked)
-        if not left:
-            self._diverge(f"the driver requested {asked.decode(errors='replace')}, which is not in the recording")
-            return b""
-        page = left.pop(0) if len(left) > 1 else left[0]
-        self._clock.wait(self.ended, page.took_s)
-        return page.reply
-
-
-class _PageAnswer(BaseRequestHandler):
-    server: _PageAnswers
-
-    def handle(self) -> None:
-        driver: socket.socket = self.request
-        driver.settimeout(HTTP_S)
-        with contextlib.suppress(OSError):  # a driver that has disconnected needs no reply
-            driver.sendall(self.server.answer(driver.recv(65536)))

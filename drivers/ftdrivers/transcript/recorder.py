@@ -5,18 +5,14 @@ time of the driver's clock as `t_ns`:
 
 {"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits", "parity_marks"}   a serial port
 {"t_ns", "event": "open", "port", "frames": true}                                                 a CAN interface
-{"t_ns", "event": "open", "port", "datagrams": true}                                              UDP
-{"t_ns", "event": "unreachable", "error"}   why a datagram was lost, which the driver does not notice
-{"t_ns", "event": "page", "request", "reply", "took_s", "error"}   one HTTP request and its reply, with headers, in hex
 {"t_ns", "dir": "tx", "hex"}    one write of the driver
-{"t_ns", "dir": "rx", "hex"}    one datagram, or what the driver read within 2 ms, stamped with its first byte
+{"t_ns", "dir": "rx", "hex"}    what the driver read within 2 ms, stamped with its first byte
 {"t_ns", "event": "end", "error"}   the error at the end; without one, what the driver decoded: "identity", "samples",
                                     "mean_force_N", "mean_torque_Nm" and more
 
-Where `parity_marks` is true, received bytes contain the marks of `drivers/ftdrivers/wires/parity.py`; older transcripts
-lack the field and the marks. An slcan adapter is recorded as a serial port. The frames of other CAN interfaces are
-written as lines of slcan, and an emulated slcan adapter plays them. Commands of
-python-can to that adapter are not compared.
+Where `parity_marks` is true, received bytes contain the marks of `drivers/ftdrivers/wires/parity.py`. An slcan adapter
+is recorded as a serial port. The frames of other CAN interfaces are written as lines of slcan, and an emulated slcan
+adapter plays them. Commands of python-can to that adapter are not compared.
 """
 
 import json
@@ -38,8 +34,6 @@ FORMAT: Final = "ftdrive.transcript/1"
 _TOGETHER_NS: Final = 2_000_000
 INTERRUPTED: Final = "interrupted"
 """The error of a recording that the user has interrupted."""
-_LONGEST_PAGE_S: Final = 60.0
-"""Longer than any driver waits for a page."""
 
 
 class Writer:
@@ -100,10 +94,6 @@ class Writer:
                 self._received_ns = now_ns
             self._received += data
 
-    def received_datagram(self, data: bytes) -> None:
-        """Record one datagram to the driver as one line."""
-        self._entry(dir="rx", hex=data.hex())
-
     def end(self, **content: Any) -> None:
         """Write the last line and rename the file."""
         self.event("end", **content)
@@ -152,21 +142,6 @@ class Passage:
 
 
 @dataclass(frozen=True, slots=True)
-class Page:
-    """An HTTP request and its reply, as they were on the wire."""
-
-    request: bytes
-    reply: bytes
-    """Empty where none arrived."""
-    took_s: float
-
-
-def asked_for(request: bytes) -> bytes:
-    """Return method and path of an HTTP request, because the rest differs between clients."""
-    return b" ".join(request.split(b"\r\n", 1)[0].split(b" ")[:2])
-
-
-@dataclass(frozen=True, slots=True)
 class Transcript:
     """A transcript read from a file."""
 
@@ -180,9 +155,6 @@ class Transcript:
     """Whether received bytes contain marks of wrong parity."""
     frames: bool = False
     """Whether the passages are frames of a CAN interface, as lines of slcan."""
-    datagrams: bool = False
-    """Whether each passage is a datagram."""
-    pages: tuple[Page, ...] = ()
 
     @property
     def is_broken_off(self) -> bool:
@@ -194,9 +166,8 @@ class Transcript:
         """Read a file. Raises `BadTranscript`, or `OSError` when it cannot be read."""
         header: Mapping[str, Any] = {}
         opened_ns: int | None = None
-        parity_marks = frames = datagrams = False
+        parity_marks = frames = False
         passages: list[Passage] = []
-        pages: list[Page] = []
         end: Mapping[str, Any] = {}
         number = 0
         try:
@@ -209,9 +180,7 @@ class Transcript:
                         passages.append(Passage(_time_ns(line), line["dir"] == "tx", bytes.fromhex(line["hex"])))
                     elif line.get("event") == "open" and opened_ns is None:
                         opened_ns, parity_marks = _time_ns(line), line.get("parity_marks") is True
-                        frames, datagrams = line.get("frames") is True, line.get("datagrams") is True
-                    elif line.get("event") == "page":
-                        pages.append(_checked_page(line))
+                        frames = line.get("frames") is True
                     elif line.get("event") == "end":
                         end = _checked_end(line)
         except (BadUrl, ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
@@ -222,14 +191,13 @@ class Transcript:
             raise BadTranscript(f"{path} is empty; record it again")
         if opened_ns is None:
             raise BadTranscript(f"{path}: nothing to play, the driver opened no port: {end.get('error')}")
-        return cls(header, opened_ns, tuple(passages), end, parity_marks, frames, datagrams, tuple(pages))
+        return cls(header, opened_ns, tuple(passages), end, parity_marks, frames)
 
     def url_at(self, port: str) -> str:
-        """Return the sensor's address with the port and the options of a player in place of the device."""
+        """Return the sensor's address with the port of a player in place of the device."""
         parts = split_url(str(self.header["url"]))
-        place, _, own = port.partition("?")
-        options = dict(parse_qsl(parts.query)) | dict(parse_qsl(own)) | ({"interface": "slcan"} if self.frames else {})
-        return f"{parts.scheme}://{place}" + (f"?{urlencode(options)}" if options else "")
+        options = dict(parse_qsl(parts.query)) | ({"interface": "slcan"} if self.frames else {})
+        return f"{parts.scheme}://{port}" + (f"?{urlencode(options)}" if options else "")
 
 
 def _checked_header(path: Path, line: Any) -> Mapping[str, Any]:
@@ -251,13 +219,6 @@ def _checked_end(line: Mapping[str, Any]) -> Mapping[str, Any]:
             if not all(map(math.isfinite, (x, y, z))):
                 raise ValueError(f"a mean of {x}, {y}, {z}")
     return line
-
-
-def _checked_page(line: Mapping[str, Any]) -> Page:
-    page = Page(bytes.fromhex(line["request"]), bytes.fromhex(line["reply"]), float(line["took_s"]))
-    if not 0 <= page.took_s <= _LONGEST_PAGE_S:
-        raise ValueError(f"took_s is {page.took_s}")
-    return page
 
 
 def _time_ns(line: Mapping[str, Any]) -> int:

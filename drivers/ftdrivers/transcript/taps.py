@@ -1,11 +1,9 @@
-"""Recording of bytes: inside pyserial and python-can, and by relays in front of pynetft."""
+"""Recording of bytes inside pyserial and python-can."""
 
 import contextlib
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext
-from importlib import import_module
 from types import ModuleType
-from typing import Any, cast
+from typing import Any
 
 import can
 import serial
@@ -15,7 +13,7 @@ from ftdrivers.wires.parity import marks_asked_for
 
 
 @contextlib.contextmanager
-def replaced(module: ModuleType, name: str, other: object) -> Iterator[None]:
+def _replaced(module: ModuleType, name: str, other: object) -> Iterator[None]:
     """Put another object in the place of the one that a module has by this name, during the `with` block."""
     plain = getattr(module, name)
     setattr(module, name, other)
@@ -27,27 +25,10 @@ def replaced(module: ModuleType, name: str, other: object) -> Iterator[None]:
 
 @contextlib.contextmanager
 def recording(writer: Writer) -> Iterator[None]:
-    """Record the bytes of all serial ports, CAN buses and pynetft clients opened in the `with` block.
+    """Record the bytes of all serial ports and CAN buses opened in the `with` block.
 
     They keep the driver's settings, so the device sees no difference.
     """
-    with _ports_and_buses(writer), _ethernet(writer):
-        yield
-
-
-def _ethernet(writer: Writer) -> AbstractContextManager[None]:
-    """Record pynetft, where it is installed."""
-    try:
-        relays = import_module("ftdrivers.transcript.relays")
-    except ModuleNotFoundError as error:
-        if error.name != "pynetft":
-            raise
-        return nullcontext()
-    return cast(AbstractContextManager[None], relays.relayed(writer))
-
-
-@contextlib.contextmanager
-def _ports_and_buses(writer: Writer) -> Iterator[None]:
     plain_bus = can.Bus
     opened: list[serial.Serial] = []
 
@@ -105,7 +86,7 @@ def _ports_and_buses(writer: Writer) -> Iterator[None]:
         vars(bus).update(recv=recv, send=recorded_send)
         return bus
 
-    with replaced(serial, "Serial", RecordedPort), replaced(can, "Bus", recorded_bus):
+    with _replaced(serial, "Serial", RecordedPort), _replaced(can, "Bus", recorded_bus):
         yield
 
 

@@ -25,8 +25,8 @@ from ftdrivers.interfaces import (
     ArmStatus,
     ControllerSettings,
     DeviceInfo,
+    Diagnosis,
     Fact,
-    Finding,
     Guard,
     RobotArm,
 )
@@ -39,7 +39,7 @@ from ftdrivers.ur.own_program import OwnProgram
 from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.robot_api import PORT as API_PORT
 from ftdrivers.ur.sample import PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Sample
-from ftdrivers.ur.timing import UrTiming
+from ftdrivers.ur.timing import STRICT, UrTiming
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +81,7 @@ class UrArm(RobotArm):
         control: ControlSetting = "auto",
         api_port: int = API_PORT,
         clock: Clock = REAL,
-        timing: UrTiming | None = None,
+        timing: UrTiming = STRICT,
     ) -> None:
         _check_speed(speed_rad_s, acceleration_rad_s2)
         if control not in CONTROL_SETTINGS:
@@ -93,7 +93,7 @@ class UrArm(RobotArm):
         self._speed_rad_s = float(speed_rad_s)
         self._acceleration_rad_s2 = float(acceleration_rad_s2)
         self._clock = clock
-        self._timing = timing or UrTiming.of(clock)
+        self._timing = timing
         self._moves_at_rad_s = self._speed_rad_s
         self._setting = control
         self._api_port = api_port
@@ -255,7 +255,7 @@ class UrArm(RobotArm):
         """
         return self._reading().reported_program()
 
-    def diagnose(self) -> list[Finding]:
+    def diagnose(self) -> list[Diagnosis]:
         """Check what control needs: a control path, the version, free RTDE registers, an open port for programs."""
         return self._opening(self._reading()).diagnose()
 

@@ -9,7 +9,7 @@ from typing import Final
 
 from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, DeviceError, DeviceTimeout, StreamBroken
-from ftdrivers.interfaces import Finding
+from ftdrivers.interfaces import Diagnosis
 from ftdrivers.ur import control_process, control_program, primary
 from ftdrivers.ur.control import Control, ControlPath, ControlSetting, ProgramRefused
 from ftdrivers.ur.control_process import ControlProcess
@@ -96,15 +96,15 @@ class Opening:
         self.program.has_started()
         return control
 
-    def diagnose(self) -> list[Finding]:
+    def diagnose(self) -> list[Diagnosis]:
         """Check what control needs; change nothing."""
 
-        def finding(name: str, require: Callable[[], None], found: str) -> Finding:
+        def diagnosis(name: str, require: Callable[[], None], found: str) -> Diagnosis:
             try:
                 require()
             except DeviceError as error:
-                return Finding(name, False, error.found, error.fix)
-            return Finding(name, True, found)
+                return Diagnosis(name, False, error.found, error.fix)
+            return Diagnosis(name, True, found)
 
         path, why = path_for(self.setting, self.reader.version)
         stops = (
@@ -116,10 +116,10 @@ class Opening:
         free = "the RTDE registers are free: no other client controls the arm"
         is_open = f"port {self._port}, which takes programs, is open"
         return [
-            finding("control", self.require_path, f"control path {path}: {why}{stops}"),
-            finding("version", self.require_version, version),
-            finding("registers", self.require_registers, free),
-            finding("programs", self.require_port, is_open),
+            diagnosis("control", self.require_path, f"control path {path}: {why}{stops}"),
+            diagnosis("version", self.require_version, version),
+            diagnosis("registers", self.require_registers, free),
+            diagnosis("programs", self.require_port, is_open),
         ]
 
     def require_path(self) -> None:

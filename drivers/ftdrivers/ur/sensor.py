@@ -19,7 +19,7 @@ from ftdrivers.errors import ConnectError, ProtocolError, StreamBroken
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.ur.rtde import Subscription
-from ftdrivers.ur.timing import UrTiming
+from ftdrivers.ur.timing import STRICT
 
 if TYPE_CHECKING:
     from ftdrivers.registry import Options
@@ -39,7 +39,7 @@ class UrWristSensor(StreamingSensor):
     host : str
         Address of the controller.
     counts_per_N, counts_per_Nm : float
-        `ft_raw_wrench` at 1 N and at 1 N·m. Measure them: see drivers/README.md.
+        `ft_raw_wrench` at 1 N and at 1 N·m. Measure them: see docs/how-to/connect-a-sensor.md.
     sign : int
         -1 for a sensor that reports the reaction.
     clock : Clock
@@ -58,7 +58,7 @@ class UrWristSensor(StreamingSensor):
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ur-ft://192.168.1.10?counts_per_N=…&counts_per_Nm=…``; both are required."""
-        why = "measure the undocumented unit of ft_raw_wrench as described in drivers/README.md"
+        why = "measure the undocumented unit of ft_raw_wrench as described in docs/how-to/connect-a-sensor.md"
         return cls(
             address,
             counts_per_N=options.positive("counts_per_N", why),
@@ -69,7 +69,7 @@ class UrWristSensor(StreamingSensor):
 
     def _connect(self) -> DeviceInfo:
         outputs = {"timestamp": "DOUBLE", "ft_raw_wrench": "VECTOR6D"}
-        connect_s = UrTiming.of(self._clock).connect_s
+        connect_s = self._clock.patience_s(STRICT.connect_s)
         self._stream = Subscription(self._host, outputs, _RATE_Hz, timeout_s=connect_s, clock=self._clock)
         version = ".".join(map(str, self._stream.version))
         if self._stream.missing:

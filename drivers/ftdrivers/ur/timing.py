@@ -15,7 +15,7 @@ _QUICKEST_OF_S: Final = 0.5
 
 @dataclass(frozen=True)
 class UrTiming:
-    """Limits in seconds. The defaults are for a real cell; `docs/drivers/ur.md` describes their effects."""
+    """Limits in seconds. The defaults are for a real cell; docs/explanation/ur-controller.md has their effects."""
 
     # Limits on samples of the controller, the same in every cell.
     stale_s: float = 0.2
@@ -66,11 +66,6 @@ class UrTiming:
     """The control process ends itself when ur_rtde, which gives up after 5 s, has not connected by then."""
     child_leaving_s: float = 3.0
     """The same for its exit after the parent has gone."""
-
-    @classmethod
-    def of(cls, clock: Clock) -> Self:
-        """Return the limits of the cell that a clock times."""
-        return cls.emulated() if clock.emulated else cls()
 
     @classmethod
     def emulated(cls) -> Self:

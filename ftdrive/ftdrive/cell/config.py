@@ -203,6 +203,11 @@ class CellConfig:
     clock: Clock = field(default=REAL, compare=False, repr=False)
     """Times everything in the cell; an emulated cell has its own. It is in no file."""
 
+    @property
+    def is_emulated(self) -> bool:
+        """Whether the cell has a time of its own."""
+        return self.clock is not REAL
+
     def to_dict(self) -> dict[str, Any]:
         """Return the sections as files have them; a password in the store's address is left out."""
         found = {name: asdict(getattr(self, name)) for name in SECTIONS}

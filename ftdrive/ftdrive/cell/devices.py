@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from math import radians
-from typing import cast
+from typing import Any, cast
 
 from ftcalib.ports import Arm, Sensor
 from ftdrive.cell.config import CellConfig
@@ -11,24 +11,27 @@ from ftdrive.errors import ConfigError
 from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrivers.registry import arm_class, sensor_from_url
+from ftdrivers.ur.timing import STRICT, UrTiming
 
 
 def build_arm(cell: CellConfig) -> RobotArm:
     """Build the arm's driver, not yet open; it moves at the speed of the cell unless a move names its own."""
+    robot = cell.robot
     try:
-        build = cast("Callable[..., RobotArm]", arm_class(cell.robot.driver))
+        build = cast("Callable[..., RobotArm]", arm_class(robot.driver))
     except BadUrl as error:
         raise ConfigError(f"[robot] driver: {error}") from error
     # Only an emulated arm takes a clock: an arm of another package may not know it.
-    emulated = {"clock": cell.clock} if cell.clock.emulated else {}
-    ur = {"control": cell.robot.control, "api_port": cell.robot.api_port} if cell.robot.driver == "ur" else {}
+    more: dict[str, Any] = {"clock": cell.clock} if cell.is_emulated else {}
+    if robot.driver == "ur":
+        timing = UrTiming.emulated() if cell.is_emulated else STRICT
+        more |= {"control": robot.control, "api_port": robot.api_port, "timing": timing}
     arm = build(
-        cell.robot.host,
-        model=cell.robot.model,
-        speed_rad_s=radians(cell.robot.speed_deg_s),
-        acceleration_rad_s2=radians(cell.robot.acceleration_deg_s2),
-        **ur,
-        **emulated,
+        robot.host,
+        model=robot.model,
+        speed_rad_s=radians(robot.speed_deg_s),
+        acceleration_rad_s2=radians(robot.acceleration_deg_s2),
+        **more,
     )
     _fits: Arm = arm  # checked statically: what the routine asks for is what the driver gives
     return arm

@@ -19,6 +19,9 @@ _SLICE_S: Final = 0.005
 """A thread that keeps up looks at the clock this often while it waits."""
 _SUSPECT_S: Final = 0.25
 """When the time has stood still for so long, it is checked whether the station has ended."""
+_PATIENCE_S: Final = 30.0
+_LOCAL_SLOTS: Final = 8
+_LOCAL_LEAD_NS: Final = 10_000_000
 _NEVER_NS: Final = 2**62
 _claiming = threading.Lock()
 
@@ -37,7 +40,9 @@ class EmulatedClock(Clock):
         There is no such page, or it has another version.
     """
 
-    emulated = True
+    poll_s = _SLICE_S
+    lead_s = 0.03
+    can_be_held = True
 
     def __init__(self, path: str) -> None:
         try:
@@ -56,10 +61,15 @@ class EmulatedClock(Clock):
         self._ended_ns: int | None = None
         """What to add to the computer's clock, once the station has ended."""
 
+    def patience_s(self, limit_s: float) -> float:
+        """Return a long limit on another process, which may starve."""
+        return max(limit_s, _PATIENCE_S)
+
     def now_ns(self) -> int:
-        """Return the cell's time, and let it go on where it waits for this thread."""
+        """Return the cell's time, and let it go on where it waits for this thread and is not held."""
         now_ns = self._read_ns()
-        self._follow(now_ns)
+        if not getattr(self._own, "held", False):
+            self._follow(now_ns)
         return now_ns
 
     def sleep(self, duration_s: float) -> None:
@@ -92,6 +102,15 @@ class EmulatedClock(Clock):
             self._page[slot] = 0
 
     @contextmanager
+    def held(self) -> Iterator[None]:
+        """Let the time stand still for this thread."""
+        self._own.held = True
+        try:
+            yield
+        finally:
+            self._own.held = False
+
+    @contextmanager
     def away(self) -> Iterator[None]:
         """Let the time go on without this thread."""
         self._follow(_NEVER_NS)
@@ -119,13 +138,16 @@ class EmulatedClock(Clock):
         with _claiming:
             fcntl.lockf(self._descriptor, fcntl.LOCK_EX, 8)
             try:
-                for slot in range(_SLOTS, _SLOTS + 2 * self._page[_COUNT], 2):
-                    if not self._page[slot]:
-                        self._page[slot + 1] = self._read_ns()
-                        self._page[slot] = os.getpid()
-                        return slot
+                return self._claim_first_free()
             finally:
                 fcntl.lockf(self._descriptor, fcntl.LOCK_UN, 8)
+
+    def _claim_first_free(self) -> int:
+        for slot in range(_SLOTS, _SLOTS + 2 * self._page[_COUNT], 2):
+            if not self._page[slot]:
+                self._page[slot + 1] = self._read_ns()
+                self._page[slot] = os.getpid()
+                return slot
         raise ConnectError("too many threads follow one emulated cell", "start another cell")
 
     def _read_ns(self) -> int:
@@ -147,3 +169,29 @@ class EmulatedClock(Clock):
         except OSError:
             return False
         return True
+
+
+class LocalClock(EmulatedClock):
+    """Time of a device that this process plays: it follows real time and waits for the threads that keep up."""
+
+    lead_s = 0.0  # what was late in a recording is late in its play
+
+    def __init__(self) -> None:
+        self._page = memoryview(bytearray(8 * (_SLOTS + 2 * _LOCAL_SLOTS))).cast("q")
+        self._page[_NOW], self._page[_COUNT] = time.monotonic_ns(), _LOCAL_SLOTS
+        self._own = threading.local()
+        self._moving = threading.RLock()
+        self._behind_ns = 0
+
+    def _claim(self) -> int:
+        with self._moving:
+            return self._claim_first_free()
+
+    def _read_ns(self) -> int:
+        with self._moving:
+            slots, real_ns = self._page[_SLOTS:].tolist(), time.monotonic_ns()
+            followed_ns = [up_to_ns for pid, up_to_ns in zip(slots[::2], slots[1::2], strict=True) if pid]
+            now_ns = min([real_ns - self._behind_ns, *(up_to_ns + _LOCAL_LEAD_NS for up_to_ns in followed_ns)])
+            self._page[_NOW] = now_ns = max(now_ns, self._page[_NOW])
+            self._behind_ns = real_ns - now_ns
+            return now_ns

@@ -28,7 +28,17 @@ from ftdrivers.errors import (
     ProtocolError,
     StreamBroken,
 )
-from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, Array, DeviceInfo, Fact, Finding, FtSamples, Health, RobotArm
+from ftdrivers.interfaces import (
+    NOT_REPORTED,
+    ArmStatus,
+    Array,
+    DeviceInfo,
+    Diagnosis,
+    Fact,
+    FtSamples,
+    Health,
+    RobotArm,
+)
 from ftdrivers.ur.kinematics import MODELS
 
 _PUSH_N = 2.0
@@ -294,10 +304,10 @@ def check_arm(info: DeviceInfo, robot: RobotConfig) -> Check:
     return Check(name, "ok", who(info))
 
 
-def check_finding(finding: Finding) -> Check:
+def check_diagnosis(diagnosis: Diagnosis) -> Check:
     """Return what an arm's driver found when it checked its own device."""
-    state: State = "ok" if finding.passed else "failed"
-    return Check(f"robot.{finding.name}", state, finding.found, finding.fix or None)
+    state: State = "ok" if diagnosis.passed else "failed"
+    return Check(f"robot.{diagnosis.name}", state, diagnosis.found, diagnosis.fix or None)
 
 
 def check_remote(arm: RobotArm) -> Check:

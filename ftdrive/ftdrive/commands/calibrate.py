@@ -14,6 +14,7 @@ from ftdrive.commands.common import (
     FOLDER,
     YES,
     NewFile,
+    declined_aborts,
     index_run,
     rows,
     runs,
@@ -78,19 +79,12 @@ def calibrate(
     quick: bool,
     minimal: bool,
     step: bool,
-    fast: bool,
     manual: bool,
     listen: bool,
-    dry_run: bool,
-    output: Path | None,
-    png: Path | None,
-    view: bool,
-    plan: Path | None,
     resume: Path | None,
-    redo: tuple[int, ...],
-    yes: bool,
     runs: Path,
     as_json: bool,
+    **as_session: Any,
 ) -> None:
     """Move the arm through 24 orientations, average the sensor at each, and solve.
 
@@ -98,11 +92,11 @@ def calibrate(
     word. If there is room, only the three wrist joints move. Ctrl-C stops the arm; the poses are kept, and --resume
     continues.
     """
-    from ftdrive.cell.emulated import MOVED_BY, Station
-    from ftdrive.errors import Declined
+    from ftdrive.cell.emulated import Station
+    from ftdrive.commands.emulated_run import start_mover
     from ftdrive.runs.run import Run
+    from ftdrive.session.options import SessionOptions
     from ftdrive.session.rehearsal import described
-    from ftdrive.session.session import Options, with_recorded_mode
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import talk
     from ftdrive.terminal.report import print_result
@@ -122,32 +116,14 @@ def calibrate(
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool, control)
             description = {"said": asdict(said)}
             cell = said.cell() if resume is None else _cell_to_resume(resume, said)
-        options = Options(
-            runs,
-            poses=6 if minimal else 12 if quick else 24,
-            mode=mode,
-            dry_run=dry_run,
-            fast=fast,
-            output=output,
-            png=png,
-            view=view,
-            plan=plan,
-            resume=resume,
-            redo=redo,
-            real=not simulate,
-            yes=yes,
-            description=description,
+        poses = 6 if minimal else 12 if quick else 24
+        options = SessionOptions(
+            runs, poses=poses, mode=mode, resume=resume, real=not simulate, description=description, **as_session
         )
-        if simulate and (mover := MOVED_BY.get(with_recorded_mode(options).mode)):
-            request, words = mover
-            station.control(**request)
-            talk.print(f"The cell is emulated: {words}.")
-        try:
-            with open_operator(as_json=as_json) as operator:
-                outcome = guide(cell, operator, options)
-        except Declined as error:
-            talk.print(str(error))
-            raise click.Abort from error
+        if simulate:
+            start_mover(station, options)
+        with declined_aborts(), open_operator(as_json=as_json) as operator:
+            outcome = guide(cell, operator, options)
     if outcome is None:
         talk.print("Dry run: nothing has moved.")
         return

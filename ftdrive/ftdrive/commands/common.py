@@ -1,7 +1,8 @@
 """What several commands share: options, JSON on stdout."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from os import fsdecode
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args
@@ -55,6 +56,9 @@ def CELL(command: F) -> F:
     return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
 
 
+EDITED = "one that was edited by hand; every output then says so"
+FORCE = click.option("--force", is_flag=True, help=f"Apply {EDITED}.")
+
 CALIBRATION = click.option(
     "--calibration",
     "path",
@@ -67,7 +71,9 @@ CALIBRATION = click.option(
 def CALIBRATION_OR_TOOL(command: F) -> F:
     """Add the options --calibration, --tool and --force, which `open_source` takes."""
     tool = click.option("--tool", metavar="NAME", help="Newest accepted calibration of this tool on this cell.")
-    force = click.option("--force", is_flag=True, help="Apply a calibration of another arm, sensor or mount.")
+    force = click.option(
+        "--force", is_flag=True, help=f"Apply a calibration of another arm, sensor or mount, or {EDITED}."
+    )
     return CALIBRATION(tool(force(command)))
 
 
@@ -174,24 +180,17 @@ def read_frame(axes: "Axes", about: str) -> "WrenchFrame":
     return WrenchFrame(axes, (x, y, z))
 
 
-def host_and_port(option: str, text: str, example: str, *, lowest: int = 1) -> tuple[str, int]:
-    """Read HOST:PORT, with brackets round an IPv6 address; raises `ConfigError`."""
-    from ftdrive.errors import ConfigError
-
-    host, _, port = text.rpartition(":")
-    if not host or not (port.isascii() and port.isdecimal()) or not lowest <= int(port) < 65536:
-        raise ConfigError(f"{option} is '{text}': give HOST:PORT, such as {example}")
-    return host.strip("[]"), int(port)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this computer reaches an address."""
-    import ipaddress
+@contextmanager
+def declined_aborts() -> Iterator[None]:
+    """Print why the operator ended a session, and abort the command."""
+    from ftdrive.errors import Declined
+    from ftdrive.terminal.console import talk
 
     try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+        yield
+    except Declined as error:
+        talk.print(str(error))
+        raise click.Abort from error
 
 
 def write_json(value: Mapping[str, Any]) -> None:
@@ -213,14 +212,6 @@ def index_run(folder: Path, cell: "CellConfig | None" = None) -> None:
         Store(store_url() if cell is None else cell.store.url).index(folder.resolve().parent)
     except (BadStore, ConfigError, OSError) as error:
         talk.print(f" The run is saved but not in the history yet, because {error}.")
-
-
-def upgrade_store(store: "Store") -> None:
-    """Migrate the tables of an older version, and print it."""
-    from ftdrive.terminal.console import talk
-
-    if (version := store.upgrade()) is not None:
-        talk.print(f"The store {store.name} is upgraded from version {version}.")
 
 
 STORE = click.option("--store", "url", metavar="URL", help="Database to use, instead of [store] url.")

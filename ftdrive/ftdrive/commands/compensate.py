@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import FILE, FRAME, JSON, NewFile, numbers, read_frame, write_json
+from ftdrive.commands.common import FILE, FORCE, FRAME, JSON, NewFile, numbers, read_frame, write_json
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
+    from ftcalib import CalibrationResult
     from ftdrive.live.samples import Axes
     from ftdrive.recording import Recording
 
@@ -32,6 +33,7 @@ BIAS = click.option(
 @click.option("--wrench", metavar="FILE", type=FILE, help="Instead of RECORDING: CSV with t,fx,fy,fz,tx,ty,tz.")
 @click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: CSV with t and the orientation.")
 @click.option("--delay", metavar="S|auto", help="With --wrench: delay of the wrench, s.  [default: auto]")
+@FORCE
 @BIAS
 @FRAME
 @click.option("-o", "--output", type=NewFile(), help="Save the result as a new .mcap, .csv or .parquet.")
@@ -42,6 +44,7 @@ def compensate(
     wrench: Path | None,
     orientation_file: Path | None,
     delay: str | None,
+    force: bool,
     bias: str,
     axes: "Axes",
     about: str,
@@ -55,10 +58,12 @@ def compensate(
     as r11..r33, qx,qy,qz,qw or rx,ry,rz in rad.
     """
     from ftdrive.recording.compensation import compensated
+    from ftdrive.runs.source import read_calibration
     from ftdrive.terminal.console import talk
 
     frame = read_frame(axes, about)
-    recording, found = _read(path, calibration, wrench, orientation_file, delay, everything=output is not None)
+    loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
+    recording, found = _read(path, calibration, loaded, wrench, orientation_file, delay, everything=output is not None)
     result = {
         **compensated(recording, frame, output, estimate_bias=bias == "estimate"),
         "delay_s": found,
@@ -75,6 +80,7 @@ def compensate(
 def _read(
     path: Path | None,
     calibration: Path | None,
+    loaded: "CalibrationResult | None",
     wrench: Path | None,
     orientation: Path | None,
     delay: str | None,
@@ -86,10 +92,8 @@ def _read(
     from ftdrive.recording.compensation import NEEDED, read_with_calibration
     from ftdrive.recording.csv_pair import read_pair
     from ftdrive.recording.recording import ROW
-    from ftdrive.runs.source import read_calibration
     from ftdrive.terminal.console import talk
 
-    loaded = None if calibration is None else read_calibration(calibration)
     if path is None:
         if wrench is None or orientation is None or loaded is None:
             raise ConfigError("no recording: give its file, or --wrench, --orientation-file and --calibration")
@@ -106,6 +110,9 @@ def _read(
 
 
 def _words(result: dict[str, Any], frame: str) -> Iterator[str]:
+    from ftdrive.runs.verification_record import MARKS
+
+    yield from (f" {MARKS[mark]}" for mark in result["marks"])
     yield f" {result['samples']} samples, {result['duration_s']:.2f} s, gaps: {result['gaps']}"
     if delay := result["delay_s"]:
         yield f" wrench after pose: {1e3 * delay['value']:.2f} ± {1e3 * delay['sigma']:.2f} ms (1 sigma)"

@@ -33,10 +33,12 @@ class Side:
     created_utc: str | None
     mass_kg: float
     mass_sigma_kg: float
+    emulated: bool
+    """Whether it was made in an emulated cell."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as JSON, without the calibration itself."""
-        names = ("id", "path", "created_utc", "mass_kg", "mass_sigma_kg")
+        names = ("id", "path", "created_utc", "mass_kg", "mass_sigma_kg", "emulated")
         return {name: getattr(self, name) for name in names}
 
 
@@ -70,7 +72,8 @@ def diff(first: str, second: str, as_json: bool) -> None:
         )
         return
     for name, side in (("A", a), ("B", b)):
-        echo(f"{name}  {side.id[:6]}  {(side.created_utc or 'unknown time')[:16].replace('T', ' ')}  {side.path}")
+        made = (side.created_utc or "unknown time")[:16].replace("T", " ")
+        echo("  ".join([name, side.id[:6], made, *(["EMULATED"] if side.emulated else []), side.path]))
     echo(f"{'B minus A':22}{'change':>12}{'± 1 sigma':>12}{'in sigmas':>11}")
     echo(_line("mass, kg", b.mass_kg - a.mass_kg, mass_sigma_kg))
     for i, (_, label, unit, scale) in enumerate(_ROWS):
@@ -84,6 +87,7 @@ def _side(text: str) -> Side:
     """Find a calibration by path or id; raises `ConfigError`."""
     from ftdrive.errors import ConfigError
     from ftdrive.runs.source import read_calibration
+    from ftdrive.runs.verification_record import EMULATED, marks_of
     from ftdrive.store.records import mass_sigma_kg
     from ftdrive.store.store import Store
 
@@ -91,7 +95,9 @@ def _side(text: str) -> Side:
         result = read_calibration(path)
         sigma_kg = mass_sigma_kg(result.parameters, result.covariance, result.g_m_s2)
         created = result.provenance.get("created_utc")
-        return Side(result, result.id, text, created if isinstance(created, str) else None, result.mass_kg, sigma_kg)
+        emulated = EMULATED in marks_of(result)
+        made = created if isinstance(created, str) else None
+        return Side(result, result.id, text, made, result.mass_kg, sigma_kg, emulated)
     if len(text) < 4 or not set(text) <= set("0123456789abcdef"):
         raise ConfigError(f"'{text}' is neither a file nor an id: give a path, or 4 digits or more of an id")
     store = Store(store_url())
@@ -102,7 +108,7 @@ def _side(text: str) -> Side:
         ids = ", ".join(one.id for one in found)
         raise ConfigError(f"{text} is the beginning of {ids}: give more digits")
     one = found[0]
-    return Side(one, one.id, one.path, one.created_utc, one.mass_kg, one.mass_sigma_kg)
+    return Side(one, one.id, one.path, one.created_utc, one.mass_kg, one.mass_sigma_kg, bool(one.emulated))
 
 
 def _line(label: str, change: float, sigma: float) -> str:

@@ -130,7 +130,7 @@ def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], Rob
         Check("robot.reachable", "ok", f"{host} answers"),
         devices.check_arm(info, cell.robot),
         devices.check_remote(arm),
-        *map(devices.check_finding, arm.diagnose()),
+        *map(devices.check_diagnosis, arm.diagnose()),
         devices.check_safety(status),
         devices.check_program(status),
         devices.check_speed(status),
@@ -150,7 +150,7 @@ def _check_poses(arm: RobotArm, status: ArmStatus, clock: Clock) -> list[Check]:
     except DeviceError as error:
         return [Check(name, "failed", error.found, error.fix or "check the robot and the network")]
     where = ", ".join(f"{value:.0f}" for value in p_mm)
-    limits = Limits.emulated() if clock.emulated else Limits()
+    limits = Limits.of(clock)
     return [
         Check(name, "ok", f"TCP offset read; flange at ({where}) mm in base"),
         devices.check_link(arm, clock, usual_s=limits.link_usual_s, gap_s=limits.link_gap_s),

@@ -5,9 +5,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from ftdrive.cell.emulated import Station, sensor_name
+from ftdrive.cell.emulated import MOVED_BY, Station, sensor_name
 from ftdrive.runs.outcome import Outcome
 from ftdrive.session import rehearsal
+from ftdrive.session.options import SessionOptions, with_recorded_mode
+from ftdrive.terminal.console import talk
 from ftdrive.terminal.screen import open_operator
 
 
@@ -15,6 +17,14 @@ def rehearse(station: Station, runs: Path, name: str, *, poses: int = 24, kept: 
     """Calibrate an emulated cell as `ftdrive.session.rehearsal.rehearse` does, and show it."""
     with open_operator() as operator:
         return rehearsal.rehearse(station, runs, name, operator, poses=poses, kept=kept)
+
+
+def start_mover(station: Station, options: SessionOptions) -> None:
+    """Let the emulated cell move its arm, in a mode in which the session does not move it."""
+    if mover := MOVED_BY.get(with_recorded_mode(options).mode):
+        request, words = mover
+        station.control(**request)
+        talk.print(f"The cell is emulated: {words}.")
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import click
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
     FILE,
+    FORCE,
     JSON,
     NewFile,
     Number,
@@ -128,6 +129,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     show_default=True,
     help="Accept a target that cannot express everything if its force differs by no more, in any orientation.",
 )
+@FORCE
 @simulate("Export a calibration of an emulated cell.")
 @EMULATED_SENSOR
 @JSON
@@ -143,6 +145,7 @@ def calibration(
     sensor_frame: str,
     tool_frame: str,
     max_force_error_N: float,
+    force: bool,
     simulate: bool,
     sensor: str | None,
     as_json: bool,
@@ -156,12 +159,12 @@ def calibration(
     from ftdrive.exports.calibration import registry
     from ftdrive.exports.calibration.settings import Settings, recorded_sensor
     from ftdrive.runs.source import read_calibration
-    from ftdrive.runs.verification import verification_near
+    from ftdrive.runs.verification_record import marks_of, verification_near
     from ftdrive.terminal.console import hanging, talk
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})
     with _calibrated(source, sensor, simulate=simulate) as path:
-        result = read_calibration(path)
+        result = read_calibration(path, accept_edited=force)
         recorded_height_mm, recorded_mass_kg = recorded_sensor(path, result)
         verification = verification_near(path, result.id)
     settings = Settings(
@@ -188,6 +191,7 @@ def calibration(
                 "schema_version": 1,
                 "format": target,
                 "calibration": result.id,
+                "marks": list(marks_of(result)),
                 "file": None if output is None else str(output),
                 "max_force_error_N": made.max_force_error_N,
                 "max_torque_error_Nm": made.max_torque_error_Nm,

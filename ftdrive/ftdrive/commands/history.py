@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, upgrade_store, write_json
+from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
@@ -28,8 +28,6 @@ def history(
 
     They come from the store, where `calibrate` and `verify` add theirs, or from the run folders in RUNS. A trend is
     significant if the uncertainty of the results explains it in less than one case of 100, and so does their scatter.
-
-    --index and --rebuild also upgrade a store of an older version.
     """
     from ftdrive.errors import ConfigError
     from ftdrive.store.history import drifts, warnings
@@ -50,7 +48,6 @@ def history(
         store = open_store(url)
         name = store.name
         if index or rebuild:
-            upgrade_store(store)
             left_out = (store.rebuild(*index) if rebuild else store.index(*index)).unreadable
         results, checks = store.results(tool), store.verifications()
     for words in left_out:
@@ -89,7 +86,7 @@ def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime)
     return (
         one.id[:6],
         "-" if one.created_utc is None else one.created_utc[:10],
-        one.tool or "-",
+        one.tool_in_words,
         one.verdict,
         f"{one.mass_kg:.4f}",
         " ".join(f"{value:.2f}" for value in one.parameters.force_bias_N),

@@ -25,7 +25,7 @@ from ftdrive.commands.common import (
     simulate,
     write_json,
 )
-from ftdrive.commands.live_source import open_source
+from ftdrive.commands.live_source import RECOVER_S, open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Axes, StreamInfo, WrenchFrame
@@ -45,8 +45,6 @@ from ftdrivers.interfaces import Array
 
 _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
 """N and N·m, sensor axes, on the tool of an emulated cell."""
-_RECOVER_S = 10.0
-"""So long a stream with an interruption may take to deliver again."""
 
 
 @click.command()
@@ -89,8 +87,8 @@ def live(
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
     if speed is not None and replay is None:
         raise ConfigError("--speed goes only with --replay: add it, or leave --speed out")
-    if replay is not None and (tool or force):
-        raise ConfigError(f"{'--tool' if tool else '--force'} does not go with --replay: leave one of the two out")
+    if replay is not None and tool:
+        raise ConfigError("--tool does not go with --replay: leave one of the two out")
     frame = read_frame(axes, about)
     with ExitStack() as stack:
         stream: CompensatedStream | ReplayedStream
@@ -98,7 +96,7 @@ def live(
         recorder: Callable[[Path], Recorder] | None = None
         push: Callable[[], object] | None = None
         if replay is not None:
-            stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed)
+            stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed, force=force)
         else:
             stream = open_source(
                 path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
@@ -117,15 +115,16 @@ def live(
             run_live(stream, recorder=recorder, push=push, checks=checks)
 
 
-def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, speed: float) -> ReplayedStream:
+def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> ReplayedStream:
     """Replay a run folder, or a recording with its own calibration unless another one is given."""
+    loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     if path.is_dir() and path.suffix != ".partial":
-        if calibration is None:
+        if loaded is None:
             raise ConfigError("no calibration: give --calibration PATH")
-        return replay_run(Run(path), read_calibration(calibration), str(calibration), frame=frame, speed=speed)
+        return replay_run(Run(path), loaded, str(calibration), frame=frame, speed=speed)
     recording = read_recording(path)
-    if calibration is not None:
-        recording = recording.with_calibration(read_calibration(calibration), str(calibration))
+    if loaded is not None:
+        recording = recording.with_calibration(loaded, str(calibration))
     return ReplayedStream(recording.header.info, recording.paired(), frame=frame, speed=speed)
 
 
@@ -171,7 +170,7 @@ def _views(stream: Stream, clock: Clock, checks: Sequence[Check] = (), *, raises
         if feed.failure is not None:
             now_s = clock.now_s()
             failing_since_s = now_s if failing_since_s is None else failing_since_s
-            if raises or not is_known or now_s - failing_since_s > _RECOVER_S:
+            if raises or not is_known or now_s - failing_since_s > RECOVER_S:
                 raise feed.failure
             yield summary.view()
             continue
@@ -215,6 +214,7 @@ def _reading(view: View) -> dict[str, Any]:
         "calibration": calibration.provenance.get("created_utc"),
         "calibration_id": calibration.id,
         "verdict": calibration.verdict,
+        "marks": list(view.info.marks),
         "verification": None if verification is None else verification.to_dict(),
     }
 

@@ -14,6 +14,9 @@ from ftdrive.session.rehearsal import short_calibration, station_of
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.screen import open_operator
 
+RECOVER_S = 10.0
+"""So long a stream with an interruption may take to deliver again; then the command ends."""
+
 
 def open_source(
     path: Path | None,
@@ -40,12 +43,12 @@ def open_source(
     config, robot, sensor
         As `read_cell` takes them.
     force : bool
-        Apply a calibration of another arm, sensor or mount.
+        Apply a calibration of another arm, sensor or mount, or one that was edited by hand.
     """
     check_simulate(simulate, real={"--tool": tool})
     if path is not None and tool is not None:
         raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
-    calibration = None if path is None else read_calibration(path)
+    calibration = None if path is None else read_calibration(path, accept_edited=force)
     cell: CellConfig | Station
     if simulate:
         if calibration is None:

@@ -123,6 +123,8 @@ def plan(
         cell=emulated,
     )
     cell = cell_of(found, devices=False)
+    if emulated is not None:
+        cell = replace(cell, clock=emulated.clock)
     described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
     described -= {"default", "--tool", "--plane", "--box"}
     if not described:  # described by options, or nothing but arm and mounting

@@ -13,9 +13,9 @@ from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.common import CELL, JSON, check_simulate, read_cell, simulate, write_json
+from ftdrive.commands.common import CELL, JSON, check_simulate, declined_aborts, read_cell, simulate, write_json
 from ftdrive.commands.emulated_run import rehearsed_run
-from ftdrive.errors import ConfigError, Declined
+from ftdrive.errors import ConfigError
 from ftdrive.runs.push_receipt import Receipt
 from ftdrive.runs.source import read_calibration
 from ftdrive.session.operator import Operator, Question
@@ -88,11 +88,8 @@ def push(
             if not simulate:
                 operator.ask(Question(EFFECTS[name], (WORDS[name],)))
 
-        try:
+        with declined_aborts():
             saved, read_back = send(arm, proposal, folder, ask)
-        except Declined as error:
-            talk.print(str(error))
-            raise click.Abort from error
         if as_json:
             write_json({"schema_version": 1, **json.loads(saved.read_text(encoding="utf-8")), "file": str(saved)})
             return

@@ -93,12 +93,12 @@ def record(
             path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
         )
         recorder = Recorder(paths, stream.info, stream.cell.to_dict())
-        talk.print(f" Recording at {stream.info.sensor_rate_Hz:.0f} Hz, {frame}. Ctrl-C ends.")
+        talk.print(f" Recording, {frame}. Ctrl-C ends.")
         try:
             record_stream(stream, recorder, duration_s, count)
         finally:
             if recorder.samples:
-                _report(recorder, paths, frame, stream.info.calibration_name, as_json=as_json)
+                _report(recorder, frame, stream.info.calibration_name, as_json=as_json)
     if recorder.gaps:
         raise RecordingHasGaps(
             f"gaps: {recorder.gaps}, samples lost: {recorder.lost}; check cable, supply and load of the computer, then "
@@ -139,14 +139,17 @@ def record_stream(
         recorder.close()
 
 
-def _report(recorder: "Recorder", paths: Sequence[Path], frame: "WrenchFrame", name: str, *, as_json: bool) -> None:
+def _report(recorder: "Recorder", frame: "WrenchFrame", name: str, *, as_json: bool) -> None:
     from ftdrive.terminal.console import talk
 
-    saved = [path for path in paths if path.exists()]
-    words = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, gaps: {recorder.gaps}"
-    for path in saved:
-        talk.print(f" Saved {path}: {words}")
+    rate = f"{recorder.rate_Hz:.0f} Hz"  # of all samples: that of the first half second may differ much
+    for path in recorder.saved:
+        samples = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, {rate}, gaps: {recorder.gaps}"
+        talk.print(f" Saved {path}: {samples}")
     if as_json:
-        counts = {key: getattr(recorder, key) for key in ("samples", "duration_s", "gaps", "lost")}
-        about = {**frame.to_dict(), "calibration": name}
-        write_json({"schema_version": 1, "files": [str(path) for path in saved], **counts, **about})
+        files = {
+            "files": [str(path) for path in recorder.saved],
+            "partial": {str(path): samples for path, samples in recorder.partial.items()},
+        }
+        counts = {key: getattr(recorder, key) for key in ("samples", "duration_s", "rate_Hz", "gaps", "lost")}
+        write_json({"schema_version": 1, **files, **counts, **frame.to_dict(), "calibration": name})

@@ -13,24 +13,20 @@ from ftdrive.commands.common import (
     CELL,
     FRAME,
     check_simulate,
-    host_and_port,
-    is_loopback,
     read_frame,
     simulate,
 )
-from ftdrive.commands.live_source import open_source
+from ftdrive.commands.live_source import RECOVER_S, open_source
 from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.samples import Axes
 from ftdrive.live.stream import CompensatedStream
+from ftdrive.servers.address import host_and_port, is_loopback, with_port
 from ftdrive.servers.udp import UdpSender
 from ftdrive.terminal.console import print_address, talk
 from ftdrivers.errors import DeviceError
 
 if TYPE_CHECKING:
     from ftdrive.servers.foxglove import FoxgloveServer
-
-RECOVER_S = 10.0
-"""So long a device may be silent: the viewers stay connected. Then the command ends."""
 
 
 @click.command()
@@ -118,7 +114,7 @@ def _send_events(source: CompensatedStream, sinks: Sequence["FoxgloveServer | Ud
 def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp: tuple[str, int] | None) -> None:
     """Print what is served, and how to open it."""
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
-    url = f"ws://{f'[{name}]' if ':' in name else name}:{server.port}"
+    url = f"ws://{with_port(name, server.port)}"
     talk.print(f"Serving the wrench in {source.frame}; {source.info.calibration_name}.")
     print_address("  Foxglove, Lichtblick:  Open connection > Foxglove WebSocket > ", url)
     print_address("  PlotJuggler from 3.16: Streaming > Foxglove Bridge > ", url)

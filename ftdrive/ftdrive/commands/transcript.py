@@ -12,6 +12,7 @@ import numpy as np
 
 from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import EMULATED, sensor_name, sensor_reached
+from ftdrive.cell.emulated_clock import LocalClock
 from ftdrive.checks.computer import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
@@ -34,7 +35,7 @@ _TAIL_S = 0.3
 def transcript() -> None:
     """Record the bytes on a sensor's wire, or play them to the driver: a bug report becomes a test.
 
-    For sensors on a serial port or a CAN bus, and Net F/T. The arm's own sensor is not recorded.
+    For sensors on a serial port or a CAN bus. Capture others, such as a Net F/T, with Wireshark.
     """
 
 
@@ -72,10 +73,10 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
         )
     url, clock = sensor_reached(sensor, clock_in_force())
     address = SensorAddress.of(url)
-    if address.serial_port is None and address.scheme != "ati-netft" and not address.scheme.endswith("-can"):
+    if address.serial_port is None and not address.scheme.endswith("-can"):
         raise ConfigError(
-            f"{sensor} is neither on a serial port or a CAN bus nor an ati-netft: only these can be recorded; capture "
-            "others with Wireshark"
+            f"{sensor} is neither on a serial port nor on a CAN bus: only these can be recorded; capture others with "
+            "Wireshark"
         )
     device = sensor_from_url(url, clock=clock)
     header = {
@@ -103,9 +104,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
             if kept:
                 talk.print(f" Saved {path}")
     if not writer.has_port:
-        raise ConfigError(
-            f"the driver of {sensor} uses neither pyserial nor python-can nor pynetft: only these can be recorded"
-        )
+        raise ConfigError(f"the driver of {sensor} uses neither pyserial nor python-can: only these can be recorded")
     return url, seen
 
 
@@ -120,9 +119,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     A recording that was interrupted is played to its end.
     """
     check_simulate(simulate, real={"FILE": file}, emulated={"--sensor": sensor})
-    clock = clock_in_force()
     if simulate:
-        _, clock = sensor_reached(_emulated(sensor))
         with TemporaryDirectory(prefix="ftdrive-") as folder:
             path = Path(folder) / "sensor.jsonl"
             _record(_emulated(sensor), path, 1.0, kept=False)
@@ -131,6 +128,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
         loaded = Transcript.load(file)
     else:
         raise ConfigError("no transcript is given: add its FILE, or --simulate")
+    clock = LocalClock()  # a busy computer makes it slow, never late
     player = Player(loaded, clock)
     with player as port:
         device = sensor_from_url(loaded.url_at(port), clock=clock)

@@ -14,6 +14,7 @@ from ftdrive.commands.common import (
     YES,
     Number,
     check_simulate,
+    declined_aborts,
     index_run,
     read_cell,
     runs,
@@ -24,12 +25,11 @@ from ftdrive.commands.common import (
 from ftdrive.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ftcalib import CalibrationResult
     from ftdrive.cell.config import CellConfig
     from ftdrive.cell.emulated import Station
-    from ftdrive.runs.run import Run
+    from ftdrive.runs.run import Mode
     from ftdrive.runs.verified import AcceptanceLimits, Verified
-    from ftdrive.session.session import Options
+    from ftdrive.session.options import SessionOptions
 
 Answer = Literal["ask", "no", "yes"]
 
@@ -81,22 +81,15 @@ def verify(
     --max-torque, 1 % of unchanged cells fail. If it fails, it names what has changed, offers the smallest sufficient
     update, and ends with exit code 7.
     """
-    from ftdrive.errors import Declined, NotAccepted
+    from ftdrive.errors import NotAccepted
     from ftdrive.runs.verified import AcceptanceLimits
-    from ftdrive.session.session import Options
-    from ftdrive.terminal.console import talk
+    from ftdrive.session.options import SessionOptions
 
     check_simulate(simulate, real={"--config": config, "--robot": robot})
     wanted = _wanted(path, quick, poses, AcceptanceLimits(force_N, torque_Nm), resume)
-    options = Options(
-        runs,
-        "verify",
-        poses=wanted.poses,
-        mode="manual" if manual else "auto",
-        fast=wanted.quick,
-        resume=resume,
-        real=not simulate,
-        yes=yes,
+    mode: Mode = "manual" if manual else "auto"
+    options = SessionOptions(
+        runs, "verify", wanted.poses, mode, fast=wanted.quick, resume=resume, real=not simulate, yes=yes
     )
     with ExitStack() as stack:
         station, path = None, wanted.path
@@ -105,11 +98,8 @@ def verify(
         elif path is None:
             raise ConfigError("no calibration: give --calibration PATH, or --simulate")
         cell = read_cell(config, robot, sensor) if station is None else station.cell
-        try:
+        with declined_aborts():
             verified = verify_cell(cell, path, wanted, options, station, update=update, as_json=as_json)
-        except Declined as error:
-            talk.print(str(error))
-            raise click.Abort from error
     if not verified.passed:
         raise NotAccepted(f"the verification failed: {failure_in_words(verified)}")
 
@@ -118,7 +108,7 @@ def verify_cell(
     cell: "CellConfig",
     path: Path,
     wanted: "Wanted",
-    options: "Options",
+    options: "SessionOptions",
     station: "Station | None" = None,
     *,
     update: Answer = "ask",
@@ -126,33 +116,31 @@ def verify_cell(
 ) -> "Verified":
     """Guide the operator through the poses, compare them with a calibration, report, and add the run to the store.
 
-    Parameters
-    ----------
-    cell : CellConfig
-    path : Path
-        The calibration file or its run folder.
-    wanted : Wanted
-    options : Options
-        Of the session.
-    station : Station, optional
-        The emulated cell that `cell` describes.
-    update : "ask", "no" or "yes"
-        Whether to save the smallest sufficient update.
-    as_json : bool
-        Print events, questions and the outcome as JSON.
-
-    Raises
-    ------
-    Declined
-        The operator ended the session.
-    NotAccepted, PlanRefused, ConfigError, DeviceError, OSError
-        As `ftdrive.session.session.take_poses`.
+    `path` is the calibration file or its run folder, `station` the emulated cell that `cell` describes. Raises as
+    `ftdrive.session.session.take_poses`.
     """
+    from ftdrive.commands.emulated_run import start_mover
+    from ftdrive.runs.run import Run
+    from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verified import verify_run
+    from ftdrive.session.rehearsal import described
+    from ftdrive.session.session import take_poses
+    from ftdrive.session.verifying import Verifying
+    from ftdrive.terminal.screen import open_operator
 
+    calibration = read_calibration(path)
+    path = Run(path).calibration_path if path.is_dir() else path
+    description = {"verification": {**asdict(wanted), "id": calibration.id, "path": str(path.absolute())}}
     if wanted.quick:  # 12 s of noise would take longer than the poses
         cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
-    run, calibration, path = _take_poses(cell, station, path, wanted, options, as_json=as_json)
+    if station is not None:
+        description |= described(station)
+        start_mover(station, options)
+    task = Verifying(cell, calibration, path, wanted.poses, options.runs)
+    with open_operator(as_json=as_json, command=task.command) as operator:
+        run = take_poses(task, operator, replace(options, description=description))
+    if run is None:
+        raise RuntimeError("a verification is never a dry run")
     verified = verify_run(run, calibration, path, wanted.limits)
     _report(verified, update, as_json=as_json)
     index_run(run.folder, cell if station is None else None)
@@ -179,7 +167,7 @@ def _wanted(
 ) -> Wanted:
     from ftdrive.runs.run import Run
     from ftdrive.runs.verified import AcceptanceLimits
-    from ftdrive.session.verification import POSES, QUICK_POSES
+    from ftdrive.session.verifying import POSES, QUICK_POSES
 
     if quick and poses is not None:
         raise ConfigError("--quick and --poses exclude one another: leave one of them out")
@@ -193,43 +181,6 @@ def _wanted(
         raise ConfigError(f"{resume} is not a verification: continue it with {run.resume_command}")
     begun = run.header()["verification"]
     return Wanted(Path(begun["path"]), begun["poses"], begun["quick"], AcceptanceLimits(**begun["limits"]))
-
-
-def _take_poses(
-    cell: "CellConfig",
-    station: "Station | None",
-    path: Path,
-    wanted: Wanted,
-    options: "Options",
-    *,
-    as_json: bool,
-) -> tuple["Run", "CalibrationResult", Path]:
-    """Guide the operator through the poses; return the run, and the calibration with its file."""
-    from ftdrive.cell.emulated import MOVED_BY
-    from ftdrive.runs.run import Run
-    from ftdrive.runs.source import read_calibration
-    from ftdrive.session.rehearsal import described
-    from ftdrive.session.session import take_poses, with_recorded_mode
-    from ftdrive.session.verification import Verifying
-    from ftdrive.terminal.console import talk
-    from ftdrive.terminal.screen import open_operator
-
-    calibration = read_calibration(path)
-    path = Run(path).calibration_path if path.is_dir() else path
-    about = {**asdict(wanted), "id": calibration.id, "path": str(path.absolute())}
-    description = {"verification": about}
-    if station is not None:
-        description |= described(station)
-        if mover := MOVED_BY.get(with_recorded_mode(options).mode):
-            request, words = mover
-            station.control(**request)
-            talk.print(f"The cell is emulated: {words}.")
-    task = Verifying(calibration, path, wanted.poses, options.runs)
-    with open_operator(as_json=as_json, command=task.command) as operator:
-        run = take_poses(cell, operator, replace(options, description=description), task)
-    if run is None:
-        raise RuntimeError("a verification is never a dry run")
-    return run, calibration, path
 
 
 def _report(verified: "Verified", update: Answer, *, as_json: bool) -> None:

@@ -42,6 +42,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     steps, model = plan.steps, plain(plan.description["model"])
     name = f"ftdrive plan {sha256[:12]}"
     first = _joints(steps[0].q_rad)
+    emulated = "EMULATED CELL: no real arm may follow this plan. " if plan.emulated else ""
     yield f"# ftdrive plan {sha256}"
     yield f"# for a {model} with this tool, mm from the flange face:"
     for part in plan.description["tool"]:
@@ -60,7 +61,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield ""
     yield f'textmsg("{name}: {len(steps)} poses")'
     yield (
-        f'popup("Only for a {model} with the tool of {name}. Keep a ball of {plan.ball_m:.2f} m around '
+        f'popup("{emulated}Only for a {model} with the tool of {name}. Keep a ball of {plan.ball_m:.2f} m around '
         f"{point_in_words(plan)} (the wrist){'' if plan.arm_rests else ' and the room of the whole arm'} free, "
         f"cables slack, hand on the emergency stop. Speed: {_speeds(plan)}. "
         'First time: speed slider at 30 percent. Continue moves the arm.", '

@@ -53,7 +53,7 @@ def require_own_results(recordings: Iterable[Path], folder: Path) -> None:
             raise ConfigError(f"the result of {one} would have the path of the recording: choose another folder")
 
 
-def task_of(calibration: Path | None, frame: WrenchFrame, bias: str) -> bytes:
+def task_of(calibration: Path | None, frame: WrenchFrame, bias: str, *, accept_edited: bool = False) -> bytes:
     """Return what `compensated_file` needs beside the recording, as JSON.
 
     Parameters
@@ -64,13 +64,16 @@ def task_of(calibration: Path | None, frame: WrenchFrame, bias: str) -> bytes:
         Of the results.
     bias : str
         "keep", or "estimate" from each recording.
+    accept_edited : bool
+        Of the calibration, as in `read_calibration`.
 
     Raises
     ------
     BadCalibration, OSError
         The calibration cannot be read.
     """
-    document = None if calibration is None else read_calibration(calibration).to_dict()
+    found = None if calibration is None else read_calibration(calibration, accept_edited=accept_edited)
+    document = None if found is None else found.to_dict()
     given = {"calibration": document, "calibration_name": str(calibration), "bias": bias, **frame.to_dict()}
     return json.dumps({"version": __version__, **given}).encode()
 
@@ -147,6 +150,6 @@ def _saved(path: Path, answer: bytes) -> dict[str, Any] | str:
     try:
         write_new(path, content)
     except OSError as error:
-        return in_words(error)
+        return f"{path} is not written ({error.strerror or error}): make room in {path.parent}, then repeat"
     numbers: dict[str, Any] = json.loads(line)
     return numbers

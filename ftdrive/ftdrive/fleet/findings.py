@@ -10,7 +10,7 @@ from scipy.special import chdtrc as chi2_sf
 
 from ftcalib.model import Array, skew
 from ftdrive.fleet.observed import Observed, when
-from ftdrive.fleet.state import CellState, Finding
+from ftdrive.fleet.state import CellState, FleetFinding
 from ftdrive.fleet.temperature import temperature_findings
 from ftdrive.fleet.words import listed
 from ftdrive.store.records import StoredResult
@@ -32,7 +32,7 @@ LATE: Final = timedelta(days=1)
 """A verification that is due today is not late yet."""
 
 
-def findings(observed: Observed, states: Sequence[CellState]) -> tuple[Finding, ...]:
+def findings(observed: Observed, states: Sequence[CellState]) -> tuple[FleetFinding, ...]:
     """Return all findings."""
     newest = [(cell.name, one) for cell in observed.cells for one in observed.newest(cell)]
     return (
@@ -46,7 +46,7 @@ def findings(observed: Observed, states: Sequence[CellState]) -> tuple[Finding, 
 # ------------------------------------------------------------------------------------------------------------ schedule
 
 
-def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[Finding]:
+def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[FleetFinding]:
     late = [(one.due, one.cell) for one in states if one.due is not None and one.due + LATE < observed.now]
     if late:
         due, worst = min(late)
@@ -55,13 +55,13 @@ def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[Findin
         what = f"The verification of {worst} is late by {days} d"
         if len(cells) > 1:
             what = f"The verifications of {listed(cells)} are late, that of {worst} by {days} d"
-        yield Finding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
+        yield FleetFinding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
 
 
 # ---------------------------------------------------------------------------------------------------------------- base
 
 
-def _bases(observed: Observed) -> Iterator[Finding]:
+def _bases(observed: Observed) -> Iterator[FleetFinding]:
     """Yield the cells whose base has turned between the newest calibration and the one before.
 
     An update that copies the direction of gravity shows nothing.
@@ -74,7 +74,7 @@ def _bases(observed: Observed) -> Iterator[Finding]:
             if len(seen) == 2:
                 angle, p_value = _turned(*reversed(seen))
                 if angle > TILTED_RAD and p_value < SURE:
-                    yield Finding(
+                    yield FleetFinding(
                         "base",
                         (name,),
                         f"{name}: gravity has turned by {np.rad2deg(angle):.2f}° in the base between the calibrations "
@@ -120,7 +120,7 @@ class _Load:
     """(2,) the centre that the payload amounts to, if sensor and adapter are centred on the axis of the flange."""
 
 
-def _payloads(newest: Sequence[tuple[str, StoredResult]]) -> Iterator[Finding]:
+def _payloads(newest: Sequence[tuple[str, StoredResult]]) -> Iterator[FleetFinding]:
     """Yield the tools that several cells identify alike, and whose controllers have another mass or centre."""
     tools = dict[str, list[_Load]]()
     for cell, one in newest:
@@ -144,7 +144,7 @@ def _load(cell: str, one: StoredResult, payload_kg: float) -> _Load:
     return _Load(cell, one.mass_kg, one.mass_sigma_kg, arm_m[:2], sigma[:2], payload_kg, configured)
 
 
-def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
+def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
     centre = np.median([one.off_axis_m for one in loads], axis=0)
     alike = [one for one in loads if (abs(one.off_axis_m - centre) <= _either(ALIKE_M, one.off_axis_sigma_m)).all()]
     wrong = [
@@ -162,7 +162,7 @@ def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
     )
 
 
-def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
+def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
     mass_kg = float(np.median([one.mass_kg for one in loads]))
     wrong = []
     for one in loads:
@@ -180,13 +180,13 @@ def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[Finding]:
     )
 
 
-def _wrong_payloads(wrong: Iterable[_Load], words: Callable[[_Load, str], str]) -> Iterator[Finding]:
+def _wrong_payloads(wrong: Iterable[_Load], words: Callable[[_Load, str], str]) -> Iterator[FleetFinding]:
     """Yield a finding of several loads; `words` takes the first of them and the names of all cells."""
     loads = sorted(wrong, key=lambda one: one.cell)
     if len(loads) > 1:
         cells, first = tuple(one.cell for one in loads), loads[0]
         fix = "set them with `ftdrive push`"
-        yield Finding("payload", cells, f"{words(first, listed(cells))} in {first.cell}: {fix}")
+        yield FleetFinding("payload", cells, f"{words(first, listed(cells))} in {first.cell}: {fix}")
 
 
 def _either(least: float, sigma: Array) -> Array:

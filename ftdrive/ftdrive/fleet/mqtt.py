@@ -13,6 +13,7 @@ from urllib.parse import unquote, urlsplit
 from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.serve import Reading
+from ftdrive.servers.address import with_port
 
 try:
     from paho.mqtt.client import Client
@@ -68,7 +69,7 @@ class Broker:
         return cls(host, port or _PORTS[parts.scheme], is_tls, user, password, f"{prefix}/" if prefix else "")
 
     def __str__(self) -> str:
-        return f"{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
+        return with_port(self.host, self.port)
 
 
 class Messages:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftdrive.fleet.cells import Owners
-from ftdrive.store.records import Check, StoredCell, StoredResult, StoredVerification
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification
 from ftdrive.store.store import Store
 
 WINDOW: Final = timedelta(days=90)
@@ -46,7 +46,7 @@ class Observed:
     cells: tuple[StoredCell, ...]
     results: Mapping[str, Sequence[StoredResult]]
     """The newest accepted results of each tool, by cell, the oldest first."""
-    checks: Mapping[str, Sequence[Check]]
+    checks: Mapping[str, Sequence[BriefVerification]]
     """Verifications by calibration, the oldest first; none without a time, or older than `WINDOW`."""
     changes: Mapping[str, BiasChanges]
     """By calibration, where its verifications have them."""
@@ -61,7 +61,7 @@ class Observed:
         for one in newest:
             if (name := owners.cell_of(one)) is not None:
                 results[name].append(one)
-        checks = dict[str, list[Check]]()
+        checks = dict[str, list[BriefVerification]]()
         for check in recent:
             checks.setdefault(check.calibration_id, []).append(check)
         known = [one for found in results.values() for one in found if one.id in checks]
@@ -87,7 +87,7 @@ class Observed:
         return when(result) < self.now - WINDOW
 
 
-def _changes(result: StoredResult, checks: Sequence[Check]) -> BiasChanges | None:
+def _changes(result: StoredResult, checks: Sequence[BriefVerification]) -> BiasChanges | None:
     """Return how the bias has changed since a calibration; None if no verification has this.
 
     A verification counts if it passed, or found that the bias has changed: another change, or a hand on the tool,
@@ -105,6 +105,6 @@ def _changes(result: StoredResult, checks: Sequence[Check]) -> BiasChanges | Non
     return BiasChanges(days[measured], change, sigma, np.median(common, axis=0), known[measured])
 
 
-def when(one: StoredResult | StoredVerification | Check) -> datetime:
+def when(one: StoredResult | StoredVerification | BriefVerification) -> datetime:
     """Return the time of a record that has one."""
     return datetime.fromisoformat(str(one.created_utc))

@@ -9,7 +9,7 @@ from ftdrive.fleet.observed import WINDOW, BiasChanges, Observed, when
 from ftdrive.fleet.state import CellState, Fleet
 from ftdrive.fleet.words import attention, due_in_words, summary, verified_in_words
 from ftdrive.report.page import templates, with_code
-from ftdrive.runs.verification import age_in_words
+from ftdrive.runs.verification_record import age_in_words
 
 WIDTH, HEIGHT, MARGIN = 220, 44, 3
 LEAST_SIGMAS = 4.0

@@ -5,7 +5,7 @@ solved-<version>.json   ftdrive.calibration/1, in the run folder: the result of 
 """
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from importlib.metadata import version
@@ -67,22 +67,6 @@ def task_of(folder: Path) -> tuple[bytes, bytes]:
     return run.dataset_path.read_bytes(), json.dumps(given).encode()
 
 
-def solver(task: bytes) -> Callable[[CalibrationDataset], CalibrationResult]:
-    """Return what solves a dataset in the circumstances of a task.
-
-    Raises
-    ------
-    OtherVersion
-        The task was made by another version.
-    """
-    given: dict[str, Any] = json.loads(task)
-    require_version(given["version"])
-    versions = {"ftdrive": __version__, **{name: version(name) for name in ("numpy", "scipy")}}
-    provenance = {**given["provenance"], "versions": versions}
-    circumstances = given["circumstances"] | {"setup": Setup(**given["circumstances"]["setup"])}
-    return lambda dataset: solve(dataset, **circumstances, provenance=provenance)
-
-
 def solved(dataset: bytes, task: bytes) -> bytes:
     """Return the calibration file of a task: a pure function of its bytes and of the installed versions.
 
@@ -92,12 +76,16 @@ def solved(dataset: bytes, task: bytes) -> bytes:
         The task was made by another version.
     BadDataset, NotObservable
     """
-    solve_as_the_run = solver(task)
+    given: dict[str, Any] = json.loads(task)
+    require_version(given["version"])
+    versions = {"ftdrive": __version__, **{name: version(name) for name in ("numpy", "scipy")}}
     try:
         document = json.loads(dataset)
     except ValueError as error:
         raise BadDataset(f"the dataset is not valid JSON ({error}): the file is damaged") from error
-    result = solve_as_the_run(CalibrationDataset.from_dict(document))
+    provenance = {**given["provenance"], "versions": versions}
+    circumstances = given["circumstances"] | {"setup": Setup(**given["circumstances"]["setup"])}
+    result = solve(CalibrationDataset.from_dict(document), **circumstances, provenance=provenance)
     return (json.dumps(result.to_dict(), allow_nan=False, indent=1) + "\n").encode()
 
 

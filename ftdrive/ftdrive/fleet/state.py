@@ -4,9 +4,11 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Literal
 
+from ftdrive.store.records import tool_in_words
+
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class BiasDrift:
     """Drift of the bias, from the verifications of the newest calibration."""
 
     level_sigmas: float
@@ -40,8 +42,15 @@ class CellState:
     """When the next verification is due, UTC; None for a cell that was never calibrated, which is due at once."""
     mass_kg: float | None = None
     temperature_C: float | None = None
-    drift: Drift | None = None
+    drift: BiasDrift | None = None
     """None with too few verifications."""
+    emulated: bool = False
+    """Whether the calibration was made in an emulated cell."""
+
+    @property
+    def tool_in_words(self) -> str:
+        """Name of the tool, and whether the cell was emulated."""
+        return tool_in_words(self.tool, emulated=self.emulated)
 
     def is_due(self, now: datetime) -> bool:
         """Whether a verification, or the first calibration, is due."""
@@ -59,7 +68,7 @@ FindingKind = Literal["payload", "temperature", "base", "overdue"]
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class FleetFinding:
     """Something that several results show together."""
 
     kind: FindingKind
@@ -73,4 +82,4 @@ class Fleet:
     """All cells and what they show together."""
 
     cells: tuple[CellState, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[FleetFinding, ...]

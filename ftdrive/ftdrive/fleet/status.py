@@ -8,9 +8,9 @@ import numpy as np
 from ftcalib.extras.drift_onset import drift_onset
 from ftdrive.fleet.findings import findings
 from ftdrive.fleet.observed import BiasChanges, Observed, when
-from ftdrive.fleet.state import CellState, Drift, Fleet
+from ftdrive.fleet.state import BiasDrift, CellState, Fleet
 from ftdrive.report.words import rounded
-from ftdrive.store.records import Check, StoredCell, StoredResult, StoredVerification
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification
 from ftdrive.store.store import Store
 
 LEVEL_DAYS: Final = 7.0
@@ -38,7 +38,7 @@ def fleet_of(observed: Observed, store: Store) -> Fleet:
     return Fleet(tuple(states), findings(observed, states))
 
 
-def drift_of(changes: BiasChanges | None, start: datetime) -> Drift | None:
+def drift_of(changes: BiasChanges | None, start: datetime) -> BiasDrift | None:
     """Return the drift of a bias since its calibration at `start`; None with too few verifications."""
     if changes is None:
         return None
@@ -48,7 +48,7 @@ def drift_of(changes: BiasChanges | None, start: datetime) -> Drift | None:
     lately = changes.t_days > changes.t_days[-1] - LEVEL_DAYS
     level = float(np.abs(changes.in_sigmas[lately].mean(axis=0)).max())
     if not onset.found.any():
-        return Drift(level, found=False, words="")
+        return BiasDrift(level, found=False, words="")
     k = int(onset.p_value.argmin())
     rate, unit = 7 * float(onset.slope[k]), "N" if k < 3 else "N·m"
     since = start + timedelta(days=float(onset.t0_days[k]))
@@ -56,12 +56,12 @@ def drift_of(changes: BiasChanges | None, start: datetime) -> Drift | None:
     more = f", and {others} more {'component' if others == 1 else 'components'}" if others else ""
     sign = "-" if rate < 0 else ""
     words = f"{COMPONENTS[k]} drifts by {sign}{rounded(abs(rate), 2)} {unit} a week since {since:%Y-%m-%d}{more}"
-    return Drift(level, found=True, words=words)
+    return BiasDrift(level, found=True, words=words)
 
 
 def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: Store) -> CellState:
     calibrated = when(result)
-    check: Check | StoredVerification | None = next(reversed(observed.checks.get(result.id, ())), None)
+    check: BriefVerification | StoredVerification | None = next(reversed(observed.checks.get(result.id, ())), None)
     if check is None and observed.is_cut(result):
         check = store.last_verification(result.id)
     verified = None if check is None or check.created_utc is None else when(check)
@@ -82,4 +82,5 @@ def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: St
         mass_kg=result.mass_kg,
         temperature_C=next((one for one in temperatures if one is not None), None),
         drift=drift_of(observed.changes.get(result.id), calibrated),
+        emulated=result.emulated,
     )

@@ -14,7 +14,7 @@ from scipy.special import fdtrc as f_sf
 
 from ftcalib.model import Array
 from ftdrive.fleet.observed import BiasChanges, Observed
-from ftdrive.fleet.state import Finding
+from ftdrive.fleet.state import FleetFinding
 from ftdrive.fleet.words import listed
 from ftdrive.report.words import rounded
 
@@ -39,7 +39,7 @@ class _Sums:
     dof: int = 0
 
 
-def temperature_findings(observed: Observed) -> Iterator[Finding]:
+def temperature_findings(observed: Observed) -> Iterator[FleetFinding]:
     """Yield the models of which two sensors or more follow their temperature."""
     models = dict[str, dict[str, _Sums]]()
     for cell in observed.cells:
@@ -71,7 +71,7 @@ def _add(sensors: dict[str, _Sums], serial: str, cell: str, changes: BiasChanges
     found.yy += np.sum(y * y, axis=1)
 
 
-def _finding(model: str, sensors: Mapping[str, _Sums]) -> Iterator[Finding]:
+def _finding(model: str, sensors: Mapping[str, _Sums]) -> Iterator[FleetFinding]:
     following = {serial: sums for serial, sums in sorted(sensors.items()) if _p_values(sums).min() < SURE}
     if len(following) < 2:
         return
@@ -79,7 +79,7 @@ def _finding(model: str, sensors: Mapping[str, _Sums]) -> Iterator[Finding]:
     slopes = np.max([np.where(_p_values(one) < SURE, abs(one.xy / one.xx), 0.0) for one in following.values()], axis=0)
     largest = zip((slopes[:3].max(), slopes[3:].max()), _UNITS, strict=True)
     size = " and ".join(f"{rounded(float(slope), 2)} {unit}" for slope, unit in largest if slope)
-    yield Finding(
+    yield FleetFinding(
         "temperature",
         cells,
         f"The bias of {len(following)} of {len(sensors)} sensors {model} follows their temperature, by up to "

@@ -5,7 +5,7 @@ from datetime import datetime
 from typing import Final
 
 from ftdrive.fleet.state import CellState, Fleet
-from ftdrive.runs.verification import age_in_words
+from ftdrive.runs.verification_record import age_in_words
 
 MOST: Final = 4
 

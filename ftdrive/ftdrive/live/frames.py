@@ -4,6 +4,7 @@ import numpy as np
 
 from ftcalib.model import skew
 from ftdrive.errors import ConfigError
+from ftdrive.live import ros2
 from ftdrive.live.samples import StreamInfo, WrenchFrame
 from ftdrivers.interfaces import Array
 
@@ -49,6 +50,28 @@ class FrameTransform:
     def matrix(self, R_base_flange: Array) -> Array:
         """Return the matrix (6, 6) of the transform at one orientation (3, 3)."""
         return np.kron(np.eye(2), R_base_flange) @ self._matrix if self._turns else self._matrix
+
+
+def frames_in_flange(frame: WrenchFrame, info: StreamInfo, R_base_flange: Array) -> dict[str, tuple[Array, Array]]:
+    """Return orientation and origin in the flange frame of sensor, tcp and the frame of a wrench, by their `frame_id`.
+
+    Parameters
+    ----------
+    frame : WrenchFrame
+    info : StreamInfo
+        Its sensor is drawn at the flange if its height is unknown.
+    R_base_flange : array, shape (..., 3, 3)
+        With base axes the orientation of the wrench's frame has this shape too.
+    """
+    sensor = info.calibration.R_flange_sensor, np.nan_to_num(info.p_flange_sensor_m)
+    tcp = info.R_flange_tcp, info.p_flange_tcp_m
+    found = {"sensor": sensor, "tcp": tcp} if np.isfinite(info.p_flange_tcp_m).all() else {"sensor": sensor}
+    if (name := ros2.frame_id(frame)) not in ("base", "flange", *found):
+        flange, base = (np.eye(3), np.zeros(3)), (np.swapaxes(R_base_flange, -1, -2), np.zeros(3))
+        known = {"sensor": sensor, "flange": flange, "base": base, "tcp": tcp}
+        origin = known[frame.about][1] if isinstance(frame.about, str) else np.array(frame.about)
+        found[name] = known[frame.axes][0], np.nan_to_num(origin)
+    return found
 
 
 def _sensor_from(frame: WrenchFrame, info: StreamInfo) -> Array:

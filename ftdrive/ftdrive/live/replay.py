@@ -227,6 +227,7 @@ def replay_run(run: Run, calibration: CalibrationResult, name: str = "", **optio
         R_flange_tcp=np.eye(3),
         p_flange_tcp_m=np.full(3, np.nan),
         versions=header.get("versions", {}),
+        emulated=header.get("station") is not None,
     )
     return ReplayedStream(info, rows, **options)
 

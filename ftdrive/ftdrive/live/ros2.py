@@ -5,6 +5,7 @@ and the numbers is the same in every message of a block, so that a block is pack
 """
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from ftdrive.live.samples import WrenchFrame
 from ftdrivers.interfaces import Array
 
 RAW, COMPENSATED, POSE, JOINTS = "/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states"
+TRANSFORMS = "/tf"
 
 ENCODING = b"\0\1\0\0"
 """The first bytes of a message: CDR, little endian."""
@@ -79,6 +81,19 @@ SCHEMAS = {
     ),
 }
 """The schema of each topic."""
+TRANSFORMS_SCHEMA = _schema(
+    "tf2_msgs/msg/TFMessage",
+    "geometry_msgs/TransformStamped[] transforms",
+    """geometry_msgs/TransformStamped
+std_msgs/Header header
+string child_frame_id
+Transform transform""",
+    """geometry_msgs/Transform
+Vector3 translation
+Quaternion rotation""",
+    _VECTOR,
+    _QUATERNION,
+)
 
 
 def frame_id(frame: WrenchFrame) -> str:
@@ -111,8 +126,35 @@ def pack_joints(t_utc_ns: NDArray[np.int64], q_rad: Array) -> list[bytes]:
     return _pack(t_utc_ns, names, q_rad, struct.pack("<II", 0, 0))
 
 
-def _strings(*fields: str | int) -> bytes:
-    """Pack strings and counts (uint32), each aligned to 4 bytes; what follows is aligned to 8."""
+def pack_transforms(t_utc_ns: NDArray[np.int64], transforms: Sequence[tuple[str, str, Array, Array]]) -> list[bytes]:
+    """Pack transforms as TFMessage.
+
+    Parameters
+    ----------
+    t_utc_ns : array, shape (n,)
+    transforms : sequence of tuple
+        Parent, child, origin (3,) or (n, 3) in m and orientation (3, 3) or (n, 3, 3) of the child in the parent.
+    """
+    n = len(t_utc_ns)
+    values: list[NDArray[np.void]] = [_column(n, np.void(ENCODING + struct.pack("<I", len(transforms))))]
+    for number, (parent, child, p_m, R) in enumerate(transforms):
+        stamp = np.zeros(n, [("sec", "<i4"), ("nanosec", "<u4")])
+        stamp["sec"], stamp["nanosec"] = np.divmod(t_utc_ns, 1_000_000_000)
+        names = _strings(parent, child, start=4 if number == 0 else 0)  # the count stands before the first
+        pose = np.empty((n, 7))
+        pose[:, :3], pose[:, 3:] = p_m, quaternions(R.reshape(-1, 3, 3))
+        values += [stamp, _column(n, np.void(names)), pose.view("V56")[:, 0]]
+    parts = [np.ascontiguousarray(value).view(np.uint8).reshape(n, value.itemsize) for value in values]
+    packed: list[bytes] = np.hstack(parts).view(f"V{sum(part.shape[1] for part in parts)}")[:, 0].tolist()
+    return packed
+
+
+def _column(n: int, value: np.void) -> NDArray[np.void]:
+    return np.full(n, value, f"V{value.itemsize}")
+
+
+def _strings(*fields: str | int, start: int = 0) -> bytes:
+    """Pack strings and counts (uint32), each aligned to 4 bytes; what follows is aligned to 8 from `start` before."""
     packed = b""
     for item in fields:
         packed += bytes(-len(packed) % 4)
@@ -120,7 +162,7 @@ def _strings(*fields: str | int) -> bytes:
             packed += struct.pack("<I", item)
         else:
             packed += struct.pack("<I", len(item.encode()) + 1) + item.encode() + b"\0"
-    return packed + bytes(-len(packed) % 8)
+    return packed + bytes(-(start + len(packed)) % 8)
 
 
 def _pack(t_utc_ns: NDArray[np.int64], same: bytes, numbers: Array, end: bytes = b"") -> list[bytes]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
 from ftcalib.files import JSON
-from ftdrive.runs.verification import VerificationRecord
+from ftdrive.runs.verification_record import VerificationRecord, marks_of
 from ftdrivers.interfaces import Array, DeviceInfo
 
 Axes = Literal["sensor", "flange", "base", "tcp"]
@@ -262,7 +262,14 @@ class StreamInfo:
     verification: VerificationRecord | None = None
     """The last one of the calibration, when the stream was opened."""
     calibration_state: str = ""
-    """Id, verdict, age and last verification of the calibration, when the stream was opened; for people."""
+    """Id, verdict, marks, age and last verification of the calibration, when the stream was opened; for people."""
+    emulated: bool = False
+    """Whether arm and sensor are emulated."""
+
+    @property
+    def marks(self) -> tuple[str, ...]:
+        """What every output says of the cell and the calibration, see `ftdrive.runs.verification.MARKS`."""
+        return marks_of(self.calibration, emulated=self.emulated)
 
 
 @dataclass(frozen=True, slots=True)

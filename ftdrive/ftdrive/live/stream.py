@@ -34,7 +34,7 @@ from ftdrive.live.samples import (
     sensor_origin_m,
 )
 from ftdrive.runs.run import versions
-from ftdrive.runs.verification import VerificationRecord, calibration_in_words, last_verification
+from ftdrive.runs.verification_record import VerificationRecord, calibration_in_words, marks_of, verification_near
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
@@ -67,7 +67,8 @@ class CompensatedStream(ProcessedStream):
     name : str
         Of the calibration, such as its path.
     force : bool
-        Warn instead of raising an error if the calibration is of another arm, sensor or mount.
+        Warn instead of raising an error if the calibration is of another arm, sensor or mount; of a tool, take one
+        that was edited by hand too.
     frame : WrenchFrame
         Axes and reference point; may be set at any time.
     stages : Stages
@@ -156,7 +157,7 @@ class CompensatedStream(ProcessedStream):
     def station(self) -> Station:
         """The emulated cell, such as `station.control(do="push", wrench=[0, 0, -5, 0, 0, 0], seconds=1)`.
 
-        mocks/README.md lists the requests. Raises `ConfigError` for a real cell.
+        docs/reference/emulated-cell.md lists the requests. Raises `ConfigError` for a real cell.
         """
         if not isinstance(self._given, Station):
             raise ConfigError("this is a real cell: only a stream with simulate=True has a station")
@@ -197,13 +198,16 @@ class CompensatedStream(ProcessedStream):
             versions=versions(),
             verification=verification,
             calibration_state=state,
+            emulated=self.cell.is_emulated,
         )
 
     def _trusted(self) -> tuple[VerificationRecord | None, str]:
         """Return the last verification of the calibration, and what is said of its age and of that."""
         path = Path(self._name)
-        verification = last_verification(path) if path.name and path.exists() else None
-        return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC))
+        known = path.name and path.exists()
+        verification = verification_near(path, self._calibration.id) if known else None
+        marks = marks_of(self._calibration, emulated=self.cell.is_emulated)
+        return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC), marks)
 
     def use_tool(self, name: str) -> StreamEvent:
         """Continue with the newest accepted calibration of another tool, after a change of tools.

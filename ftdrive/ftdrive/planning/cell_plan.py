@@ -53,7 +53,7 @@ def plan_for(
         made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
     if not made.certified:
         raise PlanRefused("a move of the plan could not be proven clear")
-    return made.marked(measured=cell.workcell.measured)
+    return made.marked(measured=cell.workcell.measured, emulated=cell.is_emulated)
 
 
 def certifier_for(cell: CellConfig, model: str | None) -> Certifier:

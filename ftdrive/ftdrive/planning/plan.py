@@ -57,7 +57,7 @@ class Plan:
     """(3,) in base; where the axes of joints 4 and 5 cross, if base, shoulder and elbow rest."""
     predicted: Mapping[str, Any]
     description: Mapping[str, Any]
-    """Model, tool, scene and speeds; `measured` says whether the operator has measured tool and scene, see `marked`."""
+    """Model, tool, scene and speeds; `measured` and `emulated` see `marked`."""
 
     @property
     def certified(self) -> bool:
@@ -74,9 +74,22 @@ class Plan:
         """Whether the operator has configured tool and scene as measured; else they may be placeholders."""
         return self.description.get("measured") is True
 
-    def marked(self, *, measured: bool) -> "Plan":
-        """Record in the description, and so in the file and its hash, whether tool and scene were measured."""
-        return replace(self, description={**self.description, "measured": measured})
+    @property
+    def emulated(self) -> bool:
+        """Whether it was made for an emulated cell."""
+        return self.description.get("emulated") is True
+
+    def marked(self, *, measured: bool, emulated: bool = False) -> "Plan":
+        """Record in the description, and so in the file and its hash, whether tool and scene were measured.
+
+        For an emulated cell the first sentence says so.
+        """
+        if not emulated:
+            return replace(self, description={**self.description, "measured": measured})
+        words = "The cell is EMULATED: no real arm may follow this plan."
+        return replace(
+            self, why=(words, *self.why), description={**self.description, "measured": measured, "emulated": True}
+        )
 
     @property
     def R_base_flange(self) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ftcalib.poses.information import SUBSET_6, T12, Guess, special
-from ftcalib.poses.verification import FEWEST
+from ftcalib.poses.verification_poses import FEWEST
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.certify import Certifier

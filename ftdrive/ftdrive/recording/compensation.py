@@ -82,7 +82,7 @@ def compensated(
     dict
         samples, duration_s, gaps; `raw` and `compensated` with root mean square and maximum of force in N and torque in
         N·m; `contacts` with time since the first sample in s, duration in s, peak in N and direction; `bias_change`, if
-        it was estimated; axes, about and calibration, the name.
+        it was estimated; axes, about; calibration, the name, and its marks.
 
     Raises
     ------
@@ -139,6 +139,7 @@ def compensated(
         "bias_change": change,
         **frame.to_dict(),
         "calibration": info.calibration_name,
+        "marks": list(info.marks),
     }
 
 

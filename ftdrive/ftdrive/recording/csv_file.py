@@ -2,29 +2,48 @@
 
     # ftdrive.recording/1: what the columns hold
     # header {...}
-    t_s,t_host_ns,...
+    t_s,t_utc_s,t_host_ns,...
+    # crc32 1a2b3c4d       of everything before this line
     ...
     # event {...}          where it happened
+    # crc32 5e6f7a8b
     # end
 
 A reader that skips lines with `#`, such as `pandas.read_csv(path, comment="#")`, finds a plain table.
+
+A file whose checksum does not fit is refused. Of a file without its end, samples count up to the last checksum, which
+follows at least every second. Files of the first version, without checksums, are read up to their last whole line.
 """
 
 import csv
 import io
 import json
+import zlib
 from collections.abc import Collection, Iterator, Sequence
+from itertools import chain, pairwise
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.growing_file import GrowingFile
-from ftdrive.recording.recording import COLUMNS, FORMAT, ROW, Header, Recording, Rows, event_of, event_text
+from ftdrive.recording.recording import (
+    COLUMNS,
+    FORMAT,
+    ROW,
+    Header,
+    Recording,
+    Rows,
+    event_of,
+    event_text,
+    places_of,
+    table_of,
+)
 
-_HEADER, _EVENT, _END = "# header ", "# event ", "# end"
-_NAMES = ("t_s", *(COLUMNS.names or ()))
+_HEADER, _EVENT, _CRC, _END = "# header ", "# event ", "# crc32 ", "# end"
+_HEADER_LINES = 3
 
 
 class CsvFile:
@@ -32,28 +51,50 @@ class CsvFile:
 
     def __init__(self, path: Path, header: Header) -> None:
         self._file = GrowingFile(path)
+        self.partial = self._file.partial
+        self.samples = 0
+        self._crc = 0
         self._start_ns: int | None = None
-        lines = [f"# {FORMAT}: {header.words}", _HEADER + json.dumps(header.to_dict()), ",".join(_NAMES), ""]
-        self._file.add("\n".join(lines).encode())
+        self._utc_offset_ns = header.info.utc_offset_ns
+        names = ",".join(table_of(np.zeros(0, ROW), 0, 0))
+        self._add(f"# {FORMAT}: {header.words}\n{_HEADER}{json.dumps(header.to_dict())}\n{names}\n")
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
-        """Write samples and events. Raises `OSError`."""
+        """Write samples, and each event where it happened. Raises `OSError`."""
         text = io.StringIO()
-        text.writelines(f"{_EVENT}{event_text(event)}\n" for event in events)
-        if len(rows):
-            self._start_ns = int(rows["t_host_ns"][0]) if self._start_ns is None else self._start_ns
-            t_s = (rows["t_host_ns"] - self._start_ns) * 1e-9
-            values = [rows.view(COLUMNS)[name] for name in COLUMNS.names or ()]
-            columns = [one.astype(np.uint8) if one.dtype == bool else one for one in values]
-            table = csv.writer(text, lineterminator="\n")
-            table.writerows(zip(t_s.tolist(), *(column.tolist() for column in columns), strict=True))
-        self._file.add(text.getvalue().encode())
+        table = csv.writer(text, lineterminator="\n")
+        lines = list(self._lines(rows)) if len(rows) else []
+        places = [0, *places_of(events, rows)]
+        for (start, stop), event in zip(pairwise(places), events, strict=True):
+            table.writerows(lines[start:stop])
+            text.write(f"{_EVENT}{event_text(event)}\n")
+        table.writerows(lines[places[-1] :])
+        self._add(text.getvalue())
+        self.samples += len(rows)
+
+    def _lines(self, rows: Rows) -> Iterator[tuple[float, ...]]:
+        self._start_ns = int(rows["t_host_ns"][0]) if self._start_ns is None else self._start_ns
+        columns = table_of(rows, self._start_ns, self._utc_offset_ns).values()
+        whole = [column.astype(np.uint8) if column.dtype == bool else column for column in columns]
+        return zip(*(column.tolist() for column in whole), strict=True)
+
+    def _add(self, text: str) -> None:
+        """Append lines and their checksum."""
+        content = text.encode()
+        crc = zlib.crc32(content, self._crc)
+        line = _crc_line(crc)
+        self._file.add(content + line)
+        self._crc = zlib.crc32(line, crc)
 
     def complete(self) -> None:
         """Write the end and give the file its name. Raises `OSError`."""
         with self._file:
             self._file.add(f"{_END}\n".encode())
             self._file.complete()
+
+    def keep(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
 
     def discard(self) -> None:
         """Delete what was written."""
@@ -62,8 +103,8 @@ class CsvFile:
 
 def read_csv(path: Path, _columns: Collection[str] = ()) -> Recording:
     """Read a recording. Raises `BadRecording` or `OSError`."""
-    with path.open(encoding="utf-8", errors="replace", newline="") as file:
-        lines = _whole_lines(file)
+    with path.open("rb") as file:
+        lines = _lines(file)
         if not next(lines, "").startswith(f"# {FORMAT.partition('/')[0]}/"):
             raise BadRecording(f"the first line is not '# {FORMAT}'")
         given = next(lines, "")
@@ -86,17 +127,46 @@ def read_csv(path: Path, _columns: Collection[str] = ()) -> Recording:
                     yield line
 
         order = [names.index(name) for name in COLUMNS.names or ()]
+        rows, loaded = table(), np.zeros(0, COLUMNS)
         try:
-            loaded = np.loadtxt(table(), COLUMNS, delimiter=",", usecols=order, ndmin=1, comments=None)
+            if first := next(rows, ""):
+                loaded = np.loadtxt(chain([first], rows), COLUMNS, delimiter=",", usecols=order, ndmin=1, comments=None)
         except ValueError as error:
             raise BadRecording(f"a line cannot be read ({error}): the file is damaged") from error
     cut = "" if ended else "the last line is not '# end'"
     return Recording(header, loaded.view(ROW), events, cut)
 
 
-def _whole_lines(file: io.TextIOBase) -> Iterator[str]:
-    """Give lines that end; the last line of a cut file may not."""
-    return (line for line in file if line.endswith("\n"))
+def _lines(file: IO[bytes]) -> Iterator[str]:
+    """Give the lines whose checksum follows, and the end; without checksums, all that are whole."""
+    first = [file.readline() for _ in range(_HEADER_LINES + 1)]
+    if not first[-1].startswith(_CRC.encode()):
+        yield from (_text(line) for line in chain(first, file) if line.endswith(b"\n"))
+        return
+    crc, waiting = 0, list[str]()
+    for number, line in enumerate(chain(first, file), 1):
+        if not line.endswith(b"\n"):
+            break
+        if line.startswith(_CRC.encode()):
+            if line != _crc_line(crc):
+                raise BadRecording(f"line {number} is not the checksum of the lines before it: the file is damaged")
+            yield from waiting
+            waiting = []
+        else:
+            waiting.append(_text(line))
+        crc = zlib.crc32(line, crc)
+    if waiting[:1] == [f"{_END}\n"]:
+        yield waiting[0]
+    elif f"{_END}\n" in waiting:
+        raise BadRecording("its last samples have no checksum: the file is damaged")
+
+
+def _text(line: bytes) -> str:
+    return line.decode(errors="replace")
+
+
+def _crc_line(crc: int) -> bytes:
+    return f"{_CRC}{crc:08x}\n".encode()
 
 
 def _parsed(text: str) -> dict[str, object]:

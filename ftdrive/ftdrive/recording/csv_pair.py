@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from ftcalib import CalibrationResult
 from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns, rotations_of
@@ -21,6 +22,11 @@ from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtS
 
 _WHOLE = 10**6
 """Seconds: the delay is estimated from all of a recording."""
+_NEAR = 100
+"""Samples before and after a step that show whether it is a gap."""
+_ROUNDS = 20
+_REGULAR = 0.2
+"""Largest distance of regular times from multiples of their period, in periods."""
 
 
 def read_pair(
@@ -81,13 +87,47 @@ def read_pair(
 def read_wrench(path: Path) -> FtSamples:
     """Read columns t in s, fx, fy, fz in N, tx, ty, tz in N·m. Raises `BadDataset`.
 
-    Samples are numbered by their times, so that a pause is a gap.
+    Samples are numbered by their times, see `numbers_of`.
     """
     t_s, wrench, _ = _table(path, lambda _: CHANNELS, ", ".join(CHANNELS))
-    step_s = float(np.median(np.diff(t_s)))
-    steps = np.rint(np.diff(t_s) / step_s) if step_s > 0 else np.ones(len(t_s) - 1)
-    seq = np.concatenate([[0], np.cumsum(np.maximum(steps, 1))])
-    return FtSamples.of(_ns(t_s), seq, wrench)
+    return FtSamples.of(_ns(t_s), numbers_of(t_s), wrench)
+
+
+def numbers_of(t_s: Array) -> NDArray[np.int64]:
+    """Number samples by their times (n,), so that a sample that is missing is a gap and a late one is not.
+
+    Where each time is near a multiple of the period, a longer step is a gap. Elsewhere, as with times of receipt or of
+    batches, a gap is a step after which the samples stay late by a period or more, by their median and by the earliest.
+    """
+    steps_s = np.diff(t_s)
+    if (step_s := float(np.median(steps_s))) > 0:
+        steps = np.rint(steps_s / step_s)
+        if steps.min() >= 1 and np.abs(steps_s / step_s - steps).max() < _REGULAR:
+            return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+    number = np.arange(len(t_s))
+    for _ in range(_ROUNDS):  # the period is that of all samples, the missing ones included
+        before, number = number, _with_gaps(t_s, float(t_s[-1] - t_s[0]) / int(number[-1]))
+        if np.array_equal(number, before):
+            break
+    return number
+
+
+def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
+    """Number samples (n,) of a known period."""
+    number = np.arange(len(t_s))
+    if period_s == 0:
+        return number
+    steps = np.diff(t_s) / period_s
+    late = t_s / period_s - number
+    earliest = minimum_filter1d(late, _NEAR, mode="nearest", origin=(_NEAR - 1) // 2)  # of a sample and those before
+    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # and those after
+    possible = np.flatnonzero((steps > 1.5) & (following[1:] - earliest[:-1] > 0.4))
+    for last in possible[np.argsort(-steps[possible])].tolist():  # where the samples beside it are less late
+        near = slice(max(last + 1 - _NEAR, 0), last + 1), slice(last + 1, last + 1 + _NEAR)
+        before, after = (t_s[rows] / period_s - number[rows] for rows in near)
+        missing = min(np.median(after) - np.median(before), after.min() - before.min())
+        number[last + 1 :] += max(round(float(missing)), 0)
+    return number
 
 
 def read_orientation(path: Path) -> ArmStates:

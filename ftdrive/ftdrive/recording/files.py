@@ -19,11 +19,21 @@ _PIECE_ROWS = 7000
 class RecordingFile(Protocol):
     """A new file of one format."""
 
+    samples: int
+    """So many are in the file and remain there, whatever happens."""
+
+    @property
+    def partial(self) -> Path:
+        """Name until it is complete."""
+
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
         """Write samples of one frame, and the events since the samples before."""
 
     def complete(self) -> None:
         """Write the end, fsync the file and give it its name."""
+
+    def keep(self) -> None:
+        """End the file without completing it; what was written remains in `partial`."""
 
     def discard(self) -> None:
         """Delete what was written."""

@@ -53,11 +53,15 @@ class GrowingFile:
         self._file.close()
         self.partial.unlink(missing_ok=True)
 
+    def close(self) -> None:
+        """Leave the file as it is."""
+        self._file.close()
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        self.close()
 
 
 def publish(written: Path, path: Path) -> None:

@@ -1,7 +1,8 @@
 """Recordings as MCAP, for Foxglove, Lichtblick, PlotJuggler and ROS 2 bags. Needs the extra `record`.
 
-Channels of CDR messages: those of `ftdrive.live.ros2`, `/ft_sample` with the other columns, and `/events`. All times
-are UTC. The attachments `calibration.json` and `recording.json` hold the header.
+Channels of CDR messages: those of `ftdrive.live.ros2`, `/ft_sample` with the other columns, `/events`, and `/tf` for
+viewers. All times are UTC. The attachments `calibration.json` and `recording.json` hold the header. Each chunk, each
+attachment and the whole data section have a CRC-32.
 
 The samples of about a second are packed as one array and become one chunk. The writer of the package `mcap` takes
 messages one by one, which costs half a core at 7 kHz. The format: https://mcap.dev/spec
@@ -13,6 +14,7 @@ import struct
 import zlib
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
@@ -23,6 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from ftdrive import __version__
 from ftdrive.errors import BadRecording
 from ftdrive.live import ros2
+from ftdrive.live.frames import frames_in_flange
+from ftdrive.live.quaternions import matrices
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.recording.recording import ROW, Header, Recording, Rows, changed
@@ -41,6 +45,7 @@ _SCHEMAS: Final[Mapping[str, ros2.Schema]] = {
         "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line"
         f"\n{'=' * 80}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec",
     ),
+    ros2.TRANSFORMS: ros2.TRANSFORMS_SCHEMA,
 }
 _CHANNELS: Final = {topic: number for number, topic in enumerate(_SCHEMAS, 1)}
 _SAMPLE: Final = [("t_device_s", "<f8"), ("chi2", "<f8"), ("seq", "<i8"), ("status", "<u4"), ("in_contact", "?")]
@@ -53,14 +58,17 @@ _COLUMNS: Final[Mapping[int, tuple[Any, int]]] = {
 }
 """The columns in the messages of a channel, and the number of bytes behind them."""
 _WARNINGS: Final = ("gap", "stale", "drift", "tare-refused")
+_TRANSFORMS_STEP_NS: Final = 16_666_667
+"""Between two messages on /tf: no screen shows more."""
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
-_MESSAGE, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 5, 6, 7, 9, 15
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 3, 4, 5, 6, 7, 9, 15
 _HEAD: Final = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
 """What precedes the body of a message."""
 _LARGEST: Final = 1 << 32
+_NONE: Final = np.zeros(0, np.int64)
 
 
 class McapFile:
@@ -72,6 +80,9 @@ class McapFile:
 
         self._header = header
         self._file = GrowingFile(path)
+        self.partial = self._file.partial
+        self.samples = 0
+        self._crc = 0
         self._chunks: list[McapRecord] = []
         self._counts: defaultdict[int, int] = defaultdict(int)
         self._first_ns, self._last_ns = 1 << 63, 0
@@ -80,14 +91,20 @@ class McapFile:
             schema = _SCHEMAS[topic]
             self._channels.append(Schema(data=schema.text.encode(), encoding="ros2msg", id=number, name=schema.name))
             self._channels.append(Channel(number, topic, "cdr", {}, number))
-        self._file.add(_MAGIC + _bytes(Start("ros2", f"ftdrive {__version__}"), *self._channels))
+        self._add(_MAGIC + _bytes(Start("ros2", f"ftdrive {__version__}"), *self._channels))
         self._attachments: list[McapRecord] = []
         document = header.to_dict()
         for name, content in (("calibration.json", document.pop("calibration")), ("recording.json", document)):
             data = json.dumps(content, indent=1).encode()
             record = _bytes(Attachment(0, 0, name, "application/json", data))
-            place = self._file.add(record)
+            place = self._add(record)
             self._attachments.append(AttachmentIndex(place, len(record), 0, 0, len(data), name, "application/json"))
+
+    def _add(self, content: bytes) -> int:
+        """Append to the data section; return where it begins."""
+        place = self._file.add(content)
+        self._crc = zlib.crc32(content, self._crc)
+        return place
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
         """Write samples and events as one chunk. Raises `OSError`."""
@@ -109,7 +126,7 @@ class McapFile:
             indexes += struct.pack("<BQHI", _INDEX, 6 + table.nbytes, number, table.nbytes) + table.tobytes()
         index = ChunkIndex(
             chunk_length=len(chunk),
-            chunk_start_offset=self._file.add(chunk + indexes),
+            chunk_start_offset=self._add(chunk + indexes),
             compression="zstd",
             compressed_size=len(packed),
             message_end_time=last_ns,
@@ -122,6 +139,7 @@ class McapFile:
         self._first_ns, self._last_ns = min(first_ns, self._first_ns), max(last_ns, self._last_ns)
         for number, table in tables.items():
             self._counts[number] += len(table)
+        self.samples += len(rows)
 
     def _messages(self, rows: Rows, events: Sequence[StreamEvent]) -> tuple[bytes, dict[int, NDArray[np.uint64]]]:
         """Return the messages of a chunk, and for each channel (n, 2) times and places in it."""
@@ -135,6 +153,12 @@ class McapFile:
             *starts, width = np.cumsum([0, *(part.shape[1] for part in parts)]).tolist()
             for topic, start in zip(bodies, starts, strict=True):
                 tables[_CHANNELS[topic]] = _table(t_ns, start + width * np.arange(len(rows)))
+            some = np.flatnonzero(np.diff(t_ns // _TRANSFORMS_STEP_NS, prepend=0))
+            placed = _records(_CHANNELS[ros2.TRANSFORMS], t_ns[some], 0, self._transforms(rows[some], t_ns[some]))
+            tables[_CHANNELS[ros2.TRANSFORMS]] = _table(
+                t_ns[some], len(content) + placed.shape[1] * np.arange(len(some))
+            )
+            content += placed.tobytes()
         if events:
             times = np.array([event.t_host_ns for event in events]) + offset_ns
             logs = [
@@ -144,6 +168,14 @@ class McapFile:
             tables[_CHANNELS[EVENTS]] = _table(times, places[:-1])
             content += b"".join(log.tobytes() for log in logs)
         return content, tables
+
+    def _transforms(self, rows: Rows, t_ns: NDArray[np.int64]) -> NDArray[np.void]:
+        """Pack the frames that the messages name: flange in base, and the others in flange."""
+        R_base_flange = matrices(rows["quaternion_base_flange"])
+        frames = frames_in_flange(self._header.frame, self._header.info, R_base_flange)
+        placed = [("base", "flange", np.nan_to_num(rows["p_base_flange_m"]), R_base_flange)]
+        placed += [("flange", name, p_m, R) for name, (R, p_m) in frames.items()]
+        return _array(ros2.pack_transforms(t_ns, placed))
 
     def complete(self) -> None:
         """Write the summary and give the file its name. Raises `OSError`."""
@@ -160,12 +192,16 @@ class McapFile:
             metadata_count=0,
             schema_count=len(_SCHEMAS),
         )
-        end = _bytes(DataEnd(0))
+        end = _bytes(DataEnd(self._crc))
         summary = _bytes(*self._channels, statistics, *self._attachments, *self._chunks)
         footer = _bytes(Footer(summary_start=self._file.size + len(end), summary_offset_start=0, summary_crc=0))
         with self._file:
             self._file.add(end + summary + footer + _MAGIC)
             self._file.complete()
+
+    def keep(self) -> None:
+        """Close the file as it is."""
+        self._file.close()
 
     def discard(self) -> None:
         """Delete what was written."""
@@ -185,8 +221,12 @@ def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArra
         ros2.POSE: ros2.pack_pose_numbers(t_ns, pose),
         ros2.JOINTS: ros2.pack_joints(t_ns, rows["q_rad"]),
     }
-    bodies = {topic: np.frombuffer(b"".join(each), f"V{len(each[0])}") for topic, each in packed.items()}
+    bodies = {topic: _array(each) for topic, each in packed.items()}
     return bodies | {SAMPLE: sample.view(f"V{sample.itemsize}")}
+
+
+def _array(bodies: Sequence[bytes]) -> NDArray[np.void]:
+    return np.frombuffer(b"".join(bodies), f"V{len(bodies[0])}")
 
 
 def _records(channel: int, t_ns: ArrayLike, sequence: ArrayLike, bodies: NDArray[np.void]) -> NDArray[np.uint8]:
@@ -235,40 +275,44 @@ def _bytes(*records: "McapRecord") -> bytes:
 def read_mcap(path: Path, _columns: Collection[str] = ()) -> Recording:
     """Read a recording, also one that was interrupted. Raises `BadRecording` or `OSError`."""
     from mcap.data_stream import ReadDataStream
-    from mcap.records import Attachment, Chunk
-    from mcap.stream_reader import get_chunk_data_stream
+    from mcap.records import Attachment
     from zstandard import ZstdError
 
     documents: dict[str, Any] = {}
     content = _Content()
-    messages, cut = b"", "its last record is incomplete"
+    cut = "its last record is incomplete"
     with path.open("rb") as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise BadRecording("the first bytes are not those of MCAP")
         try:
             for opcode, data in _data_section(file):
+                if opcode == _INDEX:
+                    content.index(data)
+                    continue
+                content.close_chunk()
                 if opcode == _ATTACHMENT:
+                    _require_crc(data[:-4], data[-4:])
                     attachment = Attachment.read(ReadDataStream(io.BytesIO(data)))
                     documents[attachment.name] = json.loads(attachment.data)
                 elif opcode == _CHUNK:
-                    stream, size = get_chunk_data_stream(
-                        Chunk.read(ReadDataStream(io.BytesIO(data))), validate_crc=True
-                    )
-                    messages = stream.read(size)
-                elif opcode == _INDEX:
-                    content.add(messages, data)
+                    content.open_chunk(data)
                 elif opcode == _DATA_END:
                     cut = ""
+            if cut:
+                _require_no_end(file)
             if not {"calibration.json", "recording.json"} <= documents.keys():
                 raise BadRecording("the header is missing: the file was cut within it, or another program wrote it")
             header = Header.from_dict(documents["recording.json"] | {"calibration": documents["calibration.json"]})
+            with suppress(ValueError):  # the last chunk of an interrupted file may lack the end of its index
+                content.close_chunk()
             return Recording(header, *content.on_the_clock_of(header), cut)
         except (MemoryError, OverflowError, TypeError, ValueError, ZstdError, struct.error) as error:
             raise BadRecording(f"a record cannot be read ({error!r}): the file is damaged") from error
 
 
 def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Give the records of the data section that are complete."""
+    """Give the records of the data section that are complete; raises `ValueError` if its CRC does not fit them."""
+    crc = zlib.crc32(_MAGIC)
     while len(start := file.read(9)) == 9:
         opcode, length = struct.unpack("<BQ", start)
         if length > _LARGEST:
@@ -276,9 +320,26 @@ def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
         data = file.read(length)
         if len(data) < length:
             return
-        yield opcode, data
         if opcode == _DATA_END:
+            _require_crc(crc, data)
+            yield opcode, data
             return
+        crc = zlib.crc32(data, zlib.crc32(start, crc))
+        yield opcode, data
+
+
+def _require_crc(content: bytes | int, stored: bytes) -> None:
+    """Check bytes, or their CRC-32, against the stored one; 0 is none, as other programs write."""
+    (expected,) = struct.unpack("<I", stored)
+    if expected not in (0, zlib.crc32(content) if isinstance(content, bytes) else content):
+        raise ValueError("its bytes differ from their checksum")
+
+
+def _require_no_end(file: IO[bytes]) -> None:
+    """Raise `ValueError` if a file whose data section has no end was completed."""
+    file.seek(-len(_MAGIC), io.SEEK_END)
+    if file.read() == _MAGIC:
+        raise ValueError("the end of the data is missing")
 
 
 class _Content:
@@ -287,22 +348,45 @@ class _Content:
     def __init__(self) -> None:
         self._columns: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
         self._events: list[StreamEvent] = []
+        self._messages = b""
+        self._indexes: list[bytes] = []
 
-    def add(self, messages: bytes, index: bytes) -> None:
-        """Take the messages of one channel of a chunk; other programs may have divided the file into other chunks."""
-        channel, size = struct.unpack_from("<HI", index)
-        t_ns, places = np.frombuffer(index, "<i8", size // 8, 6).reshape(-1, 2).T
-        ends = places + 9 + _at(messages, places + 1, np.dtype("<u8")).astype(np.int64)
-        if channel == _CHANNELS[EVENTS]:
-            for t, place, end in zip(t_ns.tolist(), places.tolist(), ends.tolist(), strict=True):
-                self._events.append(_event(messages[place + _HEAD.itemsize : end], t))
-        elif channel in _COLUMNS:
-            kind, behind = _COLUMNS[channel]
-            values = _at(messages, ends - behind - kind.itemsize, kind)
-            for name in kind.names:
-                self._columns[name].append(values[name].copy())
-            if channel == _CHANNELS[SAMPLE]:
-                self._columns["t_host_ns"].append(t_ns)
+    def open_chunk(self, data: bytes) -> None:
+        """Unpack the messages of a chunk, and check their CRC."""
+        from mcap.data_stream import ReadDataStream
+        from mcap.records import Chunk
+        from mcap.stream_reader import get_chunk_data_stream
+
+        stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(io.BytesIO(data))), validate_crc=True)
+        self._messages = stream.read(size)
+
+    def index(self, data: bytes) -> None:
+        """Take the index of one channel in the chunk; other programs may have divided the file into other chunks."""
+        self._indexes.append(data)
+
+    def close_chunk(self) -> None:
+        """Take the messages of the chunk; raises `ValueError` unless the indexes name each of them.
+
+        The CRC of a chunk covers its messages, not their indexes.
+        """
+        messages, indexes, self._messages, self._indexes = self._messages, self._indexes, b"", []
+        found = [_indexed(messages, index) for index in indexes]
+        _require_complete(
+            messages,
+            np.concatenate([_NONE, *(places for _, _, places, _ in found)]),
+            np.concatenate([_NONE, *(ends for *_, ends in found)]),
+        )
+        for channel, t_ns, places, ends in found:
+            if channel == _CHANNELS[EVENTS]:
+                for t, place, end in zip(t_ns.tolist(), places.tolist(), ends.tolist(), strict=True):
+                    self._events.append(_event(messages[place + _HEAD.itemsize : end], t))
+            elif channel in _COLUMNS:
+                kind, behind = _COLUMNS[channel]
+                values = _at(messages, ends - behind - kind.itemsize, kind)
+                for name in kind.names:
+                    self._columns[name].append(values[name].copy())
+                if channel == _CHANNELS[SAMPLE]:
+                    self._columns["t_host_ns"].append(t_ns)
 
     def on_the_clock_of(self, header: Header) -> tuple[Rows, list[StreamEvent]]:
         """Return samples and events with the times of the cell."""
@@ -313,6 +397,31 @@ class _Content:
         offset_ns = header.info.utc_offset_ns
         rows["t_host_ns"] -= offset_ns
         return rows, [replace(event, t_host_ns=event.t_host_ns - offset_ns) for event in self._events]
+
+
+def _indexed(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Return the channel of an index, and times, begins and ends (n,) of its messages; checks them against these."""
+    channel, size = struct.unpack_from("<HI", index)
+    t_ns, places = np.frombuffer(index, "<i8", size // 8, 6).reshape(-1, 2).T
+    heads = _at(messages, places, _HEAD)
+    if (heads["opcode"] != _MESSAGE).any() or (heads["channel"] != channel).any() or (heads["log"] != t_ns).any():
+        raise ValueError("an index differs from its chunk")
+    return channel, t_ns, places, places + 9 + heads["length"].astype(np.int64)
+
+
+def _require_complete(messages: bytes, places: NDArray[np.int64], ends: NDArray[np.int64]) -> None:
+    """Raise `ValueError` unless there is nothing but schemas and channels between the indexed messages."""
+    order = np.argsort(places)
+    begins, stops = np.append(places[order], len(messages)), np.insert(ends[order], 0, 0)
+    for stop, begin in zip(stops[stops != begins].tolist(), begins[stops != begins].tolist(), strict=True):
+        place = stop
+        while place < begin:
+            opcode, length = struct.unpack_from("<BQ", messages, place)
+            if opcode not in (_SCHEMA, _CHANNEL):
+                break
+            place += 9 + length
+        if place != begin:
+            raise ValueError("a chunk has a message that no index names")
 
 
 def _at(data: bytes, places: NDArray[np.int64], kind: np.dtype[Any]) -> NDArray[Any]:

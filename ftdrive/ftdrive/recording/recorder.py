@@ -1,9 +1,12 @@
 """The recorder: a consumer of a stream that writes files."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+import signal
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -40,21 +43,35 @@ class Recorder:
     def __init__(self, paths: Sequence[Path], info: StreamInfo, configuration: Mapping[str, JSON]) -> None:
         self.samples, self.gaps, self.lost = 0, 0, 0
         self.first_ns = self.last_ns = 0
+        self.saved: list[Path] = []
+        """Files that are complete."""
+        self.partial: dict[Path, int] = {}
+        """Files that could not be completed, and how many samples each of them keeps."""
         require_new_recordings(paths)
         self._paths, self._info, self._configuration = paths, info, configuration
         self._files: list[RecordingFile] = []
         self._header: Header | None = None
         self._blocks: list[Block] = []
         self._events: list[StreamEvent] = []
-        self._failed = False
 
     @property
     def duration_s(self) -> float:
         """From the first sample to the last."""
         return (self.last_ns - self.first_ns) * 1e-9
 
+    @property
+    def rate_Hz(self) -> float:
+        """Mean rate of all samples; 0 if there is only one."""
+        return (self.samples - 1) / self.duration_s if self.duration_s else 0.0
+
     def write(self, block: Block) -> None:
-        """Record samples. Raises `OSError`; then close: what was written before remains."""
+        """Record samples.
+
+        Raises
+        ------
+        OSError
+            A file cannot be written. None will be completed, and the error names what remains in which `.partial`.
+        """
         if not len(block):
             return
         self._follow(block)
@@ -73,13 +90,25 @@ class Recorder:
             self._events.append(event)
 
     def close(self) -> None:
-        """Complete all files; without a sample there is none. Raises the first `OSError`, after all were tried."""
-        with ExitStack() as stack:  # runs every callback, then raises
-            for file in self._files:
-                stack.callback(file.complete)
-            if not self._failed:
-                self._flush()
-        self._files = []
+        """Complete all files that hold every sample; without a sample there is none.
+
+        Raises
+        ------
+        OSError
+            A file could not be completed; the others were. It names what remains in which `.partial`.
+        """
+        self._flush()
+        files, self._files, failure = self._files, [], None
+        with _uninterrupted():
+            for path, file in zip(self._paths, files, strict=False):  # without a sample there is no file
+                try:
+                    file.complete()
+                    self.saved.append(path)
+                except OSError as error:
+                    self.partial[file.partial] = file.samples
+                    failure = failure or error
+        if failure is not None:
+            raise self._named(failure)
 
     def discard(self) -> None:
         """Delete what was written."""
@@ -112,10 +141,42 @@ class Recorder:
     def _flush(self) -> None:
         blocks, self._blocks = self._blocks, []
         events, self._events = self._events, []
-        if not blocks and not events:
+        if not self._files or (not blocks and not events):
             return
         rows = rows_of(Block.concatenate(blocks)) if blocks else np.zeros(0, ROW)
-        self._failed = True
-        for file in self._files:
-            file.append(rows, events)
-        self._failed = False
+        with _uninterrupted():
+            try:
+                for file in self._files:
+                    file.append(rows, events)
+            except BaseException as error:
+                files, self._files = self._files, []
+                for file in files:
+                    file.keep()
+                self.partial = {file.partial: file.samples for file in files}
+                if isinstance(error, OSError):
+                    raise self._named(error) from error
+                raise
+
+    def _named(self, error: OSError) -> OSError:
+        """Return an error of the same kind that names what is safe."""
+        kept = " and ".join(f"{path} keeps {samples} samples" for path, samples in self.partial.items())
+        return type(error)(f"{error.strerror or error}: {kept}, which `ftdrive convert` saves as a complete file")
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Let Ctrl-C, `kill` and a closing terminal wait, so that each file gets all of a piece."""
+    waiting: list[tuple[Any, Any, Any]] = []
+    handlers = {}
+    if threading.current_thread() is threading.main_thread():
+        names = (getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+        handlers = {number: handler for number in names if callable(handler := signal.getsignal(number))}
+    for number, handler in handlers.items():
+        signal.signal(number, lambda *given, act=handler: waiting.append((act, *given)))
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    for act, number, frame in waiting[:1]:
+        act(number, frame)

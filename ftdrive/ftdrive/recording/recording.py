@@ -6,7 +6,7 @@ The pose is stored as a quaternion, so that all formats hold the same bits.
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, Final, Self
 
 import numpy as np
@@ -18,7 +18,7 @@ from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame
-from ftdrive.runs.verification import VerificationRecord
+from ftdrive.runs.verification_record import VerificationRecord
 from ftdrivers.interfaces import DeviceInfo, Fact
 
 FORMAT: Final = "ftdrive.recording/1"
@@ -50,6 +50,31 @@ COLUMNS: Final = np.dtype([(one, kind) for name, (kind, _) in _GROUPS.items() fo
 """The same bytes, one field a number."""
 
 
+def table_of(rows: Rows, start_ns: int, utc_offset_ns: int) -> dict[str, NDArray[Any]]:
+    """Return the columns of the table formats: times for other programs, then those of `COLUMNS`.
+
+    Parameters
+    ----------
+    rows : array, shape (n,)
+    start_ns : int
+        `t_host_ns` of the first sample of the recording.
+    utc_offset_ns : int
+        As in `StreamInfo`.
+    """
+    t_ns, numbers = rows["t_host_ns"], rows.view(COLUMNS)
+    times = {"t_s": (t_ns - start_ns) * 1e-9, "t_utc_s": (t_ns + utc_offset_ns) * 1e-9}
+    return times | {name: numbers[name] for name in COLUMNS.names or ()}
+
+
+def places_of(events: Sequence[StreamEvent], rows: Rows) -> list[int]:
+    """Return for each event the number of samples before it: of a frame or stages those before its time, else up to it.
+
+    The order of the events stays.
+    """
+    after_ns = [event.t_host_ns + (event.kind not in ("frame", "stages")) for event in events]
+    return list(accumulate(np.searchsorted(rows["t_host_ns"], after_ns).tolist(), max))
+
+
 def rows_of(samples: Block | Paired) -> Rows:
     """Return samples as records; what paired samples do not have is 0."""
     rows = np.zeros(len(samples), ROW)
@@ -78,7 +103,8 @@ class Header:
             "raw_fx..raw_tz as measured, sensor axes, about the sensor origin; "
             f"fx..tz compensated, {self.frame}; N, N·m, m, rad"
         )
-        return f"{words}; {self.info.calibration_state}" if self.info.calibration_state else words
+        state = self.info.calibration_state or ", ".join(self.info.marks)
+        return f"{words}; {state}" if state else words
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the header as JSON; numbers that are not finite are null."""
@@ -114,7 +140,7 @@ class Header:
             raise BadRecording(f"the header cannot be read ({error}): the file is damaged") from error
 
 
-_LATER = ("verification", "calibration_state")
+_LATER = ("verification", "calibration_state", "emulated")
 """Fields that older recordings lack."""
 _ARRAYS = ("p_flange_sensor_m", "R_flange_tcp", "p_flange_tcp_m")
 
@@ -201,7 +227,7 @@ class Recording:
         """Give samples in pieces of one frame, the events since the piece before, and the header that holds there."""
         header, n = self.header, len(self.rows)
         events = sorted(self.events, key=lambda event: event.t_host_ns)
-        at = np.searchsorted(self.rows["t_host_ns"], [event.t_host_ns for event in events]).tolist()
+        at = places_of(events, self.rows)
         changes = [row for row, event in zip(at, events, strict=True) if event.kind in ("frame", "stages")]
         ends = sorted({*range(length, n, length), *changes, n} - {0})
         for start, end in pairwise([0, *ends]):

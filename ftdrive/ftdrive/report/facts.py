@@ -20,6 +20,7 @@ from ftdrive.report.error_map import direction_in_words, error_map
 from ftdrive.report.subject import Subject
 from ftdrive.runs.pose_hints import hints, names_of
 from ftdrive.runs.run import Run
+from ftdrive.runs.verification_record import MARKS, marks_of
 from ftdrive.terminal.report import drift_in_words, error_in_words
 
 FORMAT = "ftdrive.report/1"
@@ -58,6 +59,7 @@ def facts_of(subject: Subject) -> dict[str, Any]:
         "source": str(subject.source),
         "id": result.id,
         "verdict": result.verdict,
+        "marks": {mark: MARKS[mark] for mark in marks_of(result)},
         "findings": [one.to_dict() for one in result.findings],
         "hints": [one.to_dict() for one in hints(result, subject.records)],
         "trust": subject.trust,

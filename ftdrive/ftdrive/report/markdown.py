@@ -14,12 +14,12 @@ def markdown(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
 
 
 def _lines(facts: Mapping[str, Any], sections: Sequence[Section]) -> Iterator[str]:
-    yield f"# Calibration {facts['id']}: {facts['verdict'].upper()}\n"
+    yield f"# Calibration {facts['id']}: {', '.join([facts['verdict'].upper(), *facts['marks']])}\n"
     yield f"Compensation error {_escaped(facts['error']['words'])}.\n"
     if facts["trust"]:
         yield f"{_escaped(capital(facts['trust']['words']))}.\n"
-    for one in [*facts["findings"], *facts["hints"]]:
-        yield f"* {_escaped(capital(one['words']))}"
+    remarks = [*facts["marks"].values(), *(one["words"] for one in [*facts["findings"], *facts["hints"]])]
+    yield from (f"* {_escaped(capital(one))}" for one in remarks)
     yield f"\n**Next:** {_escaped(facts['next_step'])}\n"
     for section in sections:
         yield f"## {section.title}\n"

@@ -23,8 +23,6 @@ def tour(facts: Facts) -> Section:
         return Section("tour", title, ["The source is not a run folder: it holds no plan, devices or settings."])
     started = f"{str(run['created_utc'])[:19]} UTC"
     text = [f"Run {run['run']}, started {started}, mode {run['mode']}, {run['stops']} stops."]
-    if run["emulated"]:
-        text.append("The cell was EMULATED: these are not the values of a real tool.")
     tables = [
         Table("Devices", ("device", "model", "serial", "firmware"), _devices(run["devices"])),
         Table("Settings", ("setting", "value"), list(flattened(run["config"])), folded=True),

@@ -83,7 +83,9 @@ def is_calibration(source: Path) -> bool:
     if source.is_dir() or source.suffix != ".json":
         return False
     try:
-        return str(read_object(source, BadCalibration).get("format", "")).startswith("ftdrive.calibration/")
+        return str(read_object(source, BadCalibration, accept_changed=True).get("format", "")).startswith(
+            "ftdrive.calibration/"
+        )
     except BadCalibration:
         return False
 

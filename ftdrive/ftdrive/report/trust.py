@@ -7,7 +7,7 @@ from typing import Any
 
 from ftcalib import CalibrationResult
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.runs.verification import age_of, outcome_in_words, verification_near
+from ftdrive.runs.verification_record import age_of, outcome_in_words, verification_near
 
 
 def trust(

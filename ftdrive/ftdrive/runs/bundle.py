@@ -1,6 +1,6 @@
 """A bundle: a run in one zip file, without addresses and names, which `replay` and `solve` read like the run folder.
 
-bundle.json         ftdrive.bundle/1: name of the run, what was redacted, what was left out
+bundle.json         ftdrive.bundle/1: name of the run, whether it is emulated, what was redacted, what was left out
 environment.json    versions of all packages, and the checks of the computer that need no device
 <run>/...           the files of the run folder; texts are redacted, poses are copied byte for byte
 transcripts/...     the files of `ftdrive transcript record`, redacted
@@ -11,11 +11,11 @@ import json
 import os
 import platform
 import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from errno import EINVAL
 from importlib.metadata import distributions
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
@@ -27,7 +27,7 @@ from ftdrive.cell.config import recorded_cell
 from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, check_permissions, check_workcell
 from ftdrive.errors import BadBundle
 from ftdrive.runs.redaction import Redaction
-from ftdrive.runs.run import Run, versions
+from ftdrive.runs.run import LOCK, ZIP_DAMAGE, Run, versions
 
 FORMAT: Final = "ftdrive.bundle/1"
 MOST_BYTES: Final = 4_000_000_000
@@ -62,7 +62,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
     redaction, left_out = Redaction(), []
     texts = {"environment.json": json.dumps(_environment(folder))}
     poses: dict[str, bytes] = {}
-    for file in sorted(file for file in folder.rglob("*") if not file.is_dir() or file.is_symlink()):
+    for file in sorted(one for one in folder.rglob("*") if (not one.is_dir() or one.is_symlink()) and one.name != LOCK):
         name = file.relative_to(folder.parent).as_posix()
         content = None if file.is_symlink() else file.read_bytes()
         if content is not None and file.suffix == ".npz":
@@ -79,7 +79,13 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
         redaction.learn(text)
     clean = {name: redaction.file(text) for name, text in texts.items()}
     bundled = Bundled(redaction.counts, left_out)
-    about = {"format": FORMAT, "created_utc": datetime.now(UTC).isoformat(), "run": folder.name, **asdict(bundled)}
+    about = {
+        "format": FORMAT,
+        "created_utc": datetime.now(UTC).isoformat(),
+        "run": folder.name,
+        "emulated": _is_emulated(folder),
+        **asdict(bundled),
+    }
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("bundle.json", json.dumps(about, indent=1))
@@ -120,8 +126,9 @@ def _unpack(source: Path, folder: Path) -> Path:
         raise BadBundle(f"{source}: {error}") from error
     except FileNotFoundError as error:
         raise BadBundle(f"{source} is not a bundle, it has no bundle.json: {_COPY_AGAIN}") from error
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
-        # NotImplementedError: a compression that Python does not know; RuntimeError: a password.
+    except (*ZIP_DAMAGE, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in (None, EINVAL):  # such as a full disk
+            raise
         raise BadBundle(f"{source} is not a zip file or is damaged ({error}): {_COPY_AGAIN}") from error
 
 
@@ -152,7 +159,7 @@ def _require_small(poses: Path) -> None:
     try:
         with zipfile.ZipFile(poses) as arrays:
             size = sum(one.file_size for one in arrays.infolist())
-    except zipfile.BadZipFile:
+    except (*ZIP_DAMAGE, OSError):
         return
     if size > MOST_BYTES:
         raise BadBundle(f"{poses.name} unpacks to {size / 1e9:.0f} GB: do not use this file")
@@ -164,6 +171,13 @@ def _text(content: bytes) -> str | None:
     except UnicodeDecodeError:
         return None
     return None if "\0" in text else text
+
+
+def _is_emulated(folder: Path) -> bool | None:
+    try:
+        return Run(folder).header().get("station") is not None
+    except BadDataset:  # a damaged run is worth a report too
+        return None
 
 
 def _environment(folder: Path) -> dict[str, Any]:

@@ -21,11 +21,17 @@ class Outcome:
 
 
 def solve_and_save(run: Run) -> Outcome:
-    """Solve a run from its files, so that the files suffice to repeat it."""
+    """Solve a run from its files, so that the files suffice to repeat it. Raises `OSError` if they cannot be saved."""
     outcome = solve_records(run, run.records())
-    outcome.dataset.save(run.new_path("dataset"))
-    if outcome.result.verdict != "rejected":
-        outcome.result.save(run.new_path("calibration"))
+    try:
+        outcome.dataset.save(run.new_path("dataset"))
+        if outcome.result.verdict != "rejected":
+            outcome.result.save(run.new_path("calibration"))
+    except OSError as error:
+        raise OSError(
+            f"{error.strerror or error}: the result is not saved, but all poses are. Make room in {run.folder}, then "
+            f"{run.solve_command} --output FILE"
+        ) from error
     return outcome
 
 
@@ -39,7 +45,8 @@ def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
 def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
     """Return a run's records as a dataset, the circumstances as `solve` takes them, and the provenance."""
     circumstances, origin = circumstances_of(run)
-    dataset = dataset_from(records, {"run": run.folder.name, "devices": origin["devices"]})
+    emulated = {"emulated": True} if origin["station"] is not None else {}
+    dataset = dataset_from(records, {"run": run.folder.name, "devices": origin["devices"], **emulated})
     return dataset, circumstances, {**made_now(), **origin}
 
 

@@ -3,7 +3,6 @@
 push.json         ftdrive.push/1: devices, reason, old and new values, values read back, error; push-2.json and so on
 """
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -13,7 +12,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from ftcalib.errors import BadDataset
-from ftcalib.files import check_format, read_object, write_new
+from ftcalib.files import check_format, read_object, write_object
 from ftdrive.runs.run import Run, made_now
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo
 
@@ -52,7 +51,7 @@ def write_receipt(
         "error": error or None,
     }
     path = Run(folder).new_path(NAME)
-    write_new(path, json.dumps(receipt, allow_nan=False, indent=1) + "\n")
+    write_object(path, receipt)
     return path
 
 

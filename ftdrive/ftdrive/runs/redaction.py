@@ -11,7 +11,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ftcalib.files import JSON
+from ftcalib.files import JSON, is_changed, object_text
+from ftdrive.runs.run import CRC, event_of, with_crc32
 
 _HOME = re.compile(r"(?:/home|/Users|[A-Za-z]:\\Users)[/\\]([^/\\\s\"':;,<>]+)")
 _URL_HOST = re.compile(r"\b([a-z][a-z0-9+-]*)://(?:[^/@\s]*@)?([A-Za-z0-9][A-Za-z0-9.-]*)")
@@ -69,15 +70,24 @@ class Redaction:
             self._learn_name("host", found[1] or found[2])
 
     def file(self, text: str) -> str:
-        """Redact a text file: the values of JSON, one document or one a line, and anything else as it stands."""
+        """Redact a text file: the values of JSON, one document or one a line, and anything else as it stands.
+
+        Checksums that fitted the content fit the redacted content too; others stay, so that damage is still noticed.
+        """
         if (document := _document(text)) is not None:
+            if isinstance(document, dict) and "checksum" in document and not is_changed(document):
+                return object_text(self.json(document), allow_nan=True)
             return json.dumps(self.json(document), indent=1) + "\n"
         lines = [self._line(line) for line in text.splitlines()]
         return "\n".join(lines) + ("\n" if text.endswith("\n") else "")
 
     def _line(self, line: str) -> str:
         document = _document(line)
-        return self.text(line) if document is None else json.dumps(self.json(document))
+        if document is None:
+            return self.text(line)
+        if isinstance(document, dict) and CRC in document and (event := event_of(line)) is not None:
+            return json.dumps(with_crc32(self.json(event)))
+        return json.dumps(self.json(document))
 
     def json(self, value: JSON, key: str = "") -> JSON:
         """Redact all texts in a value of JSON; its keys stay."""

@@ -8,30 +8,38 @@ dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after
 calibration.json  ftdrive.calibration/1: the result; calibration-2.json likewise. Of a verification: the accepted update
 verification.json ftdrive.verification/1: the outcome of a verification; see `ftdrive.runs.verified`
 solved-0.1.0.json ftdrive.calibration/1: the result of a later version; see `ftdrive.fleet.resolve`
+lock              which process adds poses, or did so last
+
+Damage is refused: JSON files have a checksum, each line of events.ndjson a CRC-32, and each array of a pose too.
 """
 
 import io
 import json
+import logging
+import lzma
 import os
 import platform
 import shlex
+import struct
 import sys
 import threading
 import time
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from itertools import count, takewhile
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Final, Literal, Self, get_args
 
 import numpy as np
 
 from ftcalib.errors import BadDataset
-from ftcalib.files import check_format, read_object, write_new
+from ftcalib.files import check_format, read_object, write_new, write_object
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord, TourPose
 from ftdrive import __version__
@@ -42,15 +50,22 @@ from ftdrivers.interfaces import FtSamples
 
 RUN_FORMAT = "ftdrive.run/1"
 RECORDING_FORMAT = "ftdrive.recording/1"
+log = logging.getLogger(__name__)
+
 POSE = "pose-taken"
 """The event of a pose that is on disk, `ftdrive.session.events.PoseTaken`."""
 
 _RESTORE = "take it from a copy"
-_DAMAGE = (
-    *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError),
-    *(NotImplementedError, zipfile.BadZipFile, zlib.error),
+ZIP_DAMAGE: Final = (
+    *(EOFError, MemoryError, RuntimeError, ValueError),
+    *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
-"""Errors of numpy for a damaged file."""
+"""Errors of `zipfile` for a damaged file: RuntimeError for an apparent password or unknown compression. OSError too."""
+_DAMAGE: Final = (*ZIP_DAMAGE, KeyError, OSError, TypeError, tokenize.TokenError)
+"""Errors for the file of a pose; numpy raises TokenError."""
+LOCK: Final = "lock"
+CRC: Final = "crc32"
+"""Field of an event with the CRC-32 of the others, as JSON with sorted keys."""
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 """Of a recording, named as in `FtSamples`."""
 
@@ -68,7 +83,7 @@ class Reading:
 
 
 class Run:
-    """A run folder on disk.
+    """A run folder on disk. In a `with` block no other process can add poses.
 
     Parameters
     ----------
@@ -92,6 +107,34 @@ class Run:
         self.folder = Path(folder)
         self._clock_offset_ns = time.time_ns() - clock.now_ns()  # the anchor of all times in the files
         self._events_lock = threading.Lock()
+        self._held = ExitStack()
+
+    def __enter__(self) -> Self:
+        """Lock the folder until the block or the process ends; raises `ConfigError` if another process holds it."""
+        try:
+            import fcntl
+        except ImportError:  # not on Windows, where no session runs
+            return self
+        with ExitStack() as stack:
+            file = stack.enter_context((self.folder / LOCK).open("a+"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.seek(0)
+                raise ConfigError(
+                    f"{self.folder} is in use by {file.read() or 'another process'}: wait until it ends, or end it"
+                ) from error
+            except OSError as error:  # of a network drive without locks
+                log.warning("%s cannot be locked (%s): do not resume this run twice at once", self.folder, error)
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {platform.node()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC")
+            file.flush()
+            self._remove_incomplete_event()
+            self._held = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._held.close()
 
     @classmethod
     def create(cls, parent: Path, name: str, description: Mapping[str, Any], clock: Clock = REAL) -> "Run":
@@ -115,7 +158,7 @@ class Run:
             "versions": versions(),
             **description,
         }
-        write_new(folder / "run.json", json.dumps(header, indent=1))
+        write_object(folder / "run.json", header, allow_nan=True)
         return cls(folder, clock)
 
     @property
@@ -153,23 +196,49 @@ class Run:
         return _next(self.folder / f"{name}.json")
 
     def append_event(self, event: Mapping[str, Any], *, sync: bool = False) -> None:
-        """Add a line to events.ndjson; with `sync` return when it is on disk. Any thread."""
-        with self._events_lock, (self.folder / "events.ndjson").open("a", encoding="utf-8") as file:
-            file.write(json.dumps(event) + "\n")
+        """Add a line to events.ndjson, or nothing; with `sync` return when it is on disk. Any thread."""
+        line = (json.dumps(with_crc32(event)) + "\n").encode()
+        with self._events_lock, self._events_path.open("ab", buffering=0) as file:
+            begin = file.tell()
+            try:
+                while line:
+                    line = line[file.write(line) :]
+            except OSError:
+                file.truncate(begin)  # half a line would make the next one unreadable
+                raise
             if sync:
-                file.flush()
                 os.fsync(file.fileno())
 
     def events(self) -> Iterator[Mapping[str, Any]]:
-        """Read events.ndjson; a line cut off by a power failure is ignored."""
-        path = self.folder / "events.ndjson"
-        for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
-            try:
-                event = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(event, dict):
+        """Read events.ndjson; a last line cut off by a power failure is ignored.
+
+        Raises
+        ------
+        BadDataset
+            A line is damaged. Files of the first versions have no CRC; of them, lines that are not JSON are ignored.
+        """
+        path = self._events_path
+        text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+        checked = f'"{CRC}"' in text
+        *lines, rest = text.split("\n")
+        for number, line in enumerate(lines, 1):
+            if (event := event_of(line)) is not None:
                 yield event
+            elif checked:
+                raise BadDataset(f"{path}: line {number} is damaged: {_RESTORE}")
+        # What follows the last line is an event if only the end of its line is damaged.
+        if (event := event_of(rest) or event_of(rest[:-1])) is not None:
+            yield event
+
+    @property
+    def _events_path(self) -> Path:
+        return self.folder / "events.ndjson"
+
+    def _remove_incomplete_event(self) -> None:
+        """Remove what a power failure left of the last line, so that the next event begins a new one."""
+        if self._events_path.exists():
+            with self._events_path.open("r+b") as file:
+                file.truncate(file.read().rfind(b"\n") + 1)
 
     def temperature_C(self) -> float | None:
         """Return the mean temperature of the sensor over the poses; None where it reported none."""
@@ -233,6 +302,27 @@ class Run:
         """Return the stops taken, without reading them."""
         names = {path.stem.partition("-")[0] for path in (self.folder / "poses").glob("*.npz")}
         return sorted(int(name) for name in names if name.isdecimal())
+
+
+def event_of(line: str) -> dict[str, Any] | None:
+    """Return the event in a line of events.ndjson; None if it is damaged."""
+    try:
+        event = json.loads(line)
+    except ValueError:
+        return None
+    if not isinstance(event, dict):
+        return None
+    stored = event.pop(CRC, None)
+    return event if stored in (None, _crc32(event)) else None
+
+
+def with_crc32(event: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an event with its CRC-32, as a line of events.ndjson has it."""
+    return {**event, CRC: _crc32(event)}
+
+
+def _crc32(event: Mapping[str, Any]) -> str:
+    return f"{zlib.crc32(json.dumps(event, sort_keys=True).encode()):08x}"
 
 
 def _is_text(value: Any) -> bool:
@@ -311,8 +401,12 @@ def _newest(path: Path) -> Path:
 
 def _read_record(path: Path) -> PoseRecord:
     try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            data = {name: file[name] for name in file.files}
+        with zipfile.ZipFile(path) as file:
+            # `ZipFile.read` reads to the end of each array, where its CRC-32 is checked; `numpy.load` need not.
+            data = {
+                name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
+                for name in file.namelist()
+            }
         found = str(data.get("format"))
         if found != RECORDING_FORMAT:
             raise BadDataset(f"{path} has format {found!r}: this version reads {RECORDING_FORMAT}")

@@ -89,18 +89,20 @@ def read_dataset(path: str | Path, orientation: Orientation = "R_base_flange") -
     return read_source(Path(path), orientation).dataset
 
 
-def read_calibration(path: str | Path) -> CalibrationResult:
+def read_calibration(path: str | Path, *, accept_edited: bool = False) -> CalibrationResult:
     """Read a calibration; `CalibrationResult.save` writes it.
 
     Parameters
     ----------
     path : str or Path
         A calibration.json, or a run folder: its newest calibration.
+    accept_edited : bool
+        Accept a file that was edited by hand; the result is then `is_edited`.
 
     Raises
     ------
     DataError
-        The file is not a calibration that this version can read.
+        The file is not a calibration that this version can read, is damaged or was edited.
     OSError
         It cannot be read.
 
@@ -112,4 +114,4 @@ def read_calibration(path: str | Path) -> CalibrationResult:
     'good'
     """
     path = Path(path)
-    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path)
+    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path, accept_edited=accept_edited)

@@ -4,7 +4,6 @@ verification.json   ftdrive.verification/1, in the run folder of the poses: cali
 calibration.json    in the same folder, if the operator accepted an update: its provenance names the parent
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -16,15 +15,15 @@ from ftcalib.data.pooling import pooled_covariance
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.extras.update import Update, updated
 from ftcalib.extras.verification import Verification, verify
-from ftcalib.files import JSON, write_new
+from ftcalib.files import JSON, write_object
 from ftcalib.model import Array
 from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check, is_return
 from ftdrive.runs.run import Run, made_now
-from ftdrive.runs.verification import FORMAT, fitted_dataset
+from ftdrive.runs.verification_record import FORMAT, fitted_dataset, marks_of
 
 FALSE_ALARMS: Final = 0.01
 """Share of verifications of an unchanged cell that fail."""
-_COPIED: Final = ("devices", "station", "setup")
+_COPIED: Final = ("devices", "station", "setup", "edited")
 """Parts of a calibration's provenance that an update keeps."""
 
 
@@ -88,6 +87,11 @@ class Verified:
         )
 
     @property
+    def marks(self) -> tuple[str, ...]:
+        """Of the calibration, and of a verification in an emulated cell."""
+        return marks_of(self.calibration, emulated=self.run.header().get("station") is not None)
+
+    @property
     def update(self) -> Update | None:
         """The smallest sufficient update; None if the calibration holds, or if only a new calibration helps."""
         return self.verification.update
@@ -105,6 +109,7 @@ class Verified:
             "schema_version": 1,
             **made_now(),
             "run": self.run.folder.name,
+            "marks": list(self.marks),
             "calibration": {
                 "id": self.calibration.id,
                 "path": str(self.calibration_path.absolute()),
@@ -170,7 +175,7 @@ def verify_run(run: Run, calibration: CalibrationResult, path: Path, limits: Acc
     file = run.new_path("verification")
     verified = Verified(run, calibration, path, limits, dataset, kept, found, drift_check(records), file)
     dataset.save(run.new_path("dataset"))
-    write_new(file, json.dumps(verified.to_dict(), allow_nan=False, indent=1) + "\n")
+    write_object(file, verified.to_dict())
     return verified
 
 

@@ -211,6 +211,7 @@ class FoxgloveServer:
             "stages": asdict(self._stream.stages),
             "calibration": self._info.calibration_name,
             "verdict": calibration.verdict,
+            "marks": list(self._info.marks),
             "status": asdict(self._stream.status()),
             "sent": self._sent,
         }

@@ -15,8 +15,9 @@ from foxglove.messages import (
 )
 
 from ftdrive.live import ros2
+from ftdrive.live.frames import frames_in_flange
 from ftdrive.live.quaternions import quaternions
-from ftdrive.live.samples import Block, StreamInfo, WrenchFrame
+from ftdrive.live.samples import Block, StreamInfo
 from ftdrivers.interfaces import Array
 
 FORCE_M_N, TORQUE_M_NM = 0.01, 0.1
@@ -33,21 +34,17 @@ def stamp(t_utc_ns: int) -> Timestamp:
 def transforms(block: Block, info: StreamInfo, t_utc_ns: int) -> FrameTransforms:
     """Return the frames of the last sample of a block: flange in base; sensor, tcp and the wrench's frame in flange."""
     R_base_flange = block.R_base_flange[-1]
-    places = {"sensor": (info.calibration.R_flange_sensor, info.p_flange_sensor_m)}
-    if np.isfinite(info.p_flange_tcp_m).all():
-        places["tcp"] = (info.R_flange_tcp, info.p_flange_tcp_m)
-    if (name := ros2.frame_id(block.frame)) not in ("base", "flange", *places):
-        places[name] = _wrench_frame(block.frame, R_base_flange, info)
+    frames = frames_in_flange(block.frame, info, R_base_flange)
     return FrameTransforms(
         transforms=[
             _transform("base", "flange", R_base_flange, block.p_base_flange_m[-1], t_utc_ns),
-            *(_transform("flange", name, R, p, t_utc_ns) for name, (R, p) in places.items()),
+            *(_transform("flange", name, R, p, t_utc_ns) for name, (R, p) in frames.items()),
         ]
     )
 
 
 def _transform(parent: str, child: str, R: Array, p_m: Array, t_utc_ns: int) -> FrameTransform:
-    x, y, z = np.nan_to_num(p_m).tolist()  # a sensor at an unknown height is drawn at the flange
+    x, y, z = np.nan_to_num(p_m).tolist()
     return FrameTransform(
         timestamp=stamp(t_utc_ns),
         parent_frame_id=parent,
@@ -68,20 +65,6 @@ def arrows(block: Block, t_utc_ns: int) -> SceneUpdate:
         arrows=[_arrow(FORCE_M_N * force_N, _ORANGE), _arrow(TORQUE_M_NM * torque_Nm, _BLUE)],
     )
     return SceneUpdate(entities=[entity])
-
-
-def _wrench_frame(frame: WrenchFrame, R_base_flange: Array, info: StreamInfo) -> tuple[Array, Array]:
-    """Return orientation and origin of the frame of a wrench in flange."""
-    R_flange_axes = {
-        "sensor": info.calibration.R_flange_sensor,
-        "flange": np.eye(3),
-        "base": R_base_flange.T,
-        "tcp": info.R_flange_tcp,
-    }[frame.axes]
-    if not isinstance(frame.about, str):
-        return R_flange_axes, np.array(frame.about)
-    points = {"sensor": info.p_flange_sensor_m, "flange": np.zeros(3), "tcp": info.p_flange_tcp_m}
-    return R_flange_axes, points[frame.about]
 
 
 def _arrow(vector_m: Array, color: Color) -> ArrowPrimitive:

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 
 from ftcalib.model import Array
-from ftcalib.routine import PoseRecord
 from ftdrive.planning.plan import Plan
 from ftdrivers.interfaces import ForceTorqueSensor
 
@@ -125,34 +124,6 @@ class PoseTaken(Event):
     steady: bool
     temperature_C: float | None = None
     """Of the sensor, where it reports it."""
-
-    @classmethod
-    def of(
-        cls,
-        record: PoseRecord,
-        down_base: Array,
-        *,
-        stops: int,
-        settle_s: float,
-        average_s: float,
-        attempts: int,
-        temperature_C: float | None,
-    ) -> "PoseTaken":
-        """Describe a record on disk; `down_base` (3,) is the unit vector down in base, as mounted."""
-        return cls(
-            stop=record.stop,
-            stops=stops,
-            number=record.pose.number,
-            gravity_flange=record.before.R_base_flange.T @ down_base,
-            mean=record.mean.mean,
-            sigma=np.sqrt(np.diag(record.mean.covariance)),
-            samples=len(record.samples.t_host_ns),
-            settle_s=settle_s,
-            average_s=average_s,
-            attempts=attempts,
-            steady=record.steady,
-            temperature_C=temperature_C,
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,17 +1,18 @@
 """Forecast of a tour: its speeds, its duration, and its accuracy with the noise of this sensor."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from ftcalib.model import Array
-from ftcalib.poses.information import Guess, predicted_sigma
+from ftcalib.poses.information import predicted_sigma
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
 from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import guess_of
 from ftdrive.session.tour import APPROACH_RAD_S, SLOW
 
 
@@ -27,8 +28,8 @@ def at_most(plan: Plan, certifier: Certifier, speeds: Speeds) -> Plan:
     return replace(plan, steps=tuple(steps), acceleration_rad_s2=acceleration_rad_s2)
 
 
-def moves_s(plan: Plan, todo: Sequence[int], q_rad: Array, approach: Approach) -> float:
-    """Return the time of all moves: the approach from `q_rad` to the first stop, then moves of the plan to the rest.
+def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:
+    """Return the time of all moves: the approach to the first stop, then moves of the plan to the rest.
 
     Parameters
     ----------
@@ -37,7 +38,7 @@ def moves_s(plan: Plan, todo: Sequence[int], q_rad: Array, approach: Approach) -
     todo : sequence of int
         Stops, from 1; where some are left out between two, there is an approach too, counted as a straight move.
     """
-    turns = np.abs(np.diff(np.vstack([q_rad, approach.q_rad]), axis=0)).max(axis=1)
+    turns = np.abs(np.diff(approach.way_rad, axis=0)).max(axis=1)
     speeds = np.minimum(approach.speed_rad_s, APPROACH_RAD_S)
     total_s = float(move_duration_s(turns, speeds, SLOW.joint_rad_s2).sum())
     for stop, following in pairwise(todo):
@@ -51,27 +52,44 @@ def moves_s(plan: Plan, todo: Sequence[int], q_rad: Array, approach: Approach) -
     return total_s
 
 
-def prediction(plan: Plan, guess: Guess, average_s: float, sigma: Array, *, assumed: bool) -> str:
-    """Describe the accuracy that a plan's poses give.
+@dataclass(frozen=True, slots=True, eq=False)
+class Averages:
+    """The averages that a session will take."""
+
+    plan: Plan
+    certifier: Certifier
+    average_s: float
+    sigma: Array
+    """(6,) standard deviation of one, as measured, N and N·m."""
+
+    @property
+    def rms_sigma(self) -> tuple[float, float]:
+        """Standard deviation of one axis: force, N, and torque, N·m."""
+        force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (self.sigma[:3], self.sigma[3:]))
+        return force_N, torque_Nm
+
+    def __str__(self) -> str:
+        """Describe them."""
+        force_N, torque_Nm = self.rms_sigma
+        return f"sigma of {self.average_s:g} s averages: {force_N:.2g} N, {torque_Nm:.2g} N·m"
+
+
+def prediction(averages: Averages, mass_kg: float | None, *, assumed: bool) -> str:
+    """Describe the accuracy of a calibration from such averages.
 
     Parameters
     ----------
-    guess : Guess
+    mass_kg : float or None
         Of the tool.
-    average_s : float
-        At each pose.
-    sigma : array, shape (6,)
-        Standard deviation of such an average, as measured, N and N·m.
     assumed : bool
-        The mass of the tool is not configured.
+        It is not configured.
     """
-    force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
-    guess = replace(guess, sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
-    found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
+    force_N, torque_Nm = averages.rms_sigma
+    guess = replace(guess_of(averages.certifier, mass_kg), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
+    found = predicted_sigma(np.array([step.R_base_flange for step in averages.plan.steps]), guess)
     mass = f"{guess.mass_kg:g} kg" + (" (assumed: [tool] mass_kg is not set)" if assumed else "")
     return (
-        f"sigma of {average_s:g} s averages: {force_N:.2g} N, {torque_Nm:.2g} N·m; predicted from "
-        f"that for {mass}, one sigma: mass {1e3 * float(found.sigma['mass_kg']):.2g} g, force "
-        f"bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
+        f"{averages}; predicted from that for {mass}, one sigma: mass {1e3 * float(found.sigma['mass_kg']):.2g} g, "
+        f"force bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
         f"{found.torque_rms_Nm:.2g} N·m"
     )

@@ -1,7 +1,8 @@
 """Guards that watch the arm under control, by rows of the hazard table; `watchdog.py` runs them in a thread.
 
 A guard judges one `Seen` and raises `Tripped`. No guard is a safety function: safety is the task of the robot's safety
-system and the user's risk assessment. README.md lists every row, its guard and the test that injects it.
+system and the user's risk assessment. docs/reference/hazards.md lists every row, its guard
+and the test that injects it.
 """
 
 from abc import ABC, abstractmethod
@@ -15,6 +16,7 @@ from ftcalib.model import Array
 from ftdrive.checks.devices import AXES
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.hazards import Hazard
+from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ArmState, ArmStatus
 
@@ -82,13 +84,14 @@ class Limits:
     """The program of a killed session ends by itself within 0.5 s."""
 
     @classmethod
-    def emulated(cls) -> Self:
-        """Limits of an emulated cell, whose clock leads each follower by 10 ms and waits for no control process."""
-        return cls(link_usual_s=0.05, stalled_s=60.0)
+    def of(cls, clock: Clock) -> Self:
+        """Limits of a cell: the clock of an emulated one may lead its arm, whose control process may starve."""
+        usual = cls()
+        return cls(link_usual_s=usual.link_usual_s + clock.lead_s, stalled_s=clock.patience_s(usual.stalled_s))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class ExpectedMotion:
     """The expected motion: a straight move in joint space, or standing."""
 
     start_rad: Array
@@ -104,7 +107,7 @@ class Seen:
     """Of the guards' own clock."""
     dt_s: float
     """Since the previous look; at most `Limits.counted_s`."""
-    motion: Motion
+    motion: ExpectedMotion
     state: ArmState
     status: ArmStatus
     wrench: Array

@@ -5,36 +5,22 @@ orientation, the sensor is averaged and the pose is written to disk.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from math import degrees, radians
-from typing import Final, Protocol, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 
-from ftcalib.data.dwell_mean import CHANNELS, LEAST_SAMPLES, is_stationary, restless_channels
+from ftcalib.data.dwell_mean import CHANNELS, restless_channels
 from ftcalib.model import Array
-from ftcalib.routine import (
-    LONGER,
-    MOVED_RAD,
-    PoseRecord,
-    Sampling,
-    TourPose,
-    require_enough,
-    turned_rad,
-)
-from ftdrive.session.events import (
-    Compared,
-    Estimated,
-    Noted,
-    PoseTaken,
-    SensorEvents,
-    State,
-    StateChanged,
-)
-from ftdrive.session.operator import Key, Operator
-from ftdrivers.clock import REAL, Clock
+from ftcalib.routine import MOVED_RAD, PoseRecord, Sampling, Stage, TourPose, take_pose, turned_rad
+from ftdrive.session.events import Compared, Estimated, SensorEvents, State, StateChanged
+from ftdrive.session.open_cell import OpenCell
+from ftdrive.session.operator import Key
+from ftdrive.session.pose_book import PoseBook
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
-from ftdrivers.interfaces import ArmState, ArmStatus, ForceTorqueSensor, FtSamples
+from ftdrivers.interfaces import ArmState, FtSamples
 
 STILL_S: Final = 1.0
 """On the controller's clock, because the controller's `is_steady` is always false in freedrive."""
@@ -53,47 +39,52 @@ SURPRISE_N: Final = 0.5
 LEAST_TO_COMPARE: Final = 6
 """Number of poses, the new one included."""
 
-
 T = TypeVar("T")
 
 
-class WatchedArm(Protocol):
-    """An arm that can only be read."""
+class Interrupted(Exception):
+    """The stream of the sensor was interrupted, and is back."""
+
+
+class Moved(Exception):
+    """The arm moved while a pose was measured; it was seen in this state."""
+
+    def __init__(self, state: ArmState) -> None:
+        super().__init__()
+        self.state = state
+
+
+class _Held:
+    """An arm that an operator holds at a pose, and its sensor, as `take_pose` uses them: nothing is waited for."""
+
+    def __init__(self, state: Callable[[], ArmState], collect: Callable[[float], FtSamples]) -> None:
+        self._state, self._collect = state, collect
+        self._before: ArmState | None = None
+        self.samples: FtSamples | None = None
+        """Of the last dwell."""
+
+    def wait_until_still(self, **_: object) -> None:
+        self._before = None
 
     def state(self) -> ArmState:
-        """Read a fresh state, or raise."""
+        """Return the state; raises `Moved` after the samples if the arm does not stand where it stood before them."""
+        state = self._state()
+        if self._before is None:
+            self._before = state
+        elif turned_rad(self._before, state) >= MOVED_RAD or np.abs(state.qd_rad_s).max() >= STILL_RAD_S:
+            raise Moved(state)
+        return state
 
-    def status(self) -> ArmStatus:
-        """Read the controller's modes, or raise."""
+    def collect(self, duration_s: float) -> FtSamples:
+        self.samples = self._collect(duration_s)
+        return self.samples
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Recorder:
-    """What happens to each pose."""
-
-    judge: Callable[[PoseRecord], Estimated | Compared]
-    """Takes each pose, in place of one with the same stop; judges whether the poses suffice, and gives a hint.
-    `Judge.add` of `ftdrive.session.live_fit`."""
-    commit: Callable[[PoseRecord], None]
-    """Takes each record and returns when it is safe on disk; one with the `stop` of an earlier one replaces it."""
-    earlier: Sequence[PoseRecord] = ()
-    """Poses of the resumed run; `judge` takes them too."""
-    goal: str = "the coverage is green"
-    """When the poses suffice."""
+    def check(self) -> None:
+        """Accept a stream: it is checked wherever it is read."""
 
 
-def collect_manually(
-    arm: WatchedArm,
-    sensor: ForceTorqueSensor,
-    sampling: Sampling,
-    operator: Operator,
-    recorder: Recorder,
-    *,
-    down_base: Array,
-    listen: bool,
-    clock: Clock = REAL,
-) -> None:
-    """Take poses until there are enough, in place of a tour.
+class HandGuided:
+    """Takes poses until there are enough, in place of a tour.
 
     Keys: keep ends it once the light is green; stop ends it at once; redo takes the newest pose again, where the arm
     stands or is moved to next; skip leaves out the pose where it stands; pause pauses and resumes. A key takes effect
@@ -101,49 +92,26 @@ def collect_manually(
 
     Parameters
     ----------
-    arm, sensor
-        Open; the arm for reading. An interrupted sensor with `recover` may reconnect.
-    down_base : array, shape (3,)
-        Unit vector down in base, as mounted.
+    cell : OpenCell
+        The arm may be open for reading only. An interrupted sensor with `recover` may reconnect.
+    book : PoseBook
+    sampling : Sampling
     listen : bool
         A program moves the arm, so no pose is suggested. Poses are taken from its start to its end, or until it
         returns to its first pose when there are enough. That return is committed too and serves
         `ftcalib.routine.drift_check`. A program that passes its first pose earlier is followed to its end.
-    clock : Clock
-        Of the cell; an emulated one waits for this thread, which must see each standstill.
 
     Notes
     -----
     Poses are numbered in the order of taking, and so are their orientations: they belong to no planned set. The
     return to the first pose has its orientation number, 1. `pose.q_rad` is where the arm stood.
-
-    Raises
-    ------
-    TooFewSamples
-        The sensor is too slow for the time given to a pose.
-    Exception
-        Whatever the arm or the sensor raises; the poses committed so far stand.
     """
-    with clock.keeping_up():
-        _Collection(arm, sensor, sampling, operator, recorder, clock, down_base, listen).run()
 
-
-class _Collection:
-    def __init__(
-        self,
-        arm: WatchedArm,
-        sensor: ForceTorqueSensor,
-        sampling: Sampling,
-        operator: Operator,
-        recorder: Recorder,
-        clock: Clock,
-        down_base: Array,
-        listen: bool,
-    ) -> None:
-        self._arm, self._sensor, self._sampling = arm, sensor, sampling
-        self._sensor_events = SensorEvents(sensor, operator.show)
-        self._operator, self._recorder = operator, recorder
-        self._clock, self._down_base, self._listen = clock, down_base, listen
+    def __init__(self, cell: OpenCell, book: PoseBook, sampling: Sampling, *, listen: bool) -> None:
+        self._arm, self._sensor, self._operator, self._clock = cell.arm, cell.sensor, cell.journal, cell.clock
+        self._note = cell.note
+        self._book, self._sampling, self._listen = book, sampling, listen
+        self._sensor_events = SensorEvents(cell.sensor, cell.journal.show)
         self._taken: dict[int, PoseRecord] = {}
         self._level: Array | None = None
         self._redo: int | None = None
@@ -157,31 +125,50 @@ class _Collection:
         self._program_ran = False
         self._program = ""
         """State of the program, as the controller reports it; empty before its start."""
-        self._passes_first = bool(recorder.earlier)
+        self._passes_first = False
         """Whether the program passes its first pose before its end, as a restarted one does."""
         self._fault: str | None = None
         self._over = False
-        self._ends_by_itself = not (listen or operator.has_keys)
+        self._ends_by_itself = not (listen or cell.journal.has_keys)
         self._enough = False
         """Whether the light is green and the newest pose is good."""
 
-    def run(self) -> None:
-        self._greet()
-        for record in self._recorder.earlier:
-            self._learn(record)
-        if self._ends_by_itself and self._enough:
-            self._note("The poses of the run suffice: it ends with the next one.")
-        self._show_state(State.MOVE)
-        while not self._over:
-            state = self._ask(self._arm.state)
-            self._collect(LOOK_S)  # paces the loop, and raises as soon as the sensor fails
-            self._obey_keys()
-            if self._over or not self._may_measure():
-                continue
-            if self._at_rest(state):
-                self._take(state)
-            elif self._program == "stopped" and self._dealt_with and self._rests_at is not None:
-                self._end("The program has ended")
+    def run(self, earlier: Sequence[PoseRecord], goal: str) -> None:
+        """Take poses.
+
+        Parameters
+        ----------
+        earlier
+            Poses of the resumed run.
+        goal
+            When the poses suffice, in words.
+
+        Raises
+        ------
+        TooFewSamples
+            The sensor is too slow for the time given to a pose.
+        Exception
+            Whatever the arm or the sensor raises; the poses committed so far stand.
+        """
+        self._passes_first = bool(earlier)
+        with self._clock.keeping_up():  # an emulated clock waits for this thread, which must see each standstill
+            self._greet(goal)
+            for record in earlier:
+                self._learn(record, self._book.judge.add(record))
+            if self._ends_by_itself and self._enough:
+                self._note("The poses of the run suffice: it ends with the next one.")
+            self._show_state(State.MOVE)
+            while not self._over:
+                state = self._ask(self._arm.state)
+                with suppress(Interrupted):
+                    self._collect(LOOK_S)  # paces the loop, and raises as soon as the sensor fails
+                self._obey_keys()
+                if self._over or not self._may_measure():
+                    continue
+                if self._at_rest(state):
+                    self._take(state)
+                elif self._program == "stopped" and self._dealt_with and self._rests_at is not None:
+                    self._end("The program has ended")
 
     def _ask(self, arm: Callable[[], T]) -> T:
         """Read the arm; wait if it does not answer, because ftdrive does not move it."""
@@ -191,30 +178,17 @@ class _Collection:
             self._note(f"Nothing is measured until the arm answers again: {silence.found}.", warning=True)
         return self._wait_out(arm, DeviceTimeout)
 
-    def _collect(self, duration_s: float) -> FtSamples | None:
-        """Collect samples; None if the stream was interrupted and the driver has reconnected."""
+    def _collect(self, duration_s: float) -> FtSamples:
+        """Collect samples. Raises `Interrupted` if the stream was interrupted and the driver has reconnected."""
         try:
-            samples = self._sensor.collect(duration_s)
-        except (StreamBroken, DeviceTimeout):
+            return self._sensor.collect(duration_s)
+        except (StreamBroken, DeviceTimeout) as error:
             if not getattr(self._sensor, "recover", False):
                 raise
             self._wait_out(self._sensor.check, StreamBroken, DeviceTimeout)
-            return None
+            raise Interrupted from error
         finally:
             self._sensor_events.show_new()
-        return samples
-
-    def _collect_enough(self) -> FtSamples | None:
-        """Collect the samples of one pose, for longer if there are too few; None as in `_collect`."""
-        for times in LONGER:
-            average_s = times * self._sampling.average_s
-            if (found := self._collect(average_s)) is None:
-                return None
-            samples = found
-            if len(samples) >= LEAST_SAMPLES:
-                break
-        require_enough(samples, average_s)
-        return samples
 
     def _wait_out(self, ask: Callable[[], T], *losses: type[DeviceError]) -> T:
         """Repeat until an answer arrives, for `BACK_S` at most."""
@@ -278,59 +252,48 @@ class _Collection:
             return
         stop = self._next_stop()
         number = self._taken[first].pose.number if returned else stop
-        if not self._measure(stop, number, settle_s=state.t_device_s - self._still_since_s):
+        if not self._measure(stop, number, state):
             return
         if returned:
             self._end("The program is back at its first pose")
         elif self._ends_by_itself and self._enough:
             self._end("These poses are enough")
 
-    def _measure(self, stop: int, number: int, *, settle_s: float) -> bool:
-        """Average until the samples are quiet, and keep the pose; False if the arm moved."""
-        for attempt in range(1, self._sampling.attempts + 1):
-            self._show_state(State.SAMPLE)
-            before = self._ask(self._arm.state)
-            if (found := self._collect_enough()) is None:
-                return False
-            samples = found
-            after = self._ask(self._arm.state)
-            if turned_rad(before, after) >= MOVED_RAD or np.abs(after.qd_rad_s).max() >= STILL_RAD_S:
-                self._still_since_s = after.t_device_s
-                self._note(f"The arm moved while pose {stop} was measured: {self._hold_still()}.", warning=True)
-                self._show_state(State.SETTLE)
-                return False
-            unrest = self._unrest(samples)
-            if not unrest:
-                break
-            last = attempt == self._sampling.attempts
+    def _measure(self, stop: int, number: int, state: ArmState) -> bool:
+        """Average until the samples are quiet, and keep the pose; False if the arm moved or the operator intervened."""
+        settle_s = state.t_device_s - self._still_since_s
+        held = _Held(lambda: self._ask(self._arm.state), self._collect)
+
+        def on_stage(stage: Stage) -> None:
+            if stage == "sample":
+                self._show_state(State.SAMPLE)
+            elif held.samples is not None:
+                self._note_unrest(stop, held.samples, "Let go of tool and cable.")
+
+        pose = TourPose(number, state.q_rad)
+        try:
+            record = take_pose(held, held, stop, pose, self._sampling, on_stage=on_stage, quiet_std=self._level)
+        except Moved as moved:
+            self._still_since_s = moved.state.t_device_s
+            self._note(f"The arm moved while pose {stop} was measured: {self._hold_still()}.", warning=True)
+            self._show_state(State.SETTLE)
+            return False
+        except Interrupted:
+            return False
+        if not record.steady and held.samples is not None:
             again = "; press r to take it again" if self._operator.has_keys else ""
-            advice = f"It is kept and marked{again}." if last else "Let go of tool and cable."
-            self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
+            self._note_unrest(stop, held.samples, f"It is kept and marked{again}.")
         self._obey_keys()  # r pressed before this pose is shown means the previous one
         if self._over or self._paused or self._dealt_with:
             return False
         if self._redo is not None:
             stop = number = self._redo
-        record = PoseRecord(stop, TourPose(number, before.q_rad), before, after, samples, steady=not unrest)
-        self._keep(record, settle_s, attempt)
-        return True
-
-    def _keep(self, record: PoseRecord, settle_s: float, attempts: int) -> None:
-        self._recorder.commit(record)
+        record = replace(record, stop=stop, pose=TourPose(number, record.before.q_rad))
         self._redo = None
-        self._operator.show(
-            PoseTaken.of(
-                record,
-                self._down_base,
-                stops=max(record.stop, len(self._taken)),
-                settle_s=settle_s,
-                average_s=self._sampling.average_s,
-                attempts=attempts,
-                temperature_C=self._sensor.temperature_C(),
-            )
-        )
-        self._learn(record)
+        stops, average_s = max(stop, len(self._taken)), self._sampling.average_s
+        self._learn(record, self._book.keep(record, stops=stops, settle_s=settle_s, average_s=average_s))
         self._deal_with()
+        return True
 
     def _deal_with(self) -> None:
         """Finish the pose where the arm stands, and show it: nothing is measured there any more."""
@@ -345,13 +308,12 @@ class _Collection:
         """Whether the operator may end with k."""
         return self._light == "green" and not (self._listen or self._ends_by_itself)
 
-    def _learn(self, record: PoseRecord) -> None:
-        """Add a pose on disk to the estimate, and show it."""
+    def _learn(self, record: PoseRecord, judged: Estimated | Compared) -> None:
+        """Show what the poses show with one more, which is on disk."""
         self._taken[record.stop] = record
         if record.steady:  # the quietest pose gives the scatter of the untouched sensor
             std = record.samples.wrench.std(axis=0, ddof=1)
             self._level = std if self._level is None else np.minimum(self._level, std)
-        judged = self._recorder.judge(record)
         self._operator.show(replace(judged, hint="") if self._listen else judged)
         touched = isinstance(judged, Estimated) and self._note_if_touched(record, judged)
         self._enough = judged.light == "green" and record.steady and not touched
@@ -372,13 +334,14 @@ class _Collection:
             )
         return touched
 
-    def _unrest(self, samples: FtSamples) -> str:
-        """Describe what is not quiet; empty if all is."""
+    def _note_unrest(self, stop: int, samples: FtSamples, advice: str) -> None:
+        """Show what is not quiet in a dwell."""
+        unrest, wrench = "its mean still changes", samples.wrench
         if self._level is not None:
-            for c in np.flatnonzero(restless_channels(samples.wrench, self._level)):
-                found, unit = samples.wrench[:, c].std(ddof=1), "N" if c < 3 else "N·m"
-                return f"{CHANNELS[c]} scatters by {found:.2g} {unit}, at its quietest by {self._level[c]:.2g}"
-        return "" if is_stationary(samples.wrench) else "its mean still changes"
+            for c in np.flatnonzero(restless_channels(wrench, self._level))[:1]:
+                found, unit = wrench[:, c].std(ddof=1), "N" if c < 3 else "N·m"
+                unrest = f"{CHANNELS[c]} scatters by {found:.2g} {unit}, at its quietest by {self._level[c]:.2g}"
+        self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
 
     def _obey_keys(self) -> None:
         while not self._over and (key := self._operator.pressed()):
@@ -403,7 +366,7 @@ class _Collection:
             self._rests_at = None
             self._note("Paused: nothing is measured until p is pressed again." if self._paused else "Going on.")
 
-    def _greet(self) -> None:
+    def _greet(self, goal: str) -> None:
         if self._listen:
             self._note(f"Start the program at the pendant. Each standstill counts: {self._hold_still()}.")
         else:
@@ -412,7 +375,7 @@ class _Collection:
                 f"of them let go of the tool and {self._hold_still()}."
             )
         if self._ends_by_itself:
-            self._note(f"It ends once {self._recorder.goal}. Press Ctrl-C to end it earlier.")
+            self._note(f"It ends once {goal}. Press Ctrl-C to end it earlier.")
 
     def _hold_still(self) -> str:
         seconds = STILL_S + self._sampling.average_s + 3 * LOOK_S
@@ -431,6 +394,3 @@ class _Collection:
 
     def _next_stop(self) -> int:
         return self._redo or max(self._taken, default=0) + 1
-
-    def _note(self, words: str, *, warning: bool = False) -> None:
-        self._operator.show(Noted(words=words, warning=warning))

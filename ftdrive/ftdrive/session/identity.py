@@ -1,4 +1,4 @@
-"""Checks that a resumed run has its own devices, and a sensor with the same sign, calibration, scale and range."""
+"""Checks of the connected devices: a resumed run has its own, and a verification those of its calibration."""
 
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -6,10 +6,12 @@ from typing import Any, Final
 
 import numpy as np
 
+from ftcalib import CalibrationResult
 from ftdrive.cell.config import SensorConfig
-from ftdrive.errors import PlanRefused
+from ftdrive.checks.devices import belonging
+from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.runs.run import Run
-from ftdrivers.interfaces import NOT_REPORTED, ForceTorqueSensor, RobotArm
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from ftdrivers.registry import Options, split_url
 
 _CHOOSES_CALIBRATION: Final = {"slot": 0, "calibration": 1}
@@ -18,14 +20,34 @@ _OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range")
 """Facts that differ for another scale or calibration."""
 
 
-def require_same_devices(run: Run, config: SensorConfig, arm: RobotArm, sensor: ForceTorqueSensor) -> None:
+def require_devices(
+    connected: Mapping[str, DeviceInfo], config: SensorConfig, *, calibration: CalibrationResult | None, run: Run | None
+) -> tuple[str, ...]:
+    """Return what is uncertain about the connected devices, where a calibration or a resumed run must have the same.
+
+    Raises
+    ------
+    ConfigError
+        Arm, sensor or mounting is not that of the calibration.
+    PlanRefused
+        As `_require_same_devices`.
+    """
+    belongs = None if calibration is None else belonging(calibration, connected, config.mount)
+    if belongs is not None and belongs.others:
+        raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
+    if run is not None:
+        _require_same_devices(run, config, connected)
+    return () if belongs is None else belongs.unknown
+
+
+def _require_same_devices(run: Run, config: SensorConfig, connected: Mapping[str, DeviceInfo]) -> None:
     """Raise `PlanRefused` for other devices than those of the run, or a sensor that is scaled otherwise now.
 
     Without a serial number a device counts as the same if its model is, and the run has no serial number either.
     """
     header = run.header()
     devices = header["devices"]
-    for name, info in (("arm", arm.identify()), ("sensor", sensor.identify())):
+    for name, info in connected.items():
         model, serial = devices[name]["model"], devices[name]["serial"]
         if (model, serial) == (info.model, info.serial):
             continue
@@ -37,7 +59,7 @@ def require_same_devices(run: Run, config: SensorConfig, arm: RobotArm, sensor: 
             f"{info.serial}: {fix}, or start a new run"
         )
     then = _meaning(header["config"]["sensor"], devices["sensor"].get("facts", {}))
-    now = _meaning(asdict(config), asdict(sensor.identify())["facts"])
+    now = _meaning(asdict(config), asdict(connected["sensor"])["facts"])
     if other := [name for name in then if name in now and not np.array_equal(then[name], now[name])]:
         changes = " and ".join(f"{name} was {then[name]} and is {now[name]}" for name in other)
         raise PlanRefused(

@@ -14,10 +14,7 @@ log = logging.getLogger(__name__)
 class Journal:
     """Shows and records every event, one at a time, from any thread.
 
-    Parameters
-    ----------
-    yes : bool
-        Give the assumed answer of questions that have one; the operator answers the others.
+    With `yes` it gives the assumed answer of questions that have one; the operator answers the others.
     """
 
     def __init__(self, operator: Operator, *, yes: bool = False) -> None:

@@ -30,7 +30,7 @@ GREEN = {"cond9": 4.0, "cond_u1": 8.0}
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
 """As within 30 to 45 degrees."""
 TRUSTED_SHARE = 0.05
-"""`Running.predict` returns None if its sigma of the force is more than this share of the weight."""
+"""`RunningFit.predict` returns None if its sigma of the force is more than this share of the weight."""
 
 
 class Judge(Protocol):
@@ -50,17 +50,11 @@ class Judge(Protocol):
         """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain."""
 
 
-class Running:
+class RunningFit:
     """The calibration so far, and its coverage.
 
-    Parameters
-    ----------
-    g_m_s2 : float
-        Local gravity.
-    down_base : array_like, shape (3,)
-        Unit vector down in base, used for the coverage until the fit gives it.
-    advise : bool
-        Suggest the most useful next pose; False if a plan chooses the poses.
+    `down_base` (3,), the unit vector down in base, serves the coverage until the fit gives it. With `advise` it
+    suggests the most useful next pose.
     """
 
     def __init__(
@@ -191,17 +185,10 @@ def faces(gravity_flange: Array) -> tuple[int, int, int, int, int, int]:
 
 
 def hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
-    """Describe the simple motion from the last pose to the most useful next one.
-
-    Parameters
-    ----------
-    R_base_flange : array, shape (n, 3, 3)
-        Poses taken.
-    """
+    """Describe the simple motion from the last of the poses taken (n, 3, 3) to the most useful next one."""
     last = R_base_flange[-1]
     words, candidates = _motions(last, down_base)
-    ranked, _ = next_pose(R_base_flange, candidates, guess)
-    best = int(ranked[0])
+    best = int(next_pose(R_base_flange, candidates, guess)[0])
     before, after = (_pointing_down(down_base @ R) for R in (last, candidates[best]))
     return f"{'keep' if before == after else 'point'} {after} down: {words[best]}"
 

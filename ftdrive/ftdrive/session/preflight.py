@@ -23,8 +23,9 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.nodes import WRIST_6_RAD
 from ftdrive.session.events import Checked
 from ftdrive.session.guards import Limits, ModelGuard, Tripped
+from ftdrive.session.open_cell import OpenCell
 from ftdrivers.clock import Clock
-from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
+from ftdrivers.interfaces import FtSamples, RobotArm
 
 LISTEN_S: Final = 2.0
 _EDGE_RAD: Final = float(np.radians(5))
@@ -35,14 +36,14 @@ _ROUNDED_RAD: Final = float(np.radians(1))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Before:
-    """Everything the checks need."""
+    """What is known before any motion: everything the checks need."""
 
-    cell: CellConfig
-    arm: RobotArm
-    sensor: ForceTorqueSensor
+    cell: OpenCell
+    config: CellConfig
     certifier: Certifier
     plan: Plan
     approach: Approach
+    """To the first pose that is left."""
     runs: Path
     known: bool
     """Whether this plan has run to its end on this arm before: the controller has accepted its edges then."""
@@ -50,8 +51,12 @@ class Before:
     """`LISTEN_S` of the sensor at rest."""
     resumed: bool
     """Whether a part of the plan has run before."""
-    limits: Limits
-    sensor_range: Array | None = None
+
+    @property
+    def sensor_range(self) -> Array | None:
+        """Largest wrench (6,) of the sensor, as far as its driver knows."""
+        fact = self.cell.sensor.identify().facts.get("range")
+        return None if fact is None else np.asarray(fact.value, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +76,11 @@ class Row:
 
 def check_model(before: Before) -> Check:
     """Check that this is the configured arm, and that its flange is where the forward kinematics have it."""
-    check = devices.check_arm(before.arm.identify(), before.cell.robot)
+    check = devices.check_arm(before.cell.arm.identify(), before.config.robot)
     if check.state == "failed":
         return check
     try:
-        ModelGuard(before.limits, before.certifier).judge(before.arm.state())
+        ModelGuard(before.cell.limits, before.certifier).judge(before.cell.arm.state())
     except Tripped as trip:
         return Check("robot.model", "failed", str(trip))
     return replace(check, found=f"{check.found}: the flange is where the {before.certifier.arm.name} model has it")
@@ -83,27 +88,27 @@ def check_model(before: Before) -> Check:
 
 def check_payload(before: Before) -> Check:
     """Check the payload that is set in the controller."""
-    return devices.check_payload(before.arm.status(), before.cell.tool, before.cell.sensor.mass_kg)
+    return devices.check_payload(before.cell.arm.status(), before.config.tool, before.config.sensor.mass_kg)
 
 
 def check_link(before: Before) -> Check:
     """Check that states of the arm arrive soon; a controller that reports no TCP is asked for it and needs longer."""
-    limits = before.limits
-    asked_s = limits.link_asked_s if before.arm.status().tcp_offset is None else 0.0
+    arm, limits = before.cell.arm, before.cell.limits
+    asked_s = limits.link_asked_s if arm.status().tcp_offset is None else 0.0
     usual_s = limits.link_usual_s + asked_s
-    return devices.check_link(before.arm, before.cell.clock, usual_s=usual_s, gap_s=limits.link_gap_s)
+    return devices.check_link(arm, before.cell.clock, usual_s=usual_s, gap_s=limits.link_gap_s)
 
 
 def check_sensor(before: Before) -> Check:
     """Check that all six axes are alive, at the nominal rate."""
     wrench = before.quiet.wrench
-    rate = devices.check_rate(len(wrench) / LISTEN_S, before.sensor.health().nominal_rate_Hz)
+    rate = devices.check_rate(len(wrench) / LISTEN_S, before.cell.sensor.health().nominal_rate_Hz)
     return merged("sensor", [rate, devices.check_level(wrench)])
 
 
 def check_workcell(before: Before) -> Check:
     """Check that tool and surroundings are described and measured; `doctor` only warns of a missing tool."""
-    check = computer.check_workcell(before.cell, before.certifier.arm.name)
+    check = computer.check_workcell(before.config, before.certifier.arm.name)
     return check if check.state == "ok" else replace(check, state="failed")
 
 
@@ -131,7 +136,7 @@ def check_approach(before: Before) -> Check:
 
 def check_cable(before: Before) -> Check:
     """Check that wrist 3 stays in its window about the present angle, at which the cable lies well."""
-    stands = before.arm.state().q_rad[5]
+    stands = before.cell.arm.state().q_rad[5]
     turns = [step.q_rad[5] for step in before.plan.steps]  # an approach turns it no farther
     low, high = min(turns), max(turns)
     where, least, most = np.degrees([stands, low, high])
@@ -150,7 +155,7 @@ def check_safety_limits(before: Before) -> Check:
     path = np.vstack([nodes, nodes[:1]])
     step_rad = np.inf if before.known else _EDGE_RAD
     for q_rad in (path, before.approach.q_rad):
-        if len(q_rad) and (words := forbidden(before.arm, q_rad, step_rad)):
+        if len(q_rad) and (words := forbidden(before.cell.arm, q_rad, step_rad)):
             return Check("limits", "failed", words)
     return Check(
         "limits", "ok", "the controller accepts every pose" + ("" if before.known else " and the moves between")
@@ -183,14 +188,14 @@ def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
 _APPROACH: Final = Row("approach", check_approach)
 
 CHECKS: Final[Sequence[Row]] = (
-    Row("safety", lambda before: devices.check_safety(before.arm.status())),
-    Row("remote", lambda before: devices.check_remote(before.arm)),
+    Row("safety", lambda before: devices.check_safety(before.cell.arm.status())),
+    Row("remote", lambda before: devices.check_remote(before.cell.arm)),
     Row("model", check_model),
     Row("payload", check_payload),
-    Row("slider", lambda before: devices.check_speed(before.arm.status())),
+    Row("slider", lambda before: devices.check_speed(before.cell.arm.status())),
     Row("link", check_link),
     Row("sensor", check_sensor),
-    Row("load", lambda before: devices.check_load(before.sensor_range, before.cell)),
+    Row("load", lambda before: devices.check_load(before.sensor_range, before.config)),
     Row("workcell", check_workcell),
     Row("plan", check_plan),
     _APPROACH,
@@ -213,6 +218,16 @@ def edges(q_rad: Array, step_rad: float) -> Array:
         count = max(1, int(np.ceil(np.abs(end - start).max() / step_rad)))
         parts.append(start + np.arange(count)[:, None] / count * (end - start))
     return np.vstack([*parts, q_rad[-1:]])
+
+
+def check(before: Before, rows: Sequence[Row]) -> None:
+    """Show what each check finds; raises `NotAccepted` if one failed."""
+    found = []
+    for row in rows:
+        found.append(row(before))
+        before.cell.journal.show(found[-1])
+    if failed := [f"{one.name}: {one.words}" for one in found if not one.passed]:
+        raise NotAccepted("nothing moves: " + "; ".join(failed))
 
 
 @contextmanager

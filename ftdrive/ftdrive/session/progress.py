@@ -1,18 +1,17 @@
-"""The state of a tour as a value: which poses are left, where the arm is, what the operator asked for."""
+"""The state of a tour: which poses are left, where the arm is, what the operator asked for."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Progress:
-    """State of a tour between two steps; every method returns the next state.
+    """State of a tour between two steps.
 
     A stop counts from 1 to `poses + 1`, the return to the first pose. An index counts the poses of the plan from 0.
     """
 
     poses: int
-    todo: tuple[int, ...] = ()
+    todo: list[int] = field(default_factory=list)
     """Stops left, in order."""
     stood_at: int | None = None
     """Index of the pose where the arm stood last; None where it was moved from there by something else."""
@@ -28,11 +27,11 @@ class Progress:
     """Stop of the newest pose."""
     again: bool = False
     """Whether the newest pose is to be taken again."""
-    skipped: frozenset[int] = frozenset()
+    skipped: set[int] = field(default_factory=set)
     """Indices of postures that the arm should avoid."""
-    reopened: frozenset[int] = frozenset()
+    reopened: set[int] = field(default_factory=set)
     """Stops at which the sensor was reopened."""
-    driven: frozenset[int] = frozenset()
+    driven: set[int] = field(default_factory=set)
     """Indices of poses whose move to the next pose was completed."""
     payload_kg: float | None = None
     """Payload reported by the controller when it was last compared."""
@@ -67,30 +66,26 @@ class Progress:
         """Index of the pose of a stop."""
         return (stop - 1) % self.poses
 
-    def start_move(self) -> "Progress":
-        """Leave the pose."""
-        return replace(self, standing=False)
-
-    def lose_place(self) -> "Progress":
+    def lose_place(self) -> None:
         """Forget where the arm stood: something else has moved it."""
-        return replace(self, standing=False, stood_at=None)
+        self.standing, self.stood_at = False, None
 
-    def arrive(self, index: int, *, driven_from: int | None = None) -> "Progress":
+    def arrive(self, index: int, *, driven_from: int | None = None) -> None:
         """Stand at a pose; `driven_from` is the index where its planned move began."""
-        driven = self.driven if driven_from is None else self.driven | {driven_from}
-        return replace(self, stood_at=index, standing=True, driven=driven)
+        self.stood_at, self.standing = index, True
+        if driven_from is not None:
+            self.driven.add(driven_from)
 
-    def finish(self) -> "Progress":
-        """Take the first stop off the list."""
-        return replace(self, todo=self.todo[1:])
-
-    def redo(self, stop: int) -> "Progress":
+    def redo(self, stop: int) -> None:
         """Put a stop that was taken in front of the others."""
-        return replace(self, again=False, todo=(stop, *self.todo), skipped=self.skipped - {self.index(stop)})
+        self.again = False
+        self.todo.insert(0, stop)
+        self.skipped.discard(self.index(stop))
 
-    def skip(self) -> tuple["Progress", Sequence[int]]:
-        """Leave out the next pose, and the return to it; return the dropped stops too."""
+    def skip(self) -> list[int]:
+        """Leave out the next pose, and the return to it; return the dropped stops."""
         index = self.index(self.todo[0])
         dropped = [stop for stop in self.todo if self.index(stop) == index]
-        left = tuple(stop for stop in self.todo if stop not in dropped)
-        return replace(self, todo=left, skipped=self.skipped | {index}), dropped
+        self.todo = [stop for stop in self.todo if stop not in dropped]
+        self.skipped.add(index)
+        return dropped

@@ -10,7 +10,8 @@ from ftdrive.errors import Declined, NotAccepted
 from ftdrive.runs.outcome import Outcome
 from ftdrive.session.events import Event
 from ftdrive.session.operator import Key, Operator, Question
-from ftdrive.session.session import Options, calibrate
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.session import calibrate
 
 
 class NoOperator:
@@ -61,7 +62,7 @@ def rehearse(
     station: Station, runs: Path, name: str, operator: Operator, *, poses: int = 24, kept: bool = True
 ) -> Outcome:
     """Calibrate an emulated cell; `kept` says whether the folder `runs` outlives the calibration."""
-    options = Options(runs, name, poses=poses, real=False, questions=False, description=described(station))
+    options = SessionOptions(runs, name, poses=poses, real=False, questions=False, description=described(station))
     outcome = calibrate(station.cell, operator if kept else _Unkept(operator, runs), options)
     if outcome is None:
         raise RuntimeError("a rehearsal is never a dry run")

@@ -4,15 +4,14 @@ from ftcalib.model import Array
 from ftdrive.planning.approach import arm_moves
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.show.words import point_in_words, turns_in_words
-from ftdrive.session.journal import Journal
-from ftdrivers.interfaces import RobotArm
+from ftdrive.session.open_cell import OpenCell
 
 
 class SafetyQuestions:
     """Asks for a free tool, free room, the emergency stop, and reduced mode; raises `Declined` unless all are yes."""
 
-    def __init__(self, arm: RobotArm, journal: Journal, plan: Plan) -> None:
-        self._arm, self._journal, self._plan = arm, journal, plan
+    def __init__(self, cell: OpenCell, plan: Plan) -> None:
+        self._arm, self._journal, self._plan = cell.arm, cell.journal, plan
         self._reduced = False  # whether the operator has confirmed the reduced mode that is active
 
     def ask(self, way_rad: Array, *, assumed: bool) -> None:

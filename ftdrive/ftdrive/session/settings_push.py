@@ -71,18 +71,7 @@ def propose(
     gravity: bool,
     name: str,
 ) -> Push:
-    """Compare a calibration with what the controller assumes; nothing is changed.
-
-    Parameters
-    ----------
-    cell : CellConfig
-    arm, sensor
-        Open.
-    result : CalibrationResult
-    payload, gravity : bool
-        Which settings to push.
-    name : str
-        Path of the calibration.
+    """Compare a calibration, from the path `name`, with what the controller assumes; nothing is changed.
 
     Raises
     ------
@@ -197,14 +186,9 @@ def _unit(vector: Any) -> Array:
 
 
 def send(arm: RobotArm, push: Push, folder: Path, ask: Ask) -> tuple[Path, ControllerSettings]:
-    """Ask for a word for each setting, send them, read them back, and write the receipt.
+    """Ask for a word for each setting, send them, and read them back.
 
-    Returns
-    -------
-    path : Path
-        Of the receipt, a new file in `folder`.
-    read_back : ControllerSettings
-        What the controller keeps.
+    Returns the path of the receipt, a new file in `folder`, and what the controller keeps.
 
     Raises
     ------

@@ -1,47 +1,74 @@
-"""What a session takes its poses for: a calibration, or another task with other poses and another judgement of them."""
+"""What a session takes its poses for: a calibration, or a verification (`verifying.py`)."""
 
-from collections.abc import Mapping
-from typing import ClassVar
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
+from ftcalib import CalibrationResult
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.planning.cell_plan import plan_for
 from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import down_of
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import guess_of
-from ftdrive.session.forecast import prediction
-from ftdrive.session.live_fit import Judge, Running
-from ftdrivers.interfaces import DeviceInfo
+from ftdrive.session.forecast import Averages, prediction
+from ftdrive.session.live_fit import Judge, RunningFit
 
 
-class Task:
-    """A calibration."""
+class Task(Protocol):
+    """Which poses are taken, and how they are judged."""
 
-    command: ClassVar[str] = "calibrate"
-    """The command line of the task; the run folder names it."""
+    @property
+    def command(self) -> str:
+        """The command line of the task; the run folder names it."""
+
+    @property
+    def cell(self) -> CellConfig:
+        """The cell of the session."""
+
+    @property
+    def calibration(self) -> CalibrationResult | None:
+        """The calibration that the poses are compared with: arm, sensor and mounting must be its own."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the operator should know before a pose is taken."""
 
     @property
     def goal(self) -> str:
         """When the poses suffice that the operator moves the arm to."""
-        return "the coverage is green"
 
-    def require(self, devices: Mapping[str, DeviceInfo], mount: str | None) -> tuple[str, ...]:
-        """Return what is uncertain about arm, sensor and its mounting; raises `ConfigError` if they do not fit."""
-        del devices, mount
-        return ()
-
-    def plan(self, cell: CellConfig, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
+    def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
         """Plan the poses from joint angles (6,). Raises `PlanRefused`."""
-        return plan_for(cell, certifier, q_rad, poses)
 
-    def judge(self, cell: CellConfig, down_base: Array, *, by_hand: bool) -> Judge:
+    def judge(self, *, by_hand: bool) -> Judge:
         """Return who judges the poses; `by_hand` says that no plan chooses them."""
-        return Running(g_m_s2=cell.site.g_m_s2, down_base=down_base, advise=by_hand)
 
-    def forecast(
-        self, cell: CellConfig, certifier: Certifier, plan: Plan, average_s: float, sigma: Array, *, real: bool
-    ) -> str:
-        """Describe what averages with this standard deviation (6,), N and N·m, can show. `real`: so is the arm."""
-        mass_kg = cell.tool.mass_kg
-        assumed = real and not mass_kg
-        return prediction(plan, guess_of(certifier, mass_kg), average_s, sigma, assumed=assumed)
+    def forecast(self, averages: Averages) -> str:
+        """Describe what such averages can show."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrating:
+    """A calibration."""
+
+    command: ClassVar[str] = "calibrate"
+    goal: ClassVar[str] = "the coverage is green"
+    calibration: ClassVar[None] = None
+    warnings: ClassVar[tuple[str, ...]] = ()
+    cell: CellConfig
+    real: bool = True
+    """Whether a real arm moves."""
+
+    def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
+        """Return a tour."""
+        return plan_for(self.cell, certifier, q_rad, poses)
+
+    def judge(self, *, by_hand: bool) -> Judge:
+        """Return the running fit."""
+        down_base = down_of(self.cell.workcell.mounting)
+        return RunningFit(g_m_s2=self.cell.site.g_m_s2, down_base=down_base, advise=by_hand)
+
+    def forecast(self, averages: Averages) -> str:
+        """Describe the sigmas of the result."""
+        mass_kg = self.cell.tool.mass_kg
+        return prediction(averages, mass_kg, assumed=self.real and not mass_kg)

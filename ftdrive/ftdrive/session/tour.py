@@ -6,7 +6,7 @@ planned from where the arm stands, shown and confirmed.
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
@@ -23,22 +23,15 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.show.words import way_in_words
-from ftdrive.runs.run import Run
-from ftdrive.session.events import (
-    GuardTripped,
-    Noted,
-    PoseTaken,
-    State,
-    StateChanged,
-    Weighed,
-)
-from ftdrive.session.guards import RangeGuard, Tripped, fault
+from ftdrive.session.events import GuardTripped, State, StateChanged, Weighed
+from ftdrive.session.guards import Tripped, fault
 from ftdrive.session.hazards import Hazard
-from ftdrive.session.live_fit import Judge
 from ftdrive.session.operator import Key, Question
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.pose_book import PoseBook
 from ftdrive.session.preflight import forbidden
 from ftdrive.session.progress import Progress
-from ftdrive.session.recovery import GuardedCell, Recovery
+from ftdrive.session.recovery import GuardedCell
 from ftdrivers.errors import DeviceError
 
 log = logging.getLogger(__name__)
@@ -53,7 +46,7 @@ _NEAR_RAD: Final = float(np.radians(10))
 _FIRST_WORD: Final = "MOVE"
 
 
-class Stopped(Exception):
+class OperatorStop(Exception):
     """The operator paused, stopped, sent the arm back or answered no; the tour holds until the operator decides."""
 
     def __init__(self, words: str, *, for_good: bool = False) -> None:
@@ -69,51 +62,38 @@ class Turned(Exception):
         self.key = key
 
 
-@dataclass(frozen=True, slots=True)
-class Pace:
-    """What the operator confirms."""
-
-    step: bool
-    """Enter for each pose."""
-    trusted: bool
-    """Whether `--yes` may answer: the plan has run to its end on this arm, or the cell is emulated."""
-    asks: bool = True
-    yes: bool = False
-    """Whether `--yes` was given."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Measuring:
-    """How the sensor is averaged at a pose."""
+class Pace:
+    """How a plan is driven and measured in this session."""
 
+    plan: Plan
+    """With the speeds of this session."""
+    certifier: Certifier
     sampling: Sampling
     quiet_std: Array
     """(6,) standard deviation of the resting sensor's samples."""
-    load: RangeGuard
-    """Judges every sample of a pose."""
     sensor_kg: float | None
     """Mass of sensor and adapter; None if unknown. The payload is compared with it."""
+    trusted: bool
+    """Whether `--yes` may answer: the plan has run to its end on this arm, or the cell is emulated."""
 
 
 class Tour:
-    """Takes the arm along one plan, which has the speeds of this session; the run keeps every pose."""
+    """Takes the arm along a plan; the book keeps every pose."""
 
-    def __init__(
-        self,
-        cell: GuardedCell,
-        plan: Plan,
-        certifier: Certifier,
-        run: Run,
-        judge: Judge,
-        recovery: Recovery,
-        measuring: Measuring,
-        pace: Pace,
-    ) -> None:
-        self._arm, self._sensor, self._journal, self._watcher = cell.arm, cell.sensor, cell.journal, cell.watcher
-        self._plan, self._certifier, self._run, self._judge = plan, certifier, run, judge
-        self._recovery, self._measuring, self._pace = recovery, measuring, pace
-        self._nodes = np.array([step.q_rad for step in plan.steps])
-        self._now = Progress(len(plan.steps))
+    def __init__(self, guarded: GuardedCell, pace: Pace, book: PoseBook, options: SessionOptions) -> None:
+        self._guarded, self._watcher = guarded, guarded.watcher
+        self._arm, self._sensor, self._journal = guarded.cell.arm, guarded.cell.sensor, guarded.cell.journal
+        self._note = guarded.cell.note
+        self._plan, self._certifier, self._pace, self._book, self._options = (
+            pace.plan,
+            pace.certifier,
+            pace,
+            book,
+            options,
+        )
+        self._nodes = np.array([step.q_rad for step in pace.plan.steps])
+        self._now = Progress(len(pace.plan.steps))
 
     def run(self, todo: Sequence[int]) -> None:
         """Take the poses of these stops, counted from 1; the return to the first pose is the last.
@@ -125,16 +105,16 @@ class Tour:
         Tripped, DeviceError, OSError
             What stopped the arm, if the operator then ended the tour.
         """
-        self._now = replace(self._now, todo=tuple(todo))
+        self._now.todo = list(todo)
         self._watcher.begin()
         while self._now.todo:
             try:
                 self._next()
             except Turned as turned:
                 self._turn(turned.key)
-            except (Tripped, DeviceError, OSError, Stopped, TooFewSamples, NotAccepted) as error:
+            except (Tripped, DeviceError, OSError, OperatorStop, TooFewSamples, NotAccepted) as error:
                 self._hold(error)
-        self._recovery.show_new()
+        self._guarded.show_new()
         self._show_state(State.CLOSE)
 
     @property
@@ -145,32 +125,32 @@ class Tour:
     def _next(self) -> None:
         if self._now.back is not None:
             self._go_back(*self._now.back)
-        self._now = replace(self._now, under_way=None)
+        self._now.under_way = None
         self._obey_keys()
         stop = self._now.todo[0]
         index = self._now.index(stop)
-        if self._pace.step and not self._step(stop, index):
+        if self._options.mode == "step" and not self._step(stop, index):
             return
-        self._now = replace(self._now, under_way=stop)
+        self._now.under_way = stop
         self._go(index, stop)
         self._obey_keys()
         self._take(stop, index)
-        self._now = replace(self._now, taken_last=stop)
+        self._now.taken_last = stop
         self._compare_payload()
-        self._now = self._now.finish()
+        del self._now.todo[0]
 
     def _compare_payload(self) -> None:
         """Row 7: show the mass on the sensor, and whether the configured payload differs; once for each payload."""
-        mass_kg = self._judge.weighed_kg
+        mass_kg = self._book.judge.weighed_kg
         if mass_kg is None:
             return
         status = self._arm.status()
         payload_kg, com_m = status.payload_kg, status.p_flange_payload_m
         if payload_kg is None or payload_kg == self._now.payload_kg:
             return
-        self._now = replace(self._now, payload_kg=payload_kg)
+        self._now.payload_kg = payload_kg
         self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=payload_kg, p_flange_payload_m=com_m))
-        for finding in described_cell.payload(payload_kg, mass_kg, self._measuring.sensor_kg):
+        for finding in described_cell.payload(payload_kg, mass_kg, self._pace.sensor_kg):
             self._note(finding.words, warning=True)
 
     def _step(self, stop: int, index: int) -> bool:
@@ -200,7 +180,7 @@ class Tour:
         largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
-            drives = ", and drives it where --yes may confirm it" if self._pace.trusted and self._pace.yes else ""
+            drives = ", and drives it where --yes may confirm it" if self._pace.trusted and self._options.yes else ""
             return f"Enter plans the way and shows it{drives}, {joints}, {largest}"
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
 
@@ -214,9 +194,9 @@ class Tour:
             raise Turned(Key.REDO)
         while (key := self._journal.pressed()) is not None:
             if key is Key.PAUSE:
-                raise Stopped("paused by the operator")
+                raise OperatorStop("paused by the operator")
             if key is Key.STOP:
-                raise Stopped("stopped by the operator", for_good=True)
+                raise OperatorStop("stopped by the operator", for_good=True)
             if key is Key.KEEP:
                 self._note("every pose is saved without a key; press r to take it again")
             if key is Key.SKIP:
@@ -224,7 +204,7 @@ class Tour:
                     raise Turned(key)
                 self._note("s skips the pose that is under way: none is under way")
             if key is Key.REDO and (last := self._redoable()) is not None:
-                self._now = replace(self._now, again=True)
+                self._now.again = True
                 if not moving:
                     raise Turned(key)
                 self._note(f"the arm completes its move, then goes back to pose {last}")
@@ -252,33 +232,31 @@ class Tour:
         stop = self._now.taken_last
         if stop is None:
             return
-        self._judge.remove(stop)
-        self._now = self._now.redo(stop)
+        self._book.judge.remove(stop)
+        self._now.redo(stop)
         self._note(f"pose {stop} is taken again")
 
     def _skip(self) -> None:
         """Drop the pose, and the return to it. A pose that was to be taken again keeps its earlier samples."""
-        self._now, dropped = self._now.skip()
+        dropped = self._now.skip()
         names = {stop: "the return to pose 1" if stop == self._now.stops else f"pose {stop}" for stop in dropped}
-        stay = set(dropped).intersection(self._run.stops())
-        for record in self._run.records() if stay else ():
+        stay = set(dropped).intersection(self._book.run.stops())
+        for record in self._book.run.records() if stay else ():
             if record.stop in stay:
-                self._journal.show(self._judge.add(record))
+                self._journal.show(self._book.judge.add(record))
                 self._note(f"{names[record.stop]} stays as it was measured", warning=True)
         if left := [name for stop, name in names.items() if stop not in stay]:
             way = f"the arm goes on to pose {self._now.todo[0]}" if self._now.todo else "it was the last"
             self._note(f"skipped: {' and '.join(left)}, {way}; --resume takes skipped poses", warning=True)
 
     def _take(self, stop: int, index: int) -> None:
-        step = self._plan.steps[index]
+        step, pace, clock = self._plan.steps[index], self._pace, self._watcher.clock
         pose = TourPose(step.number, np.array(step.q_rad))
-        clock = self._watcher.clock
-        began_s, settled_s, attempts = clock.now_s(), 0.0, 0
+        began_s, settled_s = clock.now_s(), 0.0
 
         def on_stage(stage: Stage) -> None:
-            nonlocal settled_s, attempts
-            if stage == "sample":
-                settled_s, attempts = clock.now_s() - began_s, attempts + 1
+            nonlocal settled_s
+            settled_s = clock.now_s() - began_s
             self._show_state(State.SETTLE if stage == "settle" else State.SAMPLE, stop)
 
         with self._watcher.watching(pose.q_rad, pose.q_rad, moving=False):
@@ -287,27 +265,16 @@ class Tour:
                 self._sensor,
                 stop,
                 pose,
-                self._measuring.sampling,
+                pace.sampling,
                 guard=self._between_looks,
                 on_stage=on_stage,
-                quiet_std=self._measuring.quiet_std,
+                quiet_std=pace.quiet_std,
             )
-        self._measuring.load.judge(record.samples.wrench)
-        self._run.commit(record)
-        self._journal.show(
-            PoseTaken.of(
-                record,
-                self._certifier.scene.down_base,
-                stops=self._now.stops,
-                settle_s=settled_s,
-                average_s=self._measuring.sampling.average_s,
-                attempts=attempts,
-                temperature_C=self._sensor.temperature_C(),
-            ),
-            sync=True,
-        )
-        self._recovery.show_new()
-        self._journal.show(self._judge.add(record))
+        self._guarded.load.judge(record.samples.wrench)
+        average_s = pace.sampling.average_s
+        judged = self._book.keep(record, stops=self._now.stops, settle_s=settled_s, average_s=average_s)
+        self._guarded.show_new()
+        self._journal.show(judged)
 
     def _go(self, index: int, stop: int) -> None:
         """Move the arm to a pose of the plan, along certified moves only."""
@@ -320,14 +287,14 @@ class Tour:
             self._show_state(State.MOVE, stop)
             self._move(self._nodes[at], self._nodes[index], speed_rad_s, self._plan.acceleration_rad_s2)
             driven_from = at if index == (at + 1) % len(self._nodes) else None
-        self._now = self._now.arrive(index, driven_from=driven_from)
+        self._now.arrive(index, driven_from=driven_from)
 
     def _go_back(self, index: int, why: str) -> None:
-        """Return to the previous pose, then raise `Stopped`: the operator decides again."""
-        self._now = replace(self._now, back=None, under_way=self._now.todo[0])
+        """Return to the previous pose, then raise `OperatorStop`: the operator decides again."""
+        self._now.back, self._now.under_way = None, self._now.todo[0]
         self._approach(self._arm.state().q_rad, index, index + 1, back=True)
-        self._now = self._now.arrive(index)
-        raise Stopped(f"back at pose {index + 1}; what stopped the arm: {why}")
+        self._now.arrive(index)
+        raise OperatorStop(f"back at pose {index + 1}; what stopped the arm: {why}")
 
     def _own_speed(self, index: int) -> float | None:
         """Speed of the plan's move from where the arm stands to a pose, rad/s; None if the plan has no such move."""
@@ -371,27 +338,27 @@ class Tour:
 
     def _confirm(self, text: str, *, by_operator: bool = False) -> None:
         """Ask before a motion; the first motion needs a typed word."""
-        if not self._pace.asks:
+        if not self._options.questions:
             return
         trusted = self._pace.trusted and not by_operator
         if self._now.confirmed:
             if self._journal.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
-                raise Stopped(f"not confirmed: {text}")
+                raise OperatorStop(f"not confirmed: {text}")
             return
         assumed = _FIRST_WORD if trusted else None
         question = Question(f"{text} Hand on the emergency stop. Type {_FIRST_WORD}", (_FIRST_WORD,), assumed)
         if self._journal.ask(question) != _FIRST_WORD:
             raise Declined(f"{_FIRST_WORD} was not typed: nothing moves")
-        self._now = replace(self._now, confirmed=True)
+        self._now.confirmed = True
 
     def _move(self, start: Array, goal: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Make one certified move, only from where it was certified to begin."""
         if not self._now.confirmed:
             self._confirm("The arm begins the tour.")
-        self._recovery.require_answers()
+        self._guarded.require_answers()
         off_rad = np.abs(self._arm.state().q_rad - start)
         if off_rad.max() > _AT_RAD:
-            self._now = self._now.lose_place()
+            self._now.lose_place()
             raise fault(
                 Hazard.OTHER_CLIENT,
                 f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° from where its move begins: "
@@ -399,7 +366,7 @@ class Tour:
             )
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
-        self._now = self._now.start_move()
+        self._now.standing = False
         with self._watcher.watching(start, goal, moving=True):
             self._arm.move_to(
                 goal.tolist(),
@@ -416,14 +383,14 @@ class Tour:
     def _hold(self, error: Exception) -> None:
         """Show why the arm has stopped, and wait for the operator; returns when the tour may go on."""
         self._arm.stop()
-        if isinstance(error, Stopped) and error.for_good:
+        if isinstance(error, OperatorStop) and error.for_good:
             self._show_state(State.STOP, words=str(error))
             raise Declined(str(error))
-        trip = self._recovery.cause(error, moving=not self._now.standing)
+        trip = self._guarded.cause(error, moving=not self._now.standing)
         if trip is not None and self._reopened_sensor(trip):
             return
         stop, back = self._now.todo[0], self._now.came_from
-        self._now = self._now.start_move()
+        self._now.standing = False
         words = str(error if trip is None else trip)
         reported, report_error = self._watcher.tripped(wait_s=0.0), self._watcher.report_error
         if trip is not None and (trip is not reported or report_error is not None):
@@ -431,9 +398,9 @@ class Tour:
         if report_error is not None:
             self._note(f"{reported} (reported late, {report_error!r}: check screen, pipe and disk)", warning=True)
         self._show_state(State.STOP, words=words)
-        self._recovery.show_new()
+        self._guarded.show_new()
         self._show_state(State.HOLD, words=words)
-        by_operator = isinstance(error, Stopped)
+        by_operator = isinstance(error, OperatorStop)
         end = Declined(words) if by_operator else error if trip is None else trip.error
         ways = {"resume": f"go on with pose {stop}{'' if by_operator else ' after fixing the cause'}"}
         ways["skip"] = f"leave pose {stop} out"
@@ -441,7 +408,7 @@ class Tour:
             ways["back"] = f"return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f}°/s"
         ways["quit"] = "stop; continue later with --resume"
         choices = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
-        question = Question(f"{len(self._run.stops())} poses are saved. {choices}", tuple(ways))
+        question = Question(f"{len(self._book.run.stops())} poses are saved. {choices}", tuple(ways))
         while True:
             try:
                 answer = self._journal.ask(question)
@@ -450,14 +417,14 @@ class Tour:
             if answer == "quit":
                 raise end
             try:
-                self._recovery.reopen()
+                self._guarded.reopen()
             except (Tripped, DeviceError, NotAccepted, Declined) as again:
-                self._journal.show(Noted(words=f"not yet: {again}", warning=True))
+                self._note(f"not yet: {again}", warning=True)
                 continue
             if answer == "skip":
                 self._skip()
             if answer == "back" and back is not None:
-                self._now = replace(self._now, back=(back, words))
+                self._now.back = (back, words)
             return
 
     def _reopened_sensor(self, trip: Tripped) -> bool:
@@ -465,18 +432,15 @@ class Tour:
         stop = self._now.todo[0]
         if trip.hazard != Hazard.SENSOR_LOST or not self._now.standing or stop in self._now.reopened:
             return False
-        self._now = replace(self._now, reopened=self._now.reopened | {stop})
+        self._now.reopened.add(stop)
         try:
-            self._recovery.reopen()
+            self._guarded.reopen()
         except (Tripped, DeviceError, NotAccepted, Declined) as error:
             log.info("the sensor cannot be reopened: %s", error)
             return False
-        self._journal.show(Noted(words=f"{trip}; the sensor was reopened, pose {stop} restarts", warning=True))
+        self._note(f"{trip}; the sensor was reopened, pose {stop} restarts", warning=True)
         return True
 
     def _show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
         number = None if stop is None else self._plan.steps[self._now.index(stop)].number
         self._journal.show(StateChanged(state=state, stop=stop, stops=self._now.stops, number=number, words=words))
-
-    def _note(self, words: str, *, warning: bool = False) -> None:
-        self._journal.show(Noted(words=words, warning=warning))

@@ -12,11 +12,12 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftcalib.routine import turned_rad
-from ftdrive.session.guards import Guard, Limits, Motion, Seen, Tripped, arm_lost, by_safety, fault
+from ftdrive.session.guards import ExpectedMotion, Guard, Seen, Tripped, arm_lost, by_safety, fault
 from ftdrive.session.hazards import Hazard
-from ftdrivers.clock import Clock, Follower
+from ftdrive.session.open_cell import OpenCell
+from ftdrivers.clock import Follower
 from ftdrivers.errors import DeviceError, DeviceFault
-from ftdrivers.interfaces import ArmState, ForceTorqueSensor, RobotArm
+from ftdrivers.interfaces import ArmState
 
 log = logging.getLogger(__name__)
 
@@ -24,33 +25,14 @@ log = logging.getLogger(__name__)
 class Watcher:
     """Runs the guards while a `watching` block is open, from `begin` on; it looks for row 11 all the time.
 
-    Parameters
-    ----------
-    arm, sensor
-        Read from the thread.
-    guards : sequence of Guard
-    on_trip : callable
-        Called from the thread once the arm has stopped, or is slow to stop.
-    clock
-        Of the cell; an emulated clock waits for the thread.
-    limits
-        Periods and limits of the thread itself.
+    `on_trip` is called from the thread once the arm has stopped, or is slow to stop.
     """
 
-    def __init__(
-        self,
-        arm: RobotArm,
-        sensor: ForceTorqueSensor,
-        guards: Sequence[Guard],
-        on_trip: Callable[[Tripped], None],
-        *,
-        clock: Clock,
-        limits: Limits,
-    ) -> None:
-        self.clock, self._limits = clock, limits
-        self._arm, self._sensor, self._guards, self._on_trip = arm, sensor, tuple(guards), on_trip
-        self._motion: Motion | None = None
-        self._seen: Motion | None = None  # the motion that all guards have looked at
+    def __init__(self, cell: OpenCell, guards: Sequence[Guard], on_trip: Callable[[Tripped], None]) -> None:
+        self.clock, self._limits = cell.clock, cell.limits
+        self._arm, self._sensor, self._guards, self._on_trip = cell.arm, cell.sensor, tuple(guards), on_trip
+        self._motion: ExpectedMotion | None = None
+        self._seen: ExpectedMotion | None = None  # the motion that all guards have looked at
         self._wake = threading.Event()
         self._end = threading.Event()
         self._reported = threading.Event()
@@ -67,7 +49,7 @@ class Watcher:
         self._begun = False
         self._last: tuple[float, ArmState] | None = None
         self._looked_s = 0.0
-        self._thread = Follower(clock, self._run, "guards")
+        self._thread = Follower(cell.clock, self._run, "guards")
 
     def __enter__(self) -> "Watcher":
         self._thread.start()
@@ -90,7 +72,7 @@ class Watcher:
         self.check()
         self._last = None
         self._looked_s = self.clock.now_s()
-        motion = self._motion = Motion(np.asarray(start_rad), np.asarray(goal_rad), moving)
+        motion = self._motion = ExpectedMotion(np.asarray(start_rad), np.asarray(goal_rad), moving)
         self._wake.set()
         try:
             while self._seen is not motion:
@@ -177,7 +159,7 @@ class Watcher:
             pause_s = self.turn()
             self.clock.wait(self._wake if self._motion is None else self._end, pause_s)
 
-    def _look(self, motion: Motion) -> None:
+    def _look(self, motion: ExpectedMotion) -> None:
         status = self._arm.status()
         try:
             state = self._arm.state()

@@ -23,14 +23,13 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.store.tables import SCHEMA, schema
+from ftdrive.store.tables import RECORDS, SCHEMA, metadata, schema
 
 _INSERT: Final[Mapping[str, Callable[[Table], Any]]] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
 _BYTE_ORDER: Final = {"sqlite": "BINARY", "postgresql": "C"}
 """Collation that sorts texts alike everywhere."""
 _WRITERS: Final = 0x66746472697665
 """Key of the advisory lock of all writers: "ftdrive" in ASCII."""
-_UPGRADE: Final = "upgrade it with `ftdrive history --index .`"
 
 
 def default_file() -> Path:
@@ -78,15 +77,13 @@ class Database:
             yield None
             return
         with self._connected("read") as connection:
-            version = _version(connection)
-            self._require_usable(version)
-            yield None if version is None else connection
+            yield None if self._version(connection) is None else connection
 
     @contextmanager
-    def writing(self, *, upgrade: bool = False) -> Iterator[Connection]:
-        """Connect as the only writer, create the tables where they are missing, and commit at the end.
+    def writing(self) -> Iterator[Connection]:
+        """Connect as the only writer, and commit at the end.
 
-        Tables of an older version are migrated if `upgrade` is true.
+        Missing tables are created. The index of an older version is replaced by an empty one; cells are kept.
         """
         if self._file is not None:
             with self._in_words("written"):
@@ -96,25 +93,17 @@ class Database:
                 connection.exec_driver_sql("BEGIN IMMEDIATE")  # else two writers that read first cannot both go on
             else:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _WRITERS})
-            version = _version(connection)
-            self._require_usable(version, upgrade=upgrade)
-            if version != SCHEMA:
-                from ftdrive.store.migrations import migrate
-
-                migrate(connection)
+            if self._version(connection) != SCHEMA:
+                metadata.drop_all(connection, [schema, *RECORDS.values()])
+                metadata.create_all(connection)
+                connection.execute(schema.insert().values(version=SCHEMA))
             yield connection
             connection.commit()
 
-    @contextmanager
-    def older(self) -> Iterator[tuple[Connection, int] | None]:
-        """Connect to tables of an older version; None if there is nothing to upgrade."""
-        if self.is_missing:
-            yield None
-            return
-        with self._connected("read") as connection:
-            version = _version(connection)
-            self._require_usable(version, upgrade=True)
-            yield None if version is None or version == SCHEMA else (connection, version)
+    def paths_of_older(self) -> set[str] | None:
+        """Return the files that an index of an older version names; None if there is no such index."""
+        with self.reading() as connection:
+            return None if connection is None or self._version(connection) == SCHEMA else all_paths(connection)
 
     def upsert(self, table: Table, first_by: str | None = None) -> Any:
         """Return a statement that inserts rows, or replaces those with the same primary key.
@@ -132,11 +121,17 @@ class Database:
             where = insert.excluded[first_by] <= collate(table.c[first_by], _BYTE_ORDER[self._dialect])
         return insert.on_conflict_do_update(index_elements=key, set_=new, where=where)
 
-    def _require_usable(self, version: int | None, *, upgrade: bool = False) -> None:
-        if version is None or version == SCHEMA or (upgrade and version < SCHEMA):
-            return
-        fix = "install a newer ftdrive" if version > SCHEMA else _UPGRADE
-        raise BadStore(f"the store {self.name} has version {version}, this ftdrive uses version {SCHEMA}: {fix}")
+    def _version(self, connection: Connection) -> int | None:
+        """Return the version of the tables, 0 where it is lost; None where there are no tables."""
+        if not inspect(connection).has_table(schema.name):
+            return None
+        version = connection.scalar(select(schema.c.version)) or 0
+        if version > SCHEMA:
+            raise BadStore(
+                f"the store {self.name} has version {version}, this ftdrive uses version {SCHEMA}: "
+                "install a newer ftdrive"
+            )
+        return version
 
     @property
     def _file(self) -> Path | None:
@@ -177,8 +172,6 @@ class Database:
             ) from error
 
 
-def _version(connection: Connection) -> int | None:
-    """Return the version of the tables; None where there are none, 0 where it is lost."""
-    if not inspect(connection).has_table(schema.name):
-        return None
-    return connection.scalar(select(schema.c.version)) or 0
+def all_paths(connection: Connection) -> set[str]:
+    """Return the path of every record, in an index of any version."""
+    return {path for table in RECORDS.values() for path in connection.scalars(select(table.c.path))}

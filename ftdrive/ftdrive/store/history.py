@@ -27,7 +27,7 @@ _VECTORS: Final = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drift:
+class QuantityTrend:
     """Linear change of one quantity over the results of one tool on one sensor, arm and mount."""
 
     tool: str
@@ -72,7 +72,7 @@ def age_days(created_utc: str | None, now: datetime) -> float | None:
     return None if created_utc is None else (now - datetime.fromisoformat(created_utc)).total_seconds() / 86400
 
 
-def drifts(results: Sequence[StoredResult]) -> list[Drift]:
+def drifts(results: Sequence[StoredResult]) -> list[QuantityTrend]:
     """Fit the trends of each tool that has three results or more; a rejected result does not count."""
     found = []
     for series in _series(results):
@@ -81,7 +81,7 @@ def drifts(results: Sequence[StoredResult]) -> list[Drift]:
                 continue
             t, values, covariance = (np.array(column) for column in zip(*rows, strict=True))
             drift = trend(t / _MONTH_DAYS, values, covariance)
-            found.append(Drift(str(series[0].tool), series[0].sensor_serial, quantity, unit, drift))
+            found.append(QuantityTrend(str(series[0].tool), series[0].sensor_serial, quantity, unit, drift))
     return found
 
 

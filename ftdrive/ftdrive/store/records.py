@@ -14,7 +14,7 @@ from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_object
 from ftcalib.model import Array, Parameters
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import FORMAT
+from ftdrive.runs.verification_record import EMULATED, FORMAT, marks_of
 
 _NUMBERS = tuple(field.name for field in fields(Parameters))
 
@@ -56,6 +56,13 @@ class StoredResult:
     """That the controller reported during the calibration."""
     payload_com_m: list[float] | None
     """(3,) centre of mass of that payload, flange axes; None also for a run of an earlier version."""
+    emulated: bool = False
+    """Whether the cell was emulated."""
+
+    @property
+    def tool_in_words(self) -> str:
+        """Name of the tool, and whether the cell was emulated."""
+        return tool_in_words(self.tool, emulated=self.emulated)
 
     @property
     def parameters(self) -> Parameters:
@@ -96,7 +103,7 @@ class StoredVerification:
     """(6,) its standard deviation from the calibration, which all its verifications share."""
 
 
-class Check(NamedTuple):
+class BriefVerification(NamedTuple):
     """What a fleet needs of a verification: a tuple, because it reads 20,000 of them a minute."""
 
     calibration_id: str
@@ -123,6 +130,13 @@ class StoredCell:
 
 
 Record = StoredResult | StoredVerification
+
+
+def tool_in_words(tool: str | None, *, emulated: bool) -> str:
+    """Return the name of a tool, which is EMULATED in an emulated cell whose tool has no other name."""
+    if not emulated:
+        return tool or "-"
+    return EMULATED if tool in (None, "emulated") else f"{tool} {EMULATED}"
 
 
 def mass_sigma_kg(parameters: Parameters, covariance: Array, g_m_s2: float) -> float:
@@ -208,6 +222,7 @@ def _result(path: Path) -> StoredResult:
         temperature_C=_number(provenance.get("temperature_C")),
         payload_kg=_number(setup.get("payload_kg")),
         payload_com_m=_numbers(setup.get("p_flange_payload_m"), 3),
+        emulated=EMULATED in marks_of(result),
     )
 
 

@@ -3,15 +3,16 @@
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
 from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
 
 from ftdrive.store import tables
-from ftdrive.store.database import Database
+from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import (
-    Check,
+    BriefVerification,
     Record,
     StoredCell,
     StoredResult,
@@ -53,7 +54,7 @@ class Store:
     ConfigError
         The address is not one of a database, or its driver is not installed.
     BadStore
-        From every method: the database cannot be read or written, or has tables of another version.
+        From every method: the database cannot be read or written, or is of a newer version.
     """
 
     def __init__(self, url: str | None = None, *, wait_s: float = WAIT_S) -> None:
@@ -64,6 +65,15 @@ class Store:
         """The file, or the address without its password."""
         return self._database.name
 
+    @cached_property
+    def _current(self) -> Database:
+        """The database; an index of an older version is first built again from the files that it names."""
+        if (paths := self._database.paths_of_older()) is not None:
+            records, _ = read_records(map(Path, sorted(paths)))
+            with self._database.writing() as connection:
+                self._write(connection, records)
+        return self._database
+
     # -------------------------------------------------------------------------------------------------------- writing
 
     def index(self, *folders: Path) -> Indexed:
@@ -72,7 +82,7 @@ class Store:
         A file that is known by its path is not read again, because no file of a run is ever overwritten.
         """
         paths = record_paths(folders)
-        with self._database.reading() as connection:
+        with self._current.reading() as connection:
             known = set() if connection is None else _known(connection, paths)
         return self._add(path for path in paths if str(path) not in known)
 
@@ -81,47 +91,29 @@ class Store:
 
         Runs whose parent folder cannot be reached are kept: a disk may be missing, or another computer has them.
         """
-        with self._database.reading() as connection:
-            known = set() if connection is None else _all_paths(connection)
+        with self._current.reading() as connection:
+            known = set() if connection is None else all_paths(connection)
         parents = {Path(path).parent.parent for path in known}
         gone = [path for path in known if not Path(path).exists() and Path(path).parent.parent.is_dir()]
         return self._add(record_paths([*folders, *parents]), forget=gone)
 
-    def upgrade(self) -> int | None:
-        """Migrate the tables of an older version; indexed files that are still there are read again.
-
-        Returns
-        -------
-        int or None
-            The older version; None if there was nothing to upgrade.
-        """
-        with self._database.older() as found:
-            if found is None:
-                return None
-            connection, version = found
-            known = _all_paths(connection)
-        records, _ = read_records(map(Path, sorted(known)))
-        with self._database.writing(upgrade=True) as connection:
-            self._write(connection, records)
-        return version
-
     def put_cells(self, cells: Iterable[StoredCell]) -> None:
         """Insert cells, or replace those of the same name: all or none."""
         if rows := [tables.to_row(cell) for cell in cells]:
-            with self._database.writing() as connection:
+            with self._current.writing() as connection:
                 connection.execute(self._database.upsert(tables.cells), rows)
 
     def remove_cells(self, names: Iterable[str]) -> None:
         """Remove cells by name; an unknown one is no error."""
         by_name = delete(tables.cells).where(tables.cells.c.name == bindparam("cell"))
-        with self._database.writing() as connection:
+        with self._current.writing() as connection:
             for name in names:
                 connection.execute(by_name, {"cell": name})
 
     def _add(self, paths: Iterable[Path], forget: Sequence[str] = ()) -> Indexed:
         records, unreadable = read_records(paths)
         if records or forget:
-            with self._database.writing() as connection:
+            with self._current.writing() as connection:
                 self._write(connection, records, forget)
         results = sum(isinstance(one, StoredResult) for one in records)
         return Indexed(results, len(records) - results, unreadable)
@@ -166,7 +158,9 @@ class Store:
         """Return all cells by name."""
         return sorted(self._read(select(tables.cells), tables.to_cell), key=lambda cell: cell.name)
 
-    def fleet(self, newest: int, since: datetime) -> tuple[list[StoredCell], list[StoredResult], list[Check]]:
+    def fleet(
+        self, newest: int, since: datetime
+    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification]]:
         """Return what a fleet needs, in one look at the database: cells, results and checks, the oldest first.
 
         Parameters
@@ -178,24 +172,19 @@ class Store:
         """
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
         checks = select(*tables.CHECK).where(tables.verifications.c.created_utc >= start)
-        with self._database.reading() as connection:
+        with self._current.reading() as connection:
             cells = _rows(connection, select(tables.cells), tables.to_cell)
             results = _rows(connection, _newest_accepted(newest), tables.to_result)
             found = _rows(connection, checks, tables.to_check)
         return sorted(cells, key=lambda cell: cell.name), results, sorted(found, key=lambda check: check.created_utc)
 
     def _read(self, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
-        with self._database.reading() as connection:
+        with self._current.reading() as connection:
             return _rows(connection, query, make)
 
 
 def _rows(connection: Connection | None, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
     return [] if connection is None else [make(row) for row in connection.execute(query).all()]
-
-
-def _all_paths(connection: Connection) -> set[str]:
-    """Return the path of every record, in tables of any version."""
-    return {path for table in tables.RECORDS.values() for path in connection.scalars(select(table.c.path))}
 
 
 def _known(connection: Connection, paths: Iterable[Path]) -> set[str]:

@@ -1,18 +1,18 @@
 """The tables of the store as this version reads and writes them, and their rows as records.
 
-A change of a column raises `SCHEMA` and adds a migration in `ftdrive.store.migrations`.
+A change of a column of results or verifications raises `SCHEMA`: an older index is then built again from its files.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, Final
 
-from sqlalchemy import JSON, Boolean, Column, Float, Integer, MetaData, Row, String, Table
+from sqlalchemy import JSON, Boolean, Column, Float, Integer, MetaData, Row, String, Table, false
 
-from ftdrive.store.records import Check, Record, StoredCell, StoredResult, StoredVerification
+from ftdrive.store.records import BriefVerification, Record, StoredCell, StoredResult, StoredVerification
 
-SCHEMA: Final = 2
-"""Version of the tables, kept in the database."""
+SCHEMA: Final = 3
+"""Version of the index, kept in the database."""
 
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 _WRENCHES = ("bias_change", "bias_change_sigma", "calibration_sigma")
@@ -37,6 +37,7 @@ results: Final = Table(
     *(Column(name, String) for name in ("arm_model", "sensor_model", "robot_host")),
     Column("payload_kg", Float),
     Column("payload_com_m", JSON(none_as_null=True)),
+    Column("emulated", Boolean, nullable=False, server_default=false()),
 )
 verifications: Final = Table(
     "ftdrive_verifications",
@@ -62,7 +63,7 @@ cells: Final = Table(
 RECORDS: Final[Mapping[type[Record], Table]] = {StoredResult: results, StoredVerification: verifications}
 
 CHECK: Final = [
-    *(verifications.c[name] for name in Check._fields[:-1]),
+    *(verifications.c[name] for name in BriefVerification._fields[:-1]),
     *(verifications.c[f"{name}_{axis}"] for name in _WRENCHES for axis in _WRENCH),
 ]
 """Columns of a check."""
@@ -98,10 +99,10 @@ def to_verification(row: Row[Any]) -> StoredVerification:
     )
 
 
-def to_check(row: Sequence[Any]) -> Check:
+def to_check(row: Sequence[Any]) -> BriefVerification:
     """Return a row with the columns `CHECK` as a check."""
     calibration_id, created_utc, passed, change, temperature_C, *bias = row
-    return Check(calibration_id, created_utc, passed, change, temperature_C, tuple(bias))
+    return BriefVerification(calibration_id, created_utc, passed, change, temperature_C, tuple(bias))
 
 
 def _wrench(values: Sequence[Any]) -> list[float] | None:

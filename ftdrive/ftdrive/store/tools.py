@@ -50,7 +50,7 @@ def calibration_of_tool(
     runs : Path
         Folder of runs that the store may lack.
     force : bool
-        If no calibration is of these devices, take the newest of any.
+        If no calibration is of these devices, take the newest of any, also one that was edited by hand.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def calibration_of_tool(
             return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)))
     if force:
         for one in (one for one in accepted if one.tool == name):
-            if loaded := _load(one):
+            if loaded := _load(one, accept_edited=True):
                 return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)))
     known = sorted({one.tool for one in ours if one.tool and one.tool != name})
     instead = f", or choose one of {', '.join(known)}" if known else ""
@@ -95,9 +95,9 @@ def _may_belong(one: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:
     return all(made == now or made in {None, NOT_REPORTED} or now == NOT_REPORTED for made, now in pairs)
 
 
-def _load(one: StoredResult) -> CalibrationResult | None:
+def _load(one: StoredResult, *, accept_edited: bool = False) -> CalibrationResult | None:
     try:
-        return CalibrationResult.load(Path(one.path))
+        return CalibrationResult.load(Path(one.path), accept_edited=accept_edited)
     except (BadCalibration, OSError):
         return None
 

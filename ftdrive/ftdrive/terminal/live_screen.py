@@ -24,7 +24,7 @@ from ftdrive.checks.devices import check_calibration
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Axes, Point, WrenchFrame
-from ftdrive.runs.verification import fitted_dataset
+from ftdrive.runs.verification_record import fitted_dataset
 from ftdrive.terminal.console import talk
 from ftdrive.terminal.live.feed import Feed, Sink, Stream
 from ftdrive.terminal.live.history import SPANS_S

@@ -11,7 +11,7 @@ from ftdrive.errors import Declined
 from ftdrive.session.events import SCHEMA_VERSION, Asked, Event
 from ftdrive.session.operator import Key, Question
 from ftdrive.terminal.console import in_whole_words
-from ftdrive.terminal.session_text import Line, SessionText
+from ftdrive.terminal.session_text import SessionText, TextLine
 from ftdrive.terminal.text import visible
 
 
@@ -114,7 +114,7 @@ class PlainOperator(_Keyless):
     ) -> None:
         self._stdin, self._stderr = stdin or sys.stdin, stderr or sys.stderr
         self._text = SessionText(verbose=verbose)
-        self._quiet, self._withheld = quiet, list[Line]()
+        self._quiet, self._withheld = quiet, list[TextLine]()
         self._lock = Lock()
         self._asked = ""
 
@@ -153,7 +153,7 @@ class PlainOperator(_Keyless):
         """Write the checks that wait for others on their line."""
         self._write_lines(self._text.pending())
 
-    def _write_lines(self, lines: Sequence[Line]) -> None:
+    def _write_lines(self, lines: Sequence[TextLine]) -> None:
         if self._quiet:
             self._withheld += lines
             return

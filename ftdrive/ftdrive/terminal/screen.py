@@ -40,7 +40,7 @@ from ftdrive.terminal.console import hanging, talk
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
-from ftdrive.terminal.session_text import Line, SessionText, in_words, rms_sigma, sigmas_of
+from ftdrive.terminal.session_text import SessionText, TextLine, in_words, rms_sigma, sigmas_of
 from ftdrivers.interfaces import Array
 
 REFRESH_HZ = 4
@@ -72,7 +72,7 @@ _ASCII = str.maketrans(
 
 
 @dataclass
-class View:
+class SessionView:
     """The state that the screen draws."""
 
     command: str = "calibrate"
@@ -129,7 +129,7 @@ class View:
             self.drift = DriftCheck(np.subtract(event.mean, first.mean), sigma, now_s - first_s)
 
 
-def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Group:
+def frame(view: SessionView, now_s: float, *, width: int = 80, height: int = 24) -> Group:
     """Draw the screen: never wider than `width`, never higher than `height` less one line for the cursor.
 
     If there is not enough room, blocks are omitted, the highest rank first. Blocks of rank 0 stay.
@@ -160,7 +160,7 @@ def frame(view: View, now_s: float, *, width: int = 80, height: int = 24) -> Gro
     return Group(*lines)
 
 
-def _title(view: View, now_s: float, width: int) -> Text:
+def _title(view: SessionView, now_s: float, width: int) -> Text:
     times_s = sorted(at_s for _, at_s in view.taken.values())
     kept = max(len(view.taken), view.estimated.poses if view.estimated else 0)  # more if resumed
     right = f"{kept} kept"
@@ -180,7 +180,7 @@ def _title(view: View, now_s: float, width: int) -> Text:
     )
 
 
-def _state(view: View, now_s: float, width: int) -> list[Text]:
+def _state(view: SessionView, now_s: float, width: int) -> list[Text]:
     now = view.now
     if now is None:
         return [Text("starting")]
@@ -200,7 +200,7 @@ def _state(view: View, now_s: float, width: int) -> list[Text]:
     return [line]
 
 
-def _last(view: View) -> list[Text]:
+def _last(view: SessionView) -> list[Text]:
     pose, fit = view.last, view.estimated
     if pose is None:
         return []
@@ -224,7 +224,7 @@ def _last(view: View) -> list[Text]:
     return [line, residual]
 
 
-def _findings(view: View, width: int, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
+def _findings(view: SessionView, width: int, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
     """Return what the poses show: estimates and their coverage, or in a verification the poses compared."""
     if view.command == "calibrate":
         return [*_estimates(view, with_cube=with_cube), *_coverage(view, width)]
@@ -240,7 +240,7 @@ def _findings(view: View, width: int, *, with_cube: bool) -> list[tuple[int, lis
     return [(1, lines), (4, _folded(view, hint, width))]
 
 
-def _estimates(view: View, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
+def _estimates(view: SessionView, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
     """Return the estimates, with the cube beside them or its counts in a line below."""
     fit = view.estimated
     rows = [Text(f"{'estimate':<13}{'':27}{'± 1 sigma':>12}", "dim")]
@@ -295,7 +295,7 @@ def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
     ]
 
 
-def _coverage(view: View, width: int) -> list[tuple[int, list[Text]]]:
+def _coverage(view: SessionView, width: int) -> list[tuple[int, list[Text]]]:
     fit = view.estimated
     if fit is None:
         return [(1, [Text("coverage  nothing yet", "dim")])]
@@ -309,7 +309,7 @@ def _coverage(view: View, width: int) -> list[tuple[int, list[Text]]]:
     return [(1, [line]), (4, _folded(view, f"helps most: {fit.hint}" if fit.hint else "", width))]
 
 
-def _drift(view: View) -> Text:
+def _drift(view: SessionView) -> Text:
     fit = view.estimated
     if view.drift is not None:
         words, bad = drift_in_words(view.drift)
@@ -331,7 +331,7 @@ def _drift(view: View) -> Text:
     return Text(words if sure else f"{words}, perhaps", "yellow" if sure else "")
 
 
-def _keys(view: View) -> list[Text]:
+def _keys(view: SessionView) -> list[Text]:
     end = "Ctrl-C ends, poses are kept" if view.folder else "Ctrl-C ends"
     if view.keys != "live":
         return [Text(f"Enter sends the answer; {end}", "dim")] if view.keys == "asking" else []
@@ -348,7 +348,7 @@ def _keys(view: View) -> list[Text]:
     return [line]
 
 
-def _kept(view: View, width: int) -> list[Text]:
+def _kept(view: SessionView, width: int) -> list[Text]:
     if not view.folder:
         return [] if view.taken else [Text("nothing is kept yet: there is no run", "dim")]
     return [
@@ -361,7 +361,7 @@ def _rule(width: int) -> Text:
     return Text("─" * width, "dim")
 
 
-def _folded(view: View, text: str, width: int, style: str = "") -> list[Text]:
+def _folded(view: SessionView, text: str, width: int, style: str = "") -> list[Text]:
     lines = textwrap.wrap(view.shown(text), width, max_lines=3, placeholder=view.shown(" …"))
     return [Text(line, style) for line in lines]
 
@@ -402,7 +402,7 @@ class Screen:
     ) -> None:
         self._console, self._keyboard, self._stdin = console, keyboard, stdin or sys.stdin
         self._clock = clock
-        self._view = View(command, ascii_only=console.options.ascii_only)
+        self._view = SessionView(command, ascii_only=console.options.ascii_only)
         self._text = SessionText(verbose=verbose, poses=False)
         self._lock = RLock()
         self._live = self._new_live()
@@ -423,7 +423,7 @@ class Screen:
             self._live.transient = kind is None  # after an error the frame stays: it has the command to resume
             self._live.stop()
         if kind is None and self._view.folder:
-            self._print([Line(" ✔ ", f"{len(self._view.taken)} averages kept in {self._view.folder}", "green")])
+            self._print([TextLine(" ✔ ", f"{len(self._view.taken)} averages kept in {self._view.folder}", "green")])
 
     def show(self, event: Event) -> None:
         """Show an event."""
@@ -452,7 +452,7 @@ class Screen:
         """Return the oldest unread key, or None."""
         return None if self._keyboard is None else self._keyboard.pressed()
 
-    def _print(self, lines: Sequence[Line]) -> None:
+    def _print(self, lines: Sequence[TextLine]) -> None:
         for line in lines:
             head, words = self._view.shown(line.head), self._view.shown(line.words)
             self._console.print(hanging(head, words, self._console), style=line.style)
@@ -490,7 +490,7 @@ class Screen:
             return frame(self._view, self._clock(), width=size.width, height=size.height)
 
 
-def _history(event: Event, view: View) -> bool:
+def _history(event: Event, view: SessionView) -> bool:
     """Whether an event is printed above the frame, where the frame does not show it already."""
     match event:
         case StateChanged():

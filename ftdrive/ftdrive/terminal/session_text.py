@@ -23,7 +23,7 @@ from ftdrive.session.events import (
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class TextLine:
     """A line of text."""
 
     head: str
@@ -50,7 +50,7 @@ class SessionText:
         self._sections = list[str]()
         self._passed = list[str]()
 
-    def lines(self, event: Event) -> list[Line]:
+    def lines(self, event: Event) -> list[TextLine]:
         """Return the lines to print for an event, those that waited for it first."""
         if isinstance(event, Checked) and event.passed and not self._verbose:
             heading = [] if self._passed else self._heading("Checks")
@@ -61,12 +61,12 @@ class SessionText:
             return waiting
         return waiting + self._heading_before(event) + body
 
-    def pending(self) -> list[Line]:
+    def pending(self) -> list[TextLine]:
         """Return the line of the checks that have passed so far."""
         passed, self._passed = self._passed, []
-        return [Line(" ✔ ", ", ".join(passed), "green")] if passed else []
+        return [TextLine(" ✔ ", ", ".join(passed), "green")] if passed else []
 
-    def _heading_before(self, event: Event) -> list[Line]:
+    def _heading_before(self, event: Event) -> list[TextLine]:
         match event:
             case Planned():
                 return self._heading("Plan")
@@ -77,17 +77,17 @@ class SessionText:
             case _:
                 return []
 
-    def _heading(self, name: str) -> list[Line]:
+    def _heading(self, name: str) -> list[TextLine]:
         """Print each heading once: checks after a stop belong to the tour."""
         if name in self._sections:
             return []
         self._sections.append(name)
-        return [Line("", name, "bold cyan")]
+        return [TextLine("", name, "bold cyan")]
 
-    def _body(self, event: Event) -> list[Line]:
+    def _body(self, event: Event) -> list[TextLine]:
         match event:
             case Planned() if not self._verbose:
-                return [Line("   ", words) for words in (*plan_in_brief(event.plan), event.way_words)]
+                return [TextLine("   ", words) for words in (*plan_in_brief(event.plan), event.way_words)]
             case RunOpened() | PoseTaken() | Compared() if not self._poses:
                 return []
             case Estimated(hint="") if not self._verbose:
@@ -104,7 +104,7 @@ class SessionText:
             style = "yellow"
         elif isinstance(event, StateChanged) and event.state is State.HOLD:
             style = "bold yellow"
-        return [Line(f" {head}" if head.strip() else "   ", words, style)]
+        return [TextLine(f" {head}" if head.strip() else "   ", words, style)]
 
 
 def plan_in_brief(plan: Plan) -> tuple[str, str]:

@@ -16,6 +16,8 @@ def print_verification(verified: Verified) -> None:
     found, n = verified.verification, len(verified.records)
     count = f"{n} poses" if n > 1 else "1 pose"
     talk.print(Text.assemble(("Verification", "bold cyan"), f"  {count}, calibration {verified.calibration.id[:6]}"))
+    for mark in verified.marks:
+        talk.print(f" {mark}", style="yellow")
     talk.print(_table(verified))
     verdict = ("PASS", "bold green") if verified.passed else ("FAILED", "bold red")
     talk.print(hanging(Text.assemble(" ", verdict, "  "), verdict_in_words(verified)))

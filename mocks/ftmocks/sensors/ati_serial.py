@@ -23,21 +23,17 @@ from ftmocks.wires.modbus import (
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
     ILLEGAL_VALUE,
-    LONGEST_FRAME,
     ModbusError,
     read_registers,
-    reply,
     written_registers,
 )
-from ftmocks.wires.stream import SerialSensor
+from ftmocks.wires.stream import ModbusSensor
 
-ADDRESS = 0x0A
 STREAM_HZ = 7000.0
 RECORD_BYTES = 13
 CHARACTER_BITS = 11
 JAM_BYTES = 14
 JAM_PAUSE_S = 0.050  # a longer pause and the jam counts from the start again
-FRAME_GAP_S = 1.75e-3  # Modbus RTU: fixed above 19 200 baud
 MAX_READ = 64
 
 GAINS, OFFSETS, SESSION, STATUS, BAUD_STORE, BAUD = 0x0000, 0x0006, 0x000C, 0x001D, 0x001E, 0x001F
@@ -88,7 +84,7 @@ def calibration_block(calibration: Calibration) -> bytes:
 
 
 @dataclass(eq=False, kw_only=True)
-class AtiSerialBox(SerialSensor):
+class AtiSerialBox(ModbusSensor):
     """The sensor's RS-485 interface.
 
     A frame is a reply or a record. The stream has no sync byte: the
@@ -112,6 +108,8 @@ class AtiSerialBox(SerialSensor):
         Probability of a record to carry a wrong checksum and right data.
     """
 
+    address = 0x0A
+    frame_gap_s = 1.75e-3  # Modbus RTU: fixed above 19 200 baud
     has_parity = True
 
     calibrations: Mapping[int, Calibration] = field(default_factory=lambda: {1: REFERENCE})
@@ -128,8 +126,6 @@ class AtiSerialBox(SerialSensor):
         self._stored_baud_code = 0
         self._registers: dict[int, int] = {}
         self._unlocked = False
-        self._burst = bytearray()
-        self._last_byte_s = 0.0
 
     def _power_up(self) -> None:
         self._registers = dict.fromkeys(range(GAINS, SESSION + 1), 0)
@@ -150,29 +146,13 @@ class AtiSerialBox(SerialSensor):
         if self.streaming and now_s - self._last_byte_s > JAM_PAUSE_S:
             self._burst.clear()
         self._last_byte_s = now_s
-        self._burst += data[: LONGEST_FRAME + 1 - len(self._burst)]  # longer is no frame: remember no more of it
+        self._remember(data)
         if self.streaming and len(self._burst) >= JAM_BYTES:
             self._fall_silent()  # and what follows without a pause still belongs to the jam
 
     def _deliver(self, frames: list[bytes]) -> None:
         for data in frames:
             self.dropped_frames += self._send(data, RECORD_BYTES if self.streaming else len(data))
-
-    def _work(self, now_s: float) -> float | None:
-        """Answer what came before a pause; return the seconds until the pause is long enough."""
-        if self.streaming or not self._burst:
-            return None
-        wait_s = self._last_byte_s + FRAME_GAP_S - now_s
-        if wait_s > 0:
-            return wait_s
-        answer = self._reply(bytes(self._burst))
-        self._burst.clear()
-        if answer:
-            self._wire.put([answer])
-        return None
-
-    def _reply(self, frame: bytes) -> bytes:
-        return reply(ADDRESS, frame, self._execute)
 
     def _execute(self, function: int, data: bytes) -> bytes:
         match function:

@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 
 from ftmocks.arrays import Array
 from ftmocks.wires import modbus
-from ftmocks.wires.stream import SerialSensor
+from ftmocks.wires.stream import ModbusSensor
 
-ADDRESS = 0x09
 STREAM_HZ = 100.0
 HEADER = b"\x20\x4e"
 STOP_BYTE, STOP_COUNT = 0xFF, 50
-FRAME_GAP_S = 2e-3  # 3.5 characters at 19200 baud
 MAX_READ = 125
 WRENCH, ACCELERATION, OUTPUT, FIRMWARE, SERIAL, YEAR = 180, 190, 410, 500, 510, 514
 STREAM_OUTPUT = 0x0200
@@ -43,7 +41,7 @@ def stream_frame(raw: list[int]) -> bytes:
 
 
 @dataclass(eq=False, kw_only=True)
-class RobotiqBox(SerialSensor):
+class RobotiqBox(ModbusSensor):
     """The sensor on its RS-485 or USB line.
 
     Parameters
@@ -58,6 +56,9 @@ class RobotiqBox(SerialSensor):
         Streams from power-up on, as some sensors do, and as after a crash of the last client.
     """
 
+    address = 0x09
+    frame_gap_s = 2e-3  # 3.5 characters at 19200 baud
+
     firmware: tuple[str, int, int, int] = ("FTS", 2, 0, 1)
     serial: tuple[str, int] = ("FTS", 1234)
     year: int = 2022
@@ -66,8 +67,6 @@ class RobotiqBox(SerialSensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._output = 0
-        self._burst = bytearray()
-        self._last_byte_s = 0.0
         self._stop_bytes = 0
 
     def _power_up(self) -> None:
@@ -81,7 +80,7 @@ class RobotiqBox(SerialSensor):
         self._last_byte_s = self.clock.now_s()
         for byte in data:
             if not self.streaming:
-                self._burst += bytes([byte])[: modbus.LONGEST_FRAME + 1 - len(self._burst)]
+                self._remember(bytes([byte]))
                 continue
             self._stop_bytes = self._stop_bytes + 1 if byte == STOP_BYTE else 0
             if self._stop_bytes == STOP_COUNT:
@@ -89,20 +88,11 @@ class RobotiqBox(SerialSensor):
                 self._pacer.stop()  # what follows without a pause is no request either: its CRC is wrong
 
     def _work(self, now_s: float) -> float | None:
-        if not self._burst:
-            return None
-        wait_s = self._last_byte_s + FRAME_GAP_S - now_s
-        if wait_s > 0:
-            return wait_s
-        request = bytes(self._burst)
-        self._burst.clear()
-        answer = modbus.reply(ADDRESS, request, self._execute)
-        if answer:
-            self._wire.put([answer])
+        wait_s = super()._work(now_s)
         if self._output == STREAM_OUTPUT:
             self._output = 0
             self._pacer.start(STREAM_HZ)
-        return None
+        return wait_s
 
     def _execute(self, function: int, data: bytes) -> bytes:
         match function:

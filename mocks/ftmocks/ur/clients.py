@@ -3,25 +3,23 @@
 import socket
 import struct
 from abc import ABC, abstractmethod
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from ftmocks.ur import api, dashboard, http_wire, primary
-from ftmocks.ur.script import take_uploads
-
-if TYPE_CHECKING:
-    from ftmocks.ur.server import UrServer
+from ftmocks.ur.robot import Robot
+from ftmocks.ur.uploads import start_upload, take_uploads
 
 BACKLOG_LIMIT_S = 10.0  # a client that does not read for so long is disconnected
 
 
 class Client(ABC):
-    """One TCP connection: bytes in, bytes out, never blocking."""
+    """One TCP connection: bytes in, bytes out, never blocking. It calls `forget` with itself when it has ended."""
 
     kind = ""
 
-    def __init__(self, server: "UrServer", connection: socket.socket) -> None:
-        self.server = server
-        self.robot = server.robot
+    def __init__(self, robot: Robot, connection: socket.socket, forget: Callable[["Client"], None]) -> None:
+        self.robot = robot
+        self._forget = forget
         self.open = True
         self.greeted = False
         """Whether the greeting was sent."""
@@ -94,7 +92,7 @@ class Client(ABC):
         """Close the connection: in order, or with a TCP reset."""
         if self.open:
             self.open = False
-            self.server.forget(self)
+            self._forget(self)
             if reset:
                 self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             self._socket.close()
@@ -108,7 +106,7 @@ class ScriptClient(Client):
     def on_bytes(self, buffer: bytearray) -> None:
         """Start every complete program."""
         for upload in take_uploads(buffer):
-            self.robot.upload(upload)
+            start_upload(self.robot, upload)
 
 
 class PrimaryClient(Client):
@@ -120,8 +118,8 @@ class PrimaryClient(Client):
 
     kind = "primary"
 
-    def __init__(self, server: "UrServer", connection: socket.socket) -> None:
-        super().__init__(server, connection)
+    def __init__(self, robot: Robot, connection: socket.socket, forget: Callable[["Client"], None]) -> None:
+        super().__init__(robot, connection, forget)
         self._can_write = self.robot.remote_control
         self._switches = self.robot.remote_switches
         self._every = self.robot.frequency_hz // primary.STATES_HZ
@@ -143,7 +141,7 @@ class PrimaryClient(Client):
                 self.robot.note("primary port", upload.text.strip())
                 command(self.robot)
             else:
-                self.robot.upload(upload, by="primary port")
+                start_upload(self.robot, upload, by="primary port")
 
     def on_cycle(self) -> None:
         """Send what has happened, and the state when it is due."""
@@ -163,8 +161,8 @@ class DashboardClient(Client):
 
     kind = "dashboard"
 
-    def __init__(self, server: "UrServer", connection: socket.socket) -> None:
-        super().__init__(server, connection)
+    def __init__(self, robot: Robot, connection: socket.socket, forget: Callable[["Client"], None]) -> None:
+        super().__init__(robot, connection, forget)
         self._switches = self.robot.remote_switches
         self._opened_remote = self.robot.remote_control
 

@@ -6,13 +6,10 @@ Only the wrist turns. The operator holds the arm above the sensor, which does no
 import math
 from collections.abc import Iterator
 from itertools import cycle
-from typing import TYPE_CHECKING
 
 from ftmocks.kinematics import Vector6
-from ftmocks.ur.script import Upload
-
-if TYPE_CHECKING:
-    from ftmocks.ur.robot import Robot
+from ftmocks.ur.robot import Robot
+from ftmocks.ur.uploads import Upload
 
 SPEED_RAD_S = 0.6
 ACCELERATION_RAD_S2 = 1.5
@@ -38,7 +35,7 @@ def orientations(q: Vector6) -> list[Vector6]:
     ]
 
 
-def guided_by_hand(robot: "Robot", rest_s: float) -> Iterator[None]:
+def guided_by_hand(robot: Robot, rest_s: float) -> Iterator[None]:
     """Move the arm through the `orientations` over and over and rest at each; one control cycle per `next`.
 
     The operator waits while the arm cannot be moved.
@@ -53,7 +50,7 @@ def guided_by_hand(robot: "Robot", rest_s: float) -> Iterator[None]:
             yield
 
 
-def pendant_program(robot: "Robot", rest_s: float) -> Upload:
+def pendant_program(robot: Robot, rest_s: float) -> Upload:
     """Return a program that visits the first `orientations`, returns to the first and rests at each."""
     first, *others = orientations(robot.arm.q)[:IN_A_PROGRAM]
     rest = f"  sleep({rest_s * robot.settings.time_scale})\n"

@@ -9,12 +9,13 @@ from ftmocks.ur import dashboard
 from ftmocks.ur.hand import REST_S, guided_by_hand, pendant_program
 from ftmocks.ur.modes import PERMITTED, RobotMode, Runtime, SafetyMode
 from ftmocks.ur.robot import INSTALLED_G_M_S2, Robot
-from ftmocks.ur.script import Upload
 from ftmocks.ur.server import UrServer
 from ftmocks.ur.swing import Swing, SwingProgram
+from ftmocks.ur.uploads import Upload, start_upload
 
 Request = dict[str, Any]
-Verb = Callable[[Request], dict[str, Any]]
+Verb = Callable[[Request], dict[str, Any] | None]
+"""Carries out a request; returns what there is to report of it."""
 
 FOREIGN_PROGRAM_S = 5.0
 FOREIGN_SPEED_RAD_S = 0.3
@@ -35,17 +36,17 @@ class Operator:
         self._robot = robot
         self._server = server
         self.verbs: dict[str, Verb] = {
-            "protective-stop": self._protective_stop,
-            "emergency-stop": self._emergency_stop,
-            "safeguard": self._safeguard,
-            "reduced": self._reduced,
+            "protective-stop": lambda _: robot.protective_stop("requested"),
+            "emergency-stop": lambda request: robot.emergency_stop(_on(request)),
+            "safeguard": lambda request: robot.safeguard_stop(_on(request)),
+            "reduced": lambda request: robot.reduced_mode(_on(request)),
             "mode": self._mode,
-            "unlock": lambda _request: self._pendant("unlock", "unlock protective stop"),
-            "play": lambda _request: self._pendant("play", "play"),
-            "dashboard-stop": self._dashboard_stop,
-            "crash-script": self._crash_script,
+            "unlock": lambda _: self._pendant("unlock protective stop"),
+            "play": lambda _: self._pendant("play"),
+            "dashboard-stop": lambda _: {"reply": dashboard.answer(robot, "stop", by="another dashboard client")},
+            "crash-script": lambda _: {"accepted": robot.crash("requested")},
             "foreign-program": self._foreign_program,
-            "close-popup": lambda _request: self._pendant("close-popup", "close popup"),
+            "close-popup": lambda _: self._pendant("close popup"),
             "hand-move": self._hand_move,
             "hand-guide": self._hand_guide,
             "pendant-program": self._pendant_program,
@@ -64,23 +65,7 @@ class Operator:
             "listen": self._listen,
             "claim-registers": self._claim_registers,
         }
-        """Requests by the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
-
-    def _protective_stop(self, _request: Request) -> dict[str, Any]:
-        self._robot.protective_stop("requested")
-        return {"done": "protective-stop"}
-
-    def _emergency_stop(self, request: Request) -> dict[str, Any]:
-        self._robot.emergency_stop(_on(request))
-        return {"done": "emergency-stop"}
-
-    def _safeguard(self, request: Request) -> dict[str, Any]:
-        self._robot.safeguard_stop(_on(request))
-        return {"done": "safeguard"}
-
-    def _reduced(self, request: Request) -> dict[str, Any]:
-        self._robot.reduced_mode(_on(request))
-        return {"done": "reduced"}
+        """By the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
 
     def _mode(self, request: Request) -> dict[str, Any]:
         robot = self._robot
@@ -97,16 +82,15 @@ class Operator:
             robot.protective_stop("requested")
         elif safety_mode is not None:
             robot.set_safety(safety_mode, "requested")
-        return {"done": "mode", "robot_mode": robot.robot_mode.name, "safety_mode": robot.safety_mode.name}
+        return {"robot_mode": robot.robot_mode.name, "safety_mode": robot.safety_mode.name}
 
-    def _pendant(self, done: str, command: str) -> dict[str, Any]:
+    def _pendant(self, command: str) -> dict[str, Any]:
         reply = dashboard.answer(self._robot, command, by="operator")
-        return {"done": done, "accepted": self._robot.events[-1].accepted, "reply": reply}
+        return {"accepted": self._robot.events[-1].accepted, "reply": reply}
 
-    def _slider(self, request: Request) -> dict[str, Any]:
+    def _slider(self, request: Request) -> None:
         self._robot.arm.speed_fraction = _fraction(request)
         self._robot.note("operator", "slider", why=f"{request['fraction']}")
-        return {"done": "slider"}
 
     def _remote_control(self, request: Request) -> dict[str, Any]:
         robot = self._robot
@@ -114,14 +98,13 @@ class Operator:
             raise ValueError("a CB-Series pendant has no local and remote control")
         robot.remote_control = _on(request)
         robot.note("operator", f"{'remote' if robot.remote_control else 'local'} control")
-        return {"done": "remote-control", "on": robot.remote_control}
+        return {"on": robot.remote_control}
 
-    def _set_tcp(self, request: Request) -> dict[str, Any]:
+    def _set_tcp(self, request: Request) -> None:
         self._robot.tcp_offset = vector6(request["tcp"])
         self._robot.note("operator", "set-tcp", tcp=list(self._robot.tcp_offset))
-        return {"done": "set-tcp"}
 
-    def _set_payload(self, request: Request) -> dict[str, Any]:
+    def _set_payload(self, request: Request) -> None:
         payload_kg = float(request["payload_kg"])
         if not 0.0 <= payload_kg < math.inf:
             raise ValueError(f"payload {payload_kg} kg")
@@ -130,9 +113,8 @@ class Operator:
             raise ValueError(f"centre of gravity {cog_m} m")
         self._robot.payload_kg, self._robot.payload_cog_m = payload_kg, cog_m
         self._robot.note("operator", "set-payload", payload_kg=payload_kg, payload_cog_m=list(cog_m))
-        return {"done": "set-payload"}
 
-    def _set_mounting(self, request: Request) -> dict[str, Any]:
+    def _set_mounting(self, request: Request) -> None:
         robot, up = self._robot, vector3(request["up"])
         length = math.hypot(*up)
         if not 0.0 < length < math.inf:
@@ -141,9 +123,8 @@ class Operator:
             raise ValueError(f"the installation cannot be changed: the program is {robot.runtime.name}")
         robot.target_gravity_m_s2 = vector3([INSTALLED_G_M_S2 * part / length for part in up])
         robot.note("operator", "set-mounting", target_gravity_m_s2=list(robot.target_gravity_m_s2))
-        return {"done": "set-mounting"}
 
-    def _push_joint(self, request: Request) -> dict[str, Any]:
+    def _push_joint(self, request: Request) -> None:
         joint, off_rad = int(request["joint"]), math.radians(request["off_deg"])
         if not (1 <= joint <= 6 and math.isfinite(off_rad)):
             raise ValueError(f"joint {joint} is not 1 to 6, or {off_rad} rad is no angle")
@@ -151,24 +132,21 @@ class Operator:
         pushed[joint - 1] = off_rad
         self._robot.arm.pushed_rad = vector6(pushed) if off_rad else ZERO6
         self._robot.note("operator", "push-joint", joint=joint, off_deg=request["off_deg"])
-        return {"done": "push-joint"}
 
-    def _hand_move(self, request: Request) -> dict[str, Any]:
+    def _hand_move(self, request: Request) -> None:
         q, speed_rad_s = vector6(request["q_rad"]), float(request.get("speed_rad_s", HAND_SPEED_RAD_S))
         if not (speed_rad_s > 0.0 and all(map(math.isfinite, q))):
             raise ValueError(f"expected six joint angles and a positive speed, got {list(q)} and {speed_rad_s}")
         self._robot.hand_move(q, speed_rad_s)
         self._robot.note("operator", "hand-move", q_rad=list(q))
-        return {"done": "hand-move"}
 
-    def _hand_guide(self, request: Request) -> dict[str, Any]:
+    def _hand_guide(self, request: Request) -> None:
         self._robot.hand = guided_by_hand(self._robot, _rest_s(request)) if _on(request) else None
         self._robot.note("operator", "hand-guide", on=_on(request))
-        return {"done": "hand-guide"}
 
     def _pendant_program(self, request: Request) -> dict[str, Any]:
-        accepted = self._robot.upload(pendant_program(self._robot, _rest_s(request)), by="operator")
-        return {"done": "pendant-program", "accepted": accepted}
+        accepted = start_upload(self._robot, pendant_program(self._robot, _rest_s(request)), by="operator")
+        return {"accepted": accepted}
 
     def _swing(self, request: Request) -> dict[str, Any]:
         robot = self._robot
@@ -176,14 +154,8 @@ class Operator:
         if not robot.arm.at_rest:
             raise ValueError("the arm moves: let it stand first")
         swing = Swing(robot.arm.dh, robot.arm.q, float(request["seconds"]), **limits)
-        accepted = robot.pendant_start(SwingProgram(robot, swing))
-        return {"done": "swing", "accepted": accepted, "seconds": swing.duration_s, "period_s": swing.period_s}
-
-    def _dashboard_stop(self, _request: Request) -> dict[str, Any]:
-        return {"done": "dashboard-stop", "reply": dashboard.answer(self._robot, "stop", by="another dashboard client")}
-
-    def _crash_script(self, _request: Request) -> dict[str, Any]:
-        return {"done": "crash-script", "accepted": self._robot.crash("requested")}
+        accepted = robot.start_soon(SwingProgram(robot, swing), by="operator", obstacle=robot.obstacle)
+        return {"accepted": accepted, "seconds": swing.duration_s, "period_s": swing.period_s}
 
     def _foreign_program(self, request: Request) -> dict[str, Any]:
         does = f"sleep({float(request.get('seconds', FOREIGN_PROGRAM_S))})"
@@ -191,19 +163,18 @@ class Operator:
             speed = float(request.get("speed_rad_s", FOREIGN_SPEED_RAD_S))
             does = f"movej({list(vector6(request['q_rad']))}, a=1.4, v={speed})"
         upload = Upload("other", f"def other():\n  {does}\nend\n", secondary=False)
-        accepted = self._robot.upload(upload, by="another script client")
-        return {"done": "foreign-program", "accepted": accepted}
+        accepted = start_upload(self._robot, upload, by="another script client")
+        return {"accepted": accepted}
 
-    def _speed_scaling(self, request: Request) -> dict[str, Any]:
+    def _speed_scaling(self, request: Request) -> None:
         self._robot.arm.scaling = _fraction(request)
-        return {"done": "speed-scaling"}
 
     def _freeze(self, request: Request) -> dict[str, Any]:
         self._server.frozen = _on(request)
         self._robot.note("network", "freeze", on=self._server.frozen)
-        return {"done": "freeze", "on": self._server.frozen}
+        return {"on": self._server.frozen}
 
-    def _silent(self, request: Request) -> dict[str, Any]:
+    def _silent(self, request: Request) -> None:
         what, on, answers = request["what"], _on(request), bool(request.get("answers", False))
         if answers and what != "rtde":
             raise ValueError(f"only rtde can answer without streaming, not {what!r}")
@@ -211,29 +182,26 @@ class Operator:
         if what == "rtde":
             self._server.streaming = not (on and answers)
         self._robot.note("network", f"silent {what}", on=on, answers=answers)
-        return {"done": "silent"}
 
-    def _silence_arm(self, request: Request) -> dict[str, Any]:
+    def _silence_arm(self, request: Request) -> None:
         for what in set(self._server.ports.values()):
             self._server.set_silent(what, _on(request))
         self._robot.note("network", "silence-arm", on=_on(request))
-        return {"done": "silence-arm"}
 
     def _drop(self, request: Request) -> dict[str, Any]:
         reset = bool(request.get("reset", False))
         self._robot.note("network", f"drop {request['what']}", reset=reset)
-        return {"done": "drop", "connections": self._server.drop(request["what"], reset=reset)}
+        return {"connections": self._server.drop(request["what"], reset=reset)}
 
-    def _listen(self, request: Request) -> dict[str, Any]:
+    def _listen(self, request: Request) -> None:
         self._server.set_listening(request["what"], _on(request))
         self._robot.note("network", f"listen {request['what']}", on=_on(request))
-        return {"done": "listen"}
 
-    def _claim_registers(self, request: Request) -> dict[str, Any]:
+    def _claim_registers(self, request: Request) -> None:
         first = {"lower": 0, "upper": 24}[request["range"]]
         names = {f"input_{kind}_register_{first + i}" for kind in ("int", "double") for i in range(24)}
-        self._server.claimed = self._server.claimed | names if _on(request) else self._server.claimed - names
-        return {"done": "claim-registers"}
+        link = self._server.rtde
+        link.claimed = link.claimed | names if _on(request) else link.claimed - names
 
 
 def _on(request: Request) -> bool:

@@ -13,15 +13,11 @@ import numpy as np
 
 from ftmocks.arrays import Array
 from ftmocks.kinematics import ZERO6, Dh, Vector3, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
+from ftmocks.ur.controller_program import ControllerProgram, Place, ScriptError, error_at
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Runtime, SafetyMode
 from ftmocks.ur.motion import Arm, CannotFollow, HandMove, MotionError
 from ftmocks.ur.rtde import Value
-from ftmocks.ur.script import STOP_SCRIPT, ControlScript, Upload
-from ftmocks.ur.swing import SwingProgram
-from ftmocks.ur.urscript.program import Program
-from ftmocks.ur.urscript.syntax import Place, UrscriptSyntaxError
-from ftmocks.ur.urscript.values import ScriptError
 from ftmocks.world import World
 
 UNLOCK_AFTER_S = 5.0
@@ -29,11 +25,11 @@ STEADY_AFTER_S = 0.5
 PROGRAM_START_S = 0.1
 POWER_STEP_S = 0.5
 COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
+STOP_SCRIPT = 255
+"""The command in such a register that ends the control script."""
 HAND_ACCELERATION_RAD_S2 = 1.5
 INSTALLED_G_M_S2 = 9.82
 """Gravity in an installation, wherever on earth."""
-
-AnyProgram = ControlScript | Program | SwingProgram
 
 
 @dataclass(frozen=True)
@@ -142,7 +138,7 @@ class Robot:
         """The operator who guides the arm by hand; one `next` per control cycle."""
         self._remote_control = True
         self._reduced = False
-        self._program: AnyProgram | None = None
+        self._program: ControllerProgram | None = None
         self.popup: str | None = None
         """Text of the popup that a program shows, until the operator closes it."""
         self.wrist_sensor: Callable[[int], Array] | None = None
@@ -244,43 +240,15 @@ class Robot:
             return f"safety mode {self.safety_mode.name}"
         return self.arm.obstacle
 
-    def upload(self, upload: Upload, *, by: str = "script port") -> bool:
-        """Accept a program from a client, which replaces the running one; return False when it is refused."""
-        if upload.secondary:
-            self.note(by, f"secondary program {upload.name}", accepted=False, why="not interpreted")
-            return False
-        obstacle = self.obstacle if self.remote_control else "local control"
-        program: ControlScript | Program | None = None
-        detail: dict[str, Any] = {}
-        try:
-            program = self._program_of(upload)
-        except UrscriptSyntaxError as error:
-            obstacle = obstacle or f"syntax error: {error}"
-            detail = _exception(error.report, error.place)
-        self.note(by, f"program {upload.name}", accepted=obstacle is None, why=obstacle or "", **detail)
-        if obstacle or program is None:
-            return False
-        self._start_soon(program)
-        return True
-
-    def pendant_start(self, program: SwingProgram) -> bool:
-        """Start a program of the operator, which replaces the running one; return False when it is refused."""
-        obstacle = self.obstacle
-        self.note("operator", f"program {program.name}", accepted=obstacle is None, why=obstacle or "")
+    def start_soon(self, program: ControllerProgram, *, by: str, obstacle: str | None, **detail: Any) -> bool:
+        """Start a program, which replaces the running one, unless an obstacle refuses it; return whether it starts."""
+        self.note(by, f"program {program.name}", accepted=obstacle is None, why=obstacle or "", **detail)
         if obstacle is None:
-            self._start_soon(program)
+            self.stop_program("replaced")
+            self._after(PROGRAM_START_S, lambda: self._start(program))
         return obstacle is None
 
-    def _start_soon(self, program: AnyProgram) -> None:
-        self.stop_program("replaced")
-        self._after(PROGRAM_START_S, lambda: self._start(program))
-
-    def _program_of(self, upload: Upload) -> ControlScript | Program:
-        if upload.is_control_script:
-            return ControlScript(self, upload.register_offset("int"), upload.register_offset("float"))
-        return Program(self, upload.name, upload.text)
-
-    def _start(self, program: AnyProgram) -> None:
+    def _start(self, program: ControllerProgram) -> None:
         if self.obstacle is not None:
             self.note("program", f"started {program.name}", accepted=False, why=self.obstacle)
             return
@@ -293,8 +261,8 @@ class Robot:
 
     def crash(self, error: str) -> bool:
         """End the program with a run-time error, which is logged with its place; return False when there was none."""
-        place = self._program.place if isinstance(self._program, Program) else Place()
-        return self.stop_program(f"run-time error: {error}", **_exception(error, place))
+        place = Place() if self._program is None else self._program.place
+        return self.stop_program(f"run-time error: {error}", **error_at(place, error))
 
     def stop_program(self, reason: str, **detail: Any) -> bool:
         """End the program; a moving arm comes to rest by itself. Return False when there was none."""
@@ -329,7 +297,7 @@ class Robot:
             return True
         if self.loaded_program is None or self.runtime == Runtime.PLAYING:
             return False
-        self._start(Program(self, self.loaded_program, ""))
+        self._start(ControllerProgram(self.loaded_program))
         return True
 
     @property
@@ -461,7 +429,8 @@ class Robot:
         """Log a command that no program will read."""
         for name in COMMAND_REGISTERS & fields.keys():
             command = fields[name]
-            listening = self.runtime == Runtime.PLAYING and isinstance(self._program, ControlScript)
+            reader = self._program if self.runtime == Runtime.PLAYING else None
+            listening = reader is not None and reader.reads_registers
             if not listening and command not in (0, STOP_SCRIPT, self.inputs.get(name)):
                 why = f"no control script reads it: {self.runtime.name} {self.program_name}"
                 self.note("rtde", f"command {command}", accepted=False, why=why)
@@ -552,8 +521,3 @@ class Robot:
         weight = R.T @ np.array(self.target_gravity_m_s2) * -self.payload_kg
         rest: Array = self.flange_wrench() - np.concatenate((weight, cross(self.payload_cog_m, weight)))
         return rest
-
-
-def _exception(text: str, place: Place) -> dict[str, Any]:
-    """Return what the event log keeps of an error in a program."""
-    return {"error": text, "line": place.line, "column": place.column}

@@ -3,14 +3,26 @@
 import socket
 import struct
 from collections import deque
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 from ftmocks.ur import dashboard, rtde
 from ftmocks.ur.clients import Client
+from ftmocks.ur.robot import Robot
 from ftmocks.ur.variables import INPUTS, OUTPUTS, Reader, output_type
 
-if TYPE_CHECKING:
-    from ftmocks.ur.server import UrServer
+
+@dataclass
+class RtdeLink:
+    """What all RTDE clients of a controller share."""
+
+    input_owners: dict[str, "RtdeClient"] = field(default_factory=dict)
+    claimed: set[str] = field(default_factory=set)
+    """Input variables that a fieldbus holds, without those a client had before."""
+    bad_inputs: list[str] = field(default_factory=list)
+    """Packages that break the protocol."""
+    delay_s: float = 0.0
+    """Time between the cycle in which a sample is taken and its sending."""
 
 
 class RtdeClient(Client):
@@ -18,8 +30,11 @@ class RtdeClient(Client):
 
     kind = "rtde"
 
-    def __init__(self, server: "UrServer", connection: socket.socket) -> None:
-        super().__init__(server, connection)
+    def __init__(
+        self, robot: Robot, connection: socket.socket, forget: Callable[[Client], None], link: RtdeLink
+    ) -> None:
+        super().__init__(robot, connection, forget)
+        self._link = link
         self._outputs: rtde.Recipe | None = None
         self._readers: list[Reader] = []
         self._every = 1
@@ -29,19 +44,26 @@ class RtdeClient(Client):
         """Samples on their way, and when each is sent, on the cell's clock."""
         self._last = b""
 
+    def close(self, *, reset: bool = False) -> None:
+        """Close the connection; its input variables are free again."""
+        super().close(reset=reset)
+        owned = [name for name, owner in self._link.input_owners.items() if owner is self]
+        for name in owned:
+            del self._link.input_owners[name]
+
     def on_bytes(self, buffer: bytearray) -> None:
         """Answer every complete package."""
         try:
             for kind, payload in rtde.take_packages(buffer):
                 self._on_package(kind, payload)
         except rtde.RtdeError as error:
-            self.server.reject(str(error))
+            self._link.bad_inputs.append(str(error))
             self.close()
 
     def sample(self) -> None:
         """Take the outputs if this cycle is due; they are sent after the delay of the link."""
         if self._started and self.robot.cycle % self._every == 0 and self._outputs is not None:
-            self._outbox.append((self.robot.cycle_s + self.server.delay_s, self._packed(self._outputs)))
+            self._outbox.append((self.robot.cycle_s + self._link.delay_s, self._packed(self._outputs)))
 
     def _packed(self, outputs: rtde.Recipe) -> bytes:
         return outputs.pack([read(self.robot) for read in self._readers])
@@ -84,14 +106,14 @@ class RtdeClient(Client):
         elif kind == rtde.DATA:
             self._take_inputs(payload)
         elif kind != rtde.TEXT:
-            self.server.reject(f"package type {kind}")
+            self._link.bad_inputs.append(f"package type {kind}")
 
     def _reply(self, kind: int, payload: bytes) -> None:
         self.send(rtde.package(kind, payload))
 
     def _set_up_outputs(self, payload: bytes) -> None:
         if len(payload) < 8:
-            self.server.reject(f"output setup of {len(payload)} bytes")
+            self._link.bad_inputs.append(f"output setup of {len(payload)} bytes")
             return
         (frequency_hz,) = struct.unpack_from(">d", payload)
         names = rtde.names_in(payload[8:])
@@ -104,11 +126,11 @@ class RtdeClient(Client):
 
     def _set_up_inputs(self, payload: bytes) -> None:
         names = rtde.names_in(payload)
-        owners = self.server.input_owners
+        owners = self._link.input_owners
         types = []
         for name in names:
             owner = owners.get(name)
-            taken = owner is not self and (owner is not None or name in self.server.claimed)
+            taken = owner is not self and (owner is not None or name in self._link.claimed)
             types.append("IN_USE" if taken else INPUTS.get(name, "NOT_FOUND"))
         recipe = rtde.Recipe(len(self._inputs) + 1, names, types)
         self._inputs.append(recipe)
@@ -119,11 +141,11 @@ class RtdeClient(Client):
     def _take_inputs(self, payload: bytes) -> None:
         recipe_id = payload[0] if payload else 0
         if not 1 <= recipe_id <= len(self._inputs) or not self._inputs[recipe_id - 1].valid:
-            self.server.reject(f"data for unknown input recipe {recipe_id}")
+            self._link.bad_inputs.append(f"data for unknown input recipe {recipe_id}")
             return
         recipe = self._inputs[recipe_id - 1]
         size = len(payload) - 1
         if size != recipe.size:
-            self.server.reject(f"{size} bytes of data for input recipe {recipe_id}, which has {recipe.size}")
+            self._link.bad_inputs.append(f"{size} bytes of data for input recipe {recipe_id}, which has {recipe.size}")
         if size >= recipe.size:
             self.robot.write_inputs(recipe.unpack(payload[1:]))

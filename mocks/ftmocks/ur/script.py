@@ -1,28 +1,23 @@
-"""Programs from the script port, and a behavioural twin of the ur_rtde control script.
+"""A behavioural twin of the ur_rtde control script.
 
-The script port takes URScript text. The control script of ur_rtde is recognised by its name and not interpreted: this
-twin runs instead, one step per control cycle, with the same loop, registers and blocking behaviour. Any other program
-is run as it stands, by `ftmocks.ur.urscript.program`.
+The control script is recognised by its name and not interpreted: this twin runs instead, one step per control cycle,
+with the same loop, registers and blocking behaviour.
 
 Source: the control script inside ur_rtde 1.6.5 (`ScriptClient.getScript()`), read for behaviour.
 """
 
 import math
-import re
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from ftmocks.arrays import Array
-from ftmocks.kinematics import Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of
+from ftmocks.kinematics import Vector6, forward, inverse, inverse_matrix, matrix_of, pose_of, vector6
+from ftmocks.ur.controller_program import ControllerProgram, ScriptError
 from ftmocks.ur.motion import JointMove, LineMove, Path
-from ftmocks.ur.urscript.values import ScriptError
+from ftmocks.ur.robot import STOP_SCRIPT, Robot
 
-if TYPE_CHECKING:
-    from ftmocks.ur.robot import Robot
-
+NAME = "rtde_control"
+"""By which its upload is recognised."""
 READY, DONE = 1, 2
-STOP_SCRIPT = 255
 REALTIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
 """Commands executed in every cycle as long as the register holds their number."""
 
@@ -36,50 +31,7 @@ Steps = Generator[None, None, None]
 """A thread of a program: one `next()` is one control cycle."""
 
 
-@dataclass(frozen=True)
-class Upload:
-    """One program from the script port."""
-
-    name: str
-    text: str
-    secondary: bool
-
-    @property
-    def is_control_script(self) -> bool:
-        """Whether the twin knows this program."""
-        return self.name == "rtde_control"
-
-    def register_offset(self, kind: str) -> int:
-        """First register of `kind` (int or float) that the script uses: 0 or 24."""
-        found = re.search(rf"# {kind} register offset\s*\n(\d+)", self.text)
-        return int(found.group(1)) if found else 0
-
-
-def take_uploads(buffer: bytearray) -> list[Upload]:
-    """Remove every complete program from `buffer`.
-
-    A program reaches from ``def`` or ``sec`` to the first ``end`` in column 0; a line of its own outside of one is a
-    program too.
-    """
-    uploads: list[Upload] = []
-    while True:
-        text = buffer.decode("latin-1")  # one character per byte
-        head = re.match(r"\s*(def|sec)\s+(\w+)\s*\([^)]*\)\s*:[^\n]*\n", text)
-        if head:
-            whole = re.compile(r"^end\b[^\n]*\n", re.MULTILINE).search(text, head.end())
-            if whole is None:
-                return uploads
-            end, name, secondary = whole.end(), head.group(2), head.group(1) == "sec"
-        else:
-            end, name, secondary = text.find("\n") + 1, "statement", False
-            if end == 0 or re.match(r"\s*(def|sec)\b[^\n]*$", text):
-                return uploads
-        if text[:end].strip() and not text[:end].lstrip().startswith("#"):
-            uploads.append(Upload(name, text[:end], secondary))
-        del buffer[:end]
-
-
-class ControlScript:
+class ControlScript(ControllerProgram):
     """Register machine with the behaviour of the ur_rtde control script.
 
     Parameters
@@ -90,9 +42,10 @@ class ControlScript:
         First general purpose registers in use.
     """
 
-    name = "rtde_control"
+    reads_registers = True
 
-    def __init__(self, robot: "Robot", int_offset: int = 0, double_offset: int = 0) -> None:
+    def __init__(self, robot: Robot, int_offset: int = 0, double_offset: int = 0) -> None:
+        super().__init__(NAME)
         self._robot = robot
         self._int_offset, self._double_offset = int_offset, double_offset
         self._threads: dict[str, Steps] = {}
@@ -109,7 +62,7 @@ class ControlScript:
             20: self._accept,
             21: self._accept,
             26: self._step_time,
-            28: self._target_waypoint,
+            28: lambda: self._write_pose(forward(robot.arm.dh, robot.arm.q) @ robot.X_flange_tcp),
             29: self._set_tcp,
             30: lambda: self._write_vector(self._inverse_kin(qnear=self._vector(6))),
             31: self._protective_stop,
@@ -201,8 +154,7 @@ class ControlScript:
         return value
 
     def _vector(self, first: int) -> Vector6:
-        a, b, c, d, e, f = (self._read(first + i) for i in range(6))
-        return (a, b, c, d, e, f)
+        return vector6([self._read(first + i) for i in range(6)])
 
     def _write_int(self, index: int, value: int) -> None:
         self._robot.output_ints[index + self._int_offset] = value
@@ -314,23 +266,16 @@ class ControlScript:
         q = self._solve(self._robot.arm.actual_q)
         self._write_flag(q is not None and self._robot.limits.allow(q, self._robot.X_flange_tcp))
 
-    def _target_waypoint(self) -> None:
-        self._write_pose(forward(self._robot.arm.dh, self._robot.arm.q) @ self._robot.X_flange_tcp)
-
     def _set_payload(self) -> None:
         self._robot.payload_kg = self._read(0)
-        self._set_cog()
-
-    def _set_target_payload(self) -> None:
-        self._set_payload()
-        a, b, c, d, e, f = (self._read(4 + i) for i in range(6))
-        self._robot.payload_inertia = (a, b, c, d, e, f)
-        self._robot.zero_ft()
-
-    def _set_cog(self) -> None:
         cog = (self._read(1), self._read(2), self._read(3))
         if any(cog):  # all zero keeps the old one: a special case of the script
             self._robot.payload_cog_m = cog
+
+    def _set_target_payload(self) -> None:
+        self._set_payload()
+        self._robot.payload_inertia = self._vector(4)
+        self._robot.zero_ft()
 
     def _set_tcp(self) -> None:
         self._robot.tcp_offset = self._vector(0)

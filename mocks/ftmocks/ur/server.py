@@ -12,7 +12,7 @@ from ftmocks.clock import time_out_s
 from ftmocks.ur import api
 from ftmocks.ur.clients import ApiClient, Client, DashboardClient, PrimaryClient, ScriptClient
 from ftmocks.ur.robot import Robot
-from ftmocks.ur.rtde_client import RtdeClient
+from ftmocks.ur.rtde_client import RtdeClient, RtdeLink
 
 PORTS = {30001: "primary", 30002: "script", 30003: "script", 30004: "rtde"}
 DASHBOARD_PORT = 29999
@@ -26,9 +26,8 @@ After 2.5 s without a sample ur_rtde reconnects, stops the running program and u
 """
 
 Select = selectors.BaseSelector
-CLIENTS: dict[str, type[Client]] = {
-    c.kind: c for c in (ScriptClient, PrimaryClient, DashboardClient, RtdeClient, ApiClient)
-}
+CLIENTS: dict[str, type[Client]] = {c.kind: c for c in (ScriptClient, PrimaryClient, DashboardClient, ApiClient)}
+"""Those without RTDE."""
 
 
 def _ports_of(polyscope: tuple[int, int, int]) -> dict[int, str]:
@@ -59,17 +58,11 @@ class UrServer:
     def __init__(self, robot: Robot, host: str, selector: Select) -> None:
         self.robot = robot
         self.host = host
-        self.input_owners: dict[str, RtdeClient] = {}
-        self.claimed: set[str] = set()
-        """Input variables that a fieldbus holds, without those a client had before."""
-        self.bad_inputs: list[str] = []
-        """Packages that break the protocol."""
+        self.rtde = RtdeLink()
         self.frozen = False
         """While true no cycle runs and no byte is read or sent, but connections stay."""
         self.streaming = True
         """While false RTDE clients are answered, but get no samples."""
-        self.delay_s = 0.0
-        """Time between the cycle in which a sample is taken and its sending."""
         self.ports = {**PORTS, **_ports_of(robot.settings.polyscope)}
         """Kind of client by port."""
         self._silent: set[str] = set()
@@ -105,7 +98,11 @@ class UrServer:
             return  # gone again
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        client = CLIENTS[kind](self, connection)
+        client: Client
+        if kind == RtdeClient.kind:
+            client = RtdeClient(self.robot, connection, self._forget, link=self.rtde)
+        else:
+            client = CLIENTS[kind](self.robot, connection, self._forget)
         self._clients.append(client)
         self.robot.note(kind, "connected")
         if kind not in self._silent:
@@ -117,17 +114,12 @@ class UrServer:
             client.greeted = True
             client.send(client.greeting())
 
-    def forget(self, client: Client) -> None:
-        """Remove a client whose connection has ended; its input variables are free again."""
+    def _forget(self, client: Client) -> None:
+        """Remove a client whose connection has ended."""
         if client in self._selector.get_map():
             self._selector.unregister(client)
         self._clients.remove(client)
-        self.input_owners = {name: owner for name, owner in self.input_owners.items() if owner is not client}
         self.robot.note(client.kind, "disconnected")
-
-    def reject(self, what: str) -> None:
-        """Note a package that breaks the protocol."""
-        self.bad_inputs.append(what)
 
     def drop(self, kind: str, *, reset: bool = False) -> int:
         """Disconnect all clients of a kind (see `ports`); the port still listens."""

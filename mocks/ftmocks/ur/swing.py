@@ -2,15 +2,13 @@
 
 import math
 from collections.abc import Generator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ftmocks.arrays import Array
 from ftmocks.kinematics import Dh, JointState, Vector6, flange_motion, vector6
-
-if TYPE_CHECKING:
-    from ftmocks.ur.robot import Robot
+from ftmocks.ur.controller_program import ControllerProgram
+from ftmocks.ur.robot import Robot
 
 SPEED_RAD_S = 1.0
 ACCELERATION_RAD_S2 = 2.0
@@ -108,12 +106,11 @@ class Swing:
         return peaks
 
 
-class SwingProgram:
+class SwingProgram(ControllerProgram):
     """The program on the pendant that follows a `Swing`, as the controller runs programs."""
 
-    name = "swing"
-
-    def __init__(self, robot: "Robot", swing: Swing) -> None:
+    def __init__(self, robot: Robot, swing: Swing) -> None:
+        super().__init__("swing")
         self._steps = self._run(robot, swing)
 
     def step(self) -> bool:
@@ -124,6 +121,6 @@ class SwingProgram:
         """End the program; a moving arm comes to rest."""
         self._steps.close()
 
-    def _run(self, robot: "Robot", swing: Swing) -> Generator[None, None, None]:
+    def _run(self, robot: Robot, swing: Swing) -> Generator[None, None, None]:
         robot.arm.start(swing, self.name)
         yield from robot.arm.until_finished(self.name)

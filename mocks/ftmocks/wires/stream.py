@@ -1,9 +1,10 @@
-"""The two sorts of pseudo-terminal sensors: on a serial line, and on a CAN bus behind an adapter."""
+"""The sorts of pseudo-terminal sensors: on a serial line, there with Modbus too, and on a CAN bus behind an adapter."""
 
 import random
 from abc import abstractmethod
 from dataclasses import KW_ONLY, dataclass
 
+from ftmocks.wires import modbus
 from ftmocks.wires.pty import PtyDevice
 from ftmocks.wires.slcan import CanFrame, SlcanAdapter
 
@@ -13,6 +14,42 @@ class SerialSensor(PtyDevice[bytes]):
 
     def _encode(self, frames: list[bytes]) -> bytes:
         return b"".join(frames)
+
+
+class ModbusSensor(SerialSensor):
+    """A sensor that answers Modbus RTU, where a pause ends a request; while it streams, it answers nothing."""
+
+    address = 0
+    frame_gap_s = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._burst = bytearray()
+        """What came since the last pause; no more than shows that it is too long for a frame."""
+        self._last_byte_s = 0.0
+
+    @abstractmethod
+    def _execute(self, function: int, data: bytes) -> bytes:
+        """Carry out a request and return the data of the reply, as in `modbus.reply`."""
+
+    def _remember(self, data: bytes) -> None:
+        self._burst += data[: modbus.LONGEST_FRAME + 1 - len(self._burst)]
+
+    def _work(self, now_s: float) -> float | None:
+        """Answer what came before a pause; return the seconds until the pause is long enough."""
+        if self.streaming or not self._burst:
+            return None
+        wait_s = self._last_byte_s + self.frame_gap_s - now_s
+        if wait_s > 0:
+            return wait_s
+        answer = self._reply(bytes(self._burst))
+        self._burst.clear()
+        if answer:
+            self._wire.put([answer])
+        return None
+
+    def _reply(self, frame: bytes) -> bytes:
+        return modbus.reply(self.address, frame, self._execute)
 
 
 @dataclass(eq=False)

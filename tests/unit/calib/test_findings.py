@@ -74,6 +74,30 @@ def test_wrong_findings_are_refused() -> None:
         Finding("few_poses", "fatal", {})  # type: ignore[arg-type]  # the point of the test
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"code": ["few_poses"]},
+        {"severity": "fatal"},
+        {"severity": {}},
+        {"values": None},
+        {"values": [1]},
+        {"values": {}},
+        {"code": "constant_force", "values": {"force_N": "x"}},
+    ],
+)
+def test_a_damaged_finding_is_refused_when_it_is_read(change: dict[str, object]) -> None:
+    document = Finding.of("few_poses", n_poses=5, recommended=6).to_dict() | change
+    with pytest.raises(ValueError, match=r"^finding "):
+        Finding.from_dict(document)
+
+
+@pytest.mark.parametrize("document", [None, 3, "few_poses", [], {}])
+def test_what_is_no_finding_is_refused(document: object) -> None:
+    with pytest.raises(ValueError, match=r"^finding "):
+        Finding.from_dict(document)  # type: ignore[arg-type]  # the point of the test
+
+
 def test_causes_come_first_notes_last_and_the_worst_gives_the_verdict() -> None:
     def of(code: str, severity: Severity) -> Finding:
         return Finding(code, severity, dict.fromkeys(CODES[code].values, 0))

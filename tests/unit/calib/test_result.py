@@ -163,6 +163,84 @@ def test_a_file_that_is_something_else_is_named_in_one_sentence(tmp_path: Path, 
     assert str(caught.value).count("c.json") == 1
 
 
+def with_a_changed_bias(path: Path) -> dict[str, Any]:
+    """Write a file whose force bias is 6 N larger along z; return what it holds."""
+    document = json.loads(path.read_text())
+    document["force_bias_N"][2] += 6.0
+    path.write_text(json.dumps(document))
+    return dict(document)
+
+
+def test_a_file_whose_numbers_are_not_those_of_its_id_is_refused_or_marked(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    RESULT.save(path)
+    document = with_a_changed_bias(path)
+    for names in ((), ("checksum",), ("id",)):  # each of both reveals it
+        path.write_text(json.dumps({name: value for name, value in document.items() if name not in names}))
+        with pytest.raises(BadCalibration, match=r"c\.json: .*not that of calibration .* edited.*--force"):
+            CalibrationResult.load(path)
+        edited = CalibrationResult.load(path, accept_edited=True)
+        assert edited.is_edited
+        assert edited.force_bias_N[2] == RESULT.force_bias_N[2] + 6.0
+    edited.save(tmp_path / "again.json")
+    assert CalibrationResult.load(tmp_path / "again.json").is_edited
+    assert CalibrationResult.load(tmp_path / "again.json").id != RESULT.id
+    assert not RESULT.is_edited
+
+
+def test_what_the_id_does_not_cover_is_covered_by_the_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    RESULT.save(path)
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps(document | {"findings": [], "verdict": "good"}))
+    assert RESULT.verdict != "good"
+    with pytest.raises(BadCalibration, match="edited"):
+        CalibrationResult.load(path)
+
+
+def test_a_verdict_unlike_its_findings_is_refused_or_follows_them() -> None:
+    better = RESULT.to_dict() | {"verdict": "good"}
+    assert RESULT.verdict != "good"
+    with pytest.raises(BadCalibration, match="edited"):
+        CalibrationResult.from_dict(better)
+    edited = CalibrationResult.from_dict(better, accept_edited=True)
+    assert edited.is_edited
+    assert edited.verdict == RESULT.verdict
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"method": 5},
+        {"noise_source": None},
+        {"components": [1]},
+        {"findings": None},
+        {"findings": [5]},
+        {"findings": [{"code": "constant_force", "severity": "limit", "values": {"force_N": "x"}}]},
+    ],
+)
+def test_an_unknown_word_is_one_sentence(change: dict[str, Any]) -> None:
+    with pytest.raises(BadCalibration, match="cannot be read"):
+        CalibrationResult.from_dict({**RESULT.to_dict(), **change})
+
+
+def test_a_flipped_bit_is_refused_or_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "c.json"
+    RESULT.save(path)
+    content, rng, refused = path.read_bytes(), np.random.default_rng(1), 0
+    for place in rng.integers(0, len(content), 100).tolist():
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            found = CalibrationResult.load(path)
+        except BadCalibration:
+            refused += 1
+        else:
+            assert found.to_dict() == RESULT.to_dict()
+    assert refused > 50
+
+
 def test_provenance_must_be_writable() -> None:
     with pytest.raises(ValueError, match="provenance cannot be written"):
         solve(DATA, provenance={"x": object()})

@@ -130,7 +130,7 @@ def test_mistakes_are_named(url: str, message: str) -> None:
 ACME = """
 import time
 import numpy as np
-from ftdrivers.interfaces import ArmStatus, DeviceInfo, Finding, FtSamples
+from ftdrivers.interfaces import ArmStatus, DeviceInfo, Diagnosis, FtSamples
 from ftdrivers.streaming import StreamingSensor
 from ftdrivers.ur.arm import UrArm
 
@@ -168,7 +168,7 @@ class Arm(UrArm):
         return None
 
     def diagnose(self):
-        return [Finding("brakes", False, "a brake is worn", "call Acme")]
+        return [Diagnosis("brakes", False, "a brake is worn", "call Acme")]
 
     def status(self):
         now_ns = time.monotonic_ns()

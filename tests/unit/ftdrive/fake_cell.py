@@ -25,7 +25,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
 from ftdrive.runs.outcome import Outcome
 from ftdrive.runs.run import Run
-from ftdrive.session import session, task
+from ftdrive.session import along_plan, session, task
 from ftdrive.session.events import (
     Event,
     Noted,
@@ -33,8 +33,11 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
+from ftdrive.session.guards import Limits
+from ftdrive.session.journal import Journal
+from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key, Question
-from ftdrive.session.session import Options
+from ftdrive.session.options import SessionOptions
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceFault
@@ -384,7 +387,7 @@ class Lab:
         monkeypatch.setattr(session, "build_sensor", lambda _: self.sensor)
         monkeypatch.setattr(task, "plan_for", planned_once)
         monkeypatch.setattr("ftcalib.poses.information.second_minimum", second_minimum_once)
-        monkeypatch.setattr(session, "Watcher", self._watcher)
+        monkeypatch.setattr(along_plan, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
         monkeypatch.setattr("os.fsync", lambda _: None)  # the disk may be slow
 
@@ -397,8 +400,11 @@ class Lab:
         """Whether what happens now happens in a look of the guards."""
         return any(watcher.looking for watcher in self.watchers)
 
+    def open_cell(self) -> OpenCell:
+        return OpenCell(self.arm, self.sensor, self.clock, Journal(self.operator), Limits())
+
     def calibrate(self, **options: Any) -> Outcome | None:
-        return session.calibrate(self.cell, self.operator, Options(self.folder / "runs", poses=6, **options))
+        return session.calibrate(self.cell, self.operator, SessionOptions(self.folder / "runs", poses=6, **options))
 
     def run(self) -> Run:
         (folder,) = (self.folder / "runs").iterdir()

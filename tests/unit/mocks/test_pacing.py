@@ -13,7 +13,7 @@ from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.ati_serial import AtiSerialBox
 from ftmocks.sensors.bota import BANNER, BotaBox
 from ftmocks.sensors.netft import RECORD, Command, NetFtBox
-from ftmocks.sensors.robotiq import FRAME_GAP_S, RobotiqBox
+from ftmocks.sensors.robotiq import RobotiqBox
 from ftmocks.sensors.robotous import RobotousCanNode, RobotousSerialBox
 from ftmocks.wires.device import Pacer
 from ftmocks.wires.faults import Faults
@@ -144,11 +144,11 @@ def test_a_slow_line_streams_what_fits() -> None:
 def test_the_pause_before_a_frame_ends_it() -> None:
     bench = Bench(lambda **options: RobotiqBox(still, **options))
     bench.device._received(FT300_READ[:3])
-    bench.run(0.9 * FRAME_GAP_S, FRAME_GAP_S / 10)
+    bench.run(0.9 * RobotiqBox.frame_gap_s, RobotiqBox.frame_gap_s / 10)
     bench.device._received(FT300_READ[3:])
-    bench.run(0.9 * FRAME_GAP_S, FRAME_GAP_S / 10)
+    bench.run(0.9 * RobotiqBox.frame_gap_s, RobotiqBox.frame_gap_s / 10)
     assert bench.sent_bytes == 0, "the frame may go on"
-    bench.run(0.2 * FRAME_GAP_S, FRAME_GAP_S / 10)
+    bench.run(0.2 * RobotiqBox.frame_gap_s, RobotiqBox.frame_gap_s / 10)
     assert bench.sent_bytes == 17
 
 

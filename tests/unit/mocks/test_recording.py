@@ -10,7 +10,7 @@ from ftmocks.disturbances import Push
 from ftmocks.kinematics import MODELS, forward
 from ftmocks.recording import COLUMNS, RecordedArm, RecordedWorld, Recording
 from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.script import Upload
+from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.world import Truth
 from tests.unit.mocks.real_time import RealTime
 
@@ -82,7 +82,7 @@ def test_the_arm_has_the_recorded_joints_and_takes_no_command() -> None:
         assert robot.arm.actual_q[5] == pytest.approx(HOME[5] + 0.5 * 0.002 * k, abs=1e-12)
         assert robot.arm.actual_qd[5] == pytest.approx(0.5)
     np.testing.assert_allclose(robot.tcp_pose("actual")[:3], forward(DH, robot.arm.actual_q)[:3, 3])
-    assert not robot.upload(Upload("other", "def other():\n  sleep(1)\nend\n", secondary=False))
+    assert not start_upload(robot, Upload("other", "def other():\n  sleep(1)\nend\n", secondary=False))
     assert "follows a recording" in robot.events[-1].why
     with pytest.raises(ValueError, match="follows a recording"):
         robot.hand_move(robot.arm.q, 0.3)

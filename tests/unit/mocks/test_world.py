@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftmocks.clock import CellClock
-from ftmocks.disturbances import Cable, Drift, Push
+from ftmocks.disturbances import Cable, Push, SensorDrift
 from ftmocks.kinematics import MODELS, Vector6, forward, inverse, matrix_of, vector6
 from ftmocks.world import Truth, World
 from tests.unit.mocks.real_time import RealTime
@@ -156,7 +156,7 @@ def test_a_drift_is_linear_and_ends_at_its_total() -> None:
     real = RealTime()
     world = World(plain(), DH, POSTURE, clock=CellClock(real))
     before = world.true_wrench()
-    world.drifts += (Drift(np.array([0.5, 0, 0, 0, 0, 0.02]), world.now_s, 10.0),)
+    world.drifts += (SensorDrift(np.array([0.5, 0, 0, 0, 0, 0.02]), world.now_s, 10.0),)
     for later_s, share in ((0, 0.0), (5, 0.5), (5, 1.0), (50, 1.0)):
         real.pass_s(later_s)
         change = world.true_wrench() - before

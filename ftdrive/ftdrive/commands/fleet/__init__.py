@@ -2,7 +2,6 @@
 
 import click
 
-from ftdrive.commands.fleet.accuracy import accuracy
 from ftdrive.commands.fleet.add import add
 from ftdrive.commands.fleet.compensate import compensate
 from ftdrive.commands.fleet.index import index
@@ -24,6 +23,5 @@ fleet.add_command(index)
 fleet.add_command(status)
 fleet.add_command(solve)
 fleet.add_command(compensate)
-fleet.add_command(accuracy)
 fleet.add_command(verify)
 fleet.add_command(serve)

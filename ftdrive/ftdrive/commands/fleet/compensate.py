@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import FRAME, JSON, read_frame, write_json
+from ftdrive.commands.common import FORCE, FRAME, JSON, read_frame, write_json
 from ftdrive.commands.compensate import BIAS, CALIBRATION
 from ftdrive.commands.fleet.engine import ENGINE, open_workers, with_progress
 from ftdrive.terminal.text import echo
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     help="For the results; it is created if it is missing.",
 )
 @CALIBRATION
+@FORCE
 @BIAS
 @FRAME
 @ENGINE
@@ -37,6 +38,7 @@ def compensate(
     paths: Sequence[Path],
     folder: Path,
     calibration: Path | None,
+    force: bool,
     bias: str,
     axes: "Axes",
     about: str,
@@ -58,7 +60,7 @@ def compensate(
     recordings = recordings_of(paths)
     require_own_results(recordings, folder)
     _mention_incomplete(paths)
-    task = task_of(calibration, read_frame(axes, about), bias)
+    task = task_of(calibration, read_frame(axes, about), bias, accept_edited=force)
     left = [one for one in recordings if not (folder / one.name).exists()]
     report = _Report(recordings=len(recordings), before=len(recordings) - len(left))
     with open_workers(workers, cluster) as pool:
@@ -127,7 +129,7 @@ class _Report:
             f"{len(self.failed)} failed; {counted(self.samples, 'sample')}."
         )
         for one in found["compensated"]:
-            facts = list[str]()
+            facts = list(map(str, one["marks"]))
             if contacts := one["contacts"]:
                 facts.append(f"contacts: {len(contacts)}, largest {max(each['peak_N'] for each in contacts):.2f} N")
             if one["gaps"]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from ftdrive.commands.common import FOLDER, STORE, open_store, upgrade_store
+from ftdrive.commands.common import FOLDER, STORE, open_store
 
 
 @click.command()
@@ -14,14 +14,13 @@ from ftdrive.commands.common import FOLDER, STORE, open_store, upgrade_store
 def index(folders: Sequence[Path], url: str | None) -> None:
     """Add the runs in the folders RUNS to the store. A run that is known is not read again.
 
-    A store of an earlier version is upgraded first. If cells were added, arms that belong to none of them are listed.
+    If cells were added, arms that belong to none of them are listed.
     """
     from ftdrive.fleet.cells import Owners
     from ftdrive.fleet.words import counted, listed
     from ftdrive.terminal.console import hanging, talk
 
     found = open_store(url)
-    upgrade_store(found)
     indexed = found.index(*folders)
     for words in indexed.unreadable:
         talk.print(hanging(" left out: ", words))

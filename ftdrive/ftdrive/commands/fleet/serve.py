@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import STORE, host_and_port, is_loopback, open_store
+from ftdrive.commands.common import STORE, open_store
 
 if TYPE_CHECKING:
     from ftdrive.fleet.serve import Sink
@@ -45,6 +45,7 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
     from ftdrive.fleet.metrics import MetricsServer
     from ftdrive.fleet.serve import serve as serve_fleet
     from ftdrive.fleet.status import fleet_state
+    from ftdrive.servers.address import host_and_port, is_loopback, with_port
     from ftdrive.terminal.console import print_address, talk
     from ftdrivers.clock import REAL
 
@@ -54,9 +55,7 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
     with ExitStack() as stack:
         metrics = stack.enter_context(closing(MetricsServer(host, port)))
         sinks: list[Sink] = [metrics]
-        print_address(
-            f"Serving {found.name} at ", f"http://{f'[{host}]' if ':' in host else host}:{metrics.port}/metrics"
-        )
+        print_address(f"Serving {found.name} at ", f"http://{with_port(host, metrics.port)}/metrics")
         if not is_loopback(host):
             talk.print(f"Unprotected: any computer that reaches port {metrics.port} can read the state of all cells.")
         if broker_url is not None:

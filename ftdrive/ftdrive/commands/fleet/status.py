@@ -59,14 +59,14 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
 
 def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
     from ftdrive.fleet.words import due_in_words, verified_in_words
-    from ftdrive.runs.verification import age_in_words
+    from ftdrive.runs.verification_record import age_in_words
 
     drift = "-"
     if one.drift is not None:
         drift = f"{one.drift.level_sigmas:.1f}{' DRIFTS' if one.drift.found else ''}"
     return (
         one.cell,
-        one.tool or "-",
+        one.tool_in_words,
         one.verdict or "none",
         "-" if one.calibrated is None else age_in_words(now - one.calibrated),
         verified_in_words(one, now),

@@ -100,14 +100,14 @@ def _is_due(one: "StoredCell", fleet: "Fleet", now: datetime) -> bool:
 def _verify(one: "StoredCell", store: "Store", url: str | None, fleet: "Fleet") -> tuple[str, str]:
     """Ask at a cell and verify it; return the outcome and why. Raises as `verify_cell`."""
     from ftdrive.runs.verified import AcceptanceLimits
-    from ftdrive.session.session import Options
-    from ftdrive.session.verification import POSES
+    from ftdrive.session.options import SessionOptions
+    from ftdrive.session.verifying import POSES
 
     cell = _described(one)
     path = _calibration(one, cell.tool.name, store, fleet)
     if not _is_attended(one, cell):
         return "skipped", ""
-    options = Options(path.parent.parent, "verify", poses=POSES)
+    options = SessionOptions(path.parent.parent, "verify", poses=POSES)
     cell = replace(cell, store=replace(cell.store, url=url))
     verified = verify_cell(cell, path, Wanted(path, POSES, quick=False, limits=AcceptanceLimits()), options)
     return ("passed", "") if verified.passed else ("FAILED", failure_in_words(verified))

@@ -9,6 +9,7 @@ from ftcalib.files import JSON
 from ftdrive import __version__
 from ftdrive.exports.calibration.settings import Settings
 from ftdrive.exports.calibration.text import Exported, yaml_text
+from ftdrive.runs.verification_record import marks_of
 
 FORMAT = "ftdrive.export/1"
 
@@ -44,6 +45,7 @@ def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, J
     return {
         "format": FORMAT,
         "id": calibration.id,
+        "marks": list(marks_of(calibration)),
         "created_utc": made if isinstance(made, str) else None,
         "verification": None
         if last is None

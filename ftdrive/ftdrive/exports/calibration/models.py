@@ -87,6 +87,8 @@ def mujoco(calibration: CalibrationResult, settings: Settings) -> Exported:
     ET.indent(root)
     notes = (
         f"Attach the body {settings.tool_frame} to {settings.flange_frame}. A simulated sensor has no bias.",
+        "Plain MuJoCo sensors have the opposite sign: negate sensordata, as the hardware interface of "
+        "mujoco_ros2_control does, to get the wrench on the sensor.",
         "The inertia was not identified: zeros stand for a point mass. The mass of the sensor itself is not in it.",
         "The plugin FtsGravCompPlugin needs a mujoco_ros2_control newer than 0.1.2 (pull request 308, September 2026).",
         world_note(settings),

@@ -15,6 +15,7 @@ from ftdrive.exports.calibration.difference import compensations, largest_differ
 from ftdrive.exports.calibration.formats import FORMATS, MAX_FORCE_ERROR_N, Format
 from ftdrive.exports.calibration.settings import Settings
 from ftdrive.exports.calibration.text import Exported, made_by, with_header
+from ftdrive.runs.verification_record import MARKS, marks_of
 
 TARGETS: Mapping[str, Callable[[CalibrationResult, Settings], Exported]] = {
     "kth": ros1.kth,
@@ -89,6 +90,7 @@ def export(
                     f"({', '.join(_lossless(calibration, target))}), or raise --max-force-error"
                 )
             notes.insert(0, f"{words}.")
+    notes[:0] = [MARKS[mark] for mark in marks_of(calibration)]
     notes += [f"Also set {place} = {_in_words(value)}." for place, value in exported.elsewhere.items()]
     origin = made_by(calibration, settings.verification)
     text = with_header(exported.text, target.comment, [origin, target.description, *notes])
@@ -123,4 +125,4 @@ def _in_words(value: JSON) -> str:
         return f"({', '.join(f'{name} {_in_words(one)}' for name, one in value.items())})"
     if isinstance(value, list):
         return f"[{', '.join(map(_in_words, value))}]"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    return str(value)  # of a float every digit

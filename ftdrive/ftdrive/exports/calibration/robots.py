@@ -34,7 +34,7 @@ def mc_rtc(calibration: CalibrationResult, settings: Settings) -> Exported:
     ]
     notes = (
         f"The parent body of the force sensor must be the flange ({settings.flange_frame}), with the sensor at "
-        f"({', '.join(f'{x:.6g}' for x in origin_m)}) m and its axes. World z must point up.",
+        f"({', '.join(map(str, numbers(origin_m)))}) m and its axes. World z must point up.",
         f"mass is weight / {MC_RTC_G_M_S2:g} m/s2, because mc_rtc multiplies it by that. Old versions have 9.81.",
     )
     return Exported("".join(f"{value!r}\n" for value in values), notes)

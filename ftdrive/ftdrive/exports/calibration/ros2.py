@@ -145,7 +145,7 @@ def admittance(calibration: CalibrationResult, settings: Settings) -> Exported:
             "CoG": {"pos": numbers(calibration.p_sensor_com_m), "force": calibration.weight_N},
         },
     }
-    bias = ", ".join(f"{value:.6g}" for value in (*calibration.force_bias_N, *calibration.torque_bias_Nm))
+    bias = ", ".join(map(str, numbers([calibration.force_bias_N, calibration.torque_bias_Nm])))
     notes = (
         f"The controller subtracts no bias: subtract [{bias}] (N, N·m) where the hardware interface reads the sensor.",
         "If your version has the parameter sensor_filter_chain in place of gravity_compensation, copy the filter of "

@@ -13,7 +13,7 @@ from ftdrive.checks.flange_load import flange_load
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import sensor_origin_m
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import VerificationRecord
+from ftdrive.runs.verification_record import VerificationRecord
 
 _NAME = re.compile(r"[A-Za-z_](-?[A-Za-z0-9_./])*")
 """Also inside a comment of XML, where `--` is an error."""

@@ -47,7 +47,7 @@ def world_note(settings: Settings) -> str:
 
 def frame_note(calibration: CalibrationResult, settings: Settings) -> str:
     """Say how the robot model must turn the sensor frame, for targets that look it up there."""
-    rpy = ", ".join(f"{angle:.6g}" for angle in rpy_rad(R_frame_sensor(calibration, settings)))
+    rpy = ", ".join(str(angle) for angle in rpy_rad(R_frame_sensor(calibration, settings)))
     return (
         f"The robot model must turn {settings.sensor_frame} against {settings.flange_frame} by roll, pitch, yaw = "
         f"({rpy}) rad: the formats urdf and static-transform write it. {settings.base_frame} must have the axes of "

@@ -13,7 +13,7 @@ from ftcalib.files import JSON
 from ftdrive import __version__
 from ftdrive.exports.calibration.formats import Comment
 from ftdrive.exports.common import plain
-from ftdrive.runs.verification import VerificationRecord
+from ftdrive.runs.verification_record import VerificationRecord, marks_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +50,8 @@ def made_by(calibration: CalibrationResult, verification: VerificationRecord | N
     if verification is not None:
         verified = "last verified" if verification.passed else "VERIFICATION FAILED"
         verified += f" {verification.created_utc.isoformat()}"
-    return f"ftdrive calibration {calibration.id}, made {date}, {verified}; made by ftdrive {__version__}"
+    marks = "".join(f"{mark} " for mark in marks_of(calibration))
+    return f"{marks}ftdrive calibration {calibration.id}, made {date}, {verified}; made by ftdrive {__version__}"
 
 
 def with_header(text: str, comment: Comment, lines: Iterable[str]) -> str:

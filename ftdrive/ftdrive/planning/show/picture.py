@@ -87,7 +87,8 @@ def title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
     """Say what is seen, and what is not."""
     ball = f"ball of {plan.ball_m:.2f} m"
     moves = f"all that moves stays in this {ball}" if plan.arm_rests else f"wrist and tool stay in this {ball}"
-    lines = [f"{certifier.arm.name}: {len(plan.steps)} poses; blue, dotted: {moves}"]
+    name = f"EMULATED {certifier.arm.name}" if plan.emulated else certifier.arm.name
+    lines = [f"{name}: {len(plan.steps)} poses; blue, dotted: {moves}"]
     if not plan.arm_rests:
         lines[0] += ", the WHOLE ARM moves"
     lines.append("grey: arm, orange: tool, at every pose; black: base; red: planes and boxes")

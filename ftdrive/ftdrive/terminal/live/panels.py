@@ -15,7 +15,7 @@ from ftdrive.checks.devices import AXES, check_rate
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
-from ftdrive.runs.verification import age_in_words
+from ftdrive.runs.verification_record import age_in_words
 from ftdrive.terminal.live import braille
 from ftdrive.terminal.live.braille import Codes
 from ftdrive.terminal.live.history import Columns
@@ -55,6 +55,8 @@ def title(view: View, width: int) -> Line:
     line = Line(" ftdrive live", STRONG).add("  ")
     line.add(" · ".join(filter(None, [view.info.arm.model, _named(view.info.sensor), view.info.tool])))
     right = Line()
+    for mark in view.info.marks:
+        right.add(f" {mark} ", WARNING)
     if view.is_frozen:
         right.add(" FROZEN ", "reverse bold", "z").add(" ")
     if view.replay is not None:

@@ -12,14 +12,12 @@ URScript has no ``abs``: `norm` of a number is its absolute value.
 
 import math
 from collections.abc import Callable, Generator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from ftmocks.kinematics import Vector6, vector3, vector6
 from ftmocks.ur.motion import JointMove, Path
+from ftmocks.ur.robot import Robot
 from ftmocks.ur.urscript.values import Pose, Value, joints, number, numbers, text_of, whole_number
-
-if TYPE_CHECKING:
-    from ftmocks.ur.urscript.program import Program
 
 Cycles = Generator[None, None, None]
 """Takes as many control cycles as it yields."""
@@ -29,7 +27,19 @@ RAMP_SHARE = 0.2
 """Share of its time in which a move with a given time speeds up, and again slows down."""
 
 
-def movej(program: "Program", q: Value, a: Value = 1.4, v: Value = 1.05, t: Value = 0, r: Value = 0) -> Cycles:
+class Caller(Protocol):
+    """The program that calls a function."""
+
+    @property
+    def robot(self) -> Robot:
+        """The controller."""
+
+    @property
+    def owner(self) -> str:
+        """Name of the thread that calls: only one thread at a time may move the arm."""
+
+
+def movej(program: Caller, q: Value, a: Value = 1.4, v: Value = 1.05, t: Value = 0, r: Value = 0) -> Cycles:
     """Move all joints together; a time `t` (s) replaces speed and acceleration."""
     number(r, "movej: r")
     arm, goal, seconds = program.robot.arm, joints(q, "movej: q"), number(t, "movej: t")
@@ -45,37 +55,37 @@ def _pace(start: Vector6, goal: Vector6, seconds: float) -> tuple[float, float]:
     return speed, speed / (seconds * RAMP_SHARE)
 
 
-def _followed(program: "Program", path: Path) -> Cycles:
+def _followed(program: Caller, path: Path) -> Cycles:
     program.robot.arm.start(path, program.owner)
     yield from program.robot.arm.until_finished(program.owner)
 
 
-def stopj(program: "Program", a: Value) -> Cycles:
+def stopj(program: Caller, a: Value) -> Cycles:
     """Slow down the joints."""
     arm, owner = program.robot.arm, program.owner
     arm.stop_joints(number(a, "stopj: a"), owner)
     yield from arm.until_finished(owner)
 
 
-def sync(_program: "Program") -> Cycles:
+def sync(_program: Caller) -> Cycles:
     """Use up the rest of this cycle."""
     yield
 
 
-def sleep(program: "Program", t: Value) -> Cycles:
+def sleep(program: Caller, t: Value) -> Cycles:
     """Wait in the time of the arm."""
     robot = program.robot
     for _ in range(math.ceil(number(t, "sleep: t") / (robot.period_s * robot.settings.time_scale) - 1e-9)):
         yield
 
 
-def textmsg(program: "Program", s1: Value, s2: Value = "") -> None:
+def textmsg(program: Caller, s1: Value, s2: Value = "") -> None:
     """Write into the log of the pendant."""
     program.robot.note("program", "textmsg", why=text_of(s1) + text_of(s2))
 
 
 def popup(
-    program: "Program",
+    program: Caller,
     s: Value,
     title: Value = "Popup",
     warning: Value = False,
@@ -90,43 +100,43 @@ def popup(
         yield
 
 
-def get_actual_joint_positions(program: "Program") -> list[float]:
+def get_actual_joint_positions(program: Caller) -> list[float]:
     """Return the joint angles, rad."""
     return list(program.robot.arm.actual_q)
 
 
-def get_target_joint_positions(program: "Program") -> list[float]:
+def get_target_joint_positions(program: Caller) -> list[float]:
     """Return the set-points, rad."""
     return list(program.robot.arm.q)
 
 
-def get_target_joint_speeds(program: "Program") -> list[float]:
+def get_target_joint_speeds(program: Caller) -> list[float]:
     """Return the speeds of the set-points, rad/s."""
     return list(program.robot.arm.qd)
 
 
-def get_tcp_offset(program: "Program") -> Pose:
+def get_tcp_offset(program: Caller) -> Pose:
     """Return the active TCP in the flange frame."""
     return Pose(program.robot.tcp_offset)
 
 
-def get_steptime(program: "Program") -> float:
+def get_steptime(program: Caller) -> float:
     """Return the length of a cycle on the cell's clock, s."""
     return program.robot.period_s
 
 
-def is_steady(program: "Program") -> bool:
+def is_steady(program: Caller) -> bool:
     """Return whether the arm has stood still for half a second."""
     return program.robot.steady
 
 
-def is_within_safety_limits(program: "Program", q: Value) -> bool:
+def is_within_safety_limits(program: Caller, q: Value) -> bool:
     """Return whether the arm may stand at joint angles."""
     robot = program.robot
     return robot.limits.allow(joints(q, "is_within_safety_limits: q"), robot.X_flange_tcp)
 
 
-def set_payload(program: "Program", m: Value, cog: Value = None) -> None:
+def set_payload(program: Caller, m: Value, cog: Value = None) -> None:
     """Set the mass on the flange (kg) and its centre in the flange frame (m); without `cog` the centre stays."""
     robot, payload_kg = program.robot, number(m, "set_payload: m")
     if cog is not None:
@@ -134,7 +144,7 @@ def set_payload(program: "Program", m: Value, cog: Value = None) -> None:
     robot.payload_kg = payload_kg
 
 
-def set_target_payload(program: "Program", m: Value, cog: Value, inertia: Value = None) -> None:
+def set_target_payload(program: Caller, m: Value, cog: Value, inertia: Value = None) -> None:
     """Set mass (kg), centre (m) and inertia (kg·m²: Ixx, Iyy, Izz, Ixy, Ixz, Iyz) on the flange."""
     robot, six = program.robot, [0.0] * 6 if inertia is None else numbers(inertia, "set_target_payload: inertia", 6)
     cog_m = vector3(numbers(cog, "set_target_payload: cog", 3))
@@ -143,38 +153,38 @@ def set_target_payload(program: "Program", m: Value, cog: Value, inertia: Value 
     robot.zero_ft()
 
 
-def set_gravity(program: "Program", d: Value) -> None:
+def set_gravity(program: Caller, d: Value) -> None:
     """Set the acceleration away from the earth that the controller assumes, m/s², base axes."""
     program.robot.target_gravity_m_s2 = vector3(numbers(d, "set_gravity: d", 3))
 
 
-def zero_ftsensor(program: "Program") -> None:
+def zero_ftsensor(program: Caller) -> None:
     """Take the present wrench as zero."""
     program.robot.zero_ft()
 
 
-def read_input_integer_register(program: "Program", address: Value) -> int:
+def read_input_integer_register(program: Caller, address: Value) -> int:
     """Return what a client wrote."""
     return program.robot.input_int(_register(address))
 
 
-def read_input_float_register(program: "Program", address: Value) -> float:
+def read_input_float_register(program: Caller, address: Value) -> float:
     """Return what a client wrote."""
     return program.robot.input_double(_register(address))
 
 
-def read_output_integer_register(program: "Program", address: Value) -> int:
+def read_output_integer_register(program: Caller, address: Value) -> int:
     """Return what a program wrote."""
     return program.robot.output_ints[_register(address)]
 
 
-def write_output_integer_register(program: "Program", address: Value, value: Value) -> None:
+def write_output_integer_register(program: Caller, address: Value, value: Value) -> None:
     """Write a number for the clients."""
     what = "write_output_integer_register: value"
     program.robot.output_ints[_register(address)] = whole_number(value, what, -(2**31), 2**31 - 1)
 
 
-def write_output_float_register(program: "Program", address: Value, value: Value) -> None:
+def write_output_float_register(program: Caller, address: Value, value: Value) -> None:
     """Write a number for the clients."""
     program.robot.output_doubles[_register(address)] = float(number(value, "write_output_float_register: value"))
 
@@ -183,12 +193,12 @@ def _register(address: Value) -> int:
     return whole_number(address, "the address of a register", 0, LAST_REGISTER)
 
 
-def norm(_program: "Program", a: Value) -> float:
+def norm(_program: Caller, a: Value) -> float:
     """Return the absolute value of a number, or the Euclidean length of a list or pose."""
     return math.hypot(*(number(value, "norm: a") for value in (a if isinstance(a, list) else [a])))
 
 
-def floor(_program: "Program", f: Value) -> int:
+def floor(_program: Caller, f: Value) -> int:
     """Return the largest whole number not above a number."""
     return math.floor(number(f, "floor: f"))
 

@@ -13,6 +13,7 @@ is rejected as a syntax error.
 from collections.abc import Collection
 from typing import NoReturn
 
+from ftmocks.ur.controller_program import Place
 from ftmocks.ur.urscript.syntax import (
     Assignment,
     Block,
@@ -26,7 +27,6 @@ from ftmocks.ur.urscript.syntax import (
     Literal,
     Name,
     Operation,
-    Place,
     Statement,
     Token,
     UrscriptSyntaxError,

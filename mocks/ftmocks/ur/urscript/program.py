@@ -21,8 +21,9 @@ Chosen here, where the manual is silent:
 
 from collections.abc import Generator
 from inspect import isgenerator, signature
-from typing import TYPE_CHECKING
 
+from ftmocks.ur.controller_program import ControllerProgram, Place, ScriptError
+from ftmocks.ur.robot import Robot
 from ftmocks.ur.urscript.library import functions
 from ftmocks.ur.urscript.parser import parse
 from ftmocks.ur.urscript.syntax import (
@@ -37,20 +38,16 @@ from ftmocks.ur.urscript.syntax import (
     Literal,
     Name,
     Operation,
-    Place,
     Statement,
     While,
 )
 from ftmocks.ur.urscript.threads import Halt, Leave, Run, Scope, Thread
-from ftmocks.ur.urscript.values import Pose, ScriptError, Value, combined, element, negative, number, text_of, truth
-
-if TYPE_CHECKING:
-    from ftmocks.ur.robot import Robot
+from ftmocks.ur.urscript.values import Pose, Value, combined, element, negative, number, text_of, truth
 
 STATEMENTS_PER_CYCLE = 2000
 
 
-class Program:
+class Program(ControllerProgram):
     """One program from a client.
 
     Parameters
@@ -68,9 +65,9 @@ class Program:
         When the text is no program.
     """
 
-    def __init__(self, robot: "Robot", name: str, text: str) -> None:
+    def __init__(self, robot: Robot, name: str, text: str) -> None:
+        super().__init__(name)
         self.robot = robot
-        self.name = name
         self._built_in = functions(robot.settings.polyscope)
         self._globals: dict[str, Value] = {}
         main = parse(text, name, self._built_in)

@@ -9,12 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-
-class Place(NamedTuple):
-    """Where in a program something stands: line and column, both from 1."""
-
-    line: int = 1
-    column: int = 1
+from ftmocks.ur.controller_program import Place
 
 
 class UrscriptSyntaxError(Exception):

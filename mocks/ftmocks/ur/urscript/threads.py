@@ -3,7 +3,8 @@
 from collections.abc import Generator
 from dataclasses import dataclass
 
-from ftmocks.ur.urscript.syntax import Function, Place
+from ftmocks.ur.controller_program import Place
+from ftmocks.ur.urscript.syntax import Function
 from ftmocks.ur.urscript.values import Value
 
 Run = Generator[None, None, Value]

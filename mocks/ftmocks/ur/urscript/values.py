@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ftmocks.kinematics import Vector6, vector6
+from ftmocks.ur.controller_program import ScriptError
 
 Value = Any
 """A number, a truth value, a text, a list of values, a pose, a thread, or None from a function without a value."""
@@ -30,10 +31,6 @@ _ORDER: dict[str, Callable[[Any, Any], bool]] = {
     "<=": operator.le,
     ">=": operator.ge,
 }
-
-
-class ScriptError(Exception):
-    """A run-time error of the program; it ends."""
 
 
 class Pose(list[Value]):

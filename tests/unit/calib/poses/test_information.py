@@ -1,29 +1,25 @@
 """Predicted uncertainty of sets of poses, and their choice, against closed forms, other code and published figures."""
 
 from dataclasses import replace
-from typing import cast
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, solve
 from ftcalib.errors import NotObservable
-from ftcalib.model import Array, angle_between, jacobian, predict
+from ftcalib.model import Array, angle_between, predict
 from ftcalib.poses.information import (
     SUBSET_6,
     T12,
     Guess,
     TOOL_DOWN_R_base_flange,
-    information,
     predicted_sigma,
     second_basin,
     special,
-    whitened_jacobian,
 )
-from ftcalib.poses.selection import Criterion, choose, cone_candidates, next_pose, order
+from ftcalib.poses.selection import LEAST_GAP, choose, cone_candidates, next_pose
 from tests.pose_sets import AMBIGUOUS_6, SUBSET_8, SUBSET_12, efficiency, optimised
 
 ALL = special(range(1, 25))
@@ -135,7 +131,7 @@ def test_published_table_of_chosen_sets_in_cones(degrees: int, figures: list[flo
     # The candidates behind the published figures are not known: 1200 others give the same within 8 %.
     candidates = cone_candidates(np.deg2rad(degrees))
     assert 1000 < len(candidates) < 1500
-    assert_allclose(row(candidates[choose(candidates, 24, FORCES_ONLY, least_gap=0.02)]), figures, rtol=0.08)
+    assert_allclose(row(candidates[choose(candidates, 24, FORCES_ONLY)]), figures, rtol=0.08)
 
 
 def test_undetermined_parameters_have_infinite_sigma() -> None:
@@ -151,28 +147,10 @@ def test_undetermined_parameters_have_infinite_sigma() -> None:
     assert np.isfinite(predicted_sigma(special(SUBSET_8[:4]), GUESS).force_rms_N)
 
 
-def test_wandering_bias_is_generalised_least_squares() -> None:
-    rng = np.random.default_rng(5)
-    n, guess = 7, Guess(2.0, 0.1, 0.004, walk_force_N=0.3, walk_torque_Nm=0.002)
-    R = Rotation.random(n, rng=rng).as_matrix()
-    # The bias of the last pose is estimated; earlier ones differ from it by the steps in between.
-    steps = np.tril(np.ones((n, n)), -1).T  # pose i lacks steps i … n-2
-    cov = np.zeros((n, 6, n, 6))
-    for k, (white, walk) in enumerate([(0.1, 0.3)] * 3 + [(0.004, 0.002)] * 3):
-        cov[:, k, :, k] = white**2 * np.eye(n) + walk**2 * steps[:, 1:] @ steps[:, 1:].T
-    J = jacobian(guess.parameters, R).reshape(6 * n, 15)
-    expected = np.sqrt(np.diag(np.linalg.inv(J.T @ np.linalg.solve(cov.reshape(6 * n, 6 * n), J))))
-    sigma = predicted_sigma(R, guess).sigma
-    names = ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
-    assert_allclose(np.concatenate([np.atleast_1d(sigma[name]) for name in names]), expected, rtol=1e-8)
-
-
 @pytest.mark.parametrize("name", ["mass_kg", "sigma_force_N", "sigma_torque_Nm", "g_m_s2"])
 def test_a_guess_of_nothing_is_rejected(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name} is 0"):
         replace(GUESS, **{name: 0.0})
-    with pytest.raises(ValueError, match="walk_force_N is -1"):
-        replace(GUESS, walk_force_N=-1.0)
 
 
 @pytest.mark.parametrize(("com_m", "lever_m"), [(0.0, 0.04), (0.03, 0.04), (0.05, 0.05)])
@@ -248,43 +226,6 @@ def test_published_efficiencies_of_subsets() -> None:
     assert_allclose(efficiency(special(SUBSET_6), guess), [0.959, 0.967, 0.964, 0.881], atol=0.003)
 
 
-@pytest.mark.parametrize(
-    ("n", "gap", "mean", "lowest"),
-    [
-        (8, 0.8, (0.995, 0.996, 0.995, 0.985), (0.985, 0.99, 0.99, 0.97)),
-        (6, 0.4, (0.975, 0.98, 0.98, 0.92), (0.95,) * 3),
-    ],
-)
-@pytest.mark.parametrize("tilt_rad", [0.0, 0.1])
-def test_optimised_sets(
-    n: int, gap: float, mean: tuple[float, ...], lowest: tuple[float, ...], tilt_rad: float
-) -> None:
-    R = optimised(n)
-    assert R.shape == (n, 3, 3)
-    assert_allclose(R[0], TOOL_DOWN_R_base_flange, atol=1e-6)
-    rng = np.random.default_rng(n)
-    guesses = [
-        replace(GUESS, p_sensor_com_m=0.08 * d / np.linalg.norm(d), tilt_alpha_rad=tilt_rad)
-        for d in rng.normal(size=(30, 3))
-    ]
-    values = np.array([efficiency(R, guess) for guess in guesses])
-    assert (values.mean(axis=0) > mean).all(), values.mean(axis=0)
-    assert (values.min(axis=0)[: len(lowest)] > lowest).all(), values.min(axis=0)
-    assert second_basin(R, guesses[0])[0] > gap - 2 * tilt_rad
-
-
-def test_random_sets_have_the_published_efficiency() -> None:
-    rng = np.random.default_rng(0)
-    for n, median in ((6, 0.72), (8, 0.82), (12, 0.88), (24, 0.95)):
-        A = [efficiency(Rotation.random(n, rng=rng).as_matrix(), GUESS).A for _ in range(100)]
-        assert_allclose(np.median(A), median, atol=0.03)
-
-
-def test_a_set_that_is_not_stored_is_rejected() -> None:
-    with pytest.raises(ValueError, match="no stored set of 7"):
-        optimised(7)
-
-
 # ---- choice
 
 
@@ -301,14 +242,13 @@ def test_cone_candidates_fill_the_cone() -> None:
         cone_candidates(0.0)
 
 
-@pytest.mark.parametrize("criterion", ["parameters", "prediction"])
 @pytest.mark.parametrize("n", [6, 12])
-def test_chosen_poses_beat_random_ones(criterion: Criterion, n: int) -> None:
+def test_chosen_poses_beat_random_ones(n: int) -> None:
     rng = np.random.default_rng(n)
     candidates = ball(40, 500, rng)
-    chosen = choose(candidates, n, GUESS, criterion=criterion, least_gap=0.02)
+    chosen = choose(candidates, n, GUESS)
     assert len(set(chosen.tolist())) == n
-    assert_allclose(chosen, choose(candidates, n, GUESS, criterion=criterion, least_gap=0.02))
+    assert_allclose(chosen, choose(candidates, n, GUESS))
     assert second_basin(candidates[chosen], GUESS)[0] >= 0.02
     mine = efficiency(candidates[chosen], GUESS)
     others = np.array([efficiency(candidates[rng.choice(500, n, replace=False)], GUESS) for _ in range(100)])
@@ -317,39 +257,21 @@ def test_chosen_poses_beat_random_ones(criterion: Criterion, n: int) -> None:
     assert 1.5 * np.median(others[:, 1]) < mine.A
 
 
-def test_the_workspace_matters_to_the_prediction_criterion() -> None:
-    rng = np.random.default_rng(0)
-    candidates = ball(60, 400, rng)
-    everywhere = candidates[choose(candidates, 8, GUESS, criterion="prediction")]
-    near = candidates[choose(candidates, 8, GUESS, criterion="prediction", R_workspace=ball(10, 50, rng))]
-
-    def error(R: Array, R_workspace: Array) -> float:
-        J = whitened_jacobian(R, GUESS).reshape(-1, 15)
-        rows = whitened_jacobian(R_workspace, GUESS).reshape(-1, 15)
-        return float(np.sum(rows @ np.linalg.inv(J.T @ J) * rows)) / len(R_workspace)
-
-    assert error(near, ball(10, 50, rng)) < 0.9 * error(everywhere, ball(10, 50, rng))
-    assert error(near, ALL) > error(everywhere, ALL)
-
-
 def test_a_rim_gets_centre_poses() -> None:
     rim = np.array([tilted(40, a, s) for a in range(0, 360, 15) for s in range(0, 360, 60)])
     centre = np.array([tilted(0, 0, s) for s in range(0, 360, 60)])
     candidates = np.concatenate([rim, centre])
-    only_rim = rim[choose(rim, 8, GUESS, criterion="prediction")]
+    only_rim = rim[choose(rim, 8, GUESS)]
     assert second_basin(only_rim, GUESS)[0] < 1e-6  # nothing else to choose from, and the gap says so
-    for least_gap in (0.02, 0.045):
-        chosen = choose(candidates, 8, GUESS, criterion="prediction", least_gap=least_gap)
-        assert second_basin(candidates[chosen], GUESS)[0] >= least_gap
-        assert 1 <= np.count_nonzero(chosen >= len(rim)) <= 4
+    chosen = choose(candidates, 8, GUESS)
+    assert second_basin(candidates[chosen], GUESS)[0] > 0.9 * LEAST_GAP  # the widest that this rim allows
+    assert 1 <= np.count_nonzero(chosen >= len(rim)) <= 4
 
 
 def test_impossible_choices_are_rejected() -> None:
     for n in (3, 25):
         with pytest.raises(ValueError, match=f"cannot choose {n} poses of 24"):
             choose(ALL, n, GUESS)
-    with pytest.raises(ValueError, match="criterion is 'best'"):
-        choose(ALL, 8, GUESS, criterion=cast(Criterion, "best"))
     with pytest.raises(ValueError, match="no candidates"):
         next_pose(ALL, ALL[:0], GUESS)
 
@@ -363,12 +285,10 @@ def test_next_poses_improve_the_prediction_and_open_the_gap(half_angle_deg: int)
     R = np.zeros((0, 3, 3))
     sigmas, gaps = [], []
     for _ in range(12):
-        ranked, rms = next_pose(R, candidates, GUESS, least_gap=0.02)
+        ranked = next_pose(R, candidates, GUESS)
         assert sorted(ranked.tolist()) == list(range(len(candidates)))
         R = np.concatenate([R, candidates[ranked[:1]]])
         prediction = predicted_sigma(R, GUESS)
-        if len(R) >= 4:
-            assert_allclose(rms[0], prediction.force_rms_N, rtol=0.01)
         sigmas.append([prediction.force_rms_N, prediction.torque_rms_Nm, norm(prediction.sigma["mass_kg"])])
         gaps.append(prediction.second_basin_gap)
     assert np.isinf(sigmas[1]).all()
@@ -379,12 +299,10 @@ def test_next_poses_improve_the_prediction_and_open_the_gap(half_angle_deg: int)
 def test_next_pose_is_the_best_by_brute_force() -> None:
     rng = np.random.default_rng(2)
     R, candidates = optimised(8)[:5], Rotation.random(20, rng=rng).as_matrix()
-    ranked, rms = next_pose(R, candidates, GUESS, least_gap=0.0)
+    ranked = next_pose(R, candidates, GUESS)
     predictions = [predicted_sigma(np.concatenate([R, c[None]]), GUESS) for c in candidates]
     cost = [(p.force_rms_N / 0.2) ** 2 + (p.torque_rms_Nm / 0.005) ** 2 for p in predictions]
     assert ranked[0] == np.argmin(cost)
-    assert_allclose(rms, [predictions[i].force_rms_N for i in ranked], rtol=1e-4)
-    assert rms[-1] > 1.02 * rms[0]
 
 
 def test_published_greedy_against_random() -> None:
@@ -393,37 +311,6 @@ def test_published_greedy_against_random() -> None:
     candidates = Rotation.random(600, rng=rng).as_matrix()
     R = np.zeros((0, 3, 3))
     for _ in range(8):
-        ranked, rms = next_pose(R, candidates, guess)
+        ranked = next_pose(R, candidates, guess)
         R = np.concatenate([R, candidates[ranked[:1]]])
-    assert_allclose(rms[0], 0.0788, rtol=0.03)
-
-
-def test_no_random_order_is_better_than_the_chosen_one() -> None:
-    guess = Guess(20 / 9.80665, 0.02, 0.0005, walk_force_N=0.07, walk_torque_Nm=0.00175)
-    rng, six = np.random.default_rng(6), special(SUBSET_6)
-
-    def variance(index: NDArray[np.integer]) -> float:
-        J = whitened_jacobian(six[index], guess)
-        return float(np.trace(np.linalg.inv(information(J, guess))[:6, :6]))
-
-    best = order(six, guess)
-    assert sorted(best.tolist()) == list(range(6))
-    others = [variance(rng.permutation(6)) for _ in range(60)]
-    assert variance(best) <= min(others) < 0.9 * np.median(others)
-
-
-@pytest.mark.slow
-def test_order_keeps_a_wandering_bias_apart() -> None:
-    guess = Guess(20 / 9.80665, 0.02, 0.0005, walk_force_N=0.07, walk_torque_Nm=0.00175)
-
-    def figures(poses: Array) -> Array:
-        sigma = predicted_sigma(poses, guess).sigma
-        return np.array([np.rad2deg(norm(sigma["R_flange_sensor"])), norm(sigma["gravity_force_base_N"])])
-
-    best = order(ALL, guess)
-    assert sorted(best.tolist()) == list(range(24))
-    assert_allclose(figures(ALL), [0.027, 0.0124], rtol=0.02)  # published, as are the next
-    assert_allclose(figures(ALL[best]), [0.0247, 0.0102], rtol=0.02)
-    shuffled = np.array([figures(ALL[np.random.default_rng(k).permutation(24)]) for k in range(20)])
-    assert_allclose(np.median(shuffled[:, 0]), 0.033, rtol=0.1)
-    assert (shuffled.min(axis=0) > figures(ALL[best])).all()
+    assert_allclose(predicted_sigma(R, guess).force_rms_N, 0.0788, rtol=0.03)

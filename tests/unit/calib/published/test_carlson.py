@@ -1,4 +1,4 @@
-"""Carlson's methods and Umeyama's, against simulated poses."""
+"""Carlson's methods against simulated poses."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,11 +10,29 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.model import Array, nearest_rotation
+from ftcalib.published import carlson
 from ftcalib.published.carlson import ForceFit, eigen, iterative, nullspace, polynomial
-from ftcalib.published.carlson_known import cayley, cayley_rotation, relaxation
-from tests.carlson_references import nullspace_all_pairs, similarity
+from ftcalib.published.carlson_known import cayley, relaxation
 
 Method = Callable[[Array, Array, Array, bool], ForceFit]
+
+
+def nullspace_all_pairs(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
+    """Unknown gravity by the nullspace method as published, with all pairwise differences (eqs. 22-26, section 5).
+
+    Needs O(n^2) memory and time: for comparison with `nullspace`, which is equal. A must be base to flange in eq. 22
+    (the text says the opposite). With bias the constant h enters the differences as
+    `(A_k A_i^T F_i - F_k) r = (A_k A_i^T - I) h` and is eliminated by least squares.
+
+    """
+    eq = carlson._linear_equations(R_base_flange, force_N, bias=bias, method="the nullspace method")
+    i, k = np.triu_indices(len(force_N), 1)
+    A_k_i = R_base_flange[k].transpose(0, 2, 1) @ R_base_flange[i]
+    F = carlson.kron_identity(force_N).reshape(-1, 3, 9)
+    differences = (A_k_i @ F[i] - F[k]).reshape(-1, 9)
+    h_columns = (A_k_i - np.eye(3)).reshape(-1, 3) if bias else np.empty((len(differences), 0))
+    return carlson._fit_vec(eq, carlson._least_singular_vector(h_columns, differences))
+
 
 UNKNOWN: dict[str, Method] = {
     "eigen": lambda R, f, _, bias: eigen(R, f, bias=bias),
@@ -25,14 +43,12 @@ UNKNOWN: dict[str, Method] = {
 }
 DIRECTION: dict[str, Method] = {
     "relaxation": lambda R, f, g, bias: relaxation(R, f, g, bias=bias),
-    "similarity": lambda R, f, g, bias: similarity(R, f, g, bias=bias),
 }
 WEIGHT: dict[str, Method] = {
-    "cayley total": lambda R, f, g, bias: cayley(R, f, g, bias=bias),
-    "cayley ordinary": lambda R, f, g, bias: cayley(R, f, g, bias=bias, total=False),
+    "cayley": lambda R, f, g, bias: cayley(R, f, g, bias=bias),
 }
 METHODS = UNKNOWN | DIRECTION | WEIGHT
-MIN_POSES = dict.fromkeys(UNKNOWN, 4) | {"polynomial": 3, "relaxation": 3, "similarity": 2} | dict.fromkeys(WEIGHT, 2)
+MIN_POSES = dict.fromkeys(UNKNOWN, 4) | {"polynomial": 3, "relaxation": 3} | dict.fromkeys(WEIGHT, 2)
 
 SROM24 = np.array(
     [
@@ -104,7 +120,6 @@ def assert_equal(fit: ForceFit, R: Array, gravity: Array, bias: Array, tolerance
     assert np.linalg.norm(fit.R_flange_sensor - R) < tolerance
     assert np.linalg.norm(fit.gravity_force_base_N - gravity) < tolerance * size
     assert np.linalg.norm(fit.force_bias_N - bias) < tolerance * (size + np.linalg.norm(bias))
-    assert fit.converged
 
 
 # --- exact without noise ---
@@ -240,20 +255,8 @@ def test_nullspace_takes_many_poses() -> None:
 # --- algorithm 1 ---
 
 
-def test_algorithm_1_reaches_the_truth_from_any_gravity_with_100_random_poses() -> None:
-    rng = np.random.default_rng(9)
-    for trial in range(60):
-        truth, R = random_truth(rng), random_poses(rng, 100)
-        fit = iterative(
-            R, truth.force_N(R, 0.2, seed=trial), bias=bool(trial % 2), gravity_start_base=rng.normal(size=3)
-        )
-        assert fit.converged
-        assert error_deg(fit, truth) < 0.5
-
-
 def test_algorithm_1_reaches_the_truth_with_few_poses_from_its_own_start() -> None:
     rng = np.random.default_rng(10)
-    stuck = 0
     for _ in range(20):
         truth, R = random_truth(rng, 5), random_poses(rng, 8)
         force_N = truth.force_N(R)
@@ -264,28 +267,13 @@ def test_algorithm_1_reaches_the_truth_with_few_poses_from_its_own_start() -> No
             truth.force_bias_N,
             1e-9,
         )
-        stuck += error_deg(iterative(R, force_N, bias=True, gravity_start_base=rng.normal(size=3)), truth) > 1
-    assert stuck  # why the start matters
-
-
-def test_algorithm_1_reports_when_it_was_stopped() -> None:
-    rng = np.random.default_rng(11)
-    truth, R = random_truth(rng), ball(rng, 24, 20)
-    force_N = truth.force_N(R, 0.02)
-    slow = iterative(R, force_N, bias=True)
-    assert slow.converged
-    stopped = iterative(R, force_N, bias=True, max_iterations=6)
-    assert not stopped.converged
-    assert apart_deg(stopped.R_flange_sensor, slow.R_flange_sensor) > 1e-4
-    from_another = iterative(R, force_N, bias=True, gravity_start_base=truth.gravity_force_base_N)
-    assert apart_deg(from_another.R_flange_sensor, slow.R_flange_sensor) < 1e-9
 
 
 # --- the polynomial problem ---
 
 
 @pytest.mark.parametrize("bias", [False, True])
-def test_polynomial_is_the_certified_least_squares_solution(bias: bool) -> None:
+def test_polynomial_is_the_least_squares_solution(bias: bool) -> None:
     rng = np.random.default_rng(12)
 
     def residual(fit: ForceFit, R: Array, force_N: Array) -> float:
@@ -297,8 +285,6 @@ def test_polynomial_is_the_certified_least_squares_solution(bias: bool) -> None:
         force_N = truth.force_N(R, 0.2, seed=trial)
         best = polynomial(R, force_N, bias=bias)
         cost = residual(best, R, force_N)
-        assert best.certificate_gap is not None
-        assert abs(best.certificate_gap) < 1e-7 * np.sum(force_N**2)
         for other in (eigen, nullspace, iterative):
             assert cost <= residual(other(R, force_N, bias=bias), R, force_N) * (1 + 1e-9)
 
@@ -319,26 +305,6 @@ def test_polynomial_rejects_one_tilt_only_because_gravity_may_be_up_or_down(sigm
 # --- known gravity ---
 
 
-@pytest.mark.parametrize("bias", [False, True])
-def test_similarity_is_the_least_squares_solution(bias: bool) -> None:
-    rng = np.random.default_rng(14)
-    truth, R = random_truth(rng, 4 * bias), ball(rng, 10, 60)
-    force_N = truth.force_N(R, 1.0)
-    fit = similarity(R, force_N, truth.gravity_force_base_N, bias=bias)
-
-    def cost(turn: Array, scale: float, shift: Array) -> float:
-        model = Truth(
-            fit.R_flange_sensor @ Rotation.from_rotvec(turn).as_matrix(),
-            scale * fit.gravity_force_base_N,
-            fit.force_bias_N + bias * shift,
-        )
-        return float(np.sum((force_N - model.force_N(R)) ** 2))
-
-    best = cost(np.zeros(3), 1, np.zeros(3))
-    for step in rng.normal(size=(100, 7)) * np.logspace(-5, 0, 100)[:, None]:
-        assert cost(step[:3], float(np.exp(step[3])), step[4:]) >= best
-
-
 def test_a_wrong_weight_goes_into_the_rotation_of_the_cayley_transform_only() -> None:
     rng = np.random.default_rng(15)
     plateau, free = [], []
@@ -346,21 +312,9 @@ def test_a_wrong_weight_goes_into_the_rotation_of_the_cayley_transform_only() ->
         truth, R = random_truth(rng), random_poses(rng, 24)
         force_N, wrong = truth.force_N(R, 1e-6), 1.1 * truth.gravity_force_base_N
         plateau.append(error_deg(cayley(R, force_N, wrong, bias=True), truth))
-        free.append(max(error_deg(method(R, force_N, wrong, bias=True), truth) for method in (relaxation, similarity)))
+        free.append(error_deg(relaxation(R, force_N, wrong, bias=True), truth))
     assert 0.05 < np.median(plateau) < 1
     assert max(free) < 1e-4
-
-
-def test_total_least_squares_is_what_the_cayley_transform_needs() -> None:
-    rng = np.random.default_rng(16)
-    errors: dict[bool, list[float]] = {True: [], False: []}
-    for trial in range(40):
-        truth, R = random_truth(rng), random_poses(rng, 100)
-        a = truth.gravity_force_base_N @ R
-        for total, found in errors.items():
-            rotation = cayley_rotation(truth.force_N(R, 2.0, seed=trial), a, total=total)
-            found.append(apart_deg(rotation, truth.R_flange_sensor.T))
-    assert np.median(errors[False]) > 1.5 * np.median(errors[True])
 
 
 @pytest.mark.parametrize("sigma_N", [0, 0.1])
@@ -375,7 +329,7 @@ def test_known_gravity_rejects_forces_that_point_up(name: str, bias: bool, sigma
 
 
 def test_a_direction_has_a_length() -> None:
-    for method in (relaxation, similarity, cayley):
+    for method in (relaxation, cayley):
         with pytest.raises(ValueError, match="length"):
             method(SROM24, np.ones((24, 3)), np.zeros(3), bias=True)
 
@@ -398,13 +352,13 @@ DEGENERATE = {
 @pytest.mark.parametrize("poses", DEGENERATE)
 @pytest.mark.parametrize("bias", [False, True])
 @pytest.mark.parametrize("name", UNKNOWN)
-def test_rejects_poses_that_leave_gravity_open(name: str, bias: bool, poses: str, sigma_N: float) -> None:
+def test_rejects_poses_that_leave_gravity_open(
+    name: str, bias: bool, poses: str, sigma_N: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(carlson, "MOST_ITERATIONS", 300)  # the iterative method never rests here, with noise
     truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), bias * np.array([1.0, 2, -30]))
-    method = METHODS[name]
-    if name == "iterative":  # it never rests here, with noise
-        method = lambda R, f, _, bias: iterative(R, f, bias=bias, max_iterations=300)  # noqa: E731
     with pytest.raises(NotObservable, match="add poses"):
-        method(DEGENERATE[poses], truth.force_N(DEGENERATE[poses], sigma_N), np.zeros(3), bias)
+        METHODS[name](DEGENERATE[poses], truth.force_N(DEGENERATE[poses], sigma_N), np.zeros(3), bias)
 
 
 @pytest.mark.parametrize("sigma_N", [0, 0.05])
@@ -417,7 +371,7 @@ def test_known_gravity_needs_a_change_of_tilt(name: str, bias: bool, sigma_N: fl
         METHODS[name](R, truth.force_N(R, sigma_N), truth.gravity_force_base_N, bias)
 
 
-@pytest.mark.parametrize("name", ["similarity", *WEIGHT])
+@pytest.mark.parametrize("name", WEIGHT)
 def test_known_gravity_is_content_with_one_axis(name: str) -> None:
     R = DEGENERATE["one horizontal base axis"]
     truth = Truth(MOUNTS["anyhow"], np.array([0, 0, -20.0]), np.array([1.0, 2, -30]))

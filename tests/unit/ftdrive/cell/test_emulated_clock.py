@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from ftdrive.cell.emulated_clock import EmulatedClock
+from ftdrive.cell.emulated_clock import EmulatedClock, LocalClock
 from ftdrivers.errors import ConnectError
 from ftmocks.clock import LEAD_NS, CellClock
 
@@ -78,6 +78,38 @@ def test_the_cell_does_not_wait_for_a_thread_that_is_away(cell: CellClock, clock
         seen = clock.now_ns()
         time.sleep(0.05)
         assert cell.now_ns() == seen + LEAD_NS
+
+
+def test_the_time_of_the_cell_is_held_for_a_thread_that_asks_for_it(cell: CellClock, clock: EmulatedClock) -> None:
+    with clock.keeping_up():
+        seen = clock.now_ns()
+        with clock.held():
+            time.sleep(0.05)
+            assert [cell.now_ns(), clock.now_ns(), cell.now_ns()] == [seen + LEAD_NS] * 3
+        clock.now_ns()
+        assert cell.now_ns() > seen + LEAD_NS
+
+
+def test_the_time_of_a_played_device_waits_for_the_threads_of_its_process() -> None:
+    clock, passed = LocalClock(), threading.Event()
+
+    def sleep() -> None:
+        clock.sleep(0.05)
+        passed.set()
+
+    other = threading.Thread(target=sleep)
+    with clock.keeping_up():
+        other.start()
+        seen = clock.now_ns()
+        time.sleep(0.1)
+        assert not passed.is_set()
+        for _ in range(10):
+            before, now = clock.now_ns(), clock.now_ns()
+            assert seen <= before <= now <= before + LEAD_NS
+            time.sleep(0.02)
+        clock.sleep(0.01)
+    assert passed.wait(5.0)
+    other.join()
 
 
 def test_two_threads_have_two_slots(cell: CellClock, clock: EmulatedClock) -> None:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,6 +12,7 @@ from ftcalib import Finding
 from ftdrive import __version__
 from ftdrive.store.store import Store
 from tests.calibrated_runs import calibrated_run
+from tests.edited_files import edit
 
 Ran = tuple[int, str, str]
 
@@ -26,11 +28,13 @@ def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(
     runs = tmp_path / "runs"
     old = calibrated_run(runs, "old", day=-400)
     worse = calibrated_run(runs, "worse")
-    file = worse / "calibration.json"
-    document = json.loads(file.read_text())
-    document["force_bias_N"][2] += 1.0
-    few = Finding.of("few_poses", n_poses=5, recommended=6)
-    file.write_text(json.dumps(document | {"findings": [few.to_dict()]}))
+
+    def worsen(document: dict[str, Any]) -> None:
+        document["force_bias_N"][2] += 1.0
+        few = Finding.of("few_poses", n_poses=5, recommended=6)
+        document |= {"findings": [few.to_dict()], "verdict": "usable"}
+
+    edit(worse / "calibration.json", worsen)
     damaged = calibrated_run(runs, "damaged")
     Store().index(runs)
     (damaged / "dataset.json").write_text("{}")

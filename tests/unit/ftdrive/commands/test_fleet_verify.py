@@ -45,7 +45,6 @@ class Lab:
         monkeypatch.setattr(command, "verify_cell", self._session)
         monkeypatch.setattr("ftdrive.terminal.operators.PlainOperator", lambda: self)
         self.store = Store(self.url)
-        self.store.upgrade()
         now = datetime.now(UTC)
         for n, name in enumerate(NAMES):
             day = (now - timedelta(days=20 * n) - FIRST) / timedelta(days=1)

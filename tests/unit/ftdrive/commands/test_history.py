@@ -103,12 +103,12 @@ def test_a_store_that_cannot_be_used_is_one_sentence(
 ) -> None:
     Store().index(runs)
     with sqlite3.connect(default_file()) as connection:
-        connection.execute("UPDATE ftdrive_schema SET version = 3")
+        connection.execute("UPDATE ftdrive_schema SET version = 4")
     connection.close()
     for arguments in (["history"], ["history", "--index", runs], ["diff", "abcd", "abcd"]):
         code, out, err = run(*arguments)
         assert (code, out) == (6, "")
-        assert "has version 3, this ftdrive uses version 2: install a newer ftdrive" in err
+        assert "has version 4, this ftdrive uses version 3: install a newer ftdrive" in err
     monkeypatch.setenv("FTDRIVE_STORE_URL", "mysql://host/db")
     code, _, err = run("history")
     assert (code, "begins with mysql" in err) == (2, True)

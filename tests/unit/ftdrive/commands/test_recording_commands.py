@@ -1,8 +1,10 @@
 """`record`, `convert` and `compensate`: when they end, with what exit code, and what is in the files then."""
 
+import errno
 import json
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +20,7 @@ from ftdrive.cell.config import CellConfig
 from ftdrive.commands.record import Duration
 from ftdrive.live.samples import Block, StreamEvent
 from ftdrive.recording import Recorder, read_recording
+from ftdrive.recording.growing_file import GrowingFile
 from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.recorded import UTC_OFFSET_NS, block, calibration, info
 
@@ -113,7 +116,8 @@ def test_control_c_keeps_the_data(run_record: Run) -> None:
     assert code == 130
     assert answer is not None
     assert answer["samples"] == 300
-    assert "Saved a.mcap: 300 samples" in err
+    assert "Saved a.mcap: 300 samples, 0.30 s, 1000 Hz, gaps: 0" in err
+    assert answer["rate_Hz"] == pytest.approx(1000.0, rel=1e-4)
     assert read_recording(Path("a.mcap")).cut == ""
 
 
@@ -131,6 +135,29 @@ def test_a_stream_without_a_sample_leaves_no_file(run_record: Run, tmp_path: Pat
     code, answer, _ = run_record(FakeStream([], DeviceTimeout("sensor silent")), "-o", "a.csv")
     assert (code, answer) == (4, None)
     assert [path.name for path in tmp_path.iterdir()] == ["c.json"]
+
+
+def test_a_full_disk_completes_no_file_and_names_what_is_safe(run_record: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    add, written = GrowingFile.add, Counter[Path]()
+
+    def full(file: GrowingFile, content: bytes) -> int:
+        written[file.path] += 1
+        if file.path.suffix == ".csv" and written[file.path] > 5:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return add(file, content)
+
+    monkeypatch.setattr(GrowingFile, "add", full)
+    code, answer, err = run_record(FakeStream(blocks(30)), "-o", "a.mcap", "-o", "a.csv")
+    assert code == 6
+    assert answer is not None
+    assert answer["files"] == []
+    assert "Saved" not in err
+    assert answer["partial"].keys() == {"a.mcap.partial", "a.csv.partial"}
+    for path, samples in answer["partial"].items():
+        assert f"{path} keeps {samples} samples" in err
+        assert len(read_recording(Path(path)).rows) == samples > 0
+    assert not Path("a.mcap").exists()
+    assert not Path("a.csv").exists()
 
 
 def test_a_gap_is_exit_code_8(run_record: Run) -> None:
@@ -183,16 +210,19 @@ def test_a_conversion_is_complete_and_says_what_was_cut(
     monkeypatch.chdir(tmp_path)
     recorder = Recorder([Path("a.csv")], info(), {})
     recorder.write(block(1500))
-    Path("b.csv.partial").write_bytes(Path("a.csv.partial").read_bytes()[:-5])
+    recorder.write(block(100, 1500))
+    recorder.write(block(100, 1600))
+    recorder.write(block(100, 1700))
+    Path("b.csv.partial").write_bytes(Path("a.csv.partial").read_bytes()[:-30])
     recorder.close()
     assert cli.run(["convert", "a.csv", "b.mcap", "--json"]) == 0
     out, err = capsys.readouterr()
-    assert json.loads(out)["samples"] == 1500
+    assert json.loads(out)["samples"] == 1800
     assert json.loads(out)["complete"]
     assert read_recording(Path("b.mcap")).rows.tobytes() == read_recording(Path("a.csv")).rows.tobytes()
     assert cli.run(["convert", "b.csv.partial", "b.parquet", "--json"]) == 0
     out, err = capsys.readouterr()
-    assert (json.loads(out)["samples"], json.loads(out)["complete"]) == (1499, False)
+    assert (json.loads(out)["samples"], json.loads(out)["complete"]) == (1500, False)
     assert "incomplete" in err
     assert cli.run(["convert", "a.csv", "b.mcap"]) == 2
     Path("d.csv").write_text("t,fx\n")

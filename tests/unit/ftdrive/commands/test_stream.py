@@ -89,7 +89,7 @@ def test_a_device_that_stays_silent_ends_the_stream() -> None:
     with pytest.raises(DeviceTimeout) as failure:
         serve(source, sink)
     assert exit_code(failure.value) == 4
-    assert source.clock.now_s() - 1001.0 == pytest.approx(stream.RECOVER_S, abs=0.11)
+    assert source.clock.now_s() - 1001.0 == pytest.approx(live_source.RECOVER_S, abs=0.11)
     assert "silent at 11 s" in sink.events[-1].text
 
 
@@ -102,7 +102,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *arguments: str) -> tup
         return Source()
 
     monkeypatch.setattr(live_source, "CompensatedStream", open_)
-    monkeypatch.setattr(live_source, "read_calibration", lambda _: SimpleNamespace())
+    monkeypatch.setattr(live_source, "read_calibration", lambda *_, **__: SimpleNamespace())
     monkeypatch.setattr(live_source, "read_cell", lambda *_: SimpleNamespace())
     calibration = tmp_path / "calibration.json"
     calibration.touch()

@@ -12,7 +12,7 @@ from ftcalib.model import Array
 from ftdrive.fleet.observed import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
-from ftdrive.store.records import Check, StoredCell, StoredResult, StoredVerification
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.live.simulated import calibrated
 
@@ -88,11 +88,13 @@ def time(days_ago: float) -> str:
     return (NOW - timedelta(days=days_ago)).isoformat(timespec="microseconds")
 
 
-def _check(one: StoredVerification) -> Check:
+def _check(one: StoredVerification) -> BriefVerification:
     nothing: list[float | None] = [None] * 6
     bias = (one.bias_change or nothing, one.bias_change_sigma or nothing, one.calibration_sigma or nothing)
     values = tuple(value for part in bias for value in part)
-    return Check(one.calibration_id, one.created_utc or "", one.passed, one.change, one.temperature_C, values)
+    return BriefVerification(
+        one.calibration_id, one.created_utc or "", one.passed, one.change, one.temperature_C, values
+    )
 
 
 @dataclass
@@ -106,7 +108,9 @@ class FakeStore:
     def cells(self) -> list[StoredCell]:
         return sorted(self.kept_cells, key=lambda one: one.name)
 
-    def fleet(self, newest: int, since: datetime) -> tuple[list[StoredCell], list[StoredResult], list[Check]]:
+    def fleet(
+        self, newest: int, since: datetime
+    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification]]:
         return self.cells(), self._newest_accepted(newest), self._checks(since)
 
     def _newest_accepted(self, most: int) -> list[StoredResult]:
@@ -120,7 +124,7 @@ class FakeStore:
                 kept.append(one)
         return kept[::-1]
 
-    def _checks(self, since: datetime) -> list[Check]:
+    def _checks(self, since: datetime) -> list[BriefVerification]:
         start = since.isoformat(timespec="microseconds")
         found = [one for one in self.kept_checks if one.created_utc is not None and one.created_utc >= start]
         return [_check(one) for one in sorted(found, key=lambda one: (one.created_utc or "", one.id))]

@@ -4,11 +4,11 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from ftdrive.fleet.serve import Reading
-from ftdrive.fleet.state import CellState, Drift, Finding, Fleet
+from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
-CALM = Drift(0.8, found=False, words="")
-DRIFTING = Drift(6.5, found=True, words="force bias x drifts by 0.12 N a week since 2026-11-01")
+CALM = BiasDrift(0.8, found=False, words="")
+DRIFTING = BiasDrift(6.5, found=True, words="force bias x drifts by 0.12 N a week since 2026-11-01")
 
 
 def cell(name: str, tool: str | None = "gripper", **more: Any) -> CellState:
@@ -36,11 +36,11 @@ def never_calibrated(name: str) -> CellState:
     return CellState(name)
 
 
-def fleet(*cells: CellState, findings: tuple[Finding, ...] = ()) -> Fleet:
+def fleet(*cells: CellState, findings: tuple[FleetFinding, ...] = ()) -> Fleet:
     """A fleet."""
     return Fleet(cells, findings)
 
 
-def reading(*cells: CellState, findings: tuple[Finding, ...] = (), store_up: bool = True) -> Reading:
+def reading(*cells: CellState, findings: tuple[FleetFinding, ...] = (), store_up: bool = True) -> Reading:
     """A reading of a moment ago."""
     return Reading(Fleet(cells, findings), NOW, NOW, store_up)

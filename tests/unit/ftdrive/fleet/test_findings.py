@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ftcalib.model import Array
-from ftdrive.fleet.state import Finding
+from ftdrive.fleet.state import FleetFinding
 from ftdrive.store.records import StoredResult
 from tests.unit.ftdrive.fleet.fleet_records import cell, check, daily, fleet, result
 from tests.unit.ftdrive.live.simulated import calibrated
@@ -16,7 +16,7 @@ MASS_KG = result("a", 1).mass_kg
 OFF_AXIS_M = (calibrated().parameters.R_flange_sensor @ calibrated().parameters.p_sensor_com_m)[:2]
 
 
-def found(cells: str, results: list[StoredResult], checks: list[Any] | None = None) -> list[Finding]:
+def found(cells: str, results: list[StoredResult], checks: list[Any] | None = None) -> list[FleetFinding]:
     return list(fleet([cell(name, verify_every_days=1000.0) for name in cells], results, checks or []).findings)
 
 

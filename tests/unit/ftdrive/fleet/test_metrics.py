@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.metrics import NAMES, MetricsServer
-from ftdrive.fleet.state import Finding
+from ftdrive.fleet.state import FleetFinding
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
 
 Samples = dict[tuple[str, str], float]
@@ -47,7 +47,7 @@ def samples(server: MetricsServer) -> Samples:
 def test_every_field_of_a_cell_is_a_metric_and_what_is_unknown_is_absent(server: MetricsServer) -> None:
     warm = cell("A", passed=False, drift=DRIFTING, temperature_C=31.5)
     silent = cell("B", drift=None, verified=None, passed=None)
-    base = Finding("base", ("B",), "…")
+    base = FleetFinding("base", ("B",), "…")
     server.update(reading(warm, silent, never_calibrated("C"), findings=(base, base), store_up=False))
     assert samples(server) == {
         ("ftdrive_store_up", ""): 0,
@@ -75,7 +75,7 @@ def test_a_cell_that_disappears_disappears(server: MetricsServer) -> None:
     assert {name for _, name in samples(server)} == {"", "B"}
 
 
-def test_tools_of_a_cell_are_told_apart_and_any_name_is_escaped(server: MetricsServer) -> None:
+def test_tools_of_a_cell_are_distinguished_and_any_name_is_escaped(server: MetricsServer) -> None:
     name = 'Zelle "7"\\ü\n'
     server.update(reading(cell(name, "gripper"), cell(name, "drill", mass_kg=2.0)))
     families = {one.name: one for one in text_string_to_metric_families(scraped(server))}

@@ -36,6 +36,17 @@ def test_the_newest_accepted_calibration_of_each_tool_counts() -> None:
     assert [one.is_due(NOW) for one in states] == [True, True, True, True]  # c was never calibrated
 
 
+def test_a_calibration_of_an_emulated_cell_is_marked() -> None:
+    results = [
+        result("a", 20, tool="drill"),
+        result("a", 3, emulated=True),
+        result("b", 1, tool="emulated", emulated=True),
+    ]
+    states = fleet([cell("a"), cell("b"), cell("c")], results).cells
+    assert [one.tool_in_words for one in states] == ["drill", "gripper EMULATED", "EMULATED", "-"]
+    assert [one.to_dict(NOW)["emulated"] for one in states] == [False, True, True, False]
+
+
 def test_a_tool_out_of_use_is_not_listed_for_ever() -> None:
     results = [
         result("a", 200),

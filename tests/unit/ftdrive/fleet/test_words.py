@@ -5,14 +5,14 @@ from datetime import timedelta
 
 import pytest
 
-from ftdrive.fleet.state import Finding, Fleet
+from ftdrive.fleet.state import Fleet, FleetFinding
 from ftdrive.fleet.words import summary
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated
 
 SOUND = cell("A")
 LATE = cell("B", due=NOW - timedelta(days=2))
-PAYLOAD = Finding("payload", ("A", "C"), "the payload is wrong")
-BASE = Finding("base", ("C",), "the base has turned")
+PAYLOAD = FleetFinding("payload", ("A", "C"), "the payload is wrong")
+BASE = FleetFinding("base", ("C",), "the base has turned")
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ BASE = Finding("base", ("C",), "the base has turned")
     [
         (Fleet((SOUND,), ()), "1 cell: none needs attention"),
         (Fleet((SOUND, replace(SOUND, tool="drill")), ()), "1 cell: none needs attention"),
-        (Fleet((SOUND, LATE), (Finding("overdue", ("B",), "late"),)), "2 cells: 1 due"),
+        (Fleet((SOUND, LATE), (FleetFinding("overdue", ("B",), "late"),)), "2 cells: 1 due"),
         (Fleet((SOUND, cell("C")), (PAYLOAD, BASE)), "2 cells: 2 with a finding"),
         (
             Fleet((cell("A", drift=DRIFTING), replace(LATE, passed=False), never_calibrated("C")), (BASE,)),

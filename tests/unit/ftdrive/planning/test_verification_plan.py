@@ -42,7 +42,7 @@ def test_two_poses_take_less_than_30_s_of_robot_time() -> None:
     made = plan(2)
     q = USUAL_POSTURE_RAD
     approach = plan_approach(CERTIFIER, q, np.array(made.steps[0].q_rad), SLOW)
-    assert moves_s(made, [1, 2, 3], q, approach) + 3 * (2.0 + 0.6) < 30
+    assert moves_s(made, [1, 2, 3], approach) + 3 * (2.0 + 0.6) < 30
 
 
 def test_its_words_promise_no_calibration() -> None:

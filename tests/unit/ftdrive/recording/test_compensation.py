@@ -14,7 +14,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
 from ftdrive.recording import Header, Recording, read_recording
 from ftdrive.recording.compensation import compensated, with_estimated_bias
-from ftdrive.recording.csv_pair import read_pair
+from ftdrive.recording.csv_pair import numbers_of, read_pair
 from ftdrive.recording.recording import rows_of
 from ftdrivers.interfaces import Array
 from tests.unit.ftdrive.recorded import NOISE, TRUTH, calibration, info
@@ -166,6 +166,35 @@ def test_files_that_cannot_be_used_are_named_with_the_fault(
         (tmp_path / file).write_text(text)
     with pytest.raises(BadDataset, match=words):
         read_pair(tmp_path / "wrench", tmp_path / "poses", calibration(), "c", 0.0)
+
+
+RNG = np.random.default_rng(8)
+STEADY_S = np.arange(20_000) / 1000
+JITTERS = {
+    "regular": STEADY_S,
+    "rounded": np.round(STEADY_S + 4e-4, 3),
+    "jitter": STEADY_S + RNG.uniform(-4e-4, 4e-4, len(STEADY_S)),
+    "noise": np.sort(STEADY_S + RNG.normal(0, 2.5e-4, len(STEADY_S))),
+    "batches": np.repeat(STEADY_S[15::16], 16),
+    "pauses": np.maximum(STEADY_S, np.floor(STEADY_S) + 0.06),  # what waited for 60 ms comes at once
+}
+
+
+@pytest.mark.parametrize("name", JITTERS)
+def test_late_samples_of_another_program_are_no_gaps_and_missing_ones_are(name: str) -> None:
+    t_s = JITTERS[name]
+    assert np.count_nonzero(np.diff(numbers_of(t_s)) != 1) == 0
+    lost = [*range(3000, 3030), *range(9000, 9100), 15_000, 15_001]
+    numbers = numbers_of(np.delete(t_s, lost))
+    assert np.count_nonzero(np.diff(numbers) != 1) in (3, 4)  # a gap amid batches may be found in two steps
+    assert abs(numbers[-1] - (len(t_s) - 1)) <= 1
+
+
+def test_the_log_of_a_real_sensor_has_one_gap(real_data: Path) -> None:
+    t_s = np.loadtxt(real_data / "ur5e_pick_stream" / "wrench.csv", delimiter=",", usecols=0)
+    numbers = numbers_of(t_s)
+    assert np.count_nonzero(np.diff(numbers) != 1) == 1
+    assert numbers[-1] == round(500 * (t_s[-1] - t_s[0])) == len(t_s)  # the sensor of a UR5e has 500 Hz
 
 
 def test_a_pause_of_another_program_is_a_gap(tmp_path: Path) -> None:

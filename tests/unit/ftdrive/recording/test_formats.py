@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from mcap.records import Attachment, Channel, DataEnd, Message, Schema
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
+from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
 
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import Stages, StreamEvent, WrenchFrame
@@ -104,7 +107,7 @@ def test_rosbags_reads_the_messages(paths: Sequence[Path]) -> None:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
         assert counts == dict.fromkeys(
             ["/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states", "/ft_sample"], 2600
-        ) | {"/events": 4}
+        ) | {"/events": 4, "/tf": counts["/tf"]}
         seen: dict[str, list[Any]] = {topic: [] for topic in counts}
         for connection, t_ns, data in reader.messages():
             message: Any = reader.deserialize(data, connection.msgtype)
@@ -132,6 +135,41 @@ def test_rosbags_reads_the_messages(paths: Sequence[Path]) -> None:
     t_ns, log = seen["/events"][0]
     assert (log.name, log.msg, log.level) == ("mark", MARK.text, 20)
     assert t_ns == MARK.t_host_ns + UTC_OFFSET_NS
+    check_transforms(seen["/tf"], rows)
+
+
+def check_transforms(seen: list[tuple[int, Any]], rows: Any) -> None:
+    """Check the frames of some messages: up to 60 a second, flange in base, and in it all that messages name."""
+    assert 150 < len(seen) < 180
+    for t_ns, message in (seen[0], seen[80], seen[-1]):
+        row = rows[np.searchsorted(rows["t_host_ns"] + UTC_OFFSET_NS, t_ns)]
+        found = {one.child_frame_id: one for one in message.transforms}
+        last = "base_at_tcp" if t_ns < seen[-1][0] - 10**9 else "flange_at_0_0.01_0.15_m"
+        assert list(found) == ["flange", "sensor", "tcp", last]
+        assert [one.header.frame_id for one in found.values()] == ["base", "flange", "flange", "flange"]
+        assert {one.header.stamp.sec * 10**9 + one.header.stamp.nanosec for one in found.values()} == {t_ns}
+        poses = {name: (vector(one.transform.translation), rotation(one.transform)) for name, one in found.items()}
+        assert poses["flange"][0].tolist() == row["p_base_flange_m"].tolist()
+        R_base_flange = Rotation.from_quat(row["quaternion_base_flange"])
+        assert (poses["flange"][1].inv() * R_base_flange).magnitude() < 1e-15
+        assert poses["sensor"][0].tolist() == [0.0, 0.0, 0.0]  # its height is unknown
+        np.testing.assert_allclose(poses["sensor"][1].as_matrix(), info().calibration.R_flange_sensor, atol=1e-12)
+        assert poses["tcp"][0].tolist() == [0.0, 0.0, 0.1]
+        if last == "base_at_tcp":
+            assert poses[last][0].tolist() == [0.0, 0.0, 0.1]
+            assert (poses[last][1] * R_base_flange).magnitude() < 1e-12
+        else:
+            assert poses[last][0].tolist() == [0.0, 0.01, 0.15]
+            assert poses[last][1].magnitude() == 0.0
+
+
+def vector(of: Any) -> NDArray[np.float64]:
+    return np.array([of.x, of.y, of.z])
+
+
+def rotation(transform: Any) -> Rotation:
+    q = transform.rotation
+    return Rotation.from_quat([q.x, q.y, q.z, q.w])
 
 
 def test_mcap_ros2_reads_the_messages(paths: Sequence[Path]) -> None:
@@ -154,7 +192,9 @@ def test_mcap_ros2_reads_the_messages(paths: Sequence[Path]) -> None:
 def test_a_plain_reader_of_the_format_finds_no_fault(paths: Sequence[Path]) -> None:
     with paths[0].open("rb") as file:
         kinds = [type(record).__name__ for record in StreamReader(file, validate_crcs=True).records]
-    assert kinds.count("Message") == 5 * 2600 + 4
+    with paths[0].open("rb") as file:
+        frames = sum(1 for _ in make_reader(file).iter_messages("/tf"))
+    assert kinds.count("Message") == 5 * 2600 + 4 + frames
     assert kinds[-1] == "Footer"
 
 
@@ -181,13 +221,15 @@ def test_the_table_is_plain_to_other_programs(paths: Sequence[Path]) -> None:
     recording = read_recording(paths[0])
     lines = [line for line in paths[1].read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
     names = lines[0].split(",")
-    assert names[:6] == ["t_s", "t_host_ns", "t_device_s", "seq", "status", "raw_fx"]
+    assert names[:7] == ["t_s", "t_utc_s", "t_host_ns", "t_device_s", "seq", "status", "raw_fx"]
     assert "base axes, about the tcp origin" in paths[1].read_text(encoding="utf-8").partition("\n")[0]
     with duckdb.connect() as database:
         table = database.execute(f"SELECT t_s, fz, q5, in_contact FROM '{paths[2]}'").fetchnumpy()
     column = [float(line.split(",")[names.index("t_s")]) for line in lines[1:]]
     np.testing.assert_array_equal(table["t_s"], column)
     assert column[0] == 0.0
+    utc_s = [float(line.split(",")[names.index("t_utc_s")]) for line in lines[1:]]
+    np.testing.assert_allclose(utc_s, (recording.rows["t_host_ns"] + UTC_OFFSET_NS) * 1e-9, rtol=0, atol=1e-6)
     np.testing.assert_array_equal(table["fz"], recording.rows["wrench"][:, 2])
     np.testing.assert_array_equal(table["q5"], recording.rows["q_rad"][:, 5])
     np.testing.assert_array_equal(table["in_contact"], recording.rows["in_contact"])
@@ -226,16 +268,77 @@ def test_a_file_cut_anywhere_is_read_up_to_there_or_rejected(
     assert len(set(lengths)) >= least
 
 
-@pytest.mark.parametrize("ending", [".mcap", ".csv"])
-def test_damage_is_no_traceback(small: Sequence[Path], ending: str, tmp_path: Path) -> None:
-    content = small[ENDINGS.index(ending)].read_bytes()
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_flipped_bit_is_refused_or_changes_no_number(small: Sequence[Path], ending: str, tmp_path: Path) -> None:
+    path = small[ENDINGS.index(ending)]
+    whole, content = read_recording(path), path.read_bytes()
     rng = np.random.default_rng(3)
     damaged, rejected = tmp_path / f"damaged{ending}", 0
-    for place in rng.integers(0, len(content), 40).tolist():
+    for place in rng.integers(0, len(content), 60).tolist():
         flipped = bytes([content[place] ^ 1 << int(rng.integers(8))])
         damaged.write_bytes(content[:place] + flipped + content[place + 1 :])
         try:
-            read_recording(damaged)
+            found = read_recording(damaged)
         except BadRecording:
             rejected += 1
-    assert rejected
+        else:
+            assert found.rows.tobytes() == whole.rows.tobytes()
+            assert found.events == whole.events
+            assert found.header.to_dict() == whole.header.to_dict()
+    assert rejected > 20
+
+
+def test_each_block_of_a_csv_file_has_its_checksum(small: Sequence[Path], tmp_path: Path) -> None:
+    lines = small[ENDINGS.index(".csv")].read_text(encoding="utf-8").splitlines(keepends=True)
+    path = tmp_path / "a.csv"
+    ends = [number for number, line in enumerate(lines) if line.startswith("# crc32 ")]
+    assert len(ends) > 10
+    path.write_text("".join(lines[: ends[3] + 4]), encoding="utf-8")  # three samples without a checksum
+    assert len(read_recording(path).rows) == ends[3] - 3 - 3
+    changed = lines.copy()
+    changed[ends[2] - 1] = changed[ends[2] - 1].replace("0.", "1.", 1)
+    path.write_text("".join(changed), encoding="utf-8")
+    with pytest.raises(BadRecording, match=f"line {ends[2] + 1} is not the checksum"):
+        read_recording(path)
+    first_version = [line for line in lines if not line.startswith("# crc32 ")]
+    path.write_text("".join(first_version), encoding="utf-8")
+    assert read_recording(path).rows.tobytes() == read_recording(small[0]).rows.tobytes()
+
+
+@pytest.mark.parametrize("ending", [".mcap", ".parquet"])
+def test_a_file_without_checksums_is_read(
+    small: Sequence[Path], ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = read_recording(small[0])
+    monkeypatch.setattr("zlib.crc32", lambda _content, _before=0: 0)
+    write_recording(tmp_path / f"a{ending}", whole)
+    monkeypatch.undo()
+    if ending == ".parquet":
+        with duckdb.connect() as database:
+            found = dict(
+                database.execute(f"SELECT key, value FROM parquet_kv_metadata('{tmp_path}/a.parquet')").fetchall()
+            )
+            header, events = (found[name].decode().replace("'", "''") for name in (b"header", b"events"))
+            database.execute(
+                f"COPY (SELECT * FROM '{tmp_path}/a.parquet') TO '{tmp_path}/b.parquet' "
+                f"(FORMAT parquet, KV_METADATA {{header: '{header}', events: '{events}'}})"
+            )
+        (tmp_path / "b.parquet").replace(tmp_path / "a.parquet")
+    same(read_recording(tmp_path / f"a{ending}"), whole)
+
+
+def test_events_stand_where_they_happened_also_after_a_conversion(paths: Sequence[Path], tmp_path: Path) -> None:
+    end = StreamEvent(7_602_000_000_000, "delay", "…", {"value": 0.0})
+    recording = read_recording(paths[0])
+    last = StreamEvent(int(recording.rows["t_host_ns"][-1]), "mark", "at the last sample")
+    write_recording(tmp_path / "a.csv", replace(recording, events=[*recording.events, last, end]))
+    lines = (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines()
+    found = {}
+    for number, line in enumerate(lines):
+        if line.startswith("# event "):
+            event = json.loads(line.removeprefix("# event "))
+            found[event["text"]] = [one.split(",")[2] for one in lines[number + 1 :] if not one.startswith("#")]
+    t_ns = recording.rows["t_host_ns"]
+    assert found[MARK.text] == [str(t) for t in t_ns[t_ns > MARK.t_host_ns]]
+    assert found[GAP.text] == [str(t) for t in t_ns[t_ns > GAP.t_host_ns]]
+    assert found["at the last sample"] == found["…"] == []

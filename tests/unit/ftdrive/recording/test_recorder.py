@@ -1,6 +1,8 @@
 """The recorder: what is in the files when something goes wrong, and what it does not do."""
 
 import errno
+import resource
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,7 @@ import pytest
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording import Recorder, read_recording, write_recording
+from ftdrive.recording.csv_file import CsvFile
 from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.recording.recording import Header
 from tests.unit.ftdrive.recorded import BASE_TCP, USUAL, block, info
@@ -50,18 +53,43 @@ def fill_disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
 
 
 @pytest.mark.parametrize("ending", TABLES)
-def test_a_full_disk_ends_with_what_was_written(ending: str, tmp_path: Path, fill_disk: Callable[[int], None]) -> None:
-    path = tmp_path / f"a{ending}"
+def test_a_full_disk_leaves_partial_files_that_say_what_is_safe(
+    ending: str, tmp_path: Path, fill_disk: Callable[[int], None]
+) -> None:
+    first, other = tmp_path / f"a{ending}", tmp_path / "b.parquet"
     fill_disk(1_000_000)
-    recorder = Recorder([path], info(), {})
-    with pytest.raises(OSError, match="No space left"):  # noqa: PT012  # some write fails
+    recorder = Recorder([first, other], info(), {})
+    with pytest.raises(OSError, match="No space left") as failure:  # noqa: PT012  # some write fails
         for start in range(0, 5000, 100):
             recorder.write(block(100, start))
-    recorder.close()  # the end needs less room than the chunk that did not fit
-    found = read_recording(path)
-    assert found.cut == ""
-    assert 0 < len(found.rows) < 5000
-    np.testing.assert_array_equal(found.rows["seq"], found.rows["seq"][0] + np.arange(len(found.rows)))
+    recorder.close()
+    assert not first.exists()
+    assert not other.exists()
+    assert recorder.saved == []
+    for path, samples in recorder.partial.items():
+        assert f"{path} keeps {samples} samples" in str(failure.value)
+        found = read_recording(path)
+        assert found.cut
+        assert 0 < len(found.rows) == samples < 5000
+        np.testing.assert_array_equal(found.rows["seq"], found.rows["seq"][0] + np.arange(len(found.rows)))
+    assert list(recorder.partial) == [tmp_path / f"a{ending}.partial", tmp_path / "b.parquet.partial"]
+
+
+def test_a_full_disk_of_a_parquet_recording_keeps_its_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.parquet"
+    recorder = Recorder([path], info(), {})
+    for start in range(12):
+        recorder.write(block(1, start, step_ns=1_000_000_000))
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    monkeypatch.setattr(signal, "SIGXFSZ", signal.signal(signal.SIGXFSZ, signal.SIG_IGN))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limit[1]))  # of each file, as a full disk limits all
+    try:
+        with pytest.raises(OSError, match=r"^File too large: .*a\.parquet\.partial keeps 12 samples"):
+            recorder.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert not path.exists()
+    assert len(read_recording(tmp_path / "a.parquet.partial").rows) == 12
 
 
 @pytest.mark.parametrize("ending", TABLES)
@@ -76,7 +104,7 @@ def test_without_room_for_the_end_the_partial_file_is_readable(
     fill_disk(size)
     recorder = Recorder([path], info(), {})
     recorder.write(block(1100))
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match=r"No space left .*\.partial keeps 1100 samples"):
         recorder.close()
     assert not path.exists()
     partial = tmp_path / f"a{ending}.partial"
@@ -91,6 +119,27 @@ def test_without_room_for_the_end_the_partial_file_is_readable(
     assert read_recording(tmp_path / f"c{ending}").rows.tobytes() == found.rows.tobytes()
     with pytest.raises(FileExistsError, match=r"ftdrive convert .*partial"):
         Recorder([path], info(), {})
+
+
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_control_c_amid_a_write_waits_for_its_end(ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without, the files of one recording would hold different samples, or half a line."""
+    paths = [tmp_path / f"a{ending}", tmp_path / "b.csv"]
+    recorder = Recorder(paths, info(), {})
+    recorder.write(block(100))
+    append = CsvFile.append
+
+    def interrupted(*given: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        append(*given)
+
+    monkeypatch.setattr(CsvFile, "append", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        recorder.write(block(200, 100))
+    monkeypatch.undo()
+    recorder.close()
+    assert [len(read_recording(path).rows) for path in recorder.saved] == [300, 300]
+    assert recorder.saved == paths
 
 
 def test_an_interrupted_parquet_recording_is_a_folder_of_parts(tmp_path: Path) -> None:
@@ -134,8 +183,9 @@ def test_an_error_of_one_file_completes_the_others(tmp_path: Path) -> None:
     recorder = Recorder([tmp_path / "a.csv", tmp_path / "b.csv"], info(), {})
     recorder.write(block(3))
     (tmp_path / "a.csv").touch()
-    with pytest.raises(FileExistsError):
+    with pytest.raises(FileExistsError, match=r"a\.csv\.partial keeps 3 samples"):
         recorder.close()
+    assert recorder.saved == [tmp_path / "b.csv"]
     assert len(read_recording(tmp_path / "b.csv").rows) == 3
 
 

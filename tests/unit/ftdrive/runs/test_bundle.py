@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import shutil
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -208,3 +209,41 @@ def test_a_cut_off_bundle_and_another_file_are_named(
     flipped[len(whole) // 2] ^= 0xFF
     (tmp_path / "b.zip").write_bytes(flipped)
     assert run_command(["replay", str(tmp_path / "b.zip")]) == 6
+
+
+def test_a_flipped_bit_is_refused_or_changes_no_number(run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "a.zip"
+    write_bundle(run.folder, path)
+    content, rng, refused = path.read_bytes(), np.random.default_rng(2), 0
+    wrenches = [record.samples.wrench for record in run.records()]
+    for place in rng.integers(0, len(content), 80).tolist():
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        try:
+            with unpacked(path) as folder:
+                found = Run(folder)
+                assert [record.samples.wrench.tolist() for record in found.records()] == [w.tolist() for w in wrenches]
+                assert found.header()["config"]["site"] == {"g_m_s2": 9.81}
+        except (BadBundle, BadDataset):
+            refused += 1
+    assert refused > 50
+
+
+def test_a_bundle_of_a_damaged_run_keeps_the_damage_visible(run: Run, tmp_path: Path) -> None:
+    """Redaction changes texts and their checksums, but makes no new checksum for what did not fit the old one."""
+    folder = tmp_path / "runs" / "damaged"
+    shutil.copytree(run.folder, folder)
+    path = folder / "run.json"
+    path.write_text(path.read_text().replace("9.81", "9.83"))
+    write_bundle(folder, tmp_path / "a.zip")
+    with unpacked(tmp_path / "a.zip") as found, pytest.raises(BadDataset, match="differs from its checksum"):
+        Run(found).header()
+
+
+def test_who_added_poses_last_stays_here(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "runs" / "mine"
+    shutil.copytree(run.folder, folder)
+    with Run(folder):
+        write_bundle(folder, tmp_path / "a.zip")
+    assert not [name for name in contents(tmp_path / "a.zip") if name.endswith("lock")]

@@ -14,6 +14,7 @@ from ftdrive.runs.outcome import circumstances_of, solve_records
 from ftdrive.runs.pose_hints import hints
 from ftdrive.session.events import Noted, PoseTaken, Weighed
 from ftdrive.session.preflight import Before, check_payload
+from tests.edited_files import edit
 from tests.unit.ftdrive.fake_cell import Lab
 
 MEASURED_KG = 1.2 * 9.81 / 9.80665
@@ -33,7 +34,7 @@ def test_the_limit_is_that_of_the_check_before_the_tour(payload_kg: float, lab: 
     )
     lab.arm.set_status(payload_kg=float(payload_kg), p_flange_payload_m=None)
     nothing: Any = None
-    before = Before(lab.cell, lab.arm, *[nothing] * 10)
+    before = Before(lab.open_cell(), lab.cell, *[nothing] * 7)
     assert (check_payload(before).state == "ok") == (described_cell.payload(float(payload_kg), 1.7, 0.3) == [])
 
 
@@ -119,8 +120,7 @@ def test_a_session_saves_no_result_as_good_whose_tool_is_elsewhere_unless_it_was
     assert lab.calibrate() is not None
     saved = CalibrationResult.load(lab.run().calibration_path)
     assert (saved.verdict, saved.findings[0].code) == ("usable", "com_outside_tool")
-    path = lab.run().folder / "run.json"
-    path.write_text(path.read_text().replace('"measured": true', '"measured": false'))
+    edit(lab.run().folder / "run.json", lambda header: header["config"]["workcell"].update(measured=False))
     assert solve_records(lab.run(), lab.run().records()).result.verdict == "good"
 
 

@@ -23,7 +23,13 @@ RATE_HZ = 7000.0
 
 INFO = StreamInfo(
     calibration=cast(
-        Any, SimpleNamespace(R_flange_sensor=Rotation.from_euler("z", 30, True).as_matrix(), verdict="good")
+        Any,
+        SimpleNamespace(
+            R_flange_sensor=Rotation.from_euler("z", 30, True).as_matrix(),
+            verdict="good",
+            provenance={"station": {"sensor": "can"}},
+            is_edited=False,
+        ),
     ),
     calibration_name="calibration.json",
     arm=cast(Any, None),

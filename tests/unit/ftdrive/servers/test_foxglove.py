@@ -211,6 +211,7 @@ def test_the_status_says_what_is_shown_and_is_valid_json(server: FoxgloveServer,
     assert status["frame"] == "sensor axes, about the sensor origin"
     assert status["stages"]["lowpass_Hz"] is None
     assert status["calibration"] == "calibration.json"
+    assert status["marks"] == ["EMULATED"]
     assert status["status"]["arm"]["lost"] == 3
     assert status["status"]["drift_N_h"] is None  # NaN there
 
@@ -284,7 +285,7 @@ def test_a_wrong_parameter_changes_nothing(
     assert (stream.frame, stream.stages) == (WrenchFrame(), Stages())
 
 
-def test_a_client_that_never_reads_delays_nobody(
+def test_a_client_that_never_reads_delays_no_other(
     stream: FakeStream, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Every message reaches a client that reads, until the queue of another one overflows and beyond."""

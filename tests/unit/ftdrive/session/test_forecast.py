@@ -30,7 +30,7 @@ def test_the_whole_tour_takes_as_long_as_the_plan_says_and_the_approach(certifie
     first = np.array(plan.steps[0].q_rad)
     away = first + np.radians([0, 0, 0, 0, 0, 30.0])
     approach = plan_approach(certifier, away, first, SLOW)
-    total_s = moves_s(plan, range(1, 26), away, approach)
+    total_s = moves_s(plan, range(1, 26), approach)
     approach_s = float(move_duration_s(np.radians(30.0), APPROACH_RAD_S, SLOW.joint_rad_s2))
     assert total_s == pytest.approx(plan.to_dict()["motion_time_s"] + approach_s)
 
@@ -39,10 +39,10 @@ def test_the_rest_of_a_tour_counts_what_is_left_and_the_ways_past_what_is_not(ce
     third = np.array(plan.steps[2].q_rad)
     there = plan_approach(certifier, third, third, SLOW)
     one = plan.steps[2].duration_s
-    assert moves_s(plan, [3, 4], third, there) == pytest.approx(moves_s(plan, [3], third, there) + one)
+    assert moves_s(plan, [3, 4], there) == pytest.approx(moves_s(plan, [3], there) + one)
     past = np.abs(np.subtract(plan.steps[8].q_rad, plan.steps[2].q_rad)).max()
     expected_s = float(move_duration_s(past, APPROACH_RAD_S, SLOW.joint_rad_s2))
-    assert moves_s(plan, [3, 9], third, there) - moves_s(plan, [3], third, there) == pytest.approx(expected_s)
+    assert moves_s(plan, [3, 9], there) - moves_s(plan, [3], there) == pytest.approx(expected_s)
 
 
 def test_limits_in_force_slow_a_plan_down_and_never_speed_it_up(certifier: Certifier, plan: Plan) -> None:

@@ -12,10 +12,10 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene
 from ftdrive.session.guards import (
     ContactGuard,
+    ExpectedMotion,
     Guard,
     Limits,
     ModelGuard,
-    Motion,
     PathGuard,
     RangeGuard,
     SafetyGuard,
@@ -49,7 +49,7 @@ class Looks:
 
     def __init__(self, guard: Guard, *, moving: bool = True) -> None:
         self.guard = guard
-        self.motion = Motion(START, GOAL, moving=True) if moving else Motion(GOAL, GOAL, moving=False)
+        self.motion = ExpectedMotion(START, GOAL, moving=True) if moving else ExpectedMotion(GOAL, GOAL, moving=False)
         self.t_s, self.sample = 0.0, 0
         self.rng = np.random.default_rng(0)
         guard.begin(self.seen())
@@ -86,7 +86,7 @@ def test_joints_that_leave_the_straight_line_are_seen() -> None:
         assert (trip.hazard, f"joint {joint + 1}" in str(trip)) == (2, True)
 
 
-def test_an_arm_that_is_moved_while_it_should_stand_is_somebody_elses() -> None:
+def test_an_arm_that_is_moved_while_it_should_stand_has_another_client() -> None:
     looks = Looks(PathGuard(LIMITS), moving=False)
     assert looks.trips(50) is None
     assert looks.trip(state=state(GOAL + np.radians([0, 0, 0, 0, 0, 0.6]))).hazard == 21

@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,11 @@ from ftcalib.errors import TooFewSamples
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord, Sampling, dataset_from, drift_check
 from ftdrive.session.events import Compared, Estimated, Event, Noted, PoseTaken, State, StateChanged
-from ftdrive.session.hand_guided import Recorder, collect_manually
+from ftdrive.session.guards import Limits
+from ftdrive.session.hand_guided import HandGuided
+from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key, Question
+from ftdrive.session.pose_book import PoseBook
 from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health
@@ -170,7 +174,8 @@ class Person:
         self.keys = keys | {cell.end_s + 20: Key.STOP}
         self.shown: list[Event] = []
 
-    def show(self, event: Event) -> None:
+    def show(self, event: Event, *, sync: bool = False) -> None:
+        assert sync == isinstance(event, PoseTaken)
         self.shown.append(event)
 
     def ask(self, question: Question) -> str:
@@ -230,6 +235,11 @@ class Verification:
         )
 
 
+def guided(cell: Any, person: Any, run: Any, fit: Any, sampling: Sampling, *, listen: bool = False) -> HandGuided:
+    opened = OpenCell(cell, cell, cell.clock, person, Limits())
+    return HandGuided(opened, PoseBook(opened, run, fit, FLOOR), sampling, listen=listen)
+
+
 class Outcome:
     """What a collection leaves."""
 
@@ -256,15 +266,8 @@ class Outcome:
 
         def collect() -> None:
             sampling = Sampling(average_s=AVERAGE_S, attempts=3)
-            collect_manually(
-                self.cell,
-                self.cell,
-                sampling,
-                self.person,
-                Recorder(self.fit.add, self._commit, earlier),
-                down_base=FLOOR,
-                listen=listen,
-                clock=self.cell.clock,
+            guided(self.cell, self.person, self, self.fit, sampling, listen=listen).run(
+                earlier, "the coverage is green"
             )
 
         if raises is None:
@@ -273,7 +276,7 @@ class Outcome:
             with raises:
                 collect()
 
-    def _commit(self, record: PoseRecord) -> None:
+    def commit(self, record: PoseRecord) -> None:
         self.kept.append(record)
         self.person.shown.append(Noted(words=f"committed {record.stop}"))
 
@@ -307,7 +310,7 @@ def test_a_verification_ends_with_the_last_pose_however_far_from_the_prediction(
     assert "touched" not in outcome.person.words()
 
 
-def test_a_pose_is_on_disk_before_it_is_told() -> None:
+def test_a_pose_is_on_disk_before_it_is_reported() -> None:
     shown = Outcome(dwells(UP, DOWN)).person.shown
     kinds = [
         event.words if isinstance(event, Noted) else event.state.value if isinstance(event, StateChanged) else "pose"
@@ -330,14 +333,14 @@ def test_an_arm_that_hardly_rests_or_creeps_is_not_measured() -> None:
     np.testing.assert_allclose(outcome.kept[0].before.R_base_flange, FRONT.as_matrix(), atol=1e-9)
 
 
-def test_an_arm_that_moves_off_while_measured_is_told_how_long_to_wait() -> None:
+def test_if_the_arm_moves_off_while_measured_the_time_to_wait_is_shown() -> None:
     outcome = Outcome([*dwells(UP, seconds=2.0), *dwells(DOWN)])
     assert outcome.stops == [1]
     assert "moved while pose 1" in outcome.person.words()
 
 
 @pytest.mark.parametrize("turn_deg", [2.0, 9.0])
-def test_a_repeat_is_told_once_and_left_out(turn_deg: float) -> None:
+def test_a_repeat_is_reported_once_and_left_out(turn_deg: float) -> None:
     near = Rotation.from_euler("y", turn_deg, degrees=True)
     nudged = near * Rotation.from_euler("x", 0.5, degrees=True)
     outcome = Outcome(dwells(UP, DOWN, near, nudged, LEFT))
@@ -449,7 +452,7 @@ def test_a_pose_that_is_done_with_is_no_longer_measured_on_the_screen(listen: bo
     assert words == (["the program goes on"] if listen else ["move on to another orientation"]) * 3
 
 
-def test_a_sensor_that_recovers_is_waited_for_and_what_it_went_through_is_told_once() -> None:
+def test_a_sensor_that_recovers_is_waited_for_and_its_failure_is_reported_once() -> None:
     outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), recover=True, unplugged_s=9.5)  # while pose 2 is averaged
     assert outcome.stops == [1, 2, 3]
     assert outcome.person.words().count("a cable came off") == 1
@@ -630,13 +633,5 @@ def test_a_disk_that_is_full_ends_it() -> None:
         raise OSError("No space left on device")
 
     with pytest.raises(OSError, match="No space"):
-        collect_manually(
-            cell,
-            cell,
-            Sampling(average_s=AVERAGE_S),
-            person,
-            Recorder(Fit().add, commit),
-            down_base=FLOOR,
-            listen=False,
-        )
+        guided(cell, person, SimpleNamespace(commit=commit), Fit(), Sampling(average_s=AVERAGE_S)).run((), "")
     assert not any(isinstance(event, PoseTaken) for event in person.shown)

@@ -19,7 +19,7 @@ from ftcalib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from ftdrive.planning.search.constant_tour import NUMBERS
 from ftdrive.runs.pose_hints import _CHANGES, hints
 from ftdrive.session.events import Estimated
-from ftdrive.session.live_fit import Running, _light, faces
+from ftdrive.session.live_fit import RunningFit, _light, faces
 from ftdrive.terminal.report import print_result
 from tests.pose_sets import AMBIGUOUS_6
 
@@ -77,9 +77,9 @@ def tour() -> list[PoseRecord]:
     return [record(stop, R, n) for stop, (n, R) in enumerate(zip(numbers, special(numbers), strict=True), start=1)]
 
 
-def run(taken: list[PoseRecord], running: Running | None = None) -> Estimated:
+def run(taken: list[PoseRecord], running: RunningFit | None = None) -> Estimated:
     """Take all poses in and return what the last one gives, without a fit after each."""
-    running = running or Running()
+    running = running or RunningFit()
     running._records = {one.stop: one for one in taken[:-1]}
     running._refit()
     return running.add(taken[-1])
@@ -87,7 +87,7 @@ def run(taken: list[PoseRecord], running: Running | None = None) -> Estimated:
 
 @pytest.mark.slow
 def test_at_the_end_of_a_tour_the_running_fit_is_the_solvers() -> None:
-    running, taken = Running(), tour()
+    running, taken = RunningFit(), tour()
     events = [running.add(one) for one in taken]
     expected = solve(dataset_from(taken, {}))
     last = events[-1]
@@ -106,7 +106,7 @@ def test_at_the_end_of_a_tour_the_running_fit_is_the_solvers() -> None:
 
 
 def test_one_pose_is_a_start() -> None:
-    running = Running()
+    running = RunningFit()
     event = running.add(tour()[0])
     assert event.poses == 1
     assert event.values == {}
@@ -149,7 +149,7 @@ def test_one_figure_that_is_not_good_enough_decides_the_light(different: dict[st
 
 
 @pytest.mark.parametrize(("half_angle_deg", "light"), [(70, "green"), (37, "amber"), (15, "red")])
-def test_the_light_tells_wide_cones_from_narrow_ones(half_angle_deg: float, light: str) -> None:
+def test_the_light_distinguishes_wide_cones_from_narrow_ones(half_angle_deg: float, light: str) -> None:
     from ftcalib.poses.information import Guess
     from ftcalib.poses.selection import choose
 
@@ -167,7 +167,7 @@ def test_six_well_conditioned_poses_with_two_solutions_are_red_and_give_no_numbe
 
 
 def test_following_the_hints_from_tool_down_leads_to_green_soon() -> None:
-    running, R, seen = Running(), TOOL_DOWN_R_base_flange, list[Estimated]()
+    running, R, seen = RunningFit(), TOOL_DOWN_R_base_flange, list[Estimated]()
     for stop in range(1, 15):
         event = running.add(record(stop, R, stop))
         seen.append(event)
@@ -199,7 +199,7 @@ def follow(words: str, R: Array) -> Array:
 
 
 def test_a_bumped_pose_stands_out_when_it_comes_and_can_be_taken_again() -> None:
-    running, taken = Running(), tour()
+    running, taken = RunningFit(), tour()
     quiet = run(taken[:14], running)
     assert quiet.residual_sigma is not None
     assert quiet.residual_sigma < 5
@@ -218,20 +218,20 @@ def test_a_bumped_pose_stands_out_when_it_comes_and_can_be_taken_again() -> None
 
 
 def test_the_first_pose_can_be_taken_again() -> None:
-    running, first = Running(), tour()[0]
+    running, first = RunningFit(), tour()[0]
     running.add(first)
     running.remove(1)
     assert running.add(first).poses == 1
 
 
 def test_a_stop_taken_twice_counts_once() -> None:
-    running, taken = Running(), tour()
+    running, taken = RunningFit(), tour()
     run(taken[:12], running)
     assert running.add(taken[4]).poses == 12
 
 
 def test_the_return_to_the_first_pose_changes_no_estimate_but_is_compared() -> None:
-    running, taken = Running(), tour()
+    running, taken = RunningFit(), tour()
     before = run(taken[:-1], running)
     after = running.add(taken[-1])
     assert after.poses == 24
@@ -242,7 +242,7 @@ def test_the_return_to_the_first_pose_changes_no_estimate_but_is_compared() -> N
 
 @pytest.mark.slow
 def test_the_prediction_waits_until_it_can_be_trusted_and_is_then_right() -> None:
-    running, taken = Running(), tour()
+    running, taken = RunningFit(), tour()
     R = special([24])[0]
     predictions = []
     for one in taken:
@@ -266,11 +266,11 @@ def test_an_arm_on_a_wall_is_seen_as_such_once_the_fit_knows() -> None:
     R = special(range(1, 25))
     event = run([record(stop, one, stop, truth=wall) for stop, one in enumerate(R, start=1)])
     assert event.faces == faces(-R[:, 1])
-    estimate = Running(down_base=(0, -1, 0)).add(record(1, R[0], 1, truth=wall))
+    estimate = RunningFit(down_base=(0, -1, 0)).add(record(1, R[0], 1, truth=wall))
     assert estimate.faces == faces(-R[:1, 1])
 
 
-def test_drift_is_told_with_the_estimates() -> None:
+def test_drift_is_shown_with_the_estimates() -> None:
     drifting = [
         record(one.stop, one.before.R_base_flange, one.pose.number, bump_N=0.5 * k / 23)
         for k, one in enumerate(tour()[:-1])
@@ -352,7 +352,7 @@ def test_a_load_that_shifts_is_named_with_the_pose_from_which_on(since: int) -> 
     assert (change.code, change.values["pose"]) == ("com_shifted", since)
 
 
-def test_a_tare_and_a_lost_part_in_mid_tour_are_told_apart() -> None:
+def test_a_tare_and_a_lost_part_in_mid_tour_are_distinguished() -> None:
     step = np.array([0.3, 0, 0.2, 0, 0, 0])
     change = changed(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop >= 10) * step))
     assert (change.code, change.values["pose"]) == ("bias_stepped", 10)

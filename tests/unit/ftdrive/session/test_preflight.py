@@ -15,9 +15,8 @@ from ftdrive.checks import computer
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import SLOWEST_SLIDER, check_speed
 from ftdrive.errors import NotAccepted
-from ftdrive.session import preflight, session
+from ftdrive.session import preflight
 from ftdrive.session.events import Checked, Noted
-from ftdrive.session.guards import Limits
 from ftdrivers.errors import DeviceFault, StreamBroken
 from ftdrivers.interfaces import ArmState
 from tests.unit.ftdrive.fake_cell import Lab
@@ -30,7 +29,7 @@ def refuse(lab: Lab, words: str) -> None:
     assert lab.operator.asked == []
 
 
-def test_a_workcell_nobody_measured_is_refused(lab: Lab) -> None:
+def test_a_workcell_that_was_not_measured_is_refused(lab: Lab) -> None:
     lab.cell = replace(lab.cell, workcell=WorkcellConfig())
     refuse(lab, "measured = true")
 
@@ -91,7 +90,7 @@ def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
     range_N: float, range_Nm: float, share: int, passes: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     limits = np.array([200.0, range_N, 200, 20, 20, range_Nm])
-    monkeypatch.setattr(session, "_range_of", lambda _: limits)
+    monkeypatch.setattr(preflight.Before, "sensor_range", limits)
     lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=1.5))
     words = f"twice the tool's weight is {share} % of the sensor's range"
     if passes:
@@ -173,7 +172,7 @@ def test_a_plan_for_another_tool_is_refused(lab: Lab) -> None:
 
 @pytest.mark.parametrize("dry_run", [True, False])
 @pytest.mark.parametrize("program", ["playing", "paused"])
-def test_a_program_of_somebody_else_is_refused_before_anything_is_done(
+def test_a_program_of_another_client_is_refused_before_anything_is_done(
     program: str, dry_run: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lab.arm, "reported_program", lambda: "PLAYING pick.urp")
@@ -220,7 +219,7 @@ def test_control_is_taken_when_all_else_is_well(lab: Lab) -> None:
     assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
 
 
-def test_an_old_controller_is_controlled_from_the_start_for_it_tells_no_poses_before(lab: Lab) -> None:
+def test_an_old_controller_is_controlled_from_the_start_because_it_reports_no_poses_before(lab: Lab) -> None:
     lab.arm.set_status(tcp_offset=None)
     right = lab.arm.state
 
@@ -252,7 +251,7 @@ def link(lab: Lab, *, old: bool, late_s: Callable[[int], float]) -> Check:
 
     right, lab.arm.answers_s = lab.arm.state, 0.0
     lab.arm.state = late  # type: ignore[method-assign]  # this arm only
-    return preflight.check_link(cast("preflight.Before", SimpleNamespace(arm=lab.arm, cell=lab.cell, limits=Limits())))
+    return preflight.check_link(cast("preflight.Before", SimpleNamespace(cell=lab.open_cell())))
 
 
 @pytest.mark.parametrize(("old", "limit_s"), [(False, 0.02), (True, 0.06)])

@@ -14,6 +14,7 @@ from ftdrive.cell.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.runs.run import Run
 from ftdrive.session import session, tour
 from ftdrive.session.events import (
     Checked,
@@ -31,6 +32,7 @@ from ftdrive.session.operator import Key
 from ftdrive.terminal.report import drift_in_words
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
+from tests.edited_files import edit
 from tests.unit.ftdrive.fake_cell import Lab
 
 
@@ -202,7 +204,9 @@ def test_the_rate_of_a_drift_is_the_same_whichever_was_first(elapsed_s: float, w
     assert words.endswith("away: 0.1 N/min")
 
 
-def test_a_way_past_a_skipped_pose_is_told_and_confirmed_by_a_person(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_approach_past_a_skipped_pose_is_shown_and_confirmed_by_the_operator(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lab.calibrate()  # trusted from here on
     lab.operator.asked.clear()
     lab.operator.answers["Pose 3 of 7"] = ["s"] * 2
@@ -214,12 +218,12 @@ def test_a_way_past_a_skipped_pose_is_told_and_confirmed_by_a_person(lab: Lab, m
     assert [question.assumed for question in ways] == ["yes", None]
 
 
-def test_what_would_help_most_is_not_told_where_the_plan_chooses(lab: Lab) -> None:
+def test_what_would_help_most_is_not_shown_where_the_plan_chooses(lab: Lab) -> None:
     lab.calibrate()
     assert {event.hint for event in lab.operator.of(Estimated)} == {""}
 
 
-def test_a_hold_tells_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> None:
+def test_a_hold_shows_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.arm.set_status(
         fault=DeviceFault("protective stop", "…"), safety_mode="protective stop"
     )
@@ -322,8 +326,8 @@ def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
     then: tuple[str, str], now: tuple[str, str], cure: str, lab: Lab
 ) -> None:
     folder = broken_off(lab)
-    header = folder / "run.json"
-    header.write_text(header.read_text().replace('"fake"', f'"{then[0]}"').replace('"S1"', f'"{then[1]}"'))
+    model, serial = then
+    edit(folder / "run.json", lambda header: header["devices"]["sensor"].update(model=model, serial=serial))
     reports(lab, *now)
     if not cure:
         assert lab.calibrate(resume=folder) is not None
@@ -331,6 +335,16 @@ def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
     with pytest.raises(PlanRefused, match=f"{then[0]}, serial {then[1]}, connected is {now[0]}.*{cure}"):
         lab.calibrate(resume=folder)
     assert lab.arm.moves == []
+
+
+def test_a_run_that_another_process_resumes_is_refused_before_anything_moves(lab: Lab) -> None:
+    folder = broken_off(lab)
+    events = (folder / "events.ndjson").read_bytes()
+    with Run(folder), pytest.raises(ConfigError, match=r"is in use by process \d+ on .* since "):
+        lab.calibrate(resume=folder)
+    assert lab.arm.moves == []
+    assert (folder / "events.ndjson").read_bytes() == events
+    assert lab.calibrate(resume=folder) is not None
 
 
 def test_an_arm_without_a_serial_number_is_the_same_where_its_model_is(lab: Lab) -> None:
@@ -464,7 +478,7 @@ def test_by_hand_nothing_is_planned_or_moved(option: dict[str, Any], lab: Lab) -
     assert not (lab.folder / "runs").exists()
 
 
-def test_options_that_cannot_be_used_are_told_before_anything_opens(lab: Lab) -> None:
+def test_options_that_cannot_be_used_are_reported_before_anything_opens(lab: Lab) -> None:
     lab.calibrate()
     opened, run = lab.arm.opened, lab.run()
     with pytest.raises(ConfigError, match="name the run with --resume"):
@@ -478,7 +492,9 @@ def test_options_that_cannot_be_used_are_told_before_anything_opens(lab: Lab) ->
     assert lab.arm.opened == opened
 
 
-def test_a_cell_that_cannot_be_built_is_told_before_its_sensor_opens(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cell_that_cannot_be_built_is_reported_before_its_sensor_opens(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(_: object) -> None:
         raise ConfigError("[robot] driver")
 

@@ -18,6 +18,7 @@ from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo, Guard
+from tests.edited_files import edit
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import FakeArm, FakeSensor
 
@@ -346,9 +347,7 @@ def test_another_mounting_is_not_set(cell: Cell) -> None:
 
 def test_a_receipt_of_another_arm_is_refused(cell: Cell) -> None:
     path, _ = cell.send(cell.propose())
-    other = json.loads(path.read_text())
-    other["devices"]["arm"]["serial"] = "A9"
-    path.write_text(json.dumps(other))
+    edit(path, lambda other: other["devices"]["arm"].update(serial="A9"))
     with pytest.raises(NotAccepted, match="serial A9, but UR5e, serial A1"):
         restore(cell.config, cell.arm, Receipt.load(path))
 
@@ -365,7 +364,7 @@ def test_a_receipt_of_another_arm_is_refused(cell: Cell) -> None:
 )
 def test_a_damaged_receipt_is_an_error_that_names_it(cell: Cell, change: dict[str, Any], says: str) -> None:
     path, _ = cell.send(cell.propose())
-    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    edit(path, lambda receipt: receipt.update(change))
     with pytest.raises(BadDataset, match=says) as error:
         Receipt.load(path)
     assert "push.json" in str(error.value)

@@ -1,7 +1,6 @@
 """The guards' looks and their thread: how often, what counts as late, how a stop is reported, and who misses them."""
 
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -11,11 +10,13 @@ import pytest
 
 from ftdrive.session.events import Event, GuardTripped, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.guards import Guard, Limits, Seen, SensorGuard, StallGuard, Tripped
+from ftdrive.session.journal import Journal
+from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout
 from tests.fake_clock import FakeClock
-from tests.unit.ftdrive.fake_cell import FakeArm, FakeSensor, Lab, SteppedWatcher
+from tests.unit.ftdrive.fake_cell import FakeArm, FakeSensor, Lab, Scripted, SteppedWatcher
 
 
 class Looks(Guard):
@@ -36,6 +37,10 @@ def trips(hazard: int) -> Iterator[None]:
     assert found.value.hazard == hazard
 
 
+def opened(arm: FakeArm, sensor: FakeSensor | None = None, limits: Limits | None = None) -> OpenCell:
+    return OpenCell(arm, sensor or FakeSensor(arm), arm.clock, Journal(Scripted()), limits or Limits())
+
+
 class Cell:
     """An arm that stands, controlled, and its sensor; looked at by guards that are stepped by a fake clock."""
 
@@ -46,7 +51,7 @@ class Cell:
         self.arm.answers_s = 0.0
         self.sensor = FakeSensor(self.arm)
         self.trips: list[tuple[float, Tripped]] = []
-        self.watcher = SteppedWatcher(self.arm, self.sensor, guards, self._on_trip, clock=self.clock, limits=Limits())
+        self.watcher = SteppedWatcher(opened(self.arm, self.sensor), guards, self._on_trip)
 
     def _on_trip(self, trip: Tripped) -> None:
         self.trips.append((self.clock.now_s(), trip))
@@ -252,7 +257,7 @@ def test_guards_that_ended_on_the_way_are_missed_at_once(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize("stop", [0, 3])
-def test_nothing_moves_where_nobody_watches(stop: int, lab: Lab) -> None:
+def test_nothing_moves_without_a_watchdog(stop: int, lab: Lab) -> None:
     def on_event(event: Event) -> None:
         if isinstance(event, PoseTaken) and event.stop == stop:
             end(lab)
@@ -273,7 +278,7 @@ def test_nothing_moves_where_nobody_watches(stop: int, lab: Lab) -> None:
 def thread_of(arm: FakeArm, *guards: Guard) -> Iterator[Watcher]:
     """Let the thread itself watch an arm that stands, by the computer's clock; it may be as late as it likes."""
     patient = replace(Limits(), hung_s=60.0)
-    with Watcher(arm, FakeSensor(arm), guards, lambda _: None, clock=REAL, limits=patient) as watcher:
+    with Watcher(opened(arm, limits=patient), guards, lambda _: None) as watcher:
         watcher.begin()
         with watcher.watching(arm.q, arm.q, moving=False):
             yield watcher
@@ -317,7 +322,7 @@ def test_the_thread_stops_an_arm_that_does_not_answer_the_stop() -> None:
     arm.stop = slow  # type: ignore[method-assign]  # this arm only
     with (
         trips(16),
-        Watcher(arm, FakeSensor(arm), [], lambda _: reported.set(), clock=REAL, limits=Limits()) as watcher,
+        Watcher(opened(arm), [], lambda _: reported.set()) as watcher,
     ):
         watcher.begin()
         with watcher.watching(arm.q, arm.q, moving=False):
@@ -338,48 +343,3 @@ def test_a_thread_that_has_ended_is_missed() -> None:
         (guards,) = [thread for thread in threading.enumerate() if thread.name == "guards"]
         guards.join(60.0)
         watcher.check()
-
-
-def _hang(free: threading.Event) -> None:
-    free.wait(10.0)
-
-
-@pytest.mark.realtime
-def test_the_thread_looks_sixty_times_a_second_and_is_missed_after_one() -> None:
-    class Counts(Guard):
-        seen = 0
-
-        def look(self, _: Seen) -> None:
-            self.seen += 1
-
-    arm, guard, free = real_arm(), Counts(), threading.Event()
-    with Watcher(arm, FakeSensor(arm), [guard], lambda _: None, clock=REAL, limits=Limits()) as watcher:
-        watcher.begin()
-        with watcher.watching(arm.q, arm.q, moving=False):
-            time.sleep(1.0)
-            assert 60 <= guard.seen <= 102
-            arm.at_look = lambda: _hang(free)
-            began_s = time.monotonic()
-            with trips(18):
-                while time.monotonic() < began_s + 5.0:
-                    watcher.check()
-                    time.sleep(0.001)
-            assert 0.9 < time.monotonic() - began_s < 1.2
-            arm.at_look = lambda: None
-            free.set()
-
-
-@pytest.mark.realtime
-def test_a_sensor_that_falls_silent_stops_an_arm_on_its_way_within_150_ms() -> None:
-    arm = real_arm()
-    sensor = FakeSensor(arm)
-    limits = Limits()
-    with Watcher(arm, sensor, [SensorGuard(limits)], lambda _: None, clock=REAL, limits=limits) as watcher:
-        watcher.begin()
-        with trips(15), watcher.watching(arm.q, arm.q + 1, moving=True):
-            time.sleep(0.5)
-            watcher.check()
-            silent(sensor)
-            began_s = time.monotonic()
-            assert arm.halted.wait(5.0)
-            assert 0.08 < time.monotonic() - began_s < 0.15

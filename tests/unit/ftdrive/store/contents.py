@@ -11,11 +11,6 @@ _TABLES = {
     "sqlite": "SELECT name FROM sqlite_master WHERE type = 'table'",
     "postgresql": "SELECT tablename FROM pg_tables WHERE schemaname = 'public'",
 }
-_COLUMNS = {
-    "sqlite": 'SELECT m.name, c.name, c.type, c."notnull" FROM sqlite_master m, pragma_table_info(m.name) c',
-    "postgresql": "SELECT table_name, column_name, data_type, is_nullable FROM information_schema.columns "
-    "WHERE table_schema = 'public'",
-}
 
 
 @contextmanager
@@ -33,12 +28,6 @@ def dump(url: str) -> list[str]:
             for name in _names(connection)
             for row in connection.execute(text(f"SELECT * FROM {name}")).mappings()
         )
-
-
-def columns(url: str) -> set[tuple[Any, ...]]:
-    """Return every column and index with its table."""
-    with connected(url) as connection:
-        return {tuple(row) for row in connection.execute(text(_COLUMNS[connection.dialect.name]))}
 
 
 def wipe(url: str) -> None:

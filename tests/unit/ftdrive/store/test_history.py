@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftcalib.model import Array
-from ftdrive.store.history import Drift, age_days, drifts, warnings
+from ftdrive.store.history import QuantityTrend, age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
 from tests.unit.ftdrive.live.simulated import calibrated
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
@@ -33,7 +33,7 @@ def months(folder: Path, rate: Array, n: int = 6, scatter: float = 0.0, **about:
     return records(folder)[0]
 
 
-def significant(found: list[Drift]) -> dict[str, bool]:
+def significant(found: list[QuantityTrend]) -> dict[str, bool]:
     return {drift.quantity: drift.is_significant for drift in found}
 
 

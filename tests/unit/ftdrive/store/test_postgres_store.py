@@ -56,7 +56,7 @@ def test_a_writer_that_waits_in_vain_is_one_sentence_and_is_caught_up(runs: Path
     assert len(store.results()) == 4
 
 
-def test_a_reader_does_not_wait_for_an_upgrade(runs: Path, postgres_url: str) -> None:
+def test_a_reader_does_not_wait_for_a_writer(runs: Path, postgres_url: str) -> None:
     store = Store(postgres_url, wait_s=0.05)
     store.index(runs)
     with Store(postgres_url)._database.writing() as connection:

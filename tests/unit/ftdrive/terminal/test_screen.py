@@ -36,7 +36,7 @@ from ftdrive.session.events import (
 from ftdrive.session.operator import Key, Question
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator
-from ftdrive.terminal.screen import Screen, View, frame, open_operator
+from ftdrive.terminal.screen import Screen, SessionView, frame, open_operator
 
 RESUME = "ftdrive calibrate --resume runs/2026-11-20T211503Z-gripper_a"
 VALUES: dict[str, Any] = {
@@ -94,8 +94,8 @@ def estimated(**changes: Any) -> Estimated:
     return Estimated(**(fields | changes))
 
 
-def view(*events: Event) -> View:
-    found = View()
+def view(*events: Event) -> SessionView:
+    found = SessionView()
     for second, event in enumerate(events):
         found.update(event, float(second))
     return found
@@ -109,7 +109,7 @@ MIDDLE: tuple[Event, ...] = (
 )
 
 
-def drawn(found: View, *, width: int = 80, height: int = 24, now_s: float = 9.0) -> list[str]:
+def drawn(found: SessionView, *, width: int = 80, height: int = 24, now_s: float = 9.0) -> list[str]:
     console = Console(width=width, height=height, file=io.StringIO(), color_system=None, force_terminal=False)
     console.print(frame(found, now_s, width=width, height=height))
     file = console.file
@@ -243,7 +243,7 @@ def test_a_warning_stays_until_the_next_pose() -> None:
     assert "! wait" not in drawn(warned)
 
 
-def test_a_long_path_keeps_the_end_that_tells_runs_apart() -> None:
+def test_a_long_path_keeps_the_end_that_distinguishes_runs() -> None:
     long = "/home/operator/" + "deep/" * 20 + "2026-11-20T211503Z-gripper_a"
     lines = drawn(view(RunOpened(folder=long, resume=f"ftdrive calibrate --resume {long}")))
     assert [line for line in lines if line.endswith("2026-11-20T211503Z-gripper_a") and len(line) == 80] == lines[-2:]
@@ -551,7 +551,7 @@ def test_the_frame_is_erased_after_success_and_stays_after_an_error(error: type[
 
 @pytest.mark.parametrize("width", [80, 60])
 def test_a_verification_shows_each_pose_beside_its_prediction(width: int) -> None:
-    view = View("verify")
+    view = SessionView("verify")
     for stop, number, off in ((1, 103, 1.0), (2, 101, 20.0)):
         view.update(pose(stop, number, stops=3), float(stop))
         residual, sigma = np.repeat([0.03 * off, 0.001 * off], 3), np.repeat([0.03, 0.001], 3)

@@ -1,11 +1,13 @@
 """The CAN emulator without a wire: payloads and the adapter's lines."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ftmocks.sensors.ati_can import matrix_row_payloads, sg_payloads
+from ftmocks.sensors.ati_can import AtiCanNode, matrix_row_payloads, sg_payloads
 from ftmocks.sensors.ati_gauges import REFERENCE
 from ftmocks.wires.slcan import CanFrame, SlcanAdapter
 
@@ -33,6 +35,35 @@ def test_matrix_rows() -> None:
         "437E0000 00000000 C2FE0000 00000000 C2FE0000 00000000",
         "00000000 C3060000 00000000 C3060000 00000000 C3060000",
     ]
+
+
+WRENCH = [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608]
+READING = ["200#0000 0064 012C 01F4", "201#FF38 FE70 FDA8"]
+FIRMWARE = "20F#0308 0002"
+
+
+@pytest.mark.parametrize(
+    ("options", "requests", "answers"),
+    [
+        ({}, ["200#", "20F#"], [*READING, FIRMWARE]),
+        ({}, ["200#00", "207#00"], [*READING, "207#000F 4240 000F 4240"]),
+        ({}, ["200#0000", "202#", "202#06", "206#10", "209#01", "20A#", "100#", "20F#"], [FIRMWARE]),
+        ({}, ["206#0F", "200#"], ["206#0F", "200#8040 0064 012C 01F4", READING[1]]),
+        ({}, ["206#0F", "202#02"], ["206#0F", *(f"{i}#0000 0000 0000 0000" for i in (202, 203, 204))]),
+        ({}, ["206#0F", "206#00", "200#"], ["206#0F", "206#00", *READING]),
+        ({"wrong_echo": 7}, ["206#00"], ["206#07"]),
+        ({"saturated_axis": 3}, ["200#"], [READING[0], "201#FF38 7FFF FDA8"]),
+        ({"firmware": (3, 8, 0)}, ["207#", "208#", "209#00"], ["207#000F 4240 000F 4240", "208#0203", "209#07FF"]),
+        ({"firmware": (3, 7, 9)}, ["207#", "208#", "209#00"], ["207#000F 4240 000F 4240", "208#0203"]),
+        ({"firmware": (3, 6, 9)}, ["207#", "208#", "209#00"], []),
+    ],
+)
+def test_answers(options: dict[str, Any], requests: list[str], answers: list[str]) -> None:
+    node = AtiCanNode(lambda n: np.tile(WRENCH, (n, 1)), boot_s=0.0, **options)
+    frames = [
+        node._answer(CanFrame(int(head, 16), bytes.fromhex(tail))) for head, tail in (r.split("#") for r in requests)
+    ]
+    assert [f"{one.identifier:03X}#{one.data.hex(' ', -2).upper()}" for some in frames for one in some] == answers
 
 
 def opened_adapter() -> SlcanAdapter:

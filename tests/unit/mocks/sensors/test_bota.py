@@ -64,6 +64,12 @@ def test_overrange_and_uncalibrated_bits(box: BotaBox) -> None:
     assert values[4] == 15
 
 
+def test_text_and_uncalibrated_output(box: BotaBox) -> None:
+    box._received(b"C c,0,0,1,4\r\nR")
+    assert b"".join(box._wire.due(box.clock.now_s())) == b"r,0,C,0\r\nr,0,c,0\r\nr,0,R,0\r\n"
+    assert box._samples(1)[0].decode().split(",")[:7] == ["8", "1", "-2", "9.81", "0.1", "-0.2", "0.3"]
+
+
 @pytest.mark.parametrize(("sinc", "rate_hz"), [(512, 100), (256, 200), (128, 400), (64, 800), (51, 1004)])
 def test_sampling_time_follows_the_filter(sinc: int, rate_hz: float) -> None:
     assert 1 / BotaBox(lambda n: np.zeros((n, 6)), sinc_length=sinc).sample_s == pytest.approx(rate_hz, rel=1e-3)

@@ -15,6 +15,7 @@ from ftmocks.sensors.robotous import (
     packet,
     sample_field,
 )
+from ftmocks.wires.slcan import CanFrame
 
 WRENCH = np.array([10, -5, 20, 1, -0.5, 0.05])
 SAMPLE = "0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000"
@@ -160,6 +161,24 @@ def test_can_node_sets_identifiers_but_no_baud_rate(readings: Readings) -> None:
     assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 64 01 02 10 11 12")
     node.boot()
     assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 10 11 12 10 11 12")
+
+
+def test_can_node_answers_at_its_identifiers(readings: Readings) -> None:
+    node = RobotousCanNode(readings)
+    node.boot()
+    strange = [
+        CanFrame(0x65, command("0A")),
+        CanFrame(0x64, b"\x0a"),
+        CanFrame(0x64, command("0A"), extended=True),
+        CanFrame(0x64, command("0A"), remote=True),
+    ]
+    assert [node._answer(frame) for frame in strange] == [[]] * 4
+    sample = b"\x0a" + bytes.fromhex(SAMPLE)[1:]
+    assert node._answer(CanFrame(0x64, command("0A"))) == [CanFrame(1, sample[:8]), CanFrame(2, sample[8:])]
+    node.execute(command("04 70 71 72"))
+    node.boot()
+    assert node._answer(CanFrame(0x64, command("0A"))) == []
+    assert node._answer(CanFrame(0x70, command("0A"))) == [CanFrame(0x71, sample[:8]), CanFrame(0x72, sample[8:])]
 
 
 def test_while_streaming_only_stop_and_bias_are_taken(sensor: RobotousSerialBox) -> None:

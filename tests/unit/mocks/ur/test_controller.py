@@ -12,7 +12,7 @@ from ftmocks.ur.dashboard import LOCAL_CONTROL, TOO_EARLY, answer
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import RobotMode, Runtime, SafetyMode
 from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.script import Upload
+from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.ur.variables import OUTPUTS, output_type
 from ftmocks.world import Truth, World
 
@@ -35,7 +35,7 @@ def run(robot: Robot, seconds: float) -> None:
 def moving_robot() -> Robot:
     """Its program runs, an asynchronous moveJ of 1 rad is under way at 0.2 rad/s."""
     robot = new_robot()
-    robot.upload(CONTROL)
+    start_upload(robot, CONTROL)
     run(robot, 0.15)
     doubles = {f"input_double_register_{i}": v for i, v in enumerate([*GOAL, 0.2, 2.0])}
     robot.write_inputs({"input_int_register_0": 1, **doubles, "input_int_register_1": 1})
@@ -57,7 +57,7 @@ STOPPING: dict[str, Callable[[Robot], object]] = {
     "idle": lambda r: r.set_mode(RobotMode.IDLE),
     "recovery": lambda r: r.set_safety(SafetyMode.RECOVERY, "asked for"),
     "fault": lambda r: r.set_safety(SafetyMode.FAULT, "asked for"),
-    "another program": lambda r: r.upload(OTHER, by="another script client"),
+    "another program": lambda r: start_upload(r, OTHER, by="another script client"),
 }
 
 
@@ -131,7 +131,7 @@ def test_reduced_mode_stops_nothing_and_outlives_a_protective_stop() -> None:
 def test_no_program_starts_in_any_other_safety_mode(mode: SafetyMode) -> None:
     robot = new_robot()
     robot.set_safety(mode, "asked for")
-    assert robot.upload(CONTROL) is False
+    assert start_upload(robot, CONTROL) is False
     assert not found(robot, "program rtde_control").accepted
     run(robot, 0.3)
     assert robot.runtime == Runtime.STOPPED
@@ -139,7 +139,7 @@ def test_no_program_starts_in_any_other_safety_mode(mode: SafetyMode) -> None:
 
 def test_a_program_whose_start_was_under_way_does_not_start_in_a_stopped_robot() -> None:
     robot = new_robot()
-    assert robot.upload(CONTROL)
+    assert start_upload(robot, CONTROL)
     robot.protective_stop("asked for")
     run(robot, 0.3)
     assert robot.runtime == Runtime.STOPPED
@@ -163,7 +163,7 @@ def test_power_comes_back_step_by_step(late: float) -> None:
 
 def test_a_command_to_a_foreign_program_is_noted_as_lost() -> None:
     robot = moving_robot()
-    robot.upload(SLEEPING, by="another script client")
+    start_upload(robot, SLEEPING, by="another script client")
     run(robot, 0.2)
     assert (robot.runtime, robot.program_name) == (Runtime.PLAYING, "other")
     robot.write_inputs({"input_int_register_0": 34})

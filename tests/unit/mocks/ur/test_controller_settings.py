@@ -7,7 +7,7 @@ import pytest
 
 from ftmocks.kinematics import MODELS, Vector3, Vector6, forward, vector3, vector6
 from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.script import Upload
+from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.ur.variables import OUTPUTS
 from ftmocks.world import Truth, World
 
@@ -42,7 +42,7 @@ def reported(robot: Robot) -> Vector3:
 
 
 def started(name: str, body: str, robot: Robot) -> Robot:
-    assert robot.upload(Upload(name, f"def {name}():\n  {body}\nend\n", secondary=False)), robot.events[-1].why
+    assert start_upload(robot, Upload(name, f"def {name}():\n  {body}\nend\n", secondary=False)), robot.events[-1].why
     run(robot, 0.2)
     return robot
 

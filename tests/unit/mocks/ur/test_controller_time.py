@@ -17,8 +17,8 @@ from ftmocks.ur.clients import BACKLOG_LIMIT_S
 from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot, RobotSettings
 from ftmocks.ur.rtde_client import RtdeClient
-from ftmocks.ur.script import Upload
 from ftmocks.ur.server import UrServer
+from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.world import Truth, World
 from tests.unit.mocks.real_time import RealTime
 
@@ -125,7 +125,7 @@ def test_a_stall_of_the_computer_costs_no_cycle_and_makes_none_up() -> None:
 
 
 def start_guarded_program(controller: Controller) -> None:
-    controller.robot.upload(SLEEPING)
+    start_upload(controller.robot, SLEEPING)
     controller.run(0.2)
     assert controller.robot.runtime == Runtime.PLAYING
     controller.robot.set_watchdog("input_int_register_0", 10.0)
@@ -273,7 +273,7 @@ def test_samples_step_exactly_in_the_time_of_the_controller_even_when_the_comput
 def test_samples_of_the_arm_are_sent_after_the_delay_of_their_link(delay_s: float) -> None:
     with running() as controller:
         reader = Reader(controller, 500.0)
-        controller.server.delay_s = delay_s
+        controller.server.rtde.delay_s = delay_s
         controller.run(1.0)
         reader.close()
         offset_s = controller.robot.cycle_s - controller.robot.timestamp_s
@@ -287,7 +287,7 @@ def test_samples_of_the_arm_are_sent_after_the_delay_of_their_link(delay_s: floa
 
 def test_a_paused_client_gets_no_sample_that_was_on_its_way(controller: Controller) -> None:
     reader = Reader(controller, 500.0)
-    controller.server.delay_s = 0.02
+    controller.server.rtde.delay_s = 0.02
     controller.run(0.1)
     reader.pause()
     controller.run(0.01)

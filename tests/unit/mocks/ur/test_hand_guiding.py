@@ -11,7 +11,7 @@ from ftmocks.kinematics import MODELS, Vector6, forward, vector6
 from ftmocks.ur.hand import IN_A_PROGRAM, SPEED_RAD_S, guided_by_hand, orientations, pendant_program
 from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.script import Upload
+from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.world import Truth, World
 
 UR5E = MODELS["UR5e"]
@@ -88,7 +88,7 @@ def test_the_joints_stay_within_a_turn() -> None:
 
 def test_a_hand_waits_for_a_program_and_for_power() -> None:
     robot = new_robot()
-    robot.upload(Upload("other", "def other():\n  sleep(20)\nend\n", secondary=False))
+    start_upload(robot, Upload("other", "def other():\n  sleep(20)\nend\n", secondary=False))
     run(robot, 0.1)
     assert robot.runtime == Runtime.PLAYING
     robot.hand = guided_by_hand(robot, REST_S)
@@ -109,7 +109,7 @@ def test_a_hand_waits_for_a_program_and_for_power() -> None:
 
 def test_a_program_on_the_pendant_goes_there_once_and_back() -> None:
     robot = new_robot()
-    assert robot.upload(pendant_program(robot, REST_S))
+    assert start_upload(robot, pendant_program(robot, REST_S))
     _, *found = rests(robot, IN_A_PROGRAM + 1)  # before its start too
     assert robot.runtime == Runtime.PLAYING
     expected = orientations(HOME)[:IN_A_PROGRAM]

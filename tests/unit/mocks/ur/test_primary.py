@@ -7,7 +7,7 @@ from ftmocks.ur import primary
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import RobotMode
 from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.script import Upload
+from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.world import Truth, World
 from tests.unit.mocks.ur.primary_decoder import decoded, packages
 from tests.unit.mocks.ur.urscript_robot import HOME, new_robot, run, start
@@ -141,7 +141,7 @@ def test_a_replaced_program_ends_before_the_new_one_begins() -> None:
 def test_a_program_that_may_not_start_is_not_heard() -> None:
     robot = new_robot()
     robot.set_mode(RobotMode.IDLE)
-    robot.upload(Upload("f", "def f():\nend\n", secondary=False))
+    start_upload(robot, Upload("f", "def f():\nend\n", secondary=False))
     run(robot, 0.2)
     assert heard(robot) == []
 

@@ -49,7 +49,7 @@ def test_a_swing_starts_and_ends_at_rest_where_it_began_after_whole_periods() ->
 def test_the_program_swings_the_arm_and_ends() -> None:
     robot = Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME), RobotSettings(time_scale=20.0))
     swing = Swing(robot.arm.dh, HOME, 8.0)
-    assert robot.pendant_start(SwingProgram(robot, swing))
+    assert robot.start_soon(SwingProgram(robot, swing), by="operator", obstacle=robot.obstacle)
     played_s = 0.0
     for _ in range(1000):
         robot.tick()
@@ -69,7 +69,7 @@ def test_the_program_swings_the_arm_and_ends() -> None:
 
 def test_a_stop_ends_the_swing_and_the_arm_comes_to_rest() -> None:
     robot = Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME), RobotSettings())
-    robot.pendant_start(SwingProgram(robot, Swing(robot.arm.dh, HOME, 30.0)))
+    robot.start_soon(SwingProgram(robot, Swing(robot.arm.dh, HOME, 30.0)), by="operator", obstacle=robot.obstacle)
     for _ in range(500):
         robot.tick()
     assert not robot.arm.at_rest
@@ -97,5 +97,6 @@ def test_an_impossible_swing_is_refused(changes: dict[str, float], why: str) -> 
 def test_no_swing_starts_without_power() -> None:
     robot = Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME), RobotSettings())
     robot.power_off()
-    assert not robot.pendant_start(SwingProgram(robot, Swing(robot.arm.dh, HOME, 5.0)))
+    program = SwingProgram(robot, Swing(robot.arm.dh, HOME, 5.0))
+    assert not robot.start_soon(program, by="operator", obstacle=robot.obstacle)
     assert "POWER_OFF" in robot.events[-1].why

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ftmocks.ur.dashboard import answer
-from ftmocks.ur.script import Upload
+from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.ur.urscript.library import functions
 from ftmocks.ur.urscript.parser import parse
 from ftmocks.ur.urscript.syntax import UrscriptSyntaxError
@@ -201,7 +201,7 @@ def test_errors_read_as_on_a_controller(text: str, place: tuple[int, int], repor
 
 def test_a_program_that_is_rejected_leaves_the_running_one() -> None:
     robot = start("def g():\n  sleep(1)\nend\n")
-    assert not robot.upload(Upload("f", "def f():\n  speedj([0, 0, 0, 0, 0, 0])\nend\n", secondary=False))
+    assert not start_upload(robot, Upload("f", "def f():\n  speedj([0, 0, 0, 0, 0, 0])\nend\n", secondary=False))
     refused = robot.events[-1]
     assert "syntax error: line 2: the name speedj does not exist, or is not modelled" in refused.why
     assert refused.detail == {"error": "compile_error_name_not_found:speedj:", "line": 2, "column": 3}
@@ -211,7 +211,7 @@ def test_a_program_that_is_rejected_leaves_the_running_one() -> None:
 def test_a_function_exists_from_its_version_on() -> None:
     text = "def f():\n  set_target_payload(1, [0, 0, 0.1], [0, 0, 0, 0, 0, 0])\nend\n"
     for polyscope, known in {(5, 9, 0): False, (5, 10, 0): True, (3, 14, 0): False, (10, 11, 0): True}.items():
-        assert new_robot(polyscope).upload(Upload("f", text, secondary=False)) is known
+        assert start_upload(new_robot(polyscope), Upload("f", text, secondary=False)) is known
 
 
 WORDS = ["def f():\n", "thread t():\n", "if True:\n", "else:\n", "while x < 3:\n", "end\n", "break\n", "halt\n", "\n"]
@@ -223,7 +223,7 @@ WORDS += ["enter_critical\n", "2.5", '"text"', "p[", "#", *"[]),+-", "==", "(" *
 def test_any_text_is_a_program_or_a_syntax_error_and_moves_nothing(text: str) -> None:
     """Also what happens to be a program: it runs for a while, ends, or is ended by an error."""
     robot = new_robot()
-    if robot.upload(Upload("f", f"def f():\n{text}\nend\n", secondary=False)):
+    if start_upload(robot, Upload("f", f"def f():\n{text}\nend\n", secondary=False)):
         run(robot, 0.12)
     else:
         assert "syntax error" in robot.events[-1].why

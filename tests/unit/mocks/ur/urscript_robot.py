@@ -8,7 +8,7 @@ from ftmocks.kinematics import MODELS, vector6
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.script import take_uploads
+from ftmocks.ur.uploads import start_upload, take_uploads
 from ftmocks.world import Truth, World
 
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
@@ -23,7 +23,7 @@ def start(text: str, robot: Robot | None = None) -> Robot:
     """Upload a program and let it begin."""
     robot = robot or new_robot()
     (upload,) = take_uploads(bytearray(text.encode()))
-    assert robot.upload(upload), robot.events[-1].why
+    assert start_upload(robot, upload), robot.events[-1].why
     run(robot, 0.12)
     return robot
 

@@ -1,0 +1,171 @@
+"""The outcome of verifications, read from their files, and the age of a calibration.
+
+A verification belongs to a calibration by its id, whatever the paths. `last_verification` looks for `verification.json`
+in the run folders beside that of the calibration, in those in `runs` beside the calibration file, and in those in
+`runs` of the current folder.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any, Final, Self
+
+from ftcalib import CalibrationDataset, CalibrationResult
+from ftcalib.errors import BadCalibration, BadDataset
+from ftcalib.files import JSON, check_format, read_object
+from ftdrive.runs.run import Run
+
+FORMAT: Final = "ftdrive.verification/1"
+
+EMULATED: Final = "EMULATED"
+EDITED: Final = "EDITED BY HAND"
+MARKS: Final[Mapping[str, str]] = {
+    EMULATED: "The cell was EMULATED: these are not the values of a real tool.",
+    EDITED: "The file was EDITED BY HAND after it was solved: its verdict and its sigmas are not those of its numbers.",
+}
+"""What every output says of some calibrations: a mark, and its meaning in a sentence."""
+
+
+@dataclass(frozen=True, slots=True)
+class VerificationRecord:
+    """The outcome of a verification, as its file has it."""
+
+    path: Path
+    calibration_id: str
+    created_utc: datetime
+    passed: bool
+    change: str | None
+    """What has changed; None if nothing, or if no change explains the readings."""
+    reason: str
+    force_max_N: float
+    torque_max_Nm: float
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a verification.json; unknown fields are ignored. Raises `BadCalibration` or `OSError`."""
+        try:
+            document = read_object(path, BadCalibration)
+            check_format(document, FORMAT, BadCalibration)
+            found = document.get("calibration")
+            identity = found.get("id") if isinstance(found, Mapping) else None
+            return cls.from_dict({**document, "path": str(path), "calibration_id": identity})
+        except BadCalibration as error:
+            raise BadCalibration(f"{path}: {error}") from error
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Build from `to_dict`; unknown fields are ignored. Raises `BadCalibration`."""
+        try:
+            return cls(
+                Path(document["path"]),
+                str(document["calibration_id"]),
+                datetime.fromisoformat(document["created_utc"]),
+                bool(document["passed"]),
+                document["change"],
+                str(document["reason"]),
+                float(document["force_max_N"]),
+                float(document["torque_max_Nm"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadCalibration(f"the verification cannot be read ({error}): the file is damaged") from error
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return what streams and recordings keep of it."""
+        return asdict(self) | {"path": str(self.path), "created_utc": self.created_utc.isoformat()}
+
+    def in_words(self, now: datetime) -> str:
+        """Return the result and its age, such as "verified 2 h ago"."""
+        return outcome_in_words(now - self.created_utc, passed=self.passed, change=self.change)
+
+
+def last_verification(place: Path) -> VerificationRecord | None:
+    """Return the newest verification of a calibration; None if there is none. Files that cannot be read are ignored.
+
+    Parameters
+    ----------
+    place : Path
+        A calibration file or its run folder.
+
+    Raises
+    ------
+    BadCalibration, OSError
+        The calibration cannot be read.
+    """
+    path = Run(place).calibration_path if place.is_dir() else place
+    return verification_near(place, CalibrationResult.load(path).id)
+
+
+def verification_near(place: Path, calibration_id: str) -> VerificationRecord | None:
+    """Return the newest verification of a calibration as `last_verification`; its file need not be in that place."""
+    found = [record for record in _records_near(place) if record.calibration_id == calibration_id]
+    return max(found, key=lambda record: record.created_utc, default=None)
+
+
+def _records_near(place: Path) -> Iterator[VerificationRecord]:
+    folder = place.absolute() if place.is_dir() else place.absolute().parent
+    for parent in dict.fromkeys((folder.parent, folder / "runs", Path("runs").absolute())):
+        for file in sorted(parent.glob("*/verification*.json")):
+            try:
+                yield VerificationRecord.load(file)
+            except (BadCalibration, OSError):
+                continue
+
+
+def fitted_dataset(calibration: CalibrationResult, place: Path) -> CalibrationDataset | None:
+    """Read the poses of a calibration from its folder; None if they are not there.
+
+    Parameters
+    ----------
+    place : Path
+        The calibration file or its folder.
+    """
+    for path in sorted((place if place.is_dir() else place.parent).glob("dataset*.json")):
+        try:
+            dataset = CalibrationDataset.load(path)
+        except (BadDataset, OSError):
+            continue
+        if dataset.sha256() == calibration.provenance.get("dataset_sha256"):
+            return dataset
+    return None
+
+
+def outcome_in_words(age: timedelta, *, passed: bool, change: str | None) -> str:
+    """Return the outcome of a verification and its age, such as "verified 2 h ago"."""
+    if passed:
+        return f"verified {age_in_words(age)} ago"
+    return f"VERIFICATION FAILED {age_in_words(age)} ago" + (f" ({change})" if change else "")
+
+
+def age_in_words(age: timedelta) -> str:
+    """Return an age in minutes, hours or days."""
+    hours = max(0.0, age.total_seconds()) / 3600
+    return f"{hours * 60:.0f} min" if hours < 1 else f"{hours:.0f} h" if hours < 48 else f"{hours / 24:.0f} d"
+
+
+def age_of(calibration: CalibrationResult, now: datetime) -> list[str]:
+    """Return the age of a calibration, such as ["2 h old"]; empty if its file does not say when it was made."""
+    created = calibration.provenance.get("created_utc")
+    return [f"{age_in_words(now - datetime.fromisoformat(created))} old"] if isinstance(created, str) else []
+
+
+def marks_of(calibration: CalibrationResult, *, emulated: bool = False) -> tuple[str, ...]:
+    """Return the `MARKS` of a calibration; `emulated` says that what it is applied to is emulated anyhow."""
+    found = {
+        EMULATED: emulated or calibration.provenance.get("station") is not None,
+        EDITED: calibration.is_edited,
+    }
+    return tuple(mark for mark, applies in found.items() if applies)
+
+
+def calibration_in_words(
+    calibration: CalibrationResult,
+    verification: VerificationRecord | None,
+    now: datetime,
+    marks: Sequence[str] | None = None,
+) -> str:
+    """Return id, verdict, age and marks of a calibration, by default its own, and its last verification's result."""
+    verified = "not verified" if verification is None else verification.in_words(now)
+    found = marks_of(calibration) if marks is None else marks
+    words = [f"calibration {calibration.id[:6]}", calibration.verdict, *found, *age_of(calibration, now), verified]
+    return ", ".join(words)

@@ -1,0 +1,284 @@
+"""Poses along a plan, in stages: look, check, choose the pace, tour."""
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from ftcalib.data.averaging_time import averaging_time
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, mean_and_covariance, noise_level
+from ftcalib.model import Array
+from ftcalib.routine import PoseRecord, Sampling
+from ftdrive.errors import ConfigError
+from ftdrive.planning.approach import arm_moves, plan_approach
+from ftdrive.planning.cell_plan import certifier_for, speeds_of
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.motion import slower
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.planning.show.words import way_in_words
+from ftdrive.runs.run import Run
+from ftdrive.session import guards
+from ftdrive.session.completed_plans import has_completed, remember_completed
+from ftdrive.session.events import GuardTripped, Planned
+from ftdrive.session.forecast import Averages, at_most, moves_s
+from ftdrive.session.live_fit import Judge
+from ftdrive.session.open_cell import OpenCell
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.pose_book import PoseBook
+from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
+from ftdrive.session.recovery import GuardedCell
+from ftdrive.session.safety_questions import SafetyQuestions
+from ftdrive.session.task import Task
+from ftdrive.session.tour import SLOW, Pace, Tour
+from ftdrive.session.watchdog import Watcher
+from ftdrivers.interfaces import NOT_REPORTED
+
+_GRID_RAD: Final = float(np.radians(0.1))
+"""Joints 1 to 3 are rounded to this grid before planning, so that the same posture gives the same plan and hash."""
+_TARGET_N, _TARGET_NM = 0.057, 0.0035
+"""Target sigma of one average: it gives 0.02 N of bias from 24 poses."""
+_HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
+_HEAVIEST_OF_ALL_KG: Final = 30.0
+_NO_SERIAL: Final = (
+    "the controller reports no serial number, so a completed plan cannot be assigned to an arm: newer PolyScope "
+    "versions report it"
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AlongPlan:
+    """A session in which the arm goes along a plan."""
+
+    cell: OpenCell
+    task: Task
+    options: SessionOptions
+    resumed: Run | None
+    """The run that is continued."""
+    new_run: Callable[[], Run]
+    """Creates the folder of a new one."""
+
+    def take(self, plan: Plan | None) -> Run | None:
+        """Take the poses of a plan, or of one that is made where the arm stands; None after a dry run.
+
+        A dry run never takes control of the arm.
+        """
+        cell, dry_run = self.cell, self.options.dry_run
+        certifier = self._certifier()
+        plan = plan or self._plan(certifier)
+        kept = self._kept()
+        taken = {record.stop for record in kept}
+        todo = [stop for stop in range(1, len(plan.steps) + 2) if stop not in taken]
+        judge = self.task.judge(by_hand=False)
+        for record in kept:
+            cell.journal.show(judge.add(record))
+        before = self._look(certifier, plan, todo)
+        check(before, CHECKS)
+        if dry_run:
+            cell.note("the controller's safety limits are not checked: only a program on the controller can query them")
+        else:
+            cell.arm.open(control=True)
+            if path := cell.arm.identify().facts.get("control"):
+                cell.note(f"control path {path.value}")
+            check(before, IN_CONTROL)
+        pace = self._pace(before, todo, taken=len(taken))
+        return None if dry_run else self._tour(before, pace, todo, judge)
+
+    @property
+    def _serial(self) -> str:
+        return self.cell.arm.identify().serial
+
+    def _is_slow(self, before: Before) -> bool:
+        """Whether the arm moves at the speed of a first run."""
+        return self.options.real and not (self.options.fast and before.known)
+
+    def _certifier(self) -> Certifier:
+        arm = self.cell.arm
+        if not self.options.dry_run and arm.status().tcp_offset is None:
+            arm.open(control=True)  # an old controller reports no poses before
+        return certifier_for(self.task.cell, arm.identify().model)
+
+    def _plan(self, certifier: Certifier) -> Plan:
+        q = np.round(self.cell.arm.state().q_rad / _GRID_RAD) * _GRID_RAD
+        with suppress(ConfigError):  # the planner reports it, with what to do
+            q[3:5] = constant_tour(q)[0, 3:5]  # joint 6 keeps its turn: it shows how the cable is wound
+        return self.task.plan(certifier, q, self.options.poses)
+
+    def _kept(self) -> list[PoseRecord]:
+        """Return the poses of the resumed run that are not taken again."""
+        records = [] if self.resumed is None else self.resumed.records()
+        return [record for record in records if record.stop not in self.options.redo]
+
+    def _look(self, certifier: Certifier, plan: Plan, todo: Sequence[int]) -> Before:
+        """Plan the approach to the first pose that is left, listen to the resting sensor, and show every motion."""
+        cell, options, steps = self.cell, self.options, plan.steps
+        goal = steps[(todo[0] - 1) % len(steps) if todo else 0].q_rad
+        before = Before(
+            cell=cell,
+            config=self.task.cell,
+            certifier=certifier,
+            plan=plan,
+            approach=plan_approach(certifier, cell.arm.state().q_rad, np.array(goal), SLOW),
+            runs=options.runs,
+            known=not options.real or has_completed(self._serial, plan.sha256),
+            quiet=cell.listen(LISTEN_S),
+            resumed=self.resumed is not None,
+        )
+        show_plan(before, options)
+        return before
+
+    def _pace(self, before: Before, todo: Sequence[int], *, taken: int) -> Pace:
+        """Choose speeds and averaging time; show the accuracy to expect with this sensor's noise, and the duration."""
+        cell, plan = self.cell, before.plan
+        sampling, sigma = _chosen_sampling(before, todo)
+        cell.note(self.task.forecast(Averages(plan, before.certifier, sampling.average_s, sigma)))
+        slow = self._is_slow(before)
+        if self.options.fast and slow:
+            why = f": {_NO_SERIAL}" if self._serial == NOT_REPORTED else ""
+            cell.note(f"{'every' if why else 'the first'} run of a plan is slow{why}", warning=True)
+        speeds = speeds_of(self.task.cell)
+        driven = at_most(plan, before.certifier, slower(speeds, SLOW) if slow else speeds)
+        fastest_rad_s = max(step.speed_rad_s for step in driven.steps)
+        total_s = moves_s(driven, todo, before.approach)
+        total_s += len(todo) * (sampling.average_s + 0.6)
+        cell.note(
+            f"{len(todo)} stops left, at most {np.degrees(fastest_rad_s):.0f}°/s: about {total_s / 60:.1f} min; "
+            f"{taken} poses taken before"
+        )
+        window = int(len(before.quiet) * min(1.0, sampling.average_s / LISTEN_S))
+        return Pace(
+            driven,
+            before.certifier,
+            sampling,
+            quiet_std=noise_level(before.quiet.wrench, max(LEAST_SAMPLES, window)),
+            sensor_kg=before.config.sensor.mass_kg,
+            trusted=before.known,
+        )
+
+    def _tour(self, before: Before, pace: Pace, todo: Sequence[int], judge: Judge) -> Run:
+        """Ask the safety questions, then visit every pose that is left; each is on disk before the next move."""
+        cell, options, way = self.cell, self.options, before.approach.way_rad
+        load = guards.RangeGuard(cell.limits, before.sensor_range)
+        contact = self._contact_guard(pace, judge)
+        rows = (
+            guards.SafetyGuard(),
+            guards.PathGuard(cell.limits),
+            guards.SensorGuard(cell.limits),
+            load,
+            contact,
+            guards.ModelGuard(cell.limits, before.certifier),
+            guards.SettingsGuard(),
+            guards.StallGuard(cell.limits),
+        )
+
+        def on_trip(trip: guards.Tripped) -> None:
+            cell.journal.show(GuardTripped(hazard=trip.hazard, words=str(trip)))
+
+        watcher = Watcher(cell, rows, on_trip)
+        questions = SafetyQuestions(cell, before.plan)
+        recheck = partial(self._recheck, before, questions)
+        with watcher:  # sees an emergency stop at a question too
+            if options.questions and todo:
+                questions.ask(way, assumed=before.known and not arm_moves(way))  # one with base or elbow is new
+            run = self.resumed or self._keep_plan(before.plan)
+            book = PoseBook(cell, run, judge, before.certifier.scene.down_base)
+            guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)
+            tour = Tour(guarded, pace, book, options)
+            with book.reporting_early_end():
+                tour.run(todo)
+        if todo and not before.known:
+            self._judge_completed(before.plan, run, tour.undriven)
+        return run
+
+    def _contact_guard(self, pace: Pace, judge: Judge) -> guards.ContactGuard:
+        arm = pace.certifier.arm
+        heaviest_kg = self.task.cell.tool.mass_kg or _HEAVIEST_KG.get(arm.name, _HEAVIEST_OF_ALL_KG)
+        reach_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in arm.tool)
+        acceleration_rad_s2 = pace.plan.acceleration_rad_s2
+        return guards.ContactGuard(
+            self.cell.limits, heaviest_kg, reach_m, acceleration_rad_s2, pace.quiet_std, judge.predict
+        )
+
+    def _keep_plan(self, plan: Plan) -> Run:
+        """Create the run, with the plan in it."""
+        run = self.new_run()
+        plan.save(run.plan_path)
+        self.cell.journal.keep_in(run)
+        return run
+
+    def _recheck(self, before: Before, questions: SafetyQuestions, asks: bool) -> None:
+        """Repeat the checks after a stop; with `asks`, all the safety questions too."""
+        q = self.cell.arm.state().q_rad
+        stays = plan_approach(before.certifier, q, q, SLOW)  # the next approach is checked when its goal is known
+        quiet = self.cell.listen(LISTEN_S)
+        check(replace(before, quiet=quiet, approach=stays, known=True, resumed=True), AGAIN)
+        if not self.options.questions:
+            return
+        if asks:
+            questions.ask(stays.way_rad, assumed=False)
+        else:
+            questions.ask_reduced(assumed=False)
+
+    def _judge_completed(self, plan: Plan, run: Run, undriven: Sequence[int]) -> None:
+        """Record that the plan was driven to its end, slowly, or show why it does not count."""
+        if undriven or len(run.stops()) <= len(plan.steps):
+            why = "a plan counts as completed when one session takes every pose and drives every move of it; "
+            why += f"moves replaced: from {_poses(undriven)} on" if undriven else "poses are missing"
+        elif self._serial == NOT_REPORTED:
+            why = _NO_SERIAL
+        else:
+            remember_completed(self._serial, plan.sha256)
+            return
+        self.cell.note(f"the next run of this plan is slow again and needs the typed word: {why}")
+
+
+def show_plan(before: Before, options: SessionOptions) -> None:
+    """Show every motion to come: in words, and as the options ask in files and in the browser."""
+    cell, plan, way = before.cell, before.plan, before.approach.way_rad
+    words = "The arm stands at the first pose."
+    if len(way):
+        words = f"Approach to the first pose: {way_in_words(way, before.approach.clearance_m)}."
+    cell.journal.show(Planned(plan=plan, way_rad=way, way_words=words))
+    if options.output is not None:
+        plan.save(options.output)
+        cell.note(f"plan saved as {options.output}")
+    if options.png is not None:
+        from ftdrive.planning.show.picture import draw
+
+        draw(plan, before.certifier, options.png, way)
+        cell.note(f"plan drawn in {options.png}")
+    if options.view:
+        from ftdrive.planning.show.view import open_in_browser, shown
+
+        with shown(plan, before.certifier, way) as url:
+            open_in_browser(url)
+            cell.journal.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
+
+
+def _chosen_sampling(before: Before, todo: Sequence[int]) -> tuple[Sampling, Array]:
+    """Return how each pose is averaged, and (6,) one sigma of such an average.
+
+    The duration is configured, or chosen from a record of the sensor's noise.
+    """
+    cell, sampling = before.cell, before.config.sampling
+    if not (sampling.noise_record_s and todo):
+        variance = np.diag(mean_and_covariance(before.quiet.wrench).covariance)
+        return sampling, np.sqrt(variance * LISTEN_S / sampling.average_s)
+    cell.note(f"recording the sensor's noise for {sampling.noise_record_s:g} s: do not touch the arm")
+    record = cell.listen(sampling.noise_record_s)
+    chosen = averaging_time(
+        record.wrench,
+        len(record) / sampling.noise_record_s,
+        target_force_N=_TARGET_N,
+        target_torque_Nm=_TARGET_NM,
+    )
+    cell.note(chosen.words)
+    return replace(sampling, average_s=chosen.seconds), chosen.sigma
+
+
+def _poses(numbers: Sequence[int]) -> str:
+    *most, last = map(str, numbers)
+    return f"poses {', '.join(most)} and {last}" if most else f"pose {last}"

@@ -1,0 +1,83 @@
+"""Options of a session, the mode of a resumed run, and the plan on disk."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+from ftdrive.errors import ConfigError
+from ftdrive.planning.plan import Plan
+from ftdrive.runs.run import Mode, Run
+
+_BY_HAND: Final = ("manual", "listen")
+
+
+@dataclass(frozen=True, slots=True)
+class SessionOptions:
+    """Options of a session, as the operator gave them."""
+
+    runs: Path
+    name: str = "calibrate"
+    poses: int = 24
+    mode: Mode = "auto"
+    """With `resume`, "auto" means the mode of that run."""
+    dry_run: bool = False
+    fast: bool = False
+    """Move at the plan's speeds if it has run to its end slowly before."""
+    plan: Path | None = None
+    output: Path | None = None
+    """Save the plan as a new file."""
+    png: Path | None = None
+    """Draw it."""
+    view: bool = False
+    """Show it in the browser until the operator answers."""
+    resume: Path | None = None
+    redo: tuple[int, ...] = ()
+    real: bool = True
+    """Whether a real arm moves. An emulated cell needs no typed word and no slow first run."""
+    questions: bool = True
+    yes: bool = False
+    """Answer the safety questions automatically, never the first motion."""
+    description: Mapping[str, Any] = field(default_factory=dict)
+    """Goes into run.json."""
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether the operator or a program on the pendant moves the arm."""
+        return self.mode in _BY_HAND
+
+
+def with_recorded_mode(options: SessionOptions) -> SessionOptions:
+    """Return options with the mode of the resumed run; raises `ConfigError` for options that exclude each other."""
+    begun = options.mode if options.resume is None else Run(options.resume).header().get("mode", "auto")
+    if options.mode != "auto" and (begun in _BY_HAND) != options.by_hand:
+        way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
+        raise ConfigError(f"{options.resume} was started {way} and only continues so: leave out --{options.mode}")
+    options = replace(options, mode=begun if options.mode == "auto" else options.mode)
+    if options.redo and options.resume is None:
+        raise ConfigError("--redo needs a run: name the run with --resume RUN")
+    if not options.by_hand:
+        return options
+    no_motion = {
+        "--plan": options.plan is not None,
+        "--fast": options.fast,
+        "--dry-run": options.dry_run,
+        "--redo": bool(options.redo),
+        "--output": options.output is not None,
+        "--png": options.png is not None,
+        "--view": options.view,
+    }
+    if wrong := [name for name, given in no_motion.items() if given]:
+        raise ConfigError(f"with --{options.mode} ftdrive neither plans nor moves: leave out {' and '.join(wrong)}")
+    return options
+
+
+def plan_on_disk(options: SessionOptions, run: Run | None) -> Plan | None:
+    """Load the plan of the resumed run, or the given one; raises `ConfigError` if it lacks a pose of `redo`."""
+    if run is None:
+        return None if options.plan is None else Plan.load(options.plan)
+    plan = Plan.load(run.plan_path)
+    stops = len(plan.steps) + 1
+    if wrong := sorted(stop for stop in options.redo if not 1 <= stop <= stops):
+        raise ConfigError(f"pose {wrong[0]} cannot be taken again: the run has poses 1 to {stops}")
+    return plan

@@ -1,0 +1,159 @@
+"""A verification: a session with fresh poses, each compared with the prediction of a calibration."""
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar, Final
+
+import numpy as np
+
+from ftcalib import CalibrationResult
+from ftcalib.errors import BadDataset
+from ftcalib.model import Array
+from ftcalib.routine import PoseRecord
+from ftdrive.cell.config import CellConfig
+from ftdrive.errors import BadPlan, PlanRefused
+from ftdrive.planning.cell_plan import speeds_of
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import guess_of, plan_verification
+from ftdrive.planning.search.nodes import WRIST_6_RAD
+from ftdrive.runs.run import Run
+from ftdrive.runs.verification_record import fitted_dataset
+from ftdrive.session.events import Compared
+from ftdrive.session.forecast import Averages
+from ftdrive.session.live_fit import Judge
+
+POSES: Final = 6
+QUICK_POSES: Final = 2
+FRESH_RAD: Final = float(np.radians(10))
+"""A pose nearer to one of the calibration does not count."""
+HOLDS_N, HOLDS_NM = 2.0, 0.2
+HOLDS_POSES: Final = 3
+"""The contact guard uses the calibration from this many poses on, if all of them are this near their prediction."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verifying:
+    """A verification."""
+
+    command: ClassVar[str] = "verify"
+    cell: CellConfig
+    calibration: CalibrationResult
+    path: Path
+    """The file of the calibration."""
+    poses: int
+    """Number of fresh poses."""
+    runs: Path
+    """Folder of runs: the plan of an earlier verification is driven again if it still fits the cell."""
+
+    @property
+    def goal(self) -> str:
+        """When the poses suffice that the operator moves the arm to."""
+        return f"{self.poses} poses differ by {np.degrees(FRESH_RAD):.0f}° or more from those of the calibration"
+
+    @cached_property
+    def R_fitted(self) -> Array:
+        """(k, 3, 3) orientations R_base_flange of the calibration; (0, 3, 3) if they are unknown."""
+        dataset = fitted_dataset(self.calibration, self.path)
+        return np.zeros((0, 3, 3)) if dataset is None else dataset.R_base_flange
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Whether the poses may be those of the calibration."""
+        if len(self.R_fitted):
+            return ()
+        lost = f"the poses of the calibration are unknown, because its dataset.json is not beside {self.path}"
+        return (f"{lost}: the poses of the verification may be the same",)
+
+    def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
+        """Return the plan of the newest verification with as many poses, or a new one from joint angles (6,)."""
+        earlier = self._earlier(certifier, q_rad, poses)
+        if earlier is not None:
+            return earlier
+        guess = guess_of(certifier, self.cell.tool.mass_kg)
+        plan = plan_verification(certifier, q_rad, poses, self.R_fitted, speeds=speeds_of(self.cell), guess=guess)
+        return plan.marked(measured=self.cell.workcell.measured, emulated=self.cell.is_emulated)
+
+    def judge(self, *, by_hand: bool) -> Judge:
+        """Return who compares each pose with the calibration."""
+        return RunningComparison(self.calibration, self.R_fitted if by_hand else np.zeros((0, 3, 3)), self.poses)
+
+    def forecast(self, averages: Averages) -> str:
+        """Describe how far poses of an unchanged cell may be from the prediction."""
+        error_N, error_Nm = self.calibration.likely_error()
+        return f"{averages}; error of the calibration: {error_N:.2g} N, {error_Nm:.2g} N·m"
+
+    def _earlier(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan | None:
+        """Find a plan that was driven before: it may have been completed, so that it may run fast."""
+        for path in sorted(self.runs.glob("*/plan.json"), reverse=True):
+            with suppress(BadPlan, BadDataset, PlanRefused, OSError, KeyError, TypeError):
+                plan = Plan.load(path)
+                turns = np.array([step.q_rad[5] for step in plan.steps]) - q_rad[5]
+                near = turns.min() <= 0 <= turns.max() or np.abs(turns).max() <= WRIST_6_RAD  # else the cable winds up
+                if plan.kind == "verification" and len(plan.steps) == poses and near and self._is_mine(path.parent):
+                    plan.require(certifier)
+                    return plan
+        return None
+
+    def _is_mine(self, folder: Path) -> bool:
+        found = Run(folder).header().get("verification", {})
+        return bool(found.get("id") == self.calibration.id)
+
+
+class RunningComparison:
+    """Compares each pose with the prediction of a calibration.
+
+    Of the poses far from `R_fitted` (k, 3, 3), the orientations of the calibration, as many are needed as `wanted`.
+    """
+
+    weighed_kg: float | None = None
+    """Never: the payload was compared when the cell was calibrated."""
+
+    def __init__(self, calibration: CalibrationResult, R_fitted: Array, wanted: int) -> None:
+        self._calibration, self._R_fitted, self._wanted = calibration, R_fitted, wanted
+        self._compared: dict[int, Compared] = {}
+        self._fresh: set[int] = set()
+
+    def add(self, record: PoseRecord) -> Compared:
+        """Add a pose, in place of one with the same `stop`."""
+        self.remove(record.stop)
+        R_base_flange = record.before.R_base_flange
+        if self._is_fresh(R_base_flange):
+            self._fresh.add(record.stop)
+        enough = len(self._fresh) >= self._wanted
+        hint = "" if record.stop in self._fresh else "this pose is one of the calibration: turn the tool further"
+        compared = Compared(
+            stop=record.stop,
+            number=record.pose.number,
+            residual=self._calibration.compensate(record.mean.mean, R_base_flange),
+            sigma=np.sqrt(np.diag(record.mean.covariance + self._calibration.wrench_covariance(R_base_flange))),
+            poses=len(self._compared) + 1,
+            light="green" if enough else "amber",
+            hint=hint,
+        )
+        self._compared[record.stop] = compared
+        return compared
+
+    def remove(self, stop: int) -> None:
+        """Remove a pose, so that it can be taken again."""
+        self._compared.pop(stop, None)
+        self._fresh.discard(stop)
+
+    def predict(self, R_base_flange: Array) -> Array | None:
+        """Wrench (6,) of a free tool at this orientation; None until poses have shown that the calibration holds.
+
+        Any thread may call it.
+        """
+        seen = [compared.residual for compared in list(self._compared.values())]
+        norms = ((np.linalg.norm(one[:3]), np.linalg.norm(one[3:])) for one in seen)
+        if len(seen) < HOLDS_POSES or any(force_N > HOLDS_N or torque_Nm > HOLDS_NM for force_N, torque_Nm in norms):
+            return None
+        return -self._calibration.compensate(np.zeros(6), R_base_flange)
+
+    def _is_fresh(self, R_base_flange: Array) -> bool:
+        if not len(self._R_fitted):
+            return True
+        trace = np.einsum("kij,ij->k", self._R_fitted, R_base_flange)
+        return bool(np.arccos(np.clip((trace - 1) / 2, -1, 1)).min() >= FRESH_RAD)

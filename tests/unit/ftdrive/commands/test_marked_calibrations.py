@@ -1,0 +1,153 @@
+"""A calibration that was edited by hand, or made in an emulated cell: refused, or marked in every output."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ftcalib import CalibrationResult
+from ftdrive import cli
+from ftdrive.recording import Recorder, read_recording
+from ftdrive.runs.bundle import write_bundle
+from ftdrive.runs.run import Run
+from tests.calibrated_runs import calibrated_run
+from tests.unit.ftdrive.recorded import block, calibration, info
+
+Ran = tuple[int, str, str]
+SEED = 77
+"""Of runs in an emulated cell, which no other test solves."""
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
+    """Run a command line beside `c.json` and a recording `peg.csv`; return exit code, stdout and stderr as one line."""
+    monkeypatch.chdir(tmp_path)
+    calibration().save(Path("c.json"))
+    recorder = Recorder([Path("peg.csv")], info(), {})
+    recorder.write(block(3000))
+    recorder.close()
+
+    def run(*words: str) -> Ran:
+        code = cli.run(list(words))
+        out, err = capsys.readouterr()
+        return code, out, " ".join(err.split())
+
+    return run
+
+
+def add_6_N() -> None:
+    document = json.loads(Path("c.json").read_text())
+    document["force_bias_N"][2] += 6.0
+    Path("c.json").write_text(json.dumps(document))
+
+
+USES = {
+    "compensate": ["compensate", "peg.csv", "--calibration", "c.json"],
+    "fleet": ["fleet", "compensate", "peg.csv", "--calibration", "c.json", "-o", "out", "--workers", "1"],
+    "export": ["export", "calibration", "c.json", "--format", "ros2-control"],
+    "live": ["live", "--replay", "peg.csv", "--calibration", "c.json", "--once"],
+}
+
+
+@pytest.mark.parametrize("name", USES)
+def test_an_edited_calibration_is_refused_unless_it_is_forced_and_then_marked(
+    name: str, run: Callable[..., Ran]
+) -> None:
+    add_6_N()
+    code, out, err = run(*USES[name])
+    assert (code, out) == (6, "")
+    assert "error: c.json: the content is not that of calibration" in err
+    assert "--force" in err
+    code, out, err = run(*USES[name], "--force")
+    assert code == 0, err
+    if name != "live":
+        assert "EDITED BY HAND" in out
+    code, out, err = run(*USES[name], "--force", "--json")
+    if name == "fleet":
+        assert "EDITED BY HAND" in Path("out/peg.csv").read_text(encoding="utf-8").partition("\n")[0]
+    else:
+        assert json.loads(out)["marks"] == ["EDITED BY HAND"]
+
+
+def test_a_file_made_with_an_edited_calibration_says_so(run: Callable[..., Ran]) -> None:
+    add_6_N()
+    assert run(*USES["compensate"], "--force", "-o", "new.csv")[0] == 0
+    assert read_recording(Path("new.csv")).header.info.marks == ("EDITED BY HAND",)
+    assert "EDITED BY HAND" in Path("new.csv").read_text(encoding="utf-8").partition("\n")[0]
+    assert run("compensate", "new.csv")[1].startswith(" The file was EDITED BY HAND")
+
+
+@pytest.mark.parametrize("words", [["report", "c.json", "--format", "md"], ["diff", "c.json", "c.json"]])
+def test_nothing_calls_an_edited_calibration_good(words: list[str], run: Callable[..., Ran]) -> None:
+    add_6_N()
+    code, out, err = run(*words)
+    assert (code, out) == (6, "")
+    assert "the file is damaged or was edited" in err
+
+
+@pytest.fixture
+def emulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CalibrationResult:
+    """That of an emulated cell, in `e.json` and in the run `runs/e`."""
+    monkeypatch.chdir(tmp_path)
+    station = {"sensor": "can"}
+    folder = calibrated_run(Path("runs"), "e", SEED, header={"station": station})
+    result = CalibrationResult.load(folder / "calibration.json")
+    assert result.provenance["station"] == station
+    result.save(Path("e.json"))
+    replace(calibration(), provenance={"station": station}).save(Path("d.json"))  # of the devices of the recording
+    return result
+
+
+@pytest.mark.usefixtures("emulated")
+def test_every_output_of_an_emulated_calibration_says_so(run: Callable[..., Ran]) -> None:
+    for form in ("html", "md"):
+        run("report", "e.json", "--format", form, "-o", f"report.{form}")
+        text = Path(f"report.{form}").read_text(encoding="utf-8")
+        assert text.index("EMULATED") < 9000 or form == "html"
+        assert "The cell was EMULATED: these are not the values of a real tool." in text
+    assert list(json.loads(run("report", "e.json", "--format", "json")[1])["marks"]) == ["EMULATED"]
+    _, out, _ = run("history", "runs")
+    assert "gripper EMULATED" in " ".join(out.split())
+    (row,) = json.loads(run("history", "runs", "--json")[1])["results"]
+    assert row["emulated"] is True
+    assert run("diff", "e.json", "c.json")[1].splitlines()[0].endswith("EMULATED  e.json")
+    assert run("diff", "c.json", "c.json", "--json")[1].count('"emulated": false') == 2
+    for form in ("ros2-control", "urdf", "kth"):
+        _, out, err = run(
+            "export", "calibration", "e.json", "--format", form, "--max-force-error", "9", "--height", "40"
+        )
+        assert "EMULATED ftdrive calibration" in out
+        assert "note: The cell was EMULATED" in err
+    assert json.loads(run("export", "calibration", "e.json", "--format", "json")[1])["marks"] == ["EMULATED"]
+    assert run("compensate", "peg.csv", "--calibration", "d.json")[1].startswith(" The cell was EMULATED")
+    _, out, _ = run("live", "--replay", "peg.csv", "--calibration", "d.json", "--once", "--json")
+    assert json.loads(out)["marks"] == ["EMULATED"]
+
+
+def test_a_real_calibration_is_not_marked(run: Callable[..., Ran]) -> None:
+    assert "EMULATED" not in run("export", "calibration", "c.json", "--format", "ros2-control")[1]
+    assert json.loads(run("compensate", "peg.csv", "--calibration", "c.json", "--json")[1])["marks"] == []
+
+
+def test_a_recording_of_an_emulated_cell_says_so_whatever_its_calibration(tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    recorder = Recorder([path], replace(info(), emulated=True), {})
+    recorder.write(block(3))
+    recorder.close()
+    found = read_recording(path)
+    assert found.header.info.marks == ("EMULATED",)
+    assert found.with_calibration(calibration(), "c.json").header.info.marks == ("EMULATED",)
+
+
+def test_a_bundle_names_an_emulated_run(tmp_path: Path) -> None:
+    import zipfile
+
+    for name, header in (("e", {"station": {"sensor": "can"}}), ("r", {})):
+        folder = calibrated_run(tmp_path / "runs", name, SEED if header else 1, header=header)
+        write_bundle(Run(folder).folder, tmp_path / f"{name}.zip")
+        with zipfile.ZipFile(tmp_path / f"{name}.zip") as archive:
+            about: dict[str, Any] = json.loads(archive.read("bundle.json"))
+        assert about["emulated"] is (name == "e")

@@ -1,0 +1,114 @@
+"""The last verification of a calibration is found by its id, wherever the files are; damaged files are ignored."""
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ftcalib import CalibrationDataset, CalibrationResult
+from ftcalib.errors import BadCalibration
+from ftdrive.runs.verification_record import (
+    FORMAT,
+    VerificationRecord,
+    age_in_words,
+    calibration_in_words,
+    fitted_dataset,
+    last_verification,
+)
+from tests.unit.ftdrive.recorded import calibration
+
+NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
+
+
+def saved(folder: Path, result: CalibrationResult | None = None) -> Path:
+    folder.mkdir(parents=True)
+    (result or calibration()).save(path := folder / "calibration.json")
+    return path
+
+
+def verify(folder: Path, hours_ago: float, **different: Any) -> Path:
+    """Write what a verification leaves."""
+    folder.mkdir(parents=True)
+    document = {
+        "format": FORMAT,
+        "calibration": {"id": calibration().id, "path": "elsewhere/calibration.json"},
+        "created_utc": (NOW - timedelta(hours=hours_ago)).isoformat(),
+        "passed": True,
+        "change": None,
+        "reason": "the calibration holds",
+        "force_max_N": 0.1,
+        "torque_max_Nm": 0.01,
+        "later": 1,
+    }
+    (path := folder / "verification.json").write_text(json.dumps(document | different))
+    return path
+
+
+@pytest.mark.parametrize("beside", ["runs/b-verify", "runs/a-calibrate/runs/b-verify"])
+def test_the_newest_verification_of_this_calibration_counts(tmp_path: Path, beside: str) -> None:
+    path = saved(tmp_path / "runs/a-calibrate")
+    verify(tmp_path / "runs/c-verify", 5.0)
+    other = {"id": "0" * 12, "path": str(path)}
+    verify(tmp_path / "runs/d-verify", 0.5, calibration=other)
+    newest = verify(tmp_path / beside, 2.0, passed=False, change="bias")
+    for place in (path, path.parent):
+        found = last_verification(place)
+        assert found is not None
+        assert (found.path, found.passed, found.change) == (newest, False, "bias")
+
+
+def test_a_calibration_outside_of_a_run_folder_has_its_runs_beside_it(tmp_path: Path) -> None:
+    path = saved(tmp_path / "cell")
+    assert last_verification(path) is None
+    verify(tmp_path / "cell/runs/b-verify", 1.0)
+    assert last_verification(path) is not None
+
+
+def test_damaged_and_newer_files_are_ignored(tmp_path: Path) -> None:
+    path = saved(tmp_path / "runs/a-calibrate")
+    for name, text in (("b", "{"), ("c", "[]"), ("d", '{"format": "ftdrive.verification/1"}')):
+        (tmp_path / "runs" / name).mkdir()
+        (tmp_path / "runs" / name / "verification.json").write_text(text)
+    verify(tmp_path / "runs/e", 1.0, format="ftdrive.verification/2")
+    verify(tmp_path / "runs/f", 1.0, force_max_N="much")
+    assert last_verification(path) is None
+    with pytest.raises(BadCalibration, match=r"f/verification\.json"):
+        VerificationRecord.load(tmp_path / "runs/f/verification.json")
+
+
+def test_a_record_survives_its_way_into_a_recording(tmp_path: Path) -> None:
+    record = VerificationRecord.load(verify(tmp_path / "a", 1.0, passed=False, change="payload"))
+    assert VerificationRecord.from_dict(json.loads(json.dumps(record.to_dict()))) == record
+
+
+@pytest.mark.parametrize(("hours", "words"), [(0.2, "12 min"), (5, "5 h"), (47.4, "47 h"), (80, "3 d"), (-1, "0 min")])
+def test_ages(hours: float, words: str) -> None:
+    assert age_in_words(timedelta(hours=hours)) == words
+
+
+def test_the_state_of_a_calibration_in_words(tmp_path: Path) -> None:
+    made = replace(calibration(), provenance={"created_utc": (NOW - timedelta(days=3)).isoformat()})
+    words = f"calibration {made.id[:6]}, {made.verdict}, 3 d old, "
+    assert calibration_in_words(made, None, NOW) == words + "not verified"
+    record = VerificationRecord.load(verify(tmp_path / "a", 2.0))
+    assert calibration_in_words(made, record, NOW) == words + "verified 2 h ago"
+    failed = VerificationRecord.load(verify(tmp_path / "b", 2.0, passed=False, change="bias"))
+    assert calibration_in_words(made, failed, NOW) == words + "VERIFICATION FAILED 2 h ago (bias)"
+
+
+def test_the_poses_of_a_calibration_are_found_by_their_hash(tmp_path: Path) -> None:
+    poses = CalibrationDataset(
+        np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 6)), None, np.zeros(4, np.int64), np.full(4, np.nan)
+    )
+    poses.save(tmp_path / "dataset-2.json")
+    (tmp_path / "dataset.json").write_text("damaged")
+    made = replace(calibration(), provenance={"dataset_sha256": poses.sha256()})
+    for place in (tmp_path, tmp_path / "calibration.json"):
+        found = fitted_dataset(made, place)
+        assert found is not None
+        assert found.sha256() == poses.sha256()
+    assert fitted_dataset(calibration(), tmp_path) is None
