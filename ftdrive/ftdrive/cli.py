@@ -6,15 +6,17 @@ import os
 import platform
 import signal
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from errno import ENOSPC
 from io import StringIO
+from typing import Any
 
 import click
 
 from ftdrive import __version__
 from ftdrive.errors import exit_code
+from ftdrive.terminal.text import echo
 
 # A command, its module, its line in the help. The module is imported only when the command is called: help is fast.
 _COMMANDS = {
@@ -46,10 +48,31 @@ _COMMANDS = {
 _EPILOG = """\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
 5 device fault, 6 file cannot be read or written, 7 check or acceptance failed, 8 recording has gaps,
-9 supervisor gone (terminal, reader or input closed; data kept), 130 interrupted (data kept)."""
+9 supervisor gone (terminal, reader or input closed; data kept), 130 interrupted (data kept),
+141 the reader of the output has ended."""
+
+
+_CLOSED_PIPE = 128 + 13
+"""As a shell reports a program that SIGPIPE ended."""
+
+
+@contextmanager
+def _closed_pipe() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:  # click would end with 1
+        raise click.exceptions.Exit(_CLOSED_PIPE) from None
 
 
 class _LazyGroup(click.Group):
+    @_closed_pipe()
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        return super().make_context(*args, **kwargs)
+
+    @_closed_pipe()
+    def invoke(self, ctx: click.Context) -> Any:
+        return super().invoke(ctx)
+
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)
 
@@ -74,8 +97,7 @@ def cli(verbose: int, quiet: bool) -> None:
     New here? `ftdrive demo` needs no hardware.
     """
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logger = logging.StreamHandler() if quiet else _TalkHandler()
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[logger])
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_TalkHandler()])
     if quiet or verbose:
         from ftdrive.terminal.console import talk
 
@@ -88,7 +110,10 @@ class _TalkHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         from ftdrive.terminal.console import talk
 
-        with suppress(OSError):  # a terminal that is closed
+        with suppress(OSError):  # a terminal or a pipe that is closed
+            if talk.quiet:
+                echo(self.format(record), err=True)
+                return
             talk.print(self.format(record))
 
 
@@ -111,20 +136,25 @@ def main() -> int:
         if hasattr(signal, name) and not (name == "SIGHUP" and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN):
             signal.signal(getattr(signal, name), signal.default_int_handler)
     _open_closed_streams()
-    try:
-        return run(sys.argv[1:])
-    finally:
-        _leave_dead_streams()
+    code = run(sys.argv[1:])
+    is_dead = _leave_dead_streams()
+    return _CLOSED_PIPE if is_dead and code == 0 else code
 
 
-def _leave_dead_streams() -> None:
-    """Connect standard streams without a reader to nothing: Python flushes them at its end, and fails."""
+def _leave_dead_streams() -> bool:
+    """Connect standard streams without a reader to nothing, because Python writes at its end what is left.
+
+    Return whether standard output was one.
+    """
+    dead = []
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
         except (OSError, ValueError):
+            dead.append(stream)
             with suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    return sys.stdout in dead
 
 
 def _open_closed_streams() -> None:
@@ -142,7 +172,7 @@ def run(arguments: Sequence[str]) -> int:
         from ftdrive.terminal.console import in_whole_words
 
         error.show(message := StringIO())
-        click.echo(in_whole_words(message.getvalue(), sys.stderr), err=True, nl=False)
+        echo(in_whole_words(message.getvalue(), sys.stderr), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         _say("interrupted")
@@ -160,4 +190,4 @@ def run(arguments: Sequence[str]) -> int:
 def _say(text: str) -> None:
     """Print on stderr, if that is open."""
     with suppress(OSError):
-        click.echo(text, err=True)
+        echo(text, err=True)

@@ -13,6 +13,7 @@ from ftdrive.session.operator import Key, Question
 from ftdrive.terminal.console import in_whole_words
 from ftdrive.terminal.session_text import SessionText, TextLine
 from ftdrive.terminal.supervisor import Supervisor
+from ftdrive.terminal.text import visible
 
 
 def match(question: Question, typed: str) -> str | None:
@@ -78,6 +79,7 @@ class JsonOperator(_Keyless):
 
     def ask(self, question: Question) -> str:
         """Answer from stdin; raises `Declined` at its end."""
+        self.supervisor.expect_answer()
         error = None
         while True:
             self._write(
@@ -97,7 +99,7 @@ class JsonOperator(_Keyless):
     def _write(self, value: Mapping[str, Any]) -> None:
         line = json.dumps(value, allow_nan=False) + "\n"
         with self._lock, self.supervisor.writing():
-            self._stdout.write(line)
+            self._stdout.write(visible(line))
             self._stdout.flush()
 
 
@@ -130,6 +132,7 @@ class PlainOperator(_Keyless):
 
     def ask(self, question: Question) -> str:
         """Answer from stdin, without what was typed before the question; raises `Declined` at its end."""
+        self.supervisor.expect_answer()
         self._asked = question.text
         self.finish()
         quiet, self._quiet, withheld, self._withheld = self._quiet, False, self._withheld, []

@@ -437,6 +437,7 @@ class Screen:
 
     def ask(self, question: Question) -> str:
         """Ask below the frame, which is not redrawn until the answer is there."""
+        self.supervisor.expect_answer()
         suspended = self._keyboard.suspended() if self._keyboard is not None else nullcontext()
         with self.supervisor.writing():
             self._print(self._text.pending())

@@ -73,13 +73,18 @@ class Supervisor:
                 raise SupervisorGone(why) from error
             raise
 
+    def expect_answer(self) -> None:
+        """Note whether a writer of answers is there; called before a question is shown, to which it may leave."""
+        if self._input is not None and self._input not in self._terminals:
+            self._answers |= hasattr(select, "poll") and not _is_closed(self._input, reading=True)
+
     def read_line(self, unanswered: str) -> str:
         """Read one line; raises `SupervisorGone`, or `Declined` with `unanswered` if the input has ended before."""
         fd = self._input
         if fd is None or not hasattr(select, "poll"):
             line = self._stdin.readline()
         else:
-            self._answers |= fd not in self._terminals and not _is_closed(fd, reading=True)
+            self.expect_answer()
             line = self._read_bytes(fd).decode(self._stdin.encoding or "utf-8", errors="replace")
         if not line:
             if why := self.absence():

@@ -16,6 +16,7 @@ from rich.console import Console
 from ftdrive.errors import Declined, SupervisorGone
 from ftdrive.session.operator import Question
 from ftdrive.terminal.keyboard import Keyboard
+from ftdrive.terminal.operators import JsonOperator
 from ftdrive.terminal.screen import Screen
 from ftdrive.terminal.supervisor import Supervisor
 
@@ -76,6 +77,16 @@ def test_an_input_counts_once_its_writer_was_there_at_a_question(pipes: Pipes) -
     assert "standard input" in str(pipes.supervisor.absence())
     with pytest.raises(SupervisorGone, match="standard input"):
         pipes.supervisor.read_line("?")
+
+
+def test_a_writer_that_leaves_at_the_question_itself_is_gone(pipes: Pipes) -> None:
+    class Leaving(io.StringIO):
+        def write(self, text: str) -> int:
+            os.close(pipes.answers)
+            return len(text)
+
+    with pytest.raises(SupervisorGone, match="standard input"):
+        JsonOperator(stdin=pipes.stdin, stdout=Leaving()).ask(Question("Go on?"))
 
 
 def test_an_input_that_is_never_read_may_end(pipes: Pipes) -> None:
