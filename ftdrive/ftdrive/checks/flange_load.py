@@ -5,7 +5,6 @@ the sensor's origin is, so its height is configuration too.
 """
 
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -13,7 +12,7 @@ import numpy as np
 from ftcalib import CalibrationResult
 from ftcalib.model import Array
 
-RATED_KG: Final = MappingProxyType(
+RATED_KG: Final = (
     {"UR3": 3.0, "UR5": 5.0, "UR10": 10.0}
     | {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 10.0, "UR12e": 12.5, "UR16e": 16.0}
     | {"UR8long": 8.0, "UR15": 15.0, "UR18": 18.0, "UR20": 20.0, "UR30": 30.0}
