@@ -45,12 +45,11 @@ from ftdrive.recording.recording import (
 _HEADER, _EVENT, _CRC, _END = "# header ", "# event ", "# crc32 ", "# end"
 
 
-class CsvFile:
+class CsvFile(GrowingFile):
     """A new recording."""
 
     def __init__(self, path: Path, header: Header) -> None:
-        self._file = GrowingFile(path)
-        self.partial = self._file.partial
+        super().__init__(path)
         self.samples = 0
         self._crc = 0
         self._start_ns: int | None = None
@@ -82,22 +81,14 @@ class CsvFile:
         content = text.encode()
         crc = zlib.crc32(content, self._crc)
         line = _crc_line(crc)
-        self._file.add(content + line)
+        self.add(content + line)
         self._crc = zlib.crc32(line, crc)
 
     def complete(self) -> None:
         """Write the end and give the file its name. Raises `OSError`."""
-        with self._file:
-            self._file.add(f"{_END}\n".encode())
-            self._file.complete()
-
-    def keep(self) -> None:
-        """Close the file as it is."""
-        self._file.close()
-
-    def discard(self) -> None:
-        """Delete what was written."""
-        self._file.discard()
+        with self:
+            self.add(f"{_END}\n".encode())
+            super().complete()
 
 
 def read_csv(path: Path, _columns: Collection[str] = ()) -> Recording:
