@@ -1,4 +1,4 @@
-"""Digital F/T frames and stream records: golden bytes, totality, and what happens to damaged records."""
+"""Digital F/T replies, calibration blocks and stream records: what is refused, and what happens to damaged records."""
 
 import struct
 
@@ -14,45 +14,6 @@ from ftdrivers.wires.status_word import describe_status
 V1 = bytes.fromhex("00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50")
 V2 = bytes.fromhex("00 DD 00 45 09 26 FC 62 FB C2 04 F2 62")
 i16 = st.integers(-32768, 32767)
-
-
-@pytest.mark.parametrize(
-    ("request_", "golden"),
-    [
-        (modbus.read_registers(modbus.STATUS, 1), "0A 03 00 1D 00 01 15 77"),
-        (modbus.read_registers(0x00E3, 0x40), "0A 03 00 E3 00 40 B4 B7"),
-        (modbus.read_registers(0x0123, 0x40), "0A 03 01 23 00 40 B5 77"),
-        (modbus.read_registers(0x0163, 0x29), "0A 03 01 63 00 29 74 8D"),
-        (
-            modbus.write_registers(modbus.GAINS, [543, 555, 569, 579, 565, 567]),
-            "0A 10 00 00 00 06 0C 02 1F 02 2B 02 39 02 43 02 35 02 37 47 2D",
-        ),
-        (modbus.write_registers(modbus.OFFSETS, [0x8000] * 6), "0A 10 00 06 00 06 0C" + "80 00" * 6 + "75 66"),
-        (modbus.UNLOCK, "0A 6A AA FF 1D"),
-        (modbus.LOCK, "0A 6A 18 7F 68"),
-        (modbus.START, "0A 46 55 A3 9D"),
-    ],
-)
-def test_requests(request_: bytes, golden: str) -> None:
-    assert request_ == bytes.fromhex(golden)
-
-
-@pytest.mark.parametrize(
-    ("request_", "reply", "payload"),
-    [
-        (modbus.read_registers(modbus.STATUS, 1), "0A 03 02 00 00 1D 85", "0000"),
-        (modbus.read_registers(modbus.STATUS, 1), "0A 03 02 00 01 DC 45", "0001"),
-        (modbus.write_registers(modbus.GAINS, [0] * 6), "0A 10 00 00 00 06 41 70", ""),
-        (modbus.write_registers(modbus.OFFSETS, [0] * 6), "0A 10 00 06 00 06 A1 71", ""),
-        (modbus.UNLOCK, "0A 6A 01 BE A2", ""),
-        (modbus.LOCK, "0A 6A 01 BE A2", ""),
-        (modbus.START, "0A 46 01 A2 62", ""),
-    ],
-)
-def test_replies(request_: bytes, reply: str, payload: str) -> None:
-    data = bytes.fromhex(reply)
-    assert len(data) == modbus.reply_size(request_)
-    assert modbus.check_reply(request_, data) == bytes.fromhex(payload)
 
 
 @pytest.mark.parametrize(
