@@ -72,7 +72,9 @@ class BotaSensor(StreamingSensor):
         self._port.open()
         self._seen_status = 0
         if self._sinc is not None:
-            self._configure(self._sinc)
+            setup = codec.BINARY_AND_CALIBRATED, codec.filter_command(self._sinc)
+            for command in (codec.ENTER_SETUP, *setup, codec.ENTER_RUN):
+                self._command(command)
         self._frames = codec.deframer()
         first = self._first_frames()
         times = [frame.t_us for frame in first]
@@ -110,12 +112,6 @@ class BotaSensor(StreamingSensor):
 
     def _disconnect(self) -> None:
         self._port.close()
-
-    def _configure(self, sinc: int) -> None:
-        self._command(codec.ENTER_SETUP)
-        self._command(codec.BINARY_AND_CALIBRATED)
-        self._command(codec.filter_command(sinc))
-        self._command(codec.ENTER_RUN)
 
     def _command(self, command: bytes) -> None:
         for _ in range(_ATTEMPTS):

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from ftcalib import CalibrationResult
-from ftcalib.model import Array
+from ftcalib.model import Array, skew
 
 RATED_KG: Final = (
     {"UR3": 3.0, "UR5": 5.0, "UR10": 10.0}
@@ -63,8 +63,7 @@ def flange_load(
     by_mass = np.concatenate([[1.0], (c_tool_m - com_m) / mass_kg])
     jacobian = np.zeros((4, 15))
     jacobian[:, 3:6] = np.outer(by_mass, result.gravity_force_base_N / (result.weight_N * result.g_m_s2))
-    x, y, z = arm_m
-    jacobian[1:, 0:3] = share * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    jacobian[1:, 0:3] = share * skew(arm_m)
     jacobian[1:, 9:12] = share * result.R_flange_sensor
     covariance = jacobian @ result.covariance @ jacobian.T
     gain_variance = float(np.square(result.sigma["mass_kg"])) - covariance[0, 0]  # common to all axes, see `sigma`
