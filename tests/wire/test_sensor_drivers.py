@@ -2,6 +2,7 @@
 
 import gc
 import math
+import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -206,6 +207,20 @@ def test_netft_scale(start: Start, options: dict[str, Any], query: str) -> None:
 def test_netft_status_is_a_fault(start: Start, status: int, product: str, query: str, says: str) -> None:
     with pytest.raises(DeviceFault, match=says):
         start("ati-netft", status=status, product=product).sensor(query).open()
+
+
+def test_netft_reports_its_rate_and_range_and_losses_are_named(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+    emulator = start("ati-netft", rate_hz=500)
+    with emulator.sensor() as sensor:
+        assert sensor.identify().facts["range"].value == pytest.approx((130, 130, 400, 10, 10, 10))
+        assert sensor.health().nominal_rate_Hz == 500
+        emulator.faults(drop=0.3)
+        while not sensor.health().events:
+            sensor.collect(0.2)
+        what = [what for _, what in sensor.health().events]
+    assert len(what) == 1
+    assert re.fullmatch(r"rate [23]\d\d\.\d Hz instead of 500 Hz", what[0])
+    assert "Hz instead of 500 Hz" in caplog.text
 
 
 def test_netft_latched_monitor_is_a_warning(start: Start, caplog: pytest.LogCaptureFixture) -> None:
