@@ -40,7 +40,7 @@ def test_fewer_poses(option: str, poses: int) -> None:
     assert document["motion_time_s"] < 45
 
 
-def test_table_is_talk_and_the_file_is_the_plan(tmp_path: Path) -> None:
+def test_table_is_for_people_and_the_file_is_the_plan(tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
     outcome = run(*UR5E, "--mounting", "ceiling", "--box", "600:600:0:800:800:200", "--output", str(path))
     assert outcome.exit_code == 0, outcome.output
@@ -73,7 +73,7 @@ def test_no_limit_of_the_tips_however_it_is_written(text: str) -> None:
     ("workcell", "measured"),
     [("measured = false", False), ("measured = true", True), ("planes_mm = [[-1, 0, 0, -900]]", False), (None, True)],
 )
-def test_the_plan_says_whether_somebody_measured_what_it_is_for(
+def test_the_plan_says_whether_its_cell_was_measured(
     workcell: str | None, measured: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

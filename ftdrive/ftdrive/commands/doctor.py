@@ -10,7 +10,6 @@ from typing import Any
 
 import click
 import numpy as np
-from rich.console import Console
 from rich.text import Text
 
 from ftcalib import CalibrationResult
@@ -34,7 +33,8 @@ from ftdrive.commands.common import (
 )
 from ftdrive.errors import NotAccepted
 from ftdrive.session.guards import Limits
-from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.console import hanging, printer, talk
+from ftdrive.terminal.text import echo
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ArmStatus, Array, ForceTorqueSensor, RobotArm
@@ -215,7 +215,7 @@ def _examine_push(
         with ExitStack() as stack:
             if station is None:
                 words = f"Push the tool along +X of the base, about 20 N; press Enter and hold for {_PUSH_S:.0f} s"
-                click.echo(words, err=True)
+                echo(words, err=True)
                 if not sys.stdin.readline():
                     return Check("push.sign", "skipped", "no push: the standard input is closed"), None
             elif R_base_flange is not None and R_flange_sensor is not None:
@@ -232,7 +232,7 @@ def _examine_push(
 
 
 def _print(found: list[Check]) -> None:
-    data = Console(highlight=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+    data = printer()
     subject = ""
     for check in found:
         first, _, _ = check.name.partition(".")

@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
@@ -22,6 +23,13 @@ Samples = dict[tuple[str, str], float]
 def server() -> Iterator[MetricsServer]:
     with closing(MetricsServer("127.0.0.1", 0)) as server:
         yield server
+
+
+def test_pages_of_others_cannot_read_the_state(server: MetricsServer) -> None:
+    for name, value in (("Origin", "https://evil.example"), ("Host", "evil.example")):
+        foreign = urllib.request.Request(f"http://127.0.0.1:{server.port}/metrics", headers={name: value})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(foreign, timeout=30)
 
 
 def scraped(server: MetricsServer) -> str:
@@ -67,7 +75,7 @@ def test_a_cell_that_disappears_disappears(server: MetricsServer) -> None:
     assert {name for _, name in samples(server)} == {"", "B"}
 
 
-def test_tools_of_a_cell_are_told_apart_and_any_name_is_escaped(server: MetricsServer) -> None:
+def test_tools_of_a_cell_are_distinguished_and_any_name_is_escaped(server: MetricsServer) -> None:
     name = 'Zelle "7"\\ü\n'
     server.update(reading(cell(name, "gripper"), cell(name, "drill", mass_kg=2.0)))
     families = {one.name: one for one in text_string_to_metric_families(scraped(server))}
