@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from math import isfinite
-from types import MappingProxyType
 from typing import Any, cast
 from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
@@ -22,21 +21,19 @@ from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import Fact, ForceTorqueSensor, RobotArm
 from ftdrivers.streaming.sensor import StreamingSensor
 
-SENSORS: Mapping[str, str] = MappingProxyType(
-    {
-        "ati-can": "ftdrivers.ati.can:AtiCanSensor",
-        "ati-serial": "ftdrivers.ati.serial:AtiSerialSensor",
-        "ati-netft": "ftdrivers.ati.netft:NetFtSensor",
-        "bota": "ftdrivers.bota.sensor:BotaSensor",
-        "robotiq-ft300": "ftdrivers.robotiq.sensor:RobotiqFt300",
-        "robotous-can": "ftdrivers.robotous.can:RobotousCan",
-        "robotous-serial": "ftdrivers.robotous.serial:RobotousSerial",
-        "ur-ft": "ftdrivers.ur.sensor:UrWristSensor",
-    }
-)
-ARMS: Mapping[str, str] = MappingProxyType({"ur": "ftdrivers.ur.arm:UrArm"})
+SENSORS: Mapping[str, str] = {
+    "ati-can": "ftdrivers.ati.can:AtiCanSensor",
+    "ati-serial": "ftdrivers.ati.serial:AtiSerialSensor",
+    "ati-netft": "ftdrivers.ati.netft:NetFtSensor",
+    "bota": "ftdrivers.bota.sensor:BotaSensor",
+    "robotiq-ft300": "ftdrivers.robotiq.sensor:RobotiqFt300",
+    "robotous-can": "ftdrivers.robotous.can:RobotousCan",
+    "robotous-serial": "ftdrivers.robotous.serial:RobotousSerial",
+    "ur-ft": "ftdrivers.ur.sensor:UrWristSensor",
+}
+ARMS: Mapping[str, str] = {"ur": "ftdrivers.ur.arm:UrArm"}
 
-_EXTRAS: Mapping[str, str] = MappingProxyType({"pynetft": "netft"})
+_EXTRAS: Mapping[str, str] = {"pynetft": "netft"}
 """The optional part of ftdrive that installs a library."""
 
 _EXAMPLES = (

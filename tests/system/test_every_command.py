@@ -127,7 +127,7 @@ def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
     os.close(reader)
     outcome = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
-    assert (outcome.returncode, outcome.stderr) == (1, "")
+    assert (outcome.returncode, outcome.stderr) == (141, "")
 
 
 @pytest.mark.parametrize(

@@ -102,45 +102,6 @@ def client(node: AtiCanNode) -> Iterator[CanClient]:
         yield client
 
 
-@pytest.mark.parametrize(
-    ("request_", "answer"),
-    [
-        ("200#", V1_FRAMES),
-        ("202#00", ["202#0000 0000 0000 0000", "203#0000 0000 C584 D000", "204#0000 0000 4584 D000"]),
-        ("202#01", ["202#0000 0000 4599 C000", "203#0000 0000 C519 C000", "204#0000 0000 C519 C000"]),
-        ("202#02", ["202#45ED 8000 0000 0000", "203#45ED 8000 0000 0000", "204#45ED 8000 0000 0000"]),
-        ("202#03", ["202#0000 0000 0000 0000", "203#C35C 0000 0000 0000", "204#435C 0000 0000 0000"]),
-        ("202#04", ["202#437E 0000 0000 0000", "203#C2FE 0000 0000 0000", "204#C2FE 0000 0000 0000"]),
-        ("202#05", ["202#0000 0000 C306 0000", "203#0000 0000 C306 0000", "204#0000 0000 C306 0000"]),
-        ("205#", ["205#4654 3132 3334 3500"]),
-        ("206#00", ["206#00"]),
-        ("207#", ["207#000F 4240 000F 4240"]),
-        ("208#", ["208#0203"]),
-        ("209#02", ["209#0A3C"]),
-        ("20F#", ["20F#0308 0002"]),
-        ("20D#21", ["20D#"]),
-        ("20E#03", ["20E#"]),
-    ],
-)
-def test_can_transactions_of_the_document(client: CanClient, request_: str, answer: list[str]) -> None:
-    assert client.ask(request_, len(answer)) == answer
-    assert client.hears_only_the_serial_number()
-
-
-def test_can_everything_that_is_no_request_is_ignored(client: CanClient) -> None:
-    for opcode in range(16):
-        client.bus.send(can.Message(arbitration_id=0x200 + opcode, is_extended_id=True, data=b"\0"))
-        client.bus.send(can.Message(arbitration_id=0x200 + opcode, is_extended_id=False, is_remote_frame=True, dlc=1))
-        client.bus.send(frame(f"21{opcode:X}#00"))
-        client.bus.send(frame(f"20{opcode:X}#0000"))
-        client.bus.send(frame(f"20{opcode:X}#" + "00" * 8))
-    for line in ("201#", "203#", "204#", "20A#", "20B#", "201#00", "202#", "206#", "209#", "20D#", "20E#"):
-        client.bus.send(frame(line))
-    for line in ("202#06", "202#FF", "209#01", "209#06", "206#10"):
-        client.bus.send(frame(line))
-    assert client.hears_only_the_serial_number()
-
-
 def test_can_reset_is_silent_then_slot_0_with_new_base_and_bit_rate(node: AtiCanNode) -> None:
     path = node.start()
     with can_client(path) as client:
@@ -171,22 +132,10 @@ def test_can_settings_may_wait_for_power_up(node: AtiCanNode) -> None:
         assert client.hears_only_the_serial_number("7F5#")
 
 
-def test_can_gauge_offset(node: AtiCanNode, client: CanClient) -> None:
-    node.gauge_offset = (1, 0, 0, 0, 0, -1)
-    assert client.ask("200#", 2) == ["200#0000 0065 012C 01F4", "201#FF38 FE70 FDA7"]
-
-
 def test_can_adapter_answers_its_own_questions(client: CanClient) -> None:
     assert isinstance(client.bus, slcanBus)
     assert client.bus.get_version(1.0) == (10, 13)
     assert client.bus.get_serial_number(1.0) == "EMUL"
-
-
-def test_can_client_may_leave_and_come_back(node: AtiCanNode) -> None:
-    path = node.start()
-    for _ in range(3):
-        with can_client(path) as client:
-            assert client.ask("200#", 2) == V1_FRAMES
 
 
 def test_can_host_that_never_reads_costs_frames_not_memory(node: AtiCanNode) -> None:
@@ -314,14 +263,6 @@ def test_serial_frames_of_the_document(box: AtiSerialBox, line: SerialClient) ->
 def test_serial_damaged_frames_are_met_with_silence(line: SerialClient, request_: bytes) -> None:
     assert line.is_silent_to(request_)
     assert line.ask(READ_STATUS, 7) == STATUS_OK
-
-
-def test_serial_stream_starts_after_the_reply_and_stops_when_jammed(line: SerialClient) -> None:
-    for _ in range(3):
-        assert line.ask(START, 5) == STARTED
-        assert line.port.read(130) == V1_RECORD * 10
-        line.stop()
-        assert line.ask(READ_STATUS, 7) == STATUS_OK
 
 
 def test_serial_fewer_bytes_do_not_stop_it_and_a_pause_restarts_the_count(

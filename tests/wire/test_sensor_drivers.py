@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from ftdrivers.clock import Clock
-from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, DeviceTimeout, StreamBroken
-from ftdrivers.registry import sensor_from_url
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.streaming.sensor import StreamingSensor
 
 WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])  # what the emulators of conftest.py measure, with
@@ -64,30 +63,6 @@ def test_wrench_counts_and_samples(shared: Emulator) -> None:
     assert (samples.status == 0).all()
     assert info.serial.startswith(kind.serial)
     assert health.malformed == 0
-
-
-@pytest.mark.parametrize("scheme", ["robotous-can", "robotous-serial", "robotiq-ft300", "ati-netft"])
-def test_counts_and_wrench_are_the_same(start: Start, scheme: str) -> None:
-    """The others send gauges, or no counts at all."""
-    with start(scheme).sensor() as sensor:
-        samples, facts = sensor.collect(0.2), sensor.identify().facts
-    scale = np.repeat([facts[f"counts_per_{unit}"].value for unit in ("N", "Nm")], 3)
-    np.testing.assert_allclose(samples.counts / scale, samples.wrench, rtol=1e-12)
-
-
-def test_sign_turns_the_reading(shared: Emulator) -> None:
-    with shared.sensor(sign=-1) as sensor:
-        np.testing.assert_allclose(sensor.collect(0.3).wrench.mean(axis=0), -WRENCH, atol=0.1)
-
-
-def test_latest_is_fresh_and_moves_on(shared: Emulator) -> None:
-    with shared.sensor() as sensor:
-        first = sensor.latest(timeout_s=0.5)
-        sensor.collect(0.05)
-        second = sensor.latest(timeout_s=0.5)
-        assert shared.clock.now_ns() - second.t_host_ns[0] < 0.3e9
-        assert len(first) == len(second) == 1
-        assert second.seq[0] > first.seq[0]
 
 
 def test_open_close_reopen_and_nothing_stays(shared: Emulator) -> None:
@@ -185,62 +160,9 @@ def test_damage_is_dropped_and_counted(start: Start, scheme: str, fault: str) ->
     assert len(samples) > (0 if scheme == "robotous-can" else gaps)
 
 
-def test_swapped_and_doubled_frames_are_no_new_samples(start: Start) -> None:
-    emulator = start("ati-netft")
-    with emulator.sensor() as sensor:
-        emulator.faults(swap=0.1, duplicate=0.1)
-        samples = sensor.collect(0.5)
-    assert (np.diff(samples.seq) >= 1).all()
-
-
-@pytest.mark.parametrize("axis", [0, 4])
-def test_robotous_overload_names_its_axis(start: Start, axis: int) -> None:
-    for scheme in ("robotous-can", "robotous-serial"):
-        name = ["Fx", "Fy", "Fz", "Tx", "Ty", "Tz"][axis]
-        with pytest.raises(DeviceFault, match=f"overload of {name};"):
-            start(scheme, overload=0b100000 >> axis).sensor().open()
-
-
-@pytest.mark.parametrize(
-    ("name", "torque_divisor"), [("RFT40-SA01", 2000), ("RFT76-HA01", 2000), ("RFT80-6A01", 1000), ("RFT82-HA01", 1000)]
-)
-def test_robotous_scale_follows_the_model(start: Start, name: str, torque_divisor: float) -> None:
-    with start("robotous-can", model={"name": name, "torque_divisor": torque_divisor}).sensor() as sensor:
-        assert sensor.identify().model == f"Robotous {name}"
-        np.testing.assert_allclose(sensor.collect(0.3).wrench.mean(axis=0), WRENCH, atol=0.05)
-
-
-def test_robotous_of_unknown_model_is_refused(start: Start) -> None:
-    with pytest.raises(ConnectError, match="RFT99-X"):
-        start("robotous-serial", model={"name": "RFT99-X"}).sensor().open()
-
-
-def test_robotous_rate(start: Start) -> None:
-    with start("robotous-can").sensor("rate=1000") as sensor:
-        assert 75 < len(sensor.collect(0.3)) < 400  # the factory gives 60; late ones come in bursts
-    slow = start("robotous-serial")
-    with slow.sensor("rate=50") as sensor:
-        assert 8 < len(sensor.collect(0.4)) < 24
-    with slow.sensor() as sensor:  # not asked for: stays as it is
-        assert 8 < len(sensor.collect(0.4)) < 24
-
-
-def test_robotous_uart_carries_a_kilohertz_at_921600_only(start: Start) -> None:
-    with pytest.raises(BadUrl, match="choose at most 500 Hz"):
-        sensor_from_url("robotous-serial:///dev/x?rate=1000")
-    with start("robotous-serial", baud_code=1).sensor("baud=921600&rate=1000") as sensor:
-        assert 75 < len(sensor.collect(0.3)) < 400  # the factory gives 60; late ones come in bursts
-
-
 def test_robotiq_saturation_is_a_fault(start: Start) -> None:
     with pytest.raises(DeviceFault, match="end of its range"):
         start("robotiq-ft300", saturated_axis=2).sensor().open()
-
-
-def test_robotiq_unknown_serial_number(start: Start) -> None:
-    with start("robotiq-ft300", serial=("FTS", 0)).sensor() as sensor:
-        assert sensor.identify().serial == "not reported"
-        assert sensor.identify().firmware == "FTS-2.0.1"
 
 
 @pytest.mark.parametrize(("status", "says"), [(2, "overrange"), (4, "invalid"), (8, "not in N")])
@@ -253,34 +175,6 @@ def test_bota_too_slow_is_a_warning(start: Start, caplog: pytest.LogCaptureFixtu
     with start("bota", status=1).sensor() as sensor:
         assert (sensor.collect(0.1).status == 1).all()
     assert caplog.text.count("application too slow") == 1
-
-
-def test_bota_clock_is_the_sensors(start: Start) -> None:
-    with start("bota").sensor() as sensor:
-        samples = sensor.collect(0.2)
-    np.testing.assert_allclose(np.diff(samples.t_device_s), 0.01, atol=2e-6)
-
-
-def test_bota_that_boots_is_awaited(start: Start) -> None:
-    with start("bota", streaming_at_start=False, boot_s=0.5).sensor() as sensor:
-        sensor.collect(0.1)
-
-
-def test_bota_that_restarts_is_broken(start: Start) -> None:
-    emulator = start("bota")
-    with emulator.sensor() as sensor:
-        sensor.collect(0.2)  # longer than it takes to boot: its clock goes back
-        emulator.reset()
-        with pytest.raises(StreamBroken, match="it has restarted"):
-            sensor.collect(1.0)
-
-
-def test_bota_is_configured_when_asked(start: Start) -> None:
-    emulator = start("bota", sinc_length=512)
-    with emulator.sensor("sinc=64") as sensor:
-        assert 40 < len(sensor.collect(0.2)) < 180  # it was 20
-    with emulator.sensor() as sensor:  # and left as it is, streaming
-        assert 40 < len(sensor.collect(0.2)) < 180  # it was 20
 
 
 @pytest.mark.parametrize(

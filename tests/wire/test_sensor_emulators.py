@@ -1,36 +1,24 @@
-"""The emulated Robotous, Robotiq, Bota and Net F/T sensors, as python-can, pyserial and sockets see them."""
+"""The emulated Robotiq, Bota and Net F/T sensors, as pyserial and sockets see them."""
 
 import socket
 import struct
-import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
 
-import can
 import numpy as np
 import pytest
 import serial
 from numpy.typing import NDArray
 
-from ftmocks.sensors.bota import BotaBox, crc16_x25
+from ftmocks.sensors.bota import BotaBox
 from ftmocks.sensors.netft import RECORD, NetFtBox
 from ftmocks.sensors.robotiq import RobotiqBox
-from ftmocks.sensors.robotous import RobotousCanNode, RobotousSerialBox, packet
-from ftmocks.wires.modbus import with_crc
-from tests.wire.waiting import LIMIT_S, drain, read_to, wait_until
+from tests.wire.waiting import LIMIT_S, read_to, wait_until
 
-UNPLUGGED = (serial.SerialException, can.CanError, OSError, termios.error)
-RFT_WRENCH = np.array([10, -5, 20, 1, -0.5, 0.05])
-RFT_START = bytes.fromhex("55 0B 00 00 00 00 00 00 00 0B AA")
-RFT_STOP = bytes.fromhex("55 0C 00 00 00 00 00 00 00 0C AA")
-RFT_RATE_1_KHZ = bytes.fromhex("55 0F 08 00 00 00 00 00 00 17 AA")
-RFT_SAMPLE = bytes.fromhex("55 0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000 3F AA")
 FT300_WRENCH = np.array([12.34, -5.67, 100, 0.15, -0.025, 1])
 FT300_START = bytes.fromhex("09 10 01 9A 00 01 02 02 00 CD CA")
 FT300_STARTED = bytes.fromhex("09 10 01 9A 00 01 21 52")
 FT300_FRAME = bytes.fromhex("20 4E D2 04 C9 FD 10 27 96 00 E7 FF E8 03 86 DC")
-FT300_READ = bytes.fromhex("09 03 00 B4 00 06 84 A6")
 BOTA_WRENCH = np.array([1, -2, 9.81, 0.1, -0.2, 0.3])
 RDT_ONE = bytes.fromhex("12 34 00 02 00 00 00 01")
 RDT_BIAS = bytes.fromhex("12 34 00 42 00 00 00 00")
@@ -41,23 +29,8 @@ def constant(wrench: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]
     return lambda n: np.tile(wrench, (n, 1))
 
 
-class Counter:
-    """Readings that carry their number on the x axis, in steps that every sensor resolves."""
-
-    step_N = 0.02
-
-    def __init__(self) -> None:
-        self.made = 0
-
-    def __call__(self, count: int) -> NDArray[np.float64]:
-        readings = np.zeros((count, 6))
-        readings[:, 0] = np.arange(self.made, self.made + count) * self.step_N
-        self.made += count
-        return readings
-
-
 @contextmanager
-def serial_client(device: RobotousSerialBox | RobotiqBox | BotaBox) -> Iterator[serial.Serial]:
+def serial_client(device: RobotiqBox | BotaBox) -> Iterator[serial.Serial]:
     try:
         with serial.Serial(device.start(), timeout=LIMIT_S) as port:
             yield port
@@ -65,109 +38,7 @@ def serial_client(device: RobotousSerialBox | RobotiqBox | BotaBox) -> Iterator[
         device.stop()
 
 
-# ---------------------------------------------------------------- Robotous, CAN
-
-
-@pytest.fixture
-def node() -> Iterator[RobotousCanNode]:
-    node = RobotousCanNode(constant(RFT_WRENCH))
-    yield node
-    node.stop()
-
-
-@contextmanager
-def can_client(node: RobotousCanNode, bitrate: int = 1_000_000) -> Iterator[can.BusABC]:
-    try:
-        bus = can.Bus(interface="slcan", channel=node.start(), bitrate=bitrate, sleep_after_open=0)
-        try:
-            yield bus
-        finally:
-            with suppress(*UNPLUGGED):
-                bus.shutdown()
-    finally:
-        node.stop()
-
-
-def send_command(bus: can.BusABC, command: str, identifier: int = 0x64) -> None:
-    data = bytes.fromhex(command).ljust(8, b"\0")
-    bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-
-
-def hear(bus: can.BusABC, count: int) -> list[tuple[int, str]]:
-    messages = [bus.recv(LIMIT_S) for _ in range(count)]
-    return [(m.arbitration_id, m.data.hex().upper()) for m in messages if m is not None]
-
-
-def drain_bus(bus: can.BusABC) -> None:
-    """Take what was on its way from a sensor that sends nothing more: a full adapter would lose its next answer."""
-    while bus.recv(0.05):
-        pass
-
-
-CAN_SAMPLE = [(1, "0B01F4FF0603E807"), (2, "D0FC180064000000")]
-
-
-def test_robotous_can_commands_and_stream(node: RobotousCanNode) -> None:
-    with can_client(node) as bus:
-        send_command(bus, "01")
-        assert hear(bus, 2) == [(1, "015246543630" + "2D48"), (2, "4130310000000000")]
-        send_command(bus, "0A")
-        assert hear(bus, 2) == [(1, "0A01F4FF0603E807"), CAN_SAMPLE[1]]
-        send_command(bus, "0F 08")
-        assert hear(bus, 2)[0] == (1, "0F01000000000000")
-        send_command(bus, "0B")
-        assert hear(bus, 400) == CAN_SAMPLE * 200
-        send_command(bus, "01")
-        send_command(bus, "0C")
-        wait_until(lambda: not node.streaming)
-        send_command(bus, "10")
-        while (reply := hear(bus, 2)) == CAN_SAMPLE:
-            pass
-        assert reply[0] == (1, "1008000000000000")
-
-
-# ---------------------------------------------------------------- Robotous, UART
-
-
-RFT_GET_RATE = packet(b"\x10".ljust(8, b"\0"))
-
-
-def rft_rate(code: int) -> bytes:
-    return packet(bytes([0x10, code]).ljust(16, b"\0"))
-
-
-def test_robotous_uart_streams_and_stops() -> None:
-    box = RobotousSerialBox(constant(RFT_WRENCH), baud_code=1)
-    with serial_client(box) as port:
-        port.write(RFT_RATE_1_KHZ)
-        assert port.read(19) == packet(bytes.fromhex("0F 01").ljust(16, b"\0"))
-        port.write(RFT_START)
-        assert port.read(19 * 200) == RFT_SAMPLE * 200
-        port.write(packet(b"\x02".ljust(8, b"\0")) + RFT_STOP)
-        wait_until(lambda: not box.streaming)
-        rest = drain(port)
-        port.write(b"\x55\x55" + packet(b"\x0a".ljust(8, b"\0"))[:-1] + b"\0" + RFT_GET_RATE)
-        rest += read_to(port, rft_rate(8))
-        assert rest == RFT_SAMPLE * (len(rest) // 19), "nothing else is answered, and no frame is cut"
-
-
 # ---------------------------------------------------------------- Robotiq
-
-
-def test_robotiq_start_stream_stop() -> None:
-    box = RobotiqBox(constant(FT300_WRENCH))
-    with serial_client(box) as port:
-        for _ in range(2):
-            port.write(FT300_READ)
-            rest = read_to(port, with_crc(bytes.fromhex("09 03 0C 04D2 FDC9 2710 0096 FFE7 03E8")))
-            assert rest == FT300_FRAME * (len(rest) // 16), "no frame of the last stream is cut"
-            port.write(FT300_START)
-            assert port.read(8) == FT300_STARTED
-            assert port.read(16 * 20) == FT300_FRAME * 20
-            port.write(FT300_READ)
-            assert port.read(32) == FT300_FRAME * 2, "no reply in the stream"
-            port.write(b"\xff" * 50)
-            wait_until(lambda: not box.streaming)
 
 
 def test_robotiq_needs_the_whole_stop_sequence() -> None:
@@ -185,32 +56,6 @@ def test_robotiq_needs_the_whole_stop_sequence() -> None:
 
 
 # ---------------------------------------------------------------- Bota
-
-
-def bota_fields(frame: bytes) -> tuple[Any, ...]:
-    assert frame[0] == 0xAA
-    assert crc16_x25(frame[1:-2]) == frame[-2:]
-    return struct.unpack("<H6fIf", frame[1:-2])
-
-
-def test_bota_streams_when_opened_and_can_be_configured_at_once() -> None:
-    box = BotaBox(constant(BOTA_WRENCH))
-    with serial_client(box) as port:
-        frames = [bota_fields(port.read(37)) for _ in range(10)]
-        assert [round(x, 5) for x in frames[0][1:7]] == BOTA_WRENCH.tolist()
-        assert np.diff([f[7] for f in frames]).tolist() == [10_000] * 9
-        port.write(b"C")
-        assert len(read_to(port, b"r,0,C,0\r\n")) % 37 == 0
-        for command, answer in (
-            (b"c,0,1,0,4", b"r,0,c,0\r\n"),
-            (b"f,64,0,0,0", b"r,0,f,0\r\n"),
-            (b"R", b"r,0,R,0\r\n"),
-        ):
-            for byte in command:
-                port.write(bytes([byte]))
-            assert port.read(len(answer)) == answer
-        frames = [bota_fields(port.read(37)) for _ in range(100)]
-        assert np.diff([f[7] for f in frames]).tolist() == [1250] * 99, "800 Hz"
 
 
 @pytest.mark.parametrize(
@@ -290,15 +135,6 @@ def net_box() -> Iterator[NetFtBox]:
     box = NetFtBox(constant(RDT_WRENCH), rdt_port=0, rate_hz=1000)
     yield box
     box.stop()
-
-
-def test_rdt_documented_sample(net_box: NetFtBox) -> None:
-    with rdt_client(net_box) as client:
-        client.socket.send(RDT_ONE)
-        data = client.socket.recv(2048)
-        assert data[:4] == bytes.fromhex("00000001")
-        assert data[8:].hex(" ", 4).upper() == "00000000 0016E360 FFDDAAF0 00989680 000186A0 FFFF3CB0 000061A8"
-        assert client.is_silent()
 
 
 def test_rdt_listens_at_its_documented_port() -> None:
@@ -381,6 +217,3 @@ def test_pynetft_reads_the_box(net_box: NetFtBox) -> None:
         client.bias()
         wait_until(lambda: not any(next(samples).wrench))
     wait_until(lambda: not net_box.streaming)
-
-
-# ---------------------------------------------------------------- all of them

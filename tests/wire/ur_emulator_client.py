@@ -42,7 +42,7 @@ def arrived(receive: Any, goal: list[float]) -> bool:
 def some_cycles(receive: Any) -> None:
     """Let the controller go through ten cycles and more."""
     begun = receive.getTimestamp()
-    wait_for(lambda: receive.getTimestamp() > begun + 0.4)
+    wait_for(lambda: receive.getTimestamp() > begun + 0.1)
 
 
 def receive(host: str) -> dict[str, Any]:
@@ -106,25 +106,29 @@ def kinematics(host: str) -> dict[str, Any]:
     """Everything the controller computes."""
     r, c = RTDEReceiveInterface(host), RTDEControlInterface(host)
     q, pose = r.getActualQ(), r.getActualTCPPose()
-    # some results are read before the script has run: ask twice, two cycles apart (a trait of the client)
-    c.getActualToolFlangePose()
-    some_cycles(r)
+
+    def twice(question: Callable[..., Any], *about: Any) -> Any:
+        """Ask again after some cycles, because the client may read a result before the script has run."""
+        question(*about)
+        some_cycles(r)
+        return question(*about)
+
     return {
-        "flange": c.getActualToolFlangePose(),
+        "flange": twice(c.getActualToolFlangePose),
         "q": q,
         "pose": pose,
-        "ik": c.getInverseKinematics(pose),
-        "ik_near": c.getInverseKinematics(pose, q),
-        "has": c.getInverseKinematicsHasSolution(pose),
-        "has_not": c.getInverseKinematicsHasSolution([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
-        "fk": c.getForwardKinematics(),
-        "fk_of_q": c.getForwardKinematics(q, [1e-12, 0.0, 0.0, 0.0, 0.0, 0.0]),
-        "trans": c.poseTrans([1.0, 2.0, 3.0, 0.0, 0.0, math.pi / 2], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
-        "joints_safe": c.isJointsWithinSafetyLimits(q),
-        "joints_unsafe": c.isJointsWithinSafetyLimits([7.0, *q[1:]]),
-        "pose_safe": c.isPoseWithinSafetyLimits(pose),
-        "pose_below_plane": c.isPoseWithinSafetyLimits([*pose[:2], 0.05, *pose[3:]]),
-        "pose_unreachable": c.isPoseWithinSafetyLimits([3.0, *pose[1:]]),
+        "ik": twice(c.getInverseKinematics, pose),
+        "ik_near": twice(c.getInverseKinematics, pose, q),
+        "has": twice(c.getInverseKinematicsHasSolution, pose),
+        "has_not": twice(c.getInverseKinematicsHasSolution, [3.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        "fk": twice(c.getForwardKinematics),
+        "fk_of_q": twice(c.getForwardKinematics, q, [1e-12, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        "trans": twice(c.poseTrans, [1.0, 2.0, 3.0, 0.0, 0.0, math.pi / 2], [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        "joints_safe": twice(c.isJointsWithinSafetyLimits, q),
+        "joints_unsafe": twice(c.isJointsWithinSafetyLimits, [7.0, *q[1:]]),
+        "pose_safe": twice(c.isPoseWithinSafetyLimits, pose),
+        "pose_below_plane": twice(c.isPoseWithinSafetyLimits, [*pose[:2], 0.05, *pose[3:]]),
+        "pose_unreachable": twice(c.isPoseWithinSafetyLimits, [3.0, *pose[1:]]),
         "script_alive": c.isProgramRunning(),
         "unreachable_ik": c.getInverseKinematics([3.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
         "script_died": wait_for(lambda: not c.isProgramRunning()),

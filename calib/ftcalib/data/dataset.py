@@ -85,18 +85,16 @@ class CalibrationDataset:
             raise BadDataset(f"row {i + 1}: n_samples is {n_samples[i]:g}, expected a whole number, 0 for unknown.")
         n_samples = n_samples.astype(np.int64)
         n_samples.setflags(write=False)
-        object.__setattr__(self, "R_base_flange", read_only(R_base_flange))
-        object.__setattr__(self, "wrench", read_only(wrench))
-        object.__setattr__(self, "t_s", read_only(t_s))
-        object.__setattr__(self, "n_samples", n_samples)
+        arrays = {"R_base_flange": R_base_flange, "wrench": wrench, "t_s": t_s}
         if self.wrench_cov is not None:
-            cov = _covariances(_measured("wrench_cov", self.wrench_cov, (n, 6, 6)))
-            object.__setattr__(self, "wrench_cov", read_only(cov))
+            arrays["wrench_cov"] = _covariances(_measured("wrench_cov", self.wrench_cov, (n, 6, 6)))
         try:
             meta = json.loads(json.dumps(dict(self.meta), allow_nan=False))
         except (TypeError, ValueError) as exc:
             raise BadDataset(f"meta cannot be written as JSON ({exc}): use text, numbers, lists and mappings.") from exc
-        object.__setattr__(self, "meta", MappingProxyType(meta))
+        frozen = {name: read_only(array) for name, array in arrays.items()}
+        for name, value in (frozen | {"n_samples": n_samples, "meta": MappingProxyType(meta)}).items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def of(
@@ -360,8 +358,7 @@ def _rotations(R: Array) -> Array:
 
 def _covariances(cov: Array) -> Array:
     for i, C in enumerate(cov):
-        problem = _covariance_problem(C)
-        if problem:
+        if problem := _covariance_problem(C):
             raise BadDataset(f"row {i + 1}: wrench_cov is not a covariance matrix, {problem}.")
     return (cov + np.swapaxes(cov, 1, 2)) / 2
 

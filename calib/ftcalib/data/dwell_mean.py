@@ -36,8 +36,6 @@ class PoseMean:
     """(6,) N and N·m."""
     covariance: Array
     """(6, 6) of the mean, positive definite."""
-    n_effective: float
-    """Number of independent samples with the same information, for the worst channel."""
 
 
 def mean_and_covariance(wrench: Array) -> PoseMean:
@@ -75,7 +73,7 @@ def mean_and_covariance(wrench: Array) -> PoseMean:
     correlation = (1 - shrink) * S / np.outer(safe, safe)
     np.fill_diagonal(correlation, 1.0)
     sigma = np.sqrt(variance)
-    return PoseMean(mean, correlation * np.outer(sigma, sigma), float(N / tau.max()))
+    return PoseMean(mean, correlation * np.outer(sigma, sigma))
 
 
 def is_stationary(wrench: Array) -> bool:

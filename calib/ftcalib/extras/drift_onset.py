@@ -52,8 +52,6 @@ class DriftOnset:
     """One standard deviation of that, by the stated sigmas or by the scatter if that is larger."""
     p_value: Array
     """Of the slope, for one onset and one component."""
-    since_days: float
-    """Time of the first verification that counts: the series begins again after a step."""
 
     def __post_init__(self) -> None:
         for name in ("t0_days", "slope", "sigma", "p_value"):
@@ -91,7 +89,7 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
         if ahead.max() <= CLEARLY:
             scatter = np.maximum((chi2 - ramp) / (len(t) - 3), 1.0)
             found = p_ramp < SIGNIFICANT
-            return DriftOnset(found, t0, slope, slope_sigma * np.sqrt(scatter), p_ramp, float(t[0]))
+            return DriftOnset(found, t0, slope, slope_sigma * np.sqrt(scatter), p_ramp)
         first += int(after[ahead.argmax()])
         known = np.zeros_like(known)
     return None

@@ -14,6 +14,7 @@ from scipy.special import chdtrc as chi2_sf
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
 from ftcalib.errors import NotObservable
+from ftcalib.extras.difference import Estimated
 from ftcalib.findings import Finding
 from ftcalib.likelihood.gain_and_cross_talk import Response, response_columns
 from ftcalib.model import BIASES, Array, Parameters, jacobian, read_only, skew
@@ -38,16 +39,8 @@ BLOCKS: Mapping[str, tuple[Block, ...]] = {
 """Kinds of update, and what each estimates."""
 
 
-class Calibrated(Protocol):
+class Calibrated(Estimated, Protocol):
     """A calibration, or an earlier update of it."""
-
-    @property
-    def parameters(self) -> Parameters:
-        """Estimates."""
-
-    @property
-    def covariance(self) -> Array:
-        """(15, 15) of the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
 
     @property
     def response(self) -> Response | None:
@@ -78,7 +71,7 @@ class Update:
 
 
 def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noise: Array, kind: str) -> Update:
-    """Estimate some of the parameters again by generalised least squares; keep the others.
+    """Estimated some of the parameters again by generalised least squares; keep the others.
 
     With x the parameters of `kind` and e the errors of the old calibration, a reading is h(x) + K e + noise. The
     weights are the inverse of noise + K C K'. The error of the new parameters is G (noise - K e) + kept e, with G the
@@ -123,8 +116,12 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
         left = np.asarray(Compensator(new, response=response).batch(wrench, R_base_flange), dtype=np.float64).ravel()
         x = G @ left
         if "weight" in BLOCKS[kind]:
-            weight_N = float(np.linalg.norm(new.gravity_force_base_N) + x[0])
-            _require_significant(weight_N, float(np.sqrt(inverse[0, 0])))
+            weight_N, sigma_N = float(np.linalg.norm(new.gravity_force_base_N) + x[0]), float(np.sqrt(inverse[0, 0]))
+            if not weight_N > SIGNIFICANT_SIGMAS * sigma_N:
+                raise NotObservable(
+                    f"the weight of the payload, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty "
+                    f"of {sigma_N:.2g} N: hang something heavier on the sensor, or check the sign and the tare."
+                )
         if float(x @ information @ x) < SETTLED * max(1.0, float(left @ np.linalg.solve(S, left))):
             break
         new = _moved(new, estimated, x, BLOCKS[kind])
@@ -249,14 +246,6 @@ def _moved(p: Parameters, estimated: Array, x: Array, blocks: Sequence[Block]) -
         moved = p.gravity_force_base_N + step[3:6]
         step[3:6] = moved * weight_N / np.linalg.norm(moved) - p.gravity_force_base_N
     return p.moved(step)
-
-
-def _require_significant(weight_N: float, sigma_N: float) -> None:
-    if not weight_N > SIGNIFICANT_SIGMAS * sigma_N:
-        raise NotObservable(
-            f"the weight of the payload, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty of "
-            f"{sigma_N:.2g} N: hang something heavier on the sensor, or check the sign and the tare."
-        )
 
 
 def _inverse(information: Array, kind: str, n: int) -> Array:

@@ -193,8 +193,10 @@ def _explained(
     if single:
         least, update = found[single[0]]
         change = SINGLE[single[0]]
-        near = [kind for kind in single if found[kind][0] < least + INDISTINCT and not _nested(kind, single[0])]
-        others = tuple(dict.fromkeys(SINGLE[kind] for kind in near))
+        blocks = set(BLOCKS[single[0]])
+        apart = [kind for kind in single if not (blocks <= set(BLOCKS[kind]) or blocks >= set(BLOCKS[kind]))]
+        near = [SINGLE[kind] for kind in apart if found[kind][0] < least + INDISTINCT]
+        others = tuple(dict.fromkeys(near))
         reason = f"{_in_words(calibration, update)} ({misfit}, {update.chi2:.0f} after the update)"
         if others:
             reason += (
@@ -215,11 +217,6 @@ def _explained(
         f"{worst + 1} with {force_N:.2g} N and {torque_Nm:.2g} N·m): free tool and cables and verify again with 6 "
         "poses or more, or calibrate again",
     )
-
-
-def _nested(a: str, b: str) -> bool:
-    """Whether one kind of update estimates all that the other does."""
-    return set(BLOCKS[a]) <= set(BLOCKS[b]) or set(BLOCKS[b]) <= set(BLOCKS[a])
 
 
 def _in_words(calibration: CalibrationResult, update: Update) -> str:

@@ -4,6 +4,8 @@ Criteria are traces of a covariance C: a pose with whitened Jacobian J lowers tr
 trace((1 + J C J^T)^-1 J C M C J^T), so one array operation ranks all candidates. All functions are deterministic.
 """
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
@@ -98,11 +100,19 @@ def choose(R_candidates: Array, n: int, guess: Guess) -> Indices:
         raise ValueError(f"cannot choose {n} poses of {len(R_candidates)}: {FEWEST} or more, of at least as many")
     u = predict(guess.parameters, R_candidates)[:, None, :3] / guess.weight_N
     u1 = np.concatenate([u, np.ones((len(u), 1, 1))], axis=2)
-    terms = [_Term(force_rows(R_candidates, guess), np.eye(9)), _Term(u1, WEIGHT_OF_PLANE * np.eye(4))]
+    terms = (force_rows(R_candidates, guess), np.eye(9)), (u1, WEIGHT_OF_PLANE * np.eye(4))
+
+    def gains(chosen: list[int]) -> Array:
+        total = np.zeros(len(R_candidates))
+        for candidates, M in terms:  # trace(M C), with C the covariance of some parameters
+            rows = candidates[chosen].reshape(-1, len(M))
+            total += _gains(candidates, _inverse(PRIOR * np.eye(len(M)) + rows.T @ rows), M)
+        return total
+
     pinned: list[int] = []
     widest, best = -1.0, np.zeros(0, dtype=np.intp)
     while len(pinned) <= n // 2:
-        chosen = _greedy_and_exchange(terms, n, pinned)
+        chosen = greedy_and_exchange(gains, n, pinned)
         gap, other = second_basin(R_candidates[chosen], guess)
         if gap > CLEARLY_WIDER * widest:
             widest, best = gap, chosen
@@ -147,28 +157,29 @@ def next_pose(R_done: Array, R_candidates: Array, guess: Guess) -> Indices:
     return np.argsort(-worth, kind="stable")
 
 
-class _Term:
-    """A criterion trace(M C), C the covariance of some parameters, over a selection of candidates."""
+def greedy_and_exchange(gains: Callable[[list[int]], Array], n: int, pinned: Sequence[int] = ()) -> Indices:
+    """Choose n candidates greedily, then exchange one at a time as long as it helps.
 
-    def __init__(self, rows: Array, M: Array) -> None:
-        """Take the candidates' whitened rows (m, r, p) and the weight M (p, p)."""
-        self._rows, self._M = rows, M
-        self._prior = PRIOR * np.eye(rows.shape[2])
+    Parameters
+    ----------
+    gains : callable
+        Returns what each candidate (m,) improves, added to chosen ones.
+    n : int
+    pinned : sequence of int
+        Candidates that stay chosen.
 
-    def gains(self, chosen: list[int]) -> Array:
-        """(m,) decrease of the criterion by each candidate, added to the chosen poses."""
-        rows = self._rows[chosen].reshape(-1, self._rows.shape[2])
-        return _gains(self._rows, _inverse(self._prior + rows.T @ rows), self._M)
-
-
-def _greedy_and_exchange(terms: list[_Term], n: int, pinned: list[int]) -> Indices:
+    Returns
+    -------
+    int array, shape (n,)
+        Indices of candidates, the pinned ones first.
+    """
     chosen = list(pinned)
 
     def best_addition() -> tuple[int, Array]:
-        gains = np.sum([term.gains(chosen) for term in terms], axis=0)
-        free = gains.copy()
+        gain = gains(chosen)
+        free = gain.copy()
         free[chosen] = -np.inf
-        return int(free.argmax()), gains
+        return int(free.argmax()), gain
 
     while len(chosen) < n:
         chosen.append(best_addition()[0])
@@ -176,10 +187,10 @@ def _greedy_and_exchange(terms: list[_Term], n: int, pinned: list[int]) -> Indic
         changed = False
         for i in range(len(pinned), n):
             out = chosen.pop(i)
-            candidate, gains = best_addition()
-            better = gains[candidate] > gains[out] * (1 + LEAST_GAIN)
+            candidate, gain = best_addition()
+            better = bool(gain[candidate] > gain[out] * (1 + LEAST_GAIN))
             chosen.insert(i, candidate if better else out)
-            changed |= bool(better)
+            changed |= better
         if not changed:
             break
     return np.array(chosen)

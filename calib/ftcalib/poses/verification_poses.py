@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from ftcalib.model import BIASES, Array
 from ftcalib.poses.information import Guess, whitened_jacobian
-from ftcalib.poses.selection import LEAST_GAIN, Indices
+from ftcalib.poses.selection import Indices, greedy_and_exchange
 
 FEWEST = 2
 FARTHER_SHARE = 0.5
@@ -54,33 +54,15 @@ def choose_verification_poses(
     count = max(n, round(FARTHER_SHARE * len(candidates)))
     far = np.sort(np.argsort(nearest, kind="stable")[:count])
     rows = whitened_jacobian(candidates[far], TOOL) / TOOL.scale * USUAL_CHANGE
-    return np.asarray(far[_most_informative(rows, n)])
-
-
-def _most_informative(rows: Array, n: int) -> Indices:
-    """Choose n of the rows (m, 6, 15) that maximise log det(1 + sum of J'J), summed over the pairs of causes."""
     pairs = [rows[..., [*a, *b]] for a, b in combinations(CAUSES, 2)]
-    chosen: list[int] = []
 
-    def gains() -> Array:
-        total = np.zeros(len(rows))
+    def gains(chosen: list[int]) -> Array:
+        """Increase of log det(1 + sum of J'J), summed over the pairs of causes."""
+        total = np.zeros(len(far))
         for J in pairs:
             done = J[chosen].reshape(-1, J.shape[2])
             covariance = np.linalg.inv(np.eye(J.shape[2]) + done.T @ done)
             total += np.linalg.slogdet(np.eye(6) + J @ covariance @ np.swapaxes(J, 1, 2))[1]
-        total[chosen] = -np.inf
         return total
 
-    while len(chosen) < n:
-        chosen.append(int(gains().argmax()))
-    improved = True
-    while improved:
-        improved = False
-        for i in range(n):
-            old = chosen.pop(i)
-            gain = gains()
-            best = int(gain.argmax())
-            better = bool(gain[best] > gain[old] + LEAST_GAIN)
-            chosen.insert(i, best if better else old)
-            improved |= better
-    return np.array(chosen)
+    return np.asarray(far[greedy_and_exchange(gains, n)])

@@ -9,7 +9,7 @@ from ftcalib.errors import NotObservable
 from ftcalib.model import Array, Parameters
 from ftcalib.published import carlson, carlson_known
 from ftcalib.published.carlson import ForceFit
-from ftcalib.published.yu import com_and_torque_bias, lrom, special_numbers, srom_numbered
+from ftcalib.published.yu import com_and_torque_bias, lrom, special_numbers, srom
 
 Estimator = Callable[[Array], Parameters]
 """Takes the mean wrenches (n, 6) of fixed poses, returns the parameters."""
@@ -48,8 +48,7 @@ def published(
         The method needs other poses, or a weight.
     """
     if method == "srom":
-        number, Y = special_numbers(R_base_flange)
-        return partial(srom_numbered, R_base_flange, number=number, Y=Y)
+        return partial(srom, R_base_flange, numbered=special_numbers(R_base_flange))
     if method == "lrom":
         return partial(lrom, R_base_flange)
     if method == "carlson-relaxation":

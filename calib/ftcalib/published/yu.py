@@ -21,12 +21,8 @@ _ROWS = (
 )  # fmt: skip
 
 
-def _special_orientations() -> Array:
-    axes = dict(zip("xyz", np.eye(3), strict=True))
-    return np.array([[float(row[0] + "1") * axes[row[1]] for row in rows.split()] for rows in _ROWS])
-
-
-SPECIAL_R_flange_base = _special_orientations()
+_AXES = dict(zip("xyz", np.eye(3), strict=True))
+SPECIAL_R_flange_base = np.array([[float(row[0] + "1") * _AXES[row[1]] for row in rows.split()] for rows in _ROWS])
 """(24, 3, 3) the paper's e_bR_1 … e_bR_24 (Fig. 3, Table of special orientations): the rotation group of the cube."""
 
 TOLERANCE_RAD = np.deg2rad(0.1)
@@ -40,26 +36,23 @@ _SUMS = (
 )
 
 
-def srom(R_base_flange: Array, wrench: Array) -> Parameters:
+def srom(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | None = None) -> Parameters:
     """Calibrate from the 24 special orientations, in any order, possibly all turned by one common rotation.
 
     Parameters
     ----------
     R_base_flange : array, shape (24, 3, 3)
-        Y @ SPECIAL_R_flange_base[i].T for one rotation Y of the base, each within 0.1°.
     wrench : array, shape (24, 6)
         N and N·m, in the sensor frame.
+    numbered : tuple, optional
+        What `special_numbers` returns for these orientations.
 
     Raises
     ------
     NotObservable
-        Orientations are missing or repeated; the message gives their numbers.
+        As of `special_numbers`.
     """
-    return srom_numbered(R_base_flange, wrench, *special_numbers(R_base_flange))
-
-
-def srom_numbered(R_base_flange: Array, wrench: Array, number: Indices, Y: Array) -> Parameters:
-    """`srom` with the result of `special_numbers`."""
+    number, Y = numbered or special_numbers(R_base_flange)
     force_N = np.empty((24, 3))
     force_N[number] = wrench[:, :3]
     # With A_i = R_i Y.T the published formulas see the gravity force in the turned base, Y.T F_b.
@@ -67,7 +60,10 @@ def srom_numbered(R_base_flange: Array, wrench: Array, number: Indices, Y: Array
 
 
 def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
-    """Calibrate from at least five orientations.
+    """Calibrate from at least five orientations: eqs 24-34.
+
+    The sign rule of eq 34 contradicts itself (its alpha is not that of eqs 46-48). det R > 0 replaces it and needs no
+    knowledge of the mounting of the robot.
 
     Parameters
     ----------
@@ -80,14 +76,30 @@ def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
     NotObservable
         Fewer than five poses, or poses for which the linear equations have several solutions.
     """
-    A = np.swapaxes(R_base_flange, 1, 2)
-    return _remaining_steps(R_base_flange, wrench, lrom_gravity_force(A, wrench[:, :3]))
+    n, A = len(wrench), np.swapaxes(R_base_flange, 1, 2)
+    if n < 5:
+        raise NotObservable(f"LROM needs at least 5 poses, there are {n}: record more, or use ML, which needs 4.")
+    # R^T F_i - A_i F_b - R^T F0 = 0 for x9, the rows of R^T, and x6 = (F_b, R^T F0), which is eliminated.
+    A9 = np.einsum("kl,ni->nkli", np.eye(3), wrench[:, :3]).reshape(3 * n, 9)
+    A6 = np.concatenate([-A, np.broadcast_to(-np.eye(3), A.shape)], axis=2).reshape(3 * n, 6)
+    x6_of_x9 = -np.linalg.lstsq(A6, A9)[0]
+    H = np.linalg.qr(A9 + A6 @ x6_of_x9, mode="r")  # the same norm in at most nine rows
+    _, singular, Vt = np.linalg.svd(H)
+    if singular[7] <= 1e-9 * singular[0]:
+        raise NotObservable("LROM has several solutions for these poses: tilt the tool in more directions, or use ML.")
+    x9 = np.sqrt(3) * Vt[8]
+    if np.linalg.det(x9.reshape(3, 3)) < 0:
+        x9 = -x9
+    return _remaining_steps(R_base_flange, wrench, np.asarray((x6_of_x9 @ x9)[:3]))
 
 
 def _remaining_steps(R_base_flange: Array, wrench: Array, gravity_force_base_N: Array) -> Parameters:
-    A, force_N, torque_Nm = np.swapaxes(R_base_flange, 1, 2), wrench[:, :3], wrench[:, 3:]
-    R, force_bias_N = rotation_and_force_bias(A, force_N, gravity_force_base_N)
-    p_sensor_com_m, torque_bias_Nm = com_and_torque_bias(force_N - force_bias_N, torque_Nm)
+    """Rotation and force bias for a known gravity force (Wahba's problem, eqs 36-42 and 39), and eqs 43-45."""
+    force_N, gravity_flange_N = wrench[:, :3], gravity_force_base_N @ R_base_flange
+    D = (force_N - force_N.mean(axis=0)).T @ (gravity_flange_N - gravity_flange_N.mean(axis=0))
+    R = nearest_rotation(D)
+    force_bias_N = force_N.mean(axis=0) - R @ gravity_flange_N.mean(axis=0)
+    p_sensor_com_m, torque_bias_Nm = com_and_torque_bias(force_N - force_bias_N, wrench[:, 3:])
     return Parameters(R.T, gravity_force_base_N, force_bias_N, p_sensor_com_m, torque_bias_Nm)
 
 
@@ -185,84 +197,6 @@ def srom_gravity_force(force_N: Array) -> Array:
         ]
         F_b[k] = np.cbrt(np.linalg.det(np.column_stack(p)))  # [p_k1 p_k2 p_k3] = f_bk R and det R = 1
     return F_b
-
-
-def lrom_gravity_force(A: Array, force_N: Array) -> Array:
-    """Gravity force in base from any orientations: eqs 24-34.
-
-    The sign rule of eq 34 contradicts itself (its alpha is not that of eqs 46-48). det R > 0 replaces it and needs no
-    knowledge of the mounting of the robot.
-
-    Parameters
-    ----------
-    A : array, shape (n, 3, 3)
-        e_bR.
-    force_N : array, shape (n, 3)
-        In the sensor frame.
-
-    Returns
-    -------
-    array, shape (3,)
-
-    Raises
-    ------
-    NotObservable
-        Fewer than five poses, or poses for which the linear equations have several solutions.
-    """
-    if len(A) < 5:
-        raise NotObservable(f"LROM needs at least 5 poses, there are {len(A)}: record more, or use ML, which needs 4.")
-    H, x6_of_x9 = reduced_equations(A, force_N)
-    _, singular, Vt = np.linalg.svd(H)
-    if singular[7] <= 1e-9 * singular[0]:
-        raise NotObservable("LROM has several solutions for these poses: tilt the tool in more directions, or use ML.")
-    x9 = np.sqrt(3) * Vt[8]
-    if np.linalg.det(x9.reshape(3, 3)) < 0:
-        x9 = -x9
-    return np.asarray((x6_of_x9 @ x9)[:3])
-
-
-def reduced_equations(A: Array, force_N: Array) -> tuple[Array, Array]:
-    """Eliminate F_b and R^T F0 from the equations R^T F_i - A_i F_b - R^T F0 = 0: eqs 24-32.
-
-    Parameters
-    ----------
-    A : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-
-    Returns
-    -------
-    H : array, shape (m, 9), m = min(3n, 9)
-        |H x9| is the smallest possible residual for x9, the rows of R^T one after the other.
-    x6_of_x9 : array, shape (6, 9)
-        (F_b, R^T F0) = x6_of_x9 @ x9.
-    """
-    n = len(A)
-    A9 = np.einsum("kl,ni->nkli", np.eye(3), force_N).reshape(3 * n, 9)
-    A6 = np.concatenate([-A, np.broadcast_to(-np.eye(3), A.shape)], axis=2).reshape(3 * n, 6)
-    x6_of_x9 = -np.linalg.lstsq(A6, A9)[0]
-    H = np.asarray(np.linalg.qr(A9 + A6 @ x6_of_x9, mode="r"))  # the same norm in at most nine rows
-    return H, x6_of_x9
-
-
-def rotation_and_force_bias(A: Array, force_N: Array, F_b: Array) -> tuple[Array, Array]:
-    """Rotation s_eR and force bias for a known gravity force (Wahba's problem): eqs 36-42 and 39.
-
-    Parameters
-    ----------
-    A : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-    F_b : array, shape (3,)
-
-    Returns
-    -------
-    R : array, shape (3, 3)
-        Flange to sensor.
-    force_bias_N : array, shape (3,)
-    """
-    gravity_flange_N = A @ F_b
-    D = (force_N - force_N.mean(axis=0)).T @ (gravity_flange_N - gravity_flange_N.mean(axis=0))
-    R = nearest_rotation(D)
-    return R, force_N.mean(axis=0) - R @ gravity_flange_N.mean(axis=0)
 
 
 def com_and_torque_bias(weight_N: Array, torque_Nm: Array) -> tuple[Array, Array]:

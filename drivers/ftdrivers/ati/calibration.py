@@ -5,9 +5,7 @@ are counts divided by counts per unit. Unit codes are shared by NETCANOEM, Digit
 Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_calibration.py.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -16,27 +14,23 @@ from numpy.typing import NDArray
 from ftdrivers.errors import DeviceFault, ProtocolError
 from ftdrivers.interfaces import Array
 
-FORCE_UNITS_N: Mapping[str, float] = MappingProxyType(
-    {
-        "lbf": 4.4482216152605,
-        "N": 1.0,
-        "klbf": 4448.2216152605,
-        "kN": 1000.0,
-        "kgf": 9.80665,
-        "gf": 0.00980665,
-    }
-)
+FORCE_UNITS_N = {
+    "lbf": 4.4482216152605,
+    "N": 1.0,
+    "klbf": 4448.2216152605,
+    "kN": 1000.0,
+    "kgf": 9.80665,
+    "gf": 0.00980665,
+}
 """In the order of ATI's unit codes 1 to 6, as are the torque units."""
-TORQUE_UNITS_NM: Mapping[str, float] = MappingProxyType(
-    {
-        "lbf-in": 0.1129848290276167,
-        "lbf-ft": 1.3558179483314004,
-        "N-m": 1.0,
-        "N-mm": 0.001,
-        "kgf-cm": 0.0980665,
-        "kN-m": 1000.0,
-    }
-)
+TORQUE_UNITS_NM = {
+    "lbf-in": 0.1129848290276167,
+    "lbf-ft": 1.3558179483314004,
+    "N-m": 1.0,
+    "N-mm": 0.001,
+    "kgf-cm": 0.0980665,
+    "kN-m": 1000.0,
+}
 NEWTON, NEWTON_METRE = 2, 3
 
 _FORCES, _TORQUES = tuple(FORCE_UNITS_N), tuple(TORQUE_UNITS_NM)

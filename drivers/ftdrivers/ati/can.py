@@ -9,7 +9,7 @@ not report saturation. A reset selects calibration slot 0. The driver checks all
 
 import contextlib
 import logging
-from typing import TYPE_CHECKING, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 
@@ -27,12 +27,10 @@ from ftdrivers.ati.codec import Op
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import UNUSABLE, ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.interfaces import Array, DeviceInfo, FtSamples
+from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.wires.can_bus import CanBus
 from ftdrivers.wires.status_word import describe_status
-
-if TYPE_CHECKING:
-    from ftdrivers.registry import Options
 
 log = logging.getLogger(__name__)
 
@@ -100,7 +98,7 @@ class AtiCanSensor(StreamingSensor):
         self._next_poll_s = 0.0
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+    def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ati-can://can0?bitrate=250000&base=0x20&slot=0&interface=socketcan``.
 
         Firmware before 3.7 needs ``units=lbf,lbf-in``, and ``counts=1000000,1000000`` if the certificate differs.

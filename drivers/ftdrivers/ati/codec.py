@@ -9,7 +9,6 @@ A decoder returns a value or raises `ProtocolError`, never anything else. All mu
 import struct
 from collections.abc import Mapping
 from enum import IntEnum
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -34,36 +33,32 @@ class Op(IntEnum):
     FIRMWARE = 0xF
 
 
-REPLIES: Mapping[Op, Mapping[int, int]] = MappingProxyType(
-    {
-        Op.GAUGES: {0x0: 8, 0x1: 6},
-        Op.MATRIX_ROW: {0x2: 8, 0x3: 8, 0x4: 8},
-        Op.SERIAL: {0x5: 8},
-        Op.SELECT_SLOT: {0x6: 1},
-        Op.COUNTS_PER_UNIT: {0x7: 8},
-        Op.UNIT_CODES: {0x8: 2},
-        Op.FIRMWARE: {0xF: 4},
-    }
-)
+REPLIES: Mapping[Op, Mapping[int, int]] = {
+    Op.GAUGES: {0x0: 8, 0x1: 6},
+    Op.MATRIX_ROW: {0x2: 8, 0x3: 8, 0x4: 8},
+    Op.SERIAL: {0x5: 8},
+    Op.SELECT_SLOT: {0x6: 1},
+    Op.COUNTS_PER_UNIT: {0x7: 8},
+    Op.UNIT_CODES: {0x8: 2},
+    Op.FIRMWARE: {0xF: 4},
+}
 """Opcode and length of each frame of the reply to a request."""
 
-STATUS_BITS: Mapping[int, str] = MappingProxyType(
-    {
-        0: "watchdog reset",
-        1: "DAC/ADC check too high",
-        2: "DAC/ADC check too low",
-        3: "artificial analog ground out of range",
-        4: "power supply too high",
-        5: "power supply too low",
-        6: "no valid calibration in the active slot",
-        7: "EEPROM failure",
-        8: "configuration invalid, defaults in use",
-        11: "sensor temperature too high",
-        12: "sensor temperature too low",
-        14: "CAN bus error",
-        15: "any error",
-    }
-)
+STATUS_BITS: Mapping[int, str] = {
+    0: "watchdog reset",
+    1: "DAC/ADC check too high",
+    2: "DAC/ADC check too low",
+    3: "artificial analog ground out of range",
+    4: "power supply too high",
+    5: "power supply too low",
+    6: "no valid calibration in the active slot",
+    7: "EEPROM failure",
+    8: "configuration invalid, defaults in use",
+    11: "sensor temperature too high",
+    12: "sensor temperature too low",
+    14: "CAN bus error",
+    15: "any error",
+}
 WATCHDOG_RESET = 0x0001
 CRITICAL = 0x18FE
 """Status bits with which the data is unusable. The device keeps sending, so the host has to check them."""

@@ -7,10 +7,9 @@ A decoder returns a value or raises `ProtocolError`, never anything else. Regist
 """
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,26 +32,24 @@ JAM = b"\xaa" * 14
 RECORD_SIZE = 13
 NOMINAL_RATE_Hz = 7000.0
 
-STATUS_BITS: Mapping[int, str] = MappingProxyType(
-    {
-        0: "watchdog reset",
-        1: "excitation voltage too high",
-        2: "excitation voltage too low",
-        3: "artificial analog ground out of range",
-        4: "power supply too high",
-        5: "power supply too low",
-        6: "no valid active calibration",
-        7: "EEPROM error",
-        8: "invalid configuration data",
-        9: "gauge bridge supply current too high",
-        10: "gauge bridge supply current too low",
-        11: "thermistor too high",
-        12: "thermistor too low",
-        13: "DAC reading out of range",
-        14: "CAN bus error",
-        15: "any error",
-    }
-)
+STATUS_BITS = {
+    0: "watchdog reset",
+    1: "excitation voltage too high",
+    2: "excitation voltage too low",
+    3: "artificial analog ground out of range",
+    4: "power supply too high",
+    5: "power supply too low",
+    6: "no valid active calibration",
+    7: "EEPROM error",
+    8: "invalid configuration data",
+    9: "gauge bridge supply current too high",
+    10: "gauge bridge supply current too low",
+    11: "thermistor too high",
+    12: "thermistor too low",
+    13: "DAC reading out of range",
+    14: "CAN bus error",
+    15: "any error",
+}
 WATCHDOG_RESET = 0x0001
 ANY_ERROR = 0x8000
 CRITICAL = 0x3EFE

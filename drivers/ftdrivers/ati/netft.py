@@ -11,11 +11,9 @@ import http.client
 import logging
 import math
 import re
-from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import replace
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 import pynetft
@@ -24,11 +22,9 @@ from ftdrivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM, units
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import UNUSABLE, ConnectError, DeviceFault, ProtocolError, StreamBroken
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples, Health
+from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits, scale_facts
 from ftdrivers.wires.status_word import describe_status
-
-if TYPE_CHECKING:
-    from ftdrivers.registry import Options
 
 log = logging.getLogger(__name__)
 
@@ -48,73 +44,67 @@ _ONROBOT_COUNTS = (10_000, 100_000)
 MONITOR_LATCHED = 0x80010000
 """A monitored threshold was crossed earlier; the data is valid."""
 
-NET_FT_BITS: Mapping[int, str] = MappingProxyType(
-    {
-        1: "HTTP",
-        2: "temperature",
-        3: "reference voltage",
-        4: "no data from the transducer",
-        5: "supply too low",
-        6: "supply too high",
-        7: "artificial analog ground",
-        8: "excitation current low",
-        9: "excitation current high",
-        10: "analog watchdog",
-        11: "flash",
-        12: "EEPROM",
-        13: "stack",
-        14: "watchdog",
-        16: "monitor condition latched",
-        17: "transducer saturated or A/D error",
-        18: "DeviceNet",
-        19: "EtherNet/IP",
-        20: "RDT",
-        21: "CAN",
-        22: "network",
-        23: "configuration does not fit the calibration",
-        24: "settings invalid",
-        25: "halted by a configuration error",
-        26: "program memory",
-        27: "link to the transducer",
-        28: "analog board",
-        29: "digital board",
-        30: "CPU or RAM",
-        31: "any error",
-    }
-)
-AXIA_BITS: Mapping[int, str] = MappingProxyType(
-    {
-        0: "temperature",
-        1: "supply voltage",
-        2: "broken gauge",
-        3: "busy",
-        5: "hardware",
-        16: "monitor condition latched",
-        26: "gauge near its limit",
-        27: "gauge out of range",
-        28: "simulated error",
-        29: "calibration checksum",
-        30: "force or torque out of range",
-        31: "any error",
-    }
-)
-ONROBOT_BITS: Mapping[int, str] = MappingProxyType(
-    {
-        3: "several sensors failed",
-        4: "overload Fx",
-        5: "overload Fy",
-        6: "overload Fz",
-        7: "overload Tx",
-        8: "overload Ty",
-        9: "overload Tz",
-        10: "sensor not detected",
-        11: "sensor failure",
-        12: "sensor temperature",
-        13: "converter failure",
-        14: "converter communication",
-        15: "converter error",
-    }
-)
+NET_FT_BITS = {
+    1: "HTTP",
+    2: "temperature",
+    3: "reference voltage",
+    4: "no data from the transducer",
+    5: "supply too low",
+    6: "supply too high",
+    7: "artificial analog ground",
+    8: "excitation current low",
+    9: "excitation current high",
+    10: "analog watchdog",
+    11: "flash",
+    12: "EEPROM",
+    13: "stack",
+    14: "watchdog",
+    16: "monitor condition latched",
+    17: "transducer saturated or A/D error",
+    18: "DeviceNet",
+    19: "EtherNet/IP",
+    20: "RDT",
+    21: "CAN",
+    22: "network",
+    23: "configuration does not fit the calibration",
+    24: "settings invalid",
+    25: "halted by a configuration error",
+    26: "program memory",
+    27: "link to the transducer",
+    28: "analog board",
+    29: "digital board",
+    30: "CPU or RAM",
+    31: "any error",
+}
+AXIA_BITS = {
+    0: "temperature",
+    1: "supply voltage",
+    2: "broken gauge",
+    3: "busy",
+    5: "hardware",
+    16: "monitor condition latched",
+    26: "gauge near its limit",
+    27: "gauge out of range",
+    28: "simulated error",
+    29: "calibration checksum",
+    30: "force or torque out of range",
+    31: "any error",
+}
+ONROBOT_BITS = {
+    3: "several sensors failed",
+    4: "overload Fx",
+    5: "overload Fy",
+    6: "overload Fz",
+    7: "overload Tx",
+    8: "overload Ty",
+    9: "overload Tz",
+    10: "sensor not detected",
+    11: "sensor failure",
+    12: "sensor temperature",
+    13: "converter failure",
+    14: "converter communication",
+    15: "converter error",
+}
 
 
 def text_in(page: bytes, element: str) -> str:
@@ -184,7 +174,7 @@ class NetFtSensor(StreamingSensor):
         self._client: pynetft.Client | None = None
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+    def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ati-netft://192.168.1.1?onrobot=0&rdt_port=49152&http_port=80``."""
         return cls(
             address,

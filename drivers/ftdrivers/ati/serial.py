@@ -9,7 +9,7 @@ outlives the program that started it. Gauge gains and offsets are volatile, so e
 
 import logging
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
@@ -18,13 +18,11 @@ from ftdrivers.ati.calibration import Calibration, refuse_saturated, units
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
+from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import StreamingSensor, scale_facts
 from ftdrivers.wires.modbus import ask
 from ftdrivers.wires.serial_port import SerialPort
 from ftdrivers.wires.status_word import describe_status
-
-if TYPE_CHECKING:
-    from ftdrivers.registry import Options
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +68,7 @@ class AtiSerialSensor(StreamingSensor):
         """Until a restarted stream delivers: when the old one last delivered."""
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+    def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ati-serial:///dev/serial/by-id/…?calibration=1``."""
         return cls(address, calibration=options.integer("calibration", 1, 1, 16), sign=sign, clock=clock)
 

@@ -8,8 +8,6 @@ A decoder returns a value or raises `ProtocolError`, never anything else. All nu
 
 import math
 import struct
-from collections.abc import Mapping
-from types import MappingProxyType
 from typing import NamedTuple
 
 from ftdrivers.errors import ProtocolError
@@ -20,9 +18,7 @@ HEADER = b"\xaa"
 _PAYLOAD = struct.Struct("<H6fIf")
 FRAME_SIZE = 1 + _PAYLOAD.size + 2
 
-STATUS_BITS: Mapping[int, str] = MappingProxyType(
-    {0: "application too slow", 1: "overrange", 2: "invalid measurement", 3: "raw measurement"}
-)
+STATUS_BITS = {0: "application too slow", 1: "overrange", 2: "invalid measurement", 3: "raw measurement"}
 OVERRANGE, INVALID, RAW = 2, 4, 8
 
 ENTER_SETUP, ENTER_RUN = b"C", b"R"

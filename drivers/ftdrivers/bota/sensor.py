@@ -11,7 +11,7 @@ import logging
 import math
 from itertools import pairwise
 from statistics import median
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
@@ -19,12 +19,10 @@ from ftdrivers.bota import codec
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
+from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.wires.serial_port import SerialPort
 from ftdrivers.wires.status_word import describe_status
-
-if TYPE_CHECKING:
-    from ftdrivers.registry import Options
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +60,7 @@ class BotaSensor(StreamingSensor):
         self._temperature_C = math.nan
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+    def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``bota:///dev/serial/by-id/…?sinc=512``."""
         return cls(address, sinc=options.integer("sinc", 0, 0, 512) or None, sign=sign, clock=clock)
 
@@ -74,7 +72,9 @@ class BotaSensor(StreamingSensor):
         self._port.open()
         self._seen_status = 0
         if self._sinc is not None:
-            self._configure(self._sinc)
+            setup = codec.BINARY_AND_CALIBRATED, codec.filter_command(self._sinc)
+            for command in (codec.ENTER_SETUP, *setup, codec.ENTER_RUN):
+                self._command(command)
         self._frames = codec.deframer()
         first = self._first_frames()
         times = [frame.t_us for frame in first]
@@ -112,12 +112,6 @@ class BotaSensor(StreamingSensor):
 
     def _disconnect(self) -> None:
         self._port.close()
-
-    def _configure(self, sinc: int) -> None:
-        self._command(codec.ENTER_SETUP)
-        self._command(codec.BINARY_AND_CALIBRATED)
-        self._command(codec.filter_command(sinc))
-        self._command(codec.ENTER_RUN)
 
     def _command(self, command: bytes) -> None:
         for _ in range(_ATTEMPTS):

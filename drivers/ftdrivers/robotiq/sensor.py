@@ -7,20 +7,18 @@ Modbus RTU for set-up, then a bare stream at 100 Hz, which may run directly afte
 The sensor has no zero command: other programs zero on the host.
 """
 
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
+from ftdrivers.registry import Options
 from ftdrivers.robotiq import codec
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.wires.modbus import ask
 from ftdrivers.wires.serial_port import SerialPort
-
-if TYPE_CHECKING:
-    from ftdrivers.registry import Options
 
 _BAUD = 19_200
 _REPLY_S = 0.2
@@ -50,7 +48,7 @@ class RobotiqFt300(StreamingSensor):
         self._port = SerialPort(self.name, port, _BAUD, clock=clock)
 
     @classmethod
-    def from_url(cls, address: str, _options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+    def from_url(cls, address: str, _options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``robotiq-ft300:///dev/serial/by-id/…``."""
         return cls(address, sign=sign, clock=clock)
 

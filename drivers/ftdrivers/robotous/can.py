@@ -3,16 +3,14 @@
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 1 Mbit/s, 11-bit identifiers.
 """
 
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from ftdrivers.clock import REAL, Clock
+from ftdrivers.registry import Options
 from ftdrivers.robotous.codec import Field
 from ftdrivers.robotous.halves import Halves
 from ftdrivers.robotous.sensor import RobotousSensor
 from ftdrivers.wires.can_bus import CanBus
-
-if TYPE_CHECKING:
-    from ftdrivers.registry import Options
 
 COMMAND, FIRST_HALF, SECOND_HALF = 0x64, 0x01, 0x02
 BITRATE = 1_000_000
@@ -45,7 +43,7 @@ class RobotousCan(RobotousSensor):
         self._heard_ns: int | None = None
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+    def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``robotous-can://can0?interface=socketcan&rate=500``."""
         return cls(
             address,

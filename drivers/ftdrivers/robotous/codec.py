@@ -11,9 +11,7 @@ A decoder returns a value or raises `ProtocolError`, never anything else.
 
 import re
 import struct
-from collections.abc import Mapping
 from enum import IntEnum
-from types import MappingProxyType
 from typing import NamedTuple
 
 from ftdrivers.errors import ProtocolError
@@ -26,13 +24,11 @@ FRAME_SIZE = REPLY_SIZE + 3
 
 AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
-RATE_CODES: Mapping[int, int] = MappingProxyType({10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8})
+RATE_CODES = {10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8}
 """Code of each output rate in Hz. A new sensor reports code 0, which is 200 Hz."""
 
 COUNTS_PER_N = 50
-_COUNTS_PER_NM: Mapping[str, int] = MappingProxyType(
-    {"40": 2000, "44": 2000, "60": 2000, "64": 2000, "76": 2000, "80": 1000, "82": 1000}
-)
+_COUNTS_PER_NM = {"40": 2000, "44": 2000, "60": 2000, "64": 2000, "76": 2000, "80": 1000, "82": 1000}
 _FAILURES = {1: "not supported", 2: "value out of range", 3: "failed to set"}
 
 

@@ -3,16 +3,14 @@
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 8N1, 115200 baud from the factory.
 """
 
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 from ftdrivers.clock import REAL, Clock
+from ftdrivers.registry import Options
 from ftdrivers.robotous import codec
 from ftdrivers.robotous.codec import Field
 from ftdrivers.robotous.sensor import RobotousSensor
 from ftdrivers.wires.serial_port import SerialPort
-
-if TYPE_CHECKING:
-    from ftdrivers.registry import Options
 
 BAUDS = (57_600, 115_200, 230_400, 460_800, 921_600)
 
@@ -31,7 +29,7 @@ class RobotousSerial(RobotousSensor):
         self._port = SerialPort(self.name, port, baud, clock=clock)
 
     @classmethod
-    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+    def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``robotous-serial:///dev/serial/by-id/…?baud=921600&rate=1000``."""
         return cls(
             address,

@@ -4,8 +4,7 @@ Ref: Modbus over Serial Line 1.02, section 2.5; Modbus Application Protocol 1.1b
 """
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from ftdrivers.clock import Clock
@@ -18,9 +17,7 @@ T = TypeVar("T")
 READ_HOLDING, WRITE_MULTIPLE = 0x03, 0x10
 
 _ATTEMPTS = 3
-_EXCEPTIONS: Mapping[int, str] = MappingProxyType(
-    {1: "illegal function", 2: "illegal register", 3: "illegal value", 4: "device failure or locked"}
-)
+_EXCEPTIONS = {1: "illegal function", 2: "illegal register", 3: "illegal value", 4: "device failure or locked"}
 
 
 class Refused(ProtocolError):

@@ -4,7 +4,7 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import EllipsisType, MappingProxyType
+from types import EllipsisType
 from typing import Any, Final
 
 import numpy as np
@@ -58,14 +58,12 @@ AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 # ---------------------------------------------------------------------------------------------------------- the sensor
 
 
-_SOURCE: Mapping[str, str] = MappingProxyType(
-    {
-        "device": "reported by the device",
-        "documented": "fixed by its manual",
-        "configured": "configured",
-        "assumed": "assumed",
-    }
-)
+_SOURCE = {
+    "device": "reported by the device",
+    "documented": "fixed by its manual",
+    "configured": "configured",
+    "assumed": "assumed",
+}
 
 
 def who(info: DeviceInfo) -> str:

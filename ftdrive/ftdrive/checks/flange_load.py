@@ -5,15 +5,14 @@ the sensor's origin is, so its height is configuration too.
 """
 
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Final
 
 import numpy as np
 
 from ftcalib import CalibrationResult
-from ftcalib.model import Array
+from ftcalib.model import Array, skew
 
-RATED_KG: Final = MappingProxyType(
+RATED_KG: Final = (
     {"UR3": 3.0, "UR5": 5.0, "UR10": 10.0}
     | {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 10.0, "UR12e": 12.5, "UR16e": 16.0}
     | {"UR8long": 8.0, "UR15": 15.0, "UR18": 18.0, "UR20": 20.0, "UR30": 30.0}
@@ -64,8 +63,7 @@ def flange_load(
     by_mass = np.concatenate([[1.0], (c_tool_m - com_m) / mass_kg])
     jacobian = np.zeros((4, 15))
     jacobian[:, 3:6] = np.outer(by_mass, result.gravity_force_base_N / (result.weight_N * result.g_m_s2))
-    x, y, z = arm_m
-    jacobian[1:, 0:3] = share * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    jacobian[1:, 0:3] = share * skew(arm_m)
     jacobian[1:, 9:12] = share * result.R_flange_sensor
     covariance = jacobian @ result.covariance @ jacobian.T
     gain_variance = float(np.square(result.sigma["mass_kg"])) - covariance[0, 0]  # common to all axes, see `sigma`

@@ -82,17 +82,20 @@ def _attempts(certifier: Certifier, q_now: Array, poses: int, speeds: Speeds, gu
     numbers, reason = NUMBERS[poses], _reason(poses)
     if poses == 24:
         why = "The constant tour is proven clear at the present posture; base, shoulder and elbow stay at rest."
-        yield "constant", [why], _constant(certifier, q_now)
+        q = constant_tour.constant_tour(q_now)
+        fits = _winds_little(q, q_now) and certifier.clear_around(q)
+        yield "constant", [why], (constant_tour.NUMBERS, q) if fits else None
     why = f"{reason}: the wrist visits them in the fastest order that is clear, base, shoulder and elbow at rest."
     yield "wrist", [why], _wrist(certifier, q_now, numbers, speeds)
-    for tour in _clear_tours(certifier, q_now):
+    for tour in filter(certifier.clear_around, with_room(certifier, q_now)):
         elsewhere: Found | None = constant_tour.NUMBERS, tour
         if poses != 24 or not _winds_little(tour, q_now):
             elsewhere = _wrist(certifier, np.append(tour[0, :5], q_now[5]), numbers, speeds)
         why = f"{reason}, and the wrist alone has no clear tour there."
         yield "posture", [why, _elsewhere_words(tour[0])], elsewhere
     nowhere = f"{reason}, and the wrist alone has no clear tour at any posture of joints 1 to 3 that was tried."
-    for centre_m in _box_centres(certifier, q_now):
+    usual = np.array([q_now[0], *USUAL_POSTURE_RAD[1:]])  # the usual posture at this pan angle
+    for centre_m in certifier.arm.frames([q_now, usual]).flange_m:
         found = _box(certifier, q_now, numbers, centre_m, BOX_HALF_SIZE_M, speeds)
         yield "box", [nowhere, _box_words(centre_m, BOX_HALF_SIZE_M)], found
     if (chosen := chosen_tour(certifier, q_now, poses, np.pi, speeds, guess)) is not None:
@@ -229,11 +232,6 @@ def _numbers(poses: int) -> tuple[int, ...]:
     return NUMBERS[poses]
 
 
-def _constant(certifier: Certifier, q_rad: Array) -> Found | None:
-    q = constant_tour.constant_tour(q_rad)
-    return (constant_tour.NUMBERS, q) if _winds_little(q, q_rad) and certifier.clear_around(q) else None
-
-
 def _winds_little(q_rad: Array, q_now: Array) -> bool:
     """Return whether joint 6 stays in its window around its present angle."""
     return bool(np.abs(q_rad[:, 5] - q_now[5]).max() <= WRIST_6_RAD + 1e-9)
@@ -247,11 +245,6 @@ def _wrist(certifier: Certifier, q_rad: Array, numbers: Sequence[int], speeds: S
     return None if order is None else ([numbers[g] for g in group[order]], q[order])
 
 
-def _clear_tours(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
-    """Constant tours (24, 6) in other postures of joints 1 to 3."""
-    return (tour for tour in with_room(certifier, q_rad) if certifier.clear_around(tour))
-
-
 def _box(
     certifier: Certifier, q_rad: Array, numbers: Sequence[int], centre_m: Array, half_size_m: float, speeds: Speeds
 ) -> Found | None:
@@ -263,12 +256,6 @@ def _box(
     calm = np.argsort(away[:, :3].max(axis=1) + 0.01 * away.sum(axis=1), kind="stable")
     order = clear_tour(certifier, q[calm], group[calm], speeds)
     return None if order is None else ([numbers[g] for g in group[calm][order]], q[calm][order])
-
-
-def _box_centres(certifier: Certifier, q_rad: Array) -> Array:
-    """Flange positions (2, 3): the present one, and that of the usual posture at this pan angle."""
-    usual = np.array([q_rad[0], *USUAL_POSTURE_RAD[1:]])
-    return certifier.arm.frames([q_rad, usual]).flange_m
 
 
 def _at_pan(q_rad: Array, numbers: Sequence[int]) -> Array:

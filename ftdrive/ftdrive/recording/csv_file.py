@@ -12,7 +12,7 @@
 A reader that skips lines with `#`, such as `pandas.read_csv(path, comment="#")`, finds a plain table.
 
 A file whose checksum does not fit is refused. Of a file without its end, samples count up to the last checksum, which
-follows at least every second. Files of the first version, without checksums, are read up to their last whole line.
+follows at least every second.
 """
 
 import csv
@@ -43,15 +43,13 @@ from ftdrive.recording.recording import (
 )
 
 _HEADER, _EVENT, _CRC, _END = "# header ", "# event ", "# crc32 ", "# end"
-_HEADER_LINES = 3
 
 
-class CsvFile:
+class CsvFile(GrowingFile):
     """A new recording."""
 
     def __init__(self, path: Path, header: Header) -> None:
-        self._file = GrowingFile(path)
-        self.partial = self._file.partial
+        super().__init__(path)
         self.samples = 0
         self._crc = 0
         self._start_ns: int | None = None
@@ -83,31 +81,23 @@ class CsvFile:
         content = text.encode()
         crc = zlib.crc32(content, self._crc)
         line = _crc_line(crc)
-        self._file.add(content + line)
+        self.add(content + line)
         self._crc = zlib.crc32(line, crc)
 
     def complete(self) -> None:
         """Write the end and give the file its name. Raises `OSError`."""
-        with self._file:
-            self._file.add(f"{_END}\n".encode())
-            self._file.complete()
-
-    def keep(self) -> None:
-        """Close the file as it is."""
-        self._file.close()
-
-    def discard(self) -> None:
-        """Delete what was written."""
-        self._file.discard()
+        with self:
+            self.add(f"{_END}\n".encode())
+            super().complete()
 
 
 def read_csv(path: Path, _columns: Collection[str] = ()) -> Recording:
     """Read a recording. Raises `BadRecording` or `OSError`."""
     with path.open("rb") as file:
-        lines = _lines(file)
-        if not next(lines, "").startswith(f"# {FORMAT.partition('/')[0]}/"):
+        if not file.readline().startswith(f"# {FORMAT.partition('/')[0]}/".encode()):
             raise BadRecording(f"the first line is not '# {FORMAT}'")
-        given = next(lines, "")
+        file.seek(0)
+        _, given = next(lines := _lines(file), ""), next(lines, "")
         if not given.startswith(_HEADER):
             raise BadRecording("the header is missing: the file was cut within its first lines")
         header = Header.from_dict(_parsed(given.removeprefix(_HEADER)))
@@ -138,13 +128,9 @@ def read_csv(path: Path, _columns: Collection[str] = ()) -> Recording:
 
 
 def _lines(file: IO[bytes]) -> Iterator[str]:
-    """Give the lines whose checksum follows, and the end; without checksums, all that are whole."""
-    first = [file.readline() for _ in range(_HEADER_LINES + 1)]
-    if not first[-1].startswith(_CRC.encode()):
-        yield from (_text(line) for line in chain(first, file) if line.endswith(b"\n"))
-        return
+    """Give the lines whose checksum follows, and the end."""
     crc, waiting = 0, list[str]()
-    for number, line in enumerate(chain(first, file), 1):
+    for number, line in enumerate(file, 1):
         if not line.endswith(b"\n"):
             break
         if line.startswith(_CRC.encode()):
@@ -153,16 +139,12 @@ def _lines(file: IO[bytes]) -> Iterator[str]:
             yield from waiting
             waiting = []
         else:
-            waiting.append(_text(line))
+            waiting.append(line.decode(errors="replace"))
         crc = zlib.crc32(line, crc)
     if waiting[:1] == [f"{_END}\n"]:
         yield waiting[0]
     elif f"{_END}\n" in waiting:
         raise BadRecording("its last samples have no checksum: the file is damaged")
-
-
-def _text(line: bytes) -> str:
-    return line.decode(errors="replace")
 
 
 def _crc_line(crc: int) -> bytes:

@@ -53,15 +53,15 @@ class GrowingFile:
         self._file.close()
         self.partial.unlink(missing_ok=True)
 
-    def close(self) -> None:
-        """Leave the file as it is."""
+    def keep(self) -> None:
+        """Close the file as it is."""
         self._file.close()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self.keep()
 
 
 def publish(written: Path, path: Path) -> None:

@@ -71,16 +71,15 @@ _LARGEST: Final = 1 << 32
 _NONE: Final = np.zeros(0, np.int64)
 
 
-class McapFile:
+class McapFile(GrowingFile):
     """A new recording."""
 
     def __init__(self, path: Path, header: Header) -> None:
         from mcap.records import Attachment, AttachmentIndex, Channel, Schema
         from mcap.records import Header as Start
 
+        super().__init__(path)
         self._header = header
-        self._file = GrowingFile(path)
-        self.partial = self._file.partial
         self.samples = 0
         self._crc = 0
         self._chunks: list[McapRecord] = []
@@ -102,7 +101,7 @@ class McapFile:
 
     def _add(self, content: bytes) -> int:
         """Append to the data section; return where it begins."""
-        place = self._file.add(content)
+        place = self.add(content)
         self._crc = zlib.crc32(content, self._crc)
         return place
 
@@ -122,7 +121,7 @@ class McapFile:
         chunk = _bytes(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(content), len(content)))
         indexes, places = b"", {}
         for number, table in tables.items():
-            places[number] = self._file.size + len(chunk) + len(indexes)
+            places[number] = self.size + len(chunk) + len(indexes)
             indexes += struct.pack("<BQHI", _INDEX, 6 + table.nbytes, number, table.nbytes) + table.tobytes()
         index = ChunkIndex(
             chunk_length=len(chunk),
@@ -194,18 +193,10 @@ class McapFile:
         )
         end = _bytes(DataEnd(self._crc))
         summary = _bytes(*self._channels, statistics, *self._attachments, *self._chunks)
-        footer = _bytes(Footer(summary_start=self._file.size + len(end), summary_offset_start=0, summary_crc=0))
-        with self._file:
-            self._file.add(end + summary + footer + _MAGIC)
-            self._file.complete()
-
-    def keep(self) -> None:
-        """Close the file as it is."""
-        self._file.close()
-
-    def discard(self) -> None:
-        """Delete what was written."""
-        self._file.discard()
+        footer = _bytes(Footer(summary_start=self.size + len(end), summary_offset_start=0, summary_crc=0))
+        with self:
+            self.add(end + summary + footer + _MAGIC)
+            super().complete()
 
 
 def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArray[np.void]]:

@@ -134,8 +134,7 @@ def _read_part(path: Path, groups: Sequence[str]) -> tuple[Header, list[StreamEv
             rows = np.empty(len(found[names[0]]), [(name, COLUMNS[name]) for name in names])
             for name in names:
                 rows[name] = np.ma.filled(found[name], np.nan) if np.ma.isMaskedArray(found[name]) else found[name]
-            if "crc32" in metadata:  # the first version had none
-                _require(json.loads(metadata["crc32"]), metadata, rows)
+            _require(json.loads(metadata["crc32"]), metadata, rows)
             header = Header.from_dict(json.loads(metadata["header"]))
             events = [event_of(json.dumps(one)) for one in json.loads(metadata["events"])]
         except (duckdb.Error, KeyError, TypeError, ValueError) as error:

@@ -122,15 +122,11 @@ class Header:
         """Build from the content of a file; unknown fields are ignored. Raises `BadRecording`."""
         check_format(document, FORMAT, BadRecording)
         try:
-            values = {
-                item.name: document[item.name]
-                for item in fields(StreamInfo)
-                if item.name in document or item.name not in _LATER
-            }
+            values = {item.name: document[item.name] for item in fields(StreamInfo)}
             values |= {name: np.array(values[name], np.float64) for name in _ARRAYS}
             values |= {"arm": _device(values["arm"]), "sensor": _device(values["sensor"])}
             values["calibration"] = CalibrationResult.from_dict(values["calibration"])
-            if values.get("verification") is not None:
+            if values["verification"] is not None:
                 values["verification"] = VerificationRecord.from_dict(values["verification"])
             stages = {item.name: document["stages"][item.name] for item in fields(Stages)}
             return cls(StreamInfo(**values), frame_of(document["frame"]), Stages(**stages), document["configuration"])
@@ -140,8 +136,6 @@ class Header:
             raise BadRecording(f"the header cannot be read ({error}): the file is damaged") from error
 
 
-_LATER = ("verification", "calibration_state", "emulated")
-"""Fields that older recordings lack."""
 _ARRAYS = ("p_flange_sensor_m", "R_flange_tcp", "p_flange_tcp_m")
 
 

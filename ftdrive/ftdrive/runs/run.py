@@ -215,17 +215,15 @@ class Run:
         Raises
         ------
         BadDataset
-            A line is damaged. Files of the first versions have no CRC; of them, lines that are not JSON are ignored.
+            A line is damaged.
         """
         path = self._events_path
         text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
-        checked = f'"{CRC}"' in text
         *lines, rest = text.split("\n")
         for number, line in enumerate(lines, 1):
-            if (event := event_of(line)) is not None:
-                yield event
-            elif checked:
+            if (event := event_of(line)) is None:
                 raise BadDataset(f"{path}: line {number} is damaged: {_RESTORE}")
+            yield event
         # What follows the last line is an event if only the end of its line is damaged.
         if (event := event_of(rest) or event_of(rest[:-1])) is not None:
             yield event
@@ -312,8 +310,7 @@ def event_of(line: str) -> dict[str, Any] | None:
         return None
     if not isinstance(event, dict):
         return None
-    stored = event.pop(CRC, None)
-    return event if stored in (None, _crc32(event)) else None
+    return event if event.pop(CRC, None) == _crc32(event) else None
 
 
 def with_crc32(event: Mapping[str, Any]) -> dict[str, Any]:

@@ -55,7 +55,7 @@ class StoredResult:
     payload_kg: float | None
     """That the controller reported during the calibration."""
     payload_com_m: list[float] | None
-    """(3,) centre of mass of that payload, flange axes; None also for a run of an earlier version."""
+    """(3,) centre of mass of that payload, flange axes."""
     emulated: bool = False
     """Whether the cell was emulated."""
 

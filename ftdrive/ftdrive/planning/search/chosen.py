@@ -6,6 +6,7 @@ directions out of one plane.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -99,11 +100,8 @@ def _at(
     ideal: float,
 ) -> Chosen | None:
     """Choose the most informative of the poses that are reachable at this posture."""
-
-    def most_informative(reached: Array) -> Nodes:
-        return choose(reached, poses, guess)
-
-    for numbers, q in _tours_at(certifier, q_now, candidates, spins, poses, most_informative, speeds):
+    choice = partial(choose, n=poses, guess=guess)
+    for numbers, q in _tours_at(certifier, q_now, candidates, spins, poses, choice, speeds):
         rms = predicted_sigma(certifier.arm.frames(q).R_base_flange, guess).force_rms_N
         if np.isfinite(rms):  # else these poses leave a parameter unobservable
             return Chosen(numbers, q, rms, ideal, elsewhere=False)

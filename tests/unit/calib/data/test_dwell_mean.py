@@ -41,13 +41,6 @@ def test_the_mean_lies_where_its_covariance_states(N: int, rho: list[float]) -> 
     assert (0.88 if hard else 0.92) < coverage < 0.98
 
 
-def test_the_worst_channel_limits_the_effective_samples() -> None:
-    rng = np.random.default_rng(0)
-    assert 200 < mean_and_covariance(rng.normal(size=(400, 6))).n_effective < 450
-    worth = mean_and_covariance(noise(rng, 20_000, np.array(MIXED))).n_effective
-    assert worth == pytest.approx(20_000 * (1 - 0.9) / (1 + 0.9), rel=0.2)
-
-
 @pytest.mark.parametrize("rho", [0.0, 0.8])
 def test_correlation_between_channels_is_kept(rho: float) -> None:
     """Of channels as unlike in size as newtons and newton metres, in the samples and in their mean."""

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import BadDataset, NotObservable
-from ftcalib.model import Array, nearest_rotation
+from ftcalib.model import Array
 from ftcalib.published import carlson
 from ftcalib.published.carlson import ForceFit, eigen, iterative, nullspace, polynomial
 from ftcalib.published.carlson_known import cayley, relaxation
@@ -409,14 +409,3 @@ def test_names_the_row_that_is_not_finite(name: str) -> None:
 def test_names_the_shapes() -> None:
     with pytest.raises(ValueError, match=r"\(24, 3, 3\).*\(23, 3\)"):
         nullspace(SROM24, np.ones((23, 3)), bias=True)
-
-
-def test_projection_is_the_nearest_rotation() -> None:
-    rng = np.random.default_rng(19)
-    for _ in range(20):
-        M = rng.normal(size=(3, 3))
-        nearest = nearest_rotation(M)
-        assert nearest @ nearest.T == pytest.approx(np.eye(3))
-        assert np.linalg.det(nearest) == pytest.approx(1)
-        distances = np.linalg.norm(Rotation.random(200, rng=rng).as_matrix() - M, axis=(1, 2))
-        assert np.linalg.norm(nearest - M) <= distances.min()

@@ -461,9 +461,3 @@ def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -
 def test_the_error_of_an_arm_that_names_no_cure_gets_one(own: str, shown: str) -> None:
     check = diagnosis.check_unreachable(StreamBroken("ur5:30004 was lost (x; y)", own), "ur5")
     assert (check.found, check.fix) == ("ur5:30004 was lost (x; y)", shown)
-
-
-def test_what_a_dashboard_server_says_is_not_lost() -> None:
-    error = NoDashboard("ur5 says: Timeout connecting", "enable the dashboard server")
-    check = diagnosis.check_unreachable(error, "ur5")
-    assert (check.found, check.fix) == (error.found, error.fix)

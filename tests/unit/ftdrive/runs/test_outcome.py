@@ -25,7 +25,7 @@ def payload_notes(lab: Lab) -> list[str]:
     return [event.words for event in lab.operator.of(Noted) if "payload" in event.words]
 
 
-@pytest.mark.parametrize("payload_kg", np.arange(0.1, 4.0, 0.07))
+@pytest.mark.parametrize("payload_kg", np.arange(0.1, 4.0, 0.3))
 def test_the_limit_is_that_of_the_check_before_the_tour(payload_kg: float, lab: Lab) -> None:
     lab.cell = replace(
         lab.cell,

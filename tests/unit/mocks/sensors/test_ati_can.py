@@ -47,6 +47,8 @@ FIRMWARE = "20F#0308 0002"
     [
         ({}, ["200#", "20F#"], [*READING, FIRMWARE]),
         ({}, ["200#00", "207#00"], [*READING, "207#000F 4240 000F 4240"]),
+        ({}, ["205#", "209#02", "20D#21", "20E#03"], ["205#4654 3132 3334 3500", "209#0A3C", "20D#", "20E#"]),
+        ({}, ["210#", "201#00", "203#", "204#", "20B#", "20D#", "20E#", "202#FF", "209#06", "20F#"], [FIRMWARE]),
         ({}, ["200#0000", "202#", "202#06", "206#10", "209#01", "20A#", "100#", "20F#"], [FIRMWARE]),
         ({}, ["206#0F", "200#"], ["206#0F", "200#8040 0064 012C 01F4", READING[1]]),
         ({}, ["206#0F", "202#02"], ["206#0F", *(f"{i}#0000 0000 0000 0000" for i in (202, 203, 204))]),
@@ -64,6 +66,11 @@ def test_answers(options: dict[str, Any], requests: list[str], answers: list[str
         node._answer(CanFrame(int(head, 16), bytes.fromhex(tail))) for head, tail in (r.split("#") for r in requests)
     ]
     assert [f"{one.identifier:03X}#{one.data.hex(' ', -2).upper()}" for some in frames for one in some] == answers
+
+
+def test_only_standard_data_frames_are_requests() -> None:
+    node = AtiCanNode(lambda n: np.tile(WRENCH, (n, 1)), boot_s=0.0)
+    assert node._answer(CanFrame(0x200, extended=True)) == node._answer(CanFrame(0x200, remote=True)) == []
 
 
 def opened_adapter() -> SlcanAdapter:
