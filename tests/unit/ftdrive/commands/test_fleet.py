@@ -71,7 +71,7 @@ def test_from_an_empty_store_to_a_status(run: Callable[..., Ran], cells: Path, r
     code, out, err = run("status")
     head, lathe, press = (re.split(r"\s{2,}", line.strip()) for line in out.splitlines())
     assert (code, head) == (0, ["cell", "tool", "verdict", "age", "verified", "drift, σ", "due"])
-    assert lathe == ["lathe", "-", "none", "-", "-", "-", "now"]
+    assert lathe == ["lathe", "gripper", "none", "-", "-", "-", "now"]
     assert press[:5] == ["press", "gripper", "good", "40 d", "24 h"]
     assert re.fullmatch(r"\d\.\d DRIFTS", press[5])
     assert press[6] == "in 6 d"
