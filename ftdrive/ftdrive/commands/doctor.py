@@ -16,7 +16,7 @@ from rich.text import Text
 from ftcalib import CalibrationResult
 from ftdrive.cell.config import USUAL_KG, CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.cell.emulated import Station, sensor_name, sensor_reached
+from ftdrive.cell.emulated import Station, sensor_reached
 from ftdrive.checks import computer, devices
 from ftdrive.checks.check import Check, verdict
 from ftdrive.checks.computer import SensorAddress
@@ -82,7 +82,7 @@ def doctor(
     calibration = None if path is None else CalibrationResult.load(path)
     pushed: dict[str, Any] | None = None
     with ExitStack() as stack:
-        station = stack.enter_context(Station(sensor_name(sensor), ["--time-scale", "1"])) if simulate else None
+        station = stack.enter_context(Station.of(None, sensor, ["--time-scale", "1"])) if simulate else None
         cell = read_cell(config, robot, sensor, model=model) if station is None else station.cell
         address = SensorAddress.of(sensor_reached(cell.sensor.url)[0])
         device = build_sensor(cell)

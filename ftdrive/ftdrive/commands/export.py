@@ -246,6 +246,6 @@ def _emulated() -> "Plan":
     from ftdrive.planning.cell_plan import certifier_for, plan_for
     from ftdrive.planning.planner import USUAL_POSTURE_RAD
 
-    with Station() as station:
+    with Station.of(None) as station:
         cell = station.cell
     return plan_for(cell, certifier_for(cell, cell.robot.model), USUAL_POSTURE_RAD)

@@ -107,7 +107,7 @@ def plan(
     check_simulate(simulate, real={"--config": config})
     emulated = None
     if simulate:
-        with Station() as station:
+        with Station.of(None) as station:
             emulated = station.cell
     found = settings(
         config,
