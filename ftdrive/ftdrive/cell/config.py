@@ -316,12 +316,12 @@ def settings(
 
 
 def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfig:
-    """Turn settings into a cell; raises `ConfigError` when a device is needed and not named, or the cell is emulated."""
+    """Turn settings into a cell; raises `ConfigError` when a device is needed, but not named or emulated."""
     if devices and values["robot.simulate"].value:
         origin = values["robot.simulate"].origin
         raise ConfigError(
-            f"{origin} describes an emulated cell ([robot] simulate = true): add --simulate, or describe your cell with "
-            "`ftdrive init -o NEW.toml`"
+            f"{origin} describes an emulated cell ([robot] simulate = true): add --simulate, or describe your cell "
+            "with `ftdrive init -o NEW.toml`"
         )
     missing = [key for key in ("robot.host", "sensor.url") if values[key].value is None]
     if missing and devices:

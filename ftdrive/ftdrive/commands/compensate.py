@@ -109,14 +109,15 @@ def _read(
 
 
 def _words(result: dict[str, Any], frame: str) -> Iterator[str]:
+    from ftcalib.rounding import with_sigma
     from ftdrive.runs.verification_record import MARKS
 
     yield from (f" {MARKS[mark]}" for mark in result["marks"])
     yield f" {result['samples']} samples, {result['duration_s']:.2f} s, gaps: {result['gaps']}"
     if delay := result["delay_s"]:
-        yield f" wrench after pose: {1e3 * delay['value']:.2f} ± {1e3 * delay['sigma']:.2f} ms (1 sigma)"
+        yield f" wrench after pose: {with_sigma(1e3 * delay['value'], 1e3 * delay['sigma'])} ms (1 sigma)"
     if change := result["bias_change"]:
-        pairs = [f"{v:.5f} ± {s:.5f}" for v, s in zip(change["value"], change["sigma"], strict=True)]
+        pairs = [with_sigma(v, s) for v, s in zip(change["value"], change["sigma"], strict=True)]
         yield f" bias change ± 1 sigma:\n   {', '.join(pairs[:3])} N\n   {', '.join(pairs[3:])} N·m"
     yield f" {'':12}{'force rms':>10}{'max N':>10}{'torque rms':>12}{'max N·m':>10}"
     for name in ("raw", "compensated"):

@@ -112,6 +112,7 @@ def record_stream(
     """Record until the end or an exception, and complete the files. Raises what the stream or a file raises."""
     import numpy as np
 
+    from ftcalib.rounding import with_sigma
     from ftdrive.live.samples import StreamEvent
 
     try:
@@ -132,7 +133,7 @@ def record_stream(
             recorder.event(event)
         status = stream.status()
         text = (
-            f"the wrench is {1e3 * status.delay_s:.2f} ± {1e3 * status.delay_sigma_s:.2f} ms (1 sigma) after the pose"
+            f"the wrench is {with_sigma(1e3 * status.delay_s, 1e3 * status.delay_sigma_s)} ms (1 sigma) after the pose"
         )
         values = {"value": status.delay_s, "sigma": status.delay_sigma_s}
         recorder.event(StreamEvent(recorder.last_ns, "delay", text, values))

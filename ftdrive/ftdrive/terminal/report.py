@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
 from ftcalib.compare import Compared
+from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftdrive.runs.pose_hints import hints, names_of
 from ftdrive.terminal.console import hanging, talk
@@ -88,19 +89,14 @@ def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
         estimates, sigmas = (values_of(source[key], key) * scale for source in (data, data["sigma"]))
         truths = None if truth is None else values_of(truth[key], key) * scale
         fixed = sigmas <= fixed_below * scale
-        digits = 4 if fixed.all() else decimals(sigmas[~fixed].min())
         for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
-            spread = "fixed" if fixed[i] else f"{sigmas[i]:.{digits}f}"
-            known = [] if truths is None else [f"{truths[i]:.{digits}f}"]
+            sigma = 0.0 if fixed[i] else float(sigmas[i])
+            spread = "fixed" if fixed[i] else to_place_of(sigma, sigma)
+            known = [] if truths is None else [to_place_of(truths[i], sigma)]
             error = [Text(f"{errors[key][i]:+.1f}", _error_style(errors[key][i]))] if known else []
             name = f"{label} {axis}".strip() + f", {unit}"
-            table.add_row(name, *known, f"{estimates[i]:.{digits}f}", spread, *error)
+            table.add_row(name, *known, to_place_of(estimates[i], sigma), spread, *error)
     return table
-
-
-def decimals(sigma: float) -> int:
-    """Return how many decimals show two digits of a sigma, at most 7."""
-    return int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 7))
 
 
 def _error_style(error_sigma: float) -> str:
@@ -127,8 +123,8 @@ def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
     if result.drift is not None:
         change, sigma = result.drift.change, result.drift.sigma
         words = (
-            f"{np.linalg.norm(change[:3]):.3f} ± {np.max(sigma[:3]):.3f} N, "
-            f"{np.linalg.norm(change[3:]):.4f} ± {np.max(sigma[3:]):.4f} N·m from the first pose to the last"
+            f"{with_sigma(np.linalg.norm(change[:3]), np.max(sigma[:3]))} N, "
+            f"{with_sigma(np.linalg.norm(change[3:]), np.max(sigma[3:]))} N·m from the first pose to the last"
         )
         talk.print(hanging(" drift in the fit: ", words))
 

@@ -20,6 +20,7 @@ from rich.live import Live
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
+from ftcalib.rounding import decimals, to_place_of, with_sigma
 from ftcalib.routine import DriftCheck
 from ftdrive.errors import Declined
 from ftdrive.session.events import (
@@ -267,11 +268,11 @@ def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Te
     if name == "R_flange_sensor":
         value = Rotation.from_matrix(np.asarray(value)).as_rotvec()
     values, sigma = factor * np.atleast_1d(value), factor * float(np.max(fit.sigma[name]))
-    digits = int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 5))
+    digits = decimals(sigma)
     while digits and len(f"{-np.abs(values).max():.{digits}f}") > _NUMBER_WIDTH - 1:
         digits -= 1
     numbers = "".join(f"{one:{_NUMBER_WIDTH}.{digits}f}" for one in values)
-    return Text(f"{label:<13}{numbers:<27}  ± {sigma:.2g}")
+    return Text(f"{label:<13}{numbers:<27}  ± {to_place_of(sigma, sigma)}")
 
 
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
@@ -323,8 +324,8 @@ def _drift(view: SessionView) -> Text:
     fitted = sigma > _ROUNDED
     sure = bool((np.abs(change) > 4 * sigma)[fitted].any())
     parts = [
-        f"{np.linalg.norm(change[some]):.{digits}f} ± {np.max(sigma[some]):.{digits}f} {unit}"
-        for some, digits, unit in ((slice(3), 3, "N"), (slice(3, 6), 4, "N·m"))
+        f"{with_sigma(np.linalg.norm(change[some]), np.max(sigma[some]))} {unit}"
+        for some, unit in ((slice(3), "N"), (slice(3, 6), "N·m"))
         if fitted[some].any()
     ]
     words = f"drift  {', '.join(parts)} since the first pose"
