@@ -210,7 +210,7 @@ def test_simulated(tmp_path: Path) -> None:
     assert (cell.robot.simulate, cell.robot.host, cell.robot.model) == (True, "emulated", "UR5e")
     assert cell.sensor.url == "emulated://can"
     assert "/dev/" not in (tmp_path / "cell.toml").read_text()
-    assert "Next: ftdrive doctor --simulate" in outcome.stderr
+    assert "Next\n   ftdrive doctor --simulate\n" in outcome.stderr
 
 
 def test_an_emulated_cell_is_that_of_the_file_and_no_real_command_takes_it() -> None:

@@ -58,7 +58,7 @@ def compensate(
     """
     from ftdrive.recording.compensation import compensated
     from ftdrive.runs.source import read_calibration
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import answer, talk
 
     frame = read_frame(axes, about)
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
@@ -73,7 +73,7 @@ def compensate(
     else:
         click.echo("\n".join(_words(result, str(frame))))
     if output is not None:
-        talk.print(f" Saved {output}")
+        (talk if as_json else answer).print(f" Saved {output}")
 
 
 def _read(

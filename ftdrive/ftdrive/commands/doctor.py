@@ -10,7 +10,6 @@ from typing import Any
 
 import click
 import numpy as np
-from rich.console import Console
 from rich.text import Text
 
 from ftcalib import CalibrationResult
@@ -34,7 +33,7 @@ from ftdrive.commands.common import (
 )
 from ftdrive.errors import NotAccepted
 from ftdrive.session.guards import Limits
-from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.console import answer, hanging, talk
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ArmStatus, Array, ForceTorqueSensor, RobotArm
@@ -113,6 +112,11 @@ def doctor(
         write_json({**answer, "push": pushed} if push else answer)
     else:
         _print(found)
+        again = " --simulate" if simulate else ""
+        if failed:
+            talk.print_next(f"ftdrive doctor{again}   (when what is marked ✘ is fixed)")
+        else:
+            talk.print_next(f"ftdrive plan{again}   (a tour proven clear)", f"ftdrive calibrate{again}")
     if failed:
         raise NotAccepted(f"{len(failed)} of {len(found)} checks failed: {', '.join(failed)}")
 
@@ -232,14 +236,13 @@ def _examine_push(
 
 
 def _print(found: list[Check]) -> None:
-    data = Console(highlight=False, emoji=False, soft_wrap=not sys.stdout.isatty())
     subject = ""
     for check in found:
         first, _, _ = check.name.partition(".")
         head = Text.assemble(f" {'' if first == subject else first:<12}", _MARK[check.state], " ")
-        data.print(hanging(head, check.found, data))
+        answer.print(hanging(head, check.found, answer))
         if check.fix is not None and check.state in {"warning", "failed"}:
-            data.print(hanging(f"{'':15}fix: ", check.fix, data))
+            answer.print(hanging(f"{'':15}fix: ", check.fix, answer))
         subject = first
     words = {"ok": " All checks passed.", "warning": " Usable; see the lines with !", "failed": " Not ready."}
-    talk.print(words[verdict(found)])
+    answer.print(words[verdict(found)])

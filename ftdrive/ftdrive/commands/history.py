@@ -31,7 +31,7 @@ def history(
     from ftdrive.errors import ConfigError
     from ftdrive.store.history import drifts, warnings
     from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
-    from ftdrive.terminal.console import hanging, talk
+    from ftdrive.terminal.console import answer, hanging, talk
 
     left_out: tuple[str, ...] = ()
     name = None
@@ -66,7 +66,7 @@ def history(
     for drift in found:
         click.echo(f"trend: {drift}")
     for words in advice:
-        talk.print(hanging(" ! ", words), style="yellow")
+        answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
 _TITLES = ("id", "date", "tool", "verdict", "kg", "force bias, N", "verified", "°C", "parent")

@@ -79,6 +79,7 @@ def init(
     from ftdrive.cell.template import cell_file
     from ftdrive.planning.cell_plan import require_possible
     from ftdrive.planning.geometry.arm_model import SHAPES
+    from ftdrive.terminal.console import talk
     from ftdrivers.ur.kinematics import model_named
 
     check_simulate(simulate, real={"--robot": robot})
@@ -156,10 +157,10 @@ def init(
         write_json({"schema_version": 1, "file": str(output), **devices, "config": cell.to_dict()})
     if simulate:
         _say(f"Wrote {output} for an emulated cell: commands with --simulate use it, all others refuse it.")
-        _say("Next: ftdrive doctor --simulate, then ftdrive plan --simulate")
+        talk.print_next("ftdrive doctor --simulate", "ftdrive plan --simulate")
     else:
         _say(f"Wrote {output}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
-        _say("Next: ftdrive doctor, then ftdrive plan")
+        talk.print_next("ftdrive doctor", "ftdrive plan")
 
 
 class Questions:

@@ -98,7 +98,7 @@ def plan(
     from ftdrive.errors import ConfigError
     from ftdrive.planning.cell_plan import certifier_for, plan_for
     from ftdrive.planning.planner import USUAL_POSTURE_RAD
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import answer, talk
 
     if quick and minimal:
         raise ConfigError("give --quick (12 poses) or --minimal (6), not both")
@@ -153,7 +153,8 @@ def plan(
     else:
         from ftdrive.planning.show.words import plan_in_words
 
-        talk.print(plan_in_words(made))
+        answer.print(plan_in_words(made))
+        talk.print_next(f"ftdrive calibrate{' --simulate' if simulate else ''}   (asks before anything moves)")
     if view:
         _look(made, certifier)
 

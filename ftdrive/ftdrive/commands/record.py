@@ -141,12 +141,12 @@ def record_stream(
 
 
 def _report(recorder: "Recorder", frame: "WrenchFrame", name: str, *, as_json: bool) -> None:
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import answer, talk
 
     rate = f"{recorder.rate_Hz:.0f} Hz"  # of all samples: that of the first half second may differ much
     for path in recorder.saved:
         samples = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, {rate}, gaps: {recorder.gaps}"
-        talk.print(f" Saved {path}: {samples}")
+        (talk if as_json else answer).print(f" Saved {path}: {samples}")
     if as_json:
         files = {
             "files": [str(path) for path in recorder.saved],

@@ -32,7 +32,7 @@ from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject
 from ftdrive.report.trust import trust
 from ftdrive.runs.bundle import unpacked
-from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.console import answer, hanging, talk
 
 _SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up")
 DEFAULT = Path("report.html")
@@ -111,8 +111,9 @@ def report(
     text = written(facts, form)
     if output is not None:
         write_new(output, text)
-        talk.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}"))
-        talk.print(f" Saved {output}")
+        say = talk if as_json else answer
+        say.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}", say))
+        say.print(f" Saved {output}")
     if as_json:
         write_json({**facts, "file": None if output is None else str(output)})
     elif output is None:

@@ -1,18 +1,30 @@
-"""Output for people goes to stderr, because stdout is for data."""
+"""Two consoles: `answer` prints what a command was asked for on stdout, `talk` all else on stderr."""
 
 import os
 import sys
 import textwrap
-from typing import TextIO
+from typing import Any, TextIO
 
 from rich.console import Console
 from rich.text import Text
+
+from ftdrive.terminal.hints import as_typed
 
 
 class Talk(Console):
     """A console that knows whether details are wanted (`-v`); `quiet` is the console's own."""
 
     verbose = False
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print; a command in a text stands there as the user can type it."""
+        super().print(*(as_typed(one) if isinstance(one, str) else one for one in objects), **options)
+
+    def print_next(self, *commands: str) -> None:
+        """Print what the user can do next: commands, each with why behind it."""
+        self.print("Next", style="bold cyan")
+        for command in commands:
+            self.print(f"   {command}")
 
 
 talk = Talk(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
@@ -25,7 +37,7 @@ _NARROWEST = 20
 def hanging(head: str | Text, words: str, console: Console = talk) -> Text:
     """Put words behind a head; on a terminal too narrow for them the next lines begin under the first word."""
     first = Text.assemble(head)
-    text = Text(words)
+    text = Text(as_typed(words))
     width = console.width - first.cell_len
     if console.soft_wrap or width < _NARROWEST:
         return first + text
@@ -41,6 +53,7 @@ def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
     For what is written without `talk`. A word that is longer by itself, such as a path, stays whole. Where `head` is
     what the text begins with, its lines go on behind it, as in `hanging`.
     """
+    text = as_typed(text)
     try:
         width = os.get_terminal_size(file.fileno()).columns
     except (OSError, ValueError):  # no terminal; nothing of the system
@@ -58,3 +71,7 @@ def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
         fold.fill(line) + line[len(line.rstrip()) :]
         for line in text.split("\n")  # a prompt ends with a space
     )
+
+
+answer = Talk(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+"""On stdout: results, verdicts and where they were saved. `-q` does not silence it, `--json` replaces it."""

@@ -14,7 +14,7 @@ from ftcalib.compare import Compared
 from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftdrive.runs.pose_hints import hints, names_of
-from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.console import answer, hanging, talk
 from ftdrivers.interfaces import Array
 
 _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
@@ -53,26 +53,26 @@ def print_result(
     saved : Path, optional
         The calibration file, printed in the last line.
     """
-    talk.print(Text.assemble(("Result", "bold cyan"), f"  {result.n_poses} poses, method {result.method}"))
-    talk.print(_table(result, truth))
+    answer.print(Text.assemble(("Result", "bold cyan"), f"  {result.n_poses} poses, method {result.method}"))
+    answer.print(_table(result, truth))
     head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
-    talk.print(hanging(head, f"compensation error {error_in_words(result)}"))
+    answer.print(hanging(head, f"compensation error {error_in_words(result)}", answer))
     if truth is not None:
         raw, left = free_tool_wrench(truth, _RANDOM), compensation_error(result, truth)
         words = (
             f"a free tool reads {left['force_rms_N']:.4f} N, {left['torque_rms_Nm']:.5f} N·m rms; "
             f"before {_rms(raw[:, :3]):.1f} N, {_rms(raw[:, 3:]):.2f} N·m"
         )
-        talk.print(hanging(" truth: ", words))
+        answer.print(hanging(" truth: ", words, answer))
     for finding in result.findings:
-        talk.print(hanging("   ", finding.words))
+        answer.print(hanging("   ", finding.words, answer))
     if talk.verbose or result.verdict != "good":
         _print_fit(result, names_of(records))
     _print_drift(result, drift)
     for hint in hints(result, records) if hinted or talk.verbose else ():
-        talk.print(hanging(" ? ", hint.words), style="yellow")
+        answer.print(hanging(" ? ", hint.words, answer), style="yellow")
     if saved is not None:
-        talk.print(f" Saved {saved}")
+        answer.print(f" Saved {saved}")
 
 
 def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
@@ -110,23 +110,23 @@ def _print_fit(result: CalibrationResult, names: Sequence[str]) -> None:
         f"force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
         f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max"
     )
-    talk.print(hanging(" residuals: ", words))
+    answer.print(hanging(" residuals: ", words, answer))
     if (poses := poses_in_words(result, names)) is not None:
-        talk.print(hanging(" worst: ", poses))
+        answer.print(hanging(" worst: ", poses, answer))
 
 
 def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
     if drift is not None:
         words, bad = drift_in_words(drift)
         if bad or talk.verbose or result.verdict != "good":
-            talk.print(hanging(" drift: ", words), style="yellow" if bad else None)
+            answer.print(hanging(" drift: ", words, answer), style="yellow" if bad else None)
     if result.drift is not None:
         change, sigma = result.drift.change, result.drift.sigma
         words = (
             f"{with_sigma(np.linalg.norm(change[:3]), np.max(sigma[:3]))} N, "
             f"{with_sigma(np.linalg.norm(change[3:]), np.max(sigma[3:]))} N·m from the first pose to the last"
         )
-        talk.print(hanging(" drift in the fit: ", words))
+        answer.print(hanging(" drift in the fit: ", words, answer))
 
 
 def error_in_words(result: CalibrationResult) -> str:
@@ -222,12 +222,12 @@ def _rms(vectors: Array) -> float:
 def print_comparison(compared: Sequence[Compared]) -> None:
     """Print all methods side by side without cutting a number: a narrow terminal gets no vectors, a pipe long lines."""
     table = _comparison(compared, vectors=True)
-    if talk.is_terminal and table.width is not None and table.width > talk.width:
+    if answer.is_terminal and table.width is not None and table.width > answer.width:
         table = _comparison(compared, vectors=False)
-    talk.print(table, soft_wrap=True)
+    answer.print(table, soft_wrap=True)
     for one in compared:
         if one.reason is not None:
-            talk.print(hanging(f" {one.method}: ", one.reason))
+            answer.print(hanging(f" {one.method}: ", one.reason, answer))
 
 
 def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
@@ -250,7 +250,7 @@ def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
         rms = (one.force_rms_N, one.torque_rms_Nm, one.cv_force_rms_N, one.cv_torque_rms_Nm)
         cells = ("-" if np.isnan(value) else f"{value:.5f}" for value in rms)
         table.add_row(one.method, f"{one.mass_kg:.5f}", *triples, angle, *cells)
-    table.width = talk.measure(table, options=talk.options.update(width=_NO_LIMIT)).maximum
+    table.width = answer.measure(table, options=answer.options.update(width=_NO_LIMIT)).maximum
     return table
 
 

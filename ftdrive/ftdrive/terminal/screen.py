@@ -38,6 +38,7 @@ from ftdrive.session.events import (
 from ftdrive.session.live_fit import GREEN
 from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.hints import as_typed
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
@@ -354,7 +355,7 @@ def _kept(view: SessionView, width: int) -> list[Text]:
         return [] if view.taken else [Text("nothing is kept yet: there is no run", "dim")]
     return [
         Text("kept in " + _end_of(view.folder, width - 8)),
-        Text("resume  " + _end_of(view.resume, width - 8)),
+        Text("resume  " + _end_of(as_typed(view.resume), width - 8)),
     ]
 
 

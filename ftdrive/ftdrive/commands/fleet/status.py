@@ -32,7 +32,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     from ftcalib.files import write_new
     from ftdrive.fleet.observed import Observed
     from ftdrive.fleet.status import fleet_of
-    from ftdrive.terminal.console import hanging, talk
+    from ftdrive.terminal.console import answer, hanging, talk
 
     gc.freeze()  # or the imports are searched for garbage again and again: a tenth of the time
     found, now = open_store(url), datetime.now(UTC)
@@ -42,7 +42,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         from ftdrive.fleet.page import page
 
         write_new(page_path, page(fleet, observed, found.name))
-        talk.print(f" Saved {page_path}")
+        (talk if as_json else answer).print(f" Saved {page_path}")
     if as_json:
         write_json(_as_json(fleet, found.name, now))
     elif not fleet.cells:
@@ -52,9 +52,9 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         from ftdrive.terminal.table import print_table
 
         print_table(_TITLES, [_row(one, now) for one in fleet.cells], folding={"cell", "tool"})
-        talk.print(summary(fleet, now), style="bold")
+        answer.print(summary(fleet, now), style="bold")
         for words in attention(fleet, now):
-            talk.print(hanging(" ! ", words), style="yellow")
+            answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
 def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
