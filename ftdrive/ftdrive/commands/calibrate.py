@@ -17,6 +17,7 @@ from ftdrive.commands.common import (
     NewFile,
     declined_aborts,
     index_run,
+    require_viz,
     rows,
     runs,
     simulate,
@@ -104,6 +105,7 @@ def calibrate(
     from ftdrive.terminal.screen import open_operator
 
     _refuse_contradictions(click.get_current_context())
+    require_viz(as_session["png"], view=as_session["view"])
     mode: Mode = "step" if step else "manual" if manual else "listen" if listen else "auto"
     with ExitStack() as stack:
         description: dict[str, Any] = {}

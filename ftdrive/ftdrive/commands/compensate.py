@@ -57,9 +57,12 @@ def compensate(
     as r11..r33, qx,qy,qz,qw or rx,ry,rz in rad.
     """
     from ftdrive.recording.compensation import compensated
+    from ftdrive.recording.files import format_of
     from ftdrive.runs.source import read_calibration
     from ftdrive.terminal.console import answer, talk
 
+    if output is not None:
+        format_of(output)
     frame = read_frame(axes, about)
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     recording, found = _read(path, calibration, loaded, wrench, orientation_file, delay, everything=output is not None)

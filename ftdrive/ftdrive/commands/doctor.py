@@ -33,7 +33,7 @@ from ftdrive.commands.common import (
 )
 from ftdrive.errors import NotAccepted
 from ftdrive.session.guards import Limits
-from ftdrive.terminal.console import answer, hanging, talk
+from ftdrive.terminal.console import answer, hanging, talk, working
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ArmStatus, Array, ForceTorqueSensor, RobotArm
@@ -86,11 +86,13 @@ def doctor(
         address = SensorAddress.of(sensor_reached(cell.sensor.url)[0])
         device = build_sensor(cell)
 
-        found, arm = _examine_robot(cell, stack)
+        with working("Reading the arm and its clock"):
+            found, arm = _examine_robot(cell, stack)
         permissions = computer.check_permissions(address)
         blame = partial(devices.check_sensor_error, address=address, permissions=permissions)
         mass_kg = mass_kg or cell.tool.mass_kg or USUAL_KG
-        of_sensor, alive = _examine_sensor(device, address, cell, mass_kg, blame, stack)
+        with working("Reading the sensor"):
+            of_sensor, alive = _examine_sensor(device, address, cell, mass_kg, blame, stack)
         model = cell.robot.model if arm is None else arm.identify().model
         found += [*of_sensor, computer.check_workcell(cell, model), computer.check_disk(runs), *permissions]
         if calibration is not None:

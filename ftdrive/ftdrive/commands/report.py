@@ -18,6 +18,7 @@ from ftdrive.commands.common import (
     JSON,
     NewFile,
     check_simulate,
+    require_extra,
     simulate,
     store_url,
     write_json,
@@ -32,7 +33,7 @@ from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject
 from ftdrive.report.trust import trust
 from ftdrive.runs.bundle import unpacked
-from ftdrive.terminal.console import answer, hanging, talk
+from ftdrive.terminal.console import answer, hanging, talk, working
 
 _SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up")
 DEFAULT = Path("report.html")
@@ -96,10 +97,13 @@ def report(
             require_new(output := DEFAULT)
         except OSError as error:
             raise ConfigError(f"{error} with --output") from error
+    if form == "html":
+        require_extra("report", "a report in HTML (not --format md)", "jinja2", "matplotlib")
     given = known_values(mass_kg, level_deg, mounting_deg), upward(up)
     options = SolveOptions(method, orientation, drift, *given, _typed(click.get_current_context()))
     with unpacked(source) if source is not None else rehearsed_run(sensor) as found:
-        subject = read_subject(found, options, parent)
+        with working("Solving"):
+            subject = read_subject(found, options, parent)
         known = trust(subject.result, found, store_url, datetime.now(UTC))
         subject = replace(subject, trust=known)
         if known["store_error"]:
@@ -107,8 +111,9 @@ def report(
         if source is not None and found != source:  # unpacked
             reproduce = subject.reproduce.replace(str(found), shlex.quote(str(source)))
             subject = replace(subject, source=source, reproduce=reproduce)
-        facts = facts_of(subject)
-    text = written(facts, form)
+        with working("Comparing methods and drawing"):
+            facts = facts_of(subject)
+            text = written(facts, form)
     if output is not None:
         write_new(output, text)
         say = talk if as_json else answer

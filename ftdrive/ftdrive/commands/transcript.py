@@ -17,7 +17,7 @@ from ftdrive.checks.computer import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import versions
-from ftdrive.terminal.console import answer, talk
+from ftdrive.terminal.console import answer, talk, working
 from ftdrivers.errors import BadTranscript, ConnectError, DeviceTimeout, ProtocolError
 from ftdrivers.interfaces import ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
@@ -89,7 +89,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
     writer = Writer(path, header, clock)
     seen: dict[str, Any] = {"error": INTERRUPTED}
     try:
-        with recording(writer), device:
+        with working(f"Recording for {duration_s:g} s"), recording(writer), device:
             whole = _watch(device, duration_s)
             device.collect(_TAIL_S)
         seen = whole

@@ -3,6 +3,8 @@
 import os
 import sys
 import textwrap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TextIO
 
 from rich.console import Console
@@ -75,3 +77,13 @@ def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
 
 answer = Talk(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
 """On stdout: results, verdicts and where they were saved. `-q` does not silence it, `--json` replaces it."""
+
+
+@contextmanager
+def working(words: str) -> Iterator[Callable[[str], None]]:
+    """Show on a terminal that a command works, and at what; a pipe gets nothing. Yields a function for other words."""
+    if not talk.is_terminal or talk.quiet:
+        yield lambda _: None
+        return
+    with talk.status(f"{words} …") as status:
+        yield lambda now: status.update(f"{now} …")

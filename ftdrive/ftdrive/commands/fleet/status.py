@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import JSON, STORE, NewFile, open_store, write_json
+from ftdrive.commands.common import JSON, STORE, NewFile, open_store, require_extra, write_json
 
 if TYPE_CHECKING:
     from ftdrive.fleet.state import CellState, Fleet
@@ -34,6 +34,8 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     from ftdrive.fleet.status import fleet_of
     from ftdrive.terminal.console import answer, hanging, talk
 
+    if page_path is not None:
+        require_extra("fleet", "--html", "jinja2")
     gc.freeze()  # or the imports are searched for garbage again and again: a tenth of the time
     found, now = open_store(url), datetime.now(UTC)
     observed = Observed.read(found, now)
