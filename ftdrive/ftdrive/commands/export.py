@@ -220,9 +220,11 @@ def formats(as_json: bool) -> None:
         ]
         write_json({"schema_version": 1, "formats": found})
         return
+    from ftdrive.terminal.console import answer, hanging
+
     width = max(map(len, FORMATS))
     for name, one in FORMATS.items():
-        click.echo(f"{name:{width}}  {one.description}")
+        answer.print(hanging(f"{name:{width}}  ", one.description, answer))
 
 
 @contextmanager

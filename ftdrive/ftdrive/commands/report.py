@@ -1,8 +1,10 @@
 """`ftdrive report`: one file that says whether a calibration is good, and why."""
 
 import shlex
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import get_args
 
@@ -49,7 +51,12 @@ DEFAULT = Path("report.html")
     help="As of `ftdrive solve`; the report compares the others with it.",
 )
 @click.argument("source", required=False, type=click.Path(exists=True, path_type=Path))
-@click.option("-o", "--output", type=NewFile(), help=f"New file. [default: {DEFAULT}; stdout for md and json]")
+@click.option(
+    "-o",
+    "--output",
+    type=NewFile(),
+    help=f"New file. [default: {DEFAULT}, or {DEFAULT.stem}-2 and so on; stdout for md and json]",
+)
 @click.option(
     "--format",
     "form",
@@ -93,8 +100,9 @@ def report(
     if source is None and not simulate:
         raise ConfigError("nothing to report: give a calibration.json, a run folder or a CSV file, or --simulate")
     if output is None and form == "html":
+        output = next(one for one in _numbered(DEFAULT) if not one.exists())
         try:
-            require_new(output := DEFAULT)
+            require_new(output)
         except OSError as error:
             raise ConfigError(f"{error} with --output") from error
     if form == "html":
@@ -123,6 +131,12 @@ def report(
         write_json({**facts, "file": None if output is None else str(output)})
     elif output is None:
         click.echo(text, nl=False)
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    """Yield report.html, report-2.html and so on."""
+    yield path
+    yield from (path.with_stem(f"{path.stem}-{number}") for number in count(2))
 
 
 def _typed(context: click.Context) -> tuple[str, ...]:

@@ -46,7 +46,7 @@ from ftdrive.terminal.session_text import SessionText, TextLine, in_words, rms_s
 from ftdrivers.interfaces import Array
 
 REFRESH_HZ = 4
-KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "stop"}
+KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "quit"}
 
 # Label and unit, factor from SI, name, and rank in `frame`: higher ranks are omitted first.
 _ROWS = (

@@ -57,7 +57,9 @@ def test_the_list_names_results_trends_and_what_to_do(run: Callable[..., Ran], r
     code, out, err = run("history", "--index", runs)
     lines = out.splitlines()
     assert (code, len(lines), err) == (0, 6 + 4 + 2, "")
-    assert lines[0].split()[:3] == ["id", "date", "tool"]
+    assert lines[0].split()[:4] == ["id", "date", "arm", "tool"]
+    assert "arm-1" in lines[1]
+    assert "gripper-0" in lines[1]
     assert "2026-03-01" in lines[1]
     assert "drill" in lines[2]
     assert "FAILED" in lines[5]
