@@ -1,7 +1,7 @@
 """Numbers in words: a sigma has two significant digits, and its value ends at the same place."""
 
 import math
-from typing import Final
+from typing import Final, SupportsFloat
 
 MOST_DECIMALS: Final = 9
 _UNKNOWN: Final = 4
@@ -22,7 +22,7 @@ def decimals(sigma: float) -> int:
     return min(max(1 - exponent, 0), MOST_DECIMALS)
 
 
-def to_place_of(value: float, sigma: float, sign: str = "") -> str:
+def to_place_of(value: SupportsFloat, sigma: float, sign: str = "") -> str:
     """Write a value to the last place of its sigma; of the sigma itself, two significant digits.
 
     Examples
@@ -30,10 +30,10 @@ def to_place_of(value: float, sigma: float, sign: str = "") -> str:
     >>> to_place_of(1.18652, 0.00108), to_place_of(0.00108, 0.00108)
     ('1.1865', '0.0011')
     """
-    return f"{value:{sign}.{decimals(sigma)}f}"
+    return f"{float(value):{sign}.{decimals(sigma)}f}"
 
 
-def with_sigma(value: float, sigma: float, sign: str = "") -> str:
+def with_sigma(value: SupportsFloat, sigma: float, sign: str = "") -> str:
     """Write a value with its sigma.
 
     Examples
