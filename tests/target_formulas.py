@@ -266,7 +266,7 @@ def static_transform(text: str, R_base_flange: Array, wrench: Array, context: Co
 
 
 def plain_json(text: str, R_base_flange: Array, wrench: Array, _: Context) -> Array:
-    """`ftdrive.export/1`, docs/ftdrive/exports.md; the fields are those of a calibration, calib/README.md.
+    """`ftdrive.export/1`, docs/reference/export-formats.md; the fields are those of a calibration.
 
     `u = R_flange_sensor^T R_base_flange^T gravity_force_base_N;
     raw - (force_bias_N, torque_bias_Nm) - (u, p x u) - (force_gain u, cross_talk_m u)`.

@@ -253,8 +253,9 @@ CODES: Final[Mapping[str, Code]] = {
         "last", "let the sensor warm up and calibrate again"),
     "com_shifted": Code(_REJECT_OR_NOTE, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
         "load had shifted", "fix the load and calibrate again"),
-    "load_changed": Code(_REJECT_OR_NOTE, "from {pose:poses} on the weight has changed by {change_N:+.2g}",
-        "check whether something was lost or picked up, and calibrate again"),
+    "load_changed": Code(_REJECT_OR_NOTE, "from {pose:poses} on the weight has changed by {change_N:+.2g} and the "
+        "centre of mass by {shift_mm:.2g}", "check whether something was lost, picked up or shifted, and calibrate "
+        "again"),
     "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
         "of {sigma_N:.2g}", "hang something heavier on the sensor, or record longer and in more orientations"),
     "second_solution": Code(_REJECT, "a very different mounting of the sensor explains the data almost as well "

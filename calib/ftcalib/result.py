@@ -62,7 +62,7 @@ class DriftResult:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """Estimates with their covariance; arrays are read-only. Frames and signs are those of calib/README.md.
+    """Estimates with their covariance; arrays are read-only. Frames and signs: docs/explanation/model.md.
 
     Examples
     --------

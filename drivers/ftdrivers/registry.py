@@ -159,7 +159,7 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
     ----------
     url : str
         Such as ``ati-can://can0?bitrate=250000&base=0x20``, ``ati-can:///dev/ttyACM0?interface=slcan`` or
-        ``ati-serial:///dev/serial/by-id/NAME?calibration=1``; all are in drivers/README.md.
+        ``ati-serial:///dev/serial/by-id/NAME?calibration=1``; all are in docs/reference/sensors.md.
     sign : int
         -1 for a sensor that reports the reaction.
     clock : Clock

@@ -6,14 +6,17 @@ import os
 import platform
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from errno import ENOSPC
 from io import StringIO
+from typing import Any
 
 import click
 
 from ftdrive import __version__
 from ftdrive.errors import exit_code
+from ftdrive.terminal.text import echo
 
 # A command, its module, its line in the help. The module is imported only when the command is called: help is fast.
 _COMMANDS = {
@@ -45,10 +48,30 @@ _COMMANDS = {
 _EPILOG = """\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
 5 device fault, 6 file cannot be read or written, 7 check or acceptance failed, 8 recording has gaps,
-130 interrupted (data kept)."""
+130 interrupted (data kept), 141 the reader of the output has ended."""
+
+
+_CLOSED_PIPE = 128 + 13
+"""As a shell reports a program that SIGPIPE ended."""
+
+
+@contextmanager
+def _closed_pipe() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:  # click would end with 1
+        raise click.exceptions.Exit(_CLOSED_PIPE) from None
 
 
 class _LazyGroup(click.Group):
+    @_closed_pipe()
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        return super().make_context(*args, **kwargs)
+
+    @_closed_pipe()
+    def invoke(self, ctx: click.Context) -> Any:
+        return super().invoke(ctx)
+
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)
 
@@ -75,8 +98,7 @@ def cli(verbose: int, quiet: bool) -> None:
     New here? `ftdrive demo` needs no hardware.
     """
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logger = logging.StreamHandler() if quiet else _TalkHandler()
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[logger])
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_TalkHandler()])
     if quiet or verbose:
         from ftdrive.terminal.console import talk
 
@@ -89,7 +111,10 @@ class _TalkHandler(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         from ftdrive.terminal.console import talk
 
-        talk.print(self.format(record))
+        if talk.quiet:
+            echo(self.format(record), err=True)
+        else:
+            talk.print(self.format(record))
 
 
 def in_a_sentence(error: BaseException) -> str:
@@ -111,7 +136,14 @@ def main() -> int:
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.default_int_handler)
     _open_closed_streams()
-    return run(sys.argv[1:])
+    code = run(sys.argv[1:])
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        code = _CLOSED_PIPE
+    if code == _CLOSED_PIPE:  # Python writes at its end what is left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return code
 
 
 def _open_closed_streams() -> None:
@@ -129,10 +161,10 @@ def run(arguments: Sequence[str]) -> int:
         from ftdrive.terminal.console import in_whole_words
 
         error.show(message := StringIO())
-        click.echo(in_whole_words(message.getvalue(), sys.stderr), err=True, nl=False)
+        echo(in_whole_words(message.getvalue(), sys.stderr), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
-        click.echo("interrupted", err=True)
+        echo("interrupted", err=True)
         return 130
     except Exception as error:
         code = exit_code(error)
@@ -140,5 +172,5 @@ def run(arguments: Sequence[str]) -> int:
             raise
         from ftdrive.terminal.console import in_whole_words
 
-        click.echo(in_whole_words(f"error: {in_a_sentence(error)}", sys.stderr), err=True)
+        echo(in_whole_words(f"error: {in_a_sentence(error)}", sys.stderr), err=True)
         return code

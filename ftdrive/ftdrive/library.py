@@ -121,8 +121,8 @@ def open_stream(
     stages : Stages
         What is done to the raw wrench.
     on_contact : callable
-        Called with each `Contact` when it has lasted 60 ms, and again when it is over (`contact.over`), by the thread
-        that reads. `CompensatedStream.on_contact` may be set at any time.
+        Called with each `Contact` when it has lasted 60 to 80 ms, and again when it is over (`contact.over`), by the
+        thread that reads. `CompensatedStream.on_contact` may be set at any time.
     force : bool
         Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`, or one that
         was edited by hand, with a mark in `StreamInfo.marks`.

@@ -13,7 +13,7 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftdrive.live.delay import DelayEstimator
-from ftdrive.live.noise import samples_in_reading
+from ftdrive.live.motion import samples_in_reading
 from ftdrive.live.pairing import Pairing
 from ftdrive.live.processing import Processor
 from ftdrive.live.samples import Block, Stages, WrenchFrame

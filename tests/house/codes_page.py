@@ -1,4 +1,4 @@
-"""Write `docs/ftdrive/finding-codes.md` from the table of codes: `uv run python tests/house/codes_page.py`."""
+"""Write `docs/reference/finding-codes.md` from the table of codes: `uv run python tests/house/codes_page.py`."""
 
 import re
 from collections.abc import Iterator
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ftcalib.findings import CODES
 
-PAGE = Path(__file__).parents[2] / "docs/ftdrive/finding-codes.md"
+PAGE = Path(__file__).parents[2] / "docs/reference/finding-codes.md"
 
 _HEAD = """\
 # Finding codes
@@ -24,6 +24,7 @@ The worst severity gives the verdict:
 | `note` | not worse for it |
 
 Findings are ordered as in this table, notes last: a cause stands before its consequences, so fix the first one first.
+[Methods](../explanation/methods.md#mistakes-in-the-data) explains how they are found.
 Values stand as their names, which end with their units. A value that is not known is null.
 
 | code | severity | found | fix |

@@ -1,16 +1,15 @@
 """The house rules that a machine can check."""
 
-import re
 import subprocess
 import sys
 import tomllib
 from importlib.metadata import distribution
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-from tests.house import codes_page, commands_page
+from tests.house import codes_page
+from tests.house.printing import prints_in
 from tests.house.sentences import sentences_in
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,9 +32,8 @@ def test_checker_is_content(command: list[str]) -> None:
     assert outcome.returncode == 0, outcome.stdout + outcome.stderr
 
 
-@pytest.mark.parametrize("module", [commands_page, codes_page])
-def test_the_generated_pages_are_up_to_date(module: ModuleType) -> None:
-    assert module.PAGE.read_text(encoding="utf-8") == module.page(), f"uv run python {module.__file__}"
+def test_the_page_of_finding_codes_is_up_to_date() -> None:
+    assert codes_page.PAGE.read_text(encoding="utf-8") == codes_page.page(), f"uv run python {codes_page.__file__}"
 
 
 def test_no_code_tests_or_edits_a_sentence() -> None:
@@ -66,20 +64,6 @@ def test_tests_of_a_sentence_are_recognised(code: str, is_hit: bool, tmp_path: P
     assert bool(sentences_in([tmp_path])) == is_hit
 
 
-def test_the_readme_is_short_and_its_links_exist() -> None:
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert len(text.splitlines()) <= 150
-    links = re.findall(r"\]\((?!https?:)([^)#]+)", text)
-    assert len(links) > 5
-    assert [link for link in links if not (ROOT / link).exists()] == []
-
-
-def test_no_merge_was_left_half_done() -> None:
-    pages = [*ROOT.glob("*.md"), *ROOT.glob("[!.]*/**/*.md")]
-    assert len(pages) > 5
-    assert [page for page in pages if re.search(r"^(<{7}|>{7}) ", page.read_text(encoding="utf-8"), re.MULTILINE)] == []
-
-
 def test_every_dependency_is_bounded_and_has_its_reason() -> None:
     lines = (ROOT / "pyproject.toml").read_text(encoding="utf-8").splitlines()
     required = [line.strip().strip('",') for line in lines if line.startswith('  "') and ">=" in line]
@@ -106,3 +90,28 @@ def test_help_imports_nothing_heavy_and_opens_nothing() -> None:
     outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert outcome.returncode == 0, outcome.stderr
     assert "demo" in outcome.stdout
+
+
+def test_whatever_is_printed_cannot_command_the_terminal() -> None:
+    assert prints_in(ROOT / "ftdrive/ftdrive") == []
+
+
+@pytest.mark.parametrize(
+    ("code", "is_hit"),
+    [
+        ("print(name)", True),
+        ("click.echo(run.tool)", True),
+        ("self._stdout.write(line)", True),
+        ("sys.stderr.write(str(error))", True),
+        ("Console().print(table)", True),
+        ("handlers = [logging.StreamHandler()]", True),
+        ("self._stderr.write(in_whole_words(text, file))", False),
+        ("click.prompt(visible(shown))", False),
+        ("echo(run.tool)", False),
+        ("talk.print(run.tool)", False),
+        ("file.write(text)", False),
+    ],
+)
+def test_unsafe_prints_are_recognised(code: str, is_hit: bool, tmp_path: Path) -> None:
+    (tmp_path / "module.py").write_text(code, encoding="utf-8")
+    assert bool(prints_in(tmp_path)) == is_hit

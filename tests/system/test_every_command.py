@@ -84,7 +84,7 @@ def test_help_fits_into_80_columns(command: str) -> None:
     assert max(map(len, outcome.stdout.splitlines())) <= 80
 
 
-def test_a_wrong_option_is_told_in_whole_words(
+def test_the_error_of_a_wrong_option_has_whole_words(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))

@@ -77,8 +77,8 @@ def test_ctrl_c_keeps_what_is_solved_and_the_command_continues(runs: list[Path],
     kept = runs[0].parent
     wait_until(lambda: len(list(kept.glob("*/solved-*.json"))) >= 2, process)
     os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the workers too
-    code, talk = end_of(process)
-    assert (code, talk.strip()) == (130, "interrupted")
+    code, printed = end_of(process)
+    assert (code, printed.strip()) == (130, "interrupted")
     assert list(kept.glob("*/*.partial")) == []
     before = len(list(kept.glob("*/solved-*.json")))
     assert 2 <= before < 8

@@ -241,7 +241,7 @@ def test_in_a_terminal(station: Station) -> None:
     )
     os.close(follower)
     screen, decoder = "", codecs.getincrementaldecoder("utf-8")()  # a read may end within a letter
-    talk = [
+    dialogue = [
         (r"Robot address: ", station.cell.robot.host),
         (r"Sensor(: choose a number| address).*: ", serial_port(station)),
         (r"measure it\): ", "33"),
@@ -256,7 +256,7 @@ def test_in_a_terminal(station: Station) -> None:
         (r"deg/s \[60\]: ", ""),
     ]
     try:
-        for question, answer in [*talk, ("Wrote ftdrive.toml", None)]:
+        for question, answer in [*dialogue, ("Wrote ftdrive.toml", None)]:
             before, deadline = len(screen), time.monotonic() + 60
             while not re.search(question, screen[before:]):
                 assert time.monotonic() < deadline, screen

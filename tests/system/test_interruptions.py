@@ -35,12 +35,12 @@ def test_ctrl_c_stops_the_arm_and_keeps_the_poses(
     station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine, by: signal.Signals
 ) -> None:
     tour.send_signal(by)
-    code, talk = end_of(tour)
-    assert code == 130, talk
-    assert "Traceback" not in talk
+    code, printed = end_of(tour)
+    assert code == 130, printed
+    assert "Traceback" not in printed
     assert not station.control(do="state")["moving"]
     kept = ftdrive.poses()
-    assert f"{len(kept)} poses" in talk
+    assert f"{len(kept)} poses" in printed
     solved = ftdrive.run("solve", kept[0].parent.parent)
     assert solved.returncode == 7
     assert "Traceback" not in solved.stderr
@@ -51,9 +51,9 @@ def test_unplugged_sensor_stops_the_arm_and_keeps_the_poses(
     station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine
 ) -> None:
     station.control(do="unplug", device="sensor")
-    code, talk = end_of(tour)
-    assert code == 4, talk
-    assert "Traceback" not in talk
+    code, printed = end_of(tour)
+    assert code == 4, printed
+    assert "Traceback" not in printed
     assert not station.control(do="state")["moving"]
     assert len(ftdrive.poses()) >= 2
 
@@ -61,17 +61,17 @@ def test_unplugged_sensor_stops_the_arm_and_keeps_the_poses(
 @pytest.mark.slow
 def test_protective_stop_is_a_device_fault(station: Station, tour: subprocess.Popen[str]) -> None:
     station.control(do="protective-stop")
-    code, talk = end_of(tour)
-    assert code == 5, talk
-    assert "protective" in talk
+    code, printed = end_of(tour)
+    assert code == 5, printed
+    assert "protective" in printed
 
 
 @pytest.mark.slow
 def test_killed_station_is_a_lost_stream(station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine) -> None:
     os.kill(station.pid, signal.SIGKILL)
-    code, talk = end_of(tour)
-    assert code == 4, talk
-    assert "Traceback" not in talk
+    code, printed = end_of(tour)
+    assert code == 4, printed
+    assert "Traceback" not in printed
     assert len(ftdrive.poses()) >= 2
 
 
@@ -92,7 +92,7 @@ def test_without_the_typed_word_nothing_moves(
     assert not ftdrive.poses()
 
 
-def test_a_wrong_option_is_told_before_anybody_is_called(ftdrive: CommandLine) -> None:
+def test_a_wrong_option_is_reported_before_a_device_opens(ftdrive: CommandLine) -> None:
     outcome = ftdrive.run(
         "calibrate", "--robot", "127.213.7.9", "--sensor", "ati-serial:///dev/no-such-port", "--redo", "3"
     )
@@ -100,7 +100,7 @@ def test_a_wrong_option_is_told_before_anybody_is_called(ftdrive: CommandLine) -
     assert "--resume" in outcome.stderr
 
 
-def test_nobody_there(ftdrive: CommandLine) -> None:
+def test_a_device_that_does_not_answer(ftdrive: CommandLine) -> None:
     outcome = ftdrive.run("calibrate", "--robot", "127.213.7.9", "--sensor", "ati-serial:///dev/no-such-port")
     assert outcome.returncode == 3
     assert outcome.stderr.startswith("error: ")

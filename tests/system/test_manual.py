@@ -185,7 +185,7 @@ def test_a_lost_sensor_ends_it_with_the_poses_on_disk(station: Station, tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["manual", "listen"])
-def test_somebody_in_the_emulated_cell_brings_it_to_its_end(
+def test_the_operator_of_the_emulated_cell_brings_it_to_its_end(
     mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     request, words = emulated.MOVED_BY[mode]

@@ -72,7 +72,7 @@ def test_no_limit_of_the_tips_however_it_is_written(text: str) -> None:
     ("workcell", "measured"),
     [("measured = false", False), ("measured = true", True), ("planes_mm = [[-1, 0, 0, -900]]", False), (None, True)],
 )
-def test_the_plan_says_whether_somebody_measured_what_it_is_for(
+def test_the_plan_says_whether_its_cell_was_measured(
     workcell: str | None, measured: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

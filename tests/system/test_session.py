@@ -50,7 +50,7 @@ def programs_of(station: Station) -> list[str]:
 
 
 @pytest.mark.parametrize("dry", [True, False], ids=["dry-run", "calibrate"])
-def test_a_program_of_somebody_else_and_its_move_go_on(
+def test_a_program_of_another_client_and_its_move_go_on(
     dry: bool, station: Station, config: Path, ftdrive: CommandLine
 ) -> None:
     q_rad = station.control(do="state")["q_rad"]

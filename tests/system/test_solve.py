@@ -57,7 +57,7 @@ def test_a_drifting_recording_is_rejected(solve: Solve, real_data: Path) -> None
     assert result["residual"]["force_rms_N"] > 0.1 * result["weight_N"]
 
 
-def test_json_has_the_documented_keys_and_talk_stays_off_stdout(solve: Solve, tmp_path: Path) -> None:
+def test_json_has_the_documented_keys_and_messages_stay_off_stdout(solve: Solve, tmp_path: Path) -> None:
     path = tmp_path / "poses.csv"
     path.write_text("\n".join([HEADER, *rows(12)]))
     outcome = solve(path, "--json")

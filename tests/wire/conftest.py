@@ -171,7 +171,7 @@ class Emulator:
         self.laboratory = laboratory
         self.clock = laboratory.clock
         self._sensors: list[StreamingSensor] = []
-        self._number, self.endpoint = laboratory.tell("start", scheme, self.kind.options | options)
+        self._number, self.endpoint = laboratory.request("start", scheme, self.kind.options | options)
 
     def sensor(self, options: str = "", sign: int = 1, clock: Clock | None = None) -> StreamingSensor:
         """Make a driver of it, in the cell's time unless another clock is given; it is closed with the emulator."""
@@ -187,18 +187,18 @@ class Emulator:
         return sensor
 
     def faults(self, **options: Any) -> None:
-        self.laboratory.tell("faults", self._number, options)
+        self.laboratory.request("faults", self._number, options)
 
     def unplug(self) -> None:
-        self.laboratory.tell("unplug", self._number)
+        self.laboratory.request("unplug", self._number)
 
     def reset(self) -> None:
-        self.laboratory.tell("reset", self._number)
+        self.laboratory.request("reset", self._number)
 
     def stop(self) -> None:
         for sensor in self._sensors:
             sensor.close()
-        self.laboratory.tell("stop", self._number)
+        self.laboratory.request("stop", self._number)
 
 
 @pytest.fixture(scope="module")

@@ -58,7 +58,7 @@ class Laboratory:
         assert self.process.stdout
         self.clock = EmulatedClock(json.loads(self.process.stdout.readline()))
 
-    def tell(self, word: str, argument: str | int, options: dict[str, Any] | None = None) -> Any:
+    def request(self, word: str, argument: str | int, options: dict[str, Any] | None = None) -> Any:
         assert self.process.stdin
         assert self.process.stdout
         with self._lock:

@@ -31,7 +31,7 @@ def scheme(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def test_gauges_and_wrench_tell_the_same(start: Start, scheme: str) -> None:
+def test_gauges_and_wrench_give_the_same(start: Start, scheme: str) -> None:
     """One linear map, found from the data, takes all gauges to all wrenches."""
     with start(scheme).sensor() as sensor:
         samples = sensor.collect(0.2)

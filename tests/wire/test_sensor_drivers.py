@@ -315,7 +315,7 @@ def test_netft_status_is_a_fault(start: Start, status: int, product: str, query:
         start("ati-netft", status=status, product=product).sensor(query).open()
 
 
-def test_netft_tells_its_rate_and_range_and_losses_are_named(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+def test_netft_reports_its_rate_and_range_and_losses_are_named(start: Start, caplog: pytest.LogCaptureFixture) -> None:
     emulator = start("ati-netft", rate_hz=500)
     with emulator.sensor() as sensor:
         assert sensor.identify().facts["range"].value == pytest.approx((130, 130, 400, 10, 10, 10))

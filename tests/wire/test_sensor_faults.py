@@ -69,7 +69,7 @@ class Emulator:
         self.plug_in()
 
     def plug_in(self) -> None:
-        self._number, where = self._laboratory.tell("start", self.kind.scheme, self._options)
+        self._number, where = self._laboratory.request("start", self.kind.scheme, self._options)
         ports: list[str] = []
         if isinstance(where, dict):
             self._options |= where
@@ -88,16 +88,16 @@ class Emulator:
         return sensor
 
     def faults(self, **options: Any) -> None:
-        self._laboratory.tell("faults", self._number, options)
+        self._laboratory.request("faults", self._number, options)
 
     def reset(self) -> None:
-        self._laboratory.tell("reset", self._number)
+        self._laboratory.request("reset", self._number)
 
     def unplug(self) -> None:
-        self._laboratory.tell("unplug", self._number)
+        self._laboratory.request("unplug", self._number)
 
     def made(self) -> int:
-        return int(self._laboratory.tell("made", self._number))
+        return int(self._laboratory.request("made", self._number))
 
 
 @dataclass
@@ -175,7 +175,7 @@ HEALTHY = dict.fromkeys([key for fault in SCRIPT.values() for key in fault], 0.0
 
 
 def chances(scheme: str, fault: str) -> dict[str, float]:
-    """How often a fault strikes: a slip takes the ATI stream 40 ms to mend, so there it is rare."""
+    """How often a fault strikes: a slip stops the ATI stream for 40 ms, so there it is rare."""
     return {"byte_slip": 0.001} if (scheme, fault) == ("ati-serial", "byte_slip") else SCRIPT[fault]
 
 
@@ -192,18 +192,18 @@ def applies(scheme: str, fault: str) -> bool:
 
 def suffer(sensor: StreamingSensor, clock: Clock, seconds: float) -> list[DeviceError]:
     """Use a sensor for a while as a program would; return its errors."""
-    told: list[DeviceError] = []
+    errors: list[DeviceError] = []
     end_s = clock.now_s() + seconds
     while clock.now_s() < end_s:
         try:
             sensor.collect(0.2)
             sensor.latest(timeout_s=0.1)
         except DeviceError as exc:
-            told.append(exc)
+            errors.append(exc)
             if sensor._failure is not None:
                 break
             clock.sleep(0.02)
-    return told
+    return errors
 
 
 def suffering() -> list[tuple[str, str]]:
@@ -224,7 +224,7 @@ def test_no_fault_of_the_wire_delivers_a_wrong_value(emulator: Emulator, fault: 
         watched = Watched(sensor)
         emulator.faults(**chances(scheme, fault))
         try:
-            told = suffer(sensor, emulator.clock, 0.7)
+            errors = suffer(sensor, emulator.clock, 0.7)
             health, samples, steps = sensor.health(), watched.samples(), watched.steps()
         finally:
             emulator.faults(**HEALTHY)
@@ -236,7 +236,7 @@ def test_no_fault_of_the_wire_delivers_a_wrong_value(emulator: Emulator, fault: 
         assert (steps >= 0).all()
     elif watched.wrong() == 0:
         assert (steps >= 1).all()  # nothing twice, nothing late
-    assert told == []  # these faults are survived
+    assert errors == []  # these faults are survived
     if fault in {"corrupt", "byte_slip"}:
         assert health.malformed > 0
     if fault == "duplicate" and scheme in {"bota", "ati-netft"}:
@@ -263,9 +263,9 @@ def reset(emulator: Emulator, before_s: float) -> list[Watched]:
     with emulator.sensor() as sensor:
         watched = Watched(sensor, before_s)
         emulator.reset()
-        told = suffer(sensor, emulator.clock, 0.8)
-        assert all(isinstance(exc, DeviceTimeout | StreamBroken) for exc in told)
-        assert told or sensor.health().lost or emulator.kind.scheme == "ati-netft"
+        errors = suffer(sensor, emulator.clock, 0.8)
+        assert all(isinstance(exc, DeviceTimeout | StreamBroken) for exc in errors)
+        assert errors or sensor.health().lost or emulator.kind.scheme == "ati-netft"
     return [watched]
 
 
@@ -295,8 +295,8 @@ def unplugged(emulator: Emulator, before_s: float) -> list[Watched]:
     return [first, second, third]
 
 
-def mended(emulator: Emulator, before_s: float) -> list[Watched]:
-    """Unplug in mid-stream and plug in again: told at once, and mended where that was asked for."""
+def reconnected(emulator: Emulator, before_s: float) -> list[Watched]:
+    """Unplug in mid-stream and plug in again: reported at once, and reconnected where that was configured."""
     with emulator.sensor("recover=1") as sensor:
         watched = Watched(sensor, before_s)
         emulator.unplug()
@@ -319,7 +319,7 @@ CYCLES: dict[str, Callable[[Emulator, float], list[Watched]]] = {
     "reset": reset,
     "already streaming": opened,
     "unplug": unplugged,
-    "replug": mended,
+    "replug": reconnected,
 }
 """Faults that end a stream: from opening to the outcome, `before_s` after it has begun."""
 

@@ -128,7 +128,7 @@ def test_what_the_system_doubles_is_undone(far_side: FarSide, port: SerialPort, 
 
 
 @pytest.mark.parametrize("at_once", [1, 2, 416])
-def test_damaged_bytes_are_told(far_side: FarSide, port: SerialPort, at_once: int) -> None:
+def test_damaged_bytes_are_reported(far_side: FarSide, port: SerialPort, at_once: int) -> None:
     far_side.make_marks_itself()
     sent = b"ab" + b"\xff\x00c" + b"\xff\xff" + b"\xff\x00\xff" + b"\x00" + b"\xff\x00\x00" + b"z"
     assert send_and_read(far_side, port, sent, 8, at_once) == (b"abc\xff\xff\x00\x00z", [2, 4, 6])
@@ -164,7 +164,7 @@ def test_what_is_thrown_away_takes_a_cut_mark_along(far_side: FarSide, port: Ser
     assert read_until(port, 2) == (b"\x00b", [])
 
 
-def test_a_port_opened_again_begins_anew(far_side: FarSide, port: SerialPort) -> None:
+def test_a_port_opened_again_begins_empty(far_side: FarSide, port: SerialPort) -> None:
     far_side.make_marks_itself()
     far_side.send(b"a\xff")
     assert port.read(2) == b"a"

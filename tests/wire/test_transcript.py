@@ -220,15 +220,15 @@ def read_through(player: Player, request: bytes, size: int) -> tuple[bytes, list
     ("parity_marks", "read", "damaged"), [(True, b"ab\xffc", [1]), (False, b"a\xff\x00b\xff\xffc", [])]
 )
 def test_recorded_marks_are_played_as_marks(parity_marks: bool, read: bytes, damaged: list[int]) -> None:
-    told = made_up((0.00, True, b"?"), (0.01, False, b"a\xff\x00b\xff\xffc"))
-    player = Player(replace(told, parity_marks=parity_marks))
+    recorded = made_up((0.00, True, b"?"), (0.01, False, b"a\xff\x00b\xff\xffc"))
+    player = Player(replace(recorded, parity_marks=parity_marks))
     assert read_through(player, b"?", len(read)) == (read, damaged)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
 def test_marks_are_not_played_before_the_driver_is_ready_for_them() -> None:
-    told = made_up((0.00, True, b"?"), (0.01, False, b"\xff\x00b"))
-    player = Player(replace(told, passages=told.passages[1:], parity_marks=True))
+    recorded = made_up((0.00, True, b"?"), (0.01, False, b"\xff\x00b"))
+    player = Player(replace(recorded, passages=recorded.passages[1:], parity_marks=True))
     with player as path, serial.Serial(path, timeout=0.1) as port:
         assert port.read(1) == b""  # it has not asked for marks
         ask_for_marks(port)
@@ -330,8 +330,8 @@ def by_direction(lines: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[s
 
 
 def made_up(*passages: tuple[float, bool, bytes]) -> Transcript:
-    told = tuple(Passage(round(1e9 * t_s), sent, data) for t_s, sent, data in passages)
-    return Transcript({"url": "x:///y", "duration_s": 1.0}, 0, told, {})
+    recorded = tuple(Passage(round(1e9 * t_s), sent, data) for t_s, sent, data in passages)
+    return Transcript({"url": "x:///y", "duration_s": 1.0}, 0, recorded, {})
 
 
 DIALOGUE = made_up(
@@ -401,7 +401,7 @@ def test_a_request_that_was_not_recorded_ends_in_silence_with_a_reason(dialogue:
     assert is_silent(port)
 
 
-def test_a_player_that_nobody_opens_ends() -> None:
+def test_a_player_that_is_never_opened_ends() -> None:
     before = threading.active_count()
     with Player(DIALOGUE):
         pass

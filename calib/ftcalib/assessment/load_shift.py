@@ -45,7 +45,7 @@ class Change:
         step, size = self.step, float(np.linalg.norm(self.step))
         code, values = {
             "centre of mass": ("com_shifted", {"shift_mm": 1e3 * size}),
-            "load": ("load_changed", {"change_N": step[0]}),
+            "load": ("load_changed", {"change_N": step[0], "shift_mm": 1e3 * np.linalg.norm(step[1:])}),
             "force": ("bias_stepped", {"force_N": size, "torque_Nm": 0.0}),
             "torque": ("bias_stepped", {"force_N": 0.0, "torque_Nm": size}),
             "force and torque": (

@@ -1,4 +1,4 @@
-"""The base of every sensor driver; see "A driver in another package" in README.md."""
+"""The base of every sensor driver; docs/how-to/add-a-sensor.md shows a driver in another package."""
 
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits, scale_facts
 

@@ -39,7 +39,7 @@ class UrWristSensor(StreamingSensor):
     host : str
         Address of the controller.
     counts_per_N, counts_per_Nm : float
-        `ft_raw_wrench` at 1 N and at 1 N·m. Measure them: see drivers/README.md.
+        `ft_raw_wrench` at 1 N and at 1 N·m. Measure them: see docs/how-to/connect-a-sensor.md.
     sign : int
         -1 for a sensor that reports the reaction.
     clock : Clock
@@ -58,7 +58,7 @@ class UrWristSensor(StreamingSensor):
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
         """Build from ``ur-ft://192.168.1.10?counts_per_N=…&counts_per_Nm=…``; both are required."""
-        why = "measure the undocumented unit of ft_raw_wrench as described in drivers/README.md"
+        why = "measure the undocumented unit of ft_raw_wrench as described in docs/how-to/connect-a-sensor.md"
         return cls(
             address,
             counts_per_N=options.positive("counts_per_N", why),

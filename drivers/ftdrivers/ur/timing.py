@@ -15,7 +15,7 @@ _QUICKEST_OF_S: Final = 0.5
 
 @dataclass(frozen=True)
 class UrTiming:
-    """Limits in seconds. The defaults are for a real cell; `docs/drivers/ur.md` describes their effects."""
+    """Limits in seconds. The defaults are for a real cell; docs/explanation/ur-controller.md has their effects."""
 
     # Limits on samples of the controller, the same in every cell.
     stale_s: float = 0.2

@@ -59,7 +59,7 @@ def sensor_at(place: str, clock: Clock = REAL) -> str:
     if urls:
         raise ConfigError(f"{len(urls)} sensors answer on {place}: choose one, {' or '.join(urls)}")
     why = "; ".join(answer.what for answer in answers)
-    usual = "check its power and bit rate, or give its address (drivers/README lists the forms)"
+    usual = "check its power and bit rate, or give its address (docs/reference/sensors.md lists the forms)"
     raise ConfigError(f"no known sensor answers on {place}: {why or usual}")
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args
 
 import click
 
+from ftdrive.terminal.text import echo
 from ftdrivers.ur.control import CONTROL_SETTINGS
 
 if TYPE_CHECKING:
@@ -223,7 +224,7 @@ def declined_aborts() -> Iterator[None]:
 
 def write_json(value: Mapping[str, Any]) -> None:
     """Write one JSON object to stdout, on one line."""
-    click.echo(json.dumps(value))
+    echo(json.dumps(value))
 
 
 def index_run(folder: Path, cell: "CellConfig | None" = None) -> None:

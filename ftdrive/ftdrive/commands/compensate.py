@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ftdrive.commands.common import FILE, FORCE, FRAME, JSON, NewFile, numbers, read_frame, write_json
+from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftcalib import CalibrationResult
@@ -74,7 +75,7 @@ def compensate(
     if as_json:
         write_json({"schema_version": 1, **result})
     else:
-        click.echo("\n".join(_words(result, str(frame))))
+        echo("\n".join(_words(result, str(frame))))
     if output is not None:
         (talk if as_json else answer).print(f" Saved {output}")
 

@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, check_simulate, simulate, write_json
+from ftdrive.terminal.text import echo
 
 
 @click.group()
@@ -46,4 +47,4 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
         write_json({"schema_version": 1, "config": values} | ({"origin": origins} if origin else {}))
         return
     comment = (lambda key: found[key].origin) if origin else (lambda key: RULES[key].description)
-    click.echo(document({key: setting.value for key, setting in found.items()}, comment), nl=False)
+    echo(document({key: setting.value for key, setting in found.items()}, comment), nl=False)

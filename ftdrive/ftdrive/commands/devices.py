@@ -1,11 +1,9 @@
 """`ftdrive devices`: the ports and buses of this computer, and on request the known sensors on them."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
 from rich.text import Text
 from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
@@ -15,7 +13,7 @@ from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import Station
 from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
-from ftdrive.terminal.console import hanging
+from ftdrive.terminal.console import hanging, printer
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 
@@ -99,7 +97,7 @@ def _emulated(failures: list[Exception]) -> dict[str, Any]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    data = Console(highlight=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+    data = printer()
     for port in found["serial"]:
         words = [port["by_id"] or port["port"], port["description"], port["usb"]]
         data.print(hanging(" serial  ", "   ".join(word for word in words if word), data))

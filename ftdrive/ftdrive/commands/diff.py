@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ftdrive.commands.common import JSON, store_url, write_json
+from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftcalib.extras.difference import ChiSquare, Difference, Estimated
@@ -72,14 +73,14 @@ def diff(first: str, second: str, as_json: bool) -> None:
         return
     for name, side in (("A", a), ("B", b)):
         made = (side.created_utc or "unknown time")[:16].replace("T", " ")
-        click.echo("  ".join([name, side.id[:6], made, *(["EMULATED"] if side.emulated else []), side.path]))
-    click.echo(f"{'B minus A':22}{'change':>12}{'± 1 sigma':>12}{'in sigmas':>11}")
-    click.echo(_line("mass, kg", b.mass_kg - a.mass_kg, mass_sigma_kg))
+        echo("  ".join([name, side.id[:6], made, *(["EMULATED"] if side.emulated else []), side.path]))
+    echo(f"{'B minus A':22}{'change':>12}{'± 1 sigma':>12}{'in sigmas':>11}")
+    echo(_line("mass, kg", b.mass_kg - a.mass_kg, mass_sigma_kg))
     for i, (_, label, unit, scale) in enumerate(_ROWS):
         for k, axis in enumerate("xyz"):
             row = 3 * i + k
-            click.echo(_line(f"{label} {axis}, {unit}", scale * found.change[row], scale * found.sigma[row]))
-    click.echo(_in_words(found))
+            echo(_line(f"{label} {axis}, {unit}", scale * found.change[row], scale * found.sigma[row]))
+    echo(_in_words(found))
 
 
 def _side(text: str) -> Side:

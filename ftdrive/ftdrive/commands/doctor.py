@@ -34,6 +34,7 @@ from ftdrive.commands.common import (
 from ftdrive.errors import NotAccepted
 from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import answer, hanging, talk, working
+from ftdrive.terminal.text import echo
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ArmStatus, Array, ForceTorqueSensor, RobotArm
@@ -221,7 +222,7 @@ def _examine_push(
         with ExitStack() as stack:
             if station is None:
                 words = f"Push the tool along +X of the base, about 20 N; press Enter and hold for {_PUSH_S:.0f} s"
-                click.echo(words, err=True)
+                echo(words, err=True)
                 if not sys.stdin.readline():
                     return Check("push.sign", "skipped", "no push: the standard input is closed"), None
             elif R_base_flange is not None and R_flange_sensor is not None:

@@ -20,6 +20,7 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.exports.calibration.formats import FORMATS, MAX_FORCE_ERROR_N
+from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftdrive.planning.plan import Plan
@@ -72,7 +73,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
         about = {"format": target, "plan": made.sha256, "file": None if output is None else str(output)}
         write_json({"schema_version": 1, **about, "text": text})
     elif output is None:
-        click.echo(text, nl=False)
+        echo(text, nl=False)
 
 
 @export.command()
@@ -200,7 +201,7 @@ def calibration(
             }
         )
     elif output is None:
-        click.echo(made.text, nl=False)
+        echo(made.text, nl=False)
 
 
 @export.command()

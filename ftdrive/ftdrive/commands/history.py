@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
+from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftdrive.store.records import StoredResult, StoredVerification
@@ -64,7 +65,7 @@ def history(
         return
     _print_table([_row(one, last.get(one.id), now) for one in results])
     for drift in found:
-        click.echo(f"trend: {drift}")
+        echo(f"trend: {drift}")
     for words in advice:
         answer.print(hanging(" ! ", words, answer), style="yellow")
 

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import click
 
 from ftdrive.commands.common import JSON, MODEL, NewFile, check_simulate, rows, simulate, write_json
+from ftdrive.terminal.text import echo, visible
 from ftdrivers.clock import Clock
 
 T = TypeVar("T")
@@ -185,9 +186,9 @@ class Questions:
         while True:
             shown = in_whole_words(f"{words} [{usual}]: " if usual else f"{words}: ", sys.stderr)
             try:
-                answer = click.prompt(shown, default=usual, show_default=False, prompt_suffix="", err=True)
+                answer = click.prompt(visible(shown), default=usual, show_default=False, prompt_suffix="", err=True)
             except click.Abort as abort:
-                click.echo(err=True)  # the next message begins a line
+                echo(err=True)  # the next message begins a line
                 if isinstance(abort.__context__, EOFError):
                     raise ConfigError(f"the input ended before an answer: give {option}, or use a terminal") from abort
                 raise

@@ -3,7 +3,6 @@
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,9 @@ import click
 import numpy as np
 from rich.console import Group
 from rich.live import Live
-from rich.table import Table
-from rich.text import Text
 
 from ftdrive.checks.check import Check
-from ftdrive.checks.devices import AXES, check_weighed_payload
+from ftdrive.checks.devices import check_weighed_payload
 from ftdrive.commands.common import (
     CALIBRATION_OR_TOOL,
     CELL,
@@ -30,20 +27,24 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.live_source import RECOVER_S, open_source
 from ftdrive.errors import ConfigError
-from ftdrive.live.frames import FrameTransform
-from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.replay import ReplayedStream, replay_run
-from ftdrive.live.samples import Axes, Block, StreamInfo, WrenchFrame
+from ftdrive.live.samples import Axes, StreamInfo, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.recording import Recorder, read_recording
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import read_calibration
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import printer, talk
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrivers.errors import DeviceError
+from ftdrive.terminal.live.feed import MEAN_S, Feed, Stream
+from ftdrive.terminal.live.layout import plain as plain_lines
+from ftdrive.terminal.live.summary import Summary
+from ftdrive.terminal.live.view import View
+from ftdrive.terminal.text import echo
+from ftdrivers.clock import Clock
 from ftdrivers.interfaces import Array
 
-_PERIOD_S = 0.1
+_PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
+"""N and N·m, sensor axes, on the tool of an emulated cell."""
 
 
 @click.command()
@@ -59,7 +60,7 @@ _PERIOD_S = 0.1
 @click.option("--speed", type=Number(0, min_open=True), help="Of --replay; 1 is that of the recording.")
 @FRAME
 @click.option("--once", is_flag=True, help="Print one reading, then end.")
-@click.option("--plain", is_flag=True, help="Show a table instead of the full screen.")
+@click.option("--plain", is_flag=True, help="Show a table instead of the full screen; lines in a file.")
 @JSON
 def live(
     path: Path | None,
@@ -80,7 +81,8 @@ def live(
     """Show the raw and the compensated wrench, refreshed ten times a second.
 
     The compensated wrench is the contact wrench: measured minus bias and gravity, along the chosen axes and about the
-    chosen point. The arm is only read, never moved. With --json, one object per line.
+    chosen point. The arm is only read, never moved. With --json, one object per line. With --simulate, the key f pushes
+    the tool.
     """
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
     if speed is not None and replay is None:
@@ -92,6 +94,7 @@ def live(
         stream: CompensatedStream | ReplayedStream
         checks = list[Check]()
         recorder: Callable[[Path], Recorder] | None = None
+        push: Callable[[], object] | None = None
         if replay is not None:
             stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed, force=force)
         else:
@@ -99,15 +102,17 @@ def live(
                 path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
             )
             checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, stream.cell.sensor.mass_kg)]
+            if simulate:
+                push = partial(stream.station.control, do="push", wrench=_PUSH, seconds=1.0)
             recorder = partial(_recorder, stream.info, stream.cell.to_dict())
-        if once or as_json:
-            _print(stream, once=once, as_json=as_json)
-        elif talk.is_terminal and sys.stdout.isatty() and sys.stdin.isatty() and not plain:
+        if once or as_json or not sys.stdout.isatty():
+            _print(stream, stream.clock, once=once, as_json=as_json)
+        elif plain or not (talk.is_terminal and sys.stdin.isatty()):
+            _show_table(stream, stream.clock, checks)
+        else:
             from ftdrive.terminal.live_screen import run_live
 
-            run_live(stream, recorder=recorder, checks=checks)
-        else:
-            _show_table(stream)
+            run_live(stream, recorder=recorder, push=push, checks=checks)
 
 
 def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> ReplayedStream:
@@ -127,119 +132,89 @@ def _recorder(info: StreamInfo, configuration: dict[str, Any], path: Path) -> Re
     return Recorder([path], info, configuration)
 
 
-def _print(stream: CompensatedStream | ReplayedStream, *, once: bool, as_json: bool) -> None:
-    for look in _looks(stream, raises=once):
-        reading = _reading(look, stream)
+def _print(stream: Stream, clock: Clock, *, once: bool = False, as_json: bool = False) -> None:
+    for view in _views(stream, clock, raises=once):
+        reading = _reading(view)
         if as_json:
             write_json(reading)
+        elif once:
+            echo(_line(reading, stream.frame))
         else:
-            click.echo(_line(reading, stream.frame))
+            contact = "   contact" if reading["contact"] else ""
+            echo(f"{reading['t_s']:.1f} s   {_line(reading, stream.frame)}{contact}")
         if once:
             break
 
 
-def _show_table(stream: CompensatedStream | ReplayedStream) -> None:
-    shown = Group()
+def _show_table(stream: Stream, clock: Clock, checks: Sequence[Check]) -> None:
+    shown, console = Group(), printer()
     with (
         Keyboard(0) if Keyboard.usable(0) else nullcontext(),  # Enter would break the screen
-        Live(console=talk, refresh_per_second=10) as screen,
+        Live(console=console, refresh_per_second=10) as screen,
     ):
-        for look in _looks(stream):
-            made = f"{stream.info.calibration_name}: {stream.info.calibration_state or stream.info.calibration.verdict}"
-            shown = _screen(_reading(look, stream), stream.frame, made)
+        for view in _views(stream, clock, checks):
+            shown = Group(*(line.as_text() for line in plain_lines(view, console.width)))
             screen.update(Group(shown, "Ctrl-C ends"))
         screen.update(Group(shown, "The recording has ended."))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Look:
-    """The mean over about `_PERIOD_S`."""
-
-    t_s: float
-    R_base_flange: Array
-    raw: Array
-    wrench: Array
-    sigma: Array
-    chi2: float
-    in_contact: bool
-    stale: str = ""
-    """Why there is no newer one."""
-
-
-def _looks(stream: CompensatedStream | ReplayedStream, *, raises: bool = False) -> Iterator[Look]:
-    """Yield a mean for each period from when the noise is known; raise a failure at once or when it lasts."""
-    blocks: list[Block] = []
-    look: Look | None = None
+def _views(stream: Stream, clock: Clock, checks: Sequence[Check] = (), *, raises: bool = False) -> Iterator[View]:
+    """Yield the state each `MEAN_S` from when the noise is known; raise a failure at once or when it lasts."""
+    feed = Feed(stream)
+    summary = Summary(feed, checks)
+    begin_ns: int | None = None
+    is_known, ended = False, False
     failing_since_s: float | None = None
-    ended = False
     while not ended:
-        try:
-            block = stream.read()
-        except DeviceError as error:
-            now_s = stream.clock.now_s()
+        feed.step()
+        if feed.failure is not None:
+            now_s = clock.now_s()
             failing_since_s = now_s if failing_since_s is None else failing_since_s
-            if raises or look is None or now_s - failing_since_s > RECOVER_S:
-                raise
-            blocks.clear()
-            yield replace(look, stale=str(error))
+            if raises or not is_known or now_s - failing_since_s > RECOVER_S:
+                raise feed.failure
+            yield summary.view()
             continue
         failing_since_s = None
         ended = isinstance(stream, ReplayedStream) and stream.has_ended
-        if len(block):
-            blocks.append(block)
-        if not blocks:
+        if feed.newest_ns is None:
             continue
-        span_s = (blocks[-1].t_host_ns[-1] - blocks[0].t_host_ns[0]) * 1e-9
-        if span_s >= _PERIOD_S - 0.5 / stream.info.sensor_rate_Hz or (ended and look is None):
-            if np.isfinite(block.sigma).all() or isinstance(stream, ReplayedStream):
-                look = _look(blocks, stream, span_s)
-                yield look
-            blocks.clear()
+        begin_ns = feed.newest_ns if begin_ns is None else begin_ns
+        if (feed.newest_ns - begin_ns) * 1e-9 >= MEAN_S - 0.5 / stream.info.sensor_rate_Hz or (ended and not is_known):
+            begin_ns = feed.newest_ns
+            is_known = bool(np.isfinite(feed.sigma).all()) or isinstance(stream, ReplayedStream)
+            view = summary.view()
+            if is_known:
+                yield view
 
 
-def _look(blocks: Sequence[Block], stream: ProcessedStream, span_s: float) -> Look:
-    newest, frame = blocks[-1], blocks[-1].frame
-    alike = [block for block in blocks if block.frame == frame and block.stages == newest.stages]
-    to_frame = FrameTransform(frame, stream.info)
-    raw = np.concatenate([to_frame(block.raw, block.R_base_flange) for block in alike])
-    return Look(
-        t_s=newest.t_host_ns[-1] * 1e-9,
-        R_base_flange=newest.R_base_flange[-1],
-        raw=raw.mean(axis=0),
-        wrench=np.concatenate([block.wrench for block in alike]).mean(axis=0),
-        sigma=stream.sigma_of_mean(newest.R_base_flange[-1], span_s),
-        chi2=float(newest.chi2[-1]),
-        in_contact=bool(newest.in_contact[-1]),
-    )
-
-
-def _reading(look: Look, stream: ProcessedStream) -> dict[str, Any]:
-    status, frame, calibration = stream.status(), stream.frame, stream.info.calibration
-    verification = stream.info.verification
+def _reading(view: View) -> dict[str, Any]:
+    status, calibration, verification = view.status, view.info.calibration, view.info.verification
+    reading = view.reading
+    assert reading is not None  # noqa: S101
 
     def wrench(values: Array) -> dict[str, Any] | None:
-        if look.stale:
+        if view.silent:
             return None
         numbers = [float(value) if np.isfinite(value) else None for value in values]
         return {"force_N": numbers[:3], "torque_Nm": numbers[3:]}
 
     return {
         "schema_version": 1,
-        "t_s": look.t_s,
-        "axes": frame.axes,
-        "about": "sensor origin" if frame.about == "sensor" else frame.about,
-        "raw": wrench(look.raw),
-        "compensated": wrench(look.wrench),
-        "sigma": wrench(look.sigma),
-        "contact": None if look.stale else look.in_contact,
-        "stale": look.stale or None,
+        "t_s": reading.t_host_ns * 1e-9,
+        "axes": reading.frame.axes,
+        "about": "sensor origin" if reading.frame.about == "sensor" else reading.frame.about,
+        "raw": wrench(reading.raw_in_frame),
+        "compensated": wrench(reading.wrench),
+        "sigma": wrench(reading.sigma),
+        "contact": None if view.silent else reading.in_contact,
+        "stale": view.silent or None,
         "delay_s": {"value": status.delay_s, "sigma": status.delay_sigma_s},
         "rate_Hz": status.sensor.rate_Hz,
         "lost": status.sensor.lost,
         "calibration": calibration.provenance.get("created_utc"),
         "calibration_id": calibration.id,
         "verdict": calibration.verdict,
-        "marks": list(stream.info.marks),
+        "marks": list(view.info.marks),
         "verification": None if verification is None else verification.to_dict(),
     }
 
@@ -252,35 +227,3 @@ def _line(reading: dict[str, Any], frame: WrenchFrame) -> str:
         " ".join(f"{value:9.{n}f}" for value in contact[key]) for key, n in (("force_N", 3), ("torque_Nm", 5))
     )
     return f"F {force} N   T {torque} N·m   ({frame})"
-
-
-def _screen(reading: dict[str, Any], frame: WrenchFrame, made: str) -> Group:
-    table = Table(box=None)
-    for title, width in (("", 2), ("raw", 9), ("contact", 13), ("± 1 sigma", 9), ("", 20)):
-        table.add_column(title, justify="right", min_width=width, no_wrap=True)  # else they move with every sign
-    columns = [_six(reading[key]) for key in ("raw", "compensated", "sigma")]
-    for i, name in enumerate(AXES):
-        raw, contact, sigma = (column[i] for column in columns)
-        unit, full, digits = ("N", 20.0, 3) if i < 3 else ("N·m", 2.0, 5)
-        filled = 0 if contact is None else min(20, round(20 * abs(contact) / full))
-        bar = Text.assemble(("█" * filled, "red" if contact and contact < 0 else "green"), "·" * (20 - filled))
-        shown = [_digits(value, digits) for value in (raw, contact, sigma)]
-        table.add_row(name, shown[0], f"{shown[1]} {unit}", shown[2], bar)
-    delay, state = reading["delay_s"], "CONTACT" if reading["contact"] else "free"
-    return Group(
-        Text.assemble((str(frame), "bold"), "   contact: raw minus bias and gravity"),
-        made,
-        f"mean of {_PERIOD_S} s   {reading['rate_Hz']:.0f} Hz, lost {reading['lost']}",
-        Text(f"{reading['stale']}", "red")
-        if reading["stale"]
-        else f"{state}   delay {1e3 * delay['value']:.1f} ± {1e3 * delay['sigma']:.1f} ms (1 sigma)",
-        table,
-    )
-
-
-def _six(wrench: dict[str, Any] | None) -> list[float | None]:
-    return [None] * 6 if wrench is None else [*wrench["force_N"], *wrench["torque_Nm"]]
-
-
-def _digits(value: float | None, digits: int) -> str:
-    return "--.--" if value is None else f"{value:.{digits}f}"

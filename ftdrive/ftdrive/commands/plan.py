@@ -178,10 +178,10 @@ def _look(made: "Plan", certifier: "Certifier") -> None:
     from contextlib import suppress
 
     from ftdrive.planning.show.view import open_in_browser, shown
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import print_address
 
     with shown(made, certifier) as url, suppress(KeyboardInterrupt):
-        talk.print(f"The plan is shown at {url} until Ctrl-C.")
+        print_address("The plan is shown until Ctrl-C at ", url)
         open_in_browser(url)
         threading.Event().wait()
 

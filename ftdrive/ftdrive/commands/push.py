@@ -23,6 +23,7 @@ from ftdrive.session.settings_push import EFFECTS, WORDS, propose, restore, send
 from ftdrive.terminal.console import answer, in_whole_words, talk
 from ftdrive.terminal.operators import JsonOperator, PlainOperator
 from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
+from ftdrive.terminal.text import echo
 
 _PATH = click.Path(exists=True, path_type=Path)
 
@@ -80,7 +81,7 @@ def push(
         elif not (as_json or sends):
             answer.print("\n".join(proposal_in_lines(proposal)))
         elif not as_json and (asks or not talk.quiet):
-            click.echo(in_whole_words("\n".join(proposal_in_lines(proposal)), sys.stderr), err=True)
+            echo(in_whole_words("\n".join(proposal_in_lines(proposal)), sys.stderr), err=True)
         if not sends:
             (talk if as_json else answer).print(
                 "Dry run: nothing was sent." if dry_run else "The controller agrees: nothing was sent."

@@ -36,6 +36,7 @@ from ftdrive.report.subject import SolveOptions, read_subject
 from ftdrive.report.trust import trust
 from ftdrive.runs.bundle import unpacked
 from ftdrive.terminal.console import answer, hanging, talk, working
+from ftdrive.terminal.text import echo
 
 _SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up")
 DEFAULT = Path("report.html")
@@ -130,7 +131,7 @@ def report(
     if as_json:
         write_json({**facts, "file": None if output is None else str(output)})
     elif output is None:
-        click.echo(text, nl=False)
+        echo(text, nl=False)
 
 
 def _numbered(path: Path) -> Iterator[Path]:

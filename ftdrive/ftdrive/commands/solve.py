@@ -38,6 +38,7 @@ from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.source import read_source
 from ftdrive.terminal.console import answer, talk, working
 from ftdrive.terminal.report import print_comparison, print_result
+from ftdrive.terminal.text import echo
 
 _METHODS = (
     *("ml", "srom", "lrom", "carlson-relaxation", "carlson-cayley", "carlson-eigen", "carlson-nullspace"),
@@ -155,7 +156,7 @@ def _solve_each(
             first_failure = first_failure or error
             if as_json and not isinstance(error, NotAccepted):
                 write_json({"schema_version": 1, "source": str(source), "error": str(error)})
-            click.echo(f"error: {source}: {error}", err=True)
+            echo(f"error: {source}: {error}", err=True)
     if first_failure is not None:
         raise SystemExit(exit_code(first_failure))
 

@@ -22,7 +22,7 @@ from ftdrive.live.samples import Axes
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.servers.address import host_and_port, is_loopback, with_port
 from ftdrive.servers.udp import UdpSender
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import print_address, talk
 from ftdrivers.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 @FRAME
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve at. Another one is unprotected.")
 @click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Port; 0 is a free one.")
+@click.option("--allow-origin", "origins", metavar="URL", multiple=True, help="Also serve pages of this origin.")
+@click.option("--allow-control", is_flag=True, help="Pages may tare and change frame and stages; programs always may.")
 @click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
 def stream(
     path: Path | None,
@@ -49,13 +51,15 @@ def stream(
     about: str,
     host: str,
     port: int,
+    origins: tuple[str, ...],
+    allow_control: bool,
     udp: str | None,
 ) -> None:
     """Serve the raw and the compensated wrench to viewers.
 
     Foxglove, Lichtblick and PlotJuggler from 3.16 connect to one WebSocket server. They receive every sample of the
-    sensor, poses, joint angles, frames, arrows and events, and can tare and change frame and stages. The arm is only
-    read, never moved. Ctrl-C ends.
+    sensor, poses, joint angles, frames, arrows and events. Programs can tare and change frame and stages. A page in a
+    browser is served if it is of Foxglove or Lichtblick. The arm is only read, never moved. Ctrl-C ends.
     """
     from ftdrive.servers.foxglove import FoxgloveServer
 
@@ -66,7 +70,9 @@ def stream(
         source = open_source(
             path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
         )
-        server = stack.enter_context(closing(FoxgloveServer(source, host, port)))
+        server = stack.enter_context(
+            closing(FoxgloveServer(source, host, port, origins=origins, allow_control=allow_control))
+        )
         sinks: list[FoxgloveServer | UdpSender] = [server]
         if udp_address is not None:
             sinks.append(stack.enter_context(closing(UdpSender(source.info, *udp_address))))
@@ -110,15 +116,15 @@ def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     url = f"ws://{with_port(name, server.port)}"
     talk.print(f"Serving the wrench in {source.frame}; {source.info.calibration_name}.")
-    talk.print(f"  Foxglove, Lichtblick:  Open connection > Foxglove WebSocket > {url}")
-    talk.print(f"  PlotJuggler from 3.16: Streaming > Foxglove Bridge > {url}")
+    print_address("  Foxglove, Lichtblick:  Open connection > Foxglove WebSocket > ", url)
+    print_address("  PlotJuggler from 3.16: Streaming > Foxglove Bridge > ", url)
     if udp is not None:
         talk.print(f"  PlotJuggler before:    Streaming > UDP Server > port {udp[1]}, JSON, use the timestamp")
     if is_loopback(host):
-        talk.print(f"  In a browser:          {server.app_url}")
+        print_address("  In a browser:          ", server.app_url)
     else:
         talk.print(
-            f"Unprotected: any computer that reaches port {server.port} can read the stream, tare it and change its "
-            "frame and stages. There is no password and no encryption."
+            f"Unprotected: a program on any computer that reaches port {server.port} can read the stream, tare it and "
+            "change its frame and stages. There is no password and no encryption."
         )
     talk.print("Ctrl-C ends.")

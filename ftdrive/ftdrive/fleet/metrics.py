@@ -7,6 +7,7 @@ from typing import Any, Final
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.fleet.serve import Reading
 from ftdrive.fleet.state import CellState
+from ftdrive.http_gate import Gate, hidden_host
 
 try:
     from prometheus_client import CollectorRegistry, start_http_server
@@ -82,16 +83,19 @@ class MetricsServer(Collector):
         self._reading: Reading | None = None
         registry = CollectorRegistry()
         registry.register(self)
+        behind = hidden_host()
+        self._server, self._thread = start_http_server(0, behind, registry)
         try:
-            self._server, self._thread = start_http_server(port, host, registry)
+            self._gate = Gate((host, port), lambda _: (behind, self._server.server_port))
         except OSError as error:
+            self._stop()
             raise ConfigError(
                 f"/metrics cannot be served at {host}:{port} ({error.strerror}): choose another"
             ) from None
         self._metrics = self._server.get_app()
         if page is not None:
             self._server.set_app(self._answer)
-        self.port: int = self._server.server_port
+        self.port = self._gate.port
 
     def update(self, reading: Reading) -> None:
         """Serve this reading from now on."""
@@ -109,6 +113,10 @@ class MetricsServer(Collector):
 
     def close(self) -> None:
         """Stop serving."""
+        self._gate.close()
+        self._stop()
+
+    def _stop(self) -> None:
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()

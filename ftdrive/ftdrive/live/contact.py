@@ -1,6 +1,8 @@
 """Contact: which readings a free tool does not explain, and what touched it from when to when."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,14 +10,23 @@ from scipy.special import chdtri, fdtri
 
 from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from ftcalib.model import Array, Parameters
-from ftdrive.live.noise import Noise, samples_in_reading
+from ftdrive.live.motion import Motion, samples_in_reading
+from ftdrive.live.noise import Noise, NoiseEstimator
 from ftdrive.live.samples import Ns
+from ftdrive.live.tare import TARE_DRIFT_N, TARE_DRIFT_NM
 
 _TURN_RAD = 0.02
 """The covariance of a calibration is evaluated again after so much turning."""
-_LEAST_NS = 60_000_000
-"""A shorter contact is no event: three readings in a row beyond the limit are no false alarm. So short a pause does
-not end one."""
+_STEP = 10
+"""The offset of a free tool at rest follows after so many readings."""
+_GAIN = 0.1
+"""Share of the difference that one step takes away: the offset follows within 2 s."""
+_DRIFT = np.repeat([TARE_DRIFT_N, TARE_DRIFT_NM], 3)
+"""The offset follows no farther than this beyond three sigmas of the prediction."""
+_INEXACT = 1.5
+"""The wrench of a motion may be larger than that by poses 20 ms apart."""
+_OF_LAST, _ENOUGH = 5, 4
+"""So many of the last readings begin or end a contact."""
 
 
 class ContactTest:
@@ -23,6 +34,10 @@ class ContactTest:
 
     A reading is the mean of the samples of the last `READING_S` seconds, so each sample ends one; independent are those
     without common samples. The distance of a free tool follows Hotelling's T², because the noise is estimated too.
+
+    At rest the test follows the offset of the free tool, so that neither drift nor the error of the calibration in this
+    orientation is a contact. A load that grows by less than the limit within 2 s counts as drift, up to 0.5 N and
+    15 mN·m beyond three sigmas of the calibration.
 
     Parameters
     ----------
@@ -38,58 +53,99 @@ class ContactTest:
         self.false_alarm_rate = false_alarm_rate
         self._size = samples_in_reading(rate_Hz)
         self._beyond = np.diag(beyond)
-        self._noise: Noise | None = None
         self._calibration: tuple[Parameters, Array, Response | None] | None = None
-        self._known: tuple[Array, Array] | None = None
-        """Orientation and the matrix that makes its readings white."""
         self.uncertainty = np.zeros((6, 6))
         """Covariance of the prediction at the newest orientation, sensor axes."""
         self.limit = float(chdtri(6, false_alarm_rate))
-        """Of the squared distance."""
+        """Of the squared distance of the newest reading."""
         self.restart()
 
     def restart(self) -> None:
-        """Forget earlier samples."""
+        """Forget earlier samples and the offset."""
         self._earlier = np.zeros((self._size - 1, 6))
+        self._R: Array | None = None
+        self._offset = np.zeros(6)
+        self._share = 1.0
+        """Of the variance of the prediction that the offset still has."""
+        self._sum, self._count, self._is_free = np.zeros(6), 0, True
+        """Of the samples since the last step of the offset."""
+        self._whitening: tuple[tuple[Noise, float], Array] | None = None
 
-    def expect(self, noise: Noise | None, calibration: tuple[Parameters, Array, Response | None]) -> None:
-        """Set what a free tool scatters by: noise, and parameters, covariance and response of the calibration."""
-        if noise is not self._noise or self._calibration is None or calibration[0] is not self._calibration[0]:
-            self._known = None
-        if noise is not None and noise is not self._noise:
-            self.limit = _hotelling(self.false_alarm_rate, noise.dof)
-        self._noise, self._calibration = noise, calibration
+    def expect(self, calibration: tuple[Parameters, Array, Response | None]) -> None:
+        """Set parameters, covariance and response of the calibration, which predict a free tool."""
+        if self._calibration is None or calibration[0] is not self._calibration[0]:
+            self._R = None
+        self._calibration = calibration
 
-    def judge(self, residual: Array, R_base_flange: Array) -> tuple[Array, Array]:
-        """Return the readings (n, 6) and their squared distances (n,); those are NaN until the noise is known."""
+    def judge(
+        self,
+        residual: Array,
+        R_base_flange: Array,
+        motion: tuple[NDArray[np.bool_], Array],
+        noise: NoiseEstimator,
+    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Return the readings (n, 6), their squared distances (n,), and whether each is beyond the limit (n,).
+
+        The distances are NaN until the noise is known. `motion` is that of `MotionTracker.follow`: a free tool
+        may differ by its wrenches.
+        """
+        moving, wrenches = motion
         rows = np.concatenate([self._earlier, residual])
         self._earlier = rows[len(residual) :]
         sums = np.cumsum(np.concatenate([np.zeros((1, 6)), rows]), axis=0)
         readings = (sums[self._size :] - sums[: -self._size]) / self._size
-        if self._noise is None or self._calibration is None:
-            return readings, np.full(len(readings), np.nan)
-        chi2 = np.empty(len(readings))
-        starts, whiten = self._whitening(R_base_flange, self._noise, self._calibration)
-        for start, stop, W in zip(starts, [*starts[1:], len(chi2)], whiten, strict=True):
-            white = readings[start:stop] @ W.T
-            chi2[start:stop] = np.einsum("ij,ij->i", white, white)
-        return readings, chi2
+        chi2, beyond = np.full(len(readings), np.nan), np.zeros(len(readings), np.bool_)
+        for part in self._parts(R_base_flange, moving):
+            self._turn(R_base_flange[part.start])
+            state = Motion.MOVING if moving[part.start] else Motion.REST
+            if (known := noise.of(state)) is not None:
+                W = self._whiten(known)
+                distance = np.linalg.norm((readings[part] - self._offset) @ W.T, axis=1)
+                distance -= _INEXACT * np.linalg.norm(wrenches[:, part] @ W.T, axis=2).sum(axis=0)
+                chi2[part] = np.square(np.maximum(distance, 0.0))
+                beyond[part] = chi2[part] > self.limit
+                self._follow_offset(residual[part], state, is_free=not beyond[part].any())
+        return readings, chi2, beyond
 
-    def _whitening(
-        self, R_base_flange: Array, noise: Noise, calibration: tuple[Parameters, Array, Response | None]
-    ) -> tuple[list[int], list[Array]]:
-        """Return where the orientation has changed, and the whitening matrix from there on."""
-        if self._known is not None and np.abs(R_base_flange - self._known[0]).max() < _TURN_RAD:
-            return [0], [self._known[1]]
-        turned = np.sqrt(np.square(np.diff(R_base_flange, axis=0)).sum(axis=(1, 2)) / 2)
+    def _parts(self, R_base_flange: Array, moving: NDArray[np.bool_]) -> Iterator[slice]:
+        """Yield parts of one orientation, one state of motion and one offset."""
+        turned = np.sqrt(np.square(np.diff(R_base_flange, axis=0, prepend=R_base_flange[:1])).sum(axis=(1, 2)) / 2)
         cell = np.floor(np.cumsum(turned) / _TURN_RAD)
-        starts = [0, *(np.flatnonzero(np.diff(cell, prepend=0.0)) + 1).tolist()]
-        R = R_base_flange[starts]
-        uncertainty = predicted_covariance(*calibration, R) + self._beyond
-        whiten = np.linalg.inv(np.linalg.cholesky(uncertainty + noise.reading))
-        self.uncertainty = uncertainty[-1]
-        self._known = R[-1], whiten[-1]
-        return starts, list(whiten)
+        step = (self._count + np.arange(len(moving))) // (_STEP * self._size)
+        edges = np.flatnonzero(np.diff(cell) + np.diff(step) + np.diff(moving)) + 1
+        for start, stop in pairwise([0, *edges.tolist(), len(moving)] if len(moving) else []):
+            yield slice(start, stop)
+
+    def _turn(self, R_base_flange: Array) -> None:
+        """Evaluate the covariance of the prediction at another orientation, where its error is another one."""
+        if self._calibration is None or (self._R is not None and np.abs(R_base_flange - self._R).max() < _TURN_RAD):
+            return
+        self._R = R_base_flange
+        self.uncertainty = predicted_covariance(*self._calibration, R_base_flange) + self._beyond
+        self._share = 2.0 if self._offset.any() else 1.0
+        self._whitening = None
+
+    def _whiten(self, noise: Noise) -> Array:
+        """Return the matrix that makes the readings of a free tool white."""
+        key = noise, self._share
+        if self._whitening is None or self._whitening[0] != key:
+            covariance = self._share * self.uncertainty + noise.reading + noise.wander
+            self._whitening = key, np.linalg.inv(np.linalg.cholesky(covariance))
+            self.limit = _hotelling(self.false_alarm_rate, noise.dof)
+        return self._whitening[1]
+
+    def _follow_offset(self, residual: Array, state: Motion, *, is_free: bool) -> None:
+        """Take samples of one step of the offset into account."""
+        self._sum = self._sum + residual.sum(axis=0)
+        self._count += len(residual)
+        self._is_free &= is_free and state is Motion.REST
+        if self._count < _STEP * self._size:
+            return
+        if self._is_free:
+            most = _DRIFT + 3 * np.sqrt(np.diag(self.uncertainty))
+            self._offset = np.clip(self._offset + _GAIN * (self._sum / self._count - self._offset), -most, most)
+            self._share *= (1 - _GAIN) ** 2
+        self._sum, self._count, self._is_free = np.zeros(6), 0, True
 
 
 def _hotelling(rate: float, dof: float) -> float:
@@ -145,40 +201,75 @@ class Contact:
 
 
 class ContactTracker:
-    """Joins readings beyond the limit to contacts. A shorter one than `_LEAST_NS` is none."""
+    """Joins readings beyond the limit to contacts: four of the last five begin one, and four that are not end it.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    rate_Hz : float
+        Of the sensor.
+    """
+
+    def __init__(self, rate_Hz: float) -> None:
+        self._lag = samples_in_reading(rate_Hz)
+        self._forget()
+
+    def _forget(self) -> None:
+        n = (_OF_LAST - 1) * self._lag
         self.open: Contact | None = None
-        self._is_confirmed = False
+        self._earlier = np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros((n, 6))
 
-    def follow(self, t_ns: Ns, in_contact: NDArray[np.bool_], readings: Array) -> list[Contact]:
-        """Return each contact once it has lasted long enough, and again when it is over.
+    def follow(self, t_ns: Ns, beyond: NDArray[np.bool_], readings: Array) -> tuple[NDArray[np.bool_], list[Contact]]:
+        """Add readings, each of which ends at a sample.
 
-        `readings` (n, 6) are in the frame of the stream.
+        Parameters
+        ----------
+        t_ns : array, shape (n,)
+        beyond : array, shape (n,)
+            Whether they are beyond the limit.
+        readings : array, shape (n, 6)
+            In the frame of the stream.
+
+        Returns
+        -------
+        in_contact : array, shape (n,)
+        changes : list of Contact
+            Each that has begun, and each that is over.
         """
+        n, before = len(t_ns), len(self._earlier[0])
+        t_ns = np.concatenate([self._earlier[0], t_ns])
+        beyond = np.concatenate([self._earlier[1], beyond])
+        readings = np.concatenate([self._earlier[2], readings])
+        self._earlier = t_ns[n:], beyond[n:], readings[n:]
+        count = np.sum([beyond[k * self._lag :][:n] for k in range(_OF_LAST)], axis=0)
+        begins = count >= _ENOUGH
+        newest = np.maximum.accumulate(np.where(begins | (count <= _OF_LAST - _ENOUGH), np.arange(n), -1))
+        in_contact = np.where(newest < 0, self.open is not None, begins[newest])
         changes = list[Contact]()
-        if in_contact.any():
-            edges = np.flatnonzero(np.diff(in_contact, prepend=False, append=False)).reshape(-1, 2)
-            pauses = t_ns[edges[1:, 0]] - t_ns[edges[:-1, 1] - 1]
-            first = np.flatnonzero(np.concatenate([[True], pauses > _LEAST_NS]))
-            for start, stop in zip(edges[first, 0], edges[np.append(first[1:], len(edges)) - 1, 1], strict=True):
-                if self.open is not None and t_ns[start] - self.open.last_ns > _LEAST_NS:
-                    changes += self.end()
-                contact = self.open or Contact(int(t_ns[start]), 0, -1.0, readings[start])
-                force_N = np.linalg.norm(readings[start:stop, :3], axis=1)
-                k = int(np.argmax(force_N))
-                if force_N[k] > contact.peak_N:
-                    contact = replace(contact, peak_N=float(force_N[k]), peak=readings[start + k])
-                self.open = contact = replace(contact, last_ns=int(t_ns[stop - 1]))
-                if not self._is_confirmed and contact.last_ns - contact.begin_ns >= _LEAST_NS:
-                    self._is_confirmed = True
-                    changes.append(contact)
-        if self.open is not None and len(t_ns) and t_ns[-1] - self.open.last_ns > _LEAST_NS:
-            changes += self.end()
-        return changes
+        if n and self.open is not None and not in_contact[0]:
+            changes += self._over()
+        for start, stop in np.flatnonzero(np.diff(in_contact, prepend=False, append=False)).reshape(-1, 2):
+            first = start + before if self.open is not None else start  # it has begun within the last readings
+            at = first + np.flatnonzero(beyond[first : before + stop])
+            if not len(at):
+                continue
+            contact = self.open or Contact(int(t_ns[at[0]]), 0, -1.0, readings[at[0]])
+            force_N = np.linalg.norm(readings[at, :3], axis=1)
+            k = int(np.argmax(force_N))
+            if force_N[k] > contact.peak_N:
+                contact = replace(contact, peak_N=float(force_N[k]), peak=readings[at[k]])
+            contact = replace(contact, last_ns=int(t_ns[at[-1]]))
+            changes += [] if self.open is not None else [contact]
+            self.open = contact
+            if stop < n:
+                changes += self._over()
+        return in_contact, changes
+
+    def _over(self) -> list[Contact]:
+        contact, self.open = self.open, None
+        return [] if contact is None else [replace(contact, over=True)]
 
     def end(self) -> list[Contact]:
         """End an open contact, as at the end of a recording or when frame or bias change."""
-        contact, was_confirmed = self.open, self._is_confirmed
-        self.open, self._is_confirmed = None, False
-        return [replace(contact, over=True)] if contact is not None and was_confirmed else []
+        over = self._over()
+        self._forget()
+        return over

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from ftdrive.live.noise import READING_S, Noise
+from ftdrive.live.motion import READING_S
+from ftdrive.live.noise import Noise
 from ftdrive.live.samples import Ns
 from ftdrivers.interfaces import Array
 

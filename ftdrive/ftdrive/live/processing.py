@@ -17,7 +17,8 @@ from ftdrive.live.contact import Contact, ContactTest, ContactTracker
 from ftdrive.live.drift import DriftFilter
 from ftdrive.live.filters import LOWPASS_ORDER, NOTCH_Q, Filter, deadband
 from ftdrive.live.frames import FrameTransform
-from ftdrive.live.noise import READING_S, NoiseEstimator
+from ftdrive.live.motion import READING_S, Motion, MotionTracker
+from ftdrive.live.noise import NoiseEstimator
 from ftdrive.live.samples import (
     Block,
     EventKind,
@@ -35,7 +36,7 @@ from ftdrivers.interfaces import Array
 
 SENSOR_FRAME = WrenchFrame()
 STANDARD = Stages()
-FALSE_ALARM_RATE = 1e-3
+FALSE_ALARM_RATE = 1e-6
 _CHUNK_ROWS = 8192
 """More rows are processed in pieces that stay in the cache."""
 _KNOT_S = 0.002
@@ -52,7 +53,7 @@ class Processor:
     frame : WrenchFrame
     stages : Stages
     false_alarm_rate : float
-        Share of independent readings of a free tool that count as contact. See `ftdrive.live.contact`.
+        Share of independent readings of a free tool beyond the limit. See `ftdrive.live.contact`.
     inertia_com_kg_m2 : array, shape (3, 3), optional
         Inertia of the load about its centre of mass, in sensor axes; without it the load counts as a point.
 
@@ -80,10 +81,11 @@ class Processor:
         likely_error = calibration.likely_error()
         self._usual_error_N = float(likely_error[0])
         beyond = np.repeat((likely_error**2 - np.square(calibration.predicted_error())) / 3, 3)
+        self._motion = self._motion_tracker()
         self._noise = NoiseEstimator(info.sensor_rate_Hz)
         self._noise_is_learnt = False
         self._test = ContactTest(info.sensor_rate_Hz, false_alarm_rate, beyond)
-        self._tracker = ContactTracker()
+        self._tracker = ContactTracker(info.sensor_rate_Hz)
         self._drift = DriftFilter()
         self._drift_warned = False
         self._recent: deque[Paired] = deque()
@@ -153,7 +155,7 @@ class Processor:
             if len(paired) <= 2 * _CHUNK_ROWS:
                 return self._process(paired, last)
             chunks = [paired.rows(slice(i, i + _CHUNK_ROWS)) for i in range(0, len(paired), _CHUNK_ROWS)]
-            if self._noise.noise is None:
+            if self._noise.of(Motion.REST) is None:
                 self.learn_noise(paired)
             return Block.concatenate([self._process(chunk, last and chunk is chunks[-1]) for chunk in chunks])
 
@@ -183,9 +185,17 @@ class Processor:
         """Learn the noise from all of a recording, before it is processed and instead of during that."""
         with self._lock:
             self._noise_is_learnt = True
+            motion = self._motion_tracker()
             for i in range(0, len(paired), _CHUNK_ROWS):
                 rows = paired.rows(slice(i, i + _CHUNK_ROWS))
-                self._noise.add(self._free(rows)[0], rows.R_base_flange, rows.p_base_flange_m)
+                moving, wrenches = motion.follow(rows.R_base_flange, rows.p_base_flange_m)
+                self._noise.add(self._free(rows)[0] - wrenches[0], moving)
+
+    def _motion_tracker(self) -> MotionTracker:
+        calibration = self.info.calibration
+        return MotionTracker(
+            self.info.sensor_rate_Hz, calibration.mass_kg, calibration.parameters, self.info.p_flange_sensor_m
+        )
 
     def _free(self, rows: Paired) -> tuple[Array, Array, Array]:
         """Return the residual of a free tool at rest, (n, 6), its weight (n, 6) and the bias (6,)."""
@@ -219,16 +229,17 @@ class Processor:
         residual, gravity, bias = self._free(rows)  # chi2 is that of a free tool, whatever is switched off
         if inertial is not None:
             residual -= inertial
-        if n and not self._noise_is_learnt:
-            self._noise.add(residual, rows.R_base_flange, rows.p_base_flange_m)
+        moving, wrenches = self._motion.follow(rows.R_base_flange, rows.p_base_flange_m)
+        if inertial is not None:
+            wrenches[0] = 0.0
+        if not self._noise_is_learnt:
+            self._noise.add(residual - wrenches[0], moving)
         current = self._tares[-1][0]
-        uncertain = (current.parameters, current.covariance, current.response)
-        self._test.expect(self._noise.noise, uncertain)
-        if n:
-            readings, chi2 = self._test.judge(residual, rows.R_base_flange)
-        else:
-            readings, chi2 = np.empty((0, 6)), np.empty(0)
-        in_contact = chi2 > self._test.limit
+        self._test.expect((current.parameters, current.covariance, current.response))
+        readings, chi2, beyond = self._test.judge(residual, rows.R_base_flange, (moving, wrenches), self._noise)
+        readings = self._transform(readings, rows.R_base_flange)
+        in_contact, contacts = self._tracker.follow(rows.t_host_ns, beyond, readings)
+        self._report_contacts(contacts)
         wrench = residual
         if not stages.gravity:
             wrench = wrench + gravity
@@ -236,9 +247,6 @@ class Processor:
             wrench = wrench + bias
         wrench = self._transform(self._filter(wrench), rows.R_base_flange)
         wrench = deadband(wrench, stages.deadband_N, stages.deadband_Nm)
-        if self._tracker.open is not None or in_contact.any():
-            readings = self._transform(readings, rows.R_base_flange)
-            self._report_contacts(self._tracker.follow(rows.t_host_ns, in_contact, readings))
         self._follow_drift(rows, residual)
         return Block(
             rows.t_host_ns,
@@ -262,7 +270,7 @@ class Processor:
 
         NaN until it is known. `R_base_flange` (3, 3) is that of the sample.
         """
-        noise = self._noise.noise
+        noise = self._noise.of(Motion.REST)
         if noise is None:
             return np.full(6, np.nan)
         if mean_s > 0:
@@ -282,6 +290,7 @@ class Processor:
         with self._lock:
             self._report_contacts(self._tracker.end())
             self._test.restart()
+            self._motion = self._motion_tracker()
             self._filter = self._filter_of(self._stages)
             self._recent.clear()
             self._buffer, self._done = None, 0
@@ -397,7 +406,7 @@ class Processor:
         self._filter = self._filter_of(self._stages)
 
     def _follow_drift(self, rows: Paired, residual: Array) -> None:
-        noise = self._noise.noise
+        noise = self._noise.of(Motion.REST)
         if noise is None or not self._drift.follow(
             rows.t_host_ns, residual, rows.R_base_flange, noise, np.diag(self._test.uncertainty)
         ):
@@ -416,7 +425,7 @@ class ProcessedStream(ABC):
     info: StreamInfo
     clock: Clock
     on_contact: Callable[[Contact], object] | None = None
-    """Called by the thread that reads, once when a contact has lasted 60 ms and once when it is over."""
+    """Called by the thread that reads, once when a contact has lasted 60 to 80 ms and once when it is over."""
     _processor: Processor
 
     def _process(self, paired: Paired, *, last: bool = False) -> Block:

@@ -46,7 +46,7 @@ class ReplayedStream(ProcessedStream):
     clock : Clock
         Of the one who watches.
     false_alarm_rate : float
-        Share of readings of a free tool that count as contact.
+        Share of readings of a free tool beyond the limit; four of five begin a contact.
     """
 
     def __init__(

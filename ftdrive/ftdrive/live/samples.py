@@ -124,9 +124,9 @@ class Block:
     wrench: Array
     """(n, 6) after `stages`, N and N·m, in `frame`."""
     chi2: Array
-    """(n,) squared Mahalanobis distance from a free tool, 6 degrees of freedom, before filter and deadband."""
+    """(n,) squared Mahalanobis distance of the last 20 ms from a free tool, beyond what motion explains."""
     in_contact: NDArray[np.bool_]
-    """(n,)"""
+    """(n,) see `Sample`."""
     q_rad: Array
     """(n, 6) joint angles, interpolated."""
     R_base_flange: Array
@@ -190,6 +190,13 @@ class Sample:
     raw: Array
     """(6,) as measured, sensor axes, about the sensor origin."""
     in_contact: bool
+    """Whether four of the last five readings exceed the limit; it ends when four do not.
+
+    A reading is the mean over 20 ms, so a contact begins after 60 to 80 ms. One reading of a free tool in a million
+    exceeds the limit (`false_alarm_rate`); the limit follows the noise, also behind a filter of the sensor. At rest, a
+    force that grows by less than the limit in 2 s counts as drift, up to 0.5 N and 15 mN·m. In motion, inertia that is
+    not subtracted counts as unknown, so a smaller contact is not found.
+    """
     frame: WrenchFrame
 
 

@@ -74,7 +74,7 @@ class CompensatedStream(ProcessedStream):
     stages : Stages
         May be set at any time.
     false_alarm_rate : float
-        Share of readings of a free tool that count as contact.
+        Share of readings of a free tool beyond the limit; four of five begin a contact.
     devices : ForceTorqueSensor and RobotArm, optional
         Used in place of those that the cell names.
 
@@ -157,7 +157,7 @@ class CompensatedStream(ProcessedStream):
     def station(self) -> Station:
         """The emulated cell, such as `station.control(do="push", wrench=[0, 0, -5, 0, 0, 0], seconds=1)`.
 
-        mocks/README.md lists the requests. Raises `ConfigError` for a real cell.
+        docs/reference/emulated-cell.md lists the requests. Raises `ConfigError` for a real cell.
         """
         if not isinstance(self._given, Station):
             raise ConfigError("this is a real cell: only a stream with simulate=True has a station")

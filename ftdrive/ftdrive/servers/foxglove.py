@@ -1,7 +1,8 @@
 """A WebSocket server for Foxglove, Lichtblick and PlotJuggler from 3.16.
 
 Wrenches, poses and joint angles are ROS 2 messages, because the viewers know no other wrench and PlotJuggler no other
-encoding. Frames, arrows and events are Foxglove's own. A client can tare, and set the frame and the stages.
+encoding. Frames, arrows and events are Foxglove's own. A program can tare, and set frame and stages. A page in a
+browser is served from a short list of origins, and can do so if control is allowed: see `http_gate`.
 """
 
 import json
@@ -9,18 +10,20 @@ import logging
 import os
 import socket
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+from urllib.parse import urlencode
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
+from ftdrive.http_gate import Gate, hidden_host
 from ftdrive.live import ros2
 from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.samples import Block, StreamEvent
@@ -40,6 +43,14 @@ from ftdrive.servers import scene
 from ftdrive.servers.parameters import Parameters
 
 TRANSFORMS, ARROWS, EVENTS, STATUS = "/tf", "/wrench_arrows", "/events", "/stream_status"
+
+VIEWERS: Final = (
+    "https://app.foxglove.dev",
+    "https://studio.foxglove.dev",
+    "file://",  # the desktop programs; a browser sends it or null for pages of a disk
+    "http://localhost:8080",  # Lichtblick's container
+)
+"""Origins of Foxglove and Lichtblick."""
 
 SCENE_HZ = 60.0
 """Of frames and arrows: no screen shows more."""
@@ -65,6 +76,10 @@ class FoxgloveServer:
     ----------
     port : int
         0 lets the system choose; see `port`.
+    origins : collection of str
+        Of pages that are served, beside `VIEWERS`.
+    allow_control : bool
+        Pages may tare and set parameters too. Programs always may.
 
     Raises
     ------
@@ -72,7 +87,15 @@ class FoxgloveServer:
         The address cannot be used.
     """
 
-    def __init__(self, stream: ProcessedStream, host: str = "127.0.0.1", port: int = 8765) -> None:
+    def __init__(
+        self,
+        stream: ProcessedStream,
+        host: str = "127.0.0.1",
+        port: int = 8765,
+        *,
+        origins: Collection[str] = (),
+        allow_control: bool = False,
+    ) -> None:
         self._stream = stream
         self._info = stream.info
         self._context = context = Context()  # server and channels keep only weak references
@@ -92,36 +115,49 @@ class FoxgloveServer:
         }
         self._sent = dict.fromkeys(self._channels, 0)
         self._arm, self._scene, self._status = Picked(self._info.arm_rate_Hz), Picked(SCENE_HZ), Picked(STATUS_HZ)
-        self._slow_clients = _SlowClients()
+        self._slow_clients = _SlowClients(self._with_clients)
         sdk.set_log_level("INFO")
+        behind = hidden_host()
+        options: dict[str, Any] = {
+            "name": f"ftdrive: {self._info.tool}, {self._info.calibration_name}",
+            "host": behind,
+            "port": 0,
+            "context": context,
+            "message_backlog_size": BACKLOG,
+        }
+        self._control = sdk.start_server(
+            **options,
+            capabilities=[Capability.Parameters, Capability.Services],
+            supported_encodings=["json"],
+            services=[self._service("tare", stream.tare), self._service("undo_tare", stream.undo_tare)],
+            server_listener=Parameters(stream, self._warn),
+        )
+        self._read_only = sdk.start_server(**options)  # the SDK sees no Origin, so its rights are those of a server
+        self._servers = self._control, self._read_only
+        for server in self._servers:
+            _send_at_once(server.port)
+
+        def route(origin: str | None) -> tuple[str, int]:
+            return behind, (self._control if origin is None or allow_control else self._read_only).port
+
         try:
-            self._server = sdk.start_server(
-                name=f"ftdrive: {self._info.tool}, {self._info.calibration_name}",
-                host=host,
-                port=port,
-                capabilities=[Capability.Parameters, Capability.Services],
-                supported_encodings=["json"],
-                services=[self._service("tare", stream.tare), self._service("undo_tare", stream.undo_tare)],
-                server_listener=Parameters(stream, self._warn),
-                context=context,
-                message_backlog_size=BACKLOG,
-            )
-        except RuntimeError as error:
-            self._slow_clients.close()
+            self._gate = Gate((host, port), route, origins=(*VIEWERS, *origins))
+        except OSError as error:
+            self._stop()
             raise ConfigError(
-                f"the server cannot listen on {host}:{port} ({error}): choose another --port or --host"
+                f"the server cannot listen on {host}:{port} ({error.strerror}): choose another --port or --host"
             ) from error
-        _send_at_once(self._server.port)
 
     @property
     def port(self) -> int:
         """The port on which it listens."""
-        return self._server.port
+        return self._gate.port
 
     @property
     def app_url(self) -> str:
         """The address of Foxglove in a browser, with this server as its source."""
-        return self._server.app_url() or ""
+        source = {"ds": "foxglove-websocket", "ds.url": f"ws://127.0.0.1:{self.port}"}
+        return f"https://app.foxglove.dev?{urlencode(source)}"
 
     def write(self, block: Block) -> None:
         """Send a block; never waits."""
@@ -150,8 +186,16 @@ class FoxgloveServer:
 
     def close(self) -> None:
         """Disconnect the clients."""
-        self._server.stop()
+        self._gate.close()
+        self._stop()
+
+    def _stop(self) -> None:
+        for server in self._servers:
+            server.stop()
         self._slow_clients.close()
+
+    def _with_clients(self, log: str) -> str:
+        return self._gate.with_clients(log)
 
     def _send(self, topic: str, t_ns: NDArray[np.int64], pack: Callable[[], Sequence[object]]) -> None:
         channel = self._channels[topic]
@@ -173,7 +217,7 @@ class FoxgloveServer:
         }
 
     def _warn(self, text: str) -> None:
-        self._server.publish_status(text, StatusLevel.Warning)
+        self._control.publish_status(text, StatusLevel.Warning)
 
     def _service(self, name: str, action: Callable[[], StreamEvent]) -> Service:
         def handle(_: ServiceRequest) -> bytes:
@@ -209,8 +253,9 @@ def _send_at_once(port: int) -> None:
 class _SlowClients(logging.Handler):
     """Logs the clients that the SDK names as slow, in our words."""
 
-    def __init__(self) -> None:
+    def __init__(self, with_clients: Callable[[str], str]) -> None:
         super().__init__(logging.INFO)
+        self._with_clients = with_clients
         logging.getLogger("foxglove").setLevel(logging.WARNING)
         self._source = logging.getLogger("foxglove.websocket.connected_client.send_lossy")
         self._source.setLevel(logging.INFO)
@@ -219,7 +264,8 @@ class _SlowClients(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Log a report."""
-        _log.warning("a client reads too slowly, so its oldest messages are dropped (%s)", record.getMessage())
+        report = self._with_clients(record.getMessage())
+        _log.warning("a client reads too slowly, so its oldest messages are dropped (%s)", report)
 
     def close(self) -> None:
         """Stop."""

@@ -1,1 +1,1 @@
-"""A guided session: README.md has the states, the guards and the checks."""
+"""A guided session: docs/explanation/safety.md has the states, the guards and the checks."""

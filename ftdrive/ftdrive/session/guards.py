@@ -1,7 +1,8 @@
 """Guards that watch the arm under control, by rows of the hazard table; `watchdog.py` runs them in a thread.
 
 A guard judges one `Seen` and raises `Tripped`. No guard is a safety function: safety is the task of the robot's safety
-system and the user's risk assessment. README.md lists every row, its guard and the test that injects it.
+system and the user's risk assessment. docs/reference/hazards.md lists every row, its guard
+and the test that injects it.
 """
 
 from abc import ABC, abstractmethod

@@ -1,4 +1,4 @@
-"""The rows of the hazard table (README.md), by name; the values are the numbers of its rows."""
+"""The rows of the hazard table (docs/reference/hazards.md), by name; the values are the numbers of its rows."""
 
 from enum import IntEnum
 

@@ -3,17 +3,31 @@
 import os
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, TextIO
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
+from rich.style import Style
 from rich.text import Text
 
 from ftdrive.terminal.hints import as_typed
+from ftdrive.terminal.text import visible
 
 
-class Talk(Console):
+class _Console(Console):
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Render with control characters made visible, whatever file, device or network they come from."""
+        for one in super().render(renderable, options):
+            yield one if one.control else Segment(visible(one.text), one.style)
+
+    def on_broken_pipe(self) -> None:
+        """Leave a closed pipe to `ftdrive.cli.run`."""
+        raise BrokenPipeError
+
+
+class Talk(_Console):
     """A console that knows whether details are wanted (`-v`); `quiet` is the console's own."""
 
     verbose = False
@@ -31,6 +45,17 @@ class Talk(Console):
 
 talk = Talk(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
 """Folds between words in a terminal, never in a file. Prints brackets and colons as they are: paths contain them."""
+
+
+def printer() -> Console:
+    """Return a console for stdout: results as text. It prints brackets and colons as they are."""
+    return _Console(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+
+
+def print_address(words: str, address: str) -> None:
+    """Print an address behind words: on one line, however narrow the terminal is, and as a link where it can."""
+    talk.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
+
 
 _NARROWEST = 20
 """Columns behind a head: with fewer, lines begin at the left."""
@@ -50,12 +75,12 @@ def hanging(head: str | Text, words: str, console: Console = talk) -> Text:
 
 
 def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
-    """Break lines between words where they are longer than the terminal is wide; as it is for a file or pipe.
+    """Break lines between words where they are longer than the terminal is wide, but not for a file or pipe.
 
-    For what is written without `talk`. A word that is longer by itself, such as a path, stays whole. Where `head` is
-    what the text begins with, its lines go on behind it, as in `hanging`.
+    For what is written without `talk`; control characters become visible. A word that is longer by itself, such as a
+    path, stays whole. Where `head` is what the text begins with, its lines go on behind it, as in `hanging`.
     """
-    text = as_typed(text)
+    text = visible(as_typed(text))
     try:
         width = os.get_terminal_size(file.fileno()).columns
     except (OSError, ValueError):  # no terminal; nothing of the system

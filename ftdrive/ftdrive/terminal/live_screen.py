@@ -53,6 +53,7 @@ _HELP = """\
  b mark: text for recording and plots  r start or complete a recording
  p reset the peaks                     g span of the plots: 2, 10, 60, 600 s
 
+ Emulated cell: f push the tool with 8 N for 1 s
  Replay: space pause    ← → seek 5 s    . next samples    + - speed
 
  Plots: smallest and largest value of each column; dotted lines at 0 and at
@@ -62,7 +63,13 @@ _HELP = """\
  Any key returns."""
 
 
-def run_live(stream: Stream, *, recorder: Callable[[Path], Sink] | None = None, checks: Sequence[Check] = ()) -> None:
+def run_live(
+    stream: Stream,
+    *,
+    recorder: Callable[[Path], Sink] | None = None,
+    push: Callable[[], object] | None = None,
+    checks: Sequence[Check] = (),
+) -> None:
     """Show a stream until the user quits.
 
     Parameters
@@ -71,6 +78,8 @@ def run_live(stream: Stream, *, recorder: Callable[[Path], Sink] | None = None, 
         Open; it is read here, and closed by the caller.
     recorder : callable, optional
         Opens a recording in a new file; the key r starts and completes one.
+    push : callable, optional
+        Pushes the tool of an emulated cell, by the key f.
     checks : sequence of Check
         Findings about the cell that the stream does not know, such as "robot.payload".
 
@@ -81,7 +90,7 @@ def run_live(stream: Stream, *, recorder: Callable[[Path], Sink] | None = None, 
     """
     info = stream.info
     devices = check_calibration(info.calibration, {"arm": info.arm, "sensor": info.sensor})
-    feed = Feed(stream, recorder)
+    feed = Feed(stream, recorder, push)
     dataset = fitted_dataset(info.calibration, Path(info.calibration_name))
     app = LiveApp(feed, Summary(feed, [devices, *checks], dataset))
     feed.start()
@@ -210,6 +219,9 @@ def _press(feed: Feed, key: str) -> None:
         stream.tare()
     elif key == "u":
         stream.undo_tare()
+    elif key == "f" and feed.push is not None:
+        feed.push()
+        feed.note("the emulated tool is pushed")
     elif key == "r":
         feed.switch_recording()
     elif key == "x":

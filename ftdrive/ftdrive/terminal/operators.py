@@ -12,6 +12,7 @@ from ftdrive.session.events import SCHEMA_VERSION, Asked, Event
 from ftdrive.session.operator import Key, Question
 from ftdrive.terminal.console import in_whole_words
 from ftdrive.terminal.session_text import SessionText, TextLine
+from ftdrive.terminal.text import visible
 
 
 def match(question: Question, typed: str) -> str | None:
@@ -96,7 +97,7 @@ class JsonOperator(_Keyless):
     def _write(self, value: Mapping[str, Any]) -> None:
         line = json.dumps(value, allow_nan=False) + "\n"
         with self._lock:
-            self._stdout.write(line)
+            self._stdout.write(visible(line))
             self._stdout.flush()
 
 

@@ -4,7 +4,7 @@ import shutil
 import sys
 from collections.abc import Collection, Sequence
 
-import click
+from ftdrive.terminal.text import echo, visible
 
 GAP = "  "
 
@@ -20,6 +20,7 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: C
     folding : collection of str
         Titles of the columns whose texts may be folded.
     """
+    rows = [[visible(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
     width = sum(widths) + len(GAP) * (len(widths) - 1)
     narrowest = [
@@ -30,17 +31,18 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: C
     fits = sum(narrowest) + len(GAP) * (len(widths) - 1) <= columns
     if not (sys.stdout.isatty() and fits) or width <= columns:  # a terminal may break lines, never words
         head, *lines = (_line(row, widths) for row in (titles, *rows))
-        click.echo("\n".join([click.style(head, bold=True), *lines]))
+        echo("\n".join(["", *lines]), bold=head)
         return
-    from rich.console import Console
     from rich.table import Table
+
+    from ftdrive.terminal.console import printer
 
     table = Table(box=None, pad_edge=False, padding=(0, len(GAP), 0, 0), header_style="bold")
     for title, least in zip(titles, narrowest, strict=True):
         table.add_column(title, no_wrap=title not in folding, overflow="fold", min_width=least)
     for row in rows:
         table.add_row(*row)
-    Console(highlight=False, markup=False).print(table)
+    printer().print(table)
 
 
 def _line(row: Sequence[str], widths: Sequence[int]) -> str:

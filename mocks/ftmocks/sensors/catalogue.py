@@ -1,6 +1,6 @@
 """The sensors a station can start, by name, with the emulator and the address of each.
 
-The addresses have the form of drivers/README.md; another client takes the path or port from them.
+The addresses have the form of docs/reference/sensors.md; another client takes the path or port from them.
 """
 
 from collections.abc import Callable

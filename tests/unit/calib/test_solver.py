@@ -151,7 +151,7 @@ def test_sigmas_of_the_closed_forms_are_their_own(method: Method, monkeypatch: p
     assert stated[:3].sum() > 2 * best[:3].sum()  # torques add information about the rotation
 
 
-def test_noise_is_estimated_from_the_residuals_when_nobody_measured_it() -> None:
+def test_noise_that_was_not_measured_is_estimated_from_the_residuals() -> None:
     rng = np.random.default_rng(4)
     stated = []
     for _ in range(12):

@@ -11,6 +11,7 @@ import click
 from ftdrive.commands.common import FORCE, FRAME, JSON, read_frame, write_json
 from ftdrive.commands.compensate import BIAS, CALIBRATION
 from ftdrive.commands.fleet.engine import ENGINE, open_workers, with_progress
+from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftdrive.live.samples import Axes
@@ -69,7 +70,7 @@ def compensate(
     if as_json:
         write_json(report.to_dict())
     else:
-        click.echo("\n".join(report.words()))
+        echo("\n".join(report.words()))
     if report.failed:
         count = f"{len(report.failed)} of {len(recordings)} recordings"
         raise NotAccepted(f"{count} could not be compensated: fix the reasons, and repeat")

@@ -47,7 +47,7 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
     from ftdrive.fleet.serve import serve as serve_fleet
     from ftdrive.fleet.status import fleet_state
     from ftdrive.servers.address import host_and_port, is_loopback, with_port
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import print_address, talk
     from ftdrivers.clock import REAL
 
     host, port = host_and_port("--metrics", address, f"127.0.0.1:{PORT}", lowest=0)
@@ -56,8 +56,8 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
     with ExitStack() as stack:
         metrics = stack.enter_context(closing(MetricsServer(host, port, partial(_page, found))))
         sinks: list[Sink] = [metrics]
-        talk.print(f"Serving {found.name} at http://{with_port(host, metrics.port)}/metrics")
-        talk.print(f"The page of the fleet is at http://{with_port(host, metrics.port)}/")
+        print_address(f"Serving {found.name} at ", f"http://{with_port(host, metrics.port)}/metrics")
+        print_address("The page of the fleet is at ", f"http://{with_port(host, metrics.port)}/")
         if not is_loopback(host):
             talk.print(f"Unprotected: any computer that reaches port {metrics.port} can read the state of all cells.")
         if broker_url is not None:

@@ -13,6 +13,7 @@ import click
 from ftdrive import __version__
 from ftdrive.commands.common import FOLDER, JSON, STORE, write_json
 from ftdrive.commands.fleet.engine import ENGINE, open_workers, runs_to_solve, with_progress
+from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftdrive.fleet.resolve import Comparison
@@ -107,19 +108,19 @@ class _Report:
     def print(self) -> None:
         """Print the numbers, then one line for each run that changed or failed."""
         now = self.runs - self.solved_before - len(self.failed)
-        click.echo(
+        echo(
             f"{self.runs} runs with ftdrive {__version__}: {now} solved now, {self.solved_before} before, "
             f"{len(self.failed)} failed."
         )
-        click.echo(
+        echo(
             f"{self.unchanged} unchanged, {len(self.changed)} changed by more than 3 sigmas, "
             f"{len(self.other_verdict)} with another verdict."
         )
         for one in self.changed:
             how = "was known and differs" if one["sigmas"] is None else f"changed by {one['sigmas']:+.1f} sigmas"
-            click.echo(f"changed: {one['run']}: {one['parameter']} {how}")
+            echo(f"changed: {one['run']}: {one['parameter']} {how}")
         for one in self.other_verdict:
             why = f" ({one['finding']['words']})" if one["finding"] else ""
-            click.echo(f"verdict: {one['run']}: {one['before'] or 'no result'} before, now {one['now']}{why}")
+            echo(f"verdict: {one['run']}: {one['before'] or 'no result'} before, now {one['now']}{why}")
         for one in self.failed:
-            click.echo(f"failed: {one['run']}: {one['reason']}")
+            echo(f"failed: {one['run']}: {one['reason']}")

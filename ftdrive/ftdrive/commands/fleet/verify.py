@@ -12,6 +12,7 @@ import click
 from ftdrive.commands.common import STORE, read_cell, store_url
 from ftdrive.commands.verify import Wanted, failure_in_words, verify_cell
 from ftdrive.errors import ConfigError
+from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftdrive.cell.config import CellConfig
@@ -45,7 +46,7 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     fleet = fleet_state(store, now)
     chosen = [one for one in _named(store.cells(), names) if not due or _is_due(one, fleet, now)]
     if not chosen:
-        click.echo("No cell is due.", err=True)
+        echo("No cell is due.", err=True)
     failed, errors, lines = list[str](), list[Exception](), list[str]()
     try:
         for one in chosen:
@@ -162,4 +163,4 @@ def _print(lines: Sequence[str]) -> None:
     from ftdrive.terminal.console import in_whole_words
 
     for line in lines:
-        click.echo(in_whole_words(line, sys.stdout))
+        echo(in_whole_words(line, sys.stdout))

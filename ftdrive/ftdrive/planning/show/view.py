@@ -4,7 +4,7 @@ import os
 import sys
 import webbrowser
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import closing, contextmanager, redirect_stdout
 from io import StringIO
 from itertools import pairwise
 from typing import Any
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ftdrive.errors import ConfigError
+from ftdrive.http_gate import Gate, hidden_host
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Plane
 from ftdrive.planning.motion import tips
@@ -19,7 +20,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.show.words import room_in_words
 from ftdrivers.ur.kinematics import Array
 
-HOST = "127.0.0.1"
+HOST, PORT = "127.0.0.1", 8080
 """Only this computer can open the view."""
 _FRAME_RAD = np.radians(3)
 _ARM, _TOOL, _TIP, _BALL, _OBSTACLE = (150, 155, 165), (235, 130, 40), (200, 40, 40), (90, 140, 230), (90, 160, 110)
@@ -42,14 +43,24 @@ def shown(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array = (
         from viser import ViserServer
     except ImportError:
         raise ConfigError("a view needs viser: install ftdrive with its extra viz, `ftdrive[viz]`") from None
+    behind = hidden_host()
     with redirect_stdout(StringIO()):  # it prints a banner; our stdout is data
-        server = ViserServer(host=HOST, label=f"ftdrive plan, {certifier.arm.name}", verbose=False)
+        server = ViserServer(host=behind, label=f"ftdrive plan, {certifier.arm.name}", verbose=False)
     try:
         _fill(server, plan, certifier, way_rad)
-        yield f"http://{HOST}:{server.get_port()}"  # another port if the default one is in use
+        with closing(_gate((behind, server.get_port()))) as gate:
+            yield f"http://{HOST}:{gate.port}"
     finally:
         with redirect_stdout(StringIO()):
             server.stop()
+
+
+def _gate(behind: tuple[str, int]) -> Gate:
+    """Return a gate at the usual port, or at a free one if that is in use."""
+    try:
+        return Gate((HOST, PORT), lambda _: behind)
+    except OSError:
+        return Gate((HOST, 0), lambda _: behind)
 
 
 def open_in_browser(url: str) -> None:

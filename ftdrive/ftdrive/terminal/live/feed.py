@@ -91,6 +91,8 @@ class Feed:
     stream : Stream
     recorder : callable, optional
         Opens a recording in a new file.
+    push : callable, optional
+        Pushes the tool of an emulated cell.
 
     Attributes
     ----------
@@ -111,8 +113,14 @@ class Feed:
         Files of all recordings.
     """
 
-    def __init__(self, stream: Stream, recorder: Callable[[Path], Sink] | None = None) -> None:
+    def __init__(
+        self,
+        stream: Stream,
+        recorder: Callable[[Path], Sink] | None = None,
+        push: Callable[[], object] | None = None,
+    ) -> None:
         self.stream = stream
+        self.push = push
         self.blocks: deque[Block] = deque(maxlen=_MOST_BLOCKS)
         self.notes: deque[Note] = deque()
         self.status = stream.status()

@@ -35,6 +35,19 @@ def frame(view: View, width: int, height: int) -> list[Line]:
     return [*head, *body, *[Line().to(width)] * (rows - len(body)), foot][:height]
 
 
+def plain(view: View, width: int) -> list[Line]:
+    """Draw the table and the state of both links, without keys and events."""
+    return [
+        panels.title(view, width),
+        panels.provenance(view, width),
+        panels.state(view, width),
+        panels.rule(view, width),
+        *panels.table(view, width, with_trace=True),
+        Line("─" * width, FAINT),
+        *panels.links(view, width),
+    ]
+
+
 def _narrow(view: View, width: int, rows: int) -> list[Line]:
     body = panels.table(view, width, with_trace=True)
     separator = Line("─" * width, FAINT)

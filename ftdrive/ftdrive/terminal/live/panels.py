@@ -63,7 +63,7 @@ def title(view: View, width: int) -> Line:
         right.join(_replay(view.replay)).add(" ")
     if view.recording_s is not None:
         right.add(f"● REC {_clock(view.recording_s)}", BAD, "r").add(" ")
-    return line.fit(width - right.width).join(right)
+    return line.fit(max(width - right.width - 1, 0)).add(" ").join(right).fit(width)
 
 
 def _replay(replay: Replay) -> Line:
@@ -298,9 +298,10 @@ def _contact(view: View) -> Line:
         return Line()
     if np.isnan(reading.chi2):
         return Line("noise not known yet", FAINT)
-    rate = f"1 in {1 / status.false_alarm_rate:.0f}" if status.false_alarm_rate else ""
+    rate = f"p {status.false_alarm_rate:.0e}".replace("e-0", "e-")
     sign = ">" if reading.chi2 > status.contact_limit else "<"
-    test = f"χ² {reading.chi2:.0f} {sign} {status.contact_limit:.1f}, {rate}"
+    chi2 = f"{reading.chi2:.0f}" if reading.chi2 < 1e5 else f"{reading.chi2:.0e}"
+    test = f"χ² {chi2} {sign} {status.contact_limit:.1f}, {rate}"
     if reading.in_contact:
         return Line("▲ CONTACT ", f"bold {CONTACT}").add(f"{view.contact_s:.1f} s  ").add(test, FAINT)
     return Line("free  ", GOOD).add(test, FAINT)
@@ -533,6 +534,8 @@ def _hanging(head: Line, words: Sequence[Part], width: int) -> list[Line]:
 def keys(view: View, width: int) -> Line:
     """List the keys; a click on one presses it."""
     names = ["t tare", "u undo", "x axes", "a about", "1-4 stage", "z freeze", "b mark", "r rec", "p peak", "g span"]
+    if view.can_push:
+        names.insert(0, "f push")
     if view.replay is not None:
         names = ["space pause", "←→ seek", ". step", "+- speed", "x axes", "a about", "1-4 stage", "b mark", "g span"]
     last = ["? help", "q quit"] if sum(map(cell_len, names)) + len(names) + 15 <= width else ["?", "q"]

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_noise_change
+from ftdrive.live.frames import FrameTransform
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block
 from ftdrive.live.stream import STALE_S
@@ -33,6 +34,7 @@ class _Sum(NamedTuple):
     n: int
     wrench: Array
     raw: Array
+    raw_in_frame: Array
 
 
 class Summary:
@@ -102,6 +104,7 @@ class Summary:
             columns=self._columns,
             recording_s=recording_s,
             is_frozen=self.is_frozen,
+            can_push=feed.push is not None,
             calibrated=self._calibrated,
             replay=_replay(feed.stream),
         )
@@ -128,6 +131,7 @@ class Summary:
             t_host_ns=int(newest.t_host_ns[-1]),
             wrench=np.sum([each.wrench for each in self._recent], axis=0) / n,
             raw=np.sum([each.raw for each in self._recent], axis=0) / n,
+            raw_in_frame=np.sum([each.raw_in_frame for each in self._recent], axis=0) / n,
             sigma=self._feed.sigma,
             sample_sigma=newest.sigma,
             chi2=float(newest.chi2[-1]),
@@ -154,9 +158,11 @@ class Summary:
             self._recent.clear()
         self._follow_contact(t_ns, in_contact, restarted=has_gone_back)
         self._newest = newest
+        to_frame = FrameTransform(newest.frame, self._feed.stream.info)
         for block in blocks:
-            end_ns = int(block.t_host_ns[-1])
-            self._recent.append(_Sum(end_ns, len(block), block.wrench.sum(axis=0), block.raw.sum(axis=0)))
+            end_ns, raw_in_frame = int(block.t_host_ns[-1]), to_frame(block.raw, block.R_base_flange)
+            sums = [values.sum(axis=0) for values in (block.wrench, block.raw, raw_in_frame)]
+            self._recent.append(_Sum(end_ns, len(block), *sums))
         while not self._now_ns - _MEAN_NS < self._recent[0].end_ns <= self._now_ns:
             self._recent.popleft()
         self._peaks.add(wrench)

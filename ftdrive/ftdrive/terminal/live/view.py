@@ -7,10 +7,12 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from rich.cells import cell_len, set_cell_size
+from rich.text import Text
 
 from ftdrive.checks.check import Check
 from ftdrive.live.samples import Stages, StreamInfo, StreamStatus, WrenchFrame
 from ftdrive.terminal.live.history import Columns
+from ftdrive.terminal.text import visible
 from ftdrivers.interfaces import Array
 
 BAD, WARNING, GOOD = "red bold", "bold black on yellow", "green"
@@ -36,6 +38,7 @@ class Line:
 
     def add(self, text: str, style: str = "", key: str = "") -> Self:
         """Append text."""
+        text = visible(text)
         self.width += cell_len(text)
         if self.parts and self.parts[-1][1:] == (style, key):
             self.parts[-1] = Part(self.parts[-1].text + text, style, key)
@@ -54,17 +57,20 @@ class Line:
         return self
 
     def fit(self, width: int) -> "Line":
-        """Return this line padded to `width` cells, or a cut one that ends in an ellipsis."""
+        """Return this line padded to `width` cells, or the words that fit and an ellipsis."""
         if self.width <= width:
             return self.to(width)
         fitted = Line()
         for part in self.parts:
             room = width - 1 - fitted.width
             if cell_len(part.text) > room:
-                fitted.add(set_cell_size(part.text, max(room, 0)), part.style, part.key)
+                text = set_cell_size(part.text, max(room, 0))
+                if not part.text.startswith(" ", len(text)):  # a whole word or none of it
+                    text = text[: text.rfind(" ") + 1]
+                fitted.add(text, part.style, part.key)
                 break
             fitted.add(*part)
-        return fitted.add("…"[:width])
+        return fitted.add("…"[:width]).to(width)
 
     @classmethod
     def of_cells(cls, text: Sequence[str], styles: Sequence[str]) -> Self:
@@ -75,6 +81,10 @@ class Line:
             line.add("".join(text[start:end]), style)
             start = end
         return line
+
+    def as_text(self) -> Text:
+        """Return this line for rich."""
+        return Text.assemble(*((part.text, part.style) for part in self.parts), no_wrap=True)
 
     def __str__(self) -> str:
         return "".join(part.text for part in self.parts)
@@ -102,6 +112,8 @@ class Reading:
     """(6,) N and N·m, in `frame`."""
     raw: Array
     """(6,) N and N·m, sensor axes, about the sensor origin."""
+    raw_in_frame: Array
+    """(6,) the same in `frame`."""
     sigma: Array
     """(6,) of `wrench`: noise and calibration; NaN until the noise is known."""
     sample_sigma: Array
@@ -164,6 +176,8 @@ class View:
     recording_s: float | None
     """Duration of the recording; None without one."""
     is_frozen: bool = False
+    can_push: bool = False
+    """Whether the tool is emulated, so that a key can push it."""
     replay: Replay | None = None
     calibrated: Array | None = None
     """(n, 3) directions of gravity in flange axes at the calibrated orientations, as unit vectors; None: unknown."""

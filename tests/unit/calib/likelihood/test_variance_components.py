@@ -207,7 +207,7 @@ def test_what_is_always_needed_is_not_dropped() -> None:
     assert _pruned(p, at, 0).components == ALL[:2]
 
 
-def test_a_turn_of_the_flange_is_told_from_white_noise() -> None:
+def test_a_turn_of_the_flange_is_distinguished_from_white_noise() -> None:
     rng = np.random.default_rng(8)
     turned = problem(rng, 40, (ROTATION,), np.array([0.3 / 400]))
     assert select(turned, [], np.zeros(0), list(ALL[:3])).components == (ROTATION,)

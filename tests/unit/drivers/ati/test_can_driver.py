@@ -32,7 +32,7 @@ START_UP: Mapping[str, Sequence[str]] = {
     "200": GAUGES,
 }
 Answer = Sequence[str | tuple[float, str]]
-Talk = Callable[..., CanWire]
+MakeWire = Callable[..., CanWire]
 
 
 class Sensor(InOneThread, AtiCanSensor):
@@ -41,7 +41,7 @@ class Sensor(InOneThread, AtiCanSensor):
 
 
 @pytest.fixture
-def talk(table: Table) -> Talk:
+def make_wire(table: Table) -> MakeWire:
     """A sensor that starts up as usual but for `change`, then answers each poll: `polls`, then for ever `last`."""
 
     def make(
@@ -71,8 +71,8 @@ def left_alone(wire: CanWire) -> None:
     assert wire.wrong == []
 
 
-def test_start_up_is_golden_and_then_only_gauges_are_asked(talk: Talk) -> None:
-    wire = talk()
+def test_start_up_is_golden_and_then_only_gauges_are_asked(make_wire: MakeWire) -> None:
+    wire = make_wire()
     with opened(wire) as sensor:
         samples, info = sensor.collect(0.1), sensor.identify()
     left_alone(wire)
@@ -85,11 +85,11 @@ def test_start_up_is_golden_and_then_only_gauges_are_asked(talk: Talk) -> None:
     assert len(samples) == pytest.approx(100, abs=20)  # polled at 1 kHz at most
 
 
-def test_polls_are_a_millisecond_apart_and_the_next_one_leaves_before_the_last_is_decoded(talk: Talk) -> None:
-    wire = talk(last=[(0.1, GAUGES[0]), (0.2, GAUGES[1])])
+def test_polls_are_a_millisecond_apart_and_the_next_one_leaves_before_the_last_is_decoded(make_wire: MakeWire) -> None:
+    wire = make_wire(last=[(0.1, GAUGES[0]), (0.2, GAUGES[1])])
     with opened(wire) as sensor:
         assert len(sensor.collect(0.1)) == pytest.approx(100, abs=2)
-    wire = talk(last=[(2.0, GAUGES[0]), (2.1, GAUGES[1])])  # a slow one is asked as often as it can answer
+    wire = make_wire(last=[(2.0, GAUGES[0]), (2.1, GAUGES[1])])  # a slow one is asked as often as it can answer
     with opened(wire) as sensor:
         assert len(sensor.collect(0.105)) == pytest.approx(50, abs=2)
     left_alone(wire)
@@ -102,8 +102,10 @@ def test_polls_are_a_millisecond_apart_and_the_next_one_leaves_before_the_last_i
         ("C0000064012C01F4", "FF38FE70FDA8", 0xC000, WRENCH),  # bits 14 and 15 make no sample unusable
     ],
 )
-def test_samples_are_golden(talk: Talk, first_half: str, second_half: str, status: int, wrench: list[float]) -> None:
-    with opened(talk(last=[f"200 {first_half}", f"201 {second_half}"])) as sensor:
+def test_samples_are_golden(
+    make_wire: MakeWire, first_half: str, second_half: str, status: int, wrench: list[float]
+) -> None:
+    with opened(make_wire(last=[f"200 {first_half}", f"201 {second_half}"])) as sensor:
         sensor.collect(0.01)
         sample = sensor.latest(timeout_s=0.0)
         assert sample.wrench[0].tolist() == pytest.approx(wrench)
@@ -115,8 +117,8 @@ def test_slot_is_selected_and_its_echo_checked(table: Table) -> None:
         opened(wire, slot=3).open()
 
 
-def test_bus_that_echoes_does_not_fake_the_slot_echo(table: Table, talk: Talk) -> None:
-    wire = talk(echo=True)
+def test_bus_that_echoes_does_not_fake_the_slot_echo(table: Table, make_wire: MakeWire) -> None:
+    wire = make_wire(echo=True)
     with opened(wire) as sensor:
         sensor.collect(0.05)
     left_alone(wire)
@@ -135,9 +137,9 @@ def test_bus_that_echoes_does_not_fake_the_slot_echo(table: Table, talk: Talk) -
     ],
     ids=["counts", "units", "not finite", "singular"],
 )
-def test_calibration_that_is_none_names_device_slot_and_cure(talk: Talk, answers: dict[str, Answer]) -> None:
+def test_calibration_that_is_none_names_device_slot_and_cure(make_wire: MakeWire, answers: dict[str, Answer]) -> None:
     with pytest.raises(ConnectError, match=r"^ATI CAN sensor 0x20 .*slot 0: ") as caught:
-        opened(talk(answers)).open()
+        opened(make_wire(answers)).open()
     assert "slot=0 to 15" in caught.value.fix
 
 
@@ -165,14 +167,14 @@ LBF, LBF_IN = 4.4482216152605, 0.1129848290276167
     ],
 )
 def test_old_firmware_does_not_report_its_scale(
-    talk: Talk,
+    make_wire: MakeWire,
     options: dict[str, Any],
     factors: tuple[float, float],
     facts: tuple[Fact, Fact],
     warns: bool,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    wire = talk(OLD)
+    wire = make_wire(OLD)
     with opened(wire, **options) as sensor:
         wrench = sensor.latest(timeout_s=0.0).wrench[0]
         assert wrench.tolist() == pytest.approx(np.array(WRENCH) * np.repeat(factors, 3))
@@ -182,43 +184,43 @@ def test_old_firmware_does_not_report_its_scale(
     assert ("units=" in caplog.text) == warns  # what to add to the address
 
 
-def test_scale_that_the_sensor_contradicts_is_refused(talk: Talk) -> None:
-    with opened(talk(), unit_codes=(2, 3), counts_per_unit=(1_000_000, 1_000_000)) as sensor:
+def test_scale_that_the_sensor_contradicts_is_refused(make_wire: MakeWire) -> None:
+    with opened(make_wire(), unit_codes=(2, 3), counts_per_unit=(1_000_000, 1_000_000)) as sensor:
         assert sensor.identify().facts["counts_per_N"] == Fact(1e6, "device")
     for options, configured in (
         ({"unit_codes": (1, 3)}, r"1000000 counts per lbf"),
         ({"counts_per_unit": (1_000_000, 10_000)}, r"10000 per N-m"),
     ):
         with pytest.raises(ConnectError, match=rf"1000000 counts per N and .* {configured}"):
-            opened(talk(), **options).open()
+            opened(make_wire(), **options).open()
 
 
-def test_halves_pair_up_by_identifier_among_foreign_frames(talk: Talk) -> None:
+def test_halves_pair_up_by_identifier_among_foreign_frames(make_wire: MakeWire) -> None:
     swapped = ["201 FF38FE70FDA8", "1FF 0102", "210 00000064012C01F4", "200", "201 FF", GAUGES[0]]
-    with opened(talk(last=swapped)) as sensor:
+    with opened(make_wire(last=swapped)) as sensor:
         assert (sensor.collect(0.05).counts == COUNTS).all()
         assert sensor.health().lost == 0
 
 
-def test_stale_frames_are_purged_before_a_request(talk: Talk) -> None:
+def test_stale_frames_are_purged_before_a_request(make_wire: MakeWire) -> None:
     """A duplicate left over from the last reading must not become half of the next one."""
-    with opened(talk(last=[*GAUGES, (1.1, "200 0000700070007000")])) as sensor:
+    with opened(make_wire(last=[*GAUGES, (1.1, "200 0000700070007000")])) as sensor:
         assert (sensor.collect(0.05).counts == COUNTS).all()
 
 
 @pytest.mark.parametrize("frames", [["200 0000000100020003", *GAUGES], ["201 000400050006", *GAUGES]])
-def test_halves_of_two_readings_are_no_sample(talk: Talk, frames: list[str]) -> None:
+def test_halves_of_two_readings_are_no_sample(make_wire: MakeWire, frames: list[str]) -> None:
     mixed = [(1.0 + 0.5 * number, frame) for number, frame in enumerate(frames)]
-    with opened(talk(polls=[GAUGES, mixed])) as sensor:
+    with opened(make_wire(polls=[GAUGES, mixed])) as sensor:
         samples = sensor.collect(0.1)
         assert (samples.counts == COUNTS).all()
         assert (sensor.health().lost, sensor.health().malformed) == (1, 1)
 
 
 @pytest.mark.parametrize(("after_ms", "lost"), [(49.0, 0), (51.0, 1)])
-def test_a_poll_is_answered_within_fifty_milliseconds(talk: Talk, after_ms: float, lost: int) -> None:
+def test_a_poll_is_answered_within_fifty_milliseconds(make_wire: MakeWire, after_ms: float, lost: int) -> None:
     late = [(1.0, GAUGES[0]), (after_ms, GAUGES[1])]
-    wire = talk(polls=[GAUGES, late])
+    wire = make_wire(polls=[GAUGES, late])
     with opened(wire) as sensor:
         samples = sensor.collect(0.15)
         assert (samples.counts == COUNTS).all()
@@ -226,8 +228,8 @@ def test_a_poll_is_answered_within_fifty_milliseconds(talk: Talk, after_ms: floa
     left_alone(wire)
 
 
-def test_a_poll_that_this_computer_looks_at_late_is_answered_all_the_same(talk: Talk) -> None:
-    wire = talk(polls=[GAUGES])
+def test_a_poll_that_this_computer_looks_at_late_is_answered_all_the_same(make_wire: MakeWire) -> None:
+    wire = make_wire(polls=[GAUGES])
     with opened(wire) as sensor:
         wire.clock.at(0.0105, lambda: wire.clock.stall(0.2))  # between question and answer
         assert len(sensor.collect(0.1))
@@ -259,7 +261,7 @@ def test_sensor_that_stops_answering_is_silent_after_three_tenths_of_a_second(ta
         assert wire.clock.now_s() - start_s == pytest.approx(0.32, abs=0.05)
 
 
-def test_nobody_there_is_known_after_three_attempts(table: Table) -> None:
+def test_a_missing_device_is_known_after_three_attempts(table: Table) -> None:
     with table.can([("205", [])] * 3) as wire:
         start_s = wire.clock.now_s()
         with pytest.raises(ConnectError, match="SERIAL"):
@@ -290,21 +292,28 @@ def test_a_reply_of_the_start_up_has_a_tenth_of_a_second_and_is_asked_again(
         ("200 00010064012C01F4", StreamBroken, "reset itself"),
     ],
 )
-def test_status_that_ends_the_stream(talk: Talk, first_half: str, error: type[DeviceError], message: str) -> None:
-    with opened(talk(polls=[GAUGES] * 5, last=[first_half, GAUGES[1]])) as sensor, pytest.raises(error, match=message):
+def test_status_that_ends_the_stream(
+    make_wire: MakeWire, first_half: str, error: type[DeviceError], message: str
+) -> None:
+    with (
+        opened(make_wire(polls=[GAUGES] * 5, last=[first_half, GAUGES[1]])) as sensor,
+        pytest.raises(error, match=message),
+    ):
         sensor.collect(1.0)
 
 
-def test_harmless_status_is_logged_once(talk: Talk, caplog: pytest.LogCaptureFixture) -> None:
-    with opened(talk({"200": ["200 C1010064012C01F4", GAUGES[1]]}, last=["200 C1010064012C01F4", GAUGES[1]])) as sensor:
+def test_harmless_status_is_logged_once(make_wire: MakeWire, caplog: pytest.LogCaptureFixture) -> None:
+    with opened(
+        make_wire({"200": ["200 C1010064012C01F4", GAUGES[1]]}, last=["200 C1010064012C01F4", GAUGES[1]])
+    ) as sensor:
         assert (sensor.collect(0.05).status == 0xC101).all()
     assert caplog.text.count("CAN bus error") == 1
 
 
-def test_empty_slot_is_a_fault(talk: Talk) -> None:
+def test_empty_slot_is_a_fault(make_wire: MakeWire) -> None:
     zeros = {f"202 0{axis}": [f"20{n} {'00' * 8}" for n in (2, 3, 4)] for axis in range(6)}
     with pytest.raises(DeviceFault, match="slot 0 is empty"):
-        opened(talk(zeros)).open()
+        opened(make_wire(zeros)).open()
 
 
 @pytest.mark.parametrize(

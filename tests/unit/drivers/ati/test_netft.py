@@ -213,7 +213,7 @@ def test_what_was_thrown_away_is_counted_since_open() -> None:
         sensor.close()
 
 
-def test_nobody_there() -> None:
+def test_a_device_that_does_not_answer() -> None:
     with pytest.raises(ConnectError, match="configuration cannot be read"):
         NetFtSensor("127.0.0.1", http_port=1).open()
     with pytest.raises(ConnectError, match="configuration cannot be read"):

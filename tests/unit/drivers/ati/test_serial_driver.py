@@ -364,7 +364,7 @@ def test_refusals_end_the_start_up_at_once(table: Table, request_: bytes, reply:
     assert "address" in caught.value.fix
 
 
-def test_nobody_there_is_known_within_a_second(table: Table) -> None:
+def test_a_missing_device_is_known_within_a_second(table: Table) -> None:
     with table.serial([*[(JAM, b""), (STATUS, b"")] * 3, BYE]) as wire:
         start_s = wire.clock.now_s()
         with pytest.raises(ConnectError, match="no reply"):

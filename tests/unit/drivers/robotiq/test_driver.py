@@ -82,7 +82,7 @@ def test_a_question_has_a_fifth_of_a_second_and_is_asked_three_times(table: Tabl
         assert sensor.identify().serial == "FTS-1234"
 
 
-def test_nobody_there(table: Table) -> None:
+def test_a_device_that_does_not_answer(table: Table) -> None:
     ask = SERIAL[0], b""
     wire = table.serial([HALT, ask, HALT, ask, HALT, ask, HALT])
     start_s = wire.clock.now_s()

@@ -52,8 +52,8 @@ def halves(field: bytes) -> list[str]:
 def on_uart(answers: dict[str, bytes], samples: Stream) -> list[tuple[bytes, Any]]:
     asked = [(frame(bytes.fromhex(request)), frame(reply)) for request, reply in answers.items()]
     stop = frame(bytes.fromhex(STOP)), b""
-    talk = [turn for question in asked for turn in (stop, question)]
-    return [*talk, (frame(bytes.fromhex(GO)), samples), stop]  # no bias, 0x11, anywhere
+    turns = [turn for question in asked for turn in (stop, question)]
+    return [*turns, (frame(bytes.fromhex(GO)), samples), stop]  # no bias, 0x11, anywhere
 
 
 def on_can(answers: dict[str, bytes], samples: Stream) -> list[tuple[str, Any]]:

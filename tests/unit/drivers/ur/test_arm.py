@@ -101,7 +101,7 @@ def test_bad_targets_never_leave_the_house(arm: UrArm, controller: Controller, q
     assert "move" not in controller.did
 
 
-def test_a_new_arm_talks_to_nobody_and_closes() -> None:
+def test_a_new_arm_opens_no_connection_and_closes() -> None:
     arm = UrArm(HOST, model="ur5e", speed_rad_s=radians(60))
     arm.stop()
     arm.close()

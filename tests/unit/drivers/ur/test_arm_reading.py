@@ -312,7 +312,7 @@ def test_a_follower_reads_every_sample_as_flange_poses(
     assert not full_rate._followers
 
 
-def test_a_follower_loses_nothing_while_nobody_reads(
+def test_a_follower_loses_nothing_while_it_is_not_read(
     controller: Controller, full_rate: Reader, clock: FakeClock
 ) -> None:
     with full_rate.follow() as follow:

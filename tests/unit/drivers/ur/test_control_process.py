@@ -59,13 +59,13 @@ def served(controller: Controller, requests: list[tuple[float, str]]) -> list[An
 
 
 @pytest.mark.parametrize(("gap_s", "stopped"), [(0.49, False), (0.51, True), (60.0, True)])
-def test_a_move_about_which_nobody_asks_is_stopped(controller: Controller, gap_s: float, stopped: bool) -> None:
+def test_a_move_that_no_caller_watches_is_stopped(controller: Controller, gap_s: float, stopped: bool) -> None:
     times = [(0.0, "move"), (0.1, "progress"), (0.1 + gap_s, "progress")]
     assert served(controller, times) == [True, (False, False), (stopped, stopped)]
     assert ("stop softly" in controller.did) == stopped
 
 
-def test_without_a_move_nobody_has_to_ask(controller: Controller) -> None:
+def test_without_a_move_no_caller_has_to_ask(controller: Controller) -> None:
     times = [(0.0, "move"), (0.1, "stop"), (100.0, "tcp_offset"), (101.0, "move"), (101.1, "progress")]
     values = served(controller, times)
     assert values[-1] == (False, False)

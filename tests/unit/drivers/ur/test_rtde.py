@@ -219,7 +219,7 @@ def test_a_lost_connection_is_raised() -> None:
                 stream.read(30.0)
 
 
-def test_closing_wakes_whoever_reads() -> None:
+def test_closing_wakes_a_reader() -> None:
     with served() as server, closing(subscribe(server)) as stream:
         assert server.started.wait(30)
         threading.Timer(0.05, stream.close).start()
@@ -230,7 +230,7 @@ def test_closing_wakes_whoever_reads() -> None:
 @pytest.mark.parametrize(
     ("types", "taken"), [(b"INT32,DOUBLE", []), (b"IN_USE,DOUBLE", ["a"]), (b"NOT_FOUND,IN_USE", ["b"])]
 )
-def test_inputs_of_others_are_told(types: bytes, taken: list[str]) -> None:
+def test_inputs_of_other_clients_are_reported(types: bytes, taken: list[str]) -> None:
     with served(replace={"I": rtde.encode(rtde.SETUP_INPUTS, b"\x01" + types)}) as server:
         assert rtde.registers_in_use(server.host, ("a", "b"), timeout_s=30.0) == taken
     with served(replace={"I": b""}) as server, pytest.raises(DeviceTimeout, match="did not answer"):
@@ -250,7 +250,7 @@ def test_inputs_of_others_are_told(types: bytes, taken: list[str]) -> None:
         ({"O": rtde.encode(rtde.SETUP_OUTPUTS, b"\x01" + b",".join([b"DOUBLE"] * 10))}, "DOUBLE, DOUBLE"),
     ],
 )
-def test_whoever_does_not_speak_rtde_is_refused(replace: dict[str, bytes], says: str) -> None:
+def test_a_server_that_does_not_speak_rtde_is_refused(replace: dict[str, bytes], says: str) -> None:
     with served(replace=replace) as server, pytest.raises(ConnectError, match=says):
         rtde.Subscription(server.host, OUTPUTS, 125.0, timeout_s=0.2 if "did not answer" in says else 30.0)
 
@@ -271,7 +271,7 @@ def test_the_greeting_has_one_time_out_in_all() -> None:
         server.close()
 
 
-def test_nobody_there() -> None:
+def test_a_device_that_does_not_answer() -> None:
     with pytest.raises(Unreachable, match="cannot be reached") as error:
         rtde.Subscription("127.83.7.2", OUTPUTS, 125.0, timeout_s=0.5)
     assert "switched on" in error.value.fix

@@ -148,7 +148,9 @@ def test_a_robot_api_that_refuses(status: int, answer: Any, says: str) -> None:
 @pytest.mark.parametrize(
     ("version", "name", "fix"), [(V5, "dashboard server", "Services"), (VX, "Robot API", r"10\.11")]
 )
-def test_nobody_there(version: tuple[int, int, int, int], name: str, fix: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_that_does_not_answer(
+    version: tuple[int, int, int, int], name: str, fix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(dashboard, "PORT", 1)
     with pytest.raises(NoDashboard, match=f"the {name} of .* reports: .*refused.*{fix}"):
         ask(version, everything)

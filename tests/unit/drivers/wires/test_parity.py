@@ -56,7 +56,7 @@ def test_whatever_is_marked_and_however_it_is_cut_comes_back(line: list[tuple[in
 
 
 @given(st.lists(st.text("\x00\xff1", max_size=8).map(lambda text: text.encode("latin-1")), max_size=8))
-def test_bytes_that_nobody_would_mark_so_are_undone_all_the_same(reads: list[bytes]) -> None:
+def test_marks_that_no_system_writes_are_undone_all_the_same(reads: list[bytes]) -> None:
     true, damaged = undone(reads)
     assert len(true) <= len(b"".join(reads))
     assert damaged == sorted(set(damaged))

@@ -255,7 +255,7 @@ def test_the_readme_describes_every_key() -> None:
         shown = "" if default.value is None else f"`{as_toml(default.value)}`"
         return f"| `[{key.replace('.', '] ')}` | {shown} | {rule.range} | {rule.help} |"
 
-    readme = (Path(__file__).parents[4] / "docs/ftdrive/cell.md").read_text(encoding="utf-8")
+    readme = (Path(__file__).parents[4] / "docs/reference/configuration.md").read_text(encoding="utf-8")
     rows = [line for line in readme.splitlines() if line.startswith("| `[")]
     assert rows == [row(key, rule) for key, rule in RULES.items()]
 

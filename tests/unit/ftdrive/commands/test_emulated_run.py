@@ -28,7 +28,7 @@ class Listener:
 
 
 @pytest.mark.parametrize(("kept", "expected"), [(True, [RunOpened, Noted, Noted]), (False, [Noted])])
-def test_of_a_run_that_is_not_kept_nobody_is_told_where_it_is(
+def test_the_place_of_a_run_that_is_not_kept_is_not_printed(
     kept: bool, expected: list[type[Event]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, person = str(tmp_path / "2026-simulated"), Listener()

@@ -25,8 +25,8 @@ def run(fleet_here: Callable[..., Ran]) -> Callable[..., Ran]:
 
 
 def record(path: Path, *, push_N: float = 0.0, lost: int = 0) -> Path:
-    """Three seconds, in the last of which something pushes along x, and a gap."""
-    samples = block(3000)
+    """Three seconds of turning in place, in the last of which something pushes along x, and a gap."""
+    samples = replace(block(3000), p_base_flange_m=np.zeros((3000, 3)))
     raw, seq = samples.raw + np.outer(np.arange(3000) >= 2000, push_N * np.eye(6)[0]), samples.seq.copy()
     seq[1500:] += lost
     path.parent.mkdir(exist_ok=True)

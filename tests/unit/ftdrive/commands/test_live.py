@@ -4,8 +4,9 @@ import io
 import json
 import re
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -15,10 +16,12 @@ from rich.console import Console
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, solve
 from ftcalib.model import predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftdrive.checks.check import Check
 from ftdrive.commands import live
 from ftdrive.live.processing import Processor
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block, Stages, WrenchFrame
+from ftdrive.terminal.live.layout import plain
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.live.simulated import NOISE, calibrated, dwells, info, paired
@@ -96,31 +99,53 @@ def test_once_prints_one_line(arguments: list[str]) -> None:
     )
 
 
-def test_the_end_of_a_recording_is_shown(arguments: list[str]) -> None:
-    shown = run(arguments, "--plain").stderr
+def test_a_file_gets_a_line_for_each_reading(arguments: list[str]) -> None:
+    for more in (["--plain"], []):
+        result = run(arguments, *more)
+        lines = result.stdout.splitlines()
+        assert len(lines) == pytest.approx(19, abs=2)
+        assert all(re.match(r"\d+\.\d s   F( +-?\d+\.\d{3}){3} N   T", line) for line in lines)
+        assert lines[-1].endswith("(sensor axes, about the sensor origin)   contact")
+        assert "F " not in result.stderr
+
+
+class Quiet:
+    """A terminal that echoes except inside."""
+
+    used: ClassVar[list[str]] = []
+
+    def __init__(self, fd: int) -> None:
+        assert fd == 0
+
+    usable = staticmethod(lambda _: True)
+
+    def __enter__(self) -> None:
+        self.used.append("echo off")
+
+    def __exit__(self, *_: object) -> None:
+        self.used.append("as before")
+
+
+def shown_table(monkeypatch: pytest.MonkeyPatch, stream: Any, width: int = 80) -> str:
+    console = Console(width=width, file=io.StringIO(), color_system=None, force_terminal=False)
+    monkeypatch.setattr(live, "printer", lambda: console)
+    live._show_table(stream, stream.clock, [Check("robot.payload", "ok", "robot 1.44 kg")])
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_the_table_ends_with_the_recording_and_breaks_no_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "Keyboard", Quiet)
+    shown = shown_table(monkeypatch, replayed())
     assert shown.rstrip().endswith("The recording has ended.")
     assert "Ctrl-C" not in shown
-
-
-def test_typed_keys_do_not_break_the_table(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    quiet: list[str] = []
-
-    class Keyboard:
-        def __init__(self, fd: int) -> None:
-            assert fd == 0
-
-        usable = staticmethod(lambda _: True)
-
-        def __enter__(self) -> None:
-            quiet.append("echo off")
-
-        def __exit__(self, *_: object) -> None:
-            quiet.append("as before")
-
-    monkeypatch.setattr(live, "Keyboard", Keyboard)
-    monkeypatch.setattr(live, "_screen", lambda *_: quiet.append("shown") or "a table")  # type: ignore[func-returns-value]
-    run(arguments, "--plain")
-    assert (quiet[0], quiet[-1], set(quiet[1:-1])) == ("echo off", "as before", {"shown"})
+    lines = shown.splitlines()
+    assert max(map(len, lines)) <= 80
+    (force,) = [line for line in lines if line.startswith(" Fx")]
+    assert re.match(r" Fx +\+1\.\d+ +0\.\d+ ", force)
+    assert any("▲ CONTACT" in line for line in lines)
+    assert "robot 1.44 kg" in lines[-2]
+    assert Quiet.used == ["echo off", "as before"]
 
 
 class Interrupted:
@@ -130,6 +155,7 @@ class Interrupted:
         self.stream = replayed(10.0)
         self.clock, self.info, self.frame = self.stream.clock, self.stream.info, self.stream.frame
         self.status, self.sigma_of_mean = self.stream.status, self.stream.sigma_of_mean
+        self.take_events = self.stream.take_events
         self.reads, self.failures = 0, failures
 
     def read(self) -> Block:
@@ -142,11 +168,8 @@ class Interrupted:
 
 def test_a_silent_device_is_shown_and_no_old_number() -> None:
     stream: Any = Interrupted(2)
-    readings = []
-    for look in live._looks(stream):
-        readings.append(live._reading(look, stream))
-        if len(readings) == 12:
-            break
+    views = list(islice(live._views(stream, stream.clock), 12))
+    readings = [live._reading(view) for view in views]
     stale = [reading for reading in readings if reading["stale"]]
     assert len(stale) == 2
     for reading in stale:
@@ -154,20 +177,18 @@ def test_a_silent_device_is_shown_and_no_old_number() -> None:
         assert reading["compensated"] is reading["raw"] is reading["sigma"] is reading["contact"] is None
         assert live._line(reading, stream.frame).startswith("stale: sensor")
     assert readings[-1]["stale"] is None
-    console = Console(width=80, file=io.StringIO(), color_system=None)
-    console.print(live._screen(stale[0], stream.frame, "calibration.json"))
-    assert isinstance(console.file, io.StringIO)
-    shown = console.file.getvalue()
+    (view, *_) = [view for view in views if view.silent]
+    shown = "\n".join(map(str, plain(view, 80)))
     assert "no new sample for 0.300 s" in shown
     assert "--.--" in shown
-    assert not re.search(r"\d\.\d\d\d", shown.partition("Fx")[2])
+    assert not re.search(r" Fx +[+-]?\d", shown)
 
 
 def test_a_failure_that_lasts_ends_the_command() -> None:
-    with pytest.raises(DeviceTimeout):
-        list(live._looks(Interrupted(1000)))  # type: ignore[arg-type]
-    with pytest.raises(DeviceTimeout):
-        list(live._looks(Interrupted(1), raises=True))  # type: ignore[arg-type]
+    for failures, raises in ((1000, False), (1, True)):
+        stream: Any = Interrupted(failures)
+        with pytest.raises(DeviceTimeout):
+            list(live._views(stream, stream.clock, raises=raises))
 
 
 def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
@@ -190,40 +211,3 @@ def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
     rms = np.sqrt(np.square(shown).reshape(24, 2, 3).sum(axis=2).mean(axis=0))
     np.testing.assert_allclose(rms, headline, rtol=0.01)
     assert np.min(np.array(shown)[:, :3]) > 0.5 * headline[0] / np.sqrt(3)
-
-
-READING: dict[str, Any] = {
-    "verdict": "good",
-    "rate_Hz": 1e3,
-    "lost": 0,
-    "contact": False,
-    "stale": None,
-    "delay_s": {"value": 0.0031, "sigma": 2e-4},
-}
-
-
-@pytest.mark.parametrize("axes", ["sensor", "flange", "base"])
-def test_the_table_fits_into_80_columns(axes: Any) -> None:
-    three = {"force_N": [1.0] * 3, "torque_Nm": [0.1] * 3}
-    console = Console(width=80, file=io.StringIO(), color_system=None)
-    console.print(
-        live._screen(READING | {"raw": three, "compensated": three, "sigma": three}, WrenchFrame(axes), "made for this")
-    )
-    assert isinstance(console.file, io.StringIO)
-    lines = console.file.getvalue().splitlines()
-    assert "delay 3.1 ± 0.2 ms" in lines[3]
-    assert "± 1 sigma" in lines[4]
-
-
-def test_columns_stand_still_when_a_sign_changes() -> None:
-    def ends(contact: float) -> list[int]:
-        three = {"force_N": [contact] * 3, "torque_Nm": [contact / 10] * 3}
-        sigma = {"force_N": [0.1] * 3, "torque_Nm": [0.1] * 3}
-        reading = READING | {"raw": three, "compensated": three, "sigma": sigma}
-        console = Console(width=80, file=io.StringIO(), color_system=None)
-        console.print(live._screen(reading, WrenchFrame("base"), "made for this"))
-        assert isinstance(console.file, io.StringIO)
-        (line,) = [line for line in console.file.getvalue().splitlines() if line.startswith(" Fx")]
-        return [match.end() for match in re.finditer(r"\S+", line)]
-
-    assert ends(1.5) == ends(-1.5) == ends(-150.0)

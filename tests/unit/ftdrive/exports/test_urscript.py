@@ -171,7 +171,7 @@ def test_header_says_what_it_is_for(plan: Plan) -> None:
     assert "within 30 degrees" in comments
 
 
-def test_header_tells_of_the_surroundings(plan: Plan) -> None:
+def test_header_names_the_surroundings(plan: Plan) -> None:
     text = urscript.program(plan, dwell_s=1.0)
     assert "mounted: floor" in text
     assert "free space around the arm" in text
@@ -196,14 +196,14 @@ def test_a_program_that_moves_the_whole_arm_says_so(plan: Plan) -> None:
 
 
 @pytest.mark.parametrize(("tip_m_s", "words"), [(0.25, "up to 250 mm/s"), (None, "are NOT LIMITED")])
-def test_header_and_question_tell_how_fast_it_is(plan: Plan, tip_m_s: float | None, words: str) -> None:
+def test_header_and_question_say_how_fast_it_is(plan: Plan, tip_m_s: float | None, words: str) -> None:
     speeds = {**plan.description["speeds"], "tip_m_s": tip_m_s}
     lines = urscript.program(replace(plan, description={**plan.description, "speeds": speeds}), dwell_s=1.0)
     printed = [line for line in lines.splitlines() if f"joints up to 60 deg/s, the tips of the tool {words}" in line]
     assert [line.split("(")[0].split(":")[0].strip() for line in printed] == ["# Speed", "popup"]
 
 
-def test_a_plan_told_as_json_is_a_plan(tmp_path: Path) -> None:
+def test_a_plan_printed_as_json_is_a_plan(tmp_path: Path) -> None:
     path = tmp_path / "plan.json"
     printed = CliRunner().invoke(cli, ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal", "--json"])
     path.write_text(printed.stdout)

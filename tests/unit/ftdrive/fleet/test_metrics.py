@@ -25,6 +25,13 @@ def server() -> Iterator[MetricsServer]:
         yield server
 
 
+def test_pages_of_others_cannot_read_the_state(server: MetricsServer) -> None:
+    for name, value in (("Origin", "https://evil.example"), ("Host", "evil.example")):
+        foreign = urllib.request.Request(f"http://127.0.0.1:{server.port}/metrics", headers={name: value})
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(foreign, timeout=30)
+
+
 def scraped(server: MetricsServer) -> str:
     with urllib.request.urlopen(f"http://127.0.0.1:{server.port}/metrics", timeout=30) as answer:
         text: str = answer.read().decode()
@@ -87,7 +94,7 @@ def test_a_cell_that_disappears_disappears(server: MetricsServer) -> None:
     assert {name for _, name in samples(server)} == {"", "B"}
 
 
-def test_tools_of_a_cell_are_told_apart_and_any_name_is_escaped(server: MetricsServer) -> None:
+def test_tools_of_a_cell_are_distinguished_and_any_name_is_escaped(server: MetricsServer) -> None:
     name = 'Zelle "7"\\ü\n'
     server.update(reading(cell(name, "gripper"), cell(name, "drill", mass_kg=2.0)))
     families = {one.name: one for one in text_string_to_metric_families(scraped(server))}

@@ -96,7 +96,7 @@ def test_no_way_is_refused_with_the_joints_to_jog_to() -> None:
         plan_approach(certifier, now, USUAL_POSTURE_RAD, SLOW)
 
 
-def test_an_arm_that_stands_too_near_to_something_is_told_what() -> None:
+def test_the_error_names_what_an_arm_stands_too_near_to() -> None:
     arm = ArmModel("UR5e", TOOL)
     low = float(arm.frames(USUAL_POSTURE_RAD).wrist_m[0, 2])
     certifier = Certifier(arm, Scene((Plane((0.0, 0.0, 1.0), low - 0.06),)))

@@ -125,7 +125,7 @@ def test_a_recording_that_lacks_something_is_named(run: Run) -> None:
         run.records()
 
 
-def test_a_file_of_somebody_else_is_no_pose(run: Run) -> None:
+def test_a_foreign_file_is_no_pose(run: Run) -> None:
     (run.folder / "poses" / "copy of 01.npz").touch()
     assert run.stops() == [1]
 

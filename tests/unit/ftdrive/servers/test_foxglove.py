@@ -285,7 +285,7 @@ def test_a_wrong_parameter_changes_nothing(
     assert (stream.frame, stream.stages) == (WrenchFrame(), Stages())
 
 
-def test_a_client_that_never_reads_delays_nobody(
+def test_a_client_that_never_reads_delays_no_other(
     stream: FakeStream, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Every message reaches a client that reads, until the queue of another one overflows and beyond."""
@@ -341,7 +341,7 @@ def test_without_a_client_nothing_is_packed(server: FoxgloveServer, monkeypatch:
 
 def test_a_port_in_use_is_named(server: FoxgloveServer, stream: FakeStream) -> None:
     with pytest.raises(
-        ConfigError, match=rf"cannot listen on 127\.0\.0\.1:{server.port} .*Address already in use .*choose"
+        ConfigError, match=rf"cannot listen on 127\.0\.0\.1:{server.port} \(Address already in use\): choose"
     ):
         FoxgloveServer(cast(Any, stream), port=server.port)
 

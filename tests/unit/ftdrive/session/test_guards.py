@@ -86,7 +86,7 @@ def test_joints_that_leave_the_straight_line_are_seen() -> None:
         assert (trip.hazard, f"joint {joint + 1}" in str(trip)) == (2, True)
 
 
-def test_an_arm_that_is_moved_while_it_should_stand_is_somebody_elses() -> None:
+def test_an_arm_that_is_moved_while_it_should_stand_has_another_client() -> None:
     looks = Looks(PathGuard(LIMITS), moving=False)
     assert looks.trips(50) is None
     assert looks.trip(state=state(GOAL + np.radians([0, 0, 0, 0, 0, 0.6]))).hazard == 21

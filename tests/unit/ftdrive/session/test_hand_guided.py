@@ -310,7 +310,7 @@ def test_a_verification_ends_with_the_last_pose_however_far_from_the_prediction(
     assert "touched" not in outcome.person.words()
 
 
-def test_a_pose_is_on_disk_before_it_is_told() -> None:
+def test_a_pose_is_on_disk_before_it_is_reported() -> None:
     shown = Outcome(dwells(UP, DOWN)).person.shown
     kinds = [
         event.words if isinstance(event, Noted) else event.state.value if isinstance(event, StateChanged) else "pose"
@@ -333,14 +333,14 @@ def test_an_arm_that_hardly_rests_or_creeps_is_not_measured() -> None:
     np.testing.assert_allclose(outcome.kept[0].before.R_base_flange, FRONT.as_matrix(), atol=1e-9)
 
 
-def test_an_arm_that_moves_off_while_measured_is_told_how_long_to_wait() -> None:
+def test_if_the_arm_moves_off_while_measured_the_time_to_wait_is_shown() -> None:
     outcome = Outcome([*dwells(UP, seconds=2.0), *dwells(DOWN)])
     assert outcome.stops == [1]
     assert "moved while pose 1" in outcome.person.words()
 
 
 @pytest.mark.parametrize("turn_deg", [2.0, 9.0])
-def test_a_repeat_is_told_once_and_left_out(turn_deg: float) -> None:
+def test_a_repeat_is_reported_once_and_left_out(turn_deg: float) -> None:
     near = Rotation.from_euler("y", turn_deg, degrees=True)
     nudged = near * Rotation.from_euler("x", 0.5, degrees=True)
     outcome = Outcome(dwells(UP, DOWN, near, nudged, LEFT))
@@ -452,7 +452,7 @@ def test_a_pose_that_is_done_with_is_no_longer_measured_on_the_screen(listen: bo
     assert words == (["the program goes on"] if listen else ["move on to another orientation"]) * 3
 
 
-def test_a_sensor_that_recovers_is_waited_for_and_what_it_went_through_is_told_once() -> None:
+def test_a_sensor_that_recovers_is_waited_for_and_its_failure_is_reported_once() -> None:
     outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), recover=True, unplugged_s=9.5)  # while pose 2 is averaged
     assert outcome.stops == [1, 2, 3]
     assert outcome.person.words().count("a cable came off") == 1

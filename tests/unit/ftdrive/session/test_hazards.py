@@ -7,10 +7,24 @@ from pathlib import Path
 from ftdrive.session.events import GuardTripped
 from ftdrive.session.hazards import Hazard
 
+ROOT = Path(__file__).parents[4]
+PAGE = ROOT / "docs/reference/hazards.md"
+
 
 def test_the_table_has_a_row_for_each_hazard() -> None:
-    readme = (Path(__file__).parents[4] / "docs/ftdrive/session.md").read_text(encoding="utf-8")
-    assert [int(row) for row in re.findall(r"^\| (\d+) \|", readme, re.MULTILINE)] == list(Hazard)
+    assert [int(row) for row in re.findall(r"^\| (\d+) \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)] == list(
+        Hazard
+    )
+
+
+def test_the_tests_that_the_page_names_exist() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    named = [
+        name for row in re.findall(r"^\| row \d+ \|(.*)", text, re.MULTILINE) for name in re.findall(r"`([^`]+)`", row)
+    ]
+    assert len(named) > 50
+    code = "".join(file.read_text(encoding="utf-8") for file in (ROOT / "tests").rglob("test_*.py"))
+    assert [name for name in named if name not in code] == []
 
 
 def test_json_has_the_number_of_the_row() -> None:

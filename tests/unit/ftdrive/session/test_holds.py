@@ -183,7 +183,7 @@ def test_an_emergency_stop_between_two_steps_holds_the_arm_where_it_stands(lab: 
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
 
 
-def test_who_resumes_an_arm_that_nobody_could_see_is_asked_again(lab: Lab) -> None:
+def test_an_arm_that_was_out_of_sight_is_resumed_after_a_new_question(lab: Lab) -> None:
     pause_on_the_way(lab, 4)
     lab.operator.answers["resume:"] = ["resume"]
 

@@ -149,7 +149,7 @@ def test_one_figure_that_is_not_good_enough_decides_the_light(different: dict[st
 
 
 @pytest.mark.parametrize(("half_angle_deg", "light"), [(70, "green"), (37, "amber"), (15, "red")])
-def test_the_light_tells_wide_cones_from_narrow_ones(half_angle_deg: float, light: str) -> None:
+def test_the_light_distinguishes_wide_cones_from_narrow_ones(half_angle_deg: float, light: str) -> None:
     from ftcalib.poses.information import Guess
     from ftcalib.poses.selection import choose
 
@@ -270,7 +270,7 @@ def test_an_arm_on_a_wall_is_seen_as_such_once_the_fit_knows() -> None:
     assert estimate.faces == faces(-R[:1, 1])
 
 
-def test_drift_is_told_with_the_estimates() -> None:
+def test_drift_is_shown_with_the_estimates() -> None:
     drifting = [
         record(one.stop, one.before.R_base_flange, one.pose.number, bump_N=0.5 * k / 23)
         for k, one in enumerate(tour()[:-1])
@@ -352,7 +352,7 @@ def test_a_load_that_shifts_is_named_with_the_pose_from_which_on(since: int) -> 
     assert (change.code, change.values["pose"]) == ("com_shifted", since)
 
 
-def test_a_tare_and_a_lost_part_in_mid_tour_are_told_apart() -> None:
+def test_a_tare_and_a_lost_part_in_mid_tour_are_distinguished() -> None:
     step = np.array([0.3, 0, 0.2, 0, 0, 0])
     change = changed(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop >= 10) * step))
     assert (change.code, change.values["pose"]) == ("bias_stepped", 10)

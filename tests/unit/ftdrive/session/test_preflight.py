@@ -29,7 +29,7 @@ def refuse(lab: Lab, words: str) -> None:
     assert lab.operator.asked == []
 
 
-def test_a_workcell_nobody_measured_is_refused(lab: Lab) -> None:
+def test_a_workcell_that_was_not_measured_is_refused(lab: Lab) -> None:
     lab.cell = replace(lab.cell, workcell=WorkcellConfig())
     refuse(lab, "measured = true")
 
@@ -172,7 +172,7 @@ def test_a_plan_for_another_tool_is_refused(lab: Lab) -> None:
 
 @pytest.mark.parametrize("dry_run", [True, False])
 @pytest.mark.parametrize("program", ["playing", "paused"])
-def test_a_program_of_somebody_else_is_refused_before_anything_is_done(
+def test_a_program_of_another_client_is_refused_before_anything_is_done(
     program: str, dry_run: bool, lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lab.arm, "reported_program", lambda: "PLAYING pick.urp")
@@ -219,7 +219,7 @@ def test_control_is_taken_when_all_else_is_well(lab: Lab) -> None:
     assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
 
 
-def test_an_old_controller_is_controlled_from_the_start_for_it_tells_no_poses_before(lab: Lab) -> None:
+def test_an_old_controller_is_controlled_from_the_start_because_it_reports_no_poses_before(lab: Lab) -> None:
     lab.arm.set_status(tcp_offset=None)
     right = lab.arm.state
 

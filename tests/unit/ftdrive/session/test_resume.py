@@ -204,7 +204,9 @@ def test_the_rate_of_a_drift_is_the_same_whichever_was_first(elapsed_s: float, w
     assert words.endswith("away: 0.1 N/min")
 
 
-def test_a_way_past_a_skipped_pose_is_told_and_confirmed_by_a_person(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_approach_past_a_skipped_pose_is_shown_and_confirmed_by_the_operator(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lab.calibrate()  # trusted from here on
     lab.operator.asked.clear()
     lab.operator.answers["Pose 3 of 7"] = ["s"] * 2
@@ -216,12 +218,12 @@ def test_a_way_past_a_skipped_pose_is_told_and_confirmed_by_a_person(lab: Lab, m
     assert [question.assumed for question in ways] == ["yes", None]
 
 
-def test_what_would_help_most_is_not_told_where_the_plan_chooses(lab: Lab) -> None:
+def test_what_would_help_most_is_not_shown_where_the_plan_chooses(lab: Lab) -> None:
     lab.calibrate()
     assert {event.hint for event in lab.operator.of(Estimated)} == {""}
 
 
-def test_a_hold_tells_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> None:
+def test_a_hold_shows_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.arm.set_status(
         fault=DeviceFault("protective stop", "…"), safety_mode="protective stop"
     )
@@ -476,7 +478,7 @@ def test_by_hand_nothing_is_planned_or_moved(option: dict[str, Any], lab: Lab) -
     assert not (lab.folder / "runs").exists()
 
 
-def test_options_that_cannot_be_used_are_told_before_anything_opens(lab: Lab) -> None:
+def test_options_that_cannot_be_used_are_reported_before_anything_opens(lab: Lab) -> None:
     lab.calibrate()
     opened, run = lab.arm.opened, lab.run()
     with pytest.raises(ConfigError, match="name the run with --resume"):
@@ -490,7 +492,9 @@ def test_options_that_cannot_be_used_are_told_before_anything_opens(lab: Lab) ->
     assert lab.arm.opened == opened
 
 
-def test_a_cell_that_cannot_be_built_is_told_before_its_sensor_opens(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cell_that_cannot_be_built_is_reported_before_its_sensor_opens(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(_: object) -> None:
         raise ConfigError("[robot] driver")
 

@@ -132,7 +132,7 @@ def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: La
     assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
 
 
-def test_a_protective_stop_that_the_driver_tells_names_its_usual_causes_too(lab: Lab) -> None:
+def test_a_protective_stop_that_the_driver_reports_names_its_usual_causes_too(lab: Lab) -> None:
     def stop() -> None:
         lab.arm.set_status(fault=DeviceFault("protective stop", "…"), safety_mode="protective stop")
         raise DeviceFault("the arm stopped: protective stop")
@@ -152,7 +152,7 @@ def test_a_controller_that_does_not_hear_the_stop_may_end_its_move(lab: Lab) -> 
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_with_nobody_there_the_reason_is_raised_and_the_poses_are_kept(fault: str, lab: Lab) -> None:
+def test_without_an_operator_the_reason_is_raised_and_the_poses_are_kept(fault: str, lab: Lab) -> None:
     hazard, inject, _, error = FAULTS[fault]
     lab.arm.at_move[4] = lambda: inject(lab)
     with pytest.raises(error):
@@ -244,13 +244,13 @@ def test_back_is_offered_only_on_the_way_from_a_pose_that_was_not_skipped(lab: L
     assert lab.holds() == [("resume", "skip", "quit")] * 3
 
 
-def test_a_pause_with_nobody_to_end_it_is_no_fault(lab: Lab) -> None:
+def test_a_pause_without_an_operator_to_end_it_is_no_fault(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
     with pytest.raises(Declined, match="paused by the operator"):
         lab.calibrate()
 
 
-def test_resume_with_something_still_pushing_is_not_believed_though_nobody_knows_the_tool(lab: Lab) -> None:
+def test_resume_with_something_still_pushing_is_not_believed_though_the_tool_is_unknown(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: setattr(lab.sensor, "push", np.array([150.0, 0, 0, 0, 0, 0]))
     lab.operator.answers["resume:"] = ["resume", "quit"]
     with pytest.raises(DeviceFault, match="unexpected contact"):
@@ -276,7 +276,7 @@ def test_a_sensor_that_was_switched_off_may_have_another_zero(lab: Lab) -> None:
     assert not [event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
 
 
-def test_a_sensor_that_comes_back_while_the_arm_stands_needs_nobody(lab: Lab) -> None:
+def test_a_sensor_that_comes_back_while_the_arm_stands_needs_no_operator(lab: Lab) -> None:
     def fail() -> None:
         if len(lab.arm.moves) == 3 and not lab.sensor.heals:
             lab.sensor.heals = True

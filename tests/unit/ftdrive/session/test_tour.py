@@ -65,7 +65,7 @@ def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> 
     assert len(lab.operator.of(Asked)) == 5
 
 
-def test_the_diary_says_where_nobody_was_asked(lab: Lab) -> None:
+def test_the_journal_records_unanswered_questions(lab: Lab) -> None:
     lab.calibrate(yes=True)  # a first run: --yes answers nothing
     assert {event.by for event in lab.operator.of(Asked)} == {"person"}
     lab.operator.shown.clear()
@@ -243,7 +243,7 @@ def test_poses_taken_again_and_a_pause_while_one_is_measured_do_not_count_agains
     assert has_run(lab)
 
 
-def test_an_arm_that_tells_no_serial_number_runs_slowly_each_time_and_the_reason_is_said(lab: Lab) -> None:
+def test_an_arm_that_reports_no_serial_number_runs_slowly_each_time_and_the_reason_is_said(lab: Lab) -> None:
     lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
     for _ in range(2):
         lab.arm.moves.clear()

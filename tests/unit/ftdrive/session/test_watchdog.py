@@ -257,7 +257,7 @@ def test_guards_that_ended_on_the_way_are_missed_at_once(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize("stop", [0, 3])
-def test_nothing_moves_where_nobody_watches(stop: int, lab: Lab) -> None:
+def test_nothing_moves_without_a_watchdog(stop: int, lab: Lab) -> None:
     def on_event(event: Event) -> None:
         if isinstance(event, PoseTaken) and event.stop == stop:
             end(lab)

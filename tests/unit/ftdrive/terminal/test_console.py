@@ -2,27 +2,34 @@
 
 import io
 import logging
+import os
 import re
+import subprocess
+import sys
 from errno import ENOSPC
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner, Result
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 from syrupy.assertion import SnapshotAssertion
 
 from ftdrive.checks.check import Check
 from ftdrive.cli import cli, in_a_sentence
 from ftdrive.commands.doctor import _print
-from ftdrive.commands.live import _screen
 from ftdrive.errors import Declined
-from ftdrive.live.samples import WrenchFrame
 from ftdrive.session import session
 from ftdrive.session.events import Noted
 from ftdrive.session.operator import Question
-from ftdrive.terminal.console import answer, hanging, talk
+from ftdrive.terminal import console
+from ftdrive.terminal.console import answer, hanging, in_whole_words, printer, talk
+from ftdrive.terminal.live.view import Line
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.screen import open_operator
+from ftdrive.terminal.table import print_table
+from ftdrive.terminal.text import echo, visible
 
 PLAN = ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal"]
 HELD = ["calibrate", "--robot", "10.0.0.1", "--sensor", "ati-can://can0"]
@@ -46,17 +53,6 @@ def test_brackets_and_colons_are_no_markup(monkeypatch: pytest.MonkeyPatch) -> N
 
     monkeypatch.setattr(session, "calibrate", guide)
     assert text in run(*HELD).stderr
-
-
-def test_the_live_screen_shows_a_path_as_it_is() -> None:
-    numbers = {"force_N": [1.0, -2.0, 3.0], "torque_Nm": [0.1, 0.2, 0.3]}
-    reading = {"verdict": "good", "rate_Hz": 100.0, "lost": 0, "contact": False, "stale": None}
-    reading |= {"delay_s": {"value": 0.0, "sigma": 0.0}, "raw": numbers, "compensated": numbers, "sigma": numbers}
-    reading |= {"contact": False, "stale": None, "delay_s": {"value": 0.0, "sigma": 0.0}}
-    with talk.capture() as shown:
-        talk.print(_screen(reading, WrenchFrame("base"), "my [old] runs/calibration.json"))
-    assert "my [old] runs/calibration.json" in shown.get()
-    assert "[/]" not in shown.get()
 
 
 @pytest.mark.parametrize("width", [40, 80])
@@ -117,3 +113,85 @@ def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path, 
     assert in_a_sentence(OSError(ENOSPC, "No space left on device")) == snapshot
     own = FileExistsError("it is there: choose another name")
     assert in_a_sentence(own) == str(own)
+
+
+def test_an_address_stays_on_one_line_and_is_a_link_where_the_terminal_can(monkeypatch: pytest.MonkeyPatch) -> None:
+    url = "https://app.foxglove.dev?ds=foxglove-websocket&ds.url=ws%3A%2F%2F127.0.0.1%3A34567"
+    for is_terminal in (True, False):
+        file = io.StringIO()
+        monkeypatch.setattr(
+            console,
+            "talk",
+            Console(file=file, width=40, force_terminal=is_terminal, color_system="standard" if is_terminal else None),
+        )
+        console.print_address("  In a browser:          ", url)
+        shown = file.getvalue()
+        assert url in shown
+        assert shown.count("\n") == 1
+        assert (f";{url}\x1b\\" in shown) is is_terminal
+
+
+NAME = "\x1b]0;owned\x07 gripper\x9b2J \u202epilf\r0\udcff\ttab\nline\r\n"
+SHOWN = "\\x1b]0;owned\\x07 gripper\\x9b2J \\u202epilf\\r0\\udcff\ttab\nline\r\n"
+
+
+def test_no_name_commands_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    assert visible(NAME) == SHOWN
+    assert in_whole_words(NAME, sys.stderr) == SHOWN
+    assert str(Line(NAME)) == SHOWN
+    echo(NAME)
+    echo(NAME, err=True)
+    assert capsys.readouterr() == (f"{SHOWN}\n", f"{SHOWN}\n")
+
+
+def test_no_name_in_a_table_commands_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Table()
+    table.add_column("tool", min_width=20)
+    table.add_row(Text("a\x1b[2Jb", "bold"))
+    printer().print(table)
+    print_table(["tool"], [["a\x1b[2Jb"]], [])
+    shown = capsys.readouterr().out
+    assert shown.count("a\\x1b[2Jb") == 2
+    assert "\x1b[2J" not in shown
+
+
+def ended(code: str, *arguments: str) -> tuple[int, str]:
+    """Run Python with nobody who reads its output."""
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code, *arguments], stdout=write, stderr=subprocess.PIPE, text=True, check=False
+        )
+    finally:
+        os.close(write)
+    return done.returncode, done.stderr
+
+
+MAIN = "import sys; from ftdrive.cli import main; sys.exit(main())"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
+@pytest.mark.parametrize(
+    "arguments", [["export", "formats"], ["devices"], ["config", "show"], ["--help"]], ids=" ".join
+)
+def test_a_closed_pipe_ends_a_command_quietly(arguments: list[str]) -> None:
+    assert ended(MAIN, *arguments) == (141, "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
+def test_a_closed_pipe_ends_what_prints_again_and_again() -> None:
+    forever = (
+        "import sys, ftdrive.cli as cli, click\n"
+        "from ftdrive.terminal.text import echo\n"
+        "def forever():\n    while True: echo('line')\n"
+        "cli._LazyGroup.get_command = lambda *_: click.Command('x', callback=forever)\n"
+        "sys.exit(cli.main())"
+    )
+    assert ended(forever, "x") == (141, "")
+
+
+def test_a_command_without_output_does_its_work() -> None:
+    command = [sys.executable, "-c", f"import sys; sys.stdout = None; {MAIN}", "export", "formats"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

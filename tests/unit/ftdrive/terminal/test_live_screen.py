@@ -4,6 +4,8 @@ import asyncio
 import threading
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -164,6 +166,40 @@ def test_keys_tare_undo_and_mark() -> None:
     lines = screen.run(act)
     assert screen.stream.called == ["tare", "tare-undone", "mark"]
     assert 'mark "hi"' in lines[-3]
+
+
+def test_a_key_pushes_the_tool_of_an_emulated_cell_only() -> None:
+    async def act(screen: Screen, pilot: Pilot[None]) -> None:
+        await screen.press(pilot, "f")
+        await pilot.pause()
+
+    pushes: list[str] = []
+    screen = Screen()
+    assert "f push" not in screen.run(act)[-1]
+    screen = Screen()
+    screen.feed.push = partial(pushes.append, "pushed")
+    lines = screen.run(act)
+    assert pushes == ["pushed"]
+    assert "f push" in lines[-1]
+    assert "the emulated tool is pushed" in lines[-3]
+
+
+def test_at_80_columns_no_word_is_broken_and_none_touches_its_neighbour() -> None:
+    screen = Screen("contact", (80, 24))
+    screen.step(30)
+    view = screen.summary.view()
+    reading = replace(view.reading, chi2=98_765.4) if view.reading is not None else None
+    status = replace(view.status, false_alarm_rate=1e-6, contact_limit=40.6)
+    info = replace(view.info, tool="emulated gripper with long fingers and a camera")
+    view = replace(view, reading=reading, info=info, status=status, recording_s=754.0, contact_s=123.4)
+    lines = list(map(str, frame(view, 80, 24)))
+    assert all(cell_len(line) == 80 for line in lines)
+    words = {*lines[0].split()[-3:], *f"ftdrive live UR5e · ATI Mini45 FT12345 {info.tool} …".split()}
+    assert set(lines[0].split()) <= words
+    assert lines[0].endswith(" ● REC 00:12:34 ")
+    assert any(
+        line.endswith("▲ CONTACT 123.4 s  χ² 98765 > 40.6, p 1e-6 ") for line in (f"{x.rstrip()} " for x in lines)
+    )
 
 
 def test_freeze_span_and_peaks() -> None:

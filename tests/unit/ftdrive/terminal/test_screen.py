@@ -243,7 +243,7 @@ def test_a_warning_stays_until_the_next_pose() -> None:
     assert "! wait" not in drawn(warned)
 
 
-def test_a_long_path_keeps_the_end_that_tells_runs_apart() -> None:
+def test_a_long_path_keeps_the_end_that_distinguishes_runs() -> None:
     long = "/home/operator/" + "deep/" * 20 + "2026-11-20T211503Z-gripper_a"
     lines = drawn(view(RunOpened(folder=long, resume=f"ftdrive calibrate --resume {long}")))
     assert [line for line in lines if line.endswith("2026-11-20T211503Z-gripper_a") and len(line) == 80] == lines[-2:]

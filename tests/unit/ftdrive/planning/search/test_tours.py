@@ -82,7 +82,7 @@ def test_wrist_1_starts_near_where_it_stands_and_stays_in_its_range(q2: float, q
         pytest.param("UR20", LUMP, 120, 1.3, 0.5, marks=pytest.mark.slow),
     ],
 )
-def test_cone_tour_stays_in_its_cone_clear_and_tells_what_the_cone_allows(
+def test_cone_tour_stays_in_its_cone_clear_and_says_what_the_cone_allows(
     model: str, tool: tuple[Cylinder, ...], half_angle_deg: float, most_cond9: float, least_gap: float
 ) -> None:
     certifier = certifier_of(model, tool)
@@ -153,7 +153,7 @@ def test_free_box_out_of_reach_is_refused() -> None:
 
 
 @pytest.mark.slow
-def test_where_the_24_are_out_of_reach_the_most_telling_poses_are_taken_and_the_cost_is_said() -> None:
+def test_where_the_24_are_out_of_reach_the_most_informative_poses_are_taken_and_the_cost_is_said() -> None:
     # A ceiling just above the tool at rest: nothing points up.
     scene = Scene((BASE_PLANE, Plane((0.0, 0.0, -1.0), -0.42)), (Box((-0.9, -0.9, 0.0), (0.9, -0.5, 0.42)),))
     certifier = certifier_of("UR5e", (Cylinder(0, 0.3, 0.1),), scene)

@@ -31,7 +31,7 @@ def plan() -> Plan:
     return plan_tour(certifier, poses=6, speeds=Speeds(), guess=guess_of(certifier))
 
 
-def test_title_tells_whether_the_whole_arm_moves(plan: Plan) -> None:
+def test_title_says_whether_the_whole_arm_moves(plan: Plan) -> None:
     first, second, *others = plan.steps
     moving = replace(plan, steps=(first, replace(second, q_rad=(0.5, *second.q_rad[1:])), *others))
     title = title_of(plan, certifier_of(), on_its_way=False)

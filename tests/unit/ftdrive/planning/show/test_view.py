@@ -1,5 +1,6 @@
 """The scene of a plan: where it puts things. What a browser draws is looked at by eye."""
 
+import urllib.error
 import urllib.request
 from importlib.util import find_spec
 
@@ -91,3 +92,7 @@ def test_a_page_on_this_computer_or_what_to_install(plan: Plan, certifier: Certi
         assert url.startswith("http://127.0.0.1:")
         with urllib.request.urlopen(url, timeout=10) as page:
             assert b"<html" in page.read()
+        for name, value in (("Origin", "https://evil.example"), ("Host", "evil.example")):
+            foreign = urllib.request.Request(url, headers={name: value})
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(foreign, timeout=10)

@@ -56,7 +56,7 @@ def test_a_plan_that_is_not_proven_does_not_look_proven(plan: Plan) -> None:
     assert "NOT ALL PROVEN" in plan_in_words(replace(plan, steps=steps))
 
 
-def test_what_the_poses_do_not_tell_is_no_crash(plan: Plan) -> None:
+def test_what_the_poses_do_not_determine_is_no_crash(plan: Plan) -> None:
     words = plan_in_words(
         replace(plan, predicted={**plan.predicted, "mass_kg": None, "force_bias_N": [None, 0.1, 0.1]})
     )

@@ -1,0 +1,136 @@
+"""Which requests pass the gate before a server, over real sockets."""
+
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+from http.client import HTTPConnection
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from threading import Thread
+from typing import Any, cast
+
+import pytest
+from websockets import InvalidStatus, Origin, Subprotocol
+from websockets.sync.client import connect
+
+from ftdrive.http_gate import Gate, refusal
+from ftdrive.servers.foxglove import FoxgloveServer
+from tests.unit.ftdrive.servers.fake_stream import Client, FakeStream
+
+PAGE = "https://evil.example"
+VIEWER = "https://app.foxglove.dev"
+
+
+class Echo(BaseHTTPRequestHandler):
+    """Answers with the path."""
+
+    def do_GET(self) -> None:
+        """Answer."""
+        self.send_response(200)
+        self.end_headers()
+        self.wfile.write(self.path.encode())
+
+    def log_message(self, *_: object) -> None:
+        """Log nothing."""
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    """A web server behind a gate."""
+    server = HTTPServer(("127.0.0.1", 0), Echo)
+    thread = Thread(target=server.serve_forever)
+    thread.start()
+    with closing(Gate(("127.0.0.1", 0), lambda _: ("127.0.0.1", server.server_port))) as gate:
+        yield gate.port
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+def status(port: int, **headers: str) -> int:
+    connection = HTTPConnection("127.0.0.1", port, timeout=30)
+    with closing(connection):
+        connection.request("GET", "/page", headers=headers)
+        answer = connection.getresponse()
+        body = answer.read()
+    assert (body == b"/page") == (answer.status == 200)
+    return answer.status
+
+
+def test_foreign_origin_and_host_are_refused_and_programs_are_served(port: int) -> None:
+    assert status(port) == 200
+    assert status(port, Origin=f"http://127.0.0.1:{port}") == 200
+    assert status(port, Origin=PAGE) == 403
+    assert status(port, Origin="null") == 403
+    assert status(port, Host=f"evil.example:{port}") == 403
+    assert status(port, Host=f"evil.example:{port}", Origin=f"http://evil.example:{port}") == 403
+
+
+def test_a_second_request_on_one_connection_does_not_pass_unchecked(port: int) -> None:
+    request = f"GET /page HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nConnection: keep-alive\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as raw:
+        raw.sendall(request.encode() + request.replace("\r\n\r\n", f"\r\nOrigin: {PAGE}\r\n\r\n").encode())
+        received = b""
+        while piece := raw.recv(4096):
+            received += piece
+    assert received.count(b"/page") == 1
+
+
+@pytest.mark.parametrize("request_head", [b"\x00\x01\r\n\r\n", b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n"])
+def test_what_is_no_request_is_refused(port: int, request_head: bytes) -> None:
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as raw:
+        raw.sendall(request_head)
+        assert raw.recv(4096).split()[1] in (b"400", b"403")
+
+
+@pytest.mark.parametrize(
+    ("host", "bound", "served"),
+    [
+        ("localhost:8765", "127.0.0.1", True),  # a tunnel may have another port
+        ("[::1]:8765", "127.0.0.1", True),
+        ("192.168.1.5:8765", "127.0.0.1", False),
+        ("192.168.1.5:8765", "192.168.1.5", True),
+        ("192.168.1.5:8765", "0.0.0.0", True),
+        (f"{socket.gethostname()}:8765", "0.0.0.0", True),
+        ("evil.example:8765", "0.0.0.0", False),
+        ("localhost.evil.example", "localhost", False),
+        ("", "127.0.0.1", False),
+        ("[", "127.0.0.1", False),
+    ],
+)
+def test_the_host_is_the_bound_address(host: str, bound: str, served: bool) -> None:
+    assert (not refusal({"Host": host}, bound)) is served
+
+
+def handshake(port: int, origin: str | None, host: str = "127.0.0.1", **options: Any) -> Any:
+    return connect(
+        f"ws://{host}:{port}",
+        origin=None if origin is None else Origin(origin),
+        subprotocols=[Subprotocol("foxglove.sdk.v1")],
+        compression=None,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("allow_control", [False, True])
+def test_a_viewer_in_a_browser_reads_and_controls_only_if_that_is_allowed(allow_control: bool) -> None:
+    stream = FakeStream()
+    with closing(FoxgloveServer(cast(Any, stream), port=0, origins=[PAGE], allow_control=allow_control)) as server:
+        for origin in (VIEWER, PAGE):
+            with handshake(server.port, origin) as viewer:
+                info = viewer.recv(timeout=10)
+                assert ('"services"' in info) is allow_control
+        with Client.to(server.port) as program:
+            program.call("tare")
+            assert program.answer()["success"]
+    assert stream.tares == 1
+
+
+@pytest.mark.parametrize(("origin", "host"), [(PAGE, "127.0.0.1"), (None, "evil.example")])
+def test_any_other_page_is_refused_by_the_stream(origin: str | None, host: str) -> None:
+    with (
+        closing(FoxgloveServer(cast(Any, FakeStream()), port=0)) as server,
+        socket.create_connection(("127.0.0.1", server.port)) as raw,
+        pytest.raises(InvalidStatus, match="403"),
+        handshake(server.port, origin, host=host, sock=raw),
+    ):
+        pass
