@@ -103,7 +103,7 @@ class MetricsServer(Collector):
 
     def _answer(self, request: dict[str, Any], start: Any) -> Any:
         if self._page is None or request["PATH_INFO"] not in {"", "/"}:
-            return self._metrics(request, start)  # type: ignore[arg-type, misc]  # set by start_http_server
+            return self._metrics(request, start)  # type: ignore[misc]  # set by start_http_server
         try:
             status, text, kind = "200 OK", self._page(), "html"
         except BadStore as error:
