@@ -24,6 +24,7 @@ os.environ["XDG_STATE_HOME"] = _state.name
 os.environ["XDG_DATA_HOME"] = _state.name + "/data"
 for _name in [name for name in os.environ if name.startswith("FTDRIVE_") and name != "FTDRIVE_REAL_DATA"]:
     del os.environ[_name]
+os.environ.pop("UV_RUN_RECURSION_DEPTH", None)  # or every command in a message would begin with `uv run`
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -2,7 +2,7 @@
 
 `CODES` is the table of all codes. Its order is their rank: a cause stands before its consequences. A template has its
 values in braces, and the key of a value ends with its unit, which is written with it. ``{key:?yes|no}`` writes "yes" if
-the value is there, else "no".
+the value is there, else "no". ``{key:~sigma}`` writes a value to the place of its sigma, a value named `sigma`.
 """
 
 import json
@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from math import isfinite
 from types import MappingProxyType
 from typing import Any, Final, Literal, Self
+
+from ftcalib.rounding import decimals
 
 Severity = Literal["reject", "limit", "note"]
 """Of a finding: the result is rejected, usable at best, or not worse for it."""
@@ -136,7 +138,13 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
 
 
 def _written(template: str, values: Mapping[str, Any]) -> str:
-    return _PLACE.sub(lambda place: _value(place[1], values[place[1]], place[2] or ""), template)
+    def at(place: re.Match[str]) -> str:
+        name, form = place[1], place[2] or ""
+        if form[:1] == "~" and None not in (values[name], sigma := values[form[1:]]):
+            form = f".{decimals(sigma)}f"
+        return _value(name, values[name], form)
+
+    return _PLACE.sub(at, template)
 
 
 def _value(name: str, value: Any, form: str) -> str:
@@ -231,12 +239,12 @@ CODES: Final[Mapping[str, Code]] = {
         "residual is {corrected_Nm:.2g} instead of {residual_Nm:.2g}",
         "check the wiring of the axes, or the sensor's matrix"),
     # Known values that the data contradict
-    "known_mass": Code(_LIMIT_OR_NOTE, "the known mass of {known_kg:g} contradicts the data, which give {mass_kg:.5g} "
-        "(sigma {sigma_kg:.2g}){units:units}", "correct the data or the known value"),
+    "known_mass": Code(_LIMIT_OR_NOTE, "the known mass of {known_kg:g} contradicts the data, which give "
+        "{mass_kg:~sigma_kg} (sigma {sigma_kg:~sigma_kg}){units:units}", "correct the data or the known value"),
     "known_gravity_direction": Code(_LIMIT_OR_NOTE, "the known direction of gravity contradicts the data, which give "
-        "one {off_deg:.3g} away (sigma {sigma_deg:.2g})", "correct the data or the known value"),
+        "one {off_deg:~sigma_deg} away (sigma {sigma_deg:~sigma_deg})", "correct the data or the known value"),
     "known_mounting": Code(_LIMIT_OR_NOTE, "the known mounting of the sensor contradicts the data, which give one "
-        "{off_deg:.3g} away (sigma {sigma_deg:.2g}){corrections:?, as with |}{corrections:axes}",
+        "{off_deg:~sigma_deg} away (sigma {sigma_deg:~sigma_deg}){corrections:?, as with |}{corrections:axes}",
         "correct the data or the known value"),
     # Units, drift and changes of one session
     "payload_units": Code(_LIMIT, "the load is {load_kg:.2f}, but {expected_kg:.2f} by the payload in the "
@@ -320,8 +328,8 @@ CODES: Final[Mapping[str, Code]] = {
         "fasten its screws and calibrate again"),
     "gravity_tilted": Code(_NOTE, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot on a "
         "slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
-    "base_leans": Code(_NOTE, "the base leans {lean_deg:.2f} (sigma {sigma_deg:.2f}) towards its {side}, compared "
-        "with the declared mounting", "level the base, or set its mounting in the controller"),
+    "base_leans": Code(_NOTE, "the base leans {lean_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) towards its {side}, "
+        "compared with the declared mounting", "level the base, or set its mounting in the controller"),
     "noise_unknown": Code(_NOTE, "the noise was estimated from the residuals, so chi2 does not test the fit",
         "state the noise of each pose to test it"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),

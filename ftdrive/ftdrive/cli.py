@@ -89,7 +89,9 @@ class _LazyGroup(click.Group):
 
 @click.group(cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("-v", "--verbose", count=True, help="Print details on stderr; -vv also prints debug messages.")
-@click.option("-q", "--quiet", is_flag=True, help="Print only errors and, before a question, the text it refers to.")
+@click.option(
+    "-q", "--quiet", is_flag=True, help="Print only answers, errors and, before a question, what it is about."
+)
 @click.version_option(__version__, prog_name="ftdrive")
 def cli(verbose: int, quiet: bool) -> None:
     """Calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force.

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import distribution
 from pathlib import Path
 
@@ -68,6 +69,12 @@ def test_every_dependency_is_bounded_and_has_its_reason() -> None:
     required = [line.strip().strip('",') for line in lines if line.startswith('  "') and ">=" in line]
     assert len(required) >= len(distribution("ftdrive").requires or [])
     assert all("<" in line for line in required)
+
+
+def test_uv_run_compiles_nothing() -> None:
+    """A setting that compiles costs each `uv run` a look at some thousand files; CI compiles once by itself."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert "compile-bytecode" not in project["tool"].get("uv", {})
 
 
 def test_help_imports_nothing_heavy_and_opens_nothing() -> None:

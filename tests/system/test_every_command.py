@@ -174,6 +174,41 @@ def works_with_simulate_and_json(command: str, ftdrive: CommandLine, capfd: pyte
     assert SHOWN.get(command, bool)(answer)
 
 
+ANSWERED: Mapping[str, str] = {
+    "bundle": "Saved ",
+    "config show": "[robot]",
+    "devices": "/dev/pts/",
+    "doctor": "Usable; see the lines with !",
+    "export calibration": '"ftdrive.export/1"',
+    "export plan": "# ftdrive.targets/1",
+    "plan": "Predicted for",
+    "replay": "equal to the last digit",
+    "report": "# ",
+    "solve": "compensation error",
+    "transcript play": "played ",
+}
+"""What each prints on stdout without --json; for `calibrate`, `verify` and `push` see their tests."""
+
+
+@pytest.mark.parametrize("command", ANSWERED)
+def test_the_answer_is_on_stdout(
+    command: str, demo: dict[str, Any], ftdrive: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if command in REHEARSED:
+        module = importlib.import_module(f"ftdrive.commands.{'emulated_run' if ' ' in command else command}")
+        monkeypatch.setattr(module, "rehearsed_run", lambda _: nullcontext(Path(demo["run"])))
+    outcome = ftdrive.run(*command.split(), *NEEDED.get(command, ()), "--simulate")
+    assert outcome.returncode == 0, outcome.stderr
+    assert ANSWERED[command] in outcome.stdout
+    assert ANSWERED[command] not in outcome.stderr
+    quiet = ftdrive.run("-q", *command.split(), *NEEDED.get(command, ()), "--simulate", *_FRESH.get(command, ()))
+    assert (quiet.returncode, quiet.stderr) == (0, "")
+    assert ANSWERED[command] in quiet.stdout
+
+
+_FRESH: Mapping[str, tuple[str, ...]] = {"bundle": ("-o", "b.zip")}
+
+
 @pytest.mark.parametrize(
     ("command", "url"),
     [

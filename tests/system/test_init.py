@@ -2,6 +2,7 @@
 
 import codecs
 import fcntl
+import json
 import os
 import pty
 import re
@@ -15,6 +16,7 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
@@ -204,11 +206,29 @@ def test_the_operator_may_keep_addresses_that_do_not_answer() -> None:
 def test_simulated(tmp_path: Path) -> None:
     outcome = run("--simulate", "--yes", *TOOL, "-o", str(tmp_path / "cell.toml"))
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
-    cell = load(tmp_path / "cell.toml")
-    assert cell.robot.model == "UR5e"
-    assert cell.sensor.url.startswith("ati-can://")
-    assert "have ended" in outcome.stderr
-    assert "Next: ftdrive doctor --simulate" in outcome.stderr
+    cell = load(tmp_path / "cell.toml", devices=False)
+    assert (cell.robot.simulate, cell.robot.host, cell.robot.model) == (True, "emulated", "UR5e")
+    assert cell.sensor.url == "emulated://can"
+    assert "/dev/" not in (tmp_path / "cell.toml").read_text()
+    assert "Next\n   ftdrive doctor --simulate\n" in outcome.stderr
+
+
+def test_an_emulated_cell_is_that_of_the_file_and_no_real_command_takes_it() -> None:
+    more = ["--tool-name", "gripper", "--tool-mass", "1.3", "--mounting", "30", "--box", "500:500:0:900:900:90"]
+    assert run("--simulate", "--sensor", "emulated://robotiq", "--yes", *TOOL, *more).exit_code == 0
+    with Station.of(None) as emulated:
+        cell, truth = emulated.cell, emulated.truth
+    again = Station.of(json.loads(json.dumps({"sensor": "robotiq", "values": emulated.values})))
+    assert (again.sensor, again.values) == ("robotiq", emulated.values)
+    assert (emulated.sensor, cell.tool.name, cell.tool.mass_kg) == ("robotiq", "gripper", 1.3)
+    assert cell.tool.cylinders_mm == ((0, 33, 80), (33, 200, 100, 0, 5))
+    assert (cell.workcell.mounting, cell.workcell.boxes_mm) == ("30", ((500, 500, 0, 900, 900, 90),))
+    assert (truth["mass_kg"], truth["p_flange_sensor_m"]) == (1.3, [0, 0, 0.033])
+    assert truth["tilt_beta_rad"] == pytest.approx(np.radians(30))
+    for command in ("doctor", "calibrate"):
+        error = CliRunner().invoke(cli, [command]).exception
+        assert isinstance(error, ConfigError)
+        assert "describes an emulated cell ([robot] simulate = true): add --simulate" in str(error)
 
 
 @pytest.mark.slow

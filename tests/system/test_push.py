@@ -48,7 +48,7 @@ def test_a_payload_is_pushed_read_back_and_restored(station: Station, run: Path,
     before = payload(station)
     tried = ftdrive.run("push", run, "--config", "cell.toml", "--dry-run")
     assert tried.returncode == 0, tried.stderr
-    assert "nothing was sent" in tried.stderr
+    assert "nothing was sent" in tried.stdout
     declined = ftdrive.run("push", run, "--config", "cell.toml", typed="no\n")
     assert declined.returncode == 130
     assert payload(station) == before
@@ -58,7 +58,7 @@ def test_a_payload_is_pushed_read_back_and_restored(station: Station, run: Path,
     assert pushed.returncode == 0, pushed.stderr
     assert "'push' is none of the answers" in pushed.stderr
     assert "zeroes the arm's own force sensor" in pushed.stderr
-    assert f"undo: ftdrive push --restore {run / 'push.json'}" in pushed.stderr
+    assert f"undo: ftdrive push --restore {run / 'push.json'}" in pushed.stdout
     truth_kg = station.truth["mass_kg"]
     mass_kg, com_m = payload(station)
     assert mass_kg == pytest.approx(truth_kg + SENSOR_KG, abs=0.005)
@@ -140,7 +140,7 @@ def test_the_tilt_of_the_base_is_pushed_read_back_and_restored(run: Path, ftdriv
         pushed = ftdrive.run("push", run, "--gravity", "--config", "cell.toml", typed="GRAVITY\n")
         assert pushed.returncode == 0, pushed.stderr
         assert "Type GRAVITY" in pushed.stderr
-        assert "Read back" in pushed.stderr
+        assert "Read back" in pushed.stdout
         assert off_deg() < 0.1
         assert payload(station)[0] == station.truth["payload_kg"]  # it stays
         receipt = json.loads((run / "push.json").read_text())
@@ -149,7 +149,7 @@ def test_the_tilt_of_the_base_is_pushed_read_back_and_restored(run: Path, ftdriv
         assert receipt["read_back"]["up_base_m_s2"] == pytest.approx(controller_gravity(station))
         assert np.linalg.norm(receipt["new"]["up_base_m_s2"]) == pytest.approx(9.82)
         agrees = ftdrive.run("push", run, "--gravity", "--config", "cell.toml")
-        assert (agrees.returncode, "The controller agrees" in agrees.stderr) == (0, True)
+        assert (agrees.returncode, "The controller agrees" in agrees.stdout) == (0, True)
 
         restored = ftdrive.run("push", "--restore", run, "--config", "cell.toml", typed="GRAVITY\n")
         assert restored.returncode == 0, restored.stderr

@@ -9,6 +9,7 @@ import numpy as np
 from ftcalib.assessment import units
 from ftcalib.findings import Finding
 from ftcalib.model import Array, Parameters
+from ftcalib.rounding import decimals
 from ftcalib.setup import Setup
 from ftcalib.sphere import axes_along, evenly_spread
 
@@ -96,7 +97,9 @@ class Lean:
         return self.deg >= max(LEAN_DEG, _SIGNIFICANT * self.sigma_deg)
 
     def __str__(self) -> str:
-        return f"leans {self.deg:.2f}° (sigma {self.sigma_deg:.2f}°) towards its {self.side}"
+        return "leans {:.{places}f}° (sigma {:.{places}f}°) towards its {}".format(
+            self.deg, self.sigma_deg, self.side, places=decimals(self.sigma_deg)
+        )
 
 
 def lean_from(down: Array, gravity_force_base_N: Array, covariance: Array) -> Lean:

@@ -65,6 +65,11 @@ class RobotConfig:
     )
     api_port: int = entry("of the Robot API of PolyScope X", 80, between=(1, 65535))
     serial: str | None = entry("serial number; if set, nothing moves on another arm", None, reject=rules.reject_empty)
+    simulate: bool = entry(
+        "true for an emulated cell: commands with --simulate take its tool, masses, surroundings and speed, all others "
+        "refuse it",
+        False,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,7 +322,13 @@ def settings(
 
 
 def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfig:
-    """Turn settings into a cell; raises `ConfigError` when a device is needed and not named."""
+    """Turn settings into a cell; raises `ConfigError` when a device is needed, but not named or emulated."""
+    if devices and values["robot.simulate"].value:
+        origin = values["robot.simulate"].origin
+        raise ConfigError(
+            f"{origin} describes an emulated cell ([robot] simulate = true): add --simulate, or describe your cell "
+            "with `ftdrive init -o NEW.toml`"
+        )
     missing = [key for key in ("robot.host", "sensor.url") if values[key].value is None]
     if missing and devices:
         section, key = missing[0].split(".")

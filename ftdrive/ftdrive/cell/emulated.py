@@ -6,11 +6,12 @@ import platform
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any, Self
 
 from ftcalib.routine import Sampling
-from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, checked, settings
 from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError
@@ -51,12 +52,22 @@ class Station:
         More options of `python -m ftmocks station`.
     control_path : str
         As `control` of `[robot]`.
+    values : mapping
+        Of the configuration, by key such as "tool.name"; they replace those of the usual emulated cell.
     """
 
-    def __init__(self, sensor: str = "can", options: Sequence[str] = (), *, control_path: str = "auto") -> None:
+    def __init__(
+        self,
+        sensor: str = "can",
+        options: Sequence[str] = (),
+        *,
+        control_path: str = "auto",
+        values: Mapping[str, Any] = {},
+    ) -> None:
         self.sensor = sensor
         self.options = tuple(options)
         self.control_path = control_path
+        self.values = dict(values)
         self.endpoints: Mapping[str, Any] = {}
         self.clock: Clock = REAL
         """The cell's own, once it has started."""
@@ -71,15 +82,17 @@ class Station:
         *,
         control_path: str | None = None,
     ) -> Self:
-        """Describe the station that a run or a calibration names as its `station`, or the usual one; not started.
+        """Describe the station that a run or a calibration names as its `station`; not started.
 
-        An address emulated://NAME in `sensor` replaces its sensor, and `control_path` its control path; `options` come
-        after its own.
+        Without one it is that of the configuration if `[robot] simulate` is true there, else the usual one. An address
+        emulated://NAME in `sensor` replaces its sensor, and `control_path` its control path; `options` come after its
+        own.
         """
-        made_by = made_by or {}
+        made_by = made_by or _configured(sensor)
         name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
         path = control_path or made_by.get("control_path", "auto")
-        return cls(name, (*made_by.get("options", ()), *options), control_path=path)
+        values = {key: checked("the run", key, value) for key, value in made_by.get("values", {}).items()}
+        return cls(name, (*made_by.get("options", ()), *options), control_path=path, values=values)
 
     def __enter__(self) -> Self:
         if sys.platform != "linux":
@@ -144,7 +157,7 @@ class Station:
         arm = self.endpoints["arm"]
         url = next(iter(self.endpoints["sensors"].values()))["url"]
         truth = self.truth
-        return CellConfig(
+        usual = CellConfig(
             robot=RobotConfig(
                 arm["host"],
                 arm["model"],
@@ -159,6 +172,47 @@ class Station:
             sampling=Sampling(average_s=0.4, noise_record_s=0.0),
             clock=self.clock,
         )
+        return _with_values(usual, self.values)
+
+
+_OF_FILE = (
+    *("robot.speed_deg_s", "tool.name", "tool.cylinders_mm", "tool.mass_kg"),
+    *("workcell.mounting", "workcell.planes_mm", "workcell.boxes_mm"),
+)
+"""What an emulated cell takes from a configuration, beside the truth that `_options` sets."""
+
+
+def _configured(sensor: str | None) -> Mapping[str, Any]:
+    """Return the station that the configuration describes, as a run names it; nothing if its cell is not emulated."""
+    found = settings()
+    if not found["robot.simulate"].value:
+        return {}
+    values = {key: one.value for key, one in found.items() if one.value is not None}
+    name = sensor_name(sensor or values.get("sensor.url"))
+    chosen = {key: values[key] for key in _OF_FILE if key in values}
+    return {"sensor": name, "options": _options(values, name), "values": chosen}
+
+
+def _options(values: Mapping[str, Any], sensor: str) -> tuple[str, ...]:
+    """Return the options that give a station the masses, the height and the mounting of a configuration."""
+    options = list[str]()
+    if "tool.mass_kg" in values:
+        options += ["--mass", str(values["tool.mass_kg"])]
+    if "sensor.height_mm" in values:
+        options += ["--sensor-origin", f"0,0,{values['sensor.height_mm'] / 1e3}"]
+    if "sensor.mass_kg" in values and sensor != "ur-ft":  # that one is part of the arm
+        options += ["--sensor-mass-kg", str(values["sensor.mass_kg"])]
+    mounting = values.get("workcell.mounting", "floor")
+    if mounting in {"floor", "wall", "ceiling"}:
+        return (*options, "--mount", mounting)
+    return (*options, "--mount", "floor", "--tilt-deg", f"0,{mounting}")
+
+
+def _with_values(cell: CellConfig, values: Mapping[str, Any]) -> CellConfig:
+    for key, value in values.items():
+        section, name = key.split(".")
+        cell = replace(cell, **{section: replace(getattr(cell, section), **{name: value})})
+    return cell
 
 
 def sensor_reached(url: str, clock: Clock = REAL) -> tuple[str, Clock]:

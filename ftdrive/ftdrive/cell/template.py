@@ -24,6 +24,7 @@ def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
     values = {f"{section}.{key}": value for section, keys in cell.to_dict().items() for key, value in keys.items()}
     values["workcell.measured"] = False
     asked = {key for key, rule in RULES.items() if rule.option} | {"workcell.measured"}
+    asked |= {"robot.simulate"} if cell.robot.simulate else set()
     lines = [
         *(f"# {''.join(c if c.isprintable() else '?' for c in words)}" for words in found),
         "# To print the values in force and their origins: ftdrive config show --origin",

@@ -20,7 +20,7 @@ from ftdrive.commands.common import (
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError
 from ftdrive.runs.bundle import write_bundle
-from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.console import answer, hanging, talk
 
 
 @click.command()
@@ -55,8 +55,10 @@ def bundle(
         bundled = write_bundle(folder, path, transcripts)
     if as_json:
         write_json({"schema_version": 1, "file": str(path), **asdict(bundled)})
+    say = talk if as_json else answer
     counted = ", ".join(f"{count} {kind}" for kind, count in bundled.redacted.items()) or "nothing found"
-    talk.print(hanging(" redacted: ", counted))
+    say.print(hanging(" redacted: ", counted, say))
     if bundled.left_out:
-        talk.print(hanging(" left out: ", f"{', '.join(bundled.left_out)} (neither text nor a pose)"))
-    talk.print(f" Saved {path}")
+        words = f"{', '.join(bundled.left_out)} (neither text nor a pose)"
+        say.print(hanging(" left out: ", words, say))
+    say.print(f" Saved {path}")

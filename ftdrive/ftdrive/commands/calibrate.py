@@ -3,6 +3,7 @@
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -16,6 +17,7 @@ from ftdrive.commands.common import (
     NewFile,
     declined_aborts,
     index_run,
+    require_viz,
     rows,
     runs,
     simulate,
@@ -98,11 +100,12 @@ def calibrate(
     from ftdrive.session.options import SessionOptions
     from ftdrive.session.rehearsal import described
     from ftdrive.session.session import calibrate as guide
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import answer, talk
     from ftdrive.terminal.report import print_result
     from ftdrive.terminal.screen import open_operator
 
     _refuse_contradictions(click.get_current_context())
+    require_viz(as_session["png"], view=as_session["view"])
     mode: Mode = "step" if step else "manual" if manual else "listen" if listen else "auto"
     with ExitStack() as stack:
         description: dict[str, Any] = {}
@@ -125,7 +128,7 @@ def calibrate(
         with declined_aborts(), open_operator(as_json=as_json) as operator:
             outcome = guide(cell, operator, options)
     if outcome is None:
-        talk.print("Dry run: nothing has moved.")
+        (talk if as_json else answer).print("Dry run: nothing has moved.")
         return
     index_run(outcome.run.folder, None if simulate else cell)
     if as_json:
@@ -133,6 +136,10 @@ def calibrate(
     else:
         saved = None if outcome.result.verdict == "rejected" else outcome.run.calibration_path
         print_result(outcome.result, drift=outcome.drift, records=outcome.run.records(), saved=saved)
+        folder = quote(str(outcome.run.folder))
+        with_it = f"--calibration {folder}{' --simulate' if simulate else ''}"
+        useful = () if saved is None else (f"ftdrive live {with_it}", f"ftdrive verify {with_it}")
+        talk.print_next(f"ftdrive report {folder}   (how good it is, and why)", *useful)
     stop_unless_accepted(outcome.result, to_be_saved=True)
 
 

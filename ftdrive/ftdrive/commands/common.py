@@ -92,6 +92,35 @@ class Number(click.FloatRange):
         return number
 
 
+def require_extra(extra: str, what: str, *modules: str) -> None:
+    """Raise `ConfigError` before any work if a package of an extra is not installed.
+
+    Parameters
+    ----------
+    extra : str
+    what : str
+        What needs it, such as "--png".
+    modules : str
+        That it brings.
+    """
+    from importlib.util import find_spec
+
+    from ftdrive.errors import ConfigError
+
+    if missing := [name for name in modules if find_spec(name) is None]:
+        raise ConfigError(
+            f"{what} needs {missing[0]}: install ftdrive[{extra}], in a clone with `uv sync --all-extras`"
+        )
+
+
+def require_viz(png: Path | None, *, view: bool) -> None:
+    """Raise `ConfigError` if a picture or a view of a plan is wanted and its package is missing."""
+    if png is not None:
+        require_extra("viz", "--png", "matplotlib")
+    if view:
+        require_extra("viz", "--view", "viser")
+
+
 class NewFile(click.Path):
     """A file that a command creates. It is rejected before any work if it exists or its folder does not."""
 

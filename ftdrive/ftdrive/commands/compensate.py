@@ -58,9 +58,12 @@ def compensate(
     as r11..r33, qx,qy,qz,qw or rx,ry,rz in rad.
     """
     from ftdrive.recording.compensation import compensated
+    from ftdrive.recording.files import format_of
     from ftdrive.runs.source import read_calibration
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import answer, talk
 
+    if output is not None:
+        format_of(output)
     frame = read_frame(axes, about)
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     recording, found = _read(path, calibration, loaded, wrench, orientation_file, delay, everything=output is not None)
@@ -74,7 +77,7 @@ def compensate(
     else:
         echo("\n".join(_words(result, str(frame))))
     if output is not None:
-        talk.print(f" Saved {output}")
+        (talk if as_json else answer).print(f" Saved {output}")
 
 
 def _read(
@@ -110,14 +113,15 @@ def _read(
 
 
 def _words(result: dict[str, Any], frame: str) -> Iterator[str]:
+    from ftcalib.rounding import with_sigma
     from ftdrive.runs.verification_record import MARKS
 
     yield from (f" {MARKS[mark]}" for mark in result["marks"])
     yield f" {result['samples']} samples, {result['duration_s']:.2f} s, gaps: {result['gaps']}"
     if delay := result["delay_s"]:
-        yield f" wrench after pose: {1e3 * delay['value']:.2f} ± {1e3 * delay['sigma']:.2f} ms (1 sigma)"
+        yield f" wrench after pose: {with_sigma(1e3 * delay['value'], 1e3 * delay['sigma'])} ms (1 sigma)"
     if change := result["bias_change"]:
-        pairs = [f"{v:.5f} ± {s:.5f}" for v, s in zip(change["value"], change["sigma"], strict=True)]
+        pairs = [with_sigma(v, s) for v, s in zip(change["value"], change["sigma"], strict=True)]
         yield f" bias change ± 1 sigma:\n   {', '.join(pairs[:3])} N\n   {', '.join(pairs[3:])} N·m"
     yield f" {'':12}{'force rms':>10}{'max N':>10}{'torque rms':>12}{'max N·m':>10}"
     for name in ("raw", "compensated"):

@@ -31,9 +31,9 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
 
     check_simulate(simulate, real={"--config": path}, emulated={"--sensor": sensor})
     if simulate:
-        from ftdrive.cell.emulated import Station, sensor_name
+        from ftdrive.cell.emulated import Station
 
-        with Station(sensor_name(sensor)) as station:
+        with Station.of(None, sensor) as station:
             found = settings(cell=station.cell)
     else:
         found = settings(path)

@@ -1,6 +1,5 @@
 """`ftdrive demo`: a calibration of an emulated cell, with the truth beside each estimate."""
 
-import os
 from pathlib import Path
 from shlex import quote
 
@@ -50,11 +49,9 @@ def demo(sensor: str, seed: int, control: str | None, polyscope: str | None, run
         )
     else:
         print_result(outcome.result, truth=truth, drift=outcome.drift, records=outcome.run.records(), hinted=False)
-        uv = "uv run " if "UV_RUN_RECURSION_DEPTH" in os.environ else ""  # which uv run sets
-        talk.print("Next", style="bold cyan")
-        talk.print(
-            f"   {uv}ftdrive live --calibration {quote(str(outcome.run.folder))} --simulate"
-            f"\n   {uv}{outcome.run.solve_command} --method all"
-            f"\n   {uv}ftdrive init   (describe your own cell)"
+        talk.print_next(
+            f"ftdrive live --calibration {quote(str(outcome.run.folder))} --simulate",
+            f"{outcome.run.solve_command} --method all",
+            "ftdrive init   (describe your own cell)",
         )
     stop_unless_accepted(outcome.result, to_be_saved=True)

@@ -112,10 +112,12 @@ def _side(text: str) -> Side:
 
 
 def _line(label: str, change: float, sigma: float) -> str:
+    from ftcalib.rounding import to_place_of
+
     if change == 0:
         return f"{label:22}{'same':>12}"
-    spread, ratio = (f"{sigma:12.5f}", f"{change / sigma:+11.1f}") if sigma > 0 else (f"{'known':>12}", "")
-    return f"{label:22}{change:+12.5f}{spread}{ratio}"
+    spread, ratio = (to_place_of(sigma, sigma), f"{change / sigma:+11.1f}") if sigma > 0 else ("known", "")
+    return f"{label:22}{to_place_of(change, sigma, '+'):>12}{spread:>12}{ratio}"
 
 
 def _in_words(found: "Difference") -> str:

@@ -15,7 +15,7 @@ from rich.text import Text
 from ftcalib import CalibrationResult
 from ftdrive.cell.config import USUAL_KG, CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.cell.emulated import Station, sensor_name, sensor_reached
+from ftdrive.cell.emulated import Station, sensor_reached
 from ftdrive.checks import computer, devices
 from ftdrive.checks.check import Check, verdict
 from ftdrive.checks.computer import SensorAddress
@@ -33,7 +33,7 @@ from ftdrive.commands.common import (
 )
 from ftdrive.errors import NotAccepted
 from ftdrive.session.guards import Limits
-from ftdrive.terminal.console import hanging, printer, talk
+from ftdrive.terminal.console import answer, hanging, talk, working
 from ftdrive.terminal.text import echo
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
@@ -82,16 +82,18 @@ def doctor(
     calibration = None if path is None else CalibrationResult.load(path)
     pushed: dict[str, Any] | None = None
     with ExitStack() as stack:
-        station = stack.enter_context(Station(sensor_name(sensor), ["--time-scale", "1"])) if simulate else None
+        station = stack.enter_context(Station.of(None, sensor, ["--time-scale", "1"])) if simulate else None
         cell = read_cell(config, robot, sensor, model=model) if station is None else station.cell
         address = SensorAddress.of(sensor_reached(cell.sensor.url)[0])
         device = build_sensor(cell)
 
-        found, arm = _examine_robot(cell, stack)
+        with working("Reading the arm and its clock"):
+            found, arm = _examine_robot(cell, stack)
         permissions = computer.check_permissions(address)
         blame = partial(devices.check_sensor_error, address=address, permissions=permissions)
         mass_kg = mass_kg or cell.tool.mass_kg or USUAL_KG
-        of_sensor, alive = _examine_sensor(device, address, cell, mass_kg, blame, stack)
+        with working("Reading the sensor"):
+            of_sensor, alive = _examine_sensor(device, address, cell, mass_kg, blame, stack)
         model = cell.robot.model if arm is None else arm.identify().model
         found += [*of_sensor, computer.check_workcell(cell, model), computer.check_disk(runs), *permissions]
         if calibration is not None:
@@ -113,6 +115,11 @@ def doctor(
         write_json({**answer, "push": pushed} if push else answer)
     else:
         _print(found)
+        again = " --simulate" if simulate else ""
+        if failed:
+            talk.print_next(f"ftdrive doctor{again}   (when what is marked ✘ is fixed)")
+        else:
+            talk.print_next(f"ftdrive plan{again}   (a tour proven clear)", f"ftdrive calibrate{again}")
     if failed:
         raise NotAccepted(f"{len(failed)} of {len(found)} checks failed: {', '.join(failed)}")
 
@@ -232,14 +239,13 @@ def _examine_push(
 
 
 def _print(found: list[Check]) -> None:
-    data = printer()
     subject = ""
     for check in found:
         first, _, _ = check.name.partition(".")
         head = Text.assemble(f" {'' if first == subject else first:<12}", _MARK[check.state], " ")
-        data.print(hanging(head, check.found, data))
+        answer.print(hanging(head, check.found, answer))
         if check.fix is not None and check.state in {"warning", "failed"}:
-            data.print(hanging(f"{'':15}fix: ", check.fix, data))
+            answer.print(hanging(f"{'':15}fix: ", check.fix, answer))
         subject = first
     words = {"ok": " All checks passed.", "warning": " Usable; see the lines with !", "failed": " Not ready."}
-    talk.print(words[verdict(found)])
+    answer.print(words[verdict(found)])

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from ftdrive.cell.emulated import MOVED_BY, Station, sensor_name
+from ftdrive.cell.emulated import MOVED_BY, Station
 from ftdrive.runs.outcome import Outcome
 from ftdrive.session import rehearsal
 from ftdrive.session.options import SessionOptions, with_recorded_mode
@@ -37,6 +37,6 @@ def rehearsed_run(sensor: str | None) -> Iterator[Path]:
         As `sensor_name` takes it.
     """
     with TemporaryDirectory(prefix="ftdrive-") as runs:
-        with Station(sensor_name(sensor)) as station:
+        with Station.of(None, sensor) as station:
             outcome = rehearse(station, Path(runs), "simulated", poses=6, kept=False)
         yield outcome.run.folder

@@ -221,9 +221,11 @@ def formats(as_json: bool) -> None:
         ]
         write_json({"schema_version": 1, "formats": found})
         return
+    from ftdrive.terminal.console import answer, hanging
+
     width = max(map(len, FORMATS))
     for name, one in FORMATS.items():
-        echo(f"{name:{width}}  {one.description}")
+        answer.print(hanging(f"{name:{width}}  ", one.description, answer))
 
 
 @contextmanager
@@ -247,6 +249,6 @@ def _emulated() -> "Plan":
     from ftdrive.planning.cell_plan import certifier_for, plan_for
     from ftdrive.planning.planner import USUAL_POSTURE_RAD
 
-    with Station() as station:
+    with Station.of(None) as station:
         cell = station.cell
     return plan_for(cell, certifier_for(cell, cell.robot.model), USUAL_POSTURE_RAD)

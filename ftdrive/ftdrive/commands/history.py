@@ -32,7 +32,7 @@ def history(
     from ftdrive.errors import ConfigError
     from ftdrive.store.history import drifts, warnings
     from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
-    from ftdrive.terminal.console import hanging, talk
+    from ftdrive.terminal.console import answer, hanging, talk
 
     left_out: tuple[str, ...] = ()
     name = None
@@ -67,10 +67,10 @@ def history(
     for drift in found:
         echo(f"trend: {drift}")
     for words in advice:
-        talk.print(hanging(" ! ", words), style="yellow")
+        answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
-_TITLES = ("id", "date", "tool", "verdict", "kg", "force bias, N", "verified", "°C", "parent")
+_TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "force bias, N", "verified", "run", "°C", "parent")
 _OPTIONAL = {"°C", "parent"}
 """Shown if a result has one."""
 
@@ -86,11 +86,13 @@ def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime)
     return (
         one.id[:6],
         "-" if one.created_utc is None else one.created_utc[:10],
+        one.arm_serial or one.arm_model or "-",
         one.tool_in_words,
         one.verdict,
         f"{one.mass_kg:.4f}",
         " ".join(f"{value:.2f}" for value in one.parameters.force_bias_N),
         verified,
+        one.run,
         "" if one.temperature_C is None else f"{one.temperature_C:.0f}",
         f"{one.parent[:6]} ({one.update})" if one.parent else "",
     )
@@ -102,7 +104,9 @@ def _print_table(rows: Sequence[Sequence[str]]) -> None:
 
     shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
     print_table(
-        [_TITLES[n] for n in shown], [[row[n] for n in shown] for row in rows], folding={"tool", "verified", "parent"}
+        [_TITLES[n] for n in shown],
+        [[row[n] for n in shown] for row in rows],
+        folding={"arm", "tool", "force bias, N", "verified", "run", "parent"},
     )
 
 

@@ -76,24 +76,28 @@ def init(
         clock_in_force,
         settings,
     )
-    from ftdrive.cell.emulated import Station, sensor_name
+    from ftdrive.cell.emulated import EMULATED, Station, sensor_name
     from ftdrive.cell.template import cell_file
     from ftdrive.planning.cell_plan import require_possible
     from ftdrive.planning.geometry.arm_model import SHAPES
+    from ftdrive.terminal.console import talk
     from ftdrivers.ur.kinematics import model_named
 
     check_simulate(simulate, real={"--robot": robot})
     defaults = {key: setting.value for key, setting in settings().items()}
+    emulated = sensor_name(sensor) if simulate else ""
     with ExitStack() as stack:
         clock = clock_in_force()
         if simulate:
-            station = stack.enter_context(Station(sensor_name(sensor), ["--time-scale", "1"]))
+            station = stack.enter_context(Station(emulated, ["--time-scale", "1"]))
             robot, sensor, clock = station.cell.robot.host, station.cell.sensor.url, station.clock
         ask = Questions(yes, defaults)
         host, model, robot_words = _robot(ask, robot, model, clock)
         if model is not None and model_named(model, controller_major=0) not in SHAPES:
             _say(f"the {model} has no measured shape, so no motion can be planned: use calibrate --manual", "  ! ")
         url, sensor_words = _sensor(ask, sensor, clock)
+    if simulate:  # its addresses have ended with it
+        host, url = "emulated", EMULATED + emulated
     height_mm = ask.number("Sensor height above the flange, mm (measure it)", "sensor.height_mm", height)
     sensor_kg = ask.number(
         "Sensor and adapter, kg (scale or datasheet; Enter: unknown)", "sensor.mass_kg", sensor_mass, ""
@@ -143,7 +147,7 @@ def init(
     usual = f"{defaults['robot.speed_deg_s']:g}"
     speed_deg_s = ask.number("Speed of the fastest joint, deg/s", "robot.speed_deg_s", speed, usual)
     cell = CellConfig(
-        RobotConfig(host, model, speed_deg_s),
+        RobotConfig(host, model, speed_deg_s, simulate=simulate),
         SensorConfig(url, height_mm=height_mm, mass_kg=sensor_kg),
         tool_config,
         workcell,
@@ -153,11 +157,11 @@ def init(
         devices = {"robot": robot_words, "sensor": sensor_words}
         write_json({"schema_version": 1, "file": str(output), **devices, "config": cell.to_dict()})
     if simulate:
-        _say(f"Wrote {output} as an example: the emulated robot and sensor in it have ended with this command.")
-        _say("Next: ftdrive doctor --simulate, then ftdrive plan --simulate")
+        _say(f"Wrote {output} for an emulated cell: commands with --simulate use it, all others refuse it.")
+        talk.print_next("ftdrive doctor --simulate", "ftdrive plan --simulate")
     else:
         _say(f"Wrote {output}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
-        _say("Next: ftdrive doctor, then ftdrive plan")
+        talk.print_next("ftdrive doctor", "ftdrive plan")
 
 
 class Questions:

@@ -6,7 +6,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import CONFIG, JSON, NewFile, check_simulate, numbers, rows, simulate, write_json
+from ftdrive.commands.common import (
+    CONFIG,
+    JSON,
+    NewFile,
+    check_simulate,
+    numbers,
+    require_viz,
+    rows,
+    simulate,
+    write_json,
+)
 
 if TYPE_CHECKING:
     from ftdrive.planning.geometry.certify import Certifier
@@ -98,16 +108,16 @@ def plan(
     from ftdrive.errors import ConfigError
     from ftdrive.planning.cell_plan import certifier_for, plan_for
     from ftdrive.planning.planner import USUAL_POSTURE_RAD
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import answer, talk, working
 
-    if quick and minimal:
-        raise ConfigError("give --quick (12 poses) or --minimal (6), not both")
-    if cone_deg is not None and box_mm is not None:
-        raise ConfigError("give --cone or --free-box, not both")
+    for one, other in ((quick, minimal), (cone_deg, box_mm)):
+        if one and other:
+            raise ConfigError("give --quick or --minimal, and --cone or --free-box, not both")
     check_simulate(simulate, real={"--config": config})
+    require_viz(png, view=view)
     emulated = None
     if simulate:
-        with Station() as station:
+        with working("Starting the emulated cell"), Station.of(None) as station:
             emulated = station.cell
     found = settings(
         config,
@@ -133,27 +143,32 @@ def plan(
         talk.print(f"Placeholders in {', '.join(sorted(described))} (measured = false): this plan is for the eye only.")
     certifier = certifier_for(cell, cell.robot.model)
     q_rad = np.array([*np.radians(numbers("--posture", posture, ",", (3,))), *USUAL_POSTURE_RAD[3:]])
-    made = plan_for(
-        cell,
-        certifier,
-        q_rad,
-        6 if minimal else 12 if quick else 24,
-        cone_deg=cone_deg,
-        box_mm=box_mm,
-        tip_unlimited=_unlimited(tip_speed_limit),
-    )
+    with working("Planning"):
+        made = plan_for(
+            cell,
+            certifier,
+            q_rad,
+            6 if minimal else 12 if quick else 24,
+            cone_deg=cone_deg,
+            box_mm=box_mm,
+            tip_unlimited=_unlimited(tip_speed_limit),
+        )
     if png is not None:
         from ftdrive.planning.show.picture import draw
 
-        draw(made, certifier, png)
+        with working("Drawing"):
+            draw(made, certifier, png)
     if output is not None:
         made.save(output)
+    saved = [f" Saved {path}" for path in (png, output) if path is not None]
     if as_json:
         write_json({"schema_version": 1} | made.to_dict())
+        talk.print(*saved, sep="\n", end="\n" if saved else "")
     else:
         from ftdrive.planning.show.words import plan_in_words, stop_in_words
 
-        talk.print("\n".join(filter(None, (plan_in_words(made), stop_in_words(made, cell.robot)))))
+        answer.print(*filter(None, (plan_in_words(made), stop_in_words(made, cell.robot))), *saved, sep="\n")
+        talk.print_next(f"ftdrive calibrate{' --simulate' if simulate else ''}   (asks before anything moves)")
     if view:
         _look(made, certifier)
 

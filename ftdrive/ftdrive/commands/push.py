@@ -20,7 +20,7 @@ from ftdrive.runs.push_receipt import Receipt
 from ftdrive.runs.source import read_calibration
 from ftdrive.session.operator import Question
 from ftdrive.session.settings_push import EFFECTS, WORDS, propose, restore, send
-from ftdrive.terminal.console import in_whole_words, talk
+from ftdrive.terminal.console import answer, in_whole_words, talk
 from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
 from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.text import echo
@@ -78,10 +78,14 @@ def push(
         if as_json and (asks or not sends):
             values = {"old": asdict(proposal.old), "new": asdict(proposal.new)}
             write_json({"schema_version": 1, "event": "proposal", **proposal.reason, **values})
+        elif not (as_json or sends):
+            answer.print("\n".join(proposal_in_lines(proposal)))
         elif not as_json and (asks or not talk.quiet):
             echo(in_whole_words("\n".join(proposal_in_lines(proposal)), sys.stderr), err=True)
         if not sends:
-            talk.print("Dry run: nothing was sent." if dry_run else "The controller agrees: nothing was sent.")
+            (talk if as_json else answer).print(
+                "Dry run: nothing was sent." if dry_run else "The controller agrees: nothing was sent."
+            )
             return
 
         def ask(name: str) -> None:
@@ -97,10 +101,10 @@ def push(
         if as_json:
             write_json({"schema_version": 1, **json.loads(saved.read_text(encoding="utf-8")), "file": str(saved)})
             return
-    talk.print(f" ✔ Read back: {settings_in_words(read_back)}")
-    talk.print(" Programs made at the pendant set the values of their installation: enter them there too.")
+    answer.print(f" ✔ Read back: {settings_in_words(read_back)}")
+    answer.print(" Programs made at the pendant set the values of their installation: enter them there too.")
     if saved.exists():  # not of a temporary run
-        talk.print(f" Receipt {saved}; undo: ftdrive push --restore {shlex.quote(str(saved))}")
+        answer.print(f" Receipt {saved}; undo: ftdrive push --restore {shlex.quote(str(saved))}")
 
 
 def _emulated_cell(of: CalibrationResult | Receipt, sensor: str | None, stack: ExitStack) -> CellConfig:

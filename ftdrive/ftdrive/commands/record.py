@@ -1,7 +1,7 @@
 """`ftdrive record`: the raw and the compensated wrench, with pose and events, to files."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,7 +83,7 @@ def record(
     from ftdrive.commands.live_source import open_source
     from ftdrive.recording import Recorder
     from ftdrive.recording.files import require_new_recordings
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import talk, working
 
     check_simulate(simulate, real={"--config": config, "--robot": robot})
     require_new_recordings(paths)
@@ -95,7 +95,8 @@ def record(
         recorder = Recorder(paths, stream.info, stream.cell.to_dict())
         talk.print(f" Recording, {frame}. Ctrl-C ends.")
         try:
-            record_stream(stream, recorder, duration_s, count)
+            with working("Recording") as show:
+                record_stream(stream, recorder, duration_s, count, lambda: show(_so_far(recorder)))
         finally:
             if recorder.samples:
                 _report(recorder, frame, stream.info.calibration_name, as_json=as_json)
@@ -107,11 +108,19 @@ def record(
 
 
 def record_stream(
-    stream: "CompensatedStream", recorder: "Recorder", duration_s: float | None = None, count: int | None = None
+    stream: "CompensatedStream",
+    recorder: "Recorder",
+    duration_s: float | None = None,
+    count: int | None = None,
+    written: Callable[[], None] = lambda: None,
 ) -> None:
-    """Record until the end or an exception, and complete the files. Raises what the stream or a file raises."""
+    """Record until the end or an exception, and complete the files; `written` is called after each block.
+
+    Raises what the stream or a file raises.
+    """
     import numpy as np
 
+    from ftcalib.rounding import with_sigma
     from ftdrive.live.samples import StreamEvent
 
     try:
@@ -125,6 +134,7 @@ def record_stream(
                 if left >= len(block) or event.t_host_ns < block.t_host_ns[left]:
                     recorder.event(event)
             recorder.write(block.rows(slice(left)))
+            written()
             if left < len(block) or recorder.samples == count:
                 return
     finally:
@@ -132,20 +142,24 @@ def record_stream(
             recorder.event(event)
         status = stream.status()
         text = (
-            f"the wrench is {1e3 * status.delay_s:.2f} ± {1e3 * status.delay_sigma_s:.2f} ms (1 sigma) after the pose"
+            f"the wrench is {with_sigma(1e3 * status.delay_s, 1e3 * status.delay_sigma_s)} ms (1 sigma) after the pose"
         )
         values = {"value": status.delay_s, "sigma": status.delay_sigma_s}
         recorder.event(StreamEvent(recorder.last_ns, "delay", text, values))
         recorder.close()
 
 
+def _so_far(recorder: "Recorder") -> str:
+    return f"{recorder.duration_s:.1f} s, {recorder.samples} samples, gaps: {recorder.gaps}"
+
+
 def _report(recorder: "Recorder", frame: "WrenchFrame", name: str, *, as_json: bool) -> None:
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import answer, talk
 
     rate = f"{recorder.rate_Hz:.0f} Hz"  # of all samples: that of the first half second may differ much
     for path in recorder.saved:
         samples = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, {rate}, gaps: {recorder.gaps}"
-        talk.print(f" Saved {path}: {samples}")
+        (talk if as_json else answer).print(f" Saved {path}: {samples}")
     if as_json:
         files = {
             "files": [str(path) for path in recorder.saved],

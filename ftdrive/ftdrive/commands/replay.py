@@ -21,7 +21,7 @@ from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.outcome import solve_records
 from ftdrive.runs.replay_source import RecordedRun
 from ftdrive.runs.run import Run
-from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.console import answer, hanging, talk, working
 from ftdrive.terminal.report import print_result
 
 
@@ -56,7 +56,8 @@ def _repeat(run: Run, source: Path, as_json: bool) -> None:
         records.append(replace(again, clock_offset_ns=kept.clock_offset_ns))
         if talk.verbose:
             talk.print(f"{kept.stop:2d}  R{kept.pose.number:02d}  {len(kept.samples.t_host_ns)} samples")
-    outcome = solve_records(run, records)
+    with working("Solving"):
+        outcome = solve_records(run, records)
     if as_json:
         write_json(outcome.result.to_dict())
     else:
@@ -64,7 +65,9 @@ def _repeat(run: Run, source: Path, as_json: bool) -> None:
     stop_unless_accepted(outcome.result)
     if run.calibration_path.exists():
         _compare(outcome.result, CalibrationResult.load(run.calibration_path))
-        talk.print(hanging(" ✔ ", f"equal to the last digit: {run.calibration_path.name} of {source}"))
+        if not as_json:
+            words = f"equal to the last digit: {run.calibration_path.name} of {source}"
+            answer.print(hanging(" ✔ ", words, answer))
 
 
 def _compare(again: CalibrationResult, saved: CalibrationResult) -> None:

@@ -1,8 +1,10 @@
 """`ftdrive report`: one file that says whether a calibration is good, and why."""
 
 import shlex
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import get_args
 
@@ -18,6 +20,7 @@ from ftdrive.commands.common import (
     JSON,
     NewFile,
     check_simulate,
+    require_extra,
     simulate,
     store_url,
     write_json,
@@ -32,7 +35,7 @@ from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject
 from ftdrive.report.trust import trust
 from ftdrive.runs.bundle import unpacked
-from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.console import answer, hanging, talk, working
 from ftdrive.terminal.text import echo
 
 _SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up")
@@ -49,7 +52,12 @@ DEFAULT = Path("report.html")
     help="As of `ftdrive solve`; the report compares the others with it.",
 )
 @click.argument("source", required=False, type=click.Path(exists=True, path_type=Path))
-@click.option("-o", "--output", type=NewFile(), help=f"New file. [default: {DEFAULT}; stdout for md and json]")
+@click.option(
+    "-o",
+    "--output",
+    type=NewFile(),
+    help=f"New file. [default: {DEFAULT}, or {DEFAULT.stem}-2 and so on; stdout for md and json]",
+)
 @click.option(
     "--format",
     "form",
@@ -93,14 +101,18 @@ def report(
     if source is None and not simulate:
         raise ConfigError("nothing to report: give a calibration.json, a run folder or a CSV file, or --simulate")
     if output is None and form == "html":
+        output = next(one for one in _numbered(DEFAULT) if not one.exists())
         try:
-            require_new(output := DEFAULT)
+            require_new(output)
         except OSError as error:
             raise ConfigError(f"{error} with --output") from error
+    if form == "html":
+        require_extra("report", "a report in HTML (not --format md)", "jinja2", "matplotlib")
     given = known_values(mass_kg, level_deg, mounting_deg), upward(up)
     options = SolveOptions(method, orientation, drift, *given, _typed(click.get_current_context()))
     with unpacked(source) if source is not None else rehearsed_run(sensor) as found:
-        subject = read_subject(found, options, parent)
+        with working("Solving"):
+            subject = read_subject(found, options, parent)
         known = trust(subject.result, found, store_url, datetime.now(UTC))
         subject = replace(subject, trust=known)
         if known["store_error"]:
@@ -108,16 +120,24 @@ def report(
         if source is not None and found != source:  # unpacked
             reproduce = subject.reproduce.replace(str(found), shlex.quote(str(source)))
             subject = replace(subject, source=source, reproduce=reproduce)
-        facts = facts_of(subject)
-    text = written(facts, form)
+        with working("Comparing methods and drawing"):
+            facts = facts_of(subject)
+            text = written(facts, form)
     if output is not None:
         write_new(output, text)
-        talk.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}"))
-        talk.print(f" Saved {output}")
+        say = talk if as_json else answer
+        say.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}", say))
+        say.print(f" Saved {output}")
     if as_json:
         write_json({**facts, "file": None if output is None else str(output)})
     elif output is None:
         echo(text, nl=False)
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    """Yield report.html, report-2.html and so on."""
+    yield path
+    yield from (path.with_stem(f"{path.stem}-{number}") for number in count(2))
 
 
 def _typed(context: click.Context) -> tuple[str, ...]:

@@ -36,7 +36,7 @@ from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.source import read_source
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import answer, talk, working
 from ftdrive.terminal.report import print_comparison, print_result
 from ftdrive.terminal.text import echo
 
@@ -138,7 +138,8 @@ def _solve_each(
                     _show_all(source, data.dataset, {"drift": drift, **data.circumstances}, as_json)
                     continue
                 options = {"drift": drift, **data.circumstances, "provenance": data.provenance}
-                result = _solve(data.dataset, method, options)
+                with working("Solving"):
+                    result = _solve(data.dataset, method, options)
                 if as_json:
                     found = [one.to_dict() for one in hints(result, data.records)]
                     write_json({"source": str(source), "hints": found, **result.to_dict()})
@@ -148,7 +149,7 @@ def _solve_each(
                     stop_unless_accepted(result, to_be_saved=output is not None)
                 if output is not None:
                     result.save(output)
-                    talk.print(f" Saved {output}")
+                    (talk if as_json else answer).print(f" Saved {output}")
         except (AcceptanceError, DataError) as error:
             if len(sources) == 1:
                 raise
@@ -169,7 +170,8 @@ def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) ->
 
 
 def _show_all(source: Path, dataset: CalibrationDataset, options: dict[str, Any], as_json: bool) -> None:
-    compared = compare(dataset, **options)
+    with working("Solving with all methods"):
+        compared = compare(dataset, **options)
     if as_json:
         write_json({"schema_version": 1, "source": str(source), "methods": [one.to_dict() for one in compared]})
     else:

@@ -17,7 +17,7 @@ from ftdrive.checks.computer import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import versions
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import answer, talk, working
 from ftdrivers.errors import BadTranscript, ConnectError, DeviceTimeout, ProtocolError
 from ftdrivers.interfaces import ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
@@ -58,7 +58,7 @@ def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as
     if as_json:
         write_json({"schema_version": 1, "file": str(path), "url": url, "recorded": seen})
     else:
-        talk.print(_words(seen))
+        answer.print(_words(seen))
 
 
 def _emulated(sensor: str | None) -> str:
@@ -89,7 +89,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
     writer = Writer(path, header, clock)
     seen: dict[str, Any] = {"error": INTERRUPTED}
     try:
-        with recording(writer), device:
+        with working(f"Recording for {duration_s:g} s"), recording(writer), device:
             whole = _watch(device, duration_s)
             device.collect(_TAIL_S)
         seen = whole
@@ -151,8 +151,8 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     if as_json:
         write_json({"schema_version": 1, "url": loaded.header["url"], "recorded": recorded, "played": played})
     else:
-        talk.print(f" recorded  {_words(recorded)}")
-        talk.print(f" played    {_words(played)}")
+        answer.print(f" recorded  {_words(recorded)}")
+        answer.print(f" played    {_words(played)}")
     if duration_s < loaded.header["duration_s"]:
         whole_s = loaded.header["duration_s"]
         talk.print(f" The recording was broken off: {duration_s:.3g} s of {whole_s:g} s were played.")

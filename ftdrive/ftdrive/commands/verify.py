@@ -3,6 +3,7 @@
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Literal
 
 import click
@@ -142,7 +143,7 @@ def verify_cell(
     if run is None:
         raise RuntimeError("a verification is never a dry run")
     verified = verify_run(run, calibration, path, wanted.limits)
-    _report(verified, update, as_json=as_json)
+    _report(verified, update, simulated=station is not None, as_json=as_json)
     index_run(run.folder, cell if station is None else None)
     return verified
 
@@ -183,10 +184,10 @@ def _wanted(
     return Wanted(Path(begun["path"]), begun["poses"], begun["quick"], AcceptanceLimits(**begun["limits"]))
 
 
-def _report(verified: "Verified", update: Answer, *, as_json: bool) -> None:
-    """Print the outcome; save the update if it is wanted."""
+def _report(verified: "Verified", update: Answer, *, simulated: bool, as_json: bool) -> None:
+    """Print the outcome and what to do next; save the update if it is wanted."""
     from ftdrive.runs.verified import save_update
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import answer, talk
     from ftdrive.terminal.verification_text import print_verification
 
     if not as_json:
@@ -194,8 +195,16 @@ def _report(verified: "Verified", update: Answer, *, as_json: bool) -> None:
     saved = save_update(verified) if _wants_update(verified, update, as_json=as_json) else None
     if as_json:
         write_json({**verified.to_dict(), "file": str(verified.path), "saved": None if saved is None else str(saved)})
-    elif saved is not None:
-        talk.print(f" Saved {saved}: {verified.update_name} updated, parent {verified.calibration.id[:6]}")
+        return
+    if saved is not None:
+        answer.print(f" Saved {saved}: {verified.update_name} updated, parent {verified.calibration.id[:6]}")
+    again = " --simulate" if simulated else ""
+    if saved is not None:
+        talk.print_next(f"ftdrive live --calibration {quote(str(saved))}{again}")
+    elif verified.passed:
+        talk.print_next("ftdrive history   (age and trends of all calibrations)")
+    else:
+        talk.print_next(f"ftdrive calibrate{again}   (the calibration does not hold any more)")
 
 
 def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Path) -> tuple["Station", Path]:

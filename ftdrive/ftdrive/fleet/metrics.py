@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
-from typing import Final
+from typing import Any, Final
 
-from ftdrive.errors import ConfigError
+from ftdrive.errors import BadStore, ConfigError
 from ftdrive.fleet.serve import Reading
 from ftdrive.fleet.state import CellState
 from ftdrive.http_gate import Gate, hidden_host
@@ -69,6 +69,8 @@ class MetricsServer(Collector):
         Address to listen at.
     port : int
         0 lets the system choose; see `port`.
+    page : callable, optional
+        Returns the page of the fleet, which is served at / and made for each load; may raise `BadStore`.
 
     Raises
     ------
@@ -76,7 +78,8 @@ class MetricsServer(Collector):
         The address cannot be used.
     """
 
-    def __init__(self, host: str, port: int) -> None:
+    def __init__(self, host: str, port: int, page: Callable[[], str] | None = None) -> None:
+        self._page = page
         self._reading: Reading | None = None
         registry = CollectorRegistry()
         registry.register(self)
@@ -89,11 +92,24 @@ class MetricsServer(Collector):
             raise ConfigError(
                 f"/metrics cannot be served at {host}:{port} ({error.strerror}): choose another"
             ) from None
+        self._metrics = self._server.get_app()
+        if page is not None:
+            self._server.set_app(self._answer)
         self.port = self._gate.port
 
     def update(self, reading: Reading) -> None:
         """Serve this reading from now on."""
         self._reading = reading
+
+    def _answer(self, request: dict[str, Any], start: Any) -> Any:
+        if self._page is None or request["PATH_INFO"] not in {"", "/"}:
+            return self._metrics(request, start)  # type: ignore[misc]  # set by start_http_server
+        try:
+            status, text, kind = "200 OK", self._page(), "html"
+        except BadStore as error:
+            status, text, kind = "503 Service Unavailable", f"{error}\n", "plain"
+        start(status, [("Content-Type", f"text/{kind}; charset=utf-8"), ("Cache-Control", "no-store")])
+        return [text.encode()]
 
     def close(self) -> None:
         """Stop serving."""

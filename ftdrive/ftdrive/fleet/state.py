@@ -21,7 +21,7 @@ class BiasDrift:
 
 @dataclass(frozen=True, slots=True)
 class CellState:
-    """One tool of one cell. Without any calibration the cell has one state with `tool` None."""
+    """One tool of one cell. The configured tool has a state also if it was never calibrated."""
 
     cell: str
     tool: str | None = None
@@ -39,7 +39,7 @@ class CellState:
     change: str | None = None
     """What the last verification found to have changed, such as "bias"."""
     due: datetime | None = None
-    """When the next verification is due, UTC; None for a cell that was never calibrated, which is due at once."""
+    """When the next verification is due, UTC; None for a tool that was never calibrated, which is due at once."""
     mass_kg: float | None = None
     temperature_C: float | None = None
     drift: BiasDrift | None = None

@@ -34,7 +34,9 @@ def fleet_of(observed: Observed, store: Store) -> Fleet:
     states = list[CellState]()
     for cell in observed.cells:
         found = [_state(cell, one, observed, store) for one in observed.newest(cell)]
-        states += found or [CellState(cell.name, arm_serial=cell.arm_serial)]
+        if not found or cell.tool not in {None, *(one.tool for one in found)}:
+            found.append(CellState(cell.name, cell.tool, cell.arm_serial))
+        states += sorted(found, key=lambda one: one.tool or "")
     return Fleet(tuple(states), findings(observed, states))
 
 

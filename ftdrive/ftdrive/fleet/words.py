@@ -57,6 +57,8 @@ def attention(fleet: Fleet, now: datetime) -> list[str]:
     found = []
     for one in fleet.cells:
         name = f"{one.cell}, {one.tool}" if one.tool else one.cell
+        if one.calibration_id is None:
+            found.append(f"{name}: never calibrated: run `ftdrive calibrate` at this cell")
         if one.passed is False and one.verified is not None:
             failed = f"{name}: the verification failed {age_in_words(now - one.verified)} ago"
             if one.change:

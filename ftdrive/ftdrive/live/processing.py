@@ -11,6 +11,7 @@ from ftcalib.compensation import Compensator
 from ftcalib.extras.inertia import REACH_S, inertial_wrench, motion_of_poses
 from ftcalib.extras.update import Calibrated
 from ftcalib.files import JSON
+from ftcalib.rounding import with_sigma
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker
 from ftdrive.live.drift import DriftFilter
@@ -413,7 +414,7 @@ class Processor:
         rate, sigma = self._drift.force_rate_N_h
         worth = max(self._usual_error_N, _DRIFT_SIGMAS * sigma)
         if rate > worth and not self._drift_warned:
-            text = f"the bias drifts by {rate:.2g} ± {sigma:.1g} N/h (1 sigma); tare when the tool is free"
+            text = f"the bias drifts by {with_sigma(rate, sigma)} N/h (1 sigma); tare when the tool is free"
             self.note("drift", text, {"drift_N_h": rate, "sigma_N_h": sigma})
         self._drift_warned = rate > (0.5 if self._drift_warned else 1.0) * worth
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ftcalib import CalibrationResult
 from ftcalib.assessment.observability import assess
 from ftcalib.assessment.verdict import strong_correlations
 from ftcalib.compare import compare
@@ -58,6 +59,7 @@ def facts_of(subject: Subject) -> dict[str, Any]:
         "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "source": str(subject.source),
         "id": result.id,
+        "about": about_of(result),
         "verdict": result.verdict,
         "marks": {mark: MARKS[mark] for mark in marks_of(result)},
         "findings": [one.to_dict() for one in result.findings],
@@ -83,6 +85,20 @@ def facts_of(subject: Subject) -> dict[str, Any]:
         "reproduce": subject.reproduce,
         "result": result.to_dict(),
     }
+
+
+def about_of(result: CalibrationResult) -> str:
+    """Name arm, sensor, tool and time of a calibration, as far as it knows them."""
+    known = result.provenance
+    setup, devices = known.get("setup") or {}, known.get("devices") or {}
+    named = [
+        " ".join(str(one[key]) for key in ("model", "serial") if one.get(key))
+        for role in ("arm", "sensor")
+        if (one := devices.get(role))
+    ]
+    tool = [f"tool {setup['tool']}"] if setup.get("tool") else []
+    made = known.get("created_utc")
+    return ", ".join([*named, *tool, *([made[:16].replace("T", " ") + " UTC"] if isinstance(made, str) else [])])
 
 
 def _correlation(covariance: Array) -> dict[str, Any]:

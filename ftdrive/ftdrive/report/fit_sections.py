@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from ftcalib.rounding import to_place_of
 from ftdrive.report.document import Figure, Section, Table
 from ftdrive.report.words import capital, in_words, label_of, rounded, shown_poses
-from ftdrive.terminal.report import QUANTITIES, decimals, values_of
+from ftdrive.terminal.report import QUANTITIES, values_of
 
 Facts = Mapping[str, Any]
 
@@ -46,10 +47,10 @@ def _estimate_rows(result: Facts) -> Iterator[tuple[str, str, str]]:
     for label, scale, unit, key in QUANTITIES:
         values, sigmas = (values_of(source[key], key) * scale for source in (result, result["sigma"]))
         fixed = sigmas <= fixed_below * scale
-        digits = 4 if fixed.all() else decimals(float(sigmas[~fixed].min()))
         for axis, value, sigma, known in zip(_AXES, values, sigmas, fixed, strict=False):
             name = f"{label} {axis}, {unit}" if len(values) > 1 else f"{label}, {unit}"
-            yield name, f"{value:.{digits}f}", "fixed" if known else f"{sigma:.{digits}f}"
+            spread = 0.0 if known else float(sigma)
+            yield name, to_place_of(value, spread), "fixed" if known else to_place_of(spread, spread)
 
 
 def _response(result: Facts) -> list[tuple[str, str, str]]:
@@ -57,13 +58,16 @@ def _response(result: Facts) -> list[tuple[str, str, str]]:
     return [
         (
             f"{label} {_AXES[i]}{_AXES[j]}, {unit}",
-            f"{scale * result['response'][key][i][j]:.2f}",
-            f"{scale * result['response']['sigma'][key][i][j]:.2f}",
+            *_pair(scale * result["response"][key][i][j], scale * result["response"]["sigma"][key][i][j]),
         )
         for key, scale, unit, label in kinds
         for i in range(3)
         for j in range(i, 3)
     ]
+
+
+def _pair(value: float, sigma: float) -> tuple[str, str]:
+    return to_place_of(value, sigma), to_place_of(sigma, sigma)
 
 
 def error(facts: Facts) -> Section:
@@ -219,14 +223,19 @@ def drift(facts: Facts) -> Section:
         model = "random walk" if any(name.startswith("walk") for name in seen["components"]) else "linear"
         text.append(f"The fit includes a drift of the bias ({model}), listed below. Good: within 3 sigma.")
     rows = [
-        (f"{name}, {unit}", f"{scale * change:+.{digits}f}", f"{scale * sigma:.{digits}f}", f"{change / sigma:+.1f}")
+        (
+            f"{name}, {unit}",
+            to_place_of(scale * change, scale * sigma, "+"),
+            to_place_of(scale * sigma, scale * sigma),
+            f"{change / sigma:+.1f}",
+        )
         if sigma > _ROUNDED
         else (f"{name}, {unit}", "-", "-", "-")
-        for name, unit, scale, digits, change, sigma in (
+        for name, unit, scale, change, sigma in (
             ()
             if found is None
             else (
-                (f"{'FT'[k // 3]}{_AXES[k % 3]}", *(("N", 1.0, 3), ("mN·m", 1e3, 2))[k // 3], *pair)
+                (f"{'FT'[k // 3]}{_AXES[k % 3]}", *(("N", 1.0), ("mN·m", 1e3))[k // 3], *pair)
                 for k, pair in enumerate(zip(found["change"], found["sigma"], strict=True))
             )
         )

@@ -15,6 +15,8 @@ def markdown(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
 
 def _lines(facts: Mapping[str, Any], sections: Sequence[Section]) -> Iterator[str]:
     yield f"# Calibration {facts['id']}: {', '.join([facts['verdict'].upper(), *facts['marks']])}\n"
+    if facts["about"]:
+        yield f"{_escaped(facts['about'])}.\n"
     yield f"Compensation error {_escaped(facts['error']['words'])}.\n"
     if facts["trust"]:
         yield f"{_escaped(capital(facts['trust']['words']))}.\n"

@@ -5,7 +5,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from ftcalib import CalibrationResult
-from ftdrive.cell.emulated import Station, sensor_name
+from ftdrive.cell.emulated import Station
 from ftdrive.errors import Declined, NotAccepted
 from ftdrive.runs.outcome import Outcome
 from ftdrive.session.events import Event
@@ -62,7 +62,7 @@ class _Unkept:
 def described(station: Station) -> dict[str, Any]:
     """Return what run.json says about an emulated cell."""
     said = {"sensor": station.sensor, "options": station.options, "control_path": station.control_path}
-    return {"station": {**said, "truth": station.truth}}
+    return {"station": {**said, "values": station.values, "truth": station.truth}}
 
 
 def rehearse(
@@ -90,7 +90,7 @@ def short_calibration(operator: Operator, sensor: str | None = None) -> Calibrat
     NotAccepted
         The result is rejected.
     """
-    with Station(sensor_name(sensor)) as station, TemporaryDirectory(prefix="ftdrive-") as runs:
+    with Station.of(None, sensor) as station, TemporaryDirectory(prefix="ftdrive-") as runs:
         result = rehearse(station, Path(runs), "simulated", operator, poses=6, kept=False).result
     if result.verdict == "rejected":
         raise NotAccepted(f"the calibration of the emulated cell was rejected: {result.reasons[0]}")

@@ -10,6 +10,7 @@ import numpy as np
 
 from ftcalib.extras.trend import FEWEST, Trend, trend
 from ftcalib.model import PARAMETER_NAMES, Array
+from ftcalib.rounding import with_sigma
 from ftdrive.store.records import StoredResult, StoredVerification
 
 SIGNIFICANT: Final = 0.01
@@ -17,6 +18,8 @@ SIGNIFICANT: Final = 0.01
 OLD_DAYS: Final = 30.0
 """A calibration that was neither made nor verified for so long should be verified."""
 OTHER_TEMPERATURE_K: Final = 10.0
+SHORTEST_DAYS: Final = 3.0
+"""Results within fewer days have no trend: a change per 30 days would be extrapolated too far."""
 
 _MONTH_DAYS = 30.0
 _VECTORS: Final = {
@@ -57,9 +60,8 @@ class QuantityTrend:
         }
 
     def __str__(self) -> str:
-        digits = int(np.clip(1 - np.floor(np.log10(max(self.trend.sigma.min(), 1e-9))), 0, 7))
         pairs = zip(self.trend.slope, self.trend.sigma, strict=True)
-        numbers = ", ".join(f"{slope:+.{digits}f} ± {sigma:.{digits}f}" for slope, sigma in pairs)
+        numbers = ", ".join(with_sigma(slope, sigma, "+") for slope, sigma in pairs)
         verdict = "significant" if self.is_significant else "not significant"
         return (
             f"{self.tool}, {self.quantity}: {numbers} {self.unit} per 30 days (1 sigma, {self.trend.n} results), "
@@ -73,11 +75,12 @@ def age_days(created_utc: str | None, now: datetime) -> float | None:
 
 
 def drifts(results: Sequence[StoredResult]) -> list[QuantityTrend]:
-    """Fit the trends of each tool that has three results or more; a rejected result does not count."""
+    """Fit the trends of each tool with three results or more over three days; a rejected result does not count."""
     found = []
     for series in _series(results):
         for quantity, unit, rows in _quantities(series):
-            if len({row[0] for row in rows}) < FEWEST:
+            days = {row[0] for row in rows}
+            if len(days) < FEWEST or max(days) - min(days) < SHORTEST_DAYS:
                 continue
             t, values, covariance = (np.array(column) for column in zip(*rows, strict=True))
             drift = trend(t / _MONTH_DAYS, values, covariance)

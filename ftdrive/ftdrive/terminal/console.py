@@ -1,16 +1,18 @@
-"""Output for people goes to stderr, because stdout is for data."""
+"""Two consoles: `answer` prints what a command was asked for on stdout, `talk` all else on stderr."""
 
 import os
 import sys
 import textwrap
-from collections.abc import Iterable
-from typing import TextIO
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, TextIO
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 
+from ftdrive.terminal.hints import as_typed
 from ftdrive.terminal.text import visible
 
 
@@ -29,6 +31,16 @@ class Talk(_Console):
     """A console that knows whether details are wanted (`-v`); `quiet` is the console's own."""
 
     verbose = False
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """Print; a command in a text stands there as the user can type it."""
+        super().print(*(as_typed(one) if isinstance(one, str) else one for one in objects), **options)
+
+    def print_next(self, *commands: str) -> None:
+        """Print what the user can do next: commands, each with why behind it."""
+        self.print("Next", style="bold cyan")
+        for command in commands:
+            self.print(f"   {command}")
 
 
 talk = Talk(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
@@ -52,7 +64,7 @@ _NARROWEST = 20
 def hanging(head: str | Text, words: str, console: Console = talk) -> Text:
     """Put words behind a head; on a terminal too narrow for them the next lines begin under the first word."""
     first = Text.assemble(head)
-    text = Text(words)
+    text = Text(as_typed(words))
     width = console.width - first.cell_len
     if console.soft_wrap or width < _NARROWEST:
         return first + text
@@ -68,7 +80,7 @@ def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
     For what is written without `talk`; control characters become visible. A word that is longer by itself, such as a
     path, stays whole. Where `head` is what the text begins with, its lines go on behind it, as in `hanging`.
     """
-    text = visible(text)
+    text = visible(as_typed(text))
     try:
         width = os.get_terminal_size(file.fileno()).columns
     except (OSError, ValueError):  # no terminal; nothing of the system
@@ -86,3 +98,17 @@ def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
         fold.fill(line) + line[len(line.rstrip()) :]
         for line in text.split("\n")  # a prompt ends with a space
     )
+
+
+answer = Talk(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+"""On stdout: results, verdicts and where they were saved. `-q` does not silence it, `--json` replaces it."""
+
+
+@contextmanager
+def working(words: str) -> Iterator[Callable[[str], None]]:
+    """Show on a terminal that a command works, and at what; a pipe gets nothing. Yields a function for other words."""
+    if not talk.is_terminal or talk.quiet:
+        yield lambda _: None
+        return
+    with talk.status(f"{words} …") as status:
+        yield lambda now: status.update(f"{now} …")

@@ -19,13 +19,16 @@ from ftdrive.terminal.text import visible
 def match(question: Question, typed: str) -> str | None:
     """Find the answer that was typed; None for no answer.
 
-    In full, but for y and n; a word that must be typed exactly can be refused with no, which raises `Declined`.
+    In full, but for y and n, and for q and quit, which end here as on the live screen: no letter moves an arm. A word
+    that must be typed exactly can be refused with no, which raises `Declined`.
     """
     typed = typed.strip()
     if typed in question.answers:
         return typed
     if len(question.answers) > 1:
-        meant = {"y": "yes", "n": "no"}.get(typed.lower(), typed.lower())
+        meant = {"y": "yes", "n": "no", "q": "quit"}.get(typed.lower(), typed.lower())
+        if meant == "quit" and "quit" not in question.answers:
+            meant = "stop"
         return meant if meant in question.answers else None
     if typed.lower() in {"n", "no"}:
         raise Declined(f"the answer was no: {question.text}")

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ftcalib.rounding import to_place_of
 from ftdrive.checks.flange_load import FlangeLoad, margin_in_words
 from ftdrive.session.settings_push import Push
 from ftdrivers.interfaces import ControllerSettings
@@ -45,7 +46,8 @@ def _table(push: Push) -> list[str]:
 
 
 def _payload(push: Push, load: FlangeLoad) -> list[str]:
-    sigma = f"{load.sigma_kg:.4f} kg and {_numbers(load.sigma_m, '.2f', 1e3)} mm"
+    centre = ", ".join(to_place_of(1e3 * sigma_m, 1e3 * sigma_m) for sigma_m in load.sigma_m)
+    sigma = f"{to_place_of(load.sigma_kg, load.sigma_kg)} kg and {centre} mm"
     inertia = "stays that of a point mass" if not any(push.new.inertia_kg_m2 or ()) else "is kept"
     return [
         f"The centre is in flange axes. One sigma is {sigma}. The inertia {inertia}: gravity does not reveal it.",

@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
 from ftcalib.compare import Compared
+from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftdrive.runs.pose_hints import hints, names_of
-from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.console import answer, hanging, talk
 from ftdrivers.interfaces import Array
 
 _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
@@ -52,26 +53,26 @@ def print_result(
     saved : Path, optional
         The calibration file, printed in the last line.
     """
-    talk.print(Text.assemble(("Result", "bold cyan"), f"  {result.n_poses} poses, method {result.method}"))
-    talk.print(_table(result, truth))
+    answer.print(Text.assemble(("Result", "bold cyan"), f"  {result.n_poses} poses, method {result.method}"))
+    answer.print(_table(result, truth))
     head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
-    talk.print(hanging(head, f"compensation error {error_in_words(result)}"))
+    answer.print(hanging(head, f"compensation error {error_in_words(result)}", answer))
     if truth is not None:
         raw, left = free_tool_wrench(truth, _RANDOM), compensation_error(result, truth)
         words = (
             f"a free tool reads {left['force_rms_N']:.4f} N, {left['torque_rms_Nm']:.5f} N·m rms; "
             f"before {_rms(raw[:, :3]):.1f} N, {_rms(raw[:, 3:]):.2f} N·m"
         )
-        talk.print(hanging(" truth: ", words))
+        answer.print(hanging(" truth: ", words, answer))
     for finding in result.findings:
-        talk.print(hanging("   ", finding.words))
+        answer.print(hanging("   ", finding.words, answer))
     if talk.verbose or result.verdict != "good":
         _print_fit(result, names_of(records))
     _print_drift(result, drift)
     for hint in hints(result, records) if hinted or talk.verbose else ():
-        talk.print(hanging(" ? ", hint.words), style="yellow")
+        answer.print(hanging(" ? ", hint.words, answer), style="yellow")
     if saved is not None:
-        talk.print(f" Saved {saved}")
+        answer.print(f" Saved {saved}")
 
 
 def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
@@ -88,19 +89,14 @@ def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
         estimates, sigmas = (values_of(source[key], key) * scale for source in (data, data["sigma"]))
         truths = None if truth is None else values_of(truth[key], key) * scale
         fixed = sigmas <= fixed_below * scale
-        digits = 4 if fixed.all() else decimals(sigmas[~fixed].min())
         for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
-            spread = "fixed" if fixed[i] else f"{sigmas[i]:.{digits}f}"
-            known = [] if truths is None else [f"{truths[i]:.{digits}f}"]
+            sigma = 0.0 if fixed[i] else float(sigmas[i])
+            spread = "fixed" if fixed[i] else to_place_of(sigma, sigma)
+            known = [] if truths is None else [to_place_of(truths[i], sigma)]
             error = [Text(f"{errors[key][i]:+.1f}", _error_style(errors[key][i]))] if known else []
             name = f"{label} {axis}".strip() + f", {unit}"
-            table.add_row(name, *known, f"{estimates[i]:.{digits}f}", spread, *error)
+            table.add_row(name, *known, to_place_of(estimates[i], sigma), spread, *error)
     return table
-
-
-def decimals(sigma: float) -> int:
-    """Return how many decimals show two digits of a sigma, at most 7."""
-    return int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 7))
 
 
 def _error_style(error_sigma: float) -> str:
@@ -114,23 +110,23 @@ def _print_fit(result: CalibrationResult, names: Sequence[str]) -> None:
         f"force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
         f"torque {residual['torque_rms_Nm']:.5f} N·m rms, {residual['torque_max_Nm']:.5f} max"
     )
-    talk.print(hanging(" residuals: ", words))
+    answer.print(hanging(" residuals: ", words, answer))
     if (poses := poses_in_words(result, names)) is not None:
-        talk.print(hanging(" worst: ", poses))
+        answer.print(hanging(" worst: ", poses, answer))
 
 
 def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
     if drift is not None:
         words, bad = drift_in_words(drift)
         if bad or talk.verbose or result.verdict != "good":
-            talk.print(hanging(" drift: ", words), style="yellow" if bad else None)
+            answer.print(hanging(" drift: ", words, answer), style="yellow" if bad else None)
     if result.drift is not None:
         change, sigma = result.drift.change, result.drift.sigma
         words = (
-            f"{np.linalg.norm(change[:3]):.3f} ± {np.max(sigma[:3]):.3f} N, "
-            f"{np.linalg.norm(change[3:]):.4f} ± {np.max(sigma[3:]):.4f} N·m from the first pose to the last"
+            f"{with_sigma(np.linalg.norm(change[:3]), np.max(sigma[:3]))} N, "
+            f"{with_sigma(np.linalg.norm(change[3:]), np.max(sigma[3:]))} N·m from the first pose to the last"
         )
-        talk.print(hanging(" drift in the fit: ", words))
+        answer.print(hanging(" drift in the fit: ", words, answer))
 
 
 def error_in_words(result: CalibrationResult) -> str:
@@ -226,12 +222,12 @@ def _rms(vectors: Array) -> float:
 def print_comparison(compared: Sequence[Compared]) -> None:
     """Print all methods side by side without cutting a number: a narrow terminal gets no vectors, a pipe long lines."""
     table = _comparison(compared, vectors=True)
-    if talk.is_terminal and table.width is not None and table.width > talk.width:
+    if answer.is_terminal and table.width is not None and table.width > answer.width:
         table = _comparison(compared, vectors=False)
-    talk.print(table, soft_wrap=True)
+    answer.print(table, soft_wrap=True)
     for one in compared:
         if one.reason is not None:
-            talk.print(hanging(f" {one.method}: ", one.reason))
+            answer.print(hanging(f" {one.method}: ", one.reason, answer))
 
 
 def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
@@ -254,7 +250,7 @@ def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
         rms = (one.force_rms_N, one.torque_rms_Nm, one.cv_force_rms_N, one.cv_torque_rms_Nm)
         cells = ("-" if np.isnan(value) else f"{value:.5f}" for value in rms)
         table.add_row(one.method, f"{one.mass_kg:.5f}", *triples, angle, *cells)
-    table.width = talk.measure(table, options=talk.options.update(width=_NO_LIMIT)).maximum
+    table.width = answer.measure(table, options=answer.options.update(width=_NO_LIMIT)).maximum
     return table
 
 

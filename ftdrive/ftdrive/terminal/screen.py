@@ -20,6 +20,7 @@ from rich.live import Live
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
+from ftcalib.rounding import decimals, to_place_of, with_sigma
 from ftcalib.routine import DriftCheck
 from ftdrive.errors import Declined, SupervisorGone
 from ftdrive.session.events import (
@@ -37,6 +38,7 @@ from ftdrive.session.events import (
 from ftdrive.session.live_fit import GREEN
 from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.hints import as_typed
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
@@ -45,7 +47,7 @@ from ftdrive.terminal.supervisor import Supervisor
 from ftdrivers.interfaces import Array
 
 REFRESH_HZ = 4
-KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "stop"}
+KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "quit"}
 
 # Label and unit, factor from SI, name, and rank in `frame`: higher ranks are omitted first.
 _ROWS = (
@@ -268,11 +270,11 @@ def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Te
     if name == "R_flange_sensor":
         value = Rotation.from_matrix(np.asarray(value)).as_rotvec()
     values, sigma = factor * np.atleast_1d(value), factor * float(np.max(fit.sigma[name]))
-    digits = int(np.clip(1 - np.floor(np.log10(max(sigma, 1e-9))), 0, 5))
+    digits = decimals(sigma)
     while digits and len(f"{-np.abs(values).max():.{digits}f}") > _NUMBER_WIDTH - 1:
         digits -= 1
     numbers = "".join(f"{one:{_NUMBER_WIDTH}.{digits}f}" for one in values)
-    return Text(f"{label:<13}{numbers:<27}  ± {sigma:.2g}")
+    return Text(f"{label:<13}{numbers:<27}  ± {to_place_of(sigma, sigma)}")
 
 
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
@@ -324,8 +326,8 @@ def _drift(view: SessionView) -> Text:
     fitted = sigma > _ROUNDED
     sure = bool((np.abs(change) > 4 * sigma)[fitted].any())
     parts = [
-        f"{np.linalg.norm(change[some]):.{digits}f} ± {np.max(sigma[some]):.{digits}f} {unit}"
-        for some, digits, unit in ((slice(3), 3, "N"), (slice(3, 6), 4, "N·m"))
+        f"{with_sigma(np.linalg.norm(change[some]), np.max(sigma[some]))} {unit}"
+        for some, unit in ((slice(3), "N"), (slice(3, 6), "N·m"))
         if fitted[some].any()
     ]
     words = f"drift  {', '.join(parts)} since the first pose"
@@ -354,7 +356,7 @@ def _kept(view: SessionView, width: int) -> list[Text]:
         return [] if view.taken else [Text("nothing is kept yet: there is no run", "dim")]
     return [
         Text("kept in " + _end_of(view.folder, width - 8)),
-        Text("resume  " + _end_of(view.resume, width - 8)),
+        Text("resume  " + _end_of(as_typed(view.resume), width - 8)),
     ]
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ftcalib.rounding import with_sigma
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.show.words import plan_in_words, point_in_words
 from ftdrive.session.events import (
@@ -176,7 +177,7 @@ def estimate_in_words(event: Estimated) -> str:
     """Describe coverage and running fit."""
     words = f"coverage {event.light}"
     if "mass_kg" in event.values:
-        words += f", mass {event.values['mass_kg']:.4f} ± {event.sigma['mass_kg']:.4f} kg"
+        words += f", mass {with_sigma(event.values['mass_kg'], event.sigma['mass_kg'])} kg"
     if event.residual_sigma is not None and event.residual_force_N is not None:
         words += f", {event.residual_force_N:.3f} N from the fit before, {event.residual_sigma:.1f} sigma"
     return f"{words}; helps most: {event.hint}" if event.hint else words

@@ -23,7 +23,13 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: C
     rows = [[visible(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
     width = sum(widths) + len(GAP) * (len(widths) - 1)
-    if not sys.stdout.isatty() or width <= shutil.get_terminal_size().columns:
+    narrowest = [
+        max(len(word) for text in column for word in (text.split() if title in folding else [text]) or [""])
+        for title, column in zip(titles, zip(titles, *rows, strict=True), strict=True)
+    ]
+    columns = shutil.get_terminal_size().columns
+    fits = sum(narrowest) + len(GAP) * (len(widths) - 1) <= columns
+    if not (sys.stdout.isatty() and fits) or width <= columns:  # a terminal may break lines, never words
         head, *lines = (_line(row, widths) for row in (titles, *rows))
         echo("\n".join(["", *lines]), bold=head)
         return
@@ -32,8 +38,8 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: C
     from ftdrive.terminal.console import printer
 
     table = Table(box=None, pad_edge=False, padding=(0, len(GAP), 0, 0), header_style="bold")
-    for title in titles:
-        table.add_column(title, no_wrap=title not in folding, overflow="fold")
+    for title, least in zip(titles, narrowest, strict=True):
+        table.add_column(title, no_wrap=title not in folding, overflow="fold", min_width=least)
     for row in rows:
         table.add_row(*row)
     printer().print(table)

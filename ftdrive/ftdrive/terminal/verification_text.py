@@ -6,7 +6,7 @@ from rich.text import Text
 
 from ftdrive.runs.pose_hints import moved
 from ftdrive.runs.verified import FALSE_ALARMS, Verified
-from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.console import answer, hanging, talk
 from ftdrive.terminal.report import drift_in_words
 from ftdrivers.interfaces import Array
 
@@ -15,26 +15,26 @@ def print_verification(verified: Verified) -> None:
     """Print measured and predicted wrench of each pose, the verdict with its limits, and what has changed."""
     found, n = verified.verification, len(verified.records)
     count = f"{n} poses" if n > 1 else "1 pose"
-    talk.print(Text.assemble(("Verification", "bold cyan"), f"  {count}, calibration {verified.calibration.id[:6]}"))
+    answer.print(Text.assemble(("Verification", "bold cyan"), f"  {count}, calibration {verified.calibration.id[:6]}"))
     for mark in verified.marks:
-        talk.print(f" {mark}", style="yellow")
-    talk.print(_table(verified))
+        answer.print(f" {mark}", style="yellow")
+    answer.print(_table(verified))
     verdict = ("PASS", "bold green") if verified.passed else ("FAILED", "bold red")
-    talk.print(hanging(Text.assemble(" ", verdict, "  "), verdict_in_words(verified)))
+    answer.print(hanging(Text.assemble(" ", verdict, "  "), verdict_in_words(verified), answer))
     if not found.passed:
-        talk.print(hanging("   ", found.reason), style="yellow")
+        answer.print(hanging("   ", found.reason, answer), style="yellow")
     for finding in moved(verified.records):
-        talk.print(hanging(" ? ", finding.words), style="yellow")
+        answer.print(hanging(" ? ", finding.words, answer), style="yellow")
     if verified.drift is not None:
         words, bad = drift_in_words(verified.drift)
         if bad or talk.verbose:
-            talk.print(hanging(" drift: ", words), style="yellow" if bad else None)
+            answer.print(hanging(" drift: ", words, answer), style="yellow" if bad else None)
     if not verified.passed and found.passed:
         words = "Nothing has changed: the differences agree with their sigma. Average longer, or raise the limit."
-        talk.print(hanging("   ", words), style="yellow")
+        answer.print(hanging("   ", words, answer), style="yellow")
     elif not verified.passed and verified.update is None:
-        talk.print(hanging("   ", "No update makes up for the change: calibrate again."), style="yellow")
-    talk.print(f" Saved {verified.path}")
+        answer.print(hanging("   ", "No update makes up for the change: calibrate again.", answer), style="yellow")
+    answer.print(f" Saved {verified.path}")
 
 
 def verdict_in_words(verified: Verified) -> str:

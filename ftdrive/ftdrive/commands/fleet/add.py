@@ -18,7 +18,7 @@ def add(file: Path, url: str | None) -> None:
     [robot] host.
     """
     from ftdrive.fleet.cells import read_cells, refuse_ambiguous
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import answer
 
     found = open_store(url)
     cells = read_cells(file)
@@ -27,4 +27,4 @@ def add(file: Path, url: str | None) -> None:
     refuse_ambiguous([*cells, *(cell for cell in known if cell.name not in names)])
     found.put_cells(cells)
     replaced = len(names & {cell.name for cell in known})
-    talk.print(f" {len(cells) - replaced} added, {replaced} replaced in {found.name}")
+    answer.print(f" {len(cells) - replaced} added, {replaced} replaced in {found.name}")

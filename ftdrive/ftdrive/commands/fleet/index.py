@@ -18,14 +18,14 @@ def index(folders: Sequence[Path], url: str | None) -> None:
     """
     from ftdrive.fleet.cells import Owners
     from ftdrive.fleet.words import counted, listed
-    from ftdrive.terminal.console import hanging, talk
+    from ftdrive.terminal.console import answer, hanging, talk
 
     found = open_store(url)
     indexed = found.index(*folders)
     for words in indexed.unreadable:
         talk.print(hanging(" left out: ", words))
     added = f"{counted(indexed.results, 'result')} and {counted(indexed.verifications, 'verification')}"
-    talk.print(f" {added} added to {found.name}")
+    answer.print(f" {added} added to {found.name}")
     if cells := found.cells():
         owners = Owners(cells)
         strange = {one.arm_serial or one.robot_host or "?" for one in found.results() if owners.cell_of(one) is None}
@@ -34,4 +34,4 @@ def index(folders: Sequence[Path], url: str | None) -> None:
             words = (
                 f"no cell has the {arms} {listed(sorted(strange))}: add {them} to cells.toml, then `ftdrive fleet add`"
             )
-            talk.print(hanging(" ! ", words), style="yellow")
+            answer.print(hanging(" ! ", words, answer), style="yellow")

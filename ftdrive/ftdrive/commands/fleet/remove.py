@@ -14,7 +14,7 @@ def remove(names: Sequence[str], url: str | None) -> None:
     """Remove cells from the store. Their runs and results stay."""
     from ftdrive.errors import ConfigError
     from ftdrive.fleet.words import listed
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import answer
 
     found = open_store(url)
     known = [cell.name for cell in found.cells()]
@@ -22,4 +22,4 @@ def remove(names: Sequence[str], url: str | None) -> None:
         instead = f"the cells are {listed(known)}" if known else "it has no cells"
         raise ConfigError(f"the store {found.name} has no cell {unknown[0]}: {instead}")
     found.remove_cells(names)
-    talk.print(f" {len(set(names))} removed from {found.name}")
+    answer.print(f" {len(set(names))} removed from {found.name}")

@@ -12,6 +12,7 @@ from ftdrive.commands.common import STORE, open_store
 
 if TYPE_CHECKING:
     from ftdrive.fleet.serve import Sink
+    from ftdrive.store.store import Store
 
 PORT = 10018
 """Prometheus has assigned all ports from 9100 to 9999."""
@@ -37,7 +38,7 @@ MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
 )
 @STORE
 def serve(address: str, broker_url: str | None, url: str | None) -> None:
-    """Serve the state of all cells to Prometheus and to an MQTT broker.
+    """Serve the state of all cells to Prometheus, to an MQTT broker, and as a page.
 
     The store is read every 60 s. If it cannot be read later, the last state stays, with its age. Alert rules and a
     dashboard for Grafana come with ftdrive: their folder is printed. Nothing moves. Ctrl-C ends.
@@ -53,9 +54,10 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
     found = open_store(url)
     wake = Event()
     with ExitStack() as stack:
-        metrics = stack.enter_context(closing(MetricsServer(host, port)))
+        metrics = stack.enter_context(closing(MetricsServer(host, port, partial(_page, found))))
         sinks: list[Sink] = [metrics]
         print_address(f"Serving {found.name} at ", f"http://{with_port(host, metrics.port)}/metrics")
+        print_address("The page of the fleet is at ", f"http://{with_port(host, metrics.port)}/")
         if not is_loopback(host):
             talk.print(f"Unprotected: any computer that reaches port {metrics.port} can read the state of all cells.")
         if broker_url is not None:
@@ -67,3 +69,15 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
         talk.print(f"Alert rules and a dashboard are in {MONITORING}")
         talk.print("Ctrl-C ends.")
         serve_fleet(partial(fleet_state, found), sinks, REAL, wake, say=talk.print)
+
+
+def _page(store: "Store") -> str:
+    """Return the page of the fleet as it is now."""
+    from datetime import UTC, datetime
+
+    from ftdrive.fleet.observed import Observed
+    from ftdrive.fleet.page import page
+    from ftdrive.fleet.status import fleet_of
+
+    observed = Observed.read(store, datetime.now(UTC))
+    return page(fleet_of(observed, store), observed, store.name)

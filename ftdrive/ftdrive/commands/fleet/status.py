@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import JSON, STORE, NewFile, open_store, write_json
+from ftdrive.commands.common import JSON, STORE, NewFile, open_store, require_extra, write_json
 
 if TYPE_CHECKING:
     from ftdrive.fleet.state import CellState, Fleet
@@ -32,8 +32,10 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     from ftcalib.files import write_new
     from ftdrive.fleet.observed import Observed
     from ftdrive.fleet.status import fleet_of
-    from ftdrive.terminal.console import hanging, talk
+    from ftdrive.terminal.console import answer, hanging, talk
 
+    if page_path is not None:
+        require_extra("fleet", "--html", "jinja2")
     gc.freeze()  # or the imports are searched for garbage again and again: a tenth of the time
     found, now = open_store(url), datetime.now(UTC)
     observed = Observed.read(found, now)
@@ -42,7 +44,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         from ftdrive.fleet.page import page
 
         write_new(page_path, page(fleet, observed, found.name))
-        talk.print(f" Saved {page_path}")
+        (talk if as_json else answer).print(f" Saved {page_path}")
     if as_json:
         write_json(_as_json(fleet, found.name, now))
     elif not fleet.cells:
@@ -52,9 +54,9 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         from ftdrive.terminal.table import print_table
 
         print_table(_TITLES, [_row(one, now) for one in fleet.cells], folding={"cell", "tool"})
-        talk.print(summary(fleet, now), style="bold")
+        answer.print(summary(fleet, now), style="bold")
         for words in attention(fleet, now):
-            talk.print(hanging(" ! ", words), style="yellow")
+            answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
 def _row(one: "CellState", now: datetime) -> tuple[str, ...]:

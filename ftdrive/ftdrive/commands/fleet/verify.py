@@ -32,7 +32,7 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     starts the session of `ftdrive verify`, with its own plan, checks, questions and confirmation. Any other answer
     skips the cell. No option answers these questions, and a terminal is required.
     """
-    from ftdrive.errors import Declined, NotAccepted
+    from ftdrive.errors import Declined, NotAccepted, exit_code
     from ftdrive.fleet.cells import refuse_variables
     from ftdrive.fleet.status import fleet_state
     from ftdrive.store.store import Store
@@ -70,7 +70,7 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     if failed:
         raise NotAccepted(f"the verification failed in {', '.join(failed)}: the lines above have the reasons")
     if errors:
-        raise errors[0]
+        raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # its line is printed
 
 
 def _require_terminal() -> None:

@@ -176,8 +176,8 @@ def stations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Sequence[str]]]
         cell = CellConfig(RobotConfig("127.0.0.1"), SensorConfig("emulated://"))
         truth: Mapping[str, Any] = MappingProxyType({})
 
-        def __init__(self, sensor: str, options: Sequence[str] = (), *, control_path: str = "auto") -> None:
-            super().__init__(sensor, options, control_path=control_path)
+        def __init__(self, sensor: str, options: Sequence[str] = (), **more: Any) -> None:
+            super().__init__(sensor, options, **more)
             found.append((sensor, tuple(options)))
 
         def __enter__(self) -> "Emulated":

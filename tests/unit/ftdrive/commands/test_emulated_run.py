@@ -14,7 +14,9 @@ from ftdrive.runs.run import Run
 from ftdrive.session import rehearsal
 from ftdrive.session.events import Event, Noted, RunOpened
 
-STATION: Any = SimpleNamespace(sensor="can", options=(), control_path="auto", truth={"mass_kg": 0.5}, cell=None)
+STATION: Any = SimpleNamespace(
+    sensor="can", options=(), control_path="auto", values={}, truth={"mass_kg": 0.5}, cell=None
+)
 
 
 class Listener:

@@ -77,8 +77,8 @@ def test_the_page_has_the_cells_as_long_as_it_serves(run: Callable[..., Ran], mo
     opened, ports = list[metrics.MetricsServer](), list[int]()
 
     class Server(metrics.MetricsServer):
-        def __init__(self, host: str, port: int) -> None:
-            super().__init__(host, port)
+        def __init__(self, host: str, port: int, page: Callable[[], str]) -> None:
+            super().__init__(host, port, page)
             opened.append(self)
 
     monkeypatch.setattr(metrics, "MetricsServer", Server)

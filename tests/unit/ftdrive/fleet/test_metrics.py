@@ -11,7 +11,7 @@ from datetime import timedelta
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from ftdrive.errors import ConfigError
+from ftdrive.errors import BadStore, ConfigError
 from ftdrive.fleet.metrics import NAMES, MetricsServer
 from ftdrive.fleet.state import FleetFinding
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
@@ -42,6 +42,25 @@ def samples(server: MetricsServer) -> Samples:
     """Values by metric and cell, without those that describe a cell."""
     families = text_string_to_metric_families(scraped(server))
     return {(one.name, one.labels.get("cell", "")): one.value for family in families for one in family.samples}
+
+
+def test_the_page_is_made_for_each_load() -> None:
+    pages = iter(["<p>one</p>", "<p>two</p>"])
+
+    def page() -> str:
+        if (text := next(pages, None)) is None:
+            raise BadStore("the store is locked")
+        return text
+
+    with closing(MetricsServer("127.0.0.1", 0, page)) as server:
+        address = f"http://127.0.0.1:{server.port}"
+        for text in ("<p>one</p>", "<p>two</p>"):
+            with urllib.request.urlopen(f"{address}/", timeout=30) as answer:
+                assert (answer.read().decode(), answer.headers["Cache-Control"]) == (text, "no-store")
+        with pytest.raises(urllib.error.HTTPError, match="503"):
+            urllib.request.urlopen(f"{address}/", timeout=30)
+        server.update(reading(cell("A")))
+        assert "ftdrive_cell_info" in scraped(server)
 
 
 def test_every_field_of_a_cell_is_a_metric_and_what_is_unknown_is_absent(server: MetricsServer) -> None:

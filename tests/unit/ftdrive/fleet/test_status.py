@@ -5,6 +5,7 @@ from datetime import timedelta
 import numpy as np
 
 from ftdrive.fleet.status import fleet_state
+from ftdrive.fleet.words import attention, summary
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.fleet.fleet_records import NOW, cell, check, daily, fleet, result
 
@@ -23,7 +24,7 @@ def test_the_newest_accepted_calibration_of_each_tool_counts() -> None:
         ("a", "drill", "a-20"),
         ("a", "gripper", "a-40"),
         ("b", "gripper", "b-10"),
-        ("c", None, None),
+        ("c", "gripper", None),
     ]
     drill = states[0]
     assert (drill.verdict, drill.temperature_C, drill.sensor_serial, drill.sensor_model) == (
@@ -43,8 +44,23 @@ def test_a_calibration_of_an_emulated_cell_is_marked() -> None:
         result("b", 1, tool="emulated", emulated=True),
     ]
     states = fleet([cell("a"), cell("b"), cell("c")], results).cells
-    assert [one.tool_in_words for one in states] == ["drill", "gripper EMULATED", "EMULATED", "-"]
-    assert [one.to_dict(NOW)["emulated"] for one in states] == [False, True, True, False]
+    assert [one.tool_in_words for one in states] == ["drill", "gripper EMULATED", "EMULATED", "gripper", "gripper"]
+    assert [one.to_dict(NOW)["emulated"] for one in states] == [False, True, True, False, False]
+
+
+def test_a_configured_tool_that_was_never_calibrated_needs_attention() -> None:
+    found = fleet([cell("a", tool="drill"), cell("b"), cell("c", tool=None)], [result("a", 3), result("b", 3)])
+    assert [(one.cell, one.tool, one.calibration_id) for one in found.cells] == [
+        ("a", "drill", None),
+        ("a", "gripper", "a-3"),
+        ("b", "gripper", "b-3"),
+        ("c", None, None),
+    ]
+    assert summary(found, NOW) == "3 cells: 2 never calibrated"
+    assert attention(found, NOW) == [
+        "a, drill: never calibrated: run `ftdrive calibrate` at this cell",
+        "c: never calibrated: run `ftdrive calibrate` at this cell",
+    ]
 
 
 def test_a_tool_out_of_use_is_not_listed_for_ever() -> None:

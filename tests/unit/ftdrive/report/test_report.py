@@ -24,7 +24,7 @@ from ftdrive.cli import cli
 from ftdrive.errors import ConfigError
 from ftdrive.report.comparison import compared
 from ftdrive.report.error_map import error_map, orientations
-from ftdrive.report.facts import facts_of
+from ftdrive.report.facts import about_of, facts_of
 from ftdrive.report.figures import VARIABLES
 from ftdrive.report.report import report
 from ftdrive.report.sections import sections_of
@@ -61,6 +61,21 @@ def result(seed: int = 0) -> CalibrationResult:
 def facts() -> Mapping[str, Any]:
     subject = Subject(Path(f"{EVIL}.csv"), result(), "", dataset(), solved_with={"drift": "auto"}, parent=result(1))
     return facts_of(replace(subject, parent_name=EVIL))
+
+
+def test_the_head_names_arm_sensor_tool_and_date() -> None:
+    devices = {"arm": {"model": "UR5e", "serial": "1"}, "sensor": {"model": "Mini45", "serial": "FT9"}}
+    known = {"devices": devices, "setup": {"tool": "gripper"}, "created_utc": "2026-11-23T07:58:25+00:00"}
+    named = {**facts(), "about": about_of(solve(dataset(), provenance=known))}
+    assert named["about"] == "UR5e 1, Mini45 FT9, tool gripper, 2026-11-23 07:58 UTC"
+    assert f"<p>{named['about']}</p>" in report(named)
+    assert f"{named['about']}." in report(named, "md")
+
+
+def test_nothing_is_cut_on_paper() -> None:
+    printed = html().partition("@media print")[2].partition("</style>")[0]
+    assert ".scroll { overflow: visible; }" in printed
+    assert "white-space: normal" in printed
 
 
 @cache
@@ -359,7 +374,9 @@ def test_no_report_is_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.chdir(tmp_path)
     dataset().save(tmp_path / "dataset.json")
     (tmp_path / "report.html").write_text("mine")
-    for arguments in ((), ("-o", "report.html"), ("--format", "md", "-o", "report.html")):
+    for n in (2, 3):
+        assert f"Saved report-{n}.html" in command("dataset.json").stdout
+    for arguments in (("-o", "report.html"), ("--format", "md", "-o", "report.html")):
         outcome = command("dataset.json", *arguments)
         assert isinstance(outcome.exception, ConfigError)
         assert "never overwritten" in str(outcome.exception)

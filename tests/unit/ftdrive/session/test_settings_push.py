@@ -312,7 +312,7 @@ def test_gravity_is_turned_as_measured_and_keeps_its_size(cell: Cell) -> None:
     expected = 9.82 * np.array([0.0, -np.sin(np.radians(1.8)), np.cos(np.radians(1.8))])
     assert push.new.up_base_m_s2 == pytest.approx(expected)
     (line,) = [line for line in proposal_in_lines(push) if line.startswith("The base")]
-    assert line.startswith("The base leans 1.80° (sigma 0.00°) towards its +y; the controller is set to level.")
+    assert line.startswith("The base leans 1.80000° (sigma 0.00049°) towards its +y; the controller is set to level.")
     _, read_back = cell.send(push)
     assert cell.typed == ["gravity"]
     assert read_back.up_base_m_s2 == pytest.approx(expected)
@@ -344,7 +344,7 @@ def test_a_base_that_agrees_with_the_controller_needs_no_gravity(cell: Cell) -> 
 
 def test_gravity_that_is_not_reported_is_not_set(cell: Cell) -> None:
     cell.arm.settings = replace(OLD, up_base_m_s2=None)
-    with pytest.raises(NotAccepted, match=r"leans 1.80° .* set the mounting at the pendant"):
+    with pytest.raises(NotAccepted, match=r"leans 1.80000° .* set the mounting at the pendant"):
         cell.propose(cell.result(lean_deg=1.8), payload=False, gravity=True)
     push = cell.propose(cell.result(lean_deg=1.8))
     assert any("does not report its gravity" in line for line in proposal_in_lines(push))

@@ -24,7 +24,7 @@ from ftdrive.session import session
 from ftdrive.session.events import Noted
 from ftdrive.session.operator import Question
 from ftdrive.terminal import console
-from ftdrive.terminal.console import hanging, in_whole_words, printer, talk
+from ftdrive.terminal.console import answer, hanging, in_whole_words, printer, talk
 from ftdrive.terminal.live.view import Line
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.screen import open_operator
@@ -73,21 +73,22 @@ def test_findings_of_doctor_and_their_cures_are_indented(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TERM", "dumb")  # 80 columns, no colour
-    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setattr(answer, "soft_wrap", False)  # as in a terminal
     _print([Check("robot.payload", "failed", "found [1] " * 20, "fix it " * 20)])
     first, *others = (line.rstrip() for line in capsys.readouterr().out.splitlines())
     assert first.startswith(" robot       ✘ found [1]")
     cure = next(k for k, line in enumerate(others) if line.startswith(" " * 15 + "fix: fix"))
     assert cure > 0
     assert all(re.match(r" {15}\S", line) for line in others[:cure])
-    assert all(re.match(r" {20}\S", line) for line in others[cure + 1 :])
+    assert all(re.match(r" {20}\S", line) for line in others[cure + 1 : -1])
+    assert others[-1] == " Not ready."
     assert others[cure + 1 :]
 
 
-def test_quiet_leaves_only_errors() -> None:
-    assert "Predicted" in run(*PLAN).stderr
-    quiet = run("-q", *PLAN)
-    assert (quiet.exit_code, quiet.stderr, quiet.stdout) == (0, "", "")
+def test_quiet_leaves_only_errors_and_the_answer() -> None:
+    shown, quiet = run(*PLAN, "--box", "900:900:0:950:950:10"), run("-q", *PLAN, "--box", "900:900:0:950:950:10")
+    assert "Predicted" in shown.stdout
+    assert (quiet.exit_code, quiet.stderr, quiet.stdout) == (0, "", shown.stdout)
     assert '"steps"' in run("-q", *PLAN, "--json").stdout
 
 

@@ -36,6 +36,7 @@ FREE = Question("Is the tool free?", assumed="yes")
 MOVE = Question("Type MOVE to let the arm move", ("MOVE",))
 ASKED = Asked(question="?", answer="yes", by="--yes")
 STEP = Question("Next pose?", ("", "stop"))
+HELD = Question("What now?", ("resume", "skip", "back", "quit"))
 
 
 def estimated(**changes: Any) -> Estimated:
@@ -84,6 +85,9 @@ POSE = PoseTaken(
         (MOVE, "", None),
         (STEP, "\n", ""),
         (STEP, "Stop", "stop"),
+        *((HELD, letter, answer) for letter, answer in (("q", "quit"), ("Quit", "quit"), ("s", None), ("p", None))),
+        (STEP, "q", "stop"),
+        (FREE, "q", None),
         (Question("?", ("resume", "quit")), "r", None),  # one letter moves no arm
     ],
 )

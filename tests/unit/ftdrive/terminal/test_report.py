@@ -19,7 +19,7 @@ from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftcalib.result import Method
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import answer, talk
 from ftdrive.terminal.report import error_in_words, errors_in_sigma, print_comparison, print_result
 from tests.unit.ftdrive.fake_cell import Lab
 
@@ -120,7 +120,7 @@ def test_too_few_poses_to_do_without_what_is_known_blame_nothing() -> None:
 def test_beside_the_truth_the_report_says_what_a_free_tool_reads(capsys: pytest.CaptureFixture[str]) -> None:
     result = solve(tilted())
     print_result(result, truth=result.to_dict())
-    printed = capsys.readouterr().err
+    printed = capsys.readouterr().out
     (words,) = re.findall(r"a free tool reads (0\.0000) N, 0\.00000 N·m rms; before (.*) N, 0\.\d\d N·m", printed)
     weight_and_bias_N = np.hypot(np.linalg.norm(TILTED.gravity_force_base_N), np.linalg.norm(TILTED.force_bias_N))
     assert float(words[1]) == pytest.approx(weight_and_bias_N, rel=0.02)
@@ -131,7 +131,7 @@ def test_beside_the_truth_the_report_says_what_a_free_tool_reads(capsys: pytest.
 def terminal(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
     state: Any = {"_force_terminal": True, "_width": width, "_height": 25, "_color_system": None, "soft_wrap": False}
     for name, value in state.items():
-        monkeypatch.setattr(talk, name, value)
+        monkeypatch.setattr(answer, name, value)
 
 
 @pytest.mark.parametrize("width", [44, 80])
@@ -141,7 +141,7 @@ def test_lines_of_the_report_go_on_under_their_text(
     terminal(monkeypatch, width)
     result = solve(tilted(), known=Known(mass_kg=0.61))
     print_result(result)
-    lines = [line.rstrip() for line in capsys.readouterr().err.splitlines()]
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
     assert max(map(len, lines)) <= width
     start = next(i for i, line in enumerate(lines) if line.startswith(" REJECTED"))
     end = next(i for i, line in enumerate(lines) if line.startswith(" residuals:"))
@@ -179,8 +179,8 @@ def test_a_robot_on_a_wall_is_good_only_if_it_is_declared(tmp_path: Path, capsys
     found = []
     for options in ((), ("--up", "-1,0,0")):
         solve_command.main([str(tmp_path / "data.json"), "--json", *options], standalone_mode=False)
-        answer = json.loads(capsys.readouterr().out)
-        found.append((answer["verdict"], [one["code"] for one in answer["findings"]], answer["provenance"]))
+        solved = json.loads(capsys.readouterr().out)
+        found.append((solved["verdict"], [one["code"] for one in solved["findings"]], solved["provenance"]))
     assert found[0][:2] == ("usable", ["mounting_undeclared"])
     assert found[1][:2] == ("good", ["base_leans"])
     assert found[1][2]["up_in_base"] == [-1, 0, 0]
@@ -202,17 +202,17 @@ def test_calibrate_solve_and_library_say_the_same(as_json: bool, lab: Lab, capsy
     assert (result.verdict, result.findings) == (outcome.result.verdict, outcome.result.findings)
     capsys.readouterr()
     print_result(outcome.result, drift=outcome.drift, records=records)
-    by_calibrate = capsys.readouterr().err
+    by_calibrate = capsys.readouterr().out
     solve_command.main([str(outcome.run.folder), *["--json"][:as_json]], standalone_mode=False)
     by_solve = capsys.readouterr()
     if as_json:
-        answer = json.loads(by_solve.out)
-        assert answer["hints"] == []
-        assert answer["verdict"] == "usable"
-        assert [Finding.from_dict(one) for one in answer["findings"]] == list(result.findings)
-        assert [one["words"] for one in answer["findings"]] == list(result.reasons)
+        found = json.loads(by_solve.out)
+        assert found["hints"] == []
+        assert found["verdict"] == "usable"
+        assert [Finding.from_dict(one) for one in found["findings"]] == list(result.findings)
+        assert [one["words"] for one in found["findings"]] == list(result.reasons)
     else:
-        assert by_solve.err == by_calibrate
+        assert by_solve.out == by_calibrate
 
 
 def test_a_method_that_lacks_the_mass_says_how_to_give_it() -> None:
@@ -247,7 +247,7 @@ def test_what_was_taken_as_known_is_called_fixed(
 ) -> None:
     monkeypatch.setattr(talk, "verbose", True)  # with the rows that follow from others
     print_result(solve(tilted(), method, known=known))
-    lines = capsys.readouterr().err.splitlines()
+    lines = capsys.readouterr().out.splitlines()
     assert {line[: line.index("  ")].strip() for line in lines if line.rstrip().endswith(" fixed")} == fixed
     assert not any(" 0.0000000" in line for line in lines)
 
@@ -267,7 +267,7 @@ def test_a_weight_known_exactly_has_an_uncertainty_of_zero(mass_kg: float) -> No
 
 def shown(compared: list[Compared], capsys: pytest.CaptureFixture[str]) -> list[str]:
     print_comparison(compared)
-    return capsys.readouterr().err.splitlines()
+    return capsys.readouterr().out.splitlines()
 
 
 @pytest.fixture(scope="module")

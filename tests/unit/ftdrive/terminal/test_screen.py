@@ -203,9 +203,9 @@ def test_a_drift_of_the_force_alone_is_shown_without_torque() -> None:
 
     change, sigma = np.array([0.3, 0, 0.01, 3e-20, 0, 0]), np.array([6e-4, 6e-4, 6e-4, 2e-21, 0, 3e-12])
     fitted = estimated(values=VALUES | {"drift": change}, sigma=SIGMA | {"drift": sigma})
-    assert certainty("0.300 ± 0.001 N", fitted) == ["sure"]
+    assert certainty("0.30017 ± 0.00060 N", fitted) == ["sure"]
     doubtful = estimated(values=VALUES | {"drift": change / 200}, sigma=SIGMA | {"drift": sigma})
-    assert certainty("0.002 ± 0.001 N", doubtful) == ["perhaps"]
+    assert certainty("0.00150 ± 0.00060 N", doubtful) == ["perhaps"]
 
 
 def test_a_reason_stands_once_on_the_screen() -> None:
@@ -229,7 +229,7 @@ def test_while_a_question_waits_nothing_is_measured() -> None:
 def test_numbers_never_touch() -> None:
     precise = {name: np.full(np.shape(sigma), 1e-6) for name, sigma in SIGMA.items()}
     lines = drawn(view(*MIDDLE, estimated(sigma=precise)))
-    assert "F bias N        -3.210    7.900 -112.040  ± 1e-06" in "\n".join(lines)
+    assert "F bias N        -3.210    7.900 -112.040  ± 0.0000010" in "\n".join(lines)
 
 
 def test_a_resumed_run_counts_the_poses_it_had() -> None:

@@ -25,6 +25,14 @@ def test_a_row_is_one_line_where_it_fits_and_in_a_pipe(
     assert lines == ["press-4  a gripper with a long name  now", "b                                    in 5 d"]
 
 
+@pytest.mark.parametrize("columns", [26, 22, 12])
+def test_no_word_is_ever_broken(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int
+) -> None:
+    words = {word for row in ROWS for text in row for word in text.split()}
+    assert words <= {word for line in printed(capsys, monkeypatch, columns)[1:] for word in line.split()}
+
+
 def test_a_narrow_terminal_folds_only_what_may_be_folded(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,120 @@
+"""Extras are missed before any work, and no command is silent for long on a terminal."""
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ftdrive import cli
+from ftdrive.terminal.console import talk, working
+
+PLAN = ("plan", "--model", "ur5e", "--tool", "0:100:80", "--minimal")
+
+
+@pytest.fixture
+def _without_extras(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = importlib.util.find_spec
+    extras = {"jinja2", "matplotlib", "viser"}
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in extras else find(name))
+
+
+@pytest.mark.usefixtures("_without_extras")
+@pytest.mark.parametrize(
+    ("arguments", "extra"),
+    [
+        (("report", "--simulate"), "report"),
+        (("plan", "--simulate", "--view"), "viz"),
+        (("plan", "--simulate", "--png", "a.png"), "viz"),
+        (("calibrate", "--simulate", "--view"), "viz"),
+        (("fleet", "status", "--html", "a.html"), "fleet"),
+    ],
+)
+def test_an_extra_is_missed_before_any_work(
+    arguments: tuple[str, ...],
+    extra: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        "ftdrive.cell.emulated.Station.__enter__", lambda _: pytest.fail("an emulated cell has started")
+    )
+    assert cli.run(arguments) == 2
+    assert f"install ftdrive[{extra}], in a clone with `uv sync --all-extras`" in " ".join(
+        capsys.readouterr().err.split()
+    )
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_terminal_sees_at_what_a_command_works(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = list[Any]()
+    monkeypatch.setattr(talk, "_force_terminal", True)
+    monkeypatch.setattr(talk, "status", _Status.of(seen))
+    with working("Recording") as show:
+        show("3.0 s, 1500 samples, gaps: 0")
+    assert seen == ["Recording …", "3.0 s, 1500 samples, gaps: 0 …"]
+
+
+def test_a_pipe_gets_nothing_of_it(capsys: pytest.CaptureFixture[str]) -> None:
+    with working("Recording") as show:
+        show("3.0 s")
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (PLAN, "Planning …"),
+        ((*PLAN, "--png", "a.png"), "Drawing …"),
+        (("solve", "poses.csv"), "Solving …"),
+        (("solve", "poses.csv", "--method", "all"), "Solving with all methods …"),
+        (("report", "poses.csv"), "Comparing methods and drawing …"),
+    ],
+)
+def test_commands_that_take_long_say_at_what_they_work(
+    arguments: tuple[str, ...],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    R = Rotation.random(8, rng=1).as_matrix()
+    wrench = np.c_[np.einsum("nji,j->ni", R, [0, 0, -10]), np.zeros((8, 3))] + 1e-3 * np.random.default_rng(1).normal(
+        size=(8, 6)
+    )
+    header = "r11,r12,r13,r21,r22,r23,r31,r32,r33,fx,fy,fz,tx,ty,tz"
+    np.savetxt("poses.csv", np.c_[R.reshape(8, 9), wrench], delimiter=",", header=header, comments="")
+    monkeypatch.setattr(talk, "_force_terminal", True)
+    seen = list[Any]()
+    monkeypatch.setattr(talk, "status", _Status.of(seen))
+    assert cli.run(arguments) in {0, 7}
+    assert words in seen
+    if "--png" in arguments:
+        assert "Saved a.png" in capsys.readouterr().out
+
+
+class _Status:
+    """Notes the words instead of showing them."""
+
+    def __init__(self, seen: list[Any]) -> None:
+        self.update = seen.append
+
+    @classmethod
+    def of(cls, seen: list[Any]) -> Callable[[str], "_Status"]:
+        def status(words: str) -> _Status:
+            seen.append(words)
+            return cls(seen)
+
+        return status
+
+    def __enter__(self) -> "_Status":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass

@@ -1,0 +1,49 @@
+"""Commands in messages are those that the user can type."""
+
+import pytest
+from click.testing import CliRunner
+
+from ftdrive import cli
+from ftdrive.terminal.console import hanging
+from ftdrive.terminal.hints import COMMANDS, as_typed
+
+
+@pytest.fixture
+def _started_by_uv(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("UV_RUN_RECURSION_DEPTH", "1")
+
+
+def test_all_commands_are_known() -> None:
+    assert set(COMMANDS) == set(cli._COMMANDS)
+
+
+def test_without_uv_nothing_changes() -> None:
+    assert as_typed("run `ftdrive plan`") == "run `ftdrive plan`"
+
+
+@pytest.mark.parametrize(
+    ("words", "typed"),
+    [
+        ("run `ftdrive plan`, then ftdrive doctor", "run `uv run ftdrive plan`, then uv run ftdrive doctor"),
+        ("undo: ftdrive push --restore a", "undo: uv run ftdrive push --restore a"),
+        ("uv run ftdrive demo", "uv run ftdrive demo"),
+        ("this ftdrive uses version 3, see /opt/ftdrive plan", "this ftdrive uses version 3, see /opt/ftdrive plan"),
+    ],
+)
+@pytest.mark.usefixtures("_started_by_uv")
+def test_with_uv_every_command_begins_with_it(words: str, typed: str) -> None:
+    assert as_typed(words) == typed
+    assert hanging(" ! ", words).plain.split() == ["!", *typed.split()]
+
+
+@pytest.mark.usefixtures("_started_by_uv")
+def test_errors_and_next_steps_name_commands_as_they_can_be_typed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.run(["push"]) == 2
+    assert cli.run(["history"]) == 0
+    assert "`uv run ftdrive calibrate` adds them" in capsys.readouterr().err
+
+
+def test_a_plan_ends_with_the_next_step() -> None:
+    outcome = CliRunner().invoke(cli.cli, ["plan", "--model", "ur5e", "--tool", "0:100:80", "--minimal"])
+    assert outcome.stderr.splitlines()[-2:] == ["Next", "   ftdrive calibrate   (asks before anything moves)"]
+    assert "Next" not in outcome.stdout
