@@ -392,7 +392,7 @@ def test_a_slight_drift_of_the_torque_does_not_explain_a_touch_at_the_end() -> N
 def test_the_rate_of_a_drift_is_that_of_what_drifts(capsys: pytest.CaptureFixture[str]) -> None:
     taken = disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop - 1) / 24 * np.array([0, 0, 0, 0, 0, 0.096]))
     print_result(solve(dataset_from(taken, {})), drift=drift_check(taken), records=taken)
-    assert "away: 0.06 N·m/min" in capsys.readouterr().err
+    assert "away: 0.06 N·m/min" in capsys.readouterr().out
 
 
 def test_hints_refuse_records_of_another_run() -> None:
@@ -406,7 +406,7 @@ def test_the_report_names_poses_says_the_drift_and_ends_with_the_file(capsys: py
     result = solve(dataset_from(taken, {}))
     path = Path("runs") / "x [1]" / "calibration.json"
     print_result(result, drift=drift_check(taken), records=taken, saved=path)
-    lines = capsys.readouterr().err.rstrip().splitlines()
+    lines = capsys.readouterr().out.rstrip().splitlines()
     assert lines[-1] == f" Saved {path}"
     text = "\n".join(lines)
     assert "USABLE" in text
