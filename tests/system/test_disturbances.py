@@ -86,7 +86,7 @@ def words_of(capsys: pytest.CaptureFixture[str]) -> Callable[[Outcome], str]:
 
     def read(outcome: Outcome) -> str:
         print_result(outcome.result, drift=outcome.drift, records=outcome.run.records())
-        return capsys.readouterr().err
+        return capsys.readouterr().out
 
     return read
 
