@@ -99,24 +99,24 @@ def cli(verbose: int, quiet: bool) -> None:
     New here? `ftdrive demo` needs no hardware.
     """
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_TalkHandler()])
+    logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_MessageHandler()])
     if quiet or verbose:
-        from ftdrive.terminal.console import talk
+        from ftdrive.terminal.console import messages
 
-        talk.quiet, talk.verbose = quiet, bool(verbose)
+        messages.quiet, messages.verbose = quiet, bool(verbose)
 
 
-class _TalkHandler(logging.Handler):
+class _MessageHandler(logging.Handler):
     """Prints log records on stderr, above a live screen if there is one."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        from ftdrive.terminal.console import talk
+        from ftdrive.terminal.console import messages
 
         with suppress(OSError):  # a terminal or a pipe that is closed
-            if talk.quiet:
+            if messages.quiet:
                 echo(self.format(record), err=True)
                 return
-            talk.print(self.format(record))
+            messages.print(self.format(record))
 
 
 def in_a_sentence(error: BaseException) -> str:

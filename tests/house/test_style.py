@@ -108,7 +108,7 @@ def test_whatever_is_printed_cannot_command_the_terminal() -> None:
         ("self._stderr.write(in_whole_words(text, file))", False),
         ("click.prompt(visible(shown))", False),
         ("echo(run.tool)", False),
-        ("talk.print(run.tool)", False),
+        ("messages.print(run.tool)", False),
         ("file.write(text)", False),
     ],
 )

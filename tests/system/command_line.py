@@ -18,7 +18,7 @@ from click.testing import CliRunner
 from ftdrive import cli
 from ftdrive.cell.config import FORMAT
 from ftdrive.cell.emulated import Station
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import messages
 
 _LONG_S = 90
 """What takes so long hangs; no computer is that busy."""
@@ -63,7 +63,7 @@ class CommandLine:
         runner = CliRunner()
         with pytest.MonkeyPatch.context() as here, runner.isolation(typed, self._environment) as (out, err, _):
             here.chdir(self.folder)
-            here.setattr(talk, "quiet", False)
+            here.setattr(messages, "quiet", False)
             try:
                 code = cli.run([*map(str, arguments)])
             except SystemExit as ended:

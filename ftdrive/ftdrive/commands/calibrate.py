@@ -100,7 +100,7 @@ def calibrate(
     from ftdrive.session.options import SessionOptions
     from ftdrive.session.rehearsal import described
     from ftdrive.session.session import calibrate as guide
-    from ftdrive.terminal.console import answer, talk
+    from ftdrive.terminal.console import answer, messages
     from ftdrive.terminal.report import print_result
     from ftdrive.terminal.screen import open_operator
 
@@ -128,7 +128,7 @@ def calibrate(
         with declined_aborts(), open_operator(as_json=as_json) as operator:
             outcome = guide(cell, operator, options)
     if outcome is None:
-        (talk if as_json else answer).print("Dry run: nothing has moved.")
+        (messages if as_json else answer).print("Dry run: nothing has moved.")
         return
     index_run(outcome.run.folder, None if simulate else cell)
     if as_json:
@@ -139,7 +139,7 @@ def calibrate(
         folder = quote(str(outcome.run.folder))
         with_it = f"--calibration {folder}{' --simulate' if simulate else ''}"
         useful = () if saved is None else (f"ftdrive live {with_it}", f"ftdrive verify {with_it}")
-        talk.print_next(f"ftdrive report {folder}   (how good it is, and why)", *useful)
+        messages.print_next(f"ftdrive report {folder}   (how good it is, and why)", *useful)
     stop_unless_accepted(outcome.result, to_be_saved=True)
 
 
@@ -190,7 +190,7 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
     """
     from ftdrive.cell.config import Setting, cell_of, recorded_cell
     from ftdrive.runs.run import Run
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import messages
 
     header = Run(folder).header()
     begun: dict[str, Any] = {**asdict(Said()), **header.get("said", {})}
@@ -207,12 +207,12 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
     undescribed = {"default", "not set", "--tool"}
     origins = {one.origin for key, one in found.items() if key.startswith(("tool.", "workcell."))} - undescribed
     if origins:
-        talk.print(f"Tool and surroundings are read from {', '.join(sorted(origins))}.")
+        messages.print(f"Tool and surroundings are read from {', '.join(sorted(origins))}.")
         for key, value in (("robot.host", before.robot.host), ("sensor.url", before.sensor.url)):
             if found[key].value is None:
                 found[key] = Setting(value, str(folder))
         return cell_of(found)
-    talk.print("No file describes tool and surroundings: the settings of the run are used.")
+    messages.print("No file describes tool and surroundings: the settings of the run are used.")
     cylinders_mm = found["tool.cylinders_mm"].value or before.tool.cylinders_mm
     return replace(
         before,

@@ -213,12 +213,12 @@ def read_frame(axes: "Axes", about: str) -> "WrenchFrame":
 def declined_aborts() -> Iterator[None]:
     """Print why the operator ended a session, and abort the command."""
     from ftdrive.errors import Declined
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import messages
 
     try:
         yield
     except Declined as error:
-        talk.print(str(error))
+        messages.print(str(error))
         raise click.Abort from error
 
 
@@ -235,12 +235,12 @@ def index_run(folder: Path, cell: "CellConfig | None" = None) -> None:
     """
     from ftdrive.errors import BadStore, ConfigError
     from ftdrive.store.store import Store
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import messages
 
     try:
         Store(store_url() if cell is None else cell.store.url).index(folder.resolve().parent)
     except (BadStore, ConfigError, OSError) as error:
-        talk.print(f" The run is saved but not in the history yet, because {error}.")
+        messages.print(f" The run is saved but not in the history yet, because {error}.")
 
 
 STORE = click.option("--store", "url", metavar="URL", help="Database to use, instead of [store] url.")

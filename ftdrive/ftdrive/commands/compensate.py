@@ -60,7 +60,7 @@ def compensate(
     from ftdrive.recording.compensation import compensated
     from ftdrive.recording.files import format_of
     from ftdrive.runs.source import read_calibration
-    from ftdrive.terminal.console import answer, talk
+    from ftdrive.terminal.console import answer, messages
 
     if output is not None:
         format_of(output)
@@ -77,7 +77,7 @@ def compensate(
     else:
         echo("\n".join(_words(result, str(frame))))
     if output is not None:
-        (talk if as_json else answer).print(f" Saved {output}")
+        (messages if as_json else answer).print(f" Saved {output}")
 
 
 def _read(
@@ -95,7 +95,7 @@ def _read(
     from ftdrive.recording.compensation import NEEDED, read_with_calibration
     from ftdrive.recording.csv_pair import read_pair
     from ftdrive.recording.recording import ROW
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import messages
 
     if path is None:
         if wrench is None or orientation is None or loaded is None:
@@ -107,7 +107,7 @@ def _read(
     columns = ROW.names or () if everything else NEEDED
     recording = read_with_calibration(path, loaded, str(calibration), columns)
     if recording.cut:
-        talk.print(f" {path} is incomplete: {recording.duration_s:.1f} s of it are used.")
+        messages.print(f" {path} is incomplete: {recording.duration_s:.1f} s of it are used.")
     delays = [event.values for event in recording.events if event.kind == "delay"]
     return recording, {name: delays[-1][name] for name in ("value", "sigma")} if delays else None
 

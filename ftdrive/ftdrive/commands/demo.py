@@ -9,7 +9,7 @@ import numpy as np
 from ftdrive.cell.emulated import SENSORS, Station
 from ftdrive.commands.common import CONTROL, JSON, runs, stop_unless_accepted, write_json
 from ftdrive.commands.emulated_run import rehearse
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import messages
 from ftdrive.terminal.report import compensation_error, errors_in_sigma, print_result
 
 
@@ -32,7 +32,7 @@ def demo(sensor: str, seed: int, control: str | None, polyscope: str | None, run
     options = ["--seed", str(seed), *(["--polyscope", polyscope] if polyscope else [])]
     with Station(sensor, options, control_path=control or "auto") as station:
         truth = station.truth
-        talk.print(f"Emulated UR5e, {SENSORS[sensor]}, tool of {truth['mass_kg']:.3f} kg. No real device is used.")
+        messages.print(f"Emulated UR5e, {SENSORS[sensor]}, tool of {truth['mass_kg']:.3f} kg. No real device is used.")
         outcome = rehearse(station, runs, "demo")
     if as_json:
         write_json(
@@ -49,7 +49,7 @@ def demo(sensor: str, seed: int, control: str | None, polyscope: str | None, run
         )
     else:
         print_result(outcome.result, truth=truth, drift=outcome.drift, records=outcome.run.records(), hinted=False)
-        talk.print_next(
+        messages.print_next(
             f"ftdrive live --calibration {quote(str(outcome.run.folder))} --simulate",
             f"{outcome.run.solve_command} --method all",
             "ftdrive init   (describe your own cell)",

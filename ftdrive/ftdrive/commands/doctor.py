@@ -33,7 +33,7 @@ from ftdrive.commands.common import (
 )
 from ftdrive.errors import NotAccepted
 from ftdrive.session.guards import Limits
-from ftdrive.terminal.console import answer, hanging, talk, working
+from ftdrive.terminal.console import answer, hanging, messages, working
 from ftdrive.terminal.text import echo
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
@@ -117,9 +117,9 @@ def doctor(
         _print(found)
         again = " --simulate" if simulate else ""
         if failed:
-            talk.print_next(f"ftdrive doctor{again}   (when what is marked ✘ is fixed)")
+            messages.print_next(f"ftdrive doctor{again}   (when what is marked ✘ is fixed)")
         else:
-            talk.print_next(f"ftdrive plan{again}   (a tour proven clear)", f"ftdrive calibrate{again}")
+            messages.print_next(f"ftdrive plan{again}   (a tour proven clear)", f"ftdrive calibrate{again}")
     if failed:
         raise NotAccepted(f"{len(failed)} of {len(found)} checks failed: {', '.join(failed)}")
 

@@ -9,7 +9,7 @@ from ftdrive.cell.emulated import MOVED_BY, Station
 from ftdrive.runs.outcome import Outcome
 from ftdrive.session import rehearsal
 from ftdrive.session.options import SessionOptions, with_recorded_mode
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import messages
 from ftdrive.terminal.screen import open_operator
 
 
@@ -24,7 +24,7 @@ def start_mover(station: Station, options: SessionOptions) -> None:
     if mover := MOVED_BY.get(with_recorded_mode(options).mode):
         request, words = mover
         station.control(**request)
-        talk.print(f"The cell is emulated: {words}.")
+        messages.print(f"The cell is emulated: {words}.")
 
 
 @contextmanager

@@ -56,7 +56,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     from ftdrive.errors import ConfigError
     from ftdrive.exports import targets_csv, urscript
     from ftdrive.planning.plan import Plan
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import messages
 
     check_simulate(simulate, real={"PLAN.json": path})
     if simulate:
@@ -68,7 +68,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     text = urscript.program(made, dwell_s=dwell_s) if target == "urscript" else targets_csv.table(made)
     if output is not None:
         write_new(output, text)
-        talk.print(f" Wrote {output}")
+        messages.print(f" Wrote {output}")
     if as_json:
         about = {"format": target, "plan": made.sha256, "file": None if output is None else str(output)}
         write_json({"schema_version": 1, **about, "text": text})
@@ -160,7 +160,7 @@ def calibration(
     from ftdrive.exports.calibration.settings import Settings, recorded_sensor
     from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verification_record import marks_of, verification_near
-    from ftdrive.terminal.console import hanging, talk
+    from ftdrive.terminal.console import hanging, messages
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})
     with _calibrated(source, sensor, simulate=simulate) as path:
@@ -179,12 +179,12 @@ def calibration(
     )
     made = registry.export(result, target, settings, max_force_error_N=max_force_error_N)
     for note in made.notes:
-        talk.print(hanging(" note: ", note))
+        messages.print(hanging(" note: ", note))
     if verification is not None and not verification.passed:
-        talk.print(hanging(" note: ", f"the last verification of this calibration failed: {verification.reason}"))
+        messages.print(hanging(" note: ", f"the last verification of this calibration failed: {verification.reason}"))
     if output is not None:
         write_new(output, made.text)
-        talk.print(f" Wrote {output}")
+        messages.print(f" Wrote {output}")
     if as_json:
         write_json(
             {

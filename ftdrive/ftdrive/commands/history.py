@@ -32,7 +32,7 @@ def history(
     from ftdrive.errors import ConfigError
     from ftdrive.store.history import drifts, warnings
     from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
-    from ftdrive.terminal.console import answer, hanging, talk
+    from ftdrive.terminal.console import answer, hanging, messages
 
     left_out: tuple[str, ...] = ()
     name = None
@@ -51,7 +51,7 @@ def history(
             left_out = (store.rebuild(*index) if rebuild else store.index(*index)).unreadable
         results, checks = store.results(tool), store.verifications()
     for words in left_out:
-        talk.print(hanging(" left out: ", words))
+        messages.print(hanging(" left out: ", words))
     now = datetime.now(UTC)
     found, advice = drifts(results), list(warnings(results, checks, now))
     last = {check.calibration_id: check for check in checks}
@@ -61,7 +61,9 @@ def history(
         write_json({"schema_version": 1, "store": name, "results": rows, "trends": trends, "warnings": advice})
         return
     if not results:
-        talk.print("No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder.")
+        messages.print(
+            "No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder."
+        )
         return
     _print_table([_row(one, last.get(one.id), now) for one in results])
     for drift in found:

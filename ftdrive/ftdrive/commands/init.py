@@ -80,7 +80,7 @@ def init(
     from ftdrive.cell.template import cell_file
     from ftdrive.planning.cell_plan import require_possible
     from ftdrive.planning.geometry.arm_model import SHAPES
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import messages
     from ftdrivers.ur.kinematics import model_named
 
     check_simulate(simulate, real={"--robot": robot})
@@ -158,10 +158,10 @@ def init(
         write_json({"schema_version": 1, "file": str(output), **devices, "config": cell.to_dict()})
     if simulate:
         _say(f"Wrote {output} for an emulated cell: commands with --simulate use it, all others refuse it.")
-        talk.print_next("ftdrive doctor --simulate", "ftdrive plan --simulate")
+        messages.print_next("ftdrive doctor --simulate", "ftdrive plan --simulate")
     else:
         _say(f"Wrote {output}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
-        talk.print_next("ftdrive doctor", "ftdrive plan")
+        messages.print_next("ftdrive doctor", "ftdrive plan")
 
 
 class Questions:
@@ -322,6 +322,6 @@ def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
 
 
 def _say(words: str, head: str = "") -> None:
-    from ftdrive.terminal.console import hanging, talk
+    from ftdrive.terminal.console import hanging, messages
 
-    talk.print(hanging(head, words))
+    messages.print(hanging(head, words))

@@ -33,7 +33,7 @@ from ftdrive.live.stream import CompensatedStream
 from ftdrive.recording import Recorder, read_recording
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import read_calibration
-from ftdrive.terminal.console import printer, talk
+from ftdrive.terminal.console import messages, printer
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.live.feed import MEAN_S, Feed, Stream
 from ftdrive.terminal.live.layout import plain as plain_lines
@@ -107,7 +107,7 @@ def live(
             recorder = partial(_recorder, stream.info, stream.cell.to_dict())
         if once or as_json or not sys.stdout.isatty():
             _print(stream, stream.clock, once=once, as_json=as_json)
-        elif plain or not (talk.is_terminal and sys.stdin.isatty()):
+        elif plain or not (messages.is_terminal and sys.stdin.isatty()):
             _show_table(stream, stream.clock, checks)
         else:
             from ftdrive.terminal.live_screen import run_live

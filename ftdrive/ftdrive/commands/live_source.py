@@ -11,7 +11,7 @@ from ftdrive.live.samples import WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.source import read_calibration
 from ftdrive.session.rehearsal import short_calibration, station_of
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import messages
 from ftdrive.terminal.screen import open_operator
 
 RECOVER_S = 10.0
@@ -63,8 +63,8 @@ def open_source(
     name = "temporary calibration" if path is None else str(path)
     stream = stack.enter_context(CompensatedStream(cell, chosen, name=name, frame=frame, force=force))
     if tool is not None:
-        talk.print(f" {tool}: {stream.info.calibration_name}")
-    talk.print(f" {stream.info.calibration_state}")
+        messages.print(f" {tool}: {stream.info.calibration_name}")
+    messages.print(f" {stream.info.calibration_state}")
     for words in stream.warnings:
-        talk.print(f" {words}")
+        messages.print(f" {words}")
     return stream

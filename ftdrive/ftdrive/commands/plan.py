@@ -108,7 +108,7 @@ def plan(
     from ftdrive.errors import ConfigError
     from ftdrive.planning.cell_plan import certifier_for, plan_for
     from ftdrive.planning.planner import USUAL_POSTURE_RAD
-    from ftdrive.terminal.console import answer, talk, working
+    from ftdrive.terminal.console import answer, messages, working
 
     for one, other in ((quick, minimal), (cone_deg, box_mm)):
         if one and other:
@@ -140,7 +140,9 @@ def plan(
     if not described:  # described by options, or nothing but arm and mounting
         cell = replace(cell, workcell=replace(cell.workcell, measured=True))
     if not cell.workcell.measured:
-        talk.print(f"Placeholders in {', '.join(sorted(described))} (measured = false): this plan is for the eye only.")
+        messages.print(
+            f"Placeholders in {', '.join(sorted(described))} (measured = false): this plan is for the eye only."
+        )
     certifier = certifier_for(cell, cell.robot.model)
     q_rad = np.array([*np.radians(numbers("--posture", posture, ",", (3,))), *USUAL_POSTURE_RAD[3:]])
     with working("Planning"):
@@ -163,12 +165,12 @@ def plan(
     saved = [f" Saved {path}" for path in (png, output) if path is not None]
     if as_json:
         write_json({"schema_version": 1} | made.to_dict())
-        talk.print(*saved, sep="\n", end="\n" if saved else "")
+        messages.print(*saved, sep="\n", end="\n" if saved else "")
     else:
         from ftdrive.planning.show.words import plan_in_words, stop_in_words
 
         answer.print(*filter(None, (plan_in_words(made), stop_in_words(made, cell.robot))), *saved, sep="\n")
-        talk.print_next(f"ftdrive calibrate{' --simulate' if simulate else ''}   (asks before anything moves)")
+        messages.print_next(f"ftdrive calibrate{' --simulate' if simulate else ''}   (asks before anything moves)")
     if view:
         _look(made, certifier)
 

@@ -20,7 +20,7 @@ from ftdrive.runs.push_receipt import Receipt
 from ftdrive.runs.source import read_calibration
 from ftdrive.session.operator import Question
 from ftdrive.session.settings_push import EFFECTS, WORDS, propose, restore, send
-from ftdrive.terminal.console import answer, in_whole_words, talk
+from ftdrive.terminal.console import answer, in_whole_words, messages
 from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
 from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.text import echo
@@ -80,10 +80,10 @@ def push(
             write_json({"schema_version": 1, "event": "proposal", **proposal.reason, **values})
         elif not (as_json or sends):
             answer.print("\n".join(proposal_in_lines(proposal)))
-        elif not as_json and (asks or not talk.quiet):
+        elif not as_json and (asks or not messages.quiet):
             echo(in_whole_words("\n".join(proposal_in_lines(proposal)), sys.stderr), err=True)
         if not sends:
-            (talk if as_json else answer).print(
+            (messages if as_json else answer).print(
                 "Dry run: nothing was sent." if dry_run else "The controller agrees: nothing was sent."
             )
             return

@@ -83,7 +83,7 @@ def record(
     from ftdrive.commands.live_source import open_source
     from ftdrive.recording import Recorder
     from ftdrive.recording.files import require_new_recordings
-    from ftdrive.terminal.console import talk, working
+    from ftdrive.terminal.console import messages, working
 
     check_simulate(simulate, real={"--config": config, "--robot": robot})
     require_new_recordings(paths)
@@ -93,7 +93,7 @@ def record(
             path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
         )
         recorder = Recorder(paths, stream.info, stream.cell.to_dict())
-        talk.print(f" Recording, {frame}. Ctrl-C ends.")
+        messages.print(f" Recording, {frame}. Ctrl-C ends.")
         try:
             with working("Recording") as show:
                 record_stream(stream, recorder, duration_s, count, lambda: show(_so_far(recorder)))
@@ -154,12 +154,12 @@ def _so_far(recorder: "Recorder") -> str:
 
 
 def _report(recorder: "Recorder", frame: "WrenchFrame", name: str, *, as_json: bool) -> None:
-    from ftdrive.terminal.console import answer, talk
+    from ftdrive.terminal.console import answer, messages
 
     rate = f"{recorder.rate_Hz:.0f} Hz"  # of all samples: that of the first half second may differ much
     for path in recorder.saved:
         samples = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, {rate}, gaps: {recorder.gaps}"
-        (talk if as_json else answer).print(f" Saved {path}: {samples}")
+        (messages if as_json else answer).print(f" Saved {path}: {samples}")
     if as_json:
         files = {
             "files": [str(path) for path in recorder.saved],

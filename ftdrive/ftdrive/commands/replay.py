@@ -21,7 +21,7 @@ from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.outcome import solve_records
 from ftdrive.runs.replay_source import RecordedRun
 from ftdrive.runs.run import Run
-from ftdrive.terminal.console import answer, hanging, talk, working
+from ftdrive.terminal.console import answer, hanging, messages, working
 from ftdrive.terminal.report import print_result
 
 
@@ -54,8 +54,8 @@ def _repeat(run: Run, source: Path, as_json: bool) -> None:
         recorded.go_on_to(kept.pose.q_rad)
         again = take_pose(recorded, recorded, kept.stop, kept.pose, sampling)
         records.append(replace(again, clock_offset_ns=kept.clock_offset_ns))
-        if talk.verbose:
-            talk.print(f"{kept.stop:2d}  R{kept.pose.number:02d}  {len(kept.samples.t_host_ns)} samples")
+        if messages.verbose:
+            messages.print(f"{kept.stop:2d}  R{kept.pose.number:02d}  {len(kept.samples.t_host_ns)} samples")
     with working("Solving"):
         outcome = solve_records(run, records)
     if as_json:

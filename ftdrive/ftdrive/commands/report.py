@@ -35,7 +35,7 @@ from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject
 from ftdrive.report.trust import trust
 from ftdrive.runs.bundle import unpacked
-from ftdrive.terminal.console import answer, hanging, talk, working
+from ftdrive.terminal.console import answer, hanging, messages, working
 from ftdrive.terminal.text import echo
 
 _SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up")
@@ -116,7 +116,7 @@ def report(
         known = trust(subject.result, found, store_url, datetime.now(UTC))
         subject = replace(subject, trust=known)
         if known["store_error"]:
-            talk.print(hanging(" ! ", f"a later verification may be missing, because {known['store_error']}"))
+            messages.print(hanging(" ! ", f"a later verification may be missing, because {known['store_error']}"))
         if source is not None and found != source:  # unpacked
             reproduce = subject.reproduce.replace(str(found), shlex.quote(str(source)))
             subject = replace(subject, source=source, reproduce=reproduce)
@@ -125,7 +125,7 @@ def report(
             text = written(facts, form)
     if output is not None:
         write_new(output, text)
-        say = talk if as_json else answer
+        say = messages if as_json else answer
         say.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}", say))
         say.print(f" Saved {output}")
     if as_json:

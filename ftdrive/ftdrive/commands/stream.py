@@ -22,7 +22,7 @@ from ftdrive.live.samples import Axes
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.servers.address import host_and_port, is_loopback, with_port
 from ftdrive.servers.udp import UdpSender
-from ftdrive.terminal.console import print_address, talk
+from ftdrive.terminal.console import messages, print_address
 from ftdrivers.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -91,13 +91,13 @@ def serve(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender
                 now_s = source.clock.now_s()
                 if silent_since_s is None:
                     silent_since_s = now_s
-                    talk.print(f"{error}. Viewers stay connected for {RECOVER_S:g} s.")
+                    messages.print(f"{error}. Viewers stay connected for {RECOVER_S:g} s.")
                 elif now_s - silent_since_s > RECOVER_S:
                     raise
             else:
                 if silent_since_s is not None:
                     silent_since_s = None
-                    talk.print("Samples arrive again.")
+                    messages.print("Samples arrive again.")
                 for sink in sinks:
                     sink.write(block)
             _send_events(source, sinks)
@@ -115,16 +115,16 @@ def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp
     """Print what is served, and how to open it."""
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     url = f"ws://{with_port(name, server.port)}"
-    talk.print(f"Serving the wrench in {source.frame}; {source.info.calibration_name}.")
+    messages.print(f"Serving the wrench in {source.frame}; {source.info.calibration_name}.")
     print_address("  Foxglove, Lichtblick:  Open connection > Foxglove WebSocket > ", url)
     print_address("  PlotJuggler from 3.16: Streaming > Foxglove Bridge > ", url)
     if udp is not None:
-        talk.print(f"  PlotJuggler before:    Streaming > UDP Server > port {udp[1]}, JSON, use the timestamp")
+        messages.print(f"  PlotJuggler before:    Streaming > UDP Server > port {udp[1]}, JSON, use the timestamp")
     if is_loopback(host):
         print_address("  In a browser:          ", server.app_url)
     else:
-        talk.print(
+        messages.print(
             f"Unprotected: a program on any computer that reaches port {server.port} can read the stream, tare it and "
             "change its frame and stages. There is no password and no encryption."
         )
-    talk.print("Ctrl-C ends.")
+    messages.print("Ctrl-C ends.")

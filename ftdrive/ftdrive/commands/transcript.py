@@ -17,7 +17,7 @@ from ftdrive.checks.computer import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import versions
-from ftdrive.terminal.console import answer, talk, working
+from ftdrive.terminal.console import answer, messages, working
 from ftdrivers.errors import BadTranscript, ConnectError, DeviceTimeout, ProtocolError
 from ftdrivers.interfaces import ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
@@ -102,7 +102,7 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
         else:
             writer.end(**seen)
             if kept:
-                talk.print(f" Saved {path}")
+                messages.print(f" Saved {path}")
     if not writer.has_port:
         raise ConfigError(f"the driver of {sensor} uses neither pyserial nor python-can: only these can be recorded")
     return url, seen
@@ -155,7 +155,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
         answer.print(f" played    {_words(played)}")
     if duration_s < loaded.header["duration_s"]:
         whole_s = loaded.header["duration_s"]
-        talk.print(f" The recording was broken off: {duration_s:.3g} s of {whole_s:g} s were played.")
+        messages.print(f" The recording was broken off: {duration_s:.3g} s of {whole_s:g} s were played.")
 
 
 def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:

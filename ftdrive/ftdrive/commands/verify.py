@@ -187,7 +187,7 @@ def _wanted(
 def _report(verified: "Verified", update: Answer, *, simulated: bool, as_json: bool) -> None:
     """Print the outcome and what to do next; save the update if it is wanted."""
     from ftdrive.runs.verified import save_update
-    from ftdrive.terminal.console import answer, talk
+    from ftdrive.terminal.console import answer, messages
     from ftdrive.terminal.verification_text import print_verification
 
     if not as_json:
@@ -200,11 +200,11 @@ def _report(verified: "Verified", update: Answer, *, simulated: bool, as_json: b
         answer.print(f" Saved {saved}: {verified.update_name} updated, parent {verified.calibration.id[:6]}")
     again = " --simulate" if simulated else ""
     if saved is not None:
-        talk.print_next(f"ftdrive live --calibration {quote(str(saved))}{again}")
+        messages.print_next(f"ftdrive live --calibration {quote(str(saved))}{again}")
     elif verified.passed:
-        talk.print_next("ftdrive history   (age and trends of all calibrations)")
+        messages.print_next("ftdrive history   (age and trends of all calibrations)")
     else:
-        talk.print_next(f"ftdrive calibrate{again}   (the calibration does not hold any more)")
+        messages.print_next(f"ftdrive calibrate{again}   (the calibration does not hold any more)")
 
 
 def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Path) -> tuple["Station", Path]:
@@ -226,14 +226,14 @@ def _wants_update(verified: "Verified", update: Answer, *, as_json: bool) -> boo
     """Whether to save the update; without an answer, no."""
     from ftdrive.errors import Declined
     from ftdrive.session.operator import Question
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import messages
     from ftdrive.terminal.operators import JsonOperator, PlainOperator
 
     if verified.passed or verified.update is None or update == "no":
         return False
     if update == "yes":
         return True
-    operator = JsonOperator() if as_json else PlainOperator(quiet=talk.quiet)
+    operator = JsonOperator() if as_json else PlainOperator(quiet=messages.quiet)
     text = f"An update of the {verified.update_name} is sufficient. Save it as a new calibration?"
     try:
         return operator.ask(Question(text)) == "yes"

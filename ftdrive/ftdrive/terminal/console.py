@@ -1,4 +1,4 @@
-"""Two consoles: `answer` prints what a command was asked for on stdout, `talk` all else on stderr."""
+"""Two consoles: `answer` prints what a command was asked for on stdout, `messages` all else on stderr."""
 
 import os
 import sys
@@ -27,7 +27,7 @@ class _Console(Console):
         raise BrokenPipeError
 
 
-class Talk(_Console):
+class CommandConsole(_Console):
     """A console that knows whether details are wanted (`-v`); `quiet` is the console's own."""
 
     verbose = False
@@ -43,7 +43,7 @@ class Talk(_Console):
             self.print(f"   {command}")
 
 
-talk = Talk(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
+messages = CommandConsole(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
 """Folds between words in a terminal, never in a file. Prints brackets and colons as they are: paths contain them."""
 
 
@@ -54,14 +54,14 @@ def printer() -> Console:
 
 def print_address(words: str, address: str) -> None:
     """Print an address behind words: on one line, however narrow the terminal is, and as a link where it can."""
-    talk.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
+    messages.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
 
 
 _NARROWEST = 20
 """Columns behind a head: with fewer, lines begin at the left."""
 
 
-def hanging(head: str | Text, words: str, console: Console = talk) -> Text:
+def hanging(head: str | Text, words: str, console: Console = messages) -> Text:
     """Put words behind a head; on a terminal too narrow for them the next lines begin under the first word."""
     first = Text.assemble(head)
     text = Text(as_typed(words))
@@ -77,8 +77,8 @@ def hanging(head: str | Text, words: str, console: Console = talk) -> Text:
 def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
     """Break lines between words where they are longer than the terminal is wide, but not for a file or pipe.
 
-    For what is written without `talk`; control characters become visible. A word that is longer by itself, such as a
-    path, stays whole. Where `head` is what the text begins with, its lines go on behind it, as in `hanging`.
+    For what is written without `messages`; control characters become visible. A word that is longer by itself, such as
+    a path, stays whole. Where `head` is what the text begins with, its lines go on behind it, as in `hanging`.
     """
     text = visible(as_typed(text))
     try:
@@ -100,15 +100,15 @@ def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
     )
 
 
-answer = Talk(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+answer = CommandConsole(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
 """On stdout: results, verdicts and where they were saved. `-q` does not silence it, `--json` replaces it."""
 
 
 @contextmanager
 def working(words: str) -> Iterator[Callable[[str], None]]:
     """Show on a terminal that a command works, and at what; a pipe gets nothing. Yields a function for other words."""
-    if not talk.is_terminal or talk.quiet:
+    if not messages.is_terminal or messages.quiet:
         yield lambda _: None
         return
-    with talk.status(f"{words} …") as status:
+    with messages.status(f"{words} …") as status:
         yield lambda now: status.update(f"{now} …")

@@ -25,7 +25,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Axes, Point, WrenchFrame
 from ftdrive.runs.verification_record import fitted_dataset
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import messages
 from ftdrive.terminal.live.feed import Feed, Sink, Stream
 from ftdrive.terminal.live.history import SPANS_S
 from ftdrive.terminal.live.layout import frame
@@ -99,7 +99,7 @@ def run_live(
     finally:
         feed.stop()
         for path in feed.recorded:
-            talk.print(f" Recorded: {path}")
+            messages.print(f" Recorded: {path}")
     if feed.crash is not None:
         raise feed.crash
     if feed.failure is not None:

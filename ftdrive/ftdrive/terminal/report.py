@@ -14,7 +14,7 @@ from ftcalib.compare import Compared
 from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftdrive.runs.pose_hints import hints, names_of
-from ftdrive.terminal.console import answer, hanging, talk
+from ftdrive.terminal.console import answer, hanging, messages
 from ftdrivers.interfaces import Array
 
 _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
@@ -66,10 +66,10 @@ def print_result(
         answer.print(hanging(" truth: ", words, answer))
     for finding in result.findings:
         answer.print(hanging("   ", finding.words, answer))
-    if talk.verbose or result.verdict != "good":
+    if messages.verbose or result.verdict != "good":
         _print_fit(result, names_of(records))
     _print_drift(result, drift)
-    for hint in hints(result, records) if hinted or talk.verbose else ():
+    for hint in hints(result, records) if hinted or messages.verbose else ():
         answer.print(hanging(" ? ", hint.words, answer), style="yellow")
     if saved is not None:
         answer.print(f" Saved {saved}")
@@ -84,7 +84,7 @@ def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
         if truth is not None or title not in {"truth", "error / sigma"}:
             table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
     for label, scale, unit, key in QUANTITIES:
-        if key in _DERIVED and not talk.verbose:
+        if key in _DERIVED and not messages.verbose:
             continue
         estimates, sigmas = (values_of(source[key], key) * scale for source in (data, data["sigma"]))
         truths = None if truth is None else values_of(truth[key], key) * scale
@@ -118,7 +118,7 @@ def _print_fit(result: CalibrationResult, names: Sequence[str]) -> None:
 def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
     if drift is not None:
         words, bad = drift_in_words(drift)
-        if bad or talk.verbose or result.verdict != "good":
+        if bad or messages.verbose or result.verdict != "good":
             answer.print(hanging(" drift: ", words, answer), style="yellow" if bad else None)
     if result.drift is not None:
         change, sigma = result.drift.change, result.drift.sigma

@@ -37,7 +37,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.live_fit import GREEN
 from ftdrive.session.operator import Key, Operator, Question
-from ftdrive.terminal.console import hanging, talk
+from ftdrive.terminal.console import hanging, messages
 from ftdrive.terminal.hints import as_typed
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
@@ -527,8 +527,8 @@ def open_operator(*, as_json: bool = False, command: str = "calibrate", live: bo
         with scripted.supervisor:
             yield scripted
         return
-    if not live or talk.quiet or not talk.is_terminal or talk.is_dumb_terminal or not os.isatty(0):
-        operator = PlainOperator(quiet=talk.quiet, verbose=talk.verbose)
+    if not live or messages.quiet or not messages.is_terminal or messages.is_dumb_terminal or not os.isatty(0):
+        operator = PlainOperator(quiet=messages.quiet, verbose=messages.verbose)
         with operator.supervisor:
             try:
                 yield operator
@@ -537,5 +537,5 @@ def open_operator(*, as_json: bool = False, command: str = "calibrate", live: bo
                     operator.finish()
         return
     keyboard = Keyboard(0) if Keyboard.usable(0) else None
-    with Screen(talk, keyboard, verbose=talk.verbose, command=command) as screen, screen.supervisor:
+    with Screen(messages, keyboard, verbose=messages.verbose, command=command) as screen, screen.supervisor:
         yield screen

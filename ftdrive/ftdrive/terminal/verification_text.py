@@ -6,7 +6,7 @@ from rich.text import Text
 
 from ftdrive.runs.pose_hints import moved
 from ftdrive.runs.verified import FALSE_ALARMS, Verified
-from ftdrive.terminal.console import answer, hanging, talk
+from ftdrive.terminal.console import answer, hanging, messages
 from ftdrive.terminal.report import drift_in_words
 from ftdrivers.interfaces import Array
 
@@ -27,7 +27,7 @@ def print_verification(verified: Verified) -> None:
         answer.print(hanging(" ? ", finding.words, answer), style="yellow")
     if verified.drift is not None:
         words, bad = drift_in_words(verified.drift)
-        if bad or talk.verbose:
+        if bad or messages.verbose:
             answer.print(hanging(" drift: ", words, answer), style="yellow" if bad else None)
     if not verified.passed and found.passed:
         words = "Nothing has changed: the differences agree with their sigma. Average longer, or raise the limit."

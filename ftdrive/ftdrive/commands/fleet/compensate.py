@@ -79,11 +79,11 @@ def compensate(
 def _mention_incomplete(paths: Sequence[Path]) -> None:
     """Print how many recordings of these folders were interrupted."""
     from ftdrive.recording.files import ENDINGS
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import messages
 
     inside = [one for path in paths if path.is_dir() for one in path.glob("*.partial")]
     if count := sum(Path(one.stem).suffix in ENDINGS for one in inside):
-        talk.print(f"Left out, because they are incomplete: {count} recordings; `ftdrive convert` saves one.")
+        messages.print(f"Left out, because they are incomplete: {count} recordings; `ftdrive convert` saves one.")
 
 
 @dataclass(slots=True)

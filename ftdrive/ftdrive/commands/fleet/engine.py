@@ -40,10 +40,10 @@ def with_progress(title: str, found: Iterator[T], total: int) -> Iterator[T]:
     """Show a progress bar on stderr."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import messages
 
     columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=talk, transient=True, disable=not talk.is_terminal) as progress:
+    with Progress(*columns, console=messages, transient=True, disable=not messages.is_terminal) as progress:
         yield from progress.track(found, total=total)
 
 
@@ -55,7 +55,7 @@ def runs_to_solve(folders: Sequence[Path], url: str | None, since: datetime | No
     from ftdrive.errors import ConfigError
     from ftdrive.fleet.resolve import is_calibration, run_folders
     from ftdrive.runs.run import Run
-    from ftdrive.terminal.console import talk
+    from ftdrive.terminal.console import messages
 
     if folders and url:
         raise ConfigError("RUNS and --store exclude one another: leave one out")
@@ -69,7 +69,7 @@ def runs_to_solve(folders: Sequence[Path], url: str | None, since: datetime | No
                 runs.append(run)
     if unfinished:
         words = "`ftdrive calibrate --resume RUN` finishes one"
-        talk.print(f"Left out, because they have no dataset: {unfinished} runs; {words}.")
+        messages.print(f"Left out, because they have no dataset: {unfinished} runs; {words}.")
     if not found:
-        talk.print("No runs: name their folders, or add them to the store with `ftdrive fleet index RUNS`.")
+        messages.print("No runs: name their folders, or add them to the store with `ftdrive fleet index RUNS`.")
     return runs

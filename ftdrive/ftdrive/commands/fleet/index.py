@@ -18,12 +18,12 @@ def index(folders: Sequence[Path], url: str | None) -> None:
     """
     from ftdrive.fleet.cells import Owners
     from ftdrive.fleet.words import counted, listed
-    from ftdrive.terminal.console import answer, hanging, talk
+    from ftdrive.terminal.console import answer, hanging, messages
 
     found = open_store(url)
     indexed = found.index(*folders)
     for words in indexed.unreadable:
-        talk.print(hanging(" left out: ", words))
+        messages.print(hanging(" left out: ", words))
     added = f"{counted(indexed.results, 'result')} and {counted(indexed.verifications, 'verification')}"
     answer.print(f" {added} added to {found.name}")
     if cells := found.cells():

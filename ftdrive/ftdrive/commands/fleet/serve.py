@@ -47,7 +47,7 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
     from ftdrive.fleet.serve import serve as serve_fleet
     from ftdrive.fleet.status import fleet_state
     from ftdrive.servers.address import host_and_port, is_loopback, with_port
-    from ftdrive.terminal.console import print_address, talk
+    from ftdrive.terminal.console import messages, print_address
     from ftdrivers.clock import REAL
 
     host, port = host_and_port("--metrics", address, f"127.0.0.1:{PORT}", lowest=0)
@@ -59,16 +59,18 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
         print_address(f"Serving {found.name} at ", f"http://{with_port(host, metrics.port)}/metrics")
         print_address("The page of the fleet is at ", f"http://{with_port(host, metrics.port)}/")
         if not is_loopback(host):
-            talk.print(f"Unprotected: any computer that reaches port {metrics.port} can read the state of all cells.")
+            messages.print(
+                f"Unprotected: any computer that reaches port {metrics.port} can read the state of all cells."
+            )
         if broker_url is not None:
             from ftdrive.fleet.mqtt import Broker, Messages
 
             broker = Broker.of(broker_url)
-            sinks.append(stack.enter_context(closing(Messages(broker, wake, talk.print))))
-            talk.print(f"Publishing at the MQTT broker {broker}, topics {broker.prefix}ftdrive/#")
-        talk.print(f"Alert rules and a dashboard are in {MONITORING}")
-        talk.print("Ctrl-C ends.")
-        serve_fleet(partial(fleet_state, found), sinks, REAL, wake, say=talk.print)
+            sinks.append(stack.enter_context(closing(Messages(broker, wake, messages.print))))
+            messages.print(f"Publishing at the MQTT broker {broker}, topics {broker.prefix}ftdrive/#")
+        messages.print(f"Alert rules and a dashboard are in {MONITORING}")
+        messages.print("Ctrl-C ends.")
+        serve_fleet(partial(fleet_state, found), sinks, REAL, wake, say=messages.print)
 
 
 def _page(store: "Store") -> str:

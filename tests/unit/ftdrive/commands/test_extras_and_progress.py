@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftdrive import cli
-from ftdrive.terminal.console import talk, working
+from ftdrive.terminal.console import messages, working
 
 PLAN = ("plan", "--model", "ur5e", "--tool", "0:100:80", "--minimal")
 
@@ -53,8 +53,8 @@ def test_an_extra_is_missed_before_any_work(
 
 def test_a_terminal_sees_at_what_a_command_works(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = list[Any]()
-    monkeypatch.setattr(talk, "_force_terminal", True)
-    monkeypatch.setattr(talk, "status", _Status.of(seen))
+    monkeypatch.setattr(messages, "_force_terminal", True)
+    monkeypatch.setattr(messages, "status", _Status.of(seen))
     with working("Recording") as show:
         show("3.0 s, 1500 samples, gaps: 0")
     assert seen == ["Recording …", "3.0 s, 1500 samples, gaps: 0 …"]
@@ -90,9 +90,9 @@ def test_commands_that_take_long_say_at_what_they_work(
     )
     header = "r11,r12,r13,r21,r22,r23,r31,r32,r33,fx,fy,fz,tx,ty,tz"
     np.savetxt("poses.csv", np.c_[R.reshape(8, 9), wrench], delimiter=",", header=header, comments="")
-    monkeypatch.setattr(talk, "_force_terminal", True)
+    monkeypatch.setattr(messages, "_force_terminal", True)
     seen = list[Any]()
-    monkeypatch.setattr(talk, "status", _Status.of(seen))
+    monkeypatch.setattr(messages, "status", _Status.of(seen))
     assert cli.run(arguments) in {0, 7}
     assert words in seen
     if "--png" in arguments:

@@ -24,7 +24,7 @@ from ftdrive.session import session
 from ftdrive.session.events import Noted
 from ftdrive.session.operator import Question
 from ftdrive.terminal import console
-from ftdrive.terminal.console import answer, hanging, in_whole_words, printer, talk
+from ftdrive.terminal.console import answer, hanging, in_whole_words, messages, printer
 from ftdrive.terminal.live.view import Line
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.screen import open_operator
@@ -37,7 +37,7 @@ HELD = ["calibrate", "--robot", "10.0.0.1", "--sensor", "ati-can://can0"]
 
 @pytest.fixture(autouse=True)
 def _put_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(talk, "quiet", False)
+    monkeypatch.setattr(messages, "quiet", False)
     monkeypatch.setattr(logging, "basicConfig", lambda **_: None)
 
 
@@ -100,7 +100,7 @@ def test_quiet_asks_with_all_that_a_question_is_about(monkeypatch: pytest.Monkey
     assert operator.ask(Question("Go?")) == "yes"
     operator.show(Noted(words="it went"))
     assert stderr.getvalue().splitlines() == ["   the arm goes there", "Go? [yes/no] yes"]
-    monkeypatch.setattr(talk, "quiet", True)
+    monkeypatch.setattr(messages, "quiet", True)
     with open_operator() as chosen:
         assert isinstance(chosen, PlainOperator)
         chosen.show(Noted(words="not printed"))
@@ -121,7 +121,7 @@ def test_an_address_stays_on_one_line_and_is_a_link_where_the_terminal_can(monke
         file = io.StringIO()
         monkeypatch.setattr(
             console,
-            "talk",
+            "messages",
             Console(file=file, width=40, force_terminal=is_terminal, color_system="standard" if is_terminal else None),
         )
         console.print_address("  In a browser:          ", url)
@@ -156,7 +156,7 @@ def test_no_name_in_a_table_commands_the_terminal(capsys: pytest.CaptureFixture[
 
 
 def ended(code: str, *arguments: str) -> tuple[int, str]:
-    """Run Python with nobody who reads its output."""
+    """Run Python without a reader of its output."""
     read, write = os.pipe()
     os.close(read)
     try:

@@ -20,7 +20,7 @@ from ftdrive.checks.check import Check
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import STEP_S, ReplayedStream
 from ftdrive.live.samples import Block, Paired, Stages, WrenchFrame
-from ftdrive.terminal.console import talk
+from ftdrive.terminal.console import messages
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.layout import frame
 from ftdrive.terminal.live.summary import Summary
@@ -310,7 +310,7 @@ def test_recordings_are_named_at_the_end(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setattr(LiveApp, "run", run)
     monkeypatch.setattr(LiveApp, "draw", lambda _: None)
     tape = MagicMock()
-    with talk.capture() as said:
+    with messages.capture() as said:
         run_live(FakeStream(), recorder=lambda _: tape)
     assert f"Recorded: {tmp_path}/live-" in said.get().replace("\n", "")
     tape.close.assert_called_once()

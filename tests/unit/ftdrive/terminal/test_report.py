@@ -19,7 +19,7 @@ from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftcalib.result import Method
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError
-from ftdrive.terminal.console import answer, talk
+from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.report import error_in_words, errors_in_sigma, print_comparison, print_result
 from tests.unit.ftdrive.fake_cell import Lab
 
@@ -245,7 +245,7 @@ def test_what_was_taken_as_known_is_called_fixed(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(talk, "verbose", True)  # with the rows that follow from others
+    monkeypatch.setattr(messages, "verbose", True)  # with the rows that follow from others
     print_result(solve(tilted(), method, known=known))
     lines = capsys.readouterr().out.splitlines()
     assert {line[: line.index("  ")].strip() for line in lines if line.rstrip().endswith(" fixed")} == fixed
