@@ -235,7 +235,7 @@ def test_move_stillness_and_limits(station: Station, arm: UrArm) -> None:
     q = away(arm, 0.6)
     calls: list[float] = []
     arm.move_to(q, timeout_s=30, guard=lambda: calls.append(station.clock.now_s()))
-    assert len(calls) > 10
+    assert len(calls) > 1  # before and during the move
     arm.wait_until_still(timeout_s=30, guard=no_guard)
     state = arm.state()
     assert np.allclose(state.q_rad, q, atol=1e-4)
