@@ -6,7 +6,7 @@ import ftdrive
 def on_contact(contact: ftdrive.Contact) -> None:
     """Print the beginning of a contact, 60 ms later, and its end."""
     if contact.over:
-        print(f"released after {contact.duration_s:.1f} s, peak {contact.peak_N:.0f} N")
+        print(f"released after {contact.duration_s:.0f} s, peak {contact.peak_N:.0f} N")
     else:
         print("contact")
 
@@ -18,7 +18,7 @@ with ftdrive.open_stream(simulate=True, on_contact=on_contact) as stream:
     begin_s, pushed = next(samples).t_s, False
     for sample in samples:  # force_N, torque_Nm, their sigmas, raw, in_contact, frame
         if sample.t_s > begin_s + 3 and not pushed:  # the noise of the free tool is known
-            stream.station.control(do="push", wrench=[0, 0, -8, 0, 0, 0], seconds=0.5)
+            stream.station.control(do="push", wrench=[0, 0, -8, 0, 0, 0], seconds=1.0)
             pushed = True
         if sample.t_s > begin_s + 5:
             print(f"free again: {sample.force_N.round() + 0.0} N, {sample.frame}")

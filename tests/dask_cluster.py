@@ -5,7 +5,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -53,5 +53,9 @@ def dask_cluster() -> Iterator[Cluster]:
 def kill_busiest_worker() -> None:
     """Kill the process below this one that has computed most, be it of a pool or of a cluster."""
     below = psutil.Process().children(recursive=True)
-    workers = [one for one in below if "dask" not in one.cmdline()]  # neither the scheduler nor what starts workers
+    workers = []
+    for one in below:
+        with suppress(psutil.Error):  # it has ended meanwhile
+            if "dask" not in one.cmdline():  # neither the scheduler nor what starts workers
+                workers.append(one)
     max(workers, key=lambda one: one.cpu_times().user).kill()
