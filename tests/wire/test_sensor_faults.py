@@ -175,8 +175,12 @@ HEALTHY = dict.fromkeys([key for fault in SCRIPT.values() for key in fault], 0.0
 
 
 def chances(scheme: str, fault: str) -> dict[str, float]:
-    """How often a fault strikes: a slip stops the ATI stream for 40 ms, so there it is rare."""
-    return {"byte_slip": 0.001} if (scheme, fault) == ("ati-serial", "byte_slip") else SCRIPT[fault]
+    """How often a fault strikes. It is rare where few in a row are a silence of 0.3 s, which is an error."""
+    rare = {
+        ("ati-serial", "byte_slip"): {"byte_slip": 0.001},  # a slip stops the stream for 40 ms
+        ("ati-can", "drop"): {"drop": 0.02},  # after two polls the slot is selected again, with 0.1 s for each attempt
+    }
+    return rare.get((scheme, fault), SCRIPT[fault])
 
 
 def applies(scheme: str, fault: str) -> bool:
