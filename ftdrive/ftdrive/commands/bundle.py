@@ -26,7 +26,13 @@ from ftdrive.terminal.console import answer, hanging, messages
 @click.command()
 @click.argument("run", metavar="RUN", required=False, type=FOLDER)
 @click.option("-o", "--output", type=NewFile(), help="New file.  [default: RUN's name and .zip, in this folder]")
-@click.option("--transcript", "transcripts", multiple=True, type=FILE, help="Of the sensor's wire; may be repeated.")
+@click.option(
+    "--transcript",
+    "transcripts",
+    multiple=True,
+    type=FILE,
+    help="Add this transcript of the sensor's wire. Repeatable.",
+)
 @simulate("Bundle a short run of an emulated cell.")
 @EMULATED_SENSOR
 @JSON

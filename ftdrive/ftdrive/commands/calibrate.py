@@ -50,7 +50,7 @@ _EXCLUDE_ONE_ANOTHER = (
 @CONTROL
 @simulate()
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
-@click.option("--minimal", is_flag=True, help="6 poses.")
+@click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
 @click.option(
     "--fast", is_flag=True, help="Full speed of the plan (60 °/s, 250 mm/s at most), after one complete slow run."

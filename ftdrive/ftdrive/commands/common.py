@@ -22,7 +22,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
-JSON = click.option("--json", "as_json", is_flag=True, help="One JSON object on stdout.")
+JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 MODEL = click.option(
     "--model", help="Model of the arm, for controllers that do not report it (CB3 before 3.12, e-Series before 5.6)."
 )
@@ -56,8 +56,8 @@ def CELL(command: F) -> F:
     return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
 
 
-EDITED = "one that was edited by hand; every output then says so"
-FORCE = click.option("--force", is_flag=True, help=f"Apply {EDITED}.")
+EDITED = "that was edited by hand; every output then says so"
+FORCE = click.option("--force", is_flag=True, help=f"Apply a calibration {EDITED}.")
 
 CALIBRATION = click.option(
     "--calibration",
@@ -72,7 +72,7 @@ def CALIBRATION_OR_TOOL(command: F) -> F:
     """Add the options --calibration, --tool and --force, which `open_source` takes."""
     tool = click.option("--tool", metavar="NAME", help="Newest accepted calibration of this tool on this cell.")
     force = click.option(
-        "--force", is_flag=True, help=f"Apply a calibration of another arm, sensor or mount, or {EDITED}."
+        "--force", is_flag=True, help=f"Apply a calibration of another arm, sensor or mount, or one {EDITED}."
     )
     return CALIBRATION(tool(force(command)))
 

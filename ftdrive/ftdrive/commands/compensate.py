@@ -23,7 +23,7 @@ BIAS = click.option(
     type=click.Choice(["keep", "estimate"]),
     default="keep",
     show_default=True,
-    help="Of the calibration, or estimated from the recording: for sensors that are zeroed at start.",
+    help="Keep the calibration's bias, or estimate it from the recording: for sensors that are zeroed at start.",
 )
 
 

@@ -15,9 +15,9 @@ def config() -> None:
 
 
 @config.command()
-@click.option("--config", "path", type=FILE, help="In place of ./ftdrive.toml.")
+@click.option("--config", "path", type=FILE, help="TOML file to show, instead of ./ftdrive.toml.")
 @click.option("--origin", is_flag=True, help="Print the origin of each value instead of its meaning.")
-@simulate("Show that of an emulated cell. Its addresses are valid until this command ends.")
+@simulate("Show the configuration of an emulated cell. Its addresses are valid until this command ends.")
 @EMULATED_SENSOR
 @JSON
 def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as_json: bool) -> None:

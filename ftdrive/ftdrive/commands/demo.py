@@ -15,12 +15,18 @@ from ftdrive.terminal.report import compensation_error, errors_in_sigma, print_r
 
 @click.command()
 @click.option("--sensor", type=click.Choice(list(SENSORS)), default="can", show_default=True, help="Emulated sensor.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the random truth and noise.")
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the emulated truth and noise."
+)
 @CONTROL
 @click.option(
-    "--polyscope", metavar="VERSION", help="Of the emulated controller, such as 10.11.0, which has no dashboard server."
+    "--polyscope",
+    metavar="VERSION",
+    help="Version of the emulated controller, such as 10.11.0, which has no dashboard server.",
 )
-@click.option("--simulate", is_flag=True, expose_value=False, help="Always on; every command accepts it.")
+@click.option(
+    "--simulate", is_flag=True, expose_value=False, help="Emulate the cell: always on here, accepted by every command."
+)
 @runs()
 @JSON
 def demo(sensor: str, seed: int, control: str | None, polyscope: str | None, runs: Path, as_json: bool) -> None:

@@ -25,7 +25,7 @@ A PLACE is
 
 
 @click.command(epilog=_PLACES)
-@click.option("--probe", "places", multiple=True, metavar="PLACE", help="Look for known sensors there. Repeatable.")
+@click.option("--probe", "places", multiple=True, metavar="PLACE", help="Look for known sensors at PLACE. Repeatable.")
 @simulate("Show and probe the two ports of an emulated cell instead.")
 @JSON
 def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:

@@ -54,9 +54,9 @@ _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "
 @CELL
 @MODEL
 @simulate()
-@click.option("--calibration", "path", type=FILE, help="Is it of these devices?")
+@click.option("--calibration", "path", type=FILE, help="Check that this calibration is of these devices.")
 @click.option(
-    "--mass-kg", type=Number(0, min_open=True), help="Expected, of the tool.  [default: [tool] mass_kg, else 1]"
+    "--mass-kg", type=Number(0, min_open=True), help="Expected mass of the tool.  [default: [tool] mass_kg, else 1]"
 )
 @click.option("--push", is_flag=True, help="Find the sign of the sensor: you push the tool along +X of the base.")
 @runs("Folder of the runs, whose disk is checked.")

@@ -38,9 +38,9 @@ def export() -> None:
     "target",
     required=True,
     type=click.Choice(["urscript", "csv"]),
-    help="A program for the pendant or a table of joint targets.",
+    help="Format: a program for the pendant or a table of joint targets.",
 )
-@click.option("-o", "--output", type=NewFile(), help="A new file instead of stdout.")
+@click.option("-o", "--output", type=NewFile(), help="Save as a new file instead of printing to stdout.")
 @click.option(
     "--dwell", "dwell_s", type=Number(0, 600), default=4.0, show_default=True, help="Rest at each pose, s (urscript)."
 )
@@ -84,22 +84,22 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     metavar="NAME",
     required=True,
     type=click.Choice(list(FORMATS)),
-    help="One of `ftdrive export formats`.",
+    help="Format, one of those that `ftdrive export formats` lists.",
 )
-@click.option("-o", "--output", type=NewFile(), help="A new file instead of stdout.")
+@click.option("-o", "--output", type=NewFile(), help="Save as a new file instead of printing to stdout.")
 @click.option(
     "--height",
     "height_mm",
     type=Number(0, 500),
     metavar="MM",
-    help="Of the sensor's origin above the flange face. [default: as configured in the run]",
+    help="Height of the sensor's origin above the flange face. [default: as configured in the run]",
 )
 @click.option(
     "--sensor-mass",
     "sensor_mass_kg",
     type=Number(0, 20),
     metavar="KG",
-    help="Of sensor and adapter. [default: as configured in the run]",
+    help="Mass of sensor and adapter. [default: as configured in the run]",
 )
 @click.option(
     "--sensor-com",

@@ -24,22 +24,42 @@ _SILENT = "did not answer when this was written"
 @click.command()
 @click.option("--robot", metavar="HOST", help="Address of the controller.")
 @MODEL
-@click.option("--sensor", metavar="URL|PLACE", help="Its address, or what `ftdrive devices --probe` takes.")
-@click.option("--height", metavar="MM", help="Of the sensor above the flange face. Measure it.")
-@click.option("--sensor-mass", metavar="KG", help="Of sensor and adapter.")
-@click.option("--tool-name", metavar="NAME", help="Of the tool.")
+@click.option(
+    "--sensor", metavar="URL|PLACE", help="Address of the sensor, or a place that `ftdrive devices --probe` takes."
+)
+@click.option("--height", metavar="MM", help="Height of the sensor above the flange face. Measure it.")
+@click.option("--sensor-mass", metavar="KG", help="Mass of sensor and adapter.")
+@click.option("--tool-name", metavar="NAME", help="Name of the tool.")
 @click.option(
     "--tool",
     multiple=True,
     metavar="FROM:TO:DIAMETER[:X:Y]",
     help="A cylinder of what is mounted, the sensor too, in mm from the flange face. Repeatable.",
 )
-@click.option("--tool-mass", metavar="KG", help="Of what hangs on the sensor, about.")
-@click.option("--mounting", help="floor, wall, ceiling, or degrees the base leans towards its -x: 90 is wall.")
-@click.option("--plane", "planes", multiple=True, metavar="NX:NY:NZ:MM", help="A wall, base axes. Repeatable.")
-@click.option("--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block, two corners in mm. Repeatable.")
-@click.option("--speed", metavar="DEG/S", help="Of the fastest joint.")
-@click.option("-o", "--output", type=NewFile(), default="ftdrive.toml", show_default=True, help="A new file.")
+@click.option("--tool-mass", metavar="KG", help="Approximate mass of what hangs on the sensor.")
+@click.option(
+    "--mounting",
+    help="Mounting of the base: floor, wall, ceiling, or degrees the base leans towards its -x: 90 is wall.",
+)
+@click.option(
+    "--plane",
+    "planes",
+    multiple=True,
+    metavar="NX:NY:NZ:MM",
+    help="A wall: the arm stays where N·p >= MM, base axes. Repeatable.",
+)
+@click.option(
+    "--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block: two corners in mm, base axes. Repeatable."
+)
+@click.option("--speed", metavar="DEG/S", help="Speed of the fastest joint.")
+@click.option(
+    "-o",
+    "--output",
+    type=NewFile(),
+    default="ftdrive.toml",
+    show_default=True,
+    help="Save the configuration as this new file.",
+)
 @simulate("Robot and sensor are emulated, and end with this command; --sensor emulated://NAME chooses the sensor.")
 @click.option("--yes", is_flag=True, help="Ask nothing: take the options and the defaults.")
 @JSON

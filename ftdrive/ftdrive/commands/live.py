@@ -57,7 +57,7 @@ _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
     type=click.Path(exists=True, path_type=Path),
     help="Show the samples of a run, or of a recording, which has a calibration.",
 )
-@click.option("--speed", type=Number(0, min_open=True), help="Of --replay; 1 is that of the recording.")
+@click.option("--speed", type=Number(0, min_open=True), help="Speed of --replay; 1 is the speed of the recording.")
 @FRAME
 @click.option("--once", is_flag=True, help="Print one reading, then end.")
 @click.option("--plain", is_flag=True, help="Show a table instead of the full screen; lines in a file.")

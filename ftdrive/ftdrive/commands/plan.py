@@ -36,7 +36,7 @@ USUAL_POSTURE_DEG = (45, -100, 60)
     help="A cylinder of tool and sensor, mm from the flange face; X:Y is the offset of its axis. Repeatable.",
 )
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
-@click.option("--minimal", is_flag=True, help="6 poses.")
+@click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
 @click.option(
     "--cone", "cone_deg", type=float, metavar="DEG", help="Only poses with the tool within DEG of straight down."
 )
@@ -48,7 +48,7 @@ USUAL_POSTURE_DEG = (45, -100, 60)
     default=",".join(map(str, USUAL_POSTURE_DEG)),
     show_default=True,
     metavar="Q1,Q2,Q3",
-    help="First three joints, degrees.",
+    help="Angles of the first three joints, degrees.",
 )
 @click.option("--mounting", help="floor, wall, ceiling, or degrees that the base leans towards its -x (wall: 90).")
 @click.option(

@@ -51,9 +51,14 @@ class Duration(click.ParamType):  # type: ignore[type-arg]  # a generic type in 
     multiple=True,
     required=True,
     type=NewFile(),
-    help="A new .mcap, .csv or .parquet. Repeatable.",
+    help="Save as a new .mcap, .csv or .parquet. Repeatable.",
 )
-@click.option("--duration", "duration_s", type=Duration(), help="Such as 60s, 10min or 1h; otherwise Ctrl-C ends.")
+@click.option(
+    "--duration",
+    "duration_s",
+    type=Duration(),
+    help="Duration, such as 60s, 10min or 1h; without a limit, until Ctrl-C.",
+)
 @click.option("--count", type=click.IntRange(1), help="Number of samples.")
 @CALIBRATION_OR_TOOL
 @CELL

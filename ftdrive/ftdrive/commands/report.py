@@ -49,7 +49,7 @@ DEFAULT = Path("report.html")
     type=click.Choice(get_args(Method)),
     default="ml",
     show_default=True,
-    help="As of `ftdrive solve`; the report compares the others with it.",
+    help="Method, as of `ftdrive solve`; the report compares the others with it.",
 )
 @click.argument("source", required=False, type=click.Path(exists=True, path_type=Path))
 @click.option(
@@ -64,7 +64,7 @@ DEFAULT = Path("report.html")
     type=click.Choice(["html", "md", "json"]),
     default="html",
     show_default=True,
-    help="A page (needs ftdrive[report]), Markdown, or the facts as JSON.",
+    help="Format: a page (needs ftdrive[report]), Markdown, or the facts as JSON.",
 )
 @click.option(
     "--parent",

@@ -57,7 +57,7 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
     type=click.Choice(_METHODS),
     default="ml",
     show_default=True,
-    help="One of those below; all prints them side by side.",
+    help="Method, one of those below; all prints them side by side.",
 )
 @click.option(
     "--orientation",

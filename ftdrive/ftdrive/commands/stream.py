@@ -34,8 +34,15 @@ if TYPE_CHECKING:
 @CELL
 @simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
 @FRAME
-@click.option("--host", default="127.0.0.1", show_default=True, help="Address to serve at. Another one is unprotected.")
-@click.option("--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Port; 0 is a free one.")
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    help="Address to serve at. One that is not loopback is unprotected.",
+)
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Port to serve at; 0 is a free one."
+)
 @click.option("--allow-origin", "origins", metavar="URL", multiple=True, help="Also serve pages of this origin.")
 @click.option("--allow-control", is_flag=True, help="Pages may tare and change frame and stages; programs always may.")
 @click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")

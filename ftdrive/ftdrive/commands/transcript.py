@@ -40,10 +40,17 @@ def transcript() -> None:
 
 
 @transcript.command()
-@click.option("--sensor", metavar="URL", help="Such as ati-serial:///dev/serial/by-id/NAME.")
-@simulate("An emulated sensor, on RS-485 from ATI unless --sensor emulated://NAME names another.")
-@click.option("-o", "--output", "path", required=True, type=NewFile(), help="A new file.")
-@click.option("--duration", "duration_s", type=Number(0.1, 600), default=5.0, show_default=True, help="Seconds.")
+@click.option("--sensor", metavar="URL", help="Address of the sensor, such as ati-serial:///dev/serial/by-id/NAME.")
+@simulate("Use an emulated sensor, on RS-485 from ATI unless --sensor emulated://NAME names another.")
+@click.option("-o", "--output", "path", required=True, type=NewFile(), help="Save the transcript as this new file.")
+@click.option(
+    "--duration",
+    "duration_s",
+    type=Number(0.1, 600),
+    default=5.0,
+    show_default=True,
+    help="Duration of the recording, s.",
+)
 @JSON
 def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as_json: bool) -> None:
     """Record all bytes between the driver and its sensor, from opening to closing.

@@ -43,9 +43,19 @@ Answer = Literal["ask", "no", "yes"]
 )
 @click.option("--quick", is_flag=True, help="2 poses instead of 6, at the plan's speeds after one complete slow run.")
 @click.option("--poses", type=click.IntRange(2, 24), help="Number of poses.")
-@click.option("--max-force", "force_N", type=Number(0, min_open=True), metavar="N", help="Largest difference, N.")
 @click.option(
-    "--max-torque", "torque_Nm", type=Number(0, min_open=True), metavar="N·m", help="Largest difference, N·m."
+    "--max-force",
+    "force_N",
+    type=Number(0, min_open=True),
+    metavar="N",
+    help="Largest accepted difference of the force, N.",
+)
+@click.option(
+    "--max-torque",
+    "torque_Nm",
+    type=Number(0, min_open=True),
+    metavar="N·m",
+    help="Largest accepted difference of the torque, N·m.",
 )
 @click.option("--manual", is_flag=True, help="No motion commands: you move the arm.")
 @click.option(
@@ -53,7 +63,7 @@ Answer = Literal["ask", "no", "yes"]
     type=click.Choice(["ask", "no", "yes"]),
     default="ask",
     show_default=True,
-    help="If something has changed: whether to save the smallest sufficient update as a new calibration.",
+    help="Whether to save the smallest sufficient update as a new calibration if something has changed.",
 )
 @click.option("--resume", type=FOLDER, help="Continue an interrupted verification in its mode.")
 @YES

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     metavar="FOLDER",
     required=True,
     type=click.Path(file_okay=False, path_type=Path),
-    help="For the results; it is created if it is missing.",
+    help="Folder for the results; it is created if it is missing.",
 )
 @CALIBRATION
 @FORCE

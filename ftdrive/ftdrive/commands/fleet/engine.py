@@ -20,7 +20,9 @@ def ENGINE(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options `workers` and `cluster`."""
     for option in (
         click.option("--cluster", metavar="dask://HOST:PORT", help="Compute on this Dask cluster instead."),
-        click.option("--workers", metavar="N", type=click.IntRange(min=1), help="Processes.  [default: one per core]"),
+        click.option(
+            "--workers", metavar="N", type=click.IntRange(min=1), help="Number of processes.  [default: one per core]"
+        ),
     ):
         command = option(command)
     return command

@@ -26,7 +26,7 @@ MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
     metavar="HOST:PORT",
     default=f"127.0.0.1:{PORT}",
     show_default=True,
-    help="Address of /metrics; port 0 is a free one. Another host is unprotected.",
+    help="Address of /metrics; port 0 is a free one. A host that is not loopback is unprotected.",
 )
 @click.option(
     "--mqtt",
