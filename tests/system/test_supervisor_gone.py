@@ -8,14 +8,14 @@ import pytest
 from ftdrive.cell.emulated import Station
 from ftdrivers.ur.control import ControlPath
 from tests.system.command_line import CommandLine
-from tests.system.supervisor_trial import ANSWERS, GONE, KINDS, Kind, push_trial, trial, verify_trial
+from tests.system.supervisor_trial import ANSWERS, GONE, Kind, push_trial, trial, verify_trial
 from tests.ur_rtde import require_ur_rtde
 
 LONG_BEFORE_ITS_GOAL_S = 1.0
 """The move takes 3 s. `tests/benchmarks/supervisor.py` has the figure of 0.3 s: here the computer may be busy."""
 
 
-@pytest.fixture(scope="module", params=["script", "ur-rtde"])
+@pytest.fixture(scope="module")
 def station(request: pytest.FixtureRequest) -> Iterator[Station]:
     path: ControlPath = request.param
     if path == "ur-rtde":
@@ -24,9 +24,16 @@ def station(request: pytest.FixtureRequest) -> Iterator[Station]:
         yield station
 
 
+ALONE = [  # `tests/benchmarks/supervisor.py` has all: each kind at rest and in mid-move, on both paths
+    ("reader killed", True, "ur-rtde"),
+    ("stdout closed", False, "ur-rtde"),
+    ("stdin closed", False, "script"),
+    ("terminal closed", True, "script"),
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("moving", [True, False], ids=["in mid-move", "at rest"])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "moving", "station"), ALONE, indirect=["station"])
 def test_a_supervisor_that_leaves_ends_the_session(
     kind: Kind, moving: bool, station: Station, ftdrive: CommandLine
 ) -> None:
@@ -41,6 +48,7 @@ def test_a_supervisor_that_leaves_ends_the_session(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("station", ["script"], indirect=True)
 def test_verify_stops_likewise_and_push_sends_nothing(station: Station, ftdrive: CommandLine) -> None:
     config = ftdrive.connect(station)
     run = Path(ftdrive.json("calibrate", "--config", config, "--minimal", typed=ANSWERS)["run"])
