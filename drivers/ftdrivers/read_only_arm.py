@@ -31,9 +31,7 @@ class ReadOnlyArm(RobotArm):
     def open(self, *, control: bool = False) -> None:
         """Do nothing; raises `ConnectError` if control is requested."""
         if control:
-            raise ConnectError(
-                "the driver of this arm only reads it", "move the arm by hand, as calibrate --manual does"
-            )
+            raise ConnectError(*_REFUSAL)
 
     def close(self) -> None:
         """Do nothing."""
