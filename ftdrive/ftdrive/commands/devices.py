@@ -13,7 +13,7 @@ from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import Station
 from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
-from ftdrive.terminal.console import hanging, printer
+from ftdrive.terminal.console import answer, hanging
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 
@@ -97,20 +97,19 @@ def _emulated(failures: list[Exception]) -> dict[str, Any]:
 
 
 def _print(found: dict[str, Any]) -> None:
-    data = printer()
     for port in found["serial"]:
         words = [port["by_id"] or port["port"], port["description"], port["usb"]]
-        data.print(hanging(" serial  ", "   ".join(word for word in words if word), data))
+        answer.print(hanging(" serial  ", "   ".join(word for word in words if word), answer))
         for finding in port["findings"]:
-            data.print(hanging(Text.assemble(" " * 9, ("!", "yellow"), " "), finding["found"], data))
-            data.print(hanging(f"{'':11}fix: ", finding["fix"] or "-", data))
+            answer.print(hanging(Text.assemble(" " * 9, ("!", "yellow"), " "), finding["found"], answer))
+            answer.print(hanging(f"{'':11}fix: ", finding["fix"] or "-", answer))
     for interface in found["can"]:
         words = [str(value) for value in interface.values()]
-        data.print(hanging(" can     ", "   ".join(words), data))
+        answer.print(hanging(" can     ", "   ".join(words), answer))
     for kind, name in (("serial", "serial ports"), ("can", "CAN interfaces of the kernel")):
         if not found[kind]:
-            data.print(f" no {name}")
-    for answer in found.get("answers", ()):
-        what = answer["what"] if answer["error"] is None else f"{answer['what']}: {answer['error']}"
-        words = [answer["port"], what, answer["url"]]
-        data.print(hanging(" probed  ", "   ".join(word for word in words if word), data))
+            answer.print(f" no {name}")
+    for reply in found.get("answers", ()):
+        what = reply["what"] if reply["error"] is None else f"{reply['what']}: {reply['error']}"
+        words = [reply["port"], what, reply["url"]]
+        answer.print(hanging(" probed  ", "   ".join(word for word in words if word), answer))

@@ -33,7 +33,7 @@ from ftdrive.live.stream import CompensatedStream
 from ftdrive.recording import Recorder, read_recording
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import read_calibration
-from ftdrive.terminal.console import messages, printer
+from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.live.feed import MEAN_S, Feed, Stream
 from ftdrive.terminal.live.layout import plain as plain_lines
@@ -147,13 +147,13 @@ def _print(stream: Stream, clock: Clock, *, once: bool = False, as_json: bool = 
 
 
 def _show_table(stream: Stream, clock: Clock, checks: Sequence[Check]) -> None:
-    shown, console = Group(), printer()
+    shown = Group()
     with (
         Keyboard(0) if Keyboard.usable(0) else nullcontext(),  # Enter would break the screen
-        Live(console=console, refresh_per_second=10) as screen,
+        Live(console=answer, refresh_per_second=10) as screen,
     ):
         for view in _views(stream, clock, checks):
-            shown = Group(*(line.as_text() for line in plain_lines(view, console.width)))
+            shown = Group(*(line.as_text() for line in plain_lines(view, answer.width)))
             screen.update(Group(shown, "Ctrl-C ends"))
         screen.update(Group(shown, "The recording has ended."))
 
@@ -190,7 +190,7 @@ def _views(stream: Stream, clock: Clock, checks: Sequence[Check] = (), *, raises
 def _reading(view: View) -> dict[str, Any]:
     status, calibration, verification = view.status, view.info.calibration, view.info.verification
     reading = view.reading
-    assert reading is not None  # noqa: S101
+    assert reading is not None  # noqa: S101 - a view is shown from the first reading on
 
     def wrench(values: Array) -> dict[str, Any] | None:
         if view.silent:

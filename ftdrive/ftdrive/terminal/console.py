@@ -16,7 +16,11 @@ from ftdrive.terminal.hints import as_typed
 from ftdrive.terminal.text import visible
 
 
-class _Console(Console):
+class CommandConsole(Console):
+    """A console that knows whether details are wanted (`-v`); `quiet` is the console's own."""
+
+    verbose = False
+
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         """Render with control characters made visible, whatever file, device or network they come from."""
         for one in super().render(renderable, options):
@@ -25,12 +29,6 @@ class _Console(Console):
     def on_broken_pipe(self) -> None:
         """Leave a closed pipe to `ftdrive.cli.run`."""
         raise BrokenPipeError
-
-
-class CommandConsole(_Console):
-    """A console that knows whether details are wanted (`-v`); `quiet` is the console's own."""
-
-    verbose = False
 
     def print(self, *objects: Any, **options: Any) -> None:
         """Print; a command in a text stands there as the user can type it."""
@@ -46,10 +44,8 @@ class CommandConsole(_Console):
 messages = CommandConsole(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
 """Folds between words in a terminal, never in a file. Prints brackets and colons as they are: paths contain them."""
 
-
-def printer() -> Console:
-    """Return a console for stdout: results as text. It prints brackets and colons as they are."""
-    return _Console(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+answer = CommandConsole(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
+"""On stdout: results, verdicts and where they were saved. `-q` does not silence it, `--json` replaces it."""
 
 
 def print_address(words: str, address: str) -> None:
@@ -98,10 +94,6 @@ def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
         fold.fill(line) + line[len(line.rstrip()) :]
         for line in text.split("\n")  # a prompt ends with a space
     )
-
-
-answer = CommandConsole(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
-"""On stdout: results, verdicts and where they were saved. `-q` does not silence it, `--json` replaces it."""
 
 
 @contextmanager

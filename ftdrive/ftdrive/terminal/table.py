@@ -35,14 +35,14 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: C
         return
     from rich.table import Table
 
-    from ftdrive.terminal.console import printer
+    from ftdrive.terminal.console import answer
 
     table = Table(box=None, pad_edge=False, padding=(0, len(GAP), 0, 0), header_style="bold")
     for title, least in zip(titles, narrowest, strict=True):
         table.add_column(title, no_wrap=title not in folding, overflow="fold", min_width=least)
     for row in rows:
         table.add_row(*row)
-    printer().print(table)
+    answer.print(table, width=columns, soft_wrap=False)
 
 
 def _line(row: Sequence[str], widths: Sequence[int]) -> str:

@@ -128,7 +128,7 @@ class Quiet:
 
 def shown_table(monkeypatch: pytest.MonkeyPatch, stream: Any, width: int = 80) -> str:
     console = Console(width=width, file=io.StringIO(), color_system=None, force_terminal=False)
-    monkeypatch.setattr(live, "printer", lambda: console)
+    monkeypatch.setattr(live, "answer", console)
     live._show_table(stream, stream.clock, [Check("robot.payload", "ok", "robot 1.44 kg")])
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()

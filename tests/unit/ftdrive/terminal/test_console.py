@@ -24,7 +24,7 @@ from ftdrive.session import session
 from ftdrive.session.events import Noted
 from ftdrive.session.operator import Question
 from ftdrive.terminal import console
-from ftdrive.terminal.console import answer, hanging, in_whole_words, messages, printer
+from ftdrive.terminal.console import answer, hanging, in_whole_words, messages
 from ftdrive.terminal.live.view import Line
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.screen import open_operator
@@ -148,7 +148,7 @@ def test_no_name_in_a_table_commands_the_terminal(capsys: pytest.CaptureFixture[
     table = Table()
     table.add_column("tool", min_width=20)
     table.add_row(Text("a\x1b[2Jb", "bold"))
-    printer().print(table)
+    answer.print(table)
     print_table(["tool"], [["a\x1b[2Jb"]], [])
     shown = capsys.readouterr().out
     assert shown.count("a\\x1b[2Jb") == 2
