@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ftcalib.motion.samples import Means
 from ftmocks.kinematics import MODELS
 
 Array = NDArray[np.float64]
@@ -47,7 +48,7 @@ def sweep(
         x = np.clip(np.minimum(t, seconds - t) / 1.0, 0, 1)
         envelope = x**3 * (10 - 15 * x + 6 * x**2)
         moved = np.array(amplitude_rad) * np.sin(2 * np.pi * np.outer(t, hz) + phase)
-        return HOME + np.column_stack([np.zeros((len(t), 3)), envelope[:, None] * moved])
+        return np.asarray(HOME + np.column_stack([np.zeros((len(t), 3)), envelope[:, None] * moved]))
 
     return joints
 
@@ -138,9 +139,7 @@ class Truth:
         R, p = flange(joints(t))
         lever = now - (p + R @ np.array([0, 0, self.height_m]))[:, None]
         axes = R @ Q
-        return np.hstack(
-            [np.einsum("nji,nj->ni", axes, part.sum(axis=1)) for part in (pulls, np.cross(lever, pulls))]
-        )
+        return np.hstack([np.einsum("nji,nj->ni", axes, part.sum(axis=1)) for part in (pulls, np.cross(lever, pulls))])
 
 
 @dataclass(frozen=True)
@@ -187,6 +186,15 @@ def record(
     y += truth.drift_N_per_s * np.r_[1, 1, 1, 0.02, 0.02, 0.02] * (walk - walk.mean(axis=0))
     y += np.repeat(truth.noise, 3) * rng.standard_normal(y.shape)
     return Recorded(t, y, t_pose, R, p)
+
+
+def means_of(recorded: Recorded, *, positions: bool = True) -> tuple[Means, Means]:
+    """Return the two streams as the estimator takes them."""
+    wrench, poses = Means(), Means()
+    wrench.add(recorded.t_s, recorded.wrench)
+    R = recorded.R_base_flange.reshape(-1, 9)
+    poses.add(recorded.t_pose_s, np.hstack([R, recorded.p_base_flange_m]) if positions else R)
+    return wrench, poses
 
 
 def _band(rng: np.random.Generator, n: int, rate_Hz: float) -> Array:

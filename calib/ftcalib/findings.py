@@ -24,7 +24,8 @@ _VERDICTS: Final[Mapping[Severity, Verdict]] = {"reject": "rejected", "limit": "
 _PLACE: Final = re.compile(r"\{(\w+)(?::([^}]*))?\}")
 """Of a value in a template, with its form."""
 _UNITS: Final = {
-    "N": " N", "Nm": " N·m", "mNm": " mN·m", "kg": " kg", "m": " m", "s": " s", "mm": " mm", "deg": "°", "percent": " %",
+    "N": " N", "Nm": " N·m", "mNm": " mN·m", "kg": " kg", "m": " m", "s": " s", "mm": " mm", "deg": "°",
+    "percent": " %",
 }  # fmt: skip
 
 

@@ -39,7 +39,6 @@ Method = Literal[
     "carlson-polynomial",
     "known-rotation",
     "yaw-only",
-    "motion",
 ]
 NoiseSource = Literal["measured", "residuals"]
 
@@ -137,7 +136,7 @@ class CalibrationResult:
     noise_source: NoiseSource
     """Source of the noise: the spread within each pose, or the residuals of the fit."""
     g_m_s2: float
-    method: Method
+    method: Method | Literal["motion"]
     findings: tuple[Finding, ...]
     """What gives the verdict, the first one to be fixed first; then notes."""
     provenance: Mapping[str, JSON] = field(default_factory=dict)
@@ -367,8 +366,11 @@ class CalibrationResult:
 
     @property
     def noise_explains(self) -> bool:
-        """Whether the residuals agree with the noise model; True for an update, whose poses are too few for a test, and in
-        motion, whose noise comes from the residuals of each state."""
+        """Whether the residuals agree with the noise model.
+
+        True for an update, whose poses are too few for a test, and in motion, where each state has the noise of its
+        residuals.
+        """
         return not self.quality or self.motion is not None or (self.p_value is not None and self.p_value >= SURE)
 
     def likely_error(self) -> Array:
@@ -457,9 +459,10 @@ class CalibrationResult:
         """
         check_format(document, FORMAT, BadCalibration)
         try:
+            plain = [field.name for field in fields(cls) if field.name not in {"parameters", "motion"}]
             result = cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
-                **{field.name: document[field.name] for field in fields(cls) if field.name not in {"parameters", "motion"}},
+                **{name: document[name] for name in plain},
                 motion=MotionResult.from_dict(document),
             )
             derived = (("id", result._id(document.get("response"))), ("verdict", result.verdict))
@@ -492,9 +495,9 @@ class CalibrationResult:
 
 
 def _require_known_words(result: CalibrationResult) -> None:
-    for name, words in (("method", Method), ("noise_source", NoiseSource)):
-        if getattr(result, name) not in get_args(words):
-            raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(get_args(words))}")
+    for name, words in (("method", (*get_args(Method), "motion")), ("noise_source", get_args(NoiseSource))):
+        if getattr(result, name) not in words:
+            raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(words)}")
 
 
 def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:

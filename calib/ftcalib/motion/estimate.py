@@ -1,30 +1,34 @@
 """The load that explains rows in motion: Gauss-Newton from each mounting that forces allow, contact left out."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import chdtri as chi2_isf
+from scipy.special import ndtri
 
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
 from ftcalib.model import Array, Parameters, angle_between, nearest_rotation
 from ftcalib.motion.model import CROSS_TALK, DELAY, GAINS, HEIGHT, INERTIA, SIZE, Load, jacobian, wrench_of
 from ftcalib.motion.noise import Noise, runs, states
-from ftcalib.motion.samples import ROW_S, Rows
+from ftcalib.motion.samples import Rows
 from ftcalib.published.yu import com_and_torque_bias
 
 GYRATION_M, HEIGHT_M, DELAY_S = 0.15, 0.3, 0.3
 """What is expected of a tool before any data, one sigma: radius of gyration, sensor height, delay beyond the rows."""
 CONTACT = float(chi2_isf(6, 1e-7))
 """Squared distance of a row in contact."""
+QUIET = 0.4
+"""Share of the rows of a state that is free of contact."""
 MOST_CONTACT = 0.8
 """Share of rows; beyond it the model does not fit at all."""
 MARGIN = 2
 """Rows left out on both sides of a contact, which the filter spreads."""
-KNOT_S, MOST_KNOTS = 5.0, 61
+KNOT_S, MOST_KNOTS = 5.0, 25
 """Distance and number of the knots of the bias."""
 RIDGE = 1e-12
 """Keeps what is not determined finite: its sigma becomes a million times as large as its scale."""
@@ -33,16 +37,18 @@ WORTH = 4.0
 
 ROUGH: Mapping[str, float] = {"gain": 0.02, "cross_talk": 0.02}
 """Sizes of components at first."""
-_ROUGH_ROWS = 2000
+_ROUGH_ROWS = 600
 _CHUNK = 1000
-_MANY = 2500
+_MANY = 1000
 """Rows beside which what the fit absorbs is small."""
 _SAME_RAD = 0.2
+_STAGES, _CHOICES = 6, (1, 2, 4)
+"""Solutions, each with the noise and the contacts of the one before, and those before which components are chosen."""
 _SIZES: Mapping[str, Array] = {
-    "gain": np.geomspace(5e-4, 5e-2, 12),
-    "cross_talk": np.geomspace(5e-4, 5e-1, 14),
-    "walk_N": np.geomspace(3e-4, 3e-1, 13),
-    "walk_Nm": np.geomspace(6e-6, 6e-3, 13),
+    "gain": np.geomspace(5e-4, 5e-2, 9),
+    "cross_talk": np.geomspace(5e-4, 2e-1, 11),
+    "walk_N": np.geomspace(3e-4, 3e-1, 10),
+    "walk_Nm": np.geomspace(6e-6, 6e-3, 10),
 }
 """That are tried: of the entries of gain and cross-talk, and of the walk of the bias in a second."""
 
@@ -97,7 +103,7 @@ class _Problem:
     def hats(self, t_s: Array) -> Array:
         """Weight (n, knots) of each knot."""
         step = self.knots[1] - self.knots[0]
-        return np.maximum(1 - np.abs(t_s[:, None] - self.knots) / step, 0)
+        return np.asarray(np.maximum(1 - np.abs(t_s[:, None] - self.knots) / step, 0))
 
     def predicted(self, load: Load, rows: Rows) -> Array:
         return wrench_of(load, rows.motion.earlier(load.delay_s, rows.rate))
@@ -127,8 +133,8 @@ class _Problem:
         Z = block_diag(self.constraints.free(load.static), np.eye(SIZE - 15))
         return np.asarray(Z[:, ~np.concatenate([np.zeros(Z.shape[1] - (SIZE - 15), bool), self.fixed[15:]])])
 
-    def rough(self, load: Load) -> tuple[Load, Array, float]:
-        """Fit robustly with white noise; return the load, the scales (2,) of the residuals, and their size."""
+    def rough(self, load: Load) -> tuple[Load, float]:
+        """Fit robustly with white noise; return the load and the logarithm of its residuals' size."""
         rows = self.rows[:: max(1, len(self.rows) // _ROUGH_ROWS)]
         limit, no_drift = np.inf, np.zeros((len(self.knots), 6))
         nothing = np.zeros(6 * len(self.walk))
@@ -146,7 +152,7 @@ class _Problem:
             load = load.moved(step[:SIZE])
             if limit == 22.0 and np.abs(step[:6]).max() < 1e-6:
                 break
-        return load, scale, float(np.log(scale).sum())
+        return load, float(np.log(scale).sum())
 
     def sums(
         self, load: Load, drift: Array, noise: Noise, kept: NDArray[np.bool_], state: NDArray[np.intp]
@@ -173,16 +179,16 @@ class _Problem:
         T = block_diag(np.eye(SIZE), self.centred)
         return T.T @ H @ T, T.T @ b, chi2
 
-    def absorbed(self, load: Load, rows: Rows, solved: "_Step | None") -> Array:
+    def absorbed(self, load: Load, rows: Rows, solved: "_Step") -> Array:
         """Root (n, 6, k) of the covariance of the prediction; none before the first solution, nor for so many rows."""
-        if solved is None or len(rows) > _MANY:
+        if not solved.step.size or len(rows) > _MANY:
             return np.zeros((len(rows), 6, 0))
         basis, inverse_root = solved.root
         J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate)
         on_knots = np.einsum("nk,ij->nikj", self.hats(rows.t_s), np.eye(6)).reshape(len(rows), 6, -1) @ self.centred
         return np.asarray(np.concatenate([J, on_knots], axis=2) @ basis @ inverse_root)
 
-    def components(self, sizes: Mapping[str, float], load: Load, drift: Array) -> tuple[Array, Array, float]:
+    def components(self, sizes: Mapping[str, float], load: Load) -> tuple[Array, Array, float]:
         """Prior precision of response and drift, which of them are estimated, and -log det of the precision."""
         total = SIZE + self.centred.shape[1]
         P, on, log_det = np.zeros((total, total)), np.ones(total, bool), 0.0
@@ -197,12 +203,12 @@ class _Problem:
         for name, channels in (("walk_N", range(3)), ("walk_Nm", range(3, 6))):
             size = sizes.get(name, 0.0)
             for channel in channels:
-                places = at[:, channel]
+                knots = at[:, channel]
                 if size:
-                    P[np.ix_(places, places)] = self.walk / size**2
+                    P[np.ix_(knots, knots)] = self.walk / size**2
                     log_det -= float(np.linalg.slogdet(self.walk / size**2)[1])
                 else:
-                    on[places] = False
+                    on[knots] = False
         precision, _ = self.prior(load)
         P[:SIZE, :SIZE] += np.diag(precision)
         return P, on, log_det
@@ -210,7 +216,7 @@ class _Problem:
     def solved(self, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: Load, drift: Array) -> "_Step":
         """Solve the sums for load and drift with these sizes of the components."""
         H, b, chi2 = sums
-        P, on, log_det = self.components(sizes, load, drift)
+        P, on, log_det = self.components(sizes, load)
         value = np.concatenate([load.vector, self.centred.T @ drift.ravel()])
         removed = np.where(on, 0.0, -value)  # a component that is off goes to 0
         chi2 += float(removed @ H @ removed - 2 * b @ removed)
@@ -237,6 +243,12 @@ class _Step:
     basis: Array
     factor: tuple[Array, bool]
 
+    @classmethod
+    def none(cls) -> Self:
+        """Before the first one."""
+        nothing = np.zeros((0, 0))
+        return cls(np.zeros(0), 0.0, nothing, (nothing, False))
+
     @property
     def root(self) -> tuple[Array, Array]:
         """Two matrices; their product times its transpose is the covariance."""
@@ -260,31 +272,30 @@ def fit(rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = Fa
         Whether the inertia about the centre of mass is known to be 0.
     """
     problem = _Problem(rows, known, g_m_s2, point_mass=point_mass)
-    roughs = sorted((problem.rough(start) for start in problem.starts()), key=lambda one: one[2])
-    load, scale, _ = roughs[0]
+    roughs = sorted((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])
+    load, _ = roughs[0]
     kept, state = _first_kept(problem, load)
     drift, sizes = np.zeros((len(problem.knots), 6)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
-    solved: _Step | None = None
-    for stage in range(6):
+    solved = _Step.none()
+    for stage in range(_STAGES):
         r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
         absorbed = problem.absorbed(load, rows[kept], solved)
         noise = Noise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept]))
         sums = problem.sums(load, drift, noise, kept, state)
-        if stage >= 1:
+        if stage in _CHOICES:
             sizes = _chosen(problem, sizes, sums, load, drift)
         solved = problem.solved(sizes, sums, load, drift)
         load = load.moved(solved.step[:SIZE])
         drift = drift + (problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
         r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
-        before, kept = kept, _without_contact(distance, rows.t_s)
+        kept = _without_contact(distance)
         state = states(rows.speed_rad_s, kept)
     chi2, others = problem.sums(load, drift, noise, kept, state)[2], []
-    for other, _, _ in roughs[1:]:
+    for other, _ in roughs[1:]:
         if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
             there = problem.sums(other, drift, noise, kept, state)
             others.append(there[2] - float(there[1] @ problem.solved(sizes, there, other, drift).step) - chi2)
-    hats = problem.hats(rows.t_s)
     change = None
     if sizes.get("walk_N") or sizes.get("walk_Nm"):
         ends = np.zeros((6, SIZE + 6 * len(problem.knots)))
@@ -299,7 +310,7 @@ def fit(rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = Fa
         r,
         noise.scale[state],
         distance,
-        hats @ drift,
+        problem.hats(rows.t_s) @ drift,
         change,
         {name: size for name, size in sizes.items() if size},
         max(min(others), 0.0) if others else None,
@@ -310,22 +321,23 @@ def fit(rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = Fa
 def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
     """Delay of the wrench beyond that of the rows, by a robust fit."""
     problem = _Problem(rows, known, g_m_s2, point_mass=False)
-    return min((problem.rough(start) for start in problem.starts()), key=lambda one: one[2])[0].delay_s
+    return min((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])[0].delay_s
 
 
 def _first_kept(problem: _Problem, load: Load) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
-    """Rows without contact by the quiet quarter of each state; at rest there is no more noise than in motion."""
+    """Rows without contact, by the quiet rows of each state; at rest there is no more noise than in motion."""
     rows = problem.rows
     r = rows.wrench - problem.predicted(load, rows)
     state = states(rows.speed_rad_s, np.ones(len(rows), bool))
-    quiet = [[np.quantile(np.abs(r[state == k, part]), 0.4) for part in (slice(0, 3), slice(3, 6))] for k in range(state.max() + 1)]
-    scale = np.minimum.accumulate(np.array(quiet)[::-1], axis=0)[::-1] / 0.5244 + 1e-12
+    size = np.abs(r).reshape(-1, 2, 3)
+    quiet = np.array([np.quantile(size[state == k], QUIET, axis=(0, 2)) for k in np.unique(state)])
+    scale = np.minimum.accumulate(quiet[::-1], axis=0)[::-1] / ndtri((1 + QUIET) / 2) + 1e-12
     distance = np.sum((r / np.repeat(scale, 3, axis=1)[state]) ** 2, axis=1)
-    kept = _without_contact(distance / 2, rows.t_s)
+    kept = _without_contact(distance / 2)
     return kept, states(rows.speed_rad_s, kept)
 
 
-def _without_contact(distance: Array, t_s: Array) -> NDArray[np.bool_]:
+def _without_contact(distance: Array) -> NDArray[np.bool_]:
     near = distance > CONTACT
     for _ in range(MARGIN):
         near = near | np.append(near[1:], False) | np.append(False, near[:-1])
@@ -335,14 +347,10 @@ def _without_contact(distance: Array, t_s: Array) -> NDArray[np.bool_]:
 def _chosen(
     problem: _Problem, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: Load, drift: Array
 ) -> dict[str, float]:
-    """Choose the sizes of the components by restricted likelihood, one after the other, twice."""
+    """Choose the sizes of the components by restricted likelihood, one after the other."""
     chosen = dict(sizes)
-    for _ in range(2):
-        for name, tried in _SIZES.items():
-            def criterion(size: float, name: str = name) -> float:
-                return problem.solved({**chosen, name: size}, sums, load, drift).criterion
-
-            values = [criterion(size) for size in tried]
-            best = int(np.argmin(values))
-            chosen[name] = float(tried[best]) if values[best] < criterion(0.0) - WORTH else 0.0
+    for name, tried in _SIZES.items():
+        values = [problem.solved({**chosen, name: size}, sums, load, drift).criterion for size in (0.0, *tried)]
+        best = int(np.argmin(values[1:]))
+        chosen[name] = float(tried[best]) if values[1 + best] < values[0] - WORTH else 0.0
     return chosen

@@ -74,7 +74,7 @@ class Load:
 
     @property
     def inertia_kg_m2(self) -> Array:
-        """(3, 3)"""
+        """The inertia as a matrix (3, 3)."""
         return np.asarray(np.tensordot(self.inertia, _BASIS, 1))
 
 

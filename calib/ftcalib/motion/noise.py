@@ -91,7 +91,7 @@ class Noise:
 
 
 def _filters(unit: Array, place: NDArray[np.intp]) -> Array:
-    """Predictors (order + 1, order + 1) of a group of channels by Levinson's recursion; the order is that of least AIC."""
+    """Predictors (order + 1, order + 1) of a group of channels by Levinson's recursion, of the order of least AIC."""
     most, size = min(ORDER, len(unit) // _ROWS_PER_ORDER), 3 * len(unit)
     lags = np.empty(most + 1)
     for lag in range(most + 1):

@@ -41,8 +41,6 @@ _CHUNK = 600
 """Rows that are filtered at once."""
 _LEVER_M = 0.5
 """Translation counts as a rotation about a point this far away."""
-HALF_S = len(_WIDE_KERNEL) // 2 * MEAN_S
-"""Half the length of the filter."""
 
 
 class Means:

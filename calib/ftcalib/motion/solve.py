@@ -15,8 +15,8 @@ from ftcalib.known import Known
 from ftcalib.likelihood.gain_and_cross_talk import Response
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, rough_delay
-from ftcalib.motion.model import DELAY, HEIGHT, INERTIA, NAMES
-from ftcalib.motion.samples import HALF_S, ROW_S, Means, Rows, rows_of
+from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
+from ftcalib.motion.samples import ROW_S, Means, Rows, rows_of
 from ftcalib.result import CalibrationResult, DriftResult, MotionResult
 from ftcalib.setup import NOTHING, Setup
 
@@ -39,7 +39,9 @@ MOSTLY = 0.5
 """Share of contact that limits a result."""
 _UNEXPLAINED = 0.3
 """Share of the change of the force that a wrong recording leaves."""
-_MISTAKES = frozenset(("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree"))
+_MISTAKES = frozenset(
+    ("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree")
+)
 _COMPENSATED = 0.5
 """Of the inertial mass: less weight than this was subtracted."""
 _JUDGED_ROWS = 300
@@ -186,10 +188,12 @@ def _require_determined(rows: Rows, best: MotionFit, known: Known | None) -> Non
     sigma_N = float(np.sqrt(np.diag(best.covariance)[3:6].max()))
     if mounting_rad < 0.3 and sigma_N < 0.5 * weight_N:
         return
-    if known is None and weight_N > SIGNIFICANT_SIGMAS * 1e-3 and (found := assess(_orientations(rows), best.load.static)):
-        if found.ambiguities and not found.sound:
-            reason = ": ".join(found.ambiguities[:2])
-            raise NotObservable(f"{reason}; turn wrist 1 and wrist 2 by 60° or more, wrist 3 too, and record again.")
+    if known is not None:
+        return  # the verdict names it
+    found = assess(_orientations(rows), best.load.static)
+    if found.ambiguities:
+        reason = ": ".join(found.ambiguities[:2])
+        raise NotObservable(f"{reason}; turn wrist 1 and wrist 2 by 60° or more, wrist 3 too, and record again.")
 
 
 def _orientations(rows: Rows) -> Array:
@@ -297,7 +301,7 @@ def _range_deg(rows: Rows) -> float:
     return float(min(2 * np.degrees(np.arccos(cosine)).max(), 360.0))
 
 
-def _contacts(rows: Rows, best: MotionFit, first_s: float) -> Sequence[Mapping[str, float]]:
+def _contacts(rows: Rows, best: MotionFit, first_s: float) -> tuple[Mapping[str, float], ...]:
     """Segments that do not fit, without the rows at both sides that the filter or the margin adds."""
     touched = np.flatnonzero(~best.kept)
     segments = np.split(touched, np.flatnonzero(np.diff(touched) > 1) + 1) if len(touched) else []
@@ -314,7 +318,7 @@ def _contacts(rows: Rows, best: MotionFit, first_s: float) -> Sequence[Mapping[s
                 "torque_Nm": float(torque.max()),
             }
         )
-    return found
+    return tuple(found)
 
 
 def _named(names: Sequence[str]) -> str:

@@ -1,24 +1,93 @@
-"""Wrench and poses for a calibration in motion, read piece by piece: a recording, or two CSV files."""
+"""A calibration in motion from files, read piece by piece: a recording, or two CSV files of another program."""
 
 import csv
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, replace
 from itertools import islice
+from math import isfinite
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ftcalib import CalibrationResult, Known, Setup
 from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns, rotations_of
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
-from ftcalib.model import Array
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.motion.samples import Means
+from ftcalib.motion.solve import solve_motion
 from ftdrive.recording.compensation import NEEDED
-from ftdrive.recording.files import read_recording
-from ftdrive.recording.recording import Header
+from ftdrive.recording.files import ENDINGS, read_recording
+from ftdrive.recording.recording import FORMAT, Header
+from ftdrive.runs.run import made_now
 
 _PIECE = 1 << 16
 _POSITION = ("x", "y", "z")
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is a recording of `ftdrive record`, by its ending; a CSV by its first line."""
+    ending = Path(path.name.removesuffix(".partial")).suffix
+    if ending == ".csv" and path.is_file():
+        with path.open("rb") as file:
+            return file.readline(100).startswith(f"# {FORMAT.partition('/')[0]}/".encode())
+    return ending in ENDINGS and ending != ".csv"
+
+
+def solve_recording(
+    path: Path,
+    pair: tuple[Path, Path] | None = None,
+    *,
+    known: Known | None,
+    point_mass: bool,
+    up_in_base: Sequence[float] | None,
+) -> CalibrationResult:
+    """Calibrate from a recording in motion.
+
+    Parameters
+    ----------
+    path : Path
+        A recording of `ftdrive record`.
+    pair : tuple of Path, optional
+        Instead of it: CSV files of the wrench and of the poses, on one clock.
+    known : Known, optional
+        A known direction of gravity means a base that is level with respect to `up_in_base`.
+    point_mass : bool
+        Whether the load is known to have no inertia about its centre of mass.
+    up_in_base : sequence of float, optional
+        (3,) declared up direction.
+
+    Raises
+    ------
+    BadDataset, BadRecording, ConfigError, OSError
+        A file cannot be used.
+    NotObservable
+        The motion does not determine the parameters.
+    """
+    provenance, height_m, g_m_s2 = made_now(), None, STANDARD_GRAVITY_M_S2
+    if pair is None:
+        wrench, poses, header = read_in_motion(path)
+        devices = {"arm": asdict(header.info.arm), "sensor": asdict(header.info.sensor)}
+        provenance |= {"recording": path.name, "devices": devices}
+        g_m_s2 = header.info.calibration.g_m_s2
+        height_m = float(header.info.p_flange_sensor_m[2])
+    else:
+        wrench, poses = read_wrench_file(pair[0]), read_pose_file(pair[1])
+        provenance |= {"wrench": pair[0].name, "orientation": pair[1].name}
+    setup = Setup(up_in_base=up_in_base)
+    if known is not None and known.gravity_direction_base is not None:
+        known = replace(known, gravity_direction_base=-setup.up)
+    return solve_motion(
+        wrench,
+        poses,
+        known=known,
+        point_mass=point_mass,
+        height_m=height_m if height_m is not None and isfinite(height_m) else None,
+        g_m_s2=g_m_s2,
+        setup=setup,
+        provenance=provenance,
+    )
 
 
 def read_in_motion(path: Path) -> tuple[Means, Means, Header]:
