@@ -73,7 +73,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
         about = {"format": target, "plan": made.sha256, "file": None if output is None else str(output)}
         write_json({"schema_version": 1, **about, "text": text})
     elif output is None:
-        echo(text, nl=False)
+        echo(text, nl=False, fold=False)
 
 
 @export.command()
@@ -201,7 +201,7 @@ def calibration(
             }
         )
     elif output is None:
-        echo(made.text, nl=False)
+        echo(made.text, nl=False, fold=False)
 
 
 @export.command()

@@ -194,7 +194,7 @@ class Questions:
         """Return the option or the answer; `usual` is the answer of Enter and --yes, None where there is none."""
         from ftdrive.cell.config import RULES
         from ftdrive.errors import ConfigError
-        from ftdrive.terminal.console import in_whole_words
+        from ftdrive.terminal.text import in_whole_words
 
         option = RULES[key].option
         if given is None and not self.interactive:

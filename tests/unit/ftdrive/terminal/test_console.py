@@ -24,12 +24,12 @@ from ftdrive.session import session
 from ftdrive.session.events import Noted
 from ftdrive.session.operator import Question
 from ftdrive.terminal import console
-from ftdrive.terminal.console import answer, hanging, in_whole_words, messages
+from ftdrive.terminal.console import answer, hanging, messages
 from ftdrive.terminal.live.view import Line
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.table import print_table
-from ftdrive.terminal.text import echo, visible
+from ftdrive.terminal.text import echo, in_whole_words, visible
 
 PLAN = ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal"]
 HELD = ["calibrate", "--robot", "10.0.0.1", "--sensor", "ati-can://can0"]
