@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from errno import ENOSPC
+from errno import ENOSPC, EPIPE
 from pathlib import Path
 
 import pytest
@@ -18,6 +18,7 @@ from syrupy.assertion import SnapshotAssertion
 
 from ftdrive.checks.check import Check
 from ftdrive.cli import cli, in_a_sentence
+from ftdrive.cli import run as cli_run
 from ftdrive.commands.doctor import _print
 from ftdrive.errors import Declined
 from ftdrive.session import session
@@ -172,11 +173,20 @@ MAIN = "import sys; from ftdrive.cli import main; sys.exit(main())"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
-@pytest.mark.parametrize(
-    "arguments", [["export", "formats"], ["devices"], ["config", "show"], ["--help"]], ids=" ".join
-)
+@pytest.mark.parametrize("arguments", [["export", "formats"], ["--help"]], ids=" ".join)
 def test_a_closed_pipe_ends_a_command_quietly(arguments: list[str]) -> None:
     assert ended(MAIN, *arguments) == (141, "")
+
+
+def test_a_broken_pipe_of_a_device_is_no_closed_output(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def lose(*_: object) -> None:
+        raise BrokenPipeError(EPIPE, "Broken pipe")
+
+    monkeypatch.setattr(session, "calibrate", lose)
+    assert cli_run(HELD) == 4
+    assert "closed its connection" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
