@@ -61,7 +61,9 @@ def beside(as_json: bool) -> CommandConsole:
 
 
 def print_address(words: str, address: str) -> None:
-    """Print an address behind words: on one line, however narrow the terminal is, and as a link where it can."""
+    """Print an address behind words, or below if the line is too short; never broken, and as a link where it can."""
+    if not messages.soft_wrap and len(words + address) > messages.width >= len(f"   {address}"):
+        words = f"{words.rstrip()}\n   "
     messages.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
 
 

@@ -118,18 +118,42 @@ def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path, 
 
 def test_an_address_stays_on_one_line_and_is_a_link_where_the_terminal_can(monkeypatch: pytest.MonkeyPatch) -> None:
     url = "https://app.foxglove.dev?ds=foxglove-websocket&ds.url=ws%3A%2F%2F127.0.0.1%3A34567"
-    for is_terminal in (True, False):
+    for is_terminal, width, lines in ((True, 40, 1), (True, 90, 2), (False, 40, 1)):
         file = io.StringIO()
         monkeypatch.setattr(
             console,
             "messages",
-            Console(file=file, width=40, force_terminal=is_terminal, color_system="standard" if is_terminal else None),
+            Console(
+                file=file,
+                width=width,
+                soft_wrap=not is_terminal,
+                force_terminal=is_terminal,
+                color_system="standard" if is_terminal else None,
+            ),
         )
         console.print_address("  In a browser:          ", url)
         shown = file.getvalue()
         assert url in shown
-        assert shown.count("\n") == 1
+        assert shown.count("\n") == lines
         assert (f";{url}\x1b\\" in shown) is is_terminal
+
+
+def test_80_columns_hold_whole_words_and_commands_that_a_shell_reads(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
+    monkeypatch.setattr(messages, "soft_wrap", False)
+    monkeypatch.setattr(messages, "_width", 80)
+    command, why = "ftdrive live --calibration runs/2026-11-23T135517Z-with-a-long-name --simulate", "(why it helps)"
+    messages.print_next(command, f"{command}   {why}")
+    echo("words " * 30)
+    echo(f'{{"words": "{"x " * 60}"}}', fold=False)
+    out, err = capfd.readouterr()
+    *lines, data = out.splitlines()
+    assert len(data) > 120
+    assert max(map(len, [*lines, *err.splitlines()])) <= 80
+    assert set(" ".join(lines).split()) == {"words"}
+    assert " ".join(err.replace("\\\n", "").split()) == f"Next {command} {command} {why}"
 
 
 NAME = "\x1b]0;owned\x07 gripper\x9b2J \u202epilf\r0\udcff\ttab\nline\r\n"
