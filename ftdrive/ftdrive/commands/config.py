@@ -1,6 +1,8 @@
 """`ftdrive config`: the values in force, and the origin of each."""
 
+import sys
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import Any
 
 import click
@@ -28,7 +30,6 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
     """
     from ftdrive.cell.config import RULES, settings
     from ftdrive.cell.template import WIDTH, document
-    from ftdrive.terminal.console import answer
 
     check_simulate(simulate, real={"--config": path}, emulated={"--sensor": sensor})
     if simulate:
@@ -49,5 +50,5 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
         return
     comment = (lambda key: found[key].origin) if origin else (lambda key: RULES[key].description)
     values_by_key = {key: setting.value for key, setting in found.items()}
-    width = min(WIDTH, answer.width) if answer.is_terminal else WIDTH
+    width = min(WIDTH, get_terminal_size().columns) if sys.stdout.isatty() else WIDTH
     echo(document(values_by_key, comment, width=width), nl=False, fold=False)
