@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ftcalib.assessment.observability import second_minimum
+from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.rotation_minima import Minimum
 from ftcalib.model import Parameters
 from ftcalib.routine import Sampling
@@ -369,6 +370,17 @@ def second_minimum_once(R_base_flange: Array, parameters: Parameters) -> tuple[f
     return _second_minima[key]
 
 
+_fits: dict[tuple[bytes, str], Fit] = {}
+
+
+def fit_once(*arrays: Array | None, t_s: Array | None = None, **how: Any) -> Fit:
+    """As `fit`, but from memory: the sessions of most tests take the same readings."""
+    key = b"".join(np.ascontiguousarray(array).tobytes() for array in (*arrays, t_s) if array is not None), repr(how)
+    if key not in _fits:
+        _fits[key] = fit(*arrays, t_s=t_s, **how)  # type: ignore[arg-type]  # the same, in the same order
+    return _fits[key]
+
+
 class Lab:
     """A fake cell and what a test wants of it."""
 
@@ -392,6 +404,7 @@ class Lab:
         monkeypatch.setattr(session, "build_sensor", lambda _: self.sensor)
         monkeypatch.setattr(task, "plan_for", planned_once)
         monkeypatch.setattr("ftcalib.poses.information.second_minimum", second_minimum_once)
+        monkeypatch.setattr("ftcalib.solver.fit", fit_once)
         monkeypatch.setattr(along_plan, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
         monkeypatch.setattr("os.fsync", lambda _: None)  # the disk may be slow
