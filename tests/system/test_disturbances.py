@@ -12,7 +12,6 @@ from ftcalib.routine import Sampling
 from ftdrive.cell.emulated import Station
 from ftdrive.errors import Declined
 from ftdrive.runs.outcome import Outcome
-from ftdrive.runs.pose_hints import hints
 from ftdrive.session.events import Event, GuardTripped, PoseTaken, State, StateChanged
 from ftdrive.session.operator import Question
 from ftdrive.session.options import SessionOptions
@@ -136,24 +135,6 @@ def test_pushes_and_a_tap_while_poses_are_averaged(
     assert_found(errors_in_sigma(outcome.result, station.truth))
 
 
-def test_a_cable_that_pulls_in_three_poses(
-    station: Station,
-    tour: Tour,
-    words_of: Callable[[Outcome], str],
-) -> None:
-    taut_deg = -60
-    station.control(do="cable", joint=6, beyond_deg=taut_deg, force_N_deg=[0.0, 0.02, 0.01])
-    outcome, _ = tour(lambda _: None)
-    wound = [r.stop for r in outcome.run.records() if np.degrees(r.pose.q_rad[5]) < taut_deg and r.stop <= POSES]
-    assert len(wound) == 3
-    (pulled,) = (one for one in hints(outcome.result, outcome.run.records()) if one.code == "cable_pulls")
-    assert {*pulled.values["poses"]} >= set(names(outcome, *wound))
-    assert f"? {pulled.words}" in words_of(outcome)
-    assert_rejected(outcome, *wound)
-    assert outcome.result.verdict == "usable"
-    assert_found(errors_in_sigma(outcome.result, station.truth))
-
-
 def test_a_sensor_that_drifts_by_half_a_newton(
     station: Station,
     tour: Tour,
@@ -183,24 +164,3 @@ def test_a_sensor_that_drifts_by_half_a_newton(
     truth = dict(station.truth)  # the bias is the mean over the poses
     truth["force_bias_N"] = np.add(truth["force_bias_N"], [0, 0, drifted_N.mean()])
     assert_found(errors_in_sigma(outcome.result, truth))
-
-
-def test_a_payload_that_shifts_in_mid_run(
-    station: Station,
-    tour: Tour,
-    words_of: Callable[[Outcome], str],
-) -> None:
-    since = 7
-    new = np.add(station.truth["p_sensor_com_m"], [0.002, 0.001, 0.004]).tolist()
-
-    def happening(event: Event) -> None:
-        if begins(event, State.MOVE, since):
-            station.control(do="payload-shift", p_sensor_com_m=new)
-
-    outcome, _ = tour(happening)
-    text = words_of(outcome)
-    assert "REJECTED" in text
-    (shifted,) = (one for one in outcome.result.findings if one.code in {"com_shifted", "load_changed"})
-    assert (shifted.values["pose"], shifted.values["shift_mm"]) == (since, pytest.approx(4.6, abs=0.2))
-    assert shifted.words in text
-    assert not list(outcome.run.folder.glob("calibration*.json"))

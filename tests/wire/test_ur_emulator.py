@@ -172,24 +172,6 @@ def test_handshake_bytes(station: StationProcess) -> None:
         assert stamps[1] > stamps[0]
 
 
-@pytest.mark.parametrize("name", ["tcp_offset", "payload", "payload_cog", "actual_q", "safety_status_bits"])
-def test_one_variable_alone(station: StationProcess, name: str) -> None:
-    station.ask("set-tcp", tcp=[0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
-    kind = OUTPUTS[name][0]
-    expected = {
-        "tcp_offset": (0.01, 0.02, 0.03, 0.1, 0.2, 0.3),
-        "payload": 0.7,
-        "payload_cog": tuple(station.hello["truth"]["payload_cog_m"]),
-        "actual_q": tuple(station.ask("state")["q_rad"]),
-        "safety_status_bits": 1,
-    }[name]
-    with RtdeSocket(station.host) as client:
-        assert client.ask("V", b"\x00\x02") == b"\x01"
-        assert client.ask("O", struct.pack(">d", 10.0) + name.encode()) == b"\x01" + kind.encode()
-        assert client.ask("S") == b"\x01"
-        assert rtde.Recipe(1, [name], [kind]).unpack(client.answer()[4:]) == {name: expected}
-
-
 def test_every_documented_variable_can_be_read_and_unknown_ones_are_named(station: StationProcess) -> None:
     with RtdeSocket(station.host) as client:
         newer = {"actual_current_as_torque", "target_gravity"}
@@ -330,35 +312,6 @@ def test_the_clock_goes_on_when_the_station_was_killed() -> None:
         before_ns = clock.now_ns()
         cell.kill()
         wait_until(lambda: clock.now_ns() > before_ns + 10 * LEAD_NS)
-
-
-@pytest.mark.parametrize(
-    "line",
-    ['{"do": "dance"}', "not json", "[]", '{"do": "push", "wrench": [1]}', '{"do": "unplug", "device": "radio"}'],
-)
-def test_what_is_not_understood_is_answered_with_an_error(station: StationProcess, line: str) -> None:
-    assert "error" in station.say(line)
-    assert "error" not in station.ask("state")
-
-
-def test_a_push_shows_in_the_truth(station: StationProcess) -> None:
-    before = station.ask("state")["true_wrench"]
-    assert station.ask("push", wrench=[1, 2, 3, 0.1, 0.2, 0.3]) == {"done": "push"}
-    after = station.ask("state")["true_wrench"]
-    assert [b - a for a, b in zip(before, after, strict=True)] == pytest.approx([1, 2, 3, 0.1, 0.2, 0.3])
-
-
-def test_no_program_starts_without_remote_control(worn: StationProcess) -> None:
-    known = len(worn.ask("state")["events"])
-    worn.ask("remote-control", on=False)
-    with worn.connect(30002) as script:
-        script.sendall(b"def rtde_control():\nend\n")
-        worn.wait_for_event("program rtde_control", accepted=False, since=known)
-        worn.ask("remote-control", on=True)
-        script.sendall(b"def rtde_control():\nend\n")
-        worn.wait_for_event("started rtde_control", since=known)
-        script.sendall(b"def other():\nend\n")
-        worn.wait_for_event("stopped other", since=known)
 
 
 def test_dashboard_lines_end_with_a_bare_line_feed(station: StationProcess) -> None:
