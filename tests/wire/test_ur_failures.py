@@ -38,7 +38,6 @@ end off the goal        `DeviceFault`     stopped                        `test_a
 import os
 import re
 import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -541,34 +540,6 @@ def refused(station: Station, **how: Any) -> ConnectError:
         arm.open(control=True)
     arm.close()
     return caught.value
-
-
-@slow
-def test_a_second_client_does_not_stop_the_first(station: Station, arm: UrArm, control: ControlPath) -> None:
-    errors: list[ConnectError] = []
-    q = away(arm, 0.8)
-    trying = threading.Thread(target=lambda: errors.append(refused(station, control=control)))
-    arm.move_to(q, timeout_s=MOVE_S, guard=Once(trying.start, wait_until_moving(arm)))
-    trying.join()
-    assert "another client" in errors[0].found
-    assert arm.state().q_rad == pytest.approx(q, abs=1e-3)
-
-
-@slow
-@pytest.mark.parametrize(
-    ("what", "found", "fix"),
-    [
-        ("rtde", "cannot be reached", "switched on"),
-        ("dashboard", "dashboard server", "Settings, Security, Services"),
-        ("script", "30003", "Settings, Security, Services"),
-    ],
-)
-def test_services_that_are_off(station: Station, what: str, found: str, fix: str) -> None:
-    station.ask("listen", what=what, on=False)
-    error = refused(station)
-    station.ask("listen", what=what, on=True)
-    assert found in error.found
-    assert fix in error.fix
 
 
 # ---------------------------------------------------------------------- our own processes
