@@ -120,16 +120,16 @@ def drift_ahead(fit: AssessedFit, t_s: Array | None = None) -> DriftAhead:
     if fit.drift is None:
         return DriftAhead(np.zeros(6), np.zeros(6), np.zeros(6))
     n = len(fit.weights)
-    if t_s is None or not np.isfinite(t_s).all() or np.ptp(t_s) == 0:
-        t_s = USUAL_INTERVAL_S * np.arange(n)
+    timed = t_s is not None and np.isfinite(t_s).all() and np.ptp(t_s) > 0
+    time = np.asarray(t_s if timed else USUAL_INTERVAL_S * np.arange(n), dtype=np.float64)
     used = np.flatnonzero(fit.weights > 0)
-    first, last = used[np.argmin(t_s[used])], used[np.argmax(t_s[used])]
+    first, last = used[np.argmin(time[used])], used[np.argmax(time[used])]
     offset = fit.drift.bias[last]
-    intervals = NEXT_USE_S * (n - 1) / np.ptp(t_s)
+    intervals = NEXT_USE_S * (n - 1) / np.ptp(time)
     walk = np.zeros(6)
     for channels in (FORCE, TORQUE, *([c] for c in range(6))):
         walk[channels] += intervals * fit.components.get(component("walk", channels).name, 0.0) ** 2
-    linear = np.where(walk > 0, 0.0, fit.drift.change * NEXT_USE_S / (t_s[last] - t_s[first]))
+    linear = np.where(walk > 0, 0.0, fit.drift.change * NEXT_USE_S / (time[last] - time[first]))
     # The change from the first pose to the last has the errors of both ends.
     square = (offset + linear) ** 2 + walk + fit.drift.sigma**2 / 2
     return DriftAhead(offset, np.sqrt(walk + linear**2), square)

@@ -152,7 +152,7 @@ def verify(
     if p_value >= false_alarms:
         return _compared(likeliest[p_values.index(p_value)], p_value, R_base_flange, wrench, passed=True)
     changes = [_changes(calibration, one, R_base_flange, wrench) for one in likeliest]
-    best = min(range(len(changes)), key=lambda k: _least(changes[k]))
+    best = min(range(len(changes)), key=lambda k: min((cost for cost, _ in changes[k].values()), default=np.inf))
     alarm = _compared(likeliest[best], p_value, R_base_flange, wrench, passed=False)
     return _explained(alarm, calibration, changes[best])
 
@@ -195,13 +195,6 @@ def _changes(
         if cost < unchanged and expected.p_value(update.chi2, update.dof) > UNEXPLAINED:
             found[kind] = logdet + cost, update
     return found
-
-
-def _least(changes: Mapping[str, tuple[float, Update]]) -> tuple[bool, float]:
-    """Rank an explanation of the fit: by its likeliest single change, or of several quantities if it has no single."""
-    single = [changes[kind][0] for kind in SINGLE if kind in changes]
-    several = [changes[kind][0] for kind in SEVERAL if kind in changes]
-    return not single, min(single or several, default=np.inf)
 
 
 def _explained(

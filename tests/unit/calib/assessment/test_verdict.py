@@ -435,7 +435,7 @@ def test_a_drift_of_rounding_size_is_no_drift() -> None:
 @pytest.mark.parametrize("timed", [True, False])
 def test_a_linear_drift_goes_on_for_the_next_minute(timed: bool) -> None:
     ramp = np.linspace(-1, 1, 24)[:, None] * [0.3, 0, 0.4, 0, 0.01, 0]
-    times = 20.0 * np.arange(24) if timed else np.full(24, np.nan)
+    times = 20.0 * np.arange(24, dtype=np.float64) if timed else np.full(24, np.nan)
     noise = 0.01 * np.random.default_rng(26).normal(size=(24, 6)) * SIGMA / SIGMA[0]
     wrench = predict(TRUTH, R24) + ramp + noise
     result = solve(CalibrationDataset(R24, wrench, None, np.zeros(24, np.int64), times), drift="linear")
@@ -448,7 +448,7 @@ def test_a_linear_drift_goes_on_for_the_next_minute(timed: bool) -> None:
 
 def test_the_likely_error_is_that_of_the_next_use_where_the_bias_walks() -> None:
     walk, rng, ratios = np.repeat([0.1, 0.003], 3), np.random.default_rng(27), []
-    times = 10.0 * np.arange(24)
+    times = 10.0 * np.arange(24, dtype=np.float64)
     for _ in range(12):
         moved = np.cumsum(rng.normal(size=(30, 6)) * walk, axis=0)  # six more in the minute after
         wrench = noisy(rng, R24) + moved[:24]
