@@ -199,7 +199,7 @@ def _chunk(wrench: tuple[Array, Array], poses: tuple[Array, Array], grid: Array)
     speed = np.linalg.norm(omega, axis=1) + np.linalg.norm(velocity, axis=1) / _LEVER_M
     inner = slice(len(_FIT) // 2, len(grid) - len(_FIT) // 2)
     windows = sliding_window_view(motion.columns(), len(_WIDE_KERNEL), axis=0)[::_STEP]
-    whole = sliding_window_view((whole_w & whole_p)[inner], len(_WIDE_KERNEL)).all(axis=1)[::_STEP]
+    whole = np.all(sliding_window_view((whole_w & whole_p)[inner], len(_WIDE_KERNEL))[::_STEP], axis=1)
     return (
         grid[_REACH:-_REACH:_STEP][: len(whole)][whole],
         (sliding_window_view(y[inner], len(_WIDE_KERNEL), axis=0)[::_STEP] @ _WIDE_KERNEL)[whole],
