@@ -498,9 +498,9 @@ class CalibrationResult:
 
 
 def _require_known_words(result: CalibrationResult) -> None:
-    for name, words in (("method", (*get_args(Method), "motion")), ("noise_source", get_args(NoiseSource))):
-        if getattr(result, name) not in words:
-            raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(words)}")
+    for name, choices in (("method", (*get_args(Method), "motion")), ("noise_source", get_args(NoiseSource))):
+        if getattr(result, name) not in choices:
+            raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(choices)}")
 
 
 def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:

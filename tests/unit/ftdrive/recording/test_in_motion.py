@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,9 +33,9 @@ def table(path: Path, names: str, *columns: np.ndarray) -> Path:
     return path
 
 
-def run(*arguments: object) -> dict[str, object]:
+def run(*arguments: object) -> dict[str, Any]:
     result = CliRunner().invoke(solve, [*map(str, arguments), "--json"], catch_exceptions=False)
-    document: dict[str, object] = json.loads(result.stdout)
+    document: dict[str, Any] = json.loads(result.stdout)
     return document
 
 
@@ -51,10 +52,10 @@ def test_a_recording_is_solved_from_its_motion(tmp_path: Path, swept: Recorded) 
     assert document["method"] == "motion"
     assert document["delay_s"] == pytest.approx(delay_s, abs=1e-4)
     np.testing.assert_allclose(document["inertia_kg_m2"], TRUTH.inertia_kg_m2, atol=1e-4)
-    assert {"height_differs"} == {one["code"] for one in document["findings"]}  # type: ignore[attr-defined]
+    assert {"height_differs"} == {one["code"] for one in document["findings"]}
     loaded = CalibrationResult.load(saved)
     assert loaded.motion is not None
-    assert loaded.provenance["devices"]["sensor"]["serial"] == "FT1"  # type: ignore[index,call-overload]
+    assert loaded.provenance["devices"]["sensor"]["serial"] == "FT1"
 
 
 def test_files_of_another_program_are_solved(tmp_path: Path, swept: Recorded) -> None:
@@ -64,7 +65,7 @@ def test_files_of_another_program_are_solved(tmp_path: Path, swept: Recorded) ->
     document = run("--wrench", wrench, "--orientation-file", poses, "--up", "0,0,1")
     assert document["verdict"] == "good"
     assert document["mass_kg"] == pytest.approx(TRUTH.mass_kg, abs=1e-3)
-    assert document["sigma"]["inertia_kg_m2"][0][0] > 0  # type: ignore[index]
+    assert document["sigma"]["inertia_kg_m2"][0][0] > 0
 
 
 @pytest.mark.parametrize(
