@@ -1,13 +1,15 @@
 """Mistakes in the data of a bad fit: orientations, pairs, axes, units. Named only if undoing one helps."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from ftcalib.assessment import units
 from ftcalib.assessment.observability import RECOMMENDED_POSES
 from ftcalib.findings import Finding
 from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
@@ -16,21 +18,36 @@ from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
 ROUNDING = 1e-9
 """Of readings, relative to the largest: what is left at least."""
+READINGS = {
+    "orientations_inverted": "inverted orientations",
+    "quaternion_order": "quaternions in the order ({order})",
+    "euler_angles": "{order} Euler angles",
+}
+EQUAL = 0.1
+"""Scores that differ by less do not decide between two readings of the orientations."""
 COLLAPSE = 0.4
 """Accept a hypothesis if it reduces the residual to this share."""
 NO_WORSE = 1.2
 """The other residual may grow by this factor."""
-PLAUSIBLE_TILT_DEG = 60.0
+CORRECTED = 0.1
+"""Forces that a mistake explains leave no more than this share of the weight."""
 IMPLAUSIBLE = 1.0
-"""Penalty of a weight that does not pull downwards, in the logarithm of the residuals."""
+"""Penalty of a weight that pulls sideways, and of a tool inside the flange, in the logarithm of the residuals."""
 TIED = 1.3
 """Residuals that differ by less than this factor are equal: the simpler explanation is taken."""
-OTHER_POSES, OF_A_WEIGHT = 0.2, 0.1
+OTHER_POSES, OF_A_WEIGHT = 0.03, 0.1
 """Forces of a weight in other poses than given: large residuals, in shares of the weight, and little of them radial."""
 IN_BASE_RAD = np.deg2rad(10.0)
 """A constant force that points down this exactly is a weight in base axes."""
 STEADY = 0.05
 """A force that varies by less than this share of it is constant."""
+FEWEST_SATURATED = 3
+"""Poses with the same extreme reading of a channel."""
+CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
+FOR_STEPS = 1000
+"""Poses that show steps of the readings."""
+COARSE = 0.005
+"""Rounding matters if its standard deviation exceeds this share of the spread."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +61,11 @@ class _Rough:
     """(n, 3)"""
     force_rms_N: float
     torque_rms_Nm: float
+    shares: tuple[float, float]
+    """Residual of the forces relative to the weight, and of the torques relative to their spread."""
+    com_m: float
+    outwards: bool
+    """Whether the centre of mass lies on the tool's side of the sensor."""
 
     @classmethod
     def of(cls, R_base_flange: Array, wrench: Array) -> Self:
@@ -54,16 +76,20 @@ class _Rough:
         weight_sensor_N = (F_b @ R_base_flange) @ best.R.T
         P, T0 = com_and_torque_bias(weight_sensor_N, torque_Nm)
         force_rms_N = float(np.sqrt(max(best.cost, 0.0) / n)) + ROUNDING * float(np.abs(force_N).max())
-        return cls(best.R, F_b, weight_sensor_N, force_rms_N, _torque_rms(weight_sensor_N, torque_Nm, P, T0))
-
-    def tilt_deg(self, up_in_base: Array) -> float:
-        """Angle between the weight and where down should be."""
-        cosine = -float(self.F_b @ up_in_base) / float(np.linalg.norm(self.F_b) * np.linalg.norm(up_in_base) or 1.0)
-        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        torque_rms_Nm = _torque_rms(weight_sensor_N, torque_Nm, P, T0)
+        weight_N, spread_Nm = float(np.linalg.norm(F_b)), float(np.linalg.norm(torque_Nm.std(axis=0)))
+        shares = force_rms_N / (weight_N or 1.0), torque_rms_Nm / (spread_Nm or 1.0)
+        outwards = bool(P @ best.R[:, 2] >= 0)
+        com_m = float(np.linalg.norm(P))
+        return cls(best.R, F_b, weight_sensor_N, force_rms_N, torque_rms_Nm, shares, com_m, outwards)
 
     def score(self, up_in_base: Array) -> float:
-        """Logarithm of the residuals plus the penalty; lower is better."""
-        implausible = self.tilt_deg(up_in_base) > PLAUSIBLE_TILT_DEG
+        """Logarithm of the residuals plus the penalty; lower is better.
+
+        Quaternions in another order often fit as well as inverted ones, with another mounting of robot and sensor.
+        """
+        cosine = -float(self.F_b @ up_in_base) / float(np.linalg.norm(self.F_b) * np.linalg.norm(up_in_base) or 1.0)
+        implausible = (1 - cosine) / 2 + 0.5 * (not self.outwards)
         return float(np.log(self.force_rms_N * self.torque_rms_Nm)) + IMPLAUSIBLE * implausible
 
 
@@ -89,12 +115,16 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
     found = []
     for code, values, R, y in _readings(R_base_flange, wrench):
         trial = _Rough.of(R, y)
-        if trial.force_rms_N < COLLAPSE * as_read.force_rms_N and (
-            trial.torque_rms_Nm < NO_WORSE * as_read.torque_rms_Nm
-        ):
+        (force, torque), limit = trial.shares, min(COLLAPSE * as_read.shares[0], CORRECTED)
+        smaller = trial.force_rms_N < COLLAPSE * as_read.force_rms_N or code == "columns_swapped"
+        if smaller and force < limit and torque < NO_WORSE * as_read.shares[1]:
             found.append((trial.score(up), code, values, trial.force_rms_N))
     if found:
-        _, code, values, corrected_N = min(found, key=lambda each: each[0])
+        score, code, values, corrected_N = min(found, key=lambda each: each[0])
+        equal = [one for one in found if one[0] < score + EQUAL and one[1] in READINGS]
+        also = [READINGS[name].format(**own) for _, name, own, _ in equal if (name, own) != (code, values)]
+        if code in READINGS:
+            values = {**values, "also": also}
         return [Finding.of(code, **values, residual_N=as_read.force_rms_N, corrected_N=corrected_N)]
     return _axes(as_read, wrench[:, 3:], up)
 
@@ -121,6 +151,12 @@ def other_poses(R_base_flange: Array, wrench: Array) -> list[Finding]:
     return [Finding.of("pairing_or_rotations", weight_N=weight_N, radial_N=radial_rms_N, residual_N=residual_N)]
 
 
+def no_weight(R_base_flange: Array, wrench: Array) -> list[Finding]:
+    """Recognise a wrench without weight: compensated already, or zeroed at each pose."""
+    rough = _Rough.of(R_base_flange, wrench)
+    return units.too_light(float(np.linalg.norm(rough.F_b)), rough.com_m, rough.force_rms_N)
+
+
 def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:
     """Recognise a weight in base axes that was recorded without bias: the force is the same in all poses."""
     mean, up = wrench[:, :3].mean(axis=0), np.asarray(up_in_base, dtype=np.float64)
@@ -135,6 +171,14 @@ def _readings(R: Array, wrench: Array) -> Iterator[tuple[str, Mapping[str, Any],
     """Yield each mistake as code and values, with the data as they are without it."""
     yield "orientations_inverted", {}, np.swapaxes(R, 1, 2), wrench
     quaternions = Rotation.from_matrix(R).as_quat()
+    yield "columns_swapped", {}, R, np.roll(wrench, 3, axis=1)
+    for read_as, order in (("intrinsic", "extrinsic"), ("extrinsic", "intrinsic")):
+        sequence = {"intrinsic": "XYZ", "extrinsic": "xyz"}
+        with warnings.catch_warnings():  # gimbal lock: one of the angles is arbitrary
+            warnings.simplefilter("ignore")
+            angles = Rotation.from_matrix(R).as_euler(sequence[read_as])
+        values = {"order": order, "read_as": read_as}
+        yield "euler_angles", values, Rotation.from_euler(sequence[order], angles).as_matrix(), wrench
     for shift, order, read_as in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
         values = {"order": order, "read_as": read_as}
         yield "quaternion_order", values, Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(), wrench
@@ -177,17 +221,38 @@ def _torque_rms(weight_sensor_N: Array, torque_Nm: Array, P: Array, T0: Array) -
 
 
 def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
-    """Find channels that do not move and rows that were copied."""
-    names = ("fx", "fy", "fz", "tx", "ty", "tz")
+    """Find channels that do not move, that are coarse or that stop at a limit, and rows that were copied."""
     spread = np.ptp(wrench, axis=0)
     group = np.repeat([spread[:3].max(), spread[3:].max()], 3)
-    stuck = [name for name, own, all_ in zip(names, spread, group, strict=True) if own == 0 < all_]
+    stuck = [name for name, own, all_ in zip(CHANNELS, spread, group, strict=True) if own == 0 < all_]
     found = [Finding.of("stuck_channels", channels=stuck)] if stuck else []
-    if len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench):
-        return found
-    _, first, count = np.unique(wrench, axis=0, return_index=True, return_counts=True)
-    copied = [np.flatnonzero((wrench == wrench[row]).all(axis=1)) for row in np.sort(first[count > 1])]
+    coarse = [_coarse_step(part[:FOR_STEPS]) for part in np.hsplit(wrench, 2)]
+    if any(coarse):
+        return [*found, Finding.of("quantised", step_N=coarse[0], step_Nm=coarse[1])]
+    copied = _copies(wrench) if len(np.unique(wrench[:, np.argmax(spread)])) < len(wrench) else []
     for rows in copied:
         same = bool(np.ptp(R_base_flange[rows], axis=0).max() == 0)
         found.append(Finding.of("repeated_poses" if same else "repeated_wrenches", poses=rows + 1))
+    single = ~np.isin(np.arange(len(wrench)), [row for rows in copied for row in rows[1:]])
+    for k in np.flatnonzero(spread):
+        for limit in (wrench[:, k].min(), wrench[:, k].max()):
+            rows = np.flatnonzero((wrench[:, k] == limit) & single)
+            if len(rows) >= FEWEST_SATURATED:
+                found.append(Finding.of("saturated", channel=CHANNELS[k], poses=rows + 1))
     return found
+
+
+def _coarse_step(readings: Array) -> float:
+    """Return the step of which all differences of readings (n, 3) are multiples; 0 without one that matters."""
+    gaps = np.concatenate([np.diff(np.unique(channel)) for channel in readings.T])
+    if not gaps.size:
+        return 0.0
+    step, spread = float(gaps.min()), float(np.linalg.norm(readings.std(axis=0)))
+    even = np.abs(gaps / step - np.round(gaps / step)).max() < 1e-6
+    return step if even and step > np.sqrt(12) * COARSE * spread else 0.0
+
+
+def _copies(wrench: Array) -> list[NDArray[np.intp]]:
+    """Return the rows of each wrench that occurs more than once."""
+    _, first, count = np.unique(wrench, axis=0, return_index=True, return_counts=True)
+    return [np.flatnonzero((wrench == wrench[row]).all(axis=1)) for row in np.sort(first[count > 1])]

@@ -24,9 +24,6 @@ from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftcalib.setup import NOTHING, Setup
 
 SIGNIFICANT_SIGMAS = 5.0
-NEAREST_COM_M = 5e-4
-LIGHTEST_N, HEAVIEST_N = 0.05, 2000.0
-"""Weights beyond these look like forces in another unit: 5 g, and far more than any UR arm carries."""
 NOISE_FACTOR = 3.0
 USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
 SENSELESS_SHARE = 0.5
@@ -123,7 +120,7 @@ def judge(
         *at.errors,
         *_weight(fit, weight_N, setup),
         *_second_solution(fit),
-        *_implausible_units(parameters, weight_N),
+        *units.implausible(parameters, _rms(fit.residuals[at.used, :3]), described=bool(setup.cylinders_m)),
         *([] if contradicted or at.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
         *_noise(fit, at),
         *_poses(fit, at, "note" if few_rejected else "limit"),
@@ -300,23 +297,6 @@ def _second_solution(fit: AssessedFit) -> list[Finding]:
     if delta >= ACCEPTED_DELTA_CHI2:
         return []
     return [Finding.of("second_solution", probability_percent=100 * wrong_basin_probability(max(delta, 0.0)))]
-
-
-def _implausible_units(parameters: Parameters, weight_N: float) -> list[Finding]:
-    """Name the units that make an implausible weight or centre of mass usual."""
-    com_m, found = float(np.linalg.norm(parameters.p_sensor_com_m)), []
-    if not LIGHTEST_N <= weight_N <= HEAVIEST_N:
-        heavy = weight_N > HEAVIEST_N
-        suspects = units.suspects(parameters, ("mN" if heavy else "kN",))
-        found.append(
-            Finding.of("weight_implausible", "reject" if heavy else "limit", weight_N=weight_N, units=suspects)
-        )
-    if com_m > described_cell.FARTHEST_COM_M:
-        values = {"distance_m": com_m, "most_m": described_cell.FARTHEST_COM_M}
-        found.append(Finding.of("com_too_far", **values, units=units.by_com(com_m)))
-    if com_m < NEAREST_COM_M:
-        found.append(Finding.of("com_too_near", distance_mm=1e3 * com_m))
-    return found
 
 
 def _misfit_of_known_values(fit: AssessedFit, unconstrained: AssessedFit | None) -> list[Finding]:
