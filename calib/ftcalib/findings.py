@@ -265,13 +265,21 @@ CODES: Final[Mapping[str, Code]] = {
     # Units, drift and changes of one session
     "payload_units": Code(_LIMIT, "the load is {load_kg:.2f}, but {expected_kg:.2f} by the payload in the "
         "controller{units:units}", "check the units of the sensor before you correct the payload"),
-    "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
-        "last", "let the sensor warm up and calibrate again"),
-    "com_shifted": Code(_REJECT_OR_NOTE, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
+    "com_shifted": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
         "load had shifted", "fix the load and calibrate again"),
-    "load_changed": Code(_REJECT_OR_NOTE, "from {pose:poses} on the weight has changed by {change_N:+.2g} and the "
+    "load_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the weight has changed by {change_N:+.2g} and the "
         "centre of mass by {shift_mm:.2g}", "check whether something was lost, picked up or shifted, and calibrate "
         "again"),
+    "bias_stepped": Code(_LIMIT, "from {pose:poses} on the bias differs by {force_N:.2g} and {torque_Nm:.2g}",
+        "check whether the sensor was zeroed or a cable pulls, and calibrate again"),
+    "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
+        "fasten its screws and calibrate again"),
+    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the readings are those of another sensor, turned by "
+        "{turn_deg:.2g}, whose bias differs by {force_N:.2g} and {torque_Nm:.2g}", "calibrate each sensor by itself"),
+    "sensors_alternate": Code(_REJECT, "every other pose reads like another sensor, turned by {turn_deg:.2g}, whose "
+        "bias differs by {force_N:.2g} and {torque_Nm:.2g}", "separate the readings of the sensors"),
+    "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
+        "last", "let the sensor warm up and calibrate again"),
     "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
         "of {sigma_N:.2g}", "record the raw wrench if it is compensated already or zeroed "
         "at each pose, or hang something heavier on the sensor"),
@@ -344,10 +352,6 @@ CODES: Final[Mapping[str, Code]] = {
         "likely from drift", "let the sensor warm up and mix the order of the poses"),
     "pose_deviates": Code(_NOTE, "{pose:poses} deviates from the others by {sigmas:.1f} sigma",
         "consider repeating it"),
-    "bias_stepped": Code(_NOTE, "from {pose:poses} on the bias differs by {force_N:.2g} and {torque_Nm:.2g}",
-        "check whether the sensor was tared or a cable pulls, and calibrate again"),
-    "sensor_turned": Code(_NOTE, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
-        "fasten its screws and calibrate again"),
     "gravity_tilted": Code(_NOTE, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot on a "
         "slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
     "base_leans": Code(_NOTE, "the base leans {lean_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) towards its {side}, "

@@ -67,7 +67,7 @@ class Case:
     setup: dict[str, Any] = field(default_factory=dict)
     known: Known | None = None
 
-    def reading(self, rows: slice | Array = slice(None), **different: Any) -> Array:
+    def reading(self, rows: Any = slice(None), **different: Any) -> Array:
         """Return what a sensor would read in these poses, with noise of its own."""
         t = replace(self, **different)
         force = np.einsum("ji,nkj,k->ni", t.mount, t.R[rows], t.mass_kg * G * t.down)
@@ -318,7 +318,7 @@ def if_far(case: Case, factor: float) -> bool:
     return case.described or bool(np.linalg.norm(case.com_m) * factor > 0.25)
 
 
-def euler(R: Rotation, read: str, written: str) -> Rotation:
+def euler(R: Rotation, read: Literal["xyz", "XYZ"], written: Literal["xyz", "XYZ"]) -> Rotation:
     return Rotation.from_euler(read, R.as_euler(written))
 
 
@@ -382,7 +382,7 @@ KINDS: dict[str, tuple[Spoil, str, Callable[[Case], bool]]] = {
     "tool changed in mid-session": (tool_changed, "load_changed|com_shifted", always),
     "sensor loosened in mid-session": (loosened, "sensor_turned", always),
     "sensor changed in mid-session": (sensor_changed, "sensor_changed|bias_stepped", always),
-    "two sensors alternating": (alternating, "two_sensors", always),
+    "two sensors alternating": (alternating, "sensors_alternate", always),
     "cable": (cable, f"cable|{BUMPED}|force_error|torque_error|noise_exceeded", always),
     "contact at one pose": (contact, BUMPED, always),
     "contact at a fifth of the poses": (partial(contact, share=0.2), BUMPED, always),

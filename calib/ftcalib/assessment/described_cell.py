@@ -68,8 +68,7 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup) -> list[
         orders = other_orders(along, setup.up)
         found.append(Finding.of("gravity_off_mounting", off_deg=lean.deg, direction=along, orders=orders))
     elif lean.is_significant:
-        values = {"lean_deg": lean.deg, "sigma_deg": lean.sigma_deg, "side": lean.side}
-        found.append(Finding.of("base_leans", **values))
+        found.append(Finding.of("base_leans", lean_deg=lean.deg, sigma_deg=lean.sigma_deg, side=lean.side))
     return found
 
 

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,7 @@ from ftcalib.assessment import units
 from ftcalib.assessment.observability import RECOMMENDED_POSES
 from ftcalib.findings import Finding
 from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
-from ftcalib.model import UP_IN_BASE, Array
+from ftcalib.model import UP_IN_BASE, Array, Parameters, gravity_wrench, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
 ROUNDING = 1e-9
@@ -50,45 +50,53 @@ COARSE = 0.005
 """Rounding matters if its standard deviation exceeds this share of the spread."""
 
 
+def rough_fit(R_base_flange: Array, wrench: Array) -> Parameters:
+    """Fit forces alone, then torques to them by linear least squares."""
+    n, force_N, torque_Nm = len(wrench), wrench[:, :3], wrench[:, 3:]
+    best = minima(force_cost(R_base_flange, force_N, np.ones(n)))[0]
+    F_b, F0 = given_rotation(best.R, R_base_flange, force_N, np.ones(n))
+    P, T0 = com_and_torque_bias((F_b @ R_base_flange) @ best.R.T, torque_Nm)
+    return Parameters(best.R.T, F_b, F0, P, T0)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rough:
-    """A plain fit: forces alone, then torques to them by linear least squares."""
+    """A rough fit and what it leaves."""
 
-    R: Array
-    """(3, 3) flange to sensor."""
-    F_b: Array
+    parameters: Parameters
     weight_sensor_N: Array
     """(n, 3)"""
     force_rms_N: float
     torque_rms_Nm: float
     shares: tuple[float, float]
     """Residual of the forces relative to the weight, and of the torques relative to their spread."""
-    com_m: float
-    outwards: bool
-    """Whether the centre of mass lies on the tool's side of the sensor."""
 
     @classmethod
     def of(cls, R_base_flange: Array, wrench: Array) -> Self:
         """Fit."""
-        n, force_N, torque_Nm = len(wrench), wrench[:, :3], wrench[:, 3:]
-        best = minima(force_cost(R_base_flange, force_N, np.ones(n)))[0]
-        F_b, _ = given_rotation(best.R, R_base_flange, force_N, np.ones(n))
-        weight_sensor_N = (F_b @ R_base_flange) @ best.R.T
-        P, T0 = com_and_torque_bias(weight_sensor_N, torque_Nm)
-        force_rms_N = float(np.sqrt(max(best.cost, 0.0) / n)) + ROUNDING * float(np.abs(force_N).max())
-        torque_rms_Nm = _torque_rms(weight_sensor_N, torque_Nm, P, T0)
-        weight_N, spread_Nm = float(np.linalg.norm(F_b)), float(np.linalg.norm(torque_Nm.std(axis=0)))
+        p = rough_fit(R_base_flange, wrench)
+        gravity, torque_Nm = gravity_wrench(p, R_base_flange), wrench[:, 3:]
+        e = wrench - predict(p, R_base_flange)
+        force_rms_N, torque_rms_Nm = (
+            float(np.sqrt(np.mean(np.sum(part**2, axis=1)))) + ROUNDING * float(np.abs(read).max())
+            for part, read in zip(np.hsplit(e, 2), np.hsplit(wrench, 2), strict=True)
+        )
+        weight_N, spread_Nm = _length(p.gravity_force_base_N), _length(torque_Nm.std(axis=0))
         shares = force_rms_N / (weight_N or 1.0), torque_rms_Nm / (spread_Nm or 1.0)
-        outwards = bool(P @ best.R[:, 2] >= 0)
-        com_m = float(np.linalg.norm(P))
-        return cls(best.R, F_b, weight_sensor_N, force_rms_N, torque_rms_Nm, shares, com_m, outwards)
+        return cls(p, gravity[:, :3], force_rms_N, torque_rms_Nm, shares)
+
+    @property
+    def outwards(self) -> bool:
+        """Whether the centre of mass lies on the tool's side of the sensor."""
+        return bool(self.parameters.p_sensor_com_m @ self.parameters.R_flange_sensor[2] >= 0)
 
     def score(self, up_in_base: Array) -> float:
         """Logarithm of the residuals plus the penalty; lower is better.
 
         Quaternions in another order often fit as well as inverted ones, with another mounting of robot and sensor.
         """
-        cosine = -float(self.F_b @ up_in_base) / float(np.linalg.norm(self.F_b) * np.linalg.norm(up_in_base) or 1.0)
+        F_b = self.parameters.gravity_force_base_N
+        cosine = -float(F_b @ up_in_base) / (_length(F_b) * _length(up_in_base) or 1.0)
         implausible = (1 - cosine) / 2 + 0.5 * (not self.outwards)
         return float(np.log(self.force_rms_N * self.torque_rms_Nm)) + IMPLAUSIBLE * implausible
 
@@ -154,7 +162,8 @@ def other_poses(R_base_flange: Array, wrench: Array) -> list[Finding]:
 def no_weight(R_base_flange: Array, wrench: Array) -> list[Finding]:
     """Recognise a wrench without weight: compensated already, or zeroed at each pose."""
     rough = _Rough.of(R_base_flange, wrench)
-    return units.too_light(float(np.linalg.norm(rough.F_b)), rough.com_m, rough.force_rms_N)
+    p = rough.parameters
+    return units.too_light(_length(p.gravity_force_base_N), _length(p.p_sensor_com_m), rough.force_rms_N)
 
 
 def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:
@@ -173,7 +182,7 @@ def _readings(R: Array, wrench: Array) -> Iterator[tuple[str, Mapping[str, Any],
     quaternions = Rotation.from_matrix(R).as_quat()
     yield "columns_swapped", {}, R, np.roll(wrench, 3, axis=1)
     for read_as, order in (("intrinsic", "extrinsic"), ("extrinsic", "intrinsic")):
-        sequence = {"intrinsic": "XYZ", "extrinsic": "xyz"}
+        sequence: dict[str, Literal["XYZ", "xyz"]] = {"intrinsic": "XYZ", "extrinsic": "xyz"}
         with warnings.catch_warnings():  # gimbal lock: one of the angles is arbitrary
             warnings.simplefilter("ignore")
             angles = Rotation.from_matrix(R).as_euler(sequence[read_as])
@@ -194,14 +203,14 @@ def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
     for Q in SPECIAL_R_flange_base:
         P, T0 = com_and_torque_bias(as_read.weight_sensor_N, torque_Nm @ Q.T)
         rms = _torque_rms(as_read.weight_sensor_N, torque_Nm @ Q.T, P, T0)
-        outside = 1.0 if P @ as_read.R[:, 2] >= 0 else -1.0  # the tool hangs outside the flange
+        outside = 1.0 if P @ as_read.parameters.R_flange_sensor[2] >= 0 else -1.0  # the tool hangs outside the flange
         changed = int(np.count_nonzero(np.diag(outside * Q) != 1)) + int(np.count_nonzero(np.diag(Q) == 0))
         fits.append((rms, changed, outside * Q))
     least = min(fits, key=lambda fit: fit[0])[0]
     rms, _, Q = min((fit for fit in fits if fit[0] <= TIED * least), key=lambda fit: fit[1])
     if rms >= COLLAPSE * as_read.torque_rms_Nm:
         return []
-    upwards, mirrored = bool(as_read.F_b @ up > 0), bool(np.linalg.det(Q) < 0)
+    upwards, mirrored = bool(as_read.parameters.gravity_force_base_N @ up > 0), bool(np.linalg.det(Q) < 0)
     by_force, by_torque = ("force", channels(Q.T)), ("torque", channels(Q))
     corrections = [by_torque] if mirrored or upwards else [by_torque, by_force]
     if mirrored and upwards:  # a mirrored force reads like a weight that pulls upwards
@@ -213,6 +222,10 @@ def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
 def channels(Q: Array) -> Sequence[str]:
     """Name the channels from which the axes of a wrench should be taken, given the signed permutation (3, 3)."""
     return [("-" if row[k] < 0 else "") + "xyz"[k] for row in Q for k in [int(np.abs(row).argmax())]]
+
+
+def _length(vector: Array) -> float:
+    return float(np.linalg.norm(vector))
 
 
 def _torque_rms(weight_sensor_N: Array, torque_Nm: Array, P: Array, T0: Array) -> float:

@@ -13,11 +13,11 @@ from ftcalib.assessment import described_cell, units
 from ftcalib.assessment.contradictions import contradictions
 from ftcalib.assessment.cross_validation import AssessedFit, standardized
 from ftcalib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, other_poses
-from ftcalib.assessment.load_shift import lasting_change
 from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
+from ftcalib.assessment.session_change import session_change
 from ftcalib.findings import Finding, Severity, Verdict, ordered, verdict_of
 from ftcalib.known import Known
-from ftcalib.likelihood.fit import DriftEstimate
+from ftcalib.likelihood.fit import DriftEstimate, Fit
 from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters
 from ftcalib.published.yu import SPECIAL_R_flange_base
@@ -107,7 +107,9 @@ def judge(
     suspect = at.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
     broken = broken_channels(fit.wrench, fit.R_base_flange) if fit.chi2 > NOISELESS * fit.dof else []
     mistakes = _mistakes(fit, at.used, t_s, setup) if suspect else []
-    changed = _change(fit, at, measured_sigma, t_s)
+    changed = [] if mistakes else _change(unconstrained or fit, at, measured_sigma, t_s)
+    if suspect and not (mistakes or changed):
+        mistakes = _other_poses(fit, at.used, t_s)
     contradicted: list[Finding] = []
     if known is not None and unconstrained is not None:
         at_its_best = unconstrained.parameters, unconstrained.covariance
@@ -201,14 +203,24 @@ def _mistakes(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, setu
 
     A wrong pose or two were rejected; only the used poses show whether most of them are wrong.
     """
-    n = len(used)
-    order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
-    order = order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0]
+    order = _some_runs(t_s, len(used))
     found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
     order = order[used[order]]
     if not found and not used.all():
         found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
-    return found or other_poses(fit.R_base_flange[order], fit.wrench[order])
+    return found
+
+
+def _other_poses(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None) -> list[Finding]:
+    order = _some_runs(t_s, len(used))
+    order = order[used[order]]
+    return other_poses(fit.R_base_flange[order], fit.wrench[order])
+
+
+def _some_runs(t_s: Array | None, n: int) -> NDArray[np.intp]:
+    """Rows by time: all, or of many poses evenly spread runs."""
+    order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
+    return order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0]
 
 
 def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:
@@ -384,27 +396,14 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
 
 
 def _change(fit: AssessedFit, at: _Statistics, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
-    """Name a lasting change between two poses, which no white noise explains: all poses after it deviate alike.
-
-    Poses of two different loads have no result in common, unless all poses before the change were rejected.
-    """
-    if measured_sigma is None or at.chi2_p is None or (at.fits_measured_noise and at.used.all()):
+    """Name a lasting change, where the fit needs what could hide one: drift, more noise, or poses left out."""
+    kinds = ("walk", "slope") if at.chi2_p is None else ("walk", "slope", "white")
+    hides = any(name.startswith(kinds) for name in fit.components)
+    if not isinstance(fit, Fit) or not (at.errors or hides or not at.used.all()):
         return []
-    n = len(fit.wrench)
-    times = np.arange(n, dtype=np.float64) if t_s is None or not np.isfinite(t_s).all() else t_s
-    order = np.argsort(times, kind="stable")
-    change = lasting_change(
-        fit.parameters,
-        fit.R_base_flange[order],
-        fit.residuals[order],
-        measured_sigma,
-        times[order],
-        np.flatnonzero(np.isin(order, out_of_line(at.residual_sigma, at.used))).tolist(),
-    )
-    if change is None:
-        return []
-    two_loads = change.of_the_tool and at.used[order[: change.position]].any()
-    return [change.finding(int(order[change.position]) + 1, "reject" if two_loads else "note")]
+    if t_s is None or not np.isfinite(t_s).all():
+        t_s = np.arange(len(fit.wrench), dtype=np.float64)
+    return session_change(fit, np.argsort(t_s, kind="stable"), t_s, measured_sigma)
 
 
 def _rms(vectors: Array) -> float:

@@ -1,6 +1,7 @@
 """What was mixed up is named, and undoing it helps."""
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from ftcalib import (
 from ftcalib.known import Known
 from ftcalib.model import Array, predict
 
+Sequence = Literal["xyz", "XYZ"]
 SIGMA = np.repeat([0.05, 0.00125], 3)
 SWAP = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
 CYCLE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
@@ -62,7 +64,7 @@ def test_the_order_of_quaternions_is_named(shift: int, order: str, seed: int) ->
 
 
 @pytest.mark.parametrize(("read", "written"), [("xyz", "XYZ"), ("XYZ", "xyz")])
-def test_the_order_of_euler_angles_is_named(read: str, written: str) -> None:
+def test_the_order_of_euler_angles_is_named(read: Sequence, written: Sequence) -> None:
     _, R, wrench = session(1)
     angles = Rotation.from_matrix(R).as_euler(written)
     finding = first(Rotation.from_euler(read, angles).as_matrix(), wrench)
