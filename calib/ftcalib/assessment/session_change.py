@@ -4,14 +4,14 @@ Each change competes with drift, inexact orientations, gain and bumped poses: th
 it is named if their restricted likelihood is clearly larger.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.assessment.faults import CORRECTED, rough_fit
-from ftcalib.findings import Finding, Severity
+from ftcalib.findings import CODES, Finding, Severity
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.gain_and_cross_talk import response_columns
@@ -19,7 +19,16 @@ from ftcalib.likelihood.outliers import FARTHEST
 from ftcalib.likelihood.session import LEVER_M
 from ftcalib.likelihood.session_noise import summed_products
 from ftcalib.likelihood.variance_components import GAIN, GAIN_OF_RESPONSE, squared_length
-from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, predict, skew
+from ftcalib.model import (
+    Array,
+    Parameters,
+    angle_between,
+    gravity_wrench,
+    jacobian,
+    nearest_rotation,
+    predict,
+    skew,
+)
 
 FEWEST_POSES = 10
 """Fewer do not show a change beside 15 parameters."""
@@ -33,17 +42,27 @@ MARGIN = 20.0
 """By which twice the log-likelihood must rise, beside log(6 n) for each number of the change."""
 Rows = NDArray[np.bool_]
 
+TURN, BIAS, COM, LOAD = range(3), range(3, 9), range(10, 13), range(9, 13)
+"""Columns of `_columns`."""
+KINDS = {
+    "bias_stepped": [*BIAS],
+    "com_shifted": [*COM],
+    "load_changed": [*LOAD],
+    "sensor_turned": [*TURN],
+    "sensor_changed": [*TURN, *BIAS],
+}
+"""What changes, by code."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
     """A change of some rows, relative to the others."""
 
-    what: str
-    """bias, centre of mass, load, mounting or sensor."""
+    code: str
     rows: Rows
     """(n,) in the order of time."""
-    values: dict[str, float]
-    """Of its finding, as far as it has them."""
+    values: Mapping[str, float]
+    """Of its finding."""
     corrected: Array
     """(n, 6) wrench without it."""
     misfit: float
@@ -53,17 +72,12 @@ class Change:
     @property
     def takes_turns(self) -> bool:
         """Whether every other pose differs, not all from one on."""
-        return np.count_nonzero(np.diff(self.rows)) > 1
+        return bool(np.count_nonzero(np.diff(self.rows)) > 1)
 
-
-_SIZE = {"bias": 6, "centre of mass": 3, "load": 4, "mounting": 3, "sensor": 9}
-_CODES = {
-    "bias": "bias_stepped",
-    "centre of mass": "com_shifted",
-    "load": "load_changed",
-    "mounting": "sensor_turned",
-    "sensor": "sensor_changed",
-}
+    @property
+    def first(self) -> int:
+        """The first pose after it."""
+        return int(np.flatnonzero(np.diff(self.rows))[0]) + 1
 
 
 def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma: Array | None) -> list[Finding]:
@@ -88,12 +102,14 @@ def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma
     cov = None if sigma is None else np.diag(sigma**2)
     if change is None or not _is_likelier(change, R, wrench, cov, times):
         return []
+    code, values = change.code, {"pose": int(order[change.first]) + 1} | dict(change.values)
+    severity: Severity = "reject"
     if change.takes_turns:
-        return [Finding.of("sensors_alternate", **{"turn_deg": 0.0} | change.values)]
-    first = int(np.flatnonzero(np.diff(change.rows))[0]) + 1
-    as_it_is_now = not (found.weights[order[:first]] > 0.5).any()
-    severity: Severity = "limit" if as_it_is_now or change.what == "bias" else "reject"
-    return [Finding.of(_CODES[change.what], severity, pose=int(order[first]) + 1, **change.values)]
+        code = "sensors_alternate"
+    elif code == "bias_stepped" or not (found.weights[order[: change.first]] > 0.5).any():  # the load as it is now
+        severity = "limit"
+    needed = CODES[code].values
+    return [Finding.of(code, severity, **{name: value for name, value in values.items() if name in needed})]
 
 
 def _is_likelier(change: Change, R: Array, wrench: Array, cov: Array | None, t_s: Array | None) -> bool:
@@ -101,8 +117,8 @@ def _is_likelier(change: Change, R: Array, wrench: Array, cov: Array | None, t_s
     weight_N = _length(without.parameters.gravity_force_base_N)
     if np.sqrt(np.mean(np.sum(without.residuals[without.weights > 0.5, :3] ** 2, axis=1))) > CORRECTED * weight_N:
         return False
-    costs = _SIZE[change.what] * np.log(wrench.size) + 2 * np.log(len(wrench)) + MARGIN
-    return minus_two_log_likelihood(without) + costs < minus_two_log_likelihood(as_read)
+    costs = len(KINDS[change.code]) * np.log(wrench.size) + 2 * np.log(len(wrench)) + MARGIN
+    return bool(minus_two_log_likelihood(without) + costs < minus_two_log_likelihood(as_read))
 
 
 def minus_two_log_likelihood(found: Fit) -> float:
@@ -141,11 +157,11 @@ def likeliest_change(parameters: Parameters, R: Array, wrench: Array, sigma: Arr
     best: dict[str, tuple[float, Parameters, Rows]] = {}
     for pure, groups in _groups(n):
         start = parameters if pure is None else rough_fit(R[pure], wrench[pure])
-        for what, misfits in _misfits(start, R, wrench, scale, groups).items():
+        for code, misfits in _misfits(start, R, wrench, scale, groups).items():
             k = int(np.argmin(misfits))
-            if what not in best or misfits[k] < best[what][0]:
-                best[what] = misfits[k], start, groups[k]
-    changes = [_refined(what, start, R, wrench, scale, rows) for what, (_, start, rows) in best.items()]
+            if code not in best or misfits[k] < best[code][0]:
+                best[code] = misfits[k], start, groups[k]
+    changes = [_refined(code, start, R, wrench, scale, rows) for code, (_, start, rows) in best.items()]
     change = min(changes, key=lambda one: one.criterion)
     return change if change.misfit < CLEARLY * without else None
 
@@ -161,73 +177,60 @@ def _groups(n: int) -> Iterator[tuple[slice | None, NDArray[np.bool_]]]:
 
 
 def _misfits(p: Parameters, R: Array, wrench: Array, scale: Array, groups: NDArray[np.bool_]) -> dict[str, Array]:
-    """Squared misfit (k,) for each kind of change of each group (k, n), in closed form; the parameters stay."""
-    y, g = (wrench - _bias(p)) / scale, gravity_wrench(p, R) / scale
-    d = y - g
-    count = groups.sum(axis=1)
+    """Squared misfit (k,) of each kind of change of each group (k, n), in closed form; the parameters stay."""
+    y, g, C = (wrench - _bias(p)) / scale, gravity_wrench(p, R) / scale, _columns(p, R) / scale[:, None]
+    d, count = y - g, groups.sum(axis=1)[:, None, None]
 
     def sums(of_rows: Array) -> Array:
-        return np.tensordot(groups.astype(np.float64), of_rows, 1)
-
-    def turned(cross: Array, square: Array) -> Array:
-        s = np.linalg.svd(cross, compute_uv=False)
-        return square - 2 * (s[:, 0] + s[:, 1] + np.sign(np.linalg.det(cross)) * s[:, 2])
+        return np.asarray(np.tensordot(groups.astype(np.float64), of_rows, 1))
 
     def explained(X: Array) -> Array:
         moment, gram = sums(np.einsum("ncj,nc->nj", X, d)), sums(np.einsum("ncj,nck->njk", X, X))
-        return np.einsum("kj,kji,ki->k", moment, np.linalg.pinv(gram, hermitian=True), moment)
+        return np.asarray(np.einsum("kj,kji,ki->k", moment, np.linalg.pinv(gram, hermitian=True), moment))
 
-    others, own = (d**2).sum() - sums((d**2).sum(axis=1)), sums((d**2).sum(axis=1))
-    by_part = y.reshape(-1, 2, 3), g.reshape(-1, 2, 3)
-    cross, square = sums(np.einsum("npi,npj->nij", *by_part)), sums((y**2 + g**2).sum(axis=1))
-    means = [sums(part.reshape(len(d), -1)).reshape(-1, 2, 3) for part in by_part]
-    centred = cross - np.einsum("kpi,kpj->kij", *means) / count[:, None, None]
-    centred_square = square - sum((mean**2).sum(axis=(1, 2)) for mean in means) / count
-    load = _load_columns(p, R) / scale[:, None]
+    def turned(cross: Array, square: Array) -> Array:
+        """Leave what the best rotation does (Kabsch 1976)."""
+        s = np.linalg.svd(cross, compute_uv=False)
+        return np.asarray(square - 2 * (s[:, 0] + s[:, 1] + np.sign(np.linalg.det(cross)) * s[:, 2]))
+
+    own = sums((d**2).sum(axis=1))
+    others = (d**2).sum() - own
+    parts = y.reshape(-1, 2, 3), g.reshape(-1, 2, 3)
+    cross, square = sums(np.einsum("npi,npj->nij", *parts)), sums((y**2 + g**2).sum(axis=1))
+    of_y, of_g = (np.tensordot(groups.astype(np.float64), part, 1) for part in parts)
+    means = np.einsum("kpi,kpj->kij", of_y, of_g) / count, ((of_y**2 + of_g**2) / count).sum(axis=(1, 2))
+    linear = {code: others + own - explained(C[..., own_]) for code, own_ in KINDS.items() if 0 not in own_}
     return {
-        "bias": others + own - (sums(d) ** 2).sum(axis=1) / count,
-        "centre of mass": others + own - explained(load[..., 1:]),
-        "load": others + own - explained(load),
-        "mounting": others + turned(cross, square),
-        "sensor": others + turned(centred, centred_square),
+        **linear,
+        "sensor_turned": others + turned(cross, square),
+        "sensor_changed": others + turned(cross - means[0], square - means[1]),
     }
 
 
-def _refined(what: str, p: Parameters, R: Array, wrench: Array, scale: Array, rows: Rows) -> Change:
+def _refined(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, rows: Rows) -> Change:
     """Undo the change of some rows, and improve it together with all parameters by linear least squares."""
-    y, g = wrench - _bias(p), gravity_wrench(p, R)
+    y, g, own = wrench - _bias(p), gravity_wrench(p, R), KINDS[code]
     undone, turn, step = y.copy(), np.eye(3), np.zeros(6)
-    if what in ("mounting", "sensor"):
-        own_y, own_g = ((x[rows] / scale).reshape(-1, 2, 3) for x in (y, g))
-        if what == "sensor":
-            own_y, own_g = own_y - own_y.mean(axis=0), own_g - own_g.mean(axis=0)
-        U, _, Vt = np.linalg.svd(np.einsum("npi,npj->ij", own_y, own_g))
-        turn = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-        step = (y[rows] - _turned(g[rows], turn)).mean(axis=0) if what == "sensor" else step
+    if code in ("sensor_turned", "sensor_changed"):
+        mean_y, mean_g = (x[rows].mean(axis=0) if code == "sensor_changed" else np.zeros(6) for x in (y, g))
+        parts = (((x[rows] - mean) / scale).reshape(-1, 2, 3) for x, mean in ((y, mean_y), (g, mean_g)))
+        turn = nearest_rotation(np.einsum("npi,npj->ij", *parts))
+        step = mean_y - _turned(mean_g, turn)[0]
         undone[rows] = _turned(y[rows] - step, turn.T)
-    columns = {
-        "bias": lambda: np.broadcast_to(np.eye(6), (len(y), 6, 6)),
-        "centre of mass": lambda: _load_columns(p, R)[..., 1:],
-        "load": lambda: _load_columns(p, R),
-        "mounting": lambda: _turn_columns(g),
-        "sensor": lambda: np.concatenate([_turn_columns(g), np.broadcast_to(np.eye(6), (len(y), 6, 6))], axis=2),
-    }[what]() * rows[:, None, None]
-    J = np.concatenate([columns, jacobian(p, R), response_columns(p, R)], axis=2)
-    misfit, x = _least(J, undone - g, scale)
-    x = x[: columns.shape[2]]
-    sign = 1.0 if rows[-1] else -1.0
-    deg = float(np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))))
-    moved = x if what == "bias" else step
+    C = _columns(p, R)[..., own] * rows[:, None, None]
+    misfit, x = _least(np.concatenate([C, jacobian(p, R), response_columns(p, R)], axis=2), undone - g, scale)
+    moved = np.zeros(13)
+    moved[own] = x[: len(own)]
+    step += moved[BIAS]
     values = {
-        "bias": lambda: {"force_N": _length(moved[:3]), "torque_Nm": _length(moved[3:])},
-        "centre of mass": lambda: {"shift_mm": 1e3 * _length(x)},
-        "load": lambda: {"change_N": sign * float(x[0]), "shift_mm": 1e3 * _length(x[1:])},
-        "mounting": lambda: {"turn_deg": deg},
-        "sensor": lambda: {"turn_deg": deg, "force_N": _length(moved[:3]), "torque_Nm": _length(moved[3:])},
-    }[what]()
-    size = wrench.size
-    criterion = size * np.log(max(misfit, 1e-300)) + _SIZE[what] * np.log(size)
-    return Change(what, rows, values, undone - columns @ x + _bias(p), misfit, float(criterion))
+        "turn_deg": float(np.degrees(angle_between(turn, np.eye(3)))),
+        "force_N": _length(step[:3]),
+        "torque_Nm": _length(step[3:]),
+        "change_N": float(moved[9] if rows[-1] else -moved[9]),
+        "shift_mm": 1e3 * _length(moved[COM]),
+    }
+    criterion = wrench.size * np.log(max(misfit, 1e-300)) + len(own) * np.log(wrench.size)
+    return Change(code, rows, values, undone - C @ x[: len(own)] + _bias(p), misfit, float(criterion))
 
 
 def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
@@ -241,16 +244,13 @@ def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
     return max(left, 0.0) / max(r.size - len(x), 1), x / unit
 
 
-def _load_columns(p: Parameters, R: Array) -> Array:
-    """(n, 6, 4) derivative by the weight and by the centre of mass."""
-    J = jacobian(p, R)
-    down = p.gravity_force_base_N / (np.linalg.norm(p.gravity_force_base_N) or 1.0)
-    return np.concatenate([J[..., 3:6] @ down[:, None], J[..., 9:12]], axis=2)
-
-
-def _turn_columns(g: Array) -> Array:
-    """(n, 6, 3) derivative of a wrench (n, 6) by a turn of its axes."""
-    return -np.concatenate([skew(g[:, :3]), skew(g[:, 3:])], axis=1)
+def _columns(p: Parameters, R: Array) -> Array:
+    """(n, 6, 13) derivative by a turn of the sensor, both biases, weight and centre of mass."""
+    J, g = jacobian(p, R), gravity_wrench(p, R)
+    down = p.gravity_force_base_N / (_length(p.gravity_force_base_N) or 1.0)
+    turn = -np.concatenate([skew(g[:, :3]), skew(g[:, 3:])], axis=1)
+    bias = np.broadcast_to(np.eye(6), (len(R), 6, 6))
+    return np.concatenate([turn, bias, (J[..., 3:6] @ down)[..., None], J[..., 9:12]], axis=2)
 
 
 def _turned(wrench: Array, turn: Array) -> Array:

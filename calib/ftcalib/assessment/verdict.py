@@ -220,7 +220,7 @@ def _other_poses(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None) -
 def _some_runs(t_s: Array | None, n: int) -> NDArray[np.intp]:
     """Rows by time: all, or of many poses evenly spread runs."""
     order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
-    return order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0]
+    return np.asarray(order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0])
 
 
 def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:

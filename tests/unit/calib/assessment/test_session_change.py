@@ -132,7 +132,7 @@ def test_gain_and_cross_talk_of_a_fit_hide_no_part_of_a_change() -> None:
     wrench += rng.normal(0, SIGMA, wrench.shape) + response_columns(TOOL, ORIENTATIONS) @ rng.normal(0, 0.01, SIZE)
     change = likeliest_change(TOOL, ORIENTATIONS, wrench, SIGMA)
     assert change is not None
-    assert (change.what, int(np.flatnonzero(np.diff(change.rows))[0]) + 1) == ("load", 14)
+    assert (change.code, change.first) == ("load_changed", 14)
     # Beside 15 free parameters the sigma of a step between two halves is about that of a mean of 4 poses.
     lighter_N = np.linalg.norm(LIGHTER.gravity_force_base_N) - np.linalg.norm(TOOL.gravity_force_base_N)
     assert change.values["change_N"] == pytest.approx(lighter_N, abs=3 * SIGMA[0] / 2)
