@@ -30,6 +30,7 @@ from ftcalib.model import Array
 
 Rng = np.random.Generator
 Spoil = Callable[["Case"], "Case"]
+Turning = Callable[[Rotation], Rotation]
 Score = Literal["first", "misled", "later", "unnamed", "wrong", "good", "hidden", "harmless"]
 
 NOISE = np.repeat([0.01, 4e-4], 3)
@@ -133,7 +134,7 @@ def columns(case: Case) -> Case:
     return replace(case, wrench=np.roll(case.wrench, 3, axis=1), sigma=np.roll(case.sigma, 3))
 
 
-def rotations(case: Case, change: Callable[[Rotation], Rotation]) -> Case:
+def rotations(case: Case, change: Turning) -> Case:
     return replace(case, R=change(Rotation.from_matrix(case.R)).as_matrix())
 
 
@@ -324,6 +325,10 @@ def euler(R: Rotation, read: Literal["xyz", "XYZ"], written: Literal["xyz", "XYZ
     return Rotation.from_euler(read, R.as_euler(written))
 
 
+TO_EXTRINSIC: Turning = partial(euler, read="xyz", written="XYZ")
+TO_INTRINSIC: Turning = partial(euler, read="XYZ", written="xyz")
+
+
 SWAP, CYCLE, FLIP = np.eye(3)[[1, 0, 2]], np.eye(3)[[1, 2, 0]], np.diag([1.0, -1, 1])
 PAIRING = "pairing_or_rotations|euler_angles"
 BUMPED = "poses_rejected|poses_contact|pose_deviates"
@@ -360,9 +365,9 @@ KINDS: dict[str, tuple[Spoil, str, Callable[[Case], bool]]] = {
         'mounting_undeclared.*"w, x, y, z"|gravity_off_mounting.*"w, x, y, z"|weight_upwards', always),
     "degrees as radians": (
         partial(rotations, change=lambda R: Rotation.from_rotvec(np.rad2deg(R.as_rotvec()))), PAIRING, always),
-    "intrinsic Euler as extrinsic": (partial(rotations, change=partial(euler, read="xyz", written="XYZ")), PAIRING,
+    "intrinsic Euler as extrinsic": (partial(rotations, change=TO_EXTRINSIC), PAIRING,
                                      always),
-    "extrinsic Euler as intrinsic": (partial(rotations, change=partial(euler, read="XYZ", written="xyz")), PAIRING,
+    "extrinsic Euler as intrinsic": (partial(rotations, change=TO_INTRINSIC), PAIRING,
                                      always),
     "Euler angles as rotation vector": (
         partial(rotations, change=lambda R: Rotation.from_rotvec(R.as_euler("xyz"))), PAIRING, always),
@@ -472,8 +477,7 @@ def followed(finding: Finding, case: Case, clean: Case) -> list[Case]:
     if code == "quaternion_order":
         return _read_as(case, [values["order"], *values["also"]])
     if code == "euler_angles":
-        read, written = ("xyz", "XYZ") if values["order"] == "extrinsic" else ("XYZ", "xyz")
-        return [rotations(case, partial(euler, read=read, written=written))]
+        return [rotations(case, TO_EXTRINSIC if values["order"] == "extrinsic" else TO_INTRINSIC)]
     if code == "pairing_shifted":
         return [shifted(case, by=-1 if values["neighbour"] == "before" else 1)]
     if code == "columns_swapped":
@@ -491,9 +495,14 @@ def followed(finding: Finding, case: Case, clean: Case) -> list[Case]:
 
 def _read_as(case: Case, forms: list[str]) -> list[Case]:
     """Read orientations in these forms instead."""
-    reading = {"w, x, y, z": partial(quaternions, shift=-1), "x, y, z, w": partial(quaternions, shift=1)}
+    reading: dict[str, Turning] = {
+        "w, x, y, z": partial(quaternions, shift=-1),
+        "x, y, z, w": partial(quaternions, shift=1),
+    }
     found = [change for form in forms for order, change in reading.items() if order in form]
-    return [rotations(case, change) for change in [*found, *[Rotation.inv] * any("inverted" in one for one in forms)]]
+    if any("inverted" in form for form in forms):
+        found.append(Rotation.inv)
+    return [rotations(case, change) for change in found]
 
 
 def leads_to_the_truth(finding: Finding, case: Case, clean: Case) -> bool:
