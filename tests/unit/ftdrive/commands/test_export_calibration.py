@@ -79,7 +79,7 @@ def test_json_has_text_notes_and_what_is_set_elsewhere(saved: Path) -> None:
 def test_a_file_is_new_and_complete_or_absent(saved: Path, tmp_path: Path) -> None:
     path = tmp_path / "ft.yaml"
     first = export("calibration", saved, "--format", "kit", "-o", path)
-    assert (first.exit_code, first.stdout) == (0, "")
+    assert (first.exit_code, first.stdout) == (0, f" Saved {path}\n")
     text = path.read_text()
     again = export("calibration", saved, "--format", "kit", "-o", path)
     assert isinstance(again.exception, ConfigError)
