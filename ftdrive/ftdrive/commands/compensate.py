@@ -60,7 +60,7 @@ def compensate(
     from ftdrive.recording.compensation import compensated
     from ftdrive.recording.files import format_of
     from ftdrive.runs.source import read_calibration
-    from ftdrive.terminal.console import answer, messages, working
+    from ftdrive.terminal.console import beside, messages, working
 
     if output is not None:
         format_of(output)
@@ -79,7 +79,7 @@ def compensate(
         echo("\n".join(_words(result, str(frame))))
     if output is not None:
         short = "" if failure is None else f": the first {result['samples']} samples"
-        (messages if as_json else answer).print(f" Saved {output}{short}")
+        beside(as_json).print(f" Saved {output}{short}")
     if failure is not None:
         raise failure
 

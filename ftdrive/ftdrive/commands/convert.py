@@ -18,7 +18,7 @@ def convert(source: Path, target: Path, as_json: bool) -> None:
     """
     from ftdrive.recording.files import RecordingReader, format_of
     from ftdrive.recording.recorder import converted
-    from ftdrive.terminal.console import answer, messages, working
+    from ftdrive.terminal.console import beside, messages, working
 
     format_of(target)
     with working("Converting") as show:
@@ -28,7 +28,7 @@ def convert(source: Path, target: Path, as_json: bool) -> None:
     if cut:
         messages.print(f" {source} is incomplete ({cut}): {found['duration_s']:.1f} s of it are saved.")
     short = "" if failure is None else f": the first {found['samples']} samples"
-    (messages if as_json else answer).print(f" Saved {target}{short}")
+    beside(as_json).print(f" Saved {target}{short}")
     if as_json:
         write_json({"schema_version": 1, "file": str(target), **found, "complete": not cut})
     if failure is not None:
