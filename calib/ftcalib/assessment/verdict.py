@@ -13,20 +13,17 @@ from ftcalib.assessment import described_cell, units
 from ftcalib.assessment.contradictions import contradictions
 from ftcalib.assessment.cross_validation import AssessedFit, DriftAhead, drift_ahead, standardized
 from ftcalib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, other_poses
-from ftcalib.assessment.load_shift import lasting_change
 from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
+from ftcalib.assessment.session_change import session_change
 from ftcalib.findings import Finding, Severity, Verdict, ordered, verdict_of
 from ftcalib.known import Known
-from ftcalib.likelihood.fit import DriftEstimate
+from ftcalib.likelihood.fit import DriftEstimate, Fit
 from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters
 from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftcalib.setup import NOTHING, Setup
 
 SIGNIFICANT_SIGMAS = 5.0
-NEAREST_COM_M = 5e-4
-LIGHTEST_N, HEAVIEST_N = 0.05, 2000.0
-"""Weights beyond these look like forces in another unit: 5 g, and far more than any UR arm carries."""
 NOISE_FACTOR = 3.0
 USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
 SENSELESS_SHARE = 0.5
@@ -116,7 +113,9 @@ def judge(
     suspect = at.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
     broken = broken_channels(fit.wrench, fit.R_base_flange) if fit.chi2 > NOISELESS * fit.dof else []
     mistakes = _mistakes(fit, at.used, t_s, setup) if suspect else []
-    changed = _change(fit, at, measured_sigma, t_s)
+    changed = [] if mistakes else _change(unconstrained or fit, at, measured_sigma, t_s)
+    if suspect and not (mistakes or changed):
+        mistakes = _other_poses(fit, at.used, t_s)
     contradicted: list[Finding] = []
     if known is not None and unconstrained is not None:
         at_its_best = unconstrained.parameters, unconstrained.covariance
@@ -129,7 +128,7 @@ def judge(
         *at.errors,
         *_weight(fit, weight_N, setup),
         *_second_solution(fit),
-        *_implausible_units(parameters, weight_N),
+        *units.implausible(parameters, _rms(fit.residuals[at.used, :3]), described=bool(setup.cylinders_m)),
         *([] if contradicted or at.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
         *_noise(fit, at),
         *_poses(fit, at, "note" if few_rejected else "limit"),
@@ -225,14 +224,24 @@ def _mistakes(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, setu
 
     A wrong pose or two were rejected; only the used poses show whether most of them are wrong.
     """
-    n = len(used)
-    order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
-    order = order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0]
+    order = _some_runs(t_s, len(used))
     found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
     order = order[used[order]]
     if not found and not used.all():
         found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
-    return found or other_poses(fit.R_base_flange[order], fit.wrench[order])
+    return found
+
+
+def _other_poses(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None) -> list[Finding]:
+    order = _some_runs(t_s, len(used))
+    order = order[used[order]]
+    return other_poses(fit.R_base_flange[order], fit.wrench[order])
+
+
+def _some_runs(t_s: Array | None, n: int) -> NDArray[np.intp]:
+    """Rows by time: all, or of many poses evenly spread runs."""
+    order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
+    return np.asarray(order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0])
 
 
 def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:
@@ -321,23 +330,6 @@ def _second_solution(fit: AssessedFit) -> list[Finding]:
     if delta >= ACCEPTED_DELTA_CHI2:
         return []
     return [Finding.of("second_solution", probability_percent=100 * wrong_basin_probability(max(delta, 0.0)))]
-
-
-def _implausible_units(parameters: Parameters, weight_N: float) -> list[Finding]:
-    """Name the units that make an implausible weight or centre of mass usual."""
-    com_m, found = float(np.linalg.norm(parameters.p_sensor_com_m)), []
-    if not LIGHTEST_N <= weight_N <= HEAVIEST_N:
-        heavy = weight_N > HEAVIEST_N
-        suspects = units.suspects(parameters, ("mN" if heavy else "kN",))
-        found.append(
-            Finding.of("weight_implausible", "reject" if heavy else "limit", weight_N=weight_N, units=suspects)
-        )
-    if com_m > described_cell.FARTHEST_COM_M:
-        values = {"distance_m": com_m, "most_m": described_cell.FARTHEST_COM_M}
-        found.append(Finding.of("com_too_far", **values, units=units.by_com(com_m)))
-    if com_m < NEAREST_COM_M:
-        found.append(Finding.of("com_too_near", distance_mm=1e3 * com_m))
-    return found
 
 
 def _misfit_of_known_values(fit: AssessedFit, unconstrained: AssessedFit | None) -> list[Finding]:
@@ -429,27 +421,14 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
 
 
 def _change(fit: AssessedFit, at: _Statistics, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
-    """Name a lasting change between two poses, which no white noise explains: all poses after it deviate alike.
-
-    Poses of two different loads have no result in common, unless all poses before the change were rejected.
-    """
-    if measured_sigma is None or at.chi2_p is None or (at.fits_measured_noise and at.used.all()):
+    """Name a lasting change, where the fit needs what could hide one: drift, more noise, or poses left out."""
+    kinds = ("walk", "slope") if at.chi2_p is None else ("walk", "slope", "white")
+    hides = any(name.startswith(kinds) for name in fit.components)
+    if not isinstance(fit, Fit) or not (at.errors or hides or not at.used.all()):
         return []
-    n = len(fit.wrench)
-    times = np.arange(n, dtype=np.float64) if t_s is None or not np.isfinite(t_s).all() else t_s
-    order = np.argsort(times, kind="stable")
-    change = lasting_change(
-        fit.parameters,
-        fit.R_base_flange[order],
-        fit.residuals[order],
-        measured_sigma,
-        times[order],
-        np.flatnonzero(np.isin(order, out_of_line(at.residual_sigma, at.used))).tolist(),
-    )
-    if change is None:
-        return []
-    two_loads = change.of_the_tool and at.used[order[: change.position]].any()
-    return [change.finding(int(order[change.position]) + 1, "reject" if two_loads else "note")]
+    if t_s is None or not np.isfinite(t_s).all():
+        t_s = np.arange(len(fit.wrench), dtype=np.float64)
+    return session_change(fit, np.argsort(t_s, kind="stable"), t_s, measured_sigma)
 
 
 def _rms(vectors: Array) -> float:
