@@ -8,7 +8,7 @@ import numpy as np
 
 from ftcalib.assessment.contradictions import contradictions
 from ftcalib.assessment.cross_validation import AssessedFit, IndependentFit
-from ftcalib.assessment.faults import faults, other_poses
+from ftcalib.assessment.faults import faults, no_weight, other_poses
 from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from ftcalib.assessment.verdict import SIGNIFICANT_SIGMAS, judge
 from ftcalib.data.dataset import CalibrationDataset
@@ -168,6 +168,10 @@ def solve(
         quality={
             "loo_force_rms_N": quality.loo_force_rms_N,
             "loo_torque_rms_Nm": quality.loo_torque_rms_Nm,
+            "next_use_force_rms_N": quality.next_use_force_rms_N,
+            "next_use_torque_rms_Nm": quality.next_use_torque_rms_Nm,
+            "last_bias_offset": quality.ahead.offset.tolist(),
+            "bias_growth_per_min": quality.ahead.growth_per_min.tolist(),
             "worst_pose": quality.worst_pose + 1,
             "residual_sigma": quality.residual_sigma.tolist(),
             "lag1": quality.lag1,
@@ -205,7 +209,7 @@ def _mistakes(
 ) -> list[Finding]:
     """Find what explains that poses do not determine the parameters: wrong known values can leave no weight."""
     poses = dataset.R_base_flange, dataset.wrench
-    found = faults(*poses, setup.up) or other_poses(*poses)
+    found = faults(*poses, setup.up) or other_poses(*poses) or no_weight(*poses)
     if not found and known is not None and (free := _unconstrained(dataset, wrench_cov, drift)) is not None:
         found = contradictions(known, free.parameters, free.covariance, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
     return found

@@ -1,5 +1,6 @@
 """Recordings compensated in processes and on a Dask cluster: the same bytes."""
 
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,7 @@ def test_processes_and_a_cluster_give_the_same_bytes(recordings: list[Path], tmp
     here = [compensated_bytes(one.read_bytes(), one.name, TASK).rpartition(b"\n")[0] for one in recordings]
     with local_workers(2) as workers:
         assert results(recordings, tmp_path / "processes", workers) == here
+    import_module("distributed")  # its defaults first: else all of them leave with the one that is changed here
     with dask_cluster() as cluster, config.set({"distributed.admin.large-graph-warning-threshold": "1kB"}):
         cluster.start_worker()
         with cluster_workers(cluster.address, timeout_s=60) as workers:
