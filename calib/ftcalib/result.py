@@ -27,6 +27,9 @@ FORMAT = "ftdrive.calibration/1"
 COMMON_GAIN = float(np.sqrt(5 / 3 / 3))
 """Sigma of the mean of three gains over that of one; five numbers determine that one, so 5/3 as in Student's t."""
 
+INDEFINITE = -1e-6
+"""Eigenvalues of a correlation matrix below this are no rounding."""
+
 Method = Literal[
     "ml",
     "srom",
@@ -136,6 +139,8 @@ class CalibrationResult:
         if isinstance(self.response, Mapping):
             given = self.response
             object.__setattr__(self, "response", Response(given["coefficients"], given["covariance"]))
+        joint = self.covariance if self.response is None else self.response.covariance
+        require_positive_definite(joint)
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
         found = (one if isinstance(one, Finding) else Finding.from_dict(one) for one in self.findings)
         object.__setattr__(self, "findings", tuple(found))
@@ -428,6 +433,16 @@ class CalibrationResult:
             return cls.from_dict(document, accept_edited=accept_edited)
         except BadCalibration as exc:
             raise BadCalibration(f"{Path(path).name}: {exc}") from exc
+
+
+def require_positive_definite(covariance: Array) -> None:
+    """Raise `ValueError` for a covariance with a negative eigenvalue; exactly known values have none."""
+    sigma = np.sqrt(np.abs(np.diag(covariance)))
+    free = sigma > 0
+    correlations = covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
+    least = float(np.linalg.eigvalsh(correlations)[0]) if free.any() else 0.0
+    if least < INDEFINITE:
+        raise ValueError(f"the covariance is not positive definite: its smallest normalised eigenvalue is {least:.2g}")
 
 
 def _require_known_words(result: CalibrationResult) -> None:

@@ -107,7 +107,7 @@ def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
     while k < len(best.components):
         rest = [i for i in range(len(best.components)) if i != k]
         components, theta = [best.components[i] for i in rest], best.theta[rest]
-        without = point(problem, components, theta)  # the others can regain a part of what is lost
+        without = point(problem, components, theta, best)  # the others can regain a part of what is lost
         if best.loglik - without.loglik < SURE:
             without = maximise(problem, components, theta)
         if without.worth > best.worth:
@@ -121,7 +121,7 @@ def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Componen
     """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
     start = units(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * start])
-    at = point(problem, components, theta) if best.noise.walks else best
+    at = point(problem, components, theta) if best.own.walks else best
     slope, information = score(problem, at, components, theta)
     k = len(best.components)
     curvature, slope_k = np.diag(information)[k:], slope[k:]

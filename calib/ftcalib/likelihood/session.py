@@ -7,6 +7,7 @@ import numpy as np
 
 from ftcalib.known import Constraints
 from ftcalib.likelihood.descent import Descent, Minimum, column_scale
+from ftcalib.likelihood.gain_and_cross_talk import LEVER_M as CROSS_TALK_LEVER_M
 from ftcalib.likelihood.gain_and_cross_talk import response_columns
 from ftcalib.likelihood.outliers import Kept
 from ftcalib.likelihood.session_noise import Noise, pose_times
@@ -106,8 +107,9 @@ class Session:
             A, residual = self.constraints.measurements(p)
             Z = self.constraints.free(p)
             J, H, g = J @ Z, Z.T @ A.T @ A @ Z, Z.T @ A.T @ residual
-        slope = np.full(6, np.inf) if self.drift == "linear" else None
-        return Linearised(J, r, (H, g), turn, self.cov, self.time, kept, slope, response_columns(p, self.R))
+        lever = float(np.linalg.norm(p.p_sensor_com_m)) / CROSS_TALK_LEVER_M
+        response = response_columns(p, self.R)
+        return Linearised(J, r, (H, g), turn, self.cov, self.time, kept, self.drift == "linear", response, lever)
 
     def _groups(self) -> list[range]:
         return [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]

@@ -150,6 +150,7 @@ def without(name: str) -> str:
         ('{"format": "ftdrive.calibration/2"}', "version '2' of ftdrive.calibration"),
         (without("chi2"), "lacks the field chi2"),
         (json.dumps({**RESULT.to_dict(), "covariance": [[1]]}), "covariance must be"),
+        (json.dumps({**RESULT.to_dict(), "covariance": (-np.eye(15)).tolist()}), "not positive definite"),
         (json.dumps({**RESULT.to_dict(), "force_bias_N": "x"}), "cannot be read"),
         (json.dumps({**RESULT.to_dict(), "force_bias_N": [0, float("nan"), 0]}), "force_bias_N must be finite"),
         (json.dumps({**RESULT.to_dict(), "R_flange_sensor": (-np.eye(3)).tolist()}), "must be a rotation matrix"),

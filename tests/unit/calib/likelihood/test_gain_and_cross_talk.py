@@ -1,6 +1,7 @@
 """Gain and cross-talk of the sensor: found where they are, applied, kept in the file."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from ftcalib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, LEVER_M, 
 from ftcalib.likelihood.session import Session
 from ftcalib.likelihood.variance_components import FORCE, RESPONSE, component, maximise
 from ftcalib.model import Array, gravity_wrench, predict
+from ftcalib.result import require_positive_definite
 
 SIGMA = np.repeat([0.05, 0.00125], 3)
 WHITE = np.diag(SIGMA**2)
@@ -111,6 +113,26 @@ def test_white_noise_hides_no_walk_and_gain() -> None:
     found = {c.name for c in with_walks_instead(problem, hidden, data.candidates(), 0).components}
     assert {"gain", "walk_force_N"} <= found
     assert "white_force_N" not in found
+
+
+@pytest.mark.parametrize("seed", [5, 11])
+def test_the_joint_covariance_is_positive_definite_where_the_noise_is_unknown(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    _, R, wrench, _, _ = session(rng, 24, 0.02, 0.01)
+    best = fit(R, wrench + np.cumsum(2 * SIGMA * rng.normal(size=(24, 6)), axis=0), None)
+    assert best.response is not None
+    require_positive_definite(best.response.covariance)
+
+
+def test_a_far_centre_of_mass_is_no_reason_against_gain_and_cross_talk() -> None:
+    rng = np.random.default_rng(3)
+    p, R = truth(rng), np.asarray(Rotation.random(24, rng=rng).as_matrix())
+    p = replace(p, p_sensor_com_m=np.array([0.0, 0.0, 0.2]))
+    M, L = 0.03 * rng.normal(size=(3, 3)), 0.01 * LEVER_M * rng.normal(size=(3, 3))
+    best = fit(R, read(p, R, M, L) + SIGMA * rng.normal(size=(24, 6)), WHITE)
+    assert {"gain", "cross_talk"} <= best.components.keys()
+    elsewhere = Rotation.random(50, rng=rng).as_matrix()
+    assert np.sqrt(np.mean((predicted(best, elsewhere) - read(p, elsewhere, M, L)) ** 2)) < SIGMA[0]
 
 
 def test_six_poses_are_too_few_to_look_for_it() -> None:
