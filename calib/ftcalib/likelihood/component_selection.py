@@ -22,6 +22,7 @@ from ftcalib.model import Array
 
 SURE = 20.0  # a gain or loss that no other component can regain
 WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
+SMALL_RESPONSE, USUAL_RESPONSE = 0.005, 0.02  # gain and cross-talk of real sensors
 
 
 def select(
@@ -62,6 +63,23 @@ def select(
             best, last = trial, len(together)
         waiting = [c for i, c in enumerate(waiting) if i not in together]
     return best if len(best.components) - needed <= last else _pruned(problem, best, needed)
+
+
+def with_response_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
+    """Try gain and cross-talk together in place of white noise as large as a small gain.
+
+    A mounting that fits the torques alone makes the forces look noisy, and the gain that would explain them useless.
+    """
+    added = [c for c in RESPONSE if c in candidates]
+    if not added or all(c.kind != "white" for c in best.components):
+        return best
+    if len(problem.r) * max(units(problem, best, added)) < SMALL_RESPONSE**2:
+        return best
+    rest = [k for k, c in enumerate(best.components) if c not in added and (k < needed or c.kind != "white")]
+    quiet = [best.theta[k] * (1e-2 if best.components[k].kind == "white" else 1.0) for k in rest]
+    start = np.append(quiet, np.full(len(added), USUAL_RESPONSE**2))
+    trial = _pruned(problem, maximise(problem, [*(best.components[k] for k in rest), *added], start), needed)
+    return trial if trial.worth > best.worth and not trial.too_large else best
 
 
 def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:

@@ -16,6 +16,7 @@ from ftcalib.likelihood.component_selection import (
     WORTH_A_TRY,
     predicted_gains,
     select,
+    with_response_instead,
     with_slopes_instead,
     with_walks_instead,
 )
@@ -131,6 +132,7 @@ def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
     at = select(problem, always, session.start(problem, always), candidates, len(always))
     best = Explanation(p, kept)
     for _ in range(ROUNDS):
+        at = with_response_instead(problem, at, candidates, len(always))
         if session.drift == "auto":
             at = with_walks_instead(problem, at, candidates, len(always))
             at = with_slopes_instead(problem, at, len(always))

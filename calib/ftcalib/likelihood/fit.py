@@ -13,7 +13,7 @@ from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.descent import MAX_STEPS, Minimum, column_scale
 from ftcalib.likelihood.explanation import Explanation, explain, noise_under
 from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response, response_columns
-from ftcalib.likelihood.session import FEW_POSES_FOR_RESPONSE, Drift, Session
+from ftcalib.likelihood.session import Drift, Session
 from ftcalib.likelihood.session_noise import Noise, summed_products
 from ftcalib.likelihood.variance_components import (
     POSES_THAT_SHOW_THE_NOISE,
@@ -103,44 +103,32 @@ class Fit:
         return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange) - added)
 
     @cached_property
-    def _pass(self) -> tuple[Array, Array, Array]:
-        """One pass over the poses: left-out residuals, their covariance, and the normal equations (27, 27).
-
-        These are of the 15 parameters, the residual and the 11 numbers of gain and cross-talk.
-        """
-        e, S, G = np.empty((len(self.order), 6)), np.empty((len(self.order), 6, 6)), np.zeros((27, 27))
+    def _left_out(self) -> tuple[Array, Array]:
+        """Left-out residuals and their covariance."""
+        e, S = np.empty((len(self.order), 6)), np.empty((len(self.order), 6, 6))
         for part, noise in self.noise.parts():
             rows = self.order[part]
             R = self.R_base_flange[rows]
             r = self.wrench[rows] - predict(self.parameters, R)
-            X = np.concatenate(
-                [jacobian(self.parameters, R), r[..., None], response_columns(self.parameters, R)], axis=2
-            )
-            WX = noise.solve(X)
-            G += summed_products(X, WX)
+            WX = noise.solve(np.concatenate([jacobian(self.parameters, R), r[..., None]], axis=2))
             # With a prior the best parameters leave some of J' W r.
             e[rows], S[rows] = left_out(noise, WX[..., :15], WX[..., 15], self.given_noise)
-        return e, S, G
+        return e, S
 
-    @cached_property
+    @property
     def gain_sigma(self) -> float:
-        """Standard deviation of the entries of the gain: as found, else what the data leave room for, by moments."""
-        if "gain" in self.components or len(self.weights) < FEW_POSES_FOR_RESPONSE:
-            return self.components.get("gain", 0.0)
-        G, own = self._pass[2], slice(16, 21)
-        Tu, M = G[own, 15], G[own, own] - G[own, :15] @ self.given_noise @ G[:15, own]
-        excess = float(Tu @ np.linalg.lstsq(M, Tu, rcond=1e-9)[0]) - len(M)
-        return float(np.sqrt(max(excess, 0.0) / np.trace(M)))
+        """Standard deviation of the entries of the gain; 0 if none was found."""
+        return 0.0 if self.response is None else self.response.gain_sigma
 
     @property
     def left_out_residuals(self) -> Array:
         """(n, 6) measured minus what all other poses predict for this one, drift and correlation included."""
-        return self._pass[0]
+        return self._left_out[0]
 
     @property
     def left_out_cov(self) -> Array:
         """(n, 6, 6) covariance of these: noise of the pose and uncertainty of its prediction."""
-        return self._pass[1]
+        return self._left_out[1]
 
 
 def fit(
