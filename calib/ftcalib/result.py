@@ -101,7 +101,8 @@ class CalibrationResult:
     """Standard deviations of the variance components, by name and unit: beyond the measured noise, or all of the noise
     if it was not measured. `walk_…` is the random walk of the bias per mean interval between poses, `slope_…` its
     linear change over the session, `rotation_rad` the error of each pose's orientation per axis, `gain` and
-    `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm."""
+    `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm, `hysteresis` the
+    share of its last swing by which each axis lags."""
     drift: DriftResult | None = None
     """None: no drift was found, or `drift="none"`."""
     response: Response | None = None
@@ -271,7 +272,8 @@ class CalibrationResult:
         cov = self.covariance[3:6, 3:6]
         weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, cov)
         if weight > 1e-9 * self.weight_N:  # not exactly known
-            common = max(LEAST_COMMON_GAIN, COMMON_GAIN * self.gain_sigma)
+            lag = self.components.get("hysteresis", 0.0)
+            common = max(LEAST_COMMON_GAIN, float(np.hypot(COMMON_GAIN * self.gain_sigma, lag)))
             weight = float(np.hypot(weight, common * self.weight_N))
         return {
             "R_flange_sensor": std[0:3],

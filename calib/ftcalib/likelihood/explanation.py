@@ -61,7 +61,7 @@ class Explanation:
     @property
     def noise_moves(self) -> bool:
         """Whether the noise depends on the parameters."""
-        return not {"rotation", "gain", "cross_talk"}.isdisjoint(c.kind for c in self.components)
+        return not {"rotation", "gain", "cross_talk", "hysteresis"}.isdisjoint(c.kind for c in self.components)
 
 
 def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:

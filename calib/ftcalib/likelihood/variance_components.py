@@ -20,15 +20,15 @@ from ftcalib.model import Array
 GAIN = 2.0
 """A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance."""
 GAIN_OF_RESPONSE = 3.0
-"""The same for gain and cross-talk of the sensor, whose 5 and 6 numbers come in by chance in 0.4 %."""
+"""The same for gain, cross-talk and hysteresis, whose 5 and 6 numbers come in by chance in 0.4 %."""
 SETTLED = 1e-4  # squared distance from the best variances, in their standard deviations
 NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
-LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2}
+LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2, "hysteresis": 0.03**2}
 """Variances that no arm or sensor in working order exceeds. A larger one has another cause."""
 POSES_THAT_SHOW_THE_NOISE = 1000  # fewer leave its size uncertain enough to matter
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
-Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk"]
+Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk", "hysteresis"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ class Component:
     @property
     def needed(self) -> float:
         """The gain in log-likelihood that it must bring."""
-        return GAIN_OF_RESPONSE if self.kind in ("gain", "cross_talk") else GAIN
+        return GAIN_OF_RESPONSE if self.kind in ("gain", "cross_talk", "hysteresis") else GAIN
 
 
 def component(kind: Kind, channels: Sequence[int]) -> Component:
@@ -54,6 +54,7 @@ def component(kind: Kind, channels: Sequence[int]) -> Component:
 
 FORCE, TORQUE = range(3), range(3, 6)
 ROTATION = Component("rotation_rad", "rotation", (0.0,) * 6)
+HYSTERESIS = Component("hysteresis", "hysteresis", (0.0,) * 6)
 RESPONSE = tuple(Component(kind, kind, (0.0,) * 6) for kind in ("gain", "cross_talk"))
 
 
@@ -79,23 +80,24 @@ class Linearised:
     """Whether a linear drift of unknown size is part of the model."""
     response: Array
     """(n, 6, 11) derivative by gain and cross-talk of the sensor."""
+    hysteresis: Array
+    """(n, 6, 6 or more) derivative by the shares of the last swing by which the axes lag."""
     lever: float = 0.0
     """Distance of the centre of mass, in levers of the cross-talk."""
 
     @cached_property
     def X(self) -> Array:
-        """(n, 6, M) all that acts on all poses at once: parameters, slopes, gain and cross-talk; last the residuals."""
+        """(n, 6, M) by parameters, slopes, gain, cross-talk, hysteresis: all that acts on all poses; then residuals."""
         slopes = centred(self.time)[:, None, None] * np.eye(6)
-        return np.concatenate([self.J, slopes, self.response, self.r[..., None]], axis=2)
+        return np.concatenate([self.J, slopes, self.response, self.hysteresis, self.r[..., None]], axis=2)
 
     def columns(self, c: Component) -> NDArray[np.intp] | None:
         """Columns of `X` whose coefficients have this variance; None for what acts on each pose by itself."""
         m = self.J.shape[2]
         if c.kind == "slope":
             return np.asarray(m + np.flatnonzero(c.share))
-        if c.kind == "gain":
-            return np.arange(m + 6, m + 11)
-        return np.arange(m + 11, m + 17) if c.kind == "cross_talk" else None
+        ends = {"gain": (6, 11), "cross_talk": (11, 17), "hysteresis": (17, 17 + self.hysteresis.shape[2])}.get(c.kind)
+        return None if ends is None else np.arange(m + ends[0], m + ends[1])
 
     def largest(self, c: Component) -> float:
         """Variance that no arm or sensor in working order exceeds.
@@ -161,6 +163,11 @@ class Point:
         """Inverse covariance times the unknowns' columns (n, 6, k), and times the residuals of the best ones (n, 6)."""
         WX = self.WX[..., self.unknown]
         return WX, self.WX[..., -1] - WX @ self.x
+
+    def effect(self, c: Component) -> Array:
+        """(n, 6) best linear prediction of what a component that acts on all poses does to each."""
+        own = np.flatnonzero(np.isin(self.unknown, self.problem.columns(c)))
+        return np.asarray(self.problem.X[..., self.unknown[own]] @ self.x[own])
 
     def left_out(self) -> tuple[Array, Array]:
         """Residual (n, 6) of each pose when all others predict it, and its covariance (n, 6, 6)."""
@@ -367,7 +374,8 @@ def estimates(problem: Linearised, at: Point) -> tuple[Array, Array]:
     covariance : array, shape (m + 11, m + 11)
     """
     m, size = problem.J.shape[2], problem.response.shape[2]
-    values, covariance = np.zeros(m + 6 + size), np.zeros((m + 6 + size, m + 6 + size))
+    every = problem.X.shape[2] - 1
+    values, covariance = np.zeros(every), np.zeros((every, every))
     values[at.unknown], covariance[np.ix_(at.unknown, at.unknown)] = at.x, at.C
     shown = np.r_[:m, m + 6 : m + 6 + size]
     return values[shown], covariance[np.ix_(shown, shown)]

@@ -119,7 +119,16 @@ def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...],
     r = (np.linalg.cholesky(V) @ rng.normal(size=(n, 6, 1)))[..., 0]
     r += np.cumsum(rng.normal(size=(n, 6)) * walk, axis=0)
     return Linearised(
-        J, r, (np.zeros((8, 8)), np.zeros(8)), turn, D, time, np.ones(n, bool), False, np.zeros((n, 6, 11))
+        J,
+        r,
+        (np.zeros((8, 8)), np.zeros(8)),
+        turn,
+        D,
+        time,
+        np.ones(n, bool),
+        False,
+        np.zeros((n, 6, 11)),
+        np.zeros((n, 6, 12)),
     )
 
 
