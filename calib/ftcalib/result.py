@@ -113,6 +113,8 @@ class CalibrationResult:
     """Increase of chi2 at the second best solution, under the noise model; None: there is no other."""
     quality: Mapping[str, JSON] = field(default_factory=dict)
     """Statistics behind the verdict: `loo_force_rms_N` and `loo_torque_rms_Nm` (each pose predicted from all others),
+    `next_use_force_rms_N` and `next_use_torque_rms_Nm` (`likely_error`), `last_bias_offset` (6; bias at the last pose
+    minus that of the result, the mean of the tour), `bias_growth_per_min` (6; its change in the minute after),
     `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
     `correlations` (pairs of parameters above 0.9)."""
 
@@ -336,16 +338,17 @@ class CalibrationResult:
         return not self.quality or (self.p_value is not None and self.p_value >= SURE)
 
     def likely_error(self) -> Array:
-        """Root mean square error (2,) of compensating a free tool over all orientations, N and N·m.
+        """Root mean square error (2,) of compensating a free tool at the next use, N and N·m.
 
-        It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the larger of that and
-        of the error in predicting each pose from all others.
+        It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the error in predicting
+        each pose from all others, so it holds for orientations like those of the tour. In both it has the drift of the
+        bias from the mean of the tour to one minute after the last pose.
         """
-        predicted = np.array(self.predicted_error())
-        if self.noise_explains:
-            return predicted
-        left_out = [self.quality["loo_force_rms_N"], self.quality["loo_torque_rms_Nm"]]
-        return np.asarray(np.maximum(predicted, np.array(left_out, dtype=np.float64)))
+        if not self.quality:
+            return np.array(self.predicted_error())
+        # Files of version 0.1.0 and earlier have only the error of predicting each pose from all others.
+        keys = [f"{name}_{unit}" for name in ("next_use", "loo") for unit in ("force_rms_N", "torque_rms_Nm")]
+        return np.array([self.quality.get(keys[k], self.quality[keys[2 + k]]) for k in range(2)], dtype=np.float64)
 
     def residual_summary(self) -> dict[str, float]:
         """Root mean square and largest norm of the force and torque residuals over the poses."""

@@ -173,6 +173,10 @@ def solve(
         quality={
             "loo_force_rms_N": quality.loo_force_rms_N,
             "loo_torque_rms_Nm": quality.loo_torque_rms_Nm,
+            "next_use_force_rms_N": quality.next_use_force_rms_N,
+            "next_use_torque_rms_Nm": quality.next_use_torque_rms_Nm,
+            "last_bias_offset": quality.ahead.offset.tolist(),
+            "bias_growth_per_min": quality.ahead.growth_per_min.tolist(),
             "worst_pose": quality.worst_pose + 1,
             "residual_sigma": quality.residual_sigma.tolist(),
             "lag1": quality.lag1,

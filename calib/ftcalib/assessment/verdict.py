@@ -11,7 +11,7 @@ from scipy.special import ndtr as normal_cdf
 
 from ftcalib.assessment import described_cell, units
 from ftcalib.assessment.contradictions import contradictions
-from ftcalib.assessment.cross_validation import AssessedFit, standardized
+from ftcalib.assessment.cross_validation import AssessedFit, DriftAhead, drift_ahead, standardized
 from ftcalib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, other_poses
 from ftcalib.assessment.load_shift import lasting_change
 from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
@@ -58,6 +58,12 @@ class Quality:
     loo_force_rms_N: float
     """Cross-validated: root mean square error of predicting each used pose from all others."""
     loo_torque_rms_Nm: float
+    next_use_force_rms_N: float
+    """Of compensating a free tool a minute after the last pose: from noise alone if it explains the residuals, else
+    cross-validated; and the drift from the mean of the tour to then."""
+    next_use_torque_rms_Nm: float
+    ahead: DriftAhead
+    """That drift."""
     worst_pose: int
     """Row of the used pose with the largest cross-validated residual."""
     residual_sigma: Array
@@ -127,7 +133,7 @@ def judge(
         *([] if contradicted or at.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
         *_noise(fit, at),
         *_poses(fit, at, "note" if few_rejected else "limit"),
-        *_drift(fit.drift, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
+        *_drift(fit.drift, at.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
         *_response(fit.response),
     ]
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
@@ -146,6 +152,9 @@ def judge(
         noise_factor=at.noise_factor,
         loo_force_rms_N=at.loo_force_rms_N,
         loo_torque_rms_Nm=at.loo_torque_rms_Nm,
+        next_use_force_rms_N=float(at.next_use_rms[0]),
+        next_use_torque_rms_Nm=float(at.next_use_rms[1]),
+        ahead=at.ahead,
         worst_pose=at.worst_pose,
         residual_sigma=at.residual_sigma,
         lag1=at.lag1,
@@ -170,12 +179,22 @@ class _Statistics:
     """Of force and torque, if they are too large."""
     loo_force_rms_N: float
     loo_torque_rms_Nm: float
+    expected_rms: Array
+    """(2,) from noise alone, over all orientations."""
+    ahead: DriftAhead
     noise_factor: float | None
     chi2_p: float | None
 
     @property
     def fits_measured_noise(self) -> bool:
         return self.chi2_p is not None and self.chi2_p >= SURE
+
+    @property
+    def next_use_rms(self) -> Array:
+        """(2,) N, N·m."""
+        left_out = np.array([self.loo_force_rms_N, self.loo_torque_rms_Nm])
+        error = self.expected_rms if self.fits_measured_noise else left_out
+        return np.asarray(np.sqrt(error**2 + self.ahead.square.reshape(2, 3).sum(axis=1)))
 
 
 def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
@@ -194,6 +213,8 @@ def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
         largest_share,
         errors,
         *left_out_rms,
+        np.array(expected_error(fit.parameters, fit.covariance, fit.response)),
+        drift_ahead(fit, t_s),
         noise_factor=float(np.sqrt(fit.measured_chi2 / fit.dof)) if measured else None,
         chi2_p=float(chi2_sf(fit.dof, fit.measured_chi2)) if measured else None,
     )
@@ -362,8 +383,11 @@ def _poses(fit: AssessedFit, at: _Statistics, severity_of_rejected: Severity) ->
     return found
 
 
-def _drift(drift: DriftEstimate | None, weight_N: float, *, is_cause: bool) -> list[Finding]:
-    """Name a significant drift, 0 where it is not; it limits the result if it is large and no consequence."""
+def _drift(drift: DriftEstimate | None, ahead: DriftAhead, weight_N: float, *, is_cause: bool) -> list[Finding]:
+    """Name a significant drift, 0 where it is not.
+
+    It limits the result if it is no consequence, and large from the first pose to the last or up to the next use.
+    """
     if drift is None:
         return []
     force_N, torque_Nm = (float(np.linalg.norm(drift.change[part])) for part in (slice(0, 3), slice(3, 6)))
@@ -373,7 +397,8 @@ def _drift(drift: DriftEstimate | None, weight_N: float, *, is_cause: bool) -> l
     significant = np.array([channels[:3].any(), channels[3:].any()])
     if not significant.any():
         return []
-    matters = is_cause and size_N > USABLE_SHARE * weight_N
+    next_N, next_Nm = np.sqrt(ahead.square.reshape(2, 3).sum(axis=1))
+    matters = is_cause and max(size_N, next_N, next_Nm / USUAL_LEVER_M) > USABLE_SHARE * weight_N
     values = {"force_N": force_N * significant[0], "torque_Nm": torque_Nm * significant[1]}
     return [Finding.of("drift", "limit" if matters else "note", **values)]
 

@@ -136,8 +136,8 @@ def expected_with_inexact_orientations(
     """Explain the fit by scaled measured noise and inexact orientations, for each ratio of both; weights sum to 1.
 
     Drift is not part of it. Gain, cross-talk and hysteresis have the variance that the fit found. Empty if the noise
-    was not measured, for parameters that were known or not estimated by maximum likelihood, and for so many poses that the fit
-    finds all that matters.
+    was not measured, for parameters that were known or not estimated by maximum likelihood, and for so many poses that
+    the fit finds all that matters.
 
     Parameters
     ----------

@@ -80,7 +80,7 @@ class Processor:
         self._tares: list[tuple[Calibrated, int]] = [(calibration, 0)]
         likely_error = calibration.likely_error()
         self._usual_error_N = float(likely_error[0])
-        beyond = np.repeat((likely_error**2 - np.square(calibration.predicted_error())) / 3, 3)
+        beyond = np.repeat((likely_error**2 - np.square(calibration.predicted_error())).clip(0.0) / 3, 3)
         self._motion = self._motion_tracker()
         self._noise = NoiseEstimator(info.sensor_rate_Hz)
         self._noise_is_learnt = False

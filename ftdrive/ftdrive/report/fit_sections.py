@@ -75,12 +75,12 @@ def error(facts: Facts) -> Section:
     """Show the predicted error over all orientations, and its worst direction."""
     force, torque = facts["error_map"]["force_N"], facts["error_map"]["torque_Nm"]
     text = [
-        f"Compensation error of a free tool: {facts['error']['words']}.",
+        f"Compensation error of a free tool at the next use: {facts['error']['words']}.",
         f"Worst direction of the tool axis for the force: {force['words']}, {rounded(force['largest'])} N.",
         f"Worst direction for the torque: {torque['words']}, {rounded(torque['largest'])} N·m.",
     ]
     trust = (
-        "The map shows the stated uncertainty only: the cross-validated error above is larger."
+        "The map shows the stated uncertainty only: the error above has what the model lacks."
         if facts["error"]["cross_validated"]
         else "The measured noise explains the residuals, so the map can be trusted."
     )
@@ -223,6 +223,8 @@ def drift(facts: Facts) -> Section:
     else:
         model = "random walk" if any(name.startswith("walk") for name in seen["components"]) else "linear"
         text.append(f"The fit includes a drift of the bias ({model}), listed below. Good: within 3 sigma.")
+    if seen["in_use"] is not None:
+        text.append(f"{capital(seen['in_use'])}. Tare before use.")
     rows = [
         (
             f"{name}, {unit}",

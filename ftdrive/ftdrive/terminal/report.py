@@ -135,16 +135,38 @@ def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
             f"{with_sigma(np.linalg.norm(change[3:]), np.max(sigma[3:]))} N·m from the first pose to the last"
         )
         answer.print(hanging(" drift in the fit: ", words, answer))
+        if (ahead := drift_in_use(result)) is not None:
+            answer.print(hanging(" next use: ", f"{ahead}. Tare before use.", answer))
 
 
 def error_in_words(result: CalibrationResult) -> str:
-    """Describe the compensation error of a free tool, N and N·m, and its source."""
-    words = "{:.4f} N, {:.5f} N·m".format(*result.predicted_error())
-    if result.noise_explains:
-        return f"{words} rms (predicted)"
-    seen = "{:.4f} N, {:.5f} N·m".format(*result.likely_error())
-    why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
-    return f"{seen} rms (cross-validated, as {why}; predicted: {words})"
+    """Describe the compensation error of a free tool at the next use, N and N·m, and its source."""
+    predicted, likely = (
+        "{:.4f} N, {:.5f} N·m".format(*error) for error in (result.predicted_error(), result.likely_error())
+    )
+    if result.noise_explains and likely == predicted:
+        return f"{predicted} rms (predicted)"
+    sources = []
+    if not result.noise_explains:
+        why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
+        sources.append(f"cross-validated, as {why}")
+    if any(result.quality.get("last_bias_offset", ())):
+        sources.append("a minute after the tour, with the drift")
+    return f"{likely} rms ({'; '.join(sources)}; predicted: {predicted})"
+
+
+def drift_in_use(result: CalibrationResult) -> str | None:
+    """Describe how far the bias was from that of the result at the last pose, and how it moves; None without drift."""
+    offset, growth = (np.array(result.quality.get(k, np.zeros(6))) for k in ("last_bias_offset", "bias_growth_per_min"))
+    if not offset.any():
+        return None
+    (off_N, off_Nm), (grow_N, grow_Nm) = (
+        [float(np.linalg.norm(part)) for part in np.split(values, 2)] for values in (offset, growth)
+    )
+    return (
+        f"at the last pose the bias was {off_N:.2g} N, {off_Nm:.2g} N·m off its mean, which the result has; "
+        f"it moves {grow_N:.2g} N, {grow_Nm:.2g} N·m a minute"
+    )
 
 
 def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:
