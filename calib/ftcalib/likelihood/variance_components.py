@@ -166,7 +166,8 @@ class Point:
 
     def effect(self, c: Component) -> Array:
         """(n, 6) best linear prediction of what a component that acts on all poses does to each."""
-        own = np.flatnonzero(np.isin(self.unknown, self.problem.columns(c)))
+        columns = self.problem.columns(c)
+        own = np.arange(0) if columns is None else np.flatnonzero(np.isin(self.unknown, columns))
         return np.asarray(self.problem.X[..., self.unknown[own]] @ self.x[own])
 
     def left_out(self) -> tuple[Array, Array]:
