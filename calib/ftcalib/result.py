@@ -63,6 +63,58 @@ class DriftResult:
             object.__setattr__(self, name, value)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionResult:
+    """What a recording in motion gives beside the static model; arrays are read-only."""
+
+    inertia_kg_m2: Array
+    """(3, 3) of the load about its centre of mass, in sensor axes."""
+    delay_s: float
+    """Of the wrench after the poses."""
+    height_m: float
+    """Of the sensor origin above the flange face."""
+    covariance: Array
+    """(23, 23) of the 15 error coordinates, ixx, iyy, izz, ixy, ixz, iyz, height and delay."""
+    used_share: float
+    """Of the recording: the rest was contact, gaps, or too fast where the position is unknown."""
+    contacts: tuple[Mapping[str, float], ...] = ()
+    """Each with `t_s` after the first sample, `duration_s`, and the peaks `force_N` and `torque_Nm`, all filtered."""
+
+    def __post_init__(self) -> None:
+        for name, shape in (("inertia_kg_m2", (3, 3)), ("covariance", (23, 23))):
+            value = read_only(getattr(self, name))
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"the motion's {name} must be {shape} finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "contacts", tuple(MappingProxyType(dict(one)) for one in self.contacts))
+
+    @property
+    def sigma(self) -> dict[str, Array | float]:
+        """One standard deviation of each estimate, by its name."""
+        std = np.sqrt(np.diag(self.covariance)[15:])
+        inertia = std[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+        return {"inertia_kg_m2": inertia, "height_m": float(std[6]), "delay_s": float(std[7])}
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return what a calibration file and `--json` have of it."""
+        return {
+            "inertia_kg_m2": self.inertia_kg_m2.tolist(),
+            "delay_s": self.delay_s,
+            "height_m": self.height_m,
+            "used_share": self.used_share,
+            "contacts": [dict(one) for one in self.contacts],
+            "motion_covariance": self.covariance.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self | None:
+        """Build from `to_dict`; None for a calibration at rest."""
+        if "inertia_kg_m2" not in document:
+            return None
+        names = ("inertia_kg_m2", "delay_s", "height_m", "motion_covariance", "used_share", "contacts")
+        return cls(*(document[name] for name in names))
+
+
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
     """Estimates with their covariance; arrays are read-only. Frames and signs: docs/explanation/model.md.
@@ -87,7 +139,7 @@ class CalibrationResult:
     noise_source: NoiseSource
     """Source of the noise: the spread within each pose, or the residuals of the fit."""
     g_m_s2: float
-    method: Method
+    method: Method | Literal["motion"]
     findings: tuple[Finding, ...]
     """What gives the verdict, the first one to be fixed first; then notes."""
     provenance: Mapping[str, JSON] = field(default_factory=dict)
@@ -117,6 +169,8 @@ class CalibrationResult:
     minus that of the result, the mean of the tour), `bias_growth_per_min` (6; its change in the minute after),
     `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
     `correlations` (pairs of parameters above 0.9)."""
+    motion: MotionResult | None = None
+    """Of a recording in motion, whose rows count as poses; None = from poses at rest."""
 
     def __post_init__(self) -> None:
         for each in fields(Parameters):
@@ -168,6 +222,8 @@ class CalibrationResult:
         numbers += [self.covariance.tolist(), self.gain_sigma, self.g_m_s2]
         if response is not None:
             numbers.append(response)
+        if self.motion is not None:
+            numbers += [self.motion.inertia_kg_m2.tolist(), self.motion.delay_s]
         return hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:12]
 
     @property
@@ -287,6 +343,7 @@ class CalibrationResult:
             "mass_kg": weight / self.g_m_s2,
             "tilt_alpha_rad": alpha,
             "tilt_beta_rad": beta,
+            **({} if self.motion is None else self.motion.sigma),
         }
 
     def compensate(self, wrench: ArrayLike, R_base_flange: Rotations, *, response: bool = True) -> Array:
@@ -334,8 +391,12 @@ class CalibrationResult:
 
     @property
     def noise_explains(self) -> bool:
-        """Whether the residuals agree with the noise model; True for an update, whose poses are too few for a test."""
-        return not self.quality or (self.p_value is not None and self.p_value >= SURE)
+        """Whether the residuals agree with the noise model.
+
+        True for an update, whose poses are too few for a test, and in motion, where each state has the noise of its
+        residuals.
+        """
+        return not self.quality or self.motion is not None or (self.p_value is not None and self.p_value >= SURE)
 
     def likely_error(self) -> Array:
         """Root mean square error (2,) of compensating a free tool at the next use, N and N·m.
@@ -405,6 +466,7 @@ class CalibrationResult:
             "covariance": self.covariance.tolist(),
             "residuals": self.residuals.tolist(),
             "provenance": dict(self.provenance),
+            **({} if self.motion is None else self.motion.to_dict()),
         }
 
     @classmethod
@@ -423,9 +485,11 @@ class CalibrationResult:
         """
         check_format(document, FORMAT, BadCalibration)
         try:
+            plain = [field.name for field in fields(cls) if field.name not in {"parameters", "motion"}]
             result = cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
-                **{field.name: document[field.name] for field in fields(cls) if field.name != "parameters"},
+                **{name: document[name] for name in plain},
+                motion=MotionResult.from_dict(document),
             )
             derived = (("id", result._id(document.get("response"))), ("verdict", result.verdict))
             edited = is_changed(document) or any(document.get(name, value) != value for name, value in derived)
@@ -467,9 +531,9 @@ def require_positive_definite(covariance: Array) -> None:
 
 
 def _require_known_words(result: CalibrationResult) -> None:
-    for name, words in (("method", Method), ("noise_source", NoiseSource)):
-        if getattr(result, name) not in get_args(words):
-            raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(get_args(words))}")
+    for name, choices in (("method", (*get_args(Method), "motion")), ("noise_source", get_args(NoiseSource))):
+        if getattr(result, name) not in choices:
+            raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(choices)}")
 
 
 def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:
