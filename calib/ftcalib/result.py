@@ -18,14 +18,17 @@ from ftcalib.compensation import Compensator
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, is_changed, read_object, write_object
 from ftcalib.findings import Finding, Verdict, verdict_of
-from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
+from ftcalib.likelihood.gain_and_cross_talk import COMMON_GAIN, Response, hidden_covariance, predicted_covariance
 from ftcalib.model import PARAMETER_NAMES, Array, Parameters, Rotations, is_rotation, read_only
 from ftcalib.published.yu import weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
 
-COMMON_GAIN = float(np.sqrt(5 / 3 / 3))
-"""Sigma of the mean of three gains over that of one; five numbers determine that one, so 5/3 as in Student's t."""
+LEAST_COMMON_GAIN = 0.002
+"""Sigma of the gain common to all axes, where no gain was found: no orientation shows it, and no sensor is better."""
+
+INDEFINITE = -1e-6
+"""Eigenvalues of a correlation matrix below this are no rounding."""
 
 Method = Literal[
     "ml",
@@ -121,7 +124,7 @@ class CalibrationResult:
     >>> import ftdrive
     >>> result = ftdrive.solve(ftdrive.read_dataset("poses.csv"))
     >>> f"{result.mass_kg:.4f} kg, sigma {result.sigma['mass_kg']:.4f} kg, {result.verdict}"
-    '1.2350 kg, sigma 0.0002 kg, good'
+    '1.2350 kg, sigma 0.0025 kg, good'
     """
 
     parameters: Parameters
@@ -150,13 +153,14 @@ class CalibrationResult:
     """Standard deviations of the variance components, by name and unit: beyond the measured noise, or all of the noise
     if it was not measured. `walk_…` is the random walk of the bias per mean interval between poses, `slope_…` its
     linear change over the session, `rotation_rad` the error of each pose's orientation per axis, `gain` and
-    `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm."""
+    `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm, `hysteresis` the
+    share of its last swing by which each axis lags."""
     drift: DriftResult | None = None
     """None: no drift was found, or `drift="none"`."""
     response: Response | None = None
     """Gain and cross-talk of the sensor; None: none were found, or the method does not estimate them."""
     gain_sigma: float = 0.0
-    """Standard deviation of the gain entries that the data do not exclude."""
+    """Standard deviation of the entries of the gain, if one was found."""
     second_basin_chi2: float | None = None
     """Increase of chi2 at the second best solution, under the noise model; None: there is no other."""
     quality: Mapping[str, JSON] = field(default_factory=dict)
@@ -192,6 +196,8 @@ class CalibrationResult:
         if isinstance(self.response, Mapping):
             given = self.response
             object.__setattr__(self, "response", Response(given["coefficients"], given["covariance"]))
+        joint = self.covariance if self.response is None else self.response.covariance
+        require_positive_definite(joint)
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
         found = (one if isinstance(one, Finding) else Finding.from_dict(one) for one in self.findings)
         object.__setattr__(self, "findings", tuple(found))
@@ -301,15 +307,32 @@ class CalibrationResult:
         return weight_and_tilt(self.gravity_force_base_N)[2]
 
     @property
+    def tool_covariance(self) -> Array:
+        """(15, 15) of mounting, weight and centre of mass of the tool itself, in the coordinates of `covariance`.
+
+        It includes what the gain and cross-talk that were found can hide in them. `covariance` does not, because
+        compensation needs only the sum of both.
+        """
+        if self.response is None:
+            return self.covariance
+        hidden = hidden_covariance(self.parameters, self.gain_sigma, self.response.cross_talk_sigma_m)
+        known = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)) < 1e-12
+        hidden[known], hidden[:, known] = 0.0, 0.0
+        return np.asarray(self.covariance + hidden)
+
+    @property
     def sigma(self) -> Mapping[str, Array | float]:
         """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes.
 
-        Those of weight and mass include the gain common to all axes, which no orientation reveals.
+        They are those of `tool_covariance`. Weight and mass have at least 0.2 %, unless they were known.
         """
-        std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, self.covariance[3:6, 3:6])
+        std = np.sqrt(np.maximum(np.diag(self.tool_covariance), 0.0))
+        cov = self.covariance[3:6, 3:6]
+        weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, cov)
         if weight > 1e-9 * self.weight_N:  # not exactly known
-            weight = float(np.hypot(weight, COMMON_GAIN * self.gain_sigma * self.weight_N))
+            lag = self.components.get("hysteresis", 0.0)
+            common = max(LEAST_COMMON_GAIN, float(np.hypot(COMMON_GAIN * self.gain_sigma, lag)))
+            weight = float(np.hypot(weight, common * self.weight_N))
         return {
             "R_flange_sensor": std[0:3],
             "gravity_force_base_N": std[3:6],
@@ -495,6 +518,16 @@ class CalibrationResult:
             return cls.from_dict(document, accept_edited=accept_edited)
         except BadCalibration as exc:
             raise BadCalibration(f"{Path(path).name}: {exc}") from exc
+
+
+def require_positive_definite(covariance: Array) -> None:
+    """Raise `ValueError` for a covariance with a negative eigenvalue; exactly known values have none."""
+    sigma = np.sqrt(np.abs(np.diag(covariance)))
+    free = sigma > 0
+    correlations = covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
+    least = float(np.linalg.eigvalsh(correlations)[0]) if free.any() else 0.0
+    if least < INDEFINITE:
+        raise ValueError(f"the covariance is not positive definite: its smallest normalised eigenvalue is {least:.2g}")
 
 
 def _require_known_words(result: CalibrationResult) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from ftcalib.rounding import to_place_of
 from ftdrive.report.document import Figure, Section, Table
 from ftdrive.report.words import capital, in_words, label_of, rounded, shown_poses
-from ftdrive.terminal.report import axes_of, quantities_of, values_of
+from ftdrive.terminal.report import SIGMA_OF_THE_TOOL, axes_of, quantities_of, values_of
 
 Facts = Mapping[str, Any]
 
@@ -37,6 +37,7 @@ def estimates(facts: Facts) -> Section:
     )
     tables = [Table("", ("quantity", "estimate", "± 1 sigma"), list(_estimate_rows(result)))]
     if result["response"] is not None:
+        text.append(f"Sigma: {SIGMA_OF_THE_TOOL}.")
         columns = ("entry", "value", "± 1 sigma")
         tables.append(Table("Gain and cross-talk of the sensor", columns, _response(result), folded=True))
     return Section("estimates", "Estimates", text, [figure], tables)

@@ -27,6 +27,12 @@ _DERIVED = {"gravity_force_base_N"}
 """Rows that follow from mass and tilt: printed only with -v."""
 
 
+SIGMA_OF_THE_TOOL = (
+    "that of mounting, weight and centre of mass includes what gain and cross-talk of the sensor hide in them; the "
+    "compensation error does not, because there they cancel"
+)
+
+
 def print_result(
     result: CalibrationResult,
     *,
@@ -56,6 +62,8 @@ def print_result(
     amount = f"{result.n_poses} poses" if result.motion is None else f"{100 * result.motion.used_share:.0f} % used"
     answer.print(Text.assemble(("Result", "bold cyan"), f"  {amount}, method {result.method}"))
     answer.print(_table(result, truth))
+    if result.response is not None:
+        answer.print(hanging(" sigma: ", SIGMA_OF_THE_TOOL, answer))
     head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
     answer.print(hanging(head, f"compensation error {error_in_words(result)}", answer))
     if truth is not None:
