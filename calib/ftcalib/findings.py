@@ -24,7 +24,8 @@ _VERDICTS: Final[Mapping[Severity, Verdict]] = {"reject": "rejected", "limit": "
 _PLACE: Final = re.compile(r"\{(\w+)(?::([^}]*))?\}")
 """Of a value in a template, with its form."""
 _UNITS: Final = {
-    "N": " N", "Nm": " N·m", "mNm": " mN·m", "kg": " kg", "m": " m", "mm": " mm", "deg": "°", "percent": " %",
+    "N": " N", "Nm": " N·m", "mNm": " mN·m", "kg": " kg", "m": " m", "s": " s", "mm": " mm", "deg": "°",
+    "percent": " %",
 }  # fmt: skip
 
 
@@ -225,6 +226,8 @@ _LIMIT_OR_NOTE: Final = ("limit", "note")
 # fmt: off
 CODES: Final[Mapping[str, Code]] = {
     # Data that cannot be right
+    "other_recording": Code(_REJECT, "the wrench does not follow the poses: {left_percent:.0f} of its change remain "
+        "unexplained", "check that wrench and poses are of one recording on one clock, and the form of the rotations"),
     "stuck_channels": Code(_REJECT, "the reading of {channels} is the same in all poses",
         "check the sensor for a channel that is stuck"),
     "quantised": Code(_LIMIT, "the readings come in steps of {step_N:.2g} and {step_Nm:.2g}",
@@ -322,6 +325,24 @@ CODES: Final[Mapping[str, Code]] = {
     "com_outside_tool": Code(_REJECT_OR_LIMIT, "the centre of mass, at {com_mm:.0f} from the {origin} in flange axes, "
         "lies {outside_mm:.0f} outside the described tool{units:units}",
         "check signs and units of forces and torques, then [tool] cylinders_mm"),
+    # Recordings in motion
+    "wrench_compensated": Code(_REJECT, "the load weighs {weight_N:.2g}, but has the inertia of {mass_kg:.2g}, as if a "
+        "controller had compensated or zeroed the wrench", "record the wrench as the sensor measures it"),
+    "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned through {range_deg:.0f} only, which leaves the mounting "
+        "{mounting_deg:.2g} and the weight {weight_N:.2g} uncertain (1 sigma)",
+        "turn wrist 2 and wrist 3 by 60° or more"),
+    "clock_offset": Code(_LIMIT, "the wrench follows the poses by {delay_s:.3f}", "correct the clock of one of the "
+        "two, or check that the times of both files mean the same"),
+    "positions_missing": Code(_LIMIT, "the poses have no positions, so only slow parts count ({share_percent:.0f}), "
+        "where the unknown acceleration adds up to {force_N:.2g}", "give the position of the flange too"),
+    "height_differs": Code(_LIMIT, "by the motion the sensor lies {height_mm:~sigma_mm} above the flange (sigma "
+        "{sigma_mm:~sigma_mm}), not {configured_mm:.3g}", "correct [sensor] height_mm, or check the positions"),
+    "mostly_contact": Code(_LIMIT, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
+        "{force_N:.2g}", "keep the tool free for most of the recording"),
+    "contacts_left_out": Code(_NOTE, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
+        "{force_N:.2g}"),
+    "motion_slow": Code(_NOTE, "the motion does not determine {names}", "turn the three wrist joints together, at "
+        "60 °/s or more"),
     # How well the data fit
     "force_error": Code(_REJECT_OR_LIMIT, "judged by the {source}, the force error is {share_percent:.1f} of the "
         "weight ({error_N:.2g}), more than {limit_percent:g}",

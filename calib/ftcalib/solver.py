@@ -21,7 +21,7 @@ from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters, predict
 from ftcalib.published.methods import PUBLISHED, Estimator, published
-from ftcalib.result import CalibrationResult, DriftResult, Method
+from ftcalib.result import CalibrationResult, DriftResult, Method, require_positive_definite
 from ftcalib.setup import NOTHING, Setup
 
 SIMULATIONS = 400
@@ -133,6 +133,11 @@ def solve(
             np.ones(len(dataset)),
             best.second_basin_chi2,
         )
+    try:
+        require_positive_definite(assessed.covariance)
+        require_positive_definite(assessed.covariance if assessed.response is None else assessed.response.covariance)
+    except ValueError as exc:
+        raise NotObservable(f"{exc}. Add poses with other orientations.") from exc
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
     unconstrained = best if estimator else None if known is None else _unconstrained(dataset, wrench_cov, drift)
     quality = judge(

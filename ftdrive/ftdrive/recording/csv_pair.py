@@ -86,8 +86,14 @@ class CsvPair:
                 share[0] = place / size
                 yield from (block.rows(slice(i, i + PIECE_ROWS)) for i in range(0, len(block), PIECE_ROWS))
 
+        waiting: list[Paired] = []
         for paired in paired_blocks(samples(), self._states, self.delay_s):
-            yield Measured(paired, (), share[0])
+            rows = Paired.concatenate([*waiting, paired])
+            if len(rows) >= PIECE_ROWS:  # as of other recordings, because the contact test goes in steps
+                yield Measured(rows.rows(slice(PIECE_ROWS)), (), share[0])
+            waiting = [rows.rows(slice(PIECE_ROWS if len(rows) >= PIECE_ROWS else 0, None))]
+        if any(map(len, waiting)):
+            yield Measured(waiting[0], (), 1.0)
 
     def _estimated_delay(self) -> tuple[float, float]:
         """Return the delay and its sigma, from means over `PERIOD_S` without contact, which would look like a delay."""

@@ -42,7 +42,7 @@ from ftdrive.recording.recording import (
 
 LEVEL: Final = -5
 """Of zstd: numbers with noise in their last digits hardly shrink, at any level."""
-_GROUP_NS, _GROUP_ROWS = 10_000_000_000, 1 << 16
+_GROUP_NS, _GROUP_ROWS = 10_000_000_000, 1 << 14
 """A row group is written after so long or so many samples."""
 _MAGIC, _RECORD = b"PAR1", b"FTDR"
 _I32, _I64, _TEXT, _LIST, _STRUCT = 5, 6, 8, 9, 12

@@ -65,7 +65,9 @@ class RecordingFiles:
                 files, self._files = self._files, []
                 for file in files:
                     file.keep()
-                self.partial = {file.partial: file.samples for file in files}
+                    if not file.samples:
+                        file.discard()
+                self.partial = {file.partial: file.samples for file in files if file.samples}
                 if isinstance(error, OSError):
                     raise self._named(error) from error
                 raise
@@ -99,7 +101,8 @@ class RecordingFiles:
     def _named(self, error: OSError) -> OSError:
         """Return an error of the same kind that names what is safe."""
         kept = " and ".join(f"{path} keeps {samples} samples" for path, samples in self.partial.items())
-        return type(error)(f"{error.strerror or error}: {kept}, which `ftdrive convert` saves as a complete file")
+        kept = f"{kept}, which `ftdrive convert` saves as a complete file" if kept else "no sample is kept"
+        return type(error)(f"{error.strerror or error}: {kept}")
 
 
 class Recorder:
