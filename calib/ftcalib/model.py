@@ -9,15 +9,18 @@ Source: Yu, Shi, Lou 2021, eqs 12-13, with e_bR = R_base_flange.T and s_eR = R_f
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Self, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, cast
 
 import numpy as np
+import scipy  # its parts are imported at their first use, so that commands that need none start fast
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
-Rotations: TypeAlias = Rotation | Sequence[Rotation] | ArrayLike
+Rotations: TypeAlias = "Rotation | Sequence[Rotation] | ArrayLike"
 """Rotations as a user has them; `matrices_of` returns their matrices."""
 
 STANDARD_GRAVITY_M_S2 = 9.80665
@@ -87,7 +90,9 @@ class Parameters:
         """Return the error vector (15,) with which `moved` gives `other`."""
         return np.concatenate(
             [
-                -Rotation.from_matrix(other.R_flange_sensor @ self.R_flange_sensor.T).as_rotvec(),
+                scipy.spatial.transform.Rotation.from_matrix(
+                    self.R_flange_sensor @ other.R_flange_sensor.T
+                ).as_rotvec(),
                 other.gravity_force_base_N - self.gravity_force_base_N,
                 other.force_bias_N - self.force_bias_N,
                 other.p_sensor_com_m - self.p_sensor_com_m,
@@ -181,9 +186,9 @@ def jacobian(parameters: Parameters, R_base_flange: Array) -> Array:
 
 def matrices_of(rotations: Rotations) -> NDArray[Any]:
     """Return the matrices (..., 3, 3) of rotations."""
-    if isinstance(rotations, Rotation):
-        return rotations.as_matrix()
-    if isinstance(rotations, Sequence) and rotations and isinstance(rotations[0], Rotation):
+    if hasattr(rotations, "as_matrix"):
+        return np.asarray(rotations.as_matrix())
+    if isinstance(rotations, Sequence) and rotations and hasattr(rotations[0], "as_matrix"):
         return np.stack([one.as_matrix() for one in cast("Sequence[Rotation]", rotations)])
     return np.asarray(rotations)
 

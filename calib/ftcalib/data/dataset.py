@@ -10,8 +10,8 @@ from types import MappingProxyType
 from typing import Any, Literal, Self, get_args
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
@@ -289,13 +289,13 @@ def rotations_of(columns: Sequence[str], table: Array) -> Array:
             raise BadDataset(
                 f"row {i + 1}: the quaternion has length {length[i]:.3g}, not 1: check {', '.join(columns)}."
             )
-        return Rotation.from_quat(table).as_matrix()
+        return scipy.spatial.transform.Rotation.from_quat(table).as_matrix()
     if length.max() > _LONGEST_VECTOR_RAD:
         raise BadDataset(
             f"row {length.argmax() + 1}: the rotation vector is {length.max():.0f} rad long, more than 2π: rx, ry, rz "
             "look like degrees, convert them to rad."
         )
-    return Rotation.from_rotvec(table).as_matrix()
+    return scipy.spatial.transform.Rotation.from_rotvec(table).as_matrix()
 
 
 def _table(path: Path) -> list[list[str]]:

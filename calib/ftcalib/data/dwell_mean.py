@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array
@@ -166,6 +166,7 @@ def checked(wrench: Array) -> Array:
 def _autocorrelation_time(noise: Array) -> Array:
     """Integrated autocorrelation time (6,) in samples: 1 for white noise, and for a channel without noise."""
     N = len(noise)
+    fft = scipy.fft
     spectrum = np.abs(fft.rfft(noise, fft.next_fast_len(2 * N, real=True), axis=0)) ** 2
     gamma = fft.irfft(spectrum, fft.next_fast_len(2 * N, real=True), axis=0)[: N // 2 * 2]
     pairs = gamma[0::2] + gamma[1::2]

@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc as chi2_sf
-from scipy.special import fdtrc as f_sf
+import scipy
 
 from ftcalib.model import Array
 
@@ -62,6 +61,7 @@ def trend(t: Array, values: Array, covariance: Array) -> Trend:
     dof = k * (n - 2)
     scatter = float(np.sum((readings - design @ x) ** 2)) / dof
     chi2 = float(slope @ np.linalg.solve(slope_cov, slope))
-    against_scatter = f_sf(k, dof, chi2 / k / scatter) if scatter > 0 else 0.0
+    special = scipy.special
+    against_scatter = special.fdtrc(k, dof, chi2 / k / scatter) if scatter > 0 else 0.0
     sigma = np.sqrt(np.diag(slope_cov) * max(scatter, 1.0))
-    return Trend(slope / scale, sigma / scale, float(max(chi2_sf(k, chi2), against_scatter)), n)
+    return Trend(slope / scale, sigma / scale, float(max(special.chdtrc(k, chi2), against_scatter)), n)

@@ -13,13 +13,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, urlencode
 
-from ftdrive.cell.config import CellConfig
 from ftdrive.checks.check import Check, State
 from ftdrive.errors import ConfigError
 from ftdrivers.registry import in_url, split_url
+
+if TYPE_CHECKING:
+    from ftdrive.cell.config import CellConfig
 
 SYS = Path("/sys")
 DEV = Path("/dev")
@@ -98,7 +100,7 @@ def check_disk(folder: Path) -> Check:
     return Check(name, state, f"{free / 1e9:.1f} GB free in {there}", fix)
 
 
-def check_workcell(cell: CellConfig, model: str | None) -> Check:
+def check_workcell(cell: "CellConfig", model: str | None) -> Check:
     """Check that tool and surroundings are described, possible for this arm, and measured."""
     from ftdrive.planning.cell_plan import require_possible
 

@@ -1,7 +1,7 @@
 """`ftdrive devices`: the ports and buses of this computer, and on request the known sensors on them."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich.text import Text
@@ -9,13 +9,13 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from ftcalib.errors import UsageError
-from ftdrive.cell.config import clock_in_force
-from ftdrive.cell.emulated import Station
 from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
 from ftdrive.terminal.console import answer, hanging
-from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
+
+if TYPE_CHECKING:
+    from ftdrivers.clock import Clock
 
 _PLACES = """\b
 A PLACE is
@@ -49,6 +49,8 @@ def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
         }
     )
     if places:
+        from ftdrive.cell.config import clock_in_force
+
         clock = clock_in_force()
         found["answers"] = [answer for place in places for answer in _answers(place, clock, failures)]
     if as_json:
@@ -72,7 +74,7 @@ def _serial_port(port: ListPortInfo) -> dict[str, Any]:
     }
 
 
-def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[str, Any]]:
+def _answers(place: str, clock: "Clock", failures: list[Exception]) -> list[dict[str, Any]]:
     """Probe one place. An error is an answer too, so that other places are probed, and is added to `failures`."""
     from ftdrive.checks.discovery import ask
 
@@ -86,6 +88,8 @@ def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[s
 
 
 def _emulated(failures: list[Exception]) -> dict[str, Any]:
+    from ftdrive.cell.emulated import Station
+
     with Station("both") as station:
         serial, can = station.endpoints["sensors"]["serial"], station.endpoints["sensors"]["can"]
         places = (serial["port"], f"slcan://{can['channel']}?bitrate={can['bitrate']}")

@@ -4,23 +4,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
-from ftdrive.cell.emulated import MOVED_BY, Station
-from ftdrive.runs.outcome import Outcome
-from ftdrive.session import rehearsal
-from ftdrive.session.options import SessionOptions, with_recorded_mode
-from ftdrive.terminal.console import messages
-from ftdrive.terminal.screen import open_operator
+if TYPE_CHECKING:
+    from ftdrive.cell.emulated import Station
+    from ftdrive.runs.outcome import Outcome
+    from ftdrive.session.options import SessionOptions
 
 
-def rehearse(station: Station, runs: Path, name: str, *, poses: int = 24, kept: bool = True) -> Outcome:
+def rehearse(station: "Station", runs: Path, name: str, *, poses: int = 24, kept: bool = True) -> "Outcome":
     """Calibrate an emulated cell as `ftdrive.session.rehearsal.rehearse` does, and show it."""
+    from ftdrive.session import rehearsal
+    from ftdrive.terminal.screen import open_operator
+
     with open_operator() as operator:
         return rehearsal.rehearse(station, runs, name, operator, poses=poses, kept=kept)
 
 
-def start_mover(station: Station, options: SessionOptions) -> None:
+def start_mover(station: "Station", options: "SessionOptions") -> None:
     """Let the emulated cell move its arm, in a mode in which the session does not move it."""
+    from ftdrive.cell.emulated import MOVED_BY
+    from ftdrive.session.options import with_recorded_mode
+    from ftdrive.terminal.console import messages
+
     if mover := MOVED_BY.get(with_recorded_mode(options).mode):
         request, words = mover
         station.control(**request)
@@ -36,6 +42,8 @@ def rehearsed_run(sensor: str | None) -> Iterator[Path]:
     sensor : str, optional
         As `sensor_name` takes it.
     """
+    from ftdrive.cell.emulated import Station
+
     with TemporaryDirectory(prefix="ftdrive-") as runs:
         with Station.of(None, sensor) as station:
             outcome = rehearse(station, Path(runs), "simulated", poses=6, kept=False)

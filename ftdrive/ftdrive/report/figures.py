@@ -75,10 +75,11 @@ def draw(name: str, facts: Facts) -> str:
         from matplotlib.figure import Figure
     except ImportError:
         raise ConfigError("figures need matplotlib: pip install 'ftdrive[report]'") from None
-    height, fill = _FIGURES[name]
-    size_in = WIDTH_IN, height(facts) if callable(height) else height
+    height, (left, right, bottom, top), fill = _FIGURES[name]
+    height_in = height(facts) if callable(height) else height
     with mpl.rc_context(dict(_STYLE)):
-        figure = Figure(figsize=size_in, layout="constrained")
+        figure = Figure(figsize=(WIDTH_IN, height_in))  # fixed margins, because a layout takes as long as the drawing
+        figure.subplots_adjust(left / WIDTH_IN, bottom / height_in, 1 - right / WIDTH_IN, 1 - top / height_in)
         fill(figure, facts)
         written = StringIO()
         figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -294,15 +295,16 @@ def _methods_height(facts: Facts) -> float:
     return 1.0 + 0.25 * len(facts["cross_validation"]["methods"])
 
 
-_FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], Callable[[Any, Facts], None]]] = {
-    "force_map": (3.4, lambda figure, facts: _map(figure, facts, "force_N", "mN")),
-    "torque_map": (3.4, lambda figure, facts: _map(figure, facts, "torque_Nm", "mN·m")),
-    "correlation": (4.6, _correlation),
-    "methods": (_methods_height, _methods),
-    "pose_residuals": (2.8, _pose_residuals),
-    "time_residuals": (3.8, _time_residuals),
-    "noise": (3.6, _noise),
-    "coverage": (2.7, _coverage),
-    "comparison": (3.8, _comparison),
+_Margins = tuple[float, float, float, float]
+_FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callable[[Any, Facts], None]]] = {
+    "force_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "force_N", "mN")),
+    "torque_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "torque_Nm", "mN·m")),
+    "correlation": (4.6, (1.05, 0.1, 1.05, 0.1), _correlation),
+    "methods": (_methods_height, (1.35, 0.2, 0.5, 0.1), _methods),
+    "pose_residuals": (2.8, (0.55, 0.1, 0.65, 0.1), _pose_residuals),
+    "time_residuals": (3.8, (0.65, 0.1, 0.5, 0.35), _time_residuals),
+    "noise": (3.6, (0.65, 0.1, 0.65, 0.1), _noise),
+    "coverage": (2.7, (0.1, 0.1, 0.1, 0.1), _coverage),
+    "comparison": (3.8, (1.15, 0.2, 0.5, 0.1), _comparison),
 }
-"""Height in inches and how to draw it, by name."""
+"""Height and margins (left, right, bottom, top) in inches and how to draw it, by name."""

@@ -9,12 +9,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
-from ftcalib import CalibrationDataset, CalibrationResult
 from ftcalib.errors import BadCalibration, BadDataset
 from ftcalib.files import JSON, check_format, read_object
-from ftdrive.runs.run import Run
+
+if TYPE_CHECKING:
+    from ftcalib import CalibrationDataset, CalibrationResult
 
 FORMAT: Final = "ftdrive.verification/1"
 
@@ -92,6 +93,9 @@ def last_verification(place: Path) -> VerificationRecord | None:
     BadCalibration, OSError
         The calibration cannot be read.
     """
+    from ftcalib import CalibrationResult
+    from ftdrive.runs.run import Run
+
     path = Run(place).calibration_path if place.is_dir() else place
     return verification_near(place, CalibrationResult.load(path).id)
 
@@ -112,7 +116,7 @@ def _records_near(place: Path) -> Iterator[VerificationRecord]:
                 continue
 
 
-def fitted_dataset(calibration: CalibrationResult, place: Path) -> CalibrationDataset | None:
+def fitted_dataset(calibration: "CalibrationResult", place: Path) -> "CalibrationDataset | None":
     """Read the poses of a calibration from its folder; None if they are not there.
 
     Parameters
@@ -120,6 +124,8 @@ def fitted_dataset(calibration: CalibrationResult, place: Path) -> CalibrationDa
     place : Path
         The calibration file or its folder.
     """
+    from ftcalib import CalibrationDataset
+
     for path in sorted((place if place.is_dir() else place.parent).glob("dataset*.json")):
         try:
             dataset = CalibrationDataset.load(path)
@@ -143,13 +149,13 @@ def age_in_words(age: timedelta) -> str:
     return f"{hours * 60:.0f} min" if hours < 1 else f"{hours:.0f} h" if hours < 48 else f"{hours / 24:.0f} d"
 
 
-def age_of(calibration: CalibrationResult, now: datetime) -> list[str]:
+def age_of(calibration: "CalibrationResult", now: datetime) -> list[str]:
     """Return the age of a calibration, such as ["2 h old"]; empty if its file does not say when it was made."""
     created = calibration.provenance.get("created_utc")
     return [f"{age_in_words(now - datetime.fromisoformat(created))} old"] if isinstance(created, str) else []
 
 
-def marks_of(calibration: CalibrationResult, *, emulated: bool = False) -> tuple[str, ...]:
+def marks_of(calibration: "CalibrationResult", *, emulated: bool = False) -> tuple[str, ...]:
     """Return the `MARKS` of a calibration; `emulated` says that what it is applied to is emulated anyhow."""
     found = {
         EMULATED: emulated or calibration.provenance.get("station") is not None,
@@ -159,7 +165,7 @@ def marks_of(calibration: CalibrationResult, *, emulated: bool = False) -> tuple
 
 
 def calibration_in_words(
-    calibration: CalibrationResult,
+    calibration: "CalibrationResult",
     verification: VerificationRecord | None,
     now: datetime,
     marks: Sequence[str] | None = None,

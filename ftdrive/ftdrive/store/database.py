@@ -1,8 +1,9 @@
 """The database behind a store: its address, its lock, the version of its tables, and its errors in words."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,13 +20,11 @@ from sqlalchemy import (
     select,
     text,
 )
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.store.tables import RECORDS, SCHEMA, metadata, schema
 
-_INSERT: Final[Mapping[str, Callable[[Table], Any]]] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
 _BYTE_ORDER: Final = {"sqlite": "BINARY", "postgresql": "C"}
 """Collation that sorts texts alike everywhere."""
 _WRITERS: Final = 0x66746472697665
@@ -48,7 +47,7 @@ class Database:
             self._url = URL.create("sqlite", database=str(default_file())) if url is None else make_url(url)
             self._dialect = self._url.get_backend_name()
             self._is_sqlite = self._dialect == "sqlite"
-            if self._dialect not in _INSERT:
+            if self._dialect not in _BYTE_ORDER:
                 raise ConfigError(
                     f"[store] url begins with {self._dialect}: give sqlite:////PATH or postgresql+psycopg://…"
                 )
@@ -113,7 +112,7 @@ class Database:
         first_by : str, optional
             Replace only rows that have a greater text in this column.
         """
-        insert = _INSERT[self._dialect](table)
+        insert = import_module(f"sqlalchemy.dialects.{self._dialect}").insert(table)  # that of the other is slow
         new = {column.name: insert.excluded[column.name] for column in table.columns}
         key = [column.name for column in table.primary_key]
         where = None

@@ -9,11 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_object
 from ftcalib.model import Array, Parameters
-from ftdrive.runs.run import Run
 from ftdrive.runs.verification_record import EMULATED, FORMAT, marks_of
 
 _NUMBERS = tuple(field.name for field in fields(Parameters))
@@ -189,6 +187,8 @@ def read_record(path: Path) -> Record:
 
 
 def _result(path: Path) -> StoredResult:
+    from ftcalib import CalibrationResult
+
     result = CalibrationResult.load(path)
     header = _header(path.parent)
     config = header.get("config", {})
@@ -251,6 +251,8 @@ def _verification(path: Path) -> StoredVerification:
 
 def _header(run: Path) -> Mapping[str, Any]:
     """Return run.json, or nothing if it is damaged: the calibration file alone suffices."""
+    from ftdrive.runs.run import Run
+
     try:
         return dict(Run(run).header())
     except (DataError, OSError):

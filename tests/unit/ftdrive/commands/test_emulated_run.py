@@ -13,6 +13,7 @@ from ftdrive.commands import demo, emulated_run
 from ftdrive.runs.run import Run
 from ftdrive.session import rehearsal
 from ftdrive.session.events import Event, Noted, RunOpened
+from ftdrive.terminal import screen
 
 STATION: Any = SimpleNamespace(
     sensor="can", options=(), control_path="auto", values={}, truth={"mass_kg": 0.5}, cell=None
@@ -44,7 +45,7 @@ def test_the_place_of_a_run_that_is_not_kept_is_not_printed(
         operator.show(Noted(words=f"3 poses are kept in {folder}"))
         return SimpleNamespace()
 
-    monkeypatch.setattr(emulated_run, "open_operator", open_operator)
+    monkeypatch.setattr(screen, "open_operator", open_operator)
     monkeypatch.setattr(rehearsal, "calibrate", calibrate)
     emulated_run.rehearse(STATION, tmp_path, "simulated", kept=kept)
     assert [type(event) for event in person.events] == expected
