@@ -17,6 +17,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ftmocks.arrays import Array
+from ftmocks.imperfections import IDEAL
 from ftmocks.kinematics import (
     ZERO6,
     Dh,
@@ -32,9 +33,6 @@ from ftmocks.kinematics import (
     rotvec,
     vector6,
 )
-
-FOLLOW_TIME_S = 0.005
-"""Time constant with which the joints follow the set-point."""
 
 SETTLED_RAD = 1e-9
 """Joints that are so near to a set-point at rest are there."""
@@ -332,24 +330,26 @@ class Following(NamedTuple):
 
     Parameters
     ----------
+    lag_s
+        Time constant with which they follow.
     target
         The set-point in that cycle.
     qd
-        Speeds of the joints in that cycle, rad/s, with which they are `FOLLOW_TIME_S` behind the set-point.
+        Speeds of the joints in that cycle, rad/s, with which they are `lag_s` behind the set-point.
     off_rad
         How far the joints are pushed off.
     """
 
+    lag_s: float
     target: JointState
     qd: Vector6
     off_rad: Vector6 = ZERO6
 
     def at(self, t: float) -> JointState:
         """Return the actual joints `t` seconds later, or earlier; exact as long as the acceleration stays."""
-        T = FOLLOW_TIME_S
-        left = math.exp(-t / T)
+        T = self.lag_s
         target_qd = [v + c * t for v, c in zip(self.target.qd, self.target.qdd, strict=True)]
-        qd = _followed(self.qd, self.target.qd, target_qd, self.target.qdd, left)
+        qd = _followed(self.qd, self.target.qd, target_qd, self.target.qdd, t, T)
         q = [
             p + (v + 0.5 * c * t) * t + off - T * own
             for p, v, c, off, own in zip(*self.target, self.off_rad, qd, strict=True)
@@ -367,13 +367,16 @@ class Arm:
         The real arm.
     q
         Joint angles (rad) to start with.
+    lag_s
+        Time constant with which the joints follow the set-point.
     """
 
     obstacle: str | None = None
     """Why this arm cannot be moved."""
 
-    def __init__(self, dh: Dh, q: Vector6) -> None:
+    def __init__(self, dh: Dh, q: Vector6, lag_s: float = IDEAL.servo_lag_s) -> None:
         self.dh = dh
+        self.lag_s = lag_s
         self.q = self.actual_q = q
         self.qd = self.actual_qd = self.qdd = ZERO6
         self.motion: Following | None = None
@@ -531,19 +534,19 @@ class Arm:
         if self.motion is None and self.qd is ZERO6 and before_qd is ZERO6 and self._off_rad is self.pushed_rad:
             self.actual_qd = ZERO6
             return
-        left = math.exp(-dt / FOLLOW_TIME_S)
+        lag_s = self.lag_s
         qdd = [(new - old) / dt for new, old in zip(self.qd, before_qd, strict=True)]
-        qd = vector6(_followed(self.motion.qd if self.motion else ZERO6, before_qd, self.qd, qdd, left))
-        off_rad = self._yielded(left)
+        qd = vector6(_followed(self.motion.qd if self.motion else ZERO6, before_qd, self.qd, qdd, dt, lag_s))
+        off_rad = self._yielded(math.exp(-dt / lag_s))
         pushed = [(new - old) / dt for new, old in zip(off_rad, self._off_rad, strict=True)]
         self._off_rad = off_rad
-        if self.qd is ZERO6 and FOLLOW_TIME_S * max(map(abs, qd)) < SETTLED_RAD:
+        if self.qd is ZERO6 and lag_s * max(map(abs, qd)) < SETTLED_RAD:
             qd, self.motion = ZERO6, None
         else:
-            self.motion = Following(JointState(self.q, self.qd, self.qdd), qd, off_rad)
+            self.motion = Following(lag_s, JointState(self.q, self.qd, self.qdd), qd, off_rad)
         behind = zip(self.q, off_rad, qd, strict=True)
         settled = self.motion is None and off_rad is ZERO6
-        self.actual_q = self.q if settled else vector6([q + off - FOLLOW_TIME_S * v for q, off, v in behind])
+        self.actual_q = self.q if settled else vector6([q + off - lag_s * v for q, off, v in behind])
         self.actual_qd = vector6([v + push for v, push in zip(qd, pushed, strict=True)])
 
     def _yielded(self, left: float) -> Vector6:
@@ -553,7 +556,9 @@ class Arm:
         return goal if max(abs(off - g) for off, g in zip(after, goal, strict=True)) < SETTLED_RAD else after
 
 
-def _followed(qd: Vector6, before: Vector6, target: Sequence[float], qdd: Sequence[float], left: float) -> list[float]:
+def _followed(
+    qd: Vector6, before: Vector6, target: Sequence[float], qdd: Sequence[float], t: float, lag_s: float
+) -> list[float]:
     """Return the speeds of joints that follow a set-point for a time.
 
     Parameters
@@ -562,10 +567,10 @@ def _followed(qd: Vector6, before: Vector6, target: Sequence[float], qdd: Sequen
         Speeds of the joints before.
     before, target, qdd
         Speeds of the set-point before and now, and its acceleration meanwhile.
-    left
-        exp(-time / `FOLLOW_TIME_S`).
+    t, lag_s
+        The time, and the time constant with which they follow.
     """
-    T = FOLLOW_TIME_S
+    T, left = lag_s, math.exp(-t / lag_s)
     return [v - T * c + (own - old + T * c) * left for own, old, v, c in zip(qd, before, target, qdd, strict=True)]
 
 

@@ -138,7 +138,7 @@ def popup(
 
 def get_actual_joint_positions(program: Caller) -> list[float]:
     """Return the joint angles, rad."""
-    return list(program.robot.arm.actual_q)
+    return list(program.robot.measured_q)
 
 
 def get_target_joint_positions(program: Caller) -> list[float]:
