@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from ftmocks.sensors.netft import RECORD, NetFtBox
+from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import ROOT, StationProcess
 from tests.wire.waiting import LIMIT_S
 
@@ -187,6 +188,23 @@ def test_a_program_swings_the_arm_and_inertia_comes_and_goes() -> None:
         station.ask("dashboard-stop")
         state = station.wait_for(lambda s: s["steady"] and s["runtime_state"] == "STOPPED")
         assert inertia_N(state) < 1e-6
+
+
+def test_a_production_runs_beside_a_reader_and_writes_its_truth(tmp_path: Path) -> None:
+    file, noise_rad = tmp_path / "truth.jsonl", 1e-2
+    scene = json.dumps({"do": "production", "file": str(file), "parts_kg": [1, 1]})
+    settings = ("--time-scale", "20", "--do", scene, "--imperfections", f"none,joint_noise_rad={noise_rad}")
+    with StationProcess(*settings) as station, RtdeSocket(station.host) as reader:
+        reader.ask("O", struct.pack(">d", 500.0) + b"actual_q,target_q,runtime_state")
+        reader.ask("S")
+        seen = [struct.unpack(">12dI", reader.answer()[4:]) for _ in range(500)]
+        assert "the arm moves" in station.refusal("production")
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert {line["part_kg"] for line in lines} == {0, 1}
+    assert lines[0]["event"] == "start"
+    q, target_q, runtime = np.split(np.array(seen), [6, 12], axis=1)
+    assert (runtime == 2).mean() > 0.9
+    assert np.std((q - target_q)[:, 1]) == pytest.approx(noise_rad, rel=0.2), "joint 2 is hardly late"
 
 
 def test_the_truth_names_the_inertia_and_the_sensor_origin(station: StationProcess) -> None:
