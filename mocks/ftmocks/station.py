@@ -12,7 +12,7 @@ import signal
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -253,7 +253,7 @@ class Station:
         """Return what is known about the cell: its truth, or the recording, whose truth is unknown."""
         recording = self._recording
         if recording is None:
-            return {"truth": self.world.truth.to_json()}
+            return {"truth": self.world.truth.to_json(), "imperfections": asdict(self.world.imperfections)}
         played = {"file": str(self._options.recording), "samples": len(recording), "duration_s": recording.duration_s}
         return {"truth": None, "recording": played}
 

@@ -199,6 +199,7 @@ def test_a_production_runs_beside_a_reader_and_writes_its_truth(tmp_path: Path) 
         reader.ask("S")
         seen = [struct.unpack(">12dI", reader.answer()[4:]) for _ in range(500)]
         assert "the arm moves" in station.refusal("production")
+        assert station.hello["imperfections"]["joint_noise_rad"] == noise_rad
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     assert {line["part_kg"] for line in lines} == {0, 1}
     assert lines[0]["event"] == "start"
