@@ -14,36 +14,11 @@ from typing import Any
 
 import click
 
+from ftcalib.errors import DeviceError
 from ftdrive import __version__
 from ftdrive.errors import exit_code
+from ftdrive.terminal.command_names import COMMANDS
 from ftdrive.terminal.text import echo
-
-# A command, its module, its line in the help. The module is imported only when the command is called: help is fast.
-_COMMANDS = {
-    "demo": ("ftdrive.commands.demo", "Calibrate an emulated cell: no hardware, 25 s."),
-    "init": ("ftdrive.commands.init", "Ask about the cell, probe it, write ftdrive.toml. Moves nothing."),
-    "config": ("ftdrive.commands.config", "Show the configuration and the source of each value."),
-    "plan": ("ftdrive.commands.plan", "Plan a tour proven clear of collisions. Needs no robot."),
-    "calibrate": ("ftdrive.commands.calibrate", "Drive the tour, average the sensor at each pose, solve."),
-    "verify": ("ftdrive.commands.verify", "Compare fresh poses with a calibration's prediction."),
-    "doctor": ("ftdrive.commands.doctor", "Check robot, sensor and computer. Moves nothing."),
-    "devices": ("ftdrive.commands.devices", "List serial ports and CAN interfaces."),
-    "solve": ("ftdrive.commands.solve", "Solve a recorded run, a dataset or a CSV file."),
-    "report": ("ftdrive.commands.report", "Report a calibration in one file: verdict, findings, figures."),
-    "live": ("ftdrive.commands.live", "Show the raw and the compensated wrench."),
-    "push": ("ftdrive.commands.push", "Set payload or gravity in the controller as calibrated."),
-    "record": ("ftdrive.commands.record", "Record raw and compensated wrench with pose and events."),
-    "history": ("ftdrive.commands.history", "List results and verifications, with their trends."),
-    "fleet": ("ftdrive.commands.fleet", "Watch many cells: what is due, what drifts, solve all again."),
-    "diff": ("ftdrive.commands.diff", "Compare two calibrations, in sigmas."),
-    "convert": ("ftdrive.commands.convert", "Convert a recording between MCAP, CSV and Parquet."),
-    "compensate": ("ftdrive.commands.compensate", "Compensate a recording. Needs no device."),
-    "stream": ("ftdrive.commands.stream", "Serve the wrench to Foxglove, Lichtblick and PlotJuggler."),
-    "replay": ("ftdrive.commands.replay", "Repeat a recorded run through the same routine and solver."),
-    "bundle": ("ftdrive.commands.bundle", "Write a run into one file for a bug report, without addresses."),
-    "export": ("ftdrive.commands.export", "Write a plan or a calibration for another program."),
-    "transcript": ("ftdrive.commands.transcript", "Record or play the bytes on a sensor's wire."),
-}
 
 _EPILOG = """\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
@@ -60,8 +35,12 @@ _CLOSED_PIPE = 128 + 13
 def _closed_pipe() -> Iterator[None]:
     try:
         yield
-    except BrokenPipeError:  # click would end with 1
-        raise click.exceptions.Exit(_CLOSED_PIPE) from None
+    except BrokenPipeError as error:  # click would end with 1, whichever pipe or socket it is
+        from ftdrive.terminal.supervisor import Supervisor
+
+        if any(Supervisor(sys.stdin, stream, "it").absence() for stream in (sys.stdout, sys.stderr)):
+            raise click.exceptions.Exit(_CLOSED_PIPE) from None
+        raise DeviceError("a device or server closed its connection: check it, then start again") from error
 
 
 class _LazyGroup(click.Group):
@@ -74,17 +53,18 @@ class _LazyGroup(click.Group):
         return super().invoke(ctx)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(_COMMANDS)
+        return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in _COMMANDS:
+        if cmd_name not in COMMANDS:
             return None
-        command: click.Command = getattr(importlib.import_module(_COMMANDS[cmd_name][0]), cmd_name)
+        # Imported only when the command is called: help is fast.
+        command: click.Command = getattr(importlib.import_module(f"ftdrive.commands.{cmd_name}"), cmd_name)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl([(name, line) for name, (_, line) in _COMMANDS.items()])
+            formatter.write_dl(list(COMMANDS.items()))
 
 
 @click.group(cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
@@ -171,10 +151,8 @@ def run(arguments: Sequence[str]) -> int:
     try:
         return int(cli.main(list(arguments), prog_name="ftdrive", standalone_mode=False) or 0)
     except click.ClickException as error:
-        from ftdrive.terminal.console import in_whole_words
-
         error.show(message := StringIO())
-        echo(in_whole_words(message.getvalue(), sys.stderr), err=True, nl=False)
+        echo(message.getvalue(), err=True, nl=False)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         _say("interrupted")
@@ -183,9 +161,7 @@ def run(arguments: Sequence[str]) -> int:
         code = exit_code(error)
         if code is None:
             raise
-        from ftdrive.terminal.console import in_whole_words
-
-        _say(in_whole_words(f"error: {in_a_sentence(error)}", sys.stderr))
+        _say(f"error: {in_a_sentence(error)}")
         return code
 
 

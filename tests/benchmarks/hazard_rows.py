@@ -24,12 +24,12 @@ PAYLOAD_KG = 1.5
 """The settings of the controller in all rows that set nothing else."""
 
 UNSEEN: Final[Mapping[str, str]] = {
-    "1 cable, gently": "nothing stops the arm below the contact limit; the report names poses (test_disturbances.py)",
+    "1 cable, gently": "nothing stops the arm below the contact limit; the report names poses (test_live_fit.py)",
     "4 what is not described": "only the question and the contact guard (14)",
     "6 singularities": "by construction: joint moves only",
     "13 overload of a known range": "the contact guard comes first (14); guard and samples of a pose: unit tests",
     "20 people": "only the questions, and 14",
-    "23 the tool moves": "named in the report, and refused where it changed the tool (test_disturbances.py)",
+    "23 the tool moves": "named in the report, and refused where it changed the tool (test_live_fit.py)",
     "24 base not bolted": "only the question; the tilt is estimated",
 }
 

@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from ftdrive.cli import _COMMANDS
+from ftdrive.terminal.command_names import COMMANDS
 
 _PEER = ("-c", "import numpy, scipy.optimize, scipy.spatial.transform, click")
 _EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -53,7 +53,7 @@ def seconds(arguments: Sequence[str], folder: Path) -> float:
 def main() -> int:
     """Print the table."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("commands", nargs="*", default=list(_COMMANDS))
+    parser.add_argument("commands", nargs="*", default=list(COMMANDS))
     parser.add_argument("--rounds", type=int, default=7)
     given = parser.parse_args()
     calls: dict[str, Sequence[str]] = {"import": _PEER}

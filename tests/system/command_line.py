@@ -1,5 +1,6 @@
 """The command line as a user runs it: in this process where that makes no difference, else in one of its own."""
 
+import io
 import json
 import os
 import subprocess
@@ -18,7 +19,7 @@ from click.testing import CliRunner
 from ftdrive import cli
 from ftdrive.cell.config import FORMAT
 from ftdrive.cell.emulated import Station
-from ftdrive.terminal.console import messages
+from ftdrive.terminal.console import answer, messages
 
 _LONG_S = 90
 """What takes so long hangs; no computer is that busy."""
@@ -58,17 +59,30 @@ class CommandLine:
         """Have the commands keep the time of a station, as the computer's may be too fast for it."""
         self._environment["FTDRIVE_CLOCK"] = station.endpoints["clock"]
 
-    def run(self, *arguments: str | Path, typed: str = "") -> CompletedProcess[str]:
-        """Run it in this process to its end: a process of its own would only import the same modules again."""
+    def run(self, *arguments: str | Path, typed: str = "", is_read: bool = True) -> CompletedProcess[str]:
+        """Run it in this process to its end: a process of its own would only import the same modules again.
+
+        Unless `is_read`, stdout is a pipe whose reader has ended.
+        """
         runner = CliRunner()
         with pytest.MonkeyPatch.context() as here, runner.isolation(typed, self._environment) as (out, err, _):
             here.chdir(self.folder)
             here.setattr(messages, "quiet", False)
+            if not is_read:
+                reader, writer = os.pipe()
+                os.close(reader)
+                here.setattr(sys, "stdout", os.fdopen(writer, "w"))
             try:
                 code = cli.run([*map(str, arguments)])
             except SystemExit as ended:
                 code = int(ended.code or 0)
-            sys.stdout.flush()
+            if is_read:
+                sys.stdout.flush()
+            else:
+                with suppress(BrokenPipeError):
+                    sys.stdout.close()
+                here.setattr(sys, "stdout", io.StringIO())
+                answer.print(end="")  # it keeps what could not be written
             sys.stderr.flush()
             return CompletedProcess(arguments, code, out.getvalue().decode(), err.getvalue().decode())
 

@@ -8,7 +8,14 @@ from typing import Any
 
 import pytest
 
+from tests.solved_once import solved_once
 from tests.system.command_line import CommandLine
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _solved_once() -> Iterator[None]:
+    with solved_once():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -71,15 +71,6 @@ def test_origins_are_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "origin" not in json.loads(run("config", "show", "--json").stdout)
 
 
-def test_a_wrong_file_is_exit_code_2() -> None:
-    Path("ftdrive.toml").write_text(CELL.replace("speed_deg_s", "sped"))
-    error = run("config", "show").exception
-    assert error is not None
-    assert exit_code(error) == 2
-    assert "ftdrive.toml" in str(error)
-    assert "'sped'" in str(error)
-
-
 def plan(*arguments: str) -> dict[str, object]:
     outcome = run("plan", "--json", *arguments)
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)

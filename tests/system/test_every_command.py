@@ -16,7 +16,9 @@ from click.testing import CliRunner
 
 from ftdrive.cli import cli, run
 from ftdrive.errors import ConfigError
+from ftdrive.recording import Recorder
 from tests.system.command_line import CommandLine
+from tests.unit.ftdrive.recorded import block, calibration, info
 
 
 def names(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[str]:
@@ -116,18 +118,13 @@ def test_a_number_of_no_use_is_refused_before_any_work(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /dev/full")
-def test_a_full_disk_and_a_reader_that_is_gone_are_no_crash() -> None:
+def test_a_full_disk_is_no_crash() -> None:
     command = [sys.executable, "-m", "ftdrive", "config", "show", "--json"]
     with Path("/dev/full").open("w") as full:
         outcome = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert outcome.returncode == 6
     assert outcome.stderr.startswith("error: No space left on device")
     assert outcome.stderr.count("\n") == 1
-    reader, writer = os.pipe()
-    os.close(reader)
-    outcome = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
-    os.close(writer)
-    assert (outcome.returncode, outcome.stderr) == (141, "")
 
 
 @pytest.mark.parametrize(
@@ -174,39 +171,71 @@ def works_with_simulate_and_json(command: str, ftdrive: CommandLine, capfd: pyte
     assert SHOWN.get(command, bool)(answer)
 
 
-ANSWERED: Mapping[str, str] = {
-    "bundle": "Saved ",
-    "config show": "[robot]",
-    "devices": "/dev/pts/",
-    "doctor": "Usable; see the lines with !",
-    "export calibration": '"ftdrive.export/1"',
-    "export plan": "# ftdrive.targets/1",
-    "plan": "Predicted for",
-    "replay": "equal to the last digit",
-    "report": "# ",
-    "solve": "compensation error",
-    "transcript play": "played ",
+ANSWERED: Mapping[str, tuple[str, str]] = {
+    "bundle": ("--simulate -o {n}.zip", "Saved "),
+    "calibrate": ("--simulate --minimal --dry-run", "Dry run: nothing has moved."),
+    "compensate": ("{csv}", "compensated "),
+    "config show": ("--simulate", "[robot]"),
+    "convert": ("{csv} {n}.csv", "Saved "),
+    "devices": ("--simulate", "/dev/pts/"),
+    "diff": ("{run} {run}", "The calibrations are the same."),
+    "doctor": ("--simulate", "Usable; see the lines with !"),
+    "export calibration": ("{run} --format json", '"ftdrive.export/1"'),
+    "export formats": ("", "ros2-control"),
+    "export plan": ("--simulate --format csv", "# ftdrive.targets/1"),
+    "fleet add": ("cells.toml", "1 added"),
+    "fleet compensate": ("{csv} -o {n}", "compensated"),
+    "fleet index": ("{run}", "added to"),
+    "fleet remove": ("press", "removed"),
+    "fleet solve": ("{run}", "run"),
+    "fleet status": ("", "never calibrated"),
+    "history": ("{run}/..", "verdict"),
+    "init": ("--simulate --yes --height 33 --tool 0:60:90 -o {n}.toml", "Wrote "),
+    "live": ("--replay {csv} --once", "N·m"),
+    "plan": ("--simulate", "Predicted for"),
+    "push": ("{run} --simulate --dry-run", "nothing was sent"),
+    "record": ("--simulate --calibration {run} -o {n}.csv --count 100", "Saved "),
+    "replay": ("{run}", "equal to the last digit"),
+    "report": ("{run} --format md", "# "),
+    "solve": ("{run}", "compensation error"),
+    "transcript play": ("--simulate", "played "),
+    "transcript record": ("--simulate -o {n}.jsonl --duration 0.2", " samples, mean "),
 }
-"""What each prints on stdout without --json; for `calibrate`, `verify` and `push` see their tests."""
+"""What each prints on stdout without --json, also with -q."""
+
+ELSEWHERE = {"demo", "verify", "stream", "fleet serve", "fleet verify"}
+"""Long sessions, servers without an answer, and a question at a terminal: see their tests."""
+
+
+def test_no_command_is_forgotten() -> None:
+    assert ANSWERED.keys() | ELSEWHERE == set(names(cli))
 
 
 @pytest.mark.parametrize("command", ANSWERED)
-def test_the_answer_is_on_stdout(
+def test_a_file_gets_the_answer_and_a_reader_that_ends_ends_the_command(
     command: str, demo: dict[str, Any], ftdrive: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if command in REHEARSED:
         module = importlib.import_module(f"ftdrive.commands.{'emulated_run' if ' ' in command else command}")
         monkeypatch.setattr(module, "rehearsed_run", lambda _: nullcontext(Path(demo["run"])))
-    outcome = ftdrive.run(*command.split(), *NEEDED.get(command, ()), "--simulate")
-    assert outcome.returncode == 0, outcome.stderr
-    assert ANSWERED[command] in outcome.stdout
-    assert ANSWERED[command] not in outcome.stderr
-    quiet = ftdrive.run("-q", *command.split(), *NEEDED.get(command, ()), "--simulate", *_FRESH.get(command, ()))
-    assert (quiet.returncode, quiet.stderr) == (0, "")
-    assert ANSWERED[command] in quiet.stdout
-
-
-_FRESH: Mapping[str, tuple[str, ...]] = {"bundle": ("-o", "b.zip")}
+    recorder = Recorder([csv := ftdrive.folder / "peg.csv"], info(), {})
+    recorder.write(block(100))
+    recorder.close()
+    calibration().save(ftdrive.folder / "calibration.json")
+    press = '[cells.press]\nconfig = "cell.toml"\nverify_every_days = 7\n'
+    (ftdrive.folder / "cells.toml").write_text(f'format = "ftdrive.cells/1"\n{press}')
+    (ftdrive.folder / "cell.toml").write_text('format = "ftdrive.config/1"\n[robot]\nhost = "10.0.0.1"\n')
+    arguments, words = ANSWERED[command]
+    for quiet in (True, False):
+        if command in ("fleet status", "fleet remove"):
+            assert ftdrive.run("fleet", "add", "cells.toml").returncode == 0
+        typed = [*command.split(), *arguments.format(n=quiet, run=demo["run"], csv=csv).split()]
+        outcome = ftdrive.run(*["-q"] * quiet, *typed, is_read=quiet)
+        assert outcome.returncode == (0 if quiet else 141), outcome.stderr
+        assert words not in outcome.stderr
+        if quiet:
+            assert words in outcome.stdout
+            assert outcome.stderr == ""
 
 
 @pytest.mark.parametrize(

@@ -75,23 +75,6 @@ def test_killed_station_is_a_lost_stream(station: Station, tour: subprocess.Pope
     assert len(ftdrive.poses()) >= 2
 
 
-@pytest.mark.parametrize(
-    ("typed", "options"),
-    [("yes\nyes\nyes\nmove\n", ()), ("", ("--yes",))],
-    ids=["another word", "--yes"],
-)
-@pytest.mark.slow
-def test_without_the_typed_word_nothing_moves(
-    typed: str, options: tuple[str, ...], station: Station, ftdrive: CommandLine
-) -> None:
-    before = station.control(do="state")["q_rad"]
-    config = ftdrive.connect(station)
-    outcome = ftdrive.run("calibrate", "--config", config, "--minimal", *options, typed=typed)
-    assert outcome.returncode == 130, outcome.stderr
-    assert station.control(do="state")["q_rad"] == before
-    assert not ftdrive.poses()
-
-
 def test_a_wrong_option_is_reported_before_a_device_opens(ftdrive: CommandLine) -> None:
     outcome = ftdrive.run(
         "calibrate", "--robot", "127.213.7.9", "--sensor", "ati-serial:///dev/no-such-port", "--redo", "3"

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from ftdrive.cell.emulated import Station
@@ -98,63 +97,9 @@ def test_what_cannot_be_pushed_is_refused_with_the_reason(station: Station, run:
     assert not list(run.glob("push*"))
 
 
-@pytest.mark.slow
-def test_a_rehearsed_push_keeps_its_receipt_in_the_run(run: Path, ftdrive: CommandLine) -> None:
-    answer = ftdrive.json("push", run, "--simulate")
-    assert answer["file"] == str(run / "push.json")
-    again = ftdrive.json("push", "--restore", run, "--simulate")
-    assert again["restores"] == answer["file"]
-    assert again["read_back"]["mass_kg"] == answer["old"]["mass_kg"]
-
-
 def controller_gravity(station: Station) -> list[float]:
     gravity: list[float] = station.control(do="state")["target_gravity_m_s2"]
     return gravity
-
-
-@pytest.mark.slow
-def test_the_tilt_of_the_base_is_pushed_read_back_and_restored(run: Path, ftdrive: CommandLine) -> None:
-    """PolyScope 5.26 reports its gravity; the base of the demo leans, and its installation does not know."""
-    made_by = json.loads((run / "run.json").read_text())["station"]
-    with Station(made_by["sensor"], [*made_by["options"], "--polyscope", "5.26.0"]) as station:
-        describe(station, ftdrive)
-        level = controller_gravity(station)
-        down = np.array(station.truth["gravity_force_base_N"]) / station.truth["weight_N"]
-
-        def off_deg() -> float:
-            up = np.array(controller_gravity(station))
-            return float(np.degrees(np.arccos(np.clip(-up @ down / np.linalg.norm(up), -1, 1))))
-
-        before_deg = off_deg()
-        assert before_deg > 0.5
-        station.control(do="foreign-program", seconds=600)
-        playing = ftdrive.run("push", run, "--gravity", "--config", "cell.toml", typed="GRAVITY\n")
-        assert playing.returncode == 7
-        assert "another program is on the controller" in playing.stderr
-        station.control(do="dashboard-stop")
-        declined = ftdrive.run("push", run, "--gravity", "--config", "cell.toml", typed="PUSH\nno\n")
-        assert declined.returncode == 130
-        assert controller_gravity(station) == level
-        assert not list(run.glob("push*"))
-
-        pushed = ftdrive.run("push", run, "--gravity", "--config", "cell.toml", typed="GRAVITY\n")
-        assert pushed.returncode == 0, pushed.stderr
-        assert "Type GRAVITY" in pushed.stderr
-        assert "Read back" in pushed.stdout
-        assert off_deg() < 0.1
-        assert payload(station)[0] == station.truth["payload_kg"]  # it stays
-        receipt = json.loads((run / "push.json").read_text())
-        assert receipt["old"]["up_base_m_s2"] == pytest.approx(level)
-        assert receipt["new"]["mass_kg"] is None
-        assert receipt["read_back"]["up_base_m_s2"] == pytest.approx(controller_gravity(station))
-        assert np.linalg.norm(receipt["new"]["up_base_m_s2"]) == pytest.approx(9.82)
-        agrees = ftdrive.run("push", run, "--gravity", "--config", "cell.toml")
-        assert (agrees.returncode, "The controller agrees" in agrees.stdout) == (0, True)
-
-        restored = ftdrive.run("push", "--restore", run, "--config", "cell.toml", typed="GRAVITY\n")
-        assert restored.returncode == 0, restored.stderr
-        assert controller_gravity(station) == pytest.approx(level)
-        assert json.loads((run / "push-2.json").read_text())["restores"] == str(run / "push.json")
 
 
 def test_a_controller_that_does_not_report_its_gravity_is_left_alone(

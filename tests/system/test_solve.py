@@ -57,23 +57,6 @@ def test_a_drifting_recording_is_rejected(solve: Solve, real_data: Path) -> None
     assert result["residual"]["force_rms_N"] > 0.1 * result["weight_N"]
 
 
-def test_json_has_the_documented_keys_and_messages_stay_off_stdout(solve: Solve, tmp_path: Path) -> None:
-    path = tmp_path / "poses.csv"
-    path.write_text("\n".join([HEADER, *rows(12)]))
-    outcome = solve(path, "--json")
-    assert outcome.returncode == 0, outcome.stderr
-    result = json.loads(outcome.stdout)
-    estimates = {
-        *("mass_kg", "weight_N", "gravity_force_base_N", "R_flange_sensor", "force_bias_N", "torque_bias_Nm"),
-        *("p_sensor_com_m", "tilt_alpha_rad", "tilt_beta_rad"),
-    }
-    assert {"schema_version", "method", "verdict", "findings", "n_poses", "sigma"} | estimates <= result.keys()
-    assert estimates <= result["sigma"].keys()
-    assert set(result["residual"]) == {"force_rms_N", "force_max_N", "torque_rms_Nm", "torque_max_Nm"}
-    assert result["mass_kg"] == pytest.approx(1.2, abs=0.001)
-    assert "compensation error" in solve(path).stdout
-
-
 def test_output_is_a_calibration_that_is_never_overwritten(solve: Solve, tmp_path: Path) -> None:
     path, output = tmp_path / "poses.csv", tmp_path / "calibration.json"
     path.write_text("\n".join([HEADER, *rows(12)]))
@@ -96,27 +79,6 @@ def test_several_files_give_a_line_each_and_one_bad_file_does_not_hide_the_other
     assert [answer["source"] for answer in answers] == [str(bad), str(good), str(good)]
     assert "error" in answers[0]
     assert answers[1]["mass_kg"] == answers[2]["mass_kg"]
-
-
-def test_all_methods_side_by_side_each_with_a_result_or_a_reason(solve: Solve, tmp_path: Path) -> None:
-    path = tmp_path / "poses.csv"
-    path.write_text("\n".join([HEADER, *rows(12)]))
-    outcome = solve(path, "--method", "all", "--json")
-    assert outcome.returncode == 0, outcome.stderr
-    methods = {one["method"]: one for one in json.loads(outcome.stdout)["methods"]}
-    assert set(methods) == {
-        *("ml", "srom", "lrom", "carlson-relaxation", "carlson-cayley", "carlson-eigen", "carlson-nullspace"),
-        *("carlson-iterative", "carlson-polynomial", "known-rotation", "yaw-only"),
-    }
-    assert "24 orientations" in methods["srom"]["reason"]
-    assert "mass" in methods["carlson-cayley"]["reason"]
-    for name in ("ml", "lrom", "carlson-eigen", "carlson-polynomial", "yaw-only"):
-        assert methods[name]["mass_kg"] == pytest.approx(1.2, abs=0.002)
-        assert methods[name]["cross_validated"]["force_rms_N"] < 0.003
-    assert methods["known-rotation"]["residual"]["force_rms_N"] > 1  # the sensor is turned by 40 degrees
-    outcome = solve(path, "--method", "carlson-cayley", "--mass-kg", "1.2", "--level-deg", "0", "--json")
-    assert outcome.returncode == 0, outcome.stderr
-    assert json.loads(outcome.stdout)["mass_kg"] == pytest.approx(1.2)
 
 
 def test_a_rejected_result_is_saved_only_by_force_and_stays_marked(solve: Solve, tmp_path: Path) -> None:
@@ -163,32 +125,3 @@ def test_bad_csv_gets_one_clear_sentence(solve: Solve, case: str, tmp_path: Path
     assert outcome.stderr.count("\n") == 1
     assert word in outcome.stderr
     assert [item.name for item in tmp_path.iterdir()] == ["poses.csv"]
-
-
-@pytest.mark.parametrize(
-    ("content", "word"),
-    [
-        ('{"format": "ftdrive.dataset/9"}', "version '9' of ftdrive.dataset"),
-        ('{"format": "something/1"}', "something/1"),
-        ("", "empty"),
-        ('{"format": "ftdr', "JSON"),
-    ],
-)
-def test_bad_dataset_file_gets_one_clear_sentence(solve: Solve, content: str, word: str, tmp_path: Path) -> None:
-    path = tmp_path / "dataset.json"
-    path.write_text(content)
-    outcome = solve(path)
-    assert outcome.returncode == 6, outcome.stderr
-    assert outcome.stderr.startswith("error: ")
-    assert outcome.stderr.count("\n") == 1
-    assert word in outcome.stderr
-
-
-def test_a_folder_that_is_no_run_and_a_run_of_another_version(solve: Solve, tmp_path: Path) -> None:
-    outcome = solve(tmp_path)
-    assert outcome.returncode == 6
-    assert "run.json" in outcome.stderr
-    (tmp_path / "run.json").write_text('{"format": "ftdrive.run/7"}')
-    outcome = solve(tmp_path)
-    assert outcome.returncode == 6
-    assert "version '7' of ftdrive.run" in outcome.stderr

@@ -4,7 +4,6 @@ import gc
 import json
 import shutil
 import subprocess
-import weakref
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -171,21 +170,6 @@ def test_the_last_will_says_that_the_server_is_gone(tmp_path: Path) -> None:
         found._client.socket().shutdown(2)  # type: ignore[union-attr]
         wait_until(lambda: not server_at(mosquitto)["online"])
         assert cells_at(mosquitto) == {"A"}
-
-
-def test_a_closed_one_leaves_no_socket_to_the_garbage_collector(tmp_path: Path) -> None:
-    def publish_once(mosquitto: Mosquitto) -> weakref.ref[Any]:
-        with messages(mosquitto) as (found, _, _):
-            found.update(reading(cell("A")))
-            wait_until(lambda: found._answers)
-            return weakref.ref(found._client)
-
-    gc.disable()
-    try:
-        with Mosquitto(tmp_path) as mosquitto:
-            assert publish_once(mosquitto)() is None
-    finally:
-        gc.enable()
 
 
 @pytest.mark.filterwarnings("ignore:unclosed <ssl:ResourceWarning")  # paho leaves it to the garbage collector

@@ -2,7 +2,6 @@
 
 import gc
 import math
-import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -133,7 +132,7 @@ def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
     [
         (scheme, fault)
         for scheme in SCHEMES
-        if scheme != "ati-serial"  # its records have no header and a short sum: see `test_ati_drivers.py`
+        if scheme != "ati-serial"  # its records have no header and a short sum: see `test_serial_driver.py`
         for fault in ("drop", "corrupt", "byte_slip")
         # CAN controllers and UDP drop damaged frames themselves
         if fault == "drop" or scheme not in {"ati-can", "robotous-can", "ati-netft"}
@@ -194,33 +193,6 @@ def test_netft_scale(start: Start, options: dict[str, Any], query: str) -> None:
     np.testing.assert_allclose(samples.wrench.mean(axis=0), WRENCH, atol=0.03)
     assert (np.diff(samples.seq) == 1).all()
     assert health.lost == 0
-
-
-@pytest.mark.parametrize(
-    ("status", "product", "query", "says"),
-    [
-        (0x80020000, "Net F/T", "", r"0x80020000 \(bit 17: transducer saturated or A/D error, bit 31: any error\)"),
-        (0x88000000, "Ethernet Axia", "", "bit 27: gauge out of range"),
-        (0x00000020, "", "onrobot=1", "bit 5: overload Fy"),
-    ],
-)
-def test_netft_status_is_a_fault(start: Start, status: int, product: str, query: str, says: str) -> None:
-    with pytest.raises(DeviceFault, match=says):
-        start("ati-netft", status=status, product=product).sensor(query).open()
-
-
-def test_netft_reports_its_rate_and_range_and_losses_are_named(start: Start, caplog: pytest.LogCaptureFixture) -> None:
-    emulator = start("ati-netft", rate_hz=500)
-    with emulator.sensor() as sensor:
-        assert sensor.identify().facts["range"].value == pytest.approx((130, 130, 400, 10, 10, 10))
-        assert sensor.health().nominal_rate_Hz == 500
-        emulator.faults(drop=0.3)
-        while not sensor.health().events:
-            sensor.collect(0.2)
-        what = [what for _, what in sensor.health().events]
-    assert len(what) == 1
-    assert re.fullmatch(r"rate [23]\d\d\.\d Hz instead of 500 Hz", what[0])
-    assert "Hz instead of 500 Hz" in caplog.text
 
 
 def test_netft_latched_monitor_is_a_warning(start: Start, caplog: pytest.LogCaptureFixture) -> None:

@@ -1,4 +1,4 @@
-"""The emulated Robotiq, Bota and Net F/T sensors, as pyserial and sockets see them."""
+"""The emulated Bota and Net F/T sensors, as pyserial and sockets see them."""
 
 import socket
 import struct
@@ -12,13 +12,8 @@ from numpy.typing import NDArray
 
 from ftmocks.sensors.bota import BotaBox
 from ftmocks.sensors.netft import RECORD, NetFtBox
-from ftmocks.sensors.robotiq import RobotiqBox
 from tests.wire.waiting import LIMIT_S, read_to, wait_until
 
-FT300_WRENCH = np.array([12.34, -5.67, 100, 0.15, -0.025, 1])
-FT300_START = bytes.fromhex("09 10 01 9A 00 01 02 02 00 CD CA")
-FT300_STARTED = bytes.fromhex("09 10 01 9A 00 01 21 52")
-FT300_FRAME = bytes.fromhex("20 4E D2 04 C9 FD 10 27 96 00 E7 FF E8 03 86 DC")
 BOTA_WRENCH = np.array([1, -2, 9.81, 0.1, -0.2, 0.3])
 RDT_ONE = bytes.fromhex("12 34 00 02 00 00 00 01")
 RDT_BIAS = bytes.fromhex("12 34 00 42 00 00 00 00")
@@ -30,29 +25,12 @@ def constant(wrench: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]
 
 
 @contextmanager
-def serial_client(device: RobotiqBox | BotaBox) -> Iterator[serial.Serial]:
+def serial_client(device: BotaBox) -> Iterator[serial.Serial]:
     try:
         with serial.Serial(device.start(), timeout=LIMIT_S) as port:
             yield port
     finally:
         device.stop()
-
-
-# ---------------------------------------------------------------- Robotiq
-
-
-def test_robotiq_needs_the_whole_stop_sequence() -> None:
-    box = RobotiqBox(constant(FT300_WRENCH), streaming_at_start=True)
-    with serial_client(box) as port:
-        port.write(b"\xff" * 49 + b"\0" + b"\xff" * 49)
-        assert port.read(160) == FT300_FRAME * 10
-        port.write(b"\xff" * 300)
-        wait_until(lambda: not box.streaming)
-        later_s = box.clock.now_s() + 0.05  # its thread has done whole turns by then
-        wait_until(lambda: box.clock.now_s() > later_s and not box._burst)  # what is more than 50 is forgotten
-        port.write(FT300_START)
-        rest = read_to(port, FT300_STARTED)
-        assert rest == FT300_FRAME * (len(rest) // 16)
 
 
 # ---------------------------------------------------------------- Bota
@@ -80,17 +58,6 @@ def test_bota_configuration_answers(written: bytes, answers: bytes) -> None:
         assert read_to(port, b"r,0,C,0\r\n") == b"", "and nothing else"
 
 
-def test_bota_waits_for_the_rest_of_a_command() -> None:
-    box = BotaBox(constant(BOTA_WRENCH))
-    with serial_client(box) as port:
-        port.write(b"C")
-        read_to(port, b"r,0,C,0\r\n")
-        port.write(b"c,0,1,")
-        wait_until(lambda: box._line == b"c,0,1,")
-        port.write(b"0,4")
-        assert port.read_until(b"\n") == b"r,0,c,0\r\n"
-
-
 # ---------------------------------------------------------------- Net F/T
 
 
@@ -105,11 +72,8 @@ class RdtClient:
         self.socket.settimeout(LIMIT_S)
         self.socket.connect((self.endpoint["host"], self.endpoint["rdt_port"]))
 
-    def datagrams(self, count: int) -> list[bytes]:
-        return [self.socket.recv(2048) for _ in range(count)]
-
     def records(self, count: int) -> NDArray[np.void]:
-        return np.frombuffer(b"".join(self.datagrams(count)), dtype=RECORD)
+        return np.frombuffer(b"".join(self.socket.recv(2048) for _ in range(count)), dtype=RECORD)
 
     def is_silent(self, silence_s: float = 0.05) -> bool:
         self.socket.settimeout(silence_s)
@@ -145,17 +109,6 @@ def test_rdt_listens_at_its_documented_port() -> None:
         assert len(client.socket.recv(2048)) == 36
 
 
-@pytest.mark.parametrize(("command", "count", "sent"), [(1, 0, 1), (1, 3, 3), (2, 25, 25), (3, 12, 12)])
-def test_rdt_count_is_honoured(net_box: NetFtBox, command: int, count: int, sent: int) -> None:
-    with rdt_client(net_box) as client:
-        client.socket.send(struct.pack(">HHI", 0x1234, command, count))
-        records = client.records(3 if command == 3 else sent)
-        assert records["rdt"].tolist() == list(range(1, sent + 1))
-        assert (np.diff(records["ft"].astype(int)) == 7).all(), "it samples at 7000 Hz inside"
-        assert client.is_silent()
-        assert not net_box.streaming
-
-
 def test_rdt_ignores_what_is_no_request(net_box: NetFtBox) -> None:
     start = struct.pack(">HHI", 0x1234, 2, 0)
     with rdt_client(net_box) as client:
@@ -164,16 +117,6 @@ def test_rdt_ignores_what_is_no_request(net_box: NetFtBox) -> None:
         assert client.is_silent()
         client.socket.send(start)
         client.records(10)
-
-
-def test_rdt_buffered_datagrams(net_box: NetFtBox) -> None:
-    net_box.buffer_size = 40
-    with rdt_client(net_box) as client:
-        client.socket.send(struct.pack(">HHI", 0x1234, 3, 0))
-        data = client.datagrams(3)
-        assert [len(datagram) for datagram in data] == [1440] * 3
-        records = np.frombuffer(b"".join(data), dtype=RECORD)
-        assert records["rdt"].tolist() == list(range(1, 121))
 
 
 def test_rdt_bias_status_latch_and_reset(net_box: NetFtBox) -> None:

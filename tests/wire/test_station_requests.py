@@ -4,8 +4,6 @@ import json
 import math
 import socket
 import struct
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ftmocks.__main__ import main
 from ftmocks.sensors.netft import RECORD, NetFtBox
 from tests.wire.rtde_socket import RtdeSocket
-from tests.wire.station_process import ROOT, StationProcess
+from tests.wire.station_process import StationProcess
 from tests.wire.waiting import LIMIT_S
 
 OPTIONS = ("--seed", "2", "--sensor", "bota")
@@ -160,16 +159,6 @@ def test_a_silent_arm_keeps_its_connections_and_answers_later(station: StationPr
         assert dashboard.recv(100) == b"Robotmode: RUNNING\n"
 
 
-def test_a_pendant_program_arrives_by_the_script_port(station: StationProcess) -> None:
-    program = b'# checks\ndef ask():\n  popup("free?", blocking=True)\n  textmsg("go")\nend\n'
-    with station.connect(30002) as script:
-        script.sendall(program)
-        station.wait_for(lambda s: s["popup"] == "free?")
-    assert station.ask("close-popup")["accepted"]
-    events = station.wait_for(lambda s: s["runtime_state"] == "STOPPED")["events"]
-    assert [event["why"] for event in events if event["what"] == "textmsg"] == ["go"]
-
-
 def test_a_program_swings_the_arm_and_inertia_comes_and_goes() -> None:
     with StationProcess("--seed", "3", "--force-bias", "0,0,0") as station:
         mass_kg, weight_N = station.hello["truth"]["mass_kg"], station.hello["truth"]["weight_N"]
@@ -275,13 +264,18 @@ def test_requests_to_begin_with() -> None:
         (["--sensor", "ur-ft", "--sensor-mass-kg", "0.2"], "leave --sensor-mass-kg out"),
         (["--sensor", "lab"], "invalid choice"),
         (["--inertia", "1,1,3,0,0,0"], "no body has"),
+        (["--imperfections", "ripples=1"], "no setting of a real cell"),
         (["--recording", "missing.csv"], "cannot read the recording"),
         (["--recording", "README.md", "--time-scale", "2"], "leave --time-scale"),
         (["--sensor", "ur-ft", "--sensor-delay-ms", "5"], "no wire of its own"),
     ],
 )
-def test_wrong_options_are_exit_code_2(options: list[str], why: str) -> None:
-    command = [sys.executable, "-m", "ftmocks", "station", *options]
-    ended = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, cwd=ROOT, check=False)
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert why in ended.stderr
+def test_wrong_options_are_exit_code_2(
+    options: list[str], why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["ftmocks", "station", *options])
+    with pytest.raises(SystemExit) as ended:
+        raise SystemExit(main())
+    answer = capsys.readouterr()
+    assert (ended.value.code, answer.out) == (2, "")
+    assert why in answer.err

@@ -70,22 +70,6 @@ def test_the_flange_does_not_depend_on_the_tcp(station: Station, new_arm: NewArm
     assert np.allclose(arm.state().R_base_flange, before.R_base_flange, atol=1e-9)
 
 
-@pytest.mark.slow
-def test_old_controllers_need_control_to_report_the_tcp(start_station: Callable[..., Station]) -> None:
-    station = start_station("--no-tcp-offset")
-    arm = station.arm()
-    try:
-        arm.open()
-        assert arm.status().tcp_offset is None
-        with pytest.raises(ConnectError, match="too old"):
-            arm.state()
-        arm.open(control=True)
-        station.ask("set-tcp", tcp=TCP)
-        assert_flange_is_right(arm)
-    finally:
-        arm.close()
-
-
 @one_path
 def test_a_tcp_that_changes_while_reading_never_gives_a_wrong_flange(station: Station, new_arm: NewArm) -> None:
     arm = new_arm()
@@ -212,21 +196,6 @@ def test_others_may_look_and_stop_while_the_arm_moves(station: Station, arm: UrA
     arm.move_to(here.tolist(), timeout_s=30, guard=no_guard)
 
 
-@pytest.mark.slow
-def test_an_arm_far_from_its_nominal_kinematics_is_refused(start_station: Callable[..., Station]) -> None:
-    for noise, refused in (("30", True), ("1", False)):  # 1: as an arm comes from the factory
-        with start_station("--dh-noise", noise) as station:
-            arm = station.arm()
-            try:
-                if refused:
-                    with pytest.raises(ConnectError, match=r"UR5e.* another model"):
-                        arm.open()
-                else:
-                    arm.open()
-            finally:
-                arm.close()
-
-
 # ---------------------------------------------------------------------- moving
 
 
@@ -346,12 +315,6 @@ def test_close_in_the_middle_of_a_move_stops_the_arm(station: Station, arm: UrAr
 
 
 @pytest.mark.slow
-def test_a_controller_that_is_gone(station: Station, arm: UrArm) -> None:
-    with pytest.raises(StreamBroken, match="lost"):
-        arm.move_to(away(arm), timeout_s=30, guard=Trigger(arm, station.kill))
-
-
-@pytest.mark.slow
 @on_ur_rtde
 def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
     assert isinstance(arm._control, ControlProcess)
@@ -380,20 +343,6 @@ def test_a_control_process_that_hangs(station: Station, new_arm: NewArm, caplog:
     assert not [record for record in caplog.records if record.levelname == "WARNING"]  # the second way worked
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
-
-
-@pytest.mark.slow
-@one_path
-def test_a_powered_off_arm(station: Station, new_arm: NewArm) -> None:
-    arm = new_arm()
-    station.dashboard("power off")
-    station.wait_for(lambda state: state["robot_mode"] != "RUNNING")
-    with pytest.raises(ConnectError, match="power the arm on"):
-        arm.open(control=True)
-    arm.open()
-    assert arm.identify().serial == "20225500001"
-    with pytest.raises(DeviceFault, match="measure its joints"):
-        arm.state()
 
 
 # ---------------------------------------------------------------------- applications that end badly

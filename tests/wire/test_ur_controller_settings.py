@@ -1,12 +1,5 @@
 """Payload and gravity of the emulated controller, through the unmodified ur_rtde."""
 
-from collections.abc import Callable
-from contextlib import closing
-
-import pytest
-
-from ftdrivers.errors import DeviceFault
-from ftdrivers.interfaces import ControllerSettings
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import ControlPath
 from tests.wire.conftest import Station
@@ -34,30 +27,3 @@ def test_a_payload_is_kept_when_our_program_has_ended(station: Station, arm: UrA
     if control == "ur-rtde":  # the functions of an interpreted program are no events
         assert taken(station, before) == ["setTargetPayload", "setGravity"]
     assert (arm.status().payload_kg, arm.status().program) == (1.442, "stopped")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("polyscope", "call", "reported"),
-    [
-        ("3.15", "setPayload", ControllerSettings(1.2, COM_M, (0.0,) * 6)),
-        ("5.4", "setPayload", ControllerSettings()),
-        ("5.9", "setPayload", ControllerSettings(1.2, COM_M)),
-        ("5.10", "setTargetPayload", ControllerSettings(1.2, COM_M)),
-    ],
-)
-def test_every_generation_takes_a_payload(
-    start_station: Callable[..., Station], polyscope: str, call: str, reported: ControllerSettings
-) -> None:
-    station = start_station("--polyscope", polyscope)
-    with closing(station.arm(model="UR5" if polyscope == "3.15" else "UR5e")) as arm:
-        arm.open(control=True)
-        arm.set_payload(1.2, COM_M)
-        if call == "setPayload":
-            with pytest.raises(DeviceFault, match="takes no inertia"):
-                arm.set_payload(1.2, COM_M, INERTIA)
-        assert arm.controller_settings() == reported
-    assert taken(station) == [call]
-    state = station.ask("state")
-    assert (state["payload_kg"], state["payload_cog_m"]) == (1.2, [*COM_M])
-    assert state["bad_inputs"] == []

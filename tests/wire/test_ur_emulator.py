@@ -1,7 +1,6 @@
-"""The emulated UR controller on the wire: bytes of the RTDE guide, a hand-written client, the unmodified ur_rtde."""
+"""The emulated UR controller on the wire: bytes of the RTDE guide, and a hand-written client."""
 
 import itertools
-import json
 import math
 import os
 import signal
@@ -9,9 +8,7 @@ import socket
 import struct
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
-from pathlib import Path
 from random import Random
 from typing import Any
 
@@ -24,7 +21,6 @@ from ftmocks.clock import LEAD_NS
 from ftmocks.ur import rtde
 from ftmocks.ur.uploads import take_uploads
 from ftmocks.ur.variables import INPUTS, OUTPUTS
-from tests.ur_rtde import require_ur_rtde
 from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import ROOT, StationProcess
 from tests.wire.waiting import LIMIT_S, wait_until
@@ -44,49 +40,6 @@ def worn() -> Iterator[StationProcess]:
     """The same, for the tests that leave it in another state."""
     with StationProcess(*OPTIONS) as cell:
         yield cell
-
-
-@pytest.fixture
-def fresh() -> Iterator[StationProcess]:
-    """The same, for one test alone."""
-    with StationProcess(*OPTIONS) as cell:
-        yield cell
-
-
-def run_client(scenario: str, station: StationProcess, timeout_s: float = 90.0) -> dict[str, Any]:
-    """Run a scenario of ur_emulator_client.py in its own process and hand its questions to the station."""
-    require_ur_rtde()
-    client = subprocess.Popen(
-        [sys.executable, str(Path(__file__).with_name("ur_emulator_client.py")), scenario, station.host],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert client.stdin is not None
-    assert client.stdout is not None
-    assert client.stderr is not None
-    alarm = threading.Timer(timeout_s, client.kill)
-    alarm.start()
-    result: dict[str, Any] | None = None
-    try:
-        for line in client.stdout:
-            if line.startswith("@ask "):
-                client.stdin.write(json.dumps(station.say(line[5:].strip())) + "\n")
-                client.stdin.flush()
-            elif line.startswith("@result "):
-                result = json.loads(line[8:])
-        client.wait()
-        assert result is not None, f"{scenario} ended with {client.returncode}: {client.stderr.read()}"
-    finally:
-        alarm.cancel()
-        client.kill()
-        client.wait()
-        for pipe in (client.stdin, client.stdout, client.stderr):
-            pipe.close()
-    state = station.ask("state")
-    assert state["bad_inputs"] == []
-    return result
 
 
 # -- codec ------------------------------------------------------------------------------------------------------------
@@ -219,24 +172,6 @@ def test_handshake_bytes(station: StationProcess) -> None:
         assert stamps[1] > stamps[0]
 
 
-@pytest.mark.parametrize("name", ["tcp_offset", "payload", "payload_cog", "actual_q", "safety_status_bits"])
-def test_one_variable_alone(station: StationProcess, name: str) -> None:
-    station.ask("set-tcp", tcp=[0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
-    kind = OUTPUTS[name][0]
-    expected = {
-        "tcp_offset": (0.01, 0.02, 0.03, 0.1, 0.2, 0.3),
-        "payload": 0.7,
-        "payload_cog": tuple(station.hello["truth"]["payload_cog_m"]),
-        "actual_q": tuple(station.ask("state")["q_rad"]),
-        "safety_status_bits": 1,
-    }[name]
-    with RtdeSocket(station.host) as client:
-        assert client.ask("V", b"\x00\x02") == b"\x01"
-        assert client.ask("O", struct.pack(">d", 10.0) + name.encode()) == b"\x01" + kind.encode()
-        assert client.ask("S") == b"\x01"
-        assert rtde.Recipe(1, [name], [kind]).unpack(client.answer()[4:]) == {name: expected}
-
-
 def test_every_documented_variable_can_be_read_and_unknown_ones_are_named(station: StationProcess) -> None:
     with RtdeSocket(station.host) as client:
         newer = {"actual_current_as_torque", "target_gravity"}
@@ -309,61 +244,6 @@ def test_the_rate_follows_the_request(station: StationProcess) -> None:
         assert min(periods_s(client, 100.0)) == 20 * 0.01
 
 
-# -- the unmodified ur_rtde -------------------------------------------------------------------------------------------
-
-
-def test_receive(station: StationProcess) -> None:
-    station.ask("set-tcp", tcp=[0.0] * 6)
-    out = run_client("receive", station)
-    assert out["advanced"]
-    assert out["q"] == pytest.approx(out["true_q"], abs=1e-12)
-    assert out["same_q"] == out["q"]
-    assert out["same_pose"] == out["pose"]
-    assert out["modes"] == [7, 1, 1]
-    assert out["payload"] == [0.7, 0.7]
-    assert out["scaling"] == [1.0, 1.0]
-
-
-def test_moves(fresh: StationProcess) -> None:
-    out = run_client("moves", fresh)
-    begun, ended = (fresh.events(what)[0]["t_robot_s"] for what in ("moves", "stands"))
-    assert ended - begun == pytest.approx(1.5, abs=3 * 0.04), "controller's time of the first move"
-    assert out.pop("moveL_error_m") < 1e-3
-    assert out.pop("next_operation") == 1
-    assert {name: value for name, value in out.items() if value is not True} == {}
-
-
-def test_kinematics(station: StationProcess) -> None:
-    station.ask("set-tcp", tcp=[0.0] * 6)
-    out = run_client("kinematics", station)
-    assert out["ik"] == pytest.approx(out["q"], abs=1e-9)
-    assert out["ik_near"] == pytest.approx(out["q"], abs=1e-9)
-    assert [out["has"], out["has_not"]] == [True, False]
-    assert out["fk"] == pytest.approx(out["pose"], abs=1e-9)
-    assert out["fk_of_q"] == pytest.approx(out["pose"], abs=1e-9)
-    assert out["flange"] == pytest.approx(out["pose"], abs=1e-9)
-    assert out["trans"] == pytest.approx([1.0, 3.0, 3.0, 0.0, 0.0, math.pi / 2])
-    assert [out["joints_safe"], out["joints_unsafe"]] == [True, False]
-    assert [out["pose_safe"], out["pose_below_plane"], out["pose_unreachable"]] == [True, False, False]
-    assert out["script_alive"]
-    assert out["unreachable_ik"] == []
-    assert out["script_died"]
-
-
-def test_settings(fresh: StationProcess) -> None:
-    out = run_client("settings", fresh)
-    assert out["offset_before"] == [0.0] * 6
-    assert out["offset"] == [0.0, 0.0, 0.1, 0.0, 0.0, 0.0]
-    assert out["flange_after"] == pytest.approx(out["flange"], abs=1e-12)
-    assert out["bare"] == pytest.approx(out["flange"], abs=1e-12)
-    assert math.dist(out["tcp"][:3], out["bare"][:3]) == pytest.approx(0.1)
-    assert out["tcp"][3:] == pytest.approx(out["bare"][3:], abs=1e-9)
-    for name in ("setTcp", "pushed", "zeroed", "setPayload", "payload_seen", "setTargetPayload", "inertia_seen"):
-        assert out[name] is True, name
-    assert out["setSpeedSlider"]
-    assert out["slider_seen"]
-
-
 # -- the station process ----------------------------------------------------------------------------------------------
 
 
@@ -378,24 +258,7 @@ def test_the_first_line_reports_addresses_and_truth(station: StationProcess) -> 
     assert math.hypot(*truth["gravity_force_base_N"]) == pytest.approx(truth["weight_N"])
 
 
-def test_options_override_the_seed() -> None:
-    options = ("--seed", "3", "--mass", "1.25", "--com", "0.001,0.002,0.06", "--mount", "ceiling", "--tilt-deg", "1,2")
-    others = ("--sensor-rotvec-deg", "0,0,90", "--tcp", "0,0,0.1,0,0,0", "--model", "UR10e")
-    with StationProcess(*options, *others) as cell:
-        truth = cell.hello["truth"]
-        assert truth["mass_kg"] == 1.25
-        assert truth["p_sensor_com_m"] == [0.001, 0.002, 0.06]
-        assert truth["R_flange_sensor"][1] == pytest.approx([1, 0, 0])
-        assert math.degrees(truth["tilt_alpha_rad"]) == pytest.approx(1)
-        assert math.degrees(truth["tilt_beta_rad"]) == pytest.approx(-178)
-        assert truth["gravity_force_base_N"][2] > 0
-        assert cell.hello["arm"]["model"] == "UR10e"
-        assert cell.ask("state")["tcp_offset"] == [0, 0, 0.1, 0, 0, 0]
-
-
-def test_two_stations_live_side_by_side(station: StationProcess) -> None:
-    with StationProcess() as other:
-        assert other.host != station.host
+def test_a_host_has_one_station(station: StationProcess) -> None:
     taken = subprocess.run(
         [sys.executable, "-m", "ftmocks", "station", "--sensor", "none", "--host", station.host],
         stdin=subprocess.DEVNULL,
@@ -408,7 +271,7 @@ def test_two_stations_live_side_by_side(station: StationProcess) -> None:
     assert "cannot listen" in taken.stderr
 
 
-@pytest.mark.parametrize("how", ["stdin", "SIGTERM", "frozen"])
+@pytest.mark.parametrize("how", ["SIGTERM", "frozen"])
 def test_a_station_ends(how: str) -> None:
     with StationProcess() as cell, RtdeSocket(cell.host) as client:
         client.ask("O", struct.pack(">d", 500.0) + b"timestamp")
@@ -451,35 +314,6 @@ def test_the_clock_goes_on_when_the_station_was_killed() -> None:
         wait_until(lambda: clock.now_ns() > before_ns + 10 * LEAD_NS)
 
 
-@pytest.mark.parametrize(
-    "line",
-    ['{"do": "dance"}', "not json", "[]", '{"do": "push", "wrench": [1]}', '{"do": "unplug", "device": "radio"}'],
-)
-def test_what_is_not_understood_is_answered_with_an_error(station: StationProcess, line: str) -> None:
-    assert "error" in station.say(line)
-    assert "error" not in station.ask("state")
-
-
-def test_a_push_shows_in_the_truth(station: StationProcess) -> None:
-    before = station.ask("state")["true_wrench"]
-    assert station.ask("push", wrench=[1, 2, 3, 0.1, 0.2, 0.3]) == {"done": "push"}
-    after = station.ask("state")["true_wrench"]
-    assert [b - a for a, b in zip(before, after, strict=True)] == pytest.approx([1, 2, 3, 0.1, 0.2, 0.3])
-
-
-def test_no_program_starts_without_remote_control(worn: StationProcess) -> None:
-    known = len(worn.ask("state")["events"])
-    worn.ask("remote-control", on=False)
-    with worn.connect(30002) as script:
-        script.sendall(b"def rtde_control():\nend\n")
-        worn.wait_for_event("program rtde_control", accepted=False, since=known)
-        worn.ask("remote-control", on=True)
-        script.sendall(b"def rtde_control():\nend\n")
-        worn.wait_for_event("started rtde_control", since=known)
-        script.sendall(b"def other():\nend\n")
-        worn.wait_for_event("stopped other", since=known)
-
-
 def test_dashboard_lines_end_with_a_bare_line_feed(station: StationProcess) -> None:
     with socket.create_connection((station.host, 29999), LIMIT_S) as client, client.makefile("rb") as lines:
         assert lines.readline() == b"Connected: Universal Robots Dashboard Server\n"
@@ -495,8 +329,20 @@ def test_dashboard_lines_end_with_a_bare_line_feed(station: StationProcess) -> N
         assert lines.readline() == b""
 
 
-def test_sensors_share_the_station() -> None:
-    with StationProcess("--sensor", "both") as cell:
+def test_options_override_the_seed_and_sensors_share_the_station(station: StationProcess) -> None:
+    options = ("--seed", "3", "--mass", "1.25", "--com", "0.001,0.002,0.06", "--mount", "ceiling", "--tilt-deg", "1,2")
+    others = ("--sensor-rotvec-deg", "0,0,90", "--tcp", "0,0,0.1,0,0,0", "--model", "UR10e", "--sensor", "both")
+    with StationProcess(*options, *others) as cell:
+        assert cell.host != station.host
+        truth = cell.hello["truth"]
+        assert truth["mass_kg"] == 1.25
+        assert truth["p_sensor_com_m"] == [0.001, 0.002, 0.06]
+        assert truth["R_flange_sensor"][1] == pytest.approx([1, 0, 0])
+        assert math.degrees(truth["tilt_alpha_rad"]) == pytest.approx(1)
+        assert math.degrees(truth["tilt_beta_rad"]) == pytest.approx(-178)
+        assert truth["gravity_force_base_N"][2] > 0
+        assert cell.hello["arm"]["model"] == "UR10e"
+        assert cell.ask("state")["tcp_offset"] == [0, 0, 0.1, 0, 0, 0]
         can, serial = cell.hello["sensors"]["can"], cell.hello["sensors"]["serial"]
         assert {key: can[key] for key in ("interface", "bitrate", "base")} == {
             "interface": "slcan",

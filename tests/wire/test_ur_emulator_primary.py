@@ -4,7 +4,6 @@ import http.client
 import itertools
 import json
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -98,24 +97,6 @@ def test_a_program_from_port_30001_runs_and_is_heard_by_every_client(station: St
     assert station.wait_for_event("program f")["by"] == "primary port"
 
 
-def test_errors_of_a_program_come_with_their_place(station: StationProcess) -> None:
-    with PrimarySocket(station.host) as client:
-        client.send("def f():\n  txtmsg(1)\nend\n")
-        error = client.next("exception")
-        assert (error["place"], error["text"]) == ((2, 3), "compile_error_name_not_found:txtmsg:")
-        client.send("def f():\n  sync()\n  x = [1][2]\nend\n")
-        error = client.next("exception")
-        assert (error["place"], error["text"]) == ((3, 3), "[1] has no element 2")
-
-
-def test_commands_of_the_primary_interface(station: StationProcess) -> None:
-    with PrimarySocket(station.host) as client:
-        client.send(SLEEPING)
-        client.wait_for(lambda m: m["type"] == "state" and m["mode"]["running"] == 1)
-        client.send("stop program\n")
-        client.wait_for(lambda m: m["type"] == "state" and m["mode"]["running"] == 0)
-
-
 def test_local_control_ends_connections_and_lets_new_ones_only_read(station: StationProcess) -> None:
     known = len(station.ask("state")["events"])
     with PrimarySocket(station.host) as before:
@@ -133,35 +114,6 @@ def test_local_control_ends_connections_and_lets_new_ones_only_read(station: Sta
     with PrimarySocket(station.host) as client:
         client.send(SLEEPING)
         assert client.next("key")["title"] == "PROGRAM_XXX_STARTED"
-
-
-def test_a_silent_arm_sends_what_has_waited_and_misses_the_end_of_a_client(station: StationProcess) -> None:
-    known = len(station.ask("state")["events"])
-    with PrimarySocket(station.host) as client:
-        client.next("state")
-        client.send(SLEEPING)
-        client.next("key")
-        station.ask("silence-arm")
-        client.send("def never():\nend\n")
-        station.ask("dashboard-stop")
-    missed = {"disconnected", "program never"}
-    assert not missed & {event["what"] for event in station.ask("state", since=known)["events"]}
-    station.ask("silence-arm", on=False)
-    station.wait_for_event("disconnected", since=known)
-
-
-def test_the_port_closes_and_opens_with_its_kind(station: StationProcess) -> None:
-    with PrimarySocket(station.host) as client:
-        client.next("state")
-        station.ask("listen", what="primary", on=False)
-        with pytest.raises(ConnectionRefusedError):
-            station.connect(30001)
-        client.next("state")
-        station.ask("listen", what="primary")
-        assert station.ask("drop", what="primary")["connections"] == 1
-        client.end()
-    station.connect(30001).close()
-    assert "is none of" in station.refusal("drop", what="api")
 
 
 CLIENT = """
@@ -230,28 +182,3 @@ def test_polyscope_x_has_the_robot_api_in_place_of_the_dashboard(polyscope_x: St
     with RtdeSocket(polyscope_x.host) as rtde:
         assert struct.unpack(">4I", rtde.ask("v"))[:3] == (10, 12, 0)
         assert rtde.ask("O", struct.pack(">d", 125.0) + b"safety_mode,payload") == b"\x01INT32,DOUBLE"
-
-
-def test_the_robot_api_knows_the_faults_of_the_network(polyscope_x: StationProcess) -> None:
-    address = (polyscope_x.host, polyscope_x.hello["arm"]["api_port"])
-    request = b"GET /universal-robots/robot-api/openapi.json HTTP/1.1\r\nHost: x\r\n\r\n"
-    with socket.create_connection(address, 30) as client:
-        client.sendall(request)
-        assert client.recv(4096).startswith(b"HTTP/1.1 200 OK\r\n")
-        polyscope_x.ask("silence-arm")
-        client.sendall(request)
-        client.settimeout(0.1)
-        with pytest.raises(TimeoutError):
-            client.recv(1)
-        polyscope_x.ask("silence-arm", on=False)
-        client.settimeout(30)
-        assert client.recv(4096).startswith(b"HTTP/1.1 200 OK\r\n")
-        assert polyscope_x.ask("drop", what="api")["connections"] == 1
-        assert client.recv(1) == b""
-    polyscope_x.ask("listen", what="api", on=False)
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(address, 30)
-    polyscope_x.ask("listen", what="api")
-    with socket.create_connection(address, 30) as client:
-        client.sendall(b"hello\r\n\r\n")
-        assert client.recv(4096).startswith(b"HTTP/1.1 400 ")

@@ -38,7 +38,6 @@ end off the goal        `DeviceFault`     stopped                        `test_a
 import os
 import re
 import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -541,73 +540,6 @@ def refused(station: Station, **how: Any) -> ConnectError:
         arm.open(control=True)
     arm.close()
     return caught.value
-
-
-@slow
-@on_ur_rtde
-def test_registers_of_a_fieldbus(station: Station, new_arm: NewArm) -> None:
-    station.ask("claim-registers", range="lower", on=True)
-    error = refused(station)
-    station.ask("claim-registers", range="lower", on=False)
-    assert "EtherNet/IP" in error.fix
-    assert "input_int_register_0" in error.found
-    station.ask("claim-registers", range="upper", on=True)
-    moves_again(new_arm())  # these are not ours
-    station.ask("claim-registers", range="upper", on=False)
-
-
-@slow
-def test_a_second_client_does_not_stop_the_first(station: Station, arm: UrArm, control: ControlPath) -> None:
-    errors: list[ConnectError] = []
-    q = away(arm, 0.8)
-    trying = threading.Thread(target=lambda: errors.append(refused(station, control=control)))
-    arm.move_to(q, timeout_s=MOVE_S, guard=Once(trying.start, wait_until_moving(arm)))
-    trying.join()
-    assert "another client" in errors[0].found
-    assert arm.state().q_rad == pytest.approx(q, abs=1e-3)
-
-
-@slow
-def test_local_mode_keeps_the_running_program(station: Station) -> None:
-    another_takes_over(station)
-    station.ask("remote-control", on=False)
-    assert "press Local, Remote Control" in refused(station).fix
-    assert plays_another(station)
-    station.ask("remote-control", on=True)
-    station.ask("dashboard-stop")
-
-
-@slow
-@pytest.mark.parametrize(("mode", "fix"), [(3, "power the arm on"), (5, "release its brakes")])
-def test_an_arm_that_is_not_ready(station: Station, mode: int, fix: str) -> None:
-    station.ask("mode", robot=mode)
-    assert fix in refused(station).fix
-    station.ask("mode", robot=7)
-
-
-@slow
-@pytest.mark.parametrize(
-    ("what", "found", "fix"),
-    [
-        ("rtde", "cannot be reached", "switched on"),
-        ("dashboard", "dashboard server", "Settings, Security, Services"),
-        ("script", "30003", "Settings, Security, Services"),
-    ],
-)
-def test_services_that_are_off(station: Station, what: str, found: str, fix: str) -> None:
-    station.ask("listen", what=what, on=False)
-    error = refused(station)
-    station.ask("listen", what=what, on=True)
-    assert found in error.found
-    assert fix in error.fix
-
-
-@slow
-def test_a_silent_dashboard(station: Station) -> None:
-    station.ask("silent", what="dashboard", on=True)
-    error = refused(station, timing=replace(EMULATED, connect_s=1.0))
-    station.ask("silent", what="dashboard", on=False)
-    assert "did not answer" in error.found
 
 
 # ---------------------------------------------------------------------- our own processes

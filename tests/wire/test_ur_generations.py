@@ -8,7 +8,7 @@ from math import radians
 import numpy as np
 import pytest
 
-from ftdrivers.errors import ConnectError, DeviceFault, ModelUnknown
+from ftdrivers.errors import DeviceFault, ModelUnknown
 from ftdrivers.interfaces import NOT_REPORTED
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.kinematics import MODELS, forward
@@ -100,38 +100,3 @@ def use(arm: UrArm, station: Station, polyscope: str, model: str, tcp: str) -> N
     stopping.join()
     assert not station.ask("state")["moving"]
     assert abs(arm.state().q_rad[5] - q[5]) > 0.3
-
-
-@pytest.mark.parametrize(
-    ("polyscope", "control", "found", "fix"),
-    [
-        ("5.3.0", True, "PolyScope 5.3", "5.4"),
-        ("10.7.0", True, "PolyScope 10.7", "10.11"),
-    ],
-)
-def test_versions_that_cannot_be_used(
-    start_station: Callable[..., Station], polyscope: str, control: bool, found: str, fix: str
-) -> None:
-    station = start_station("--polyscope", polyscope)
-    with pytest.raises(ConnectError) as error:
-        station.arm(model="UR5e").open(control=control)
-    assert found in error.value.found
-    assert fix in error.value.fix
-    assert station.ask("state")["runtime_state"] == "STOPPED"
-    station.kill()
-
-
-def test_local_control_shows_itself_when_the_program_is_refused(start_station: Callable[..., Station]) -> None:
-    """PolyScope X before 10.12 does not report its control mode."""
-    station = start_station("--polyscope", "10.11.0")
-    station.ask("remote-control", on=False)
-    with closing(station.arm()) as arm:
-        arm.open()
-        assert arm.in_remote_control() is None
-        with pytest.raises(ConnectError, match="takes no programs from the network") as error:
-            arm.open(control=True)
-        assert "remote control" in error.value.fix
-        station.ask("remote-control", on=True)
-        arm.open(control=True)
-    assert station.ask("state")["runtime_state"] == "STOPPED"
-    station.kill()

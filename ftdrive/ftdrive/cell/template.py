@@ -8,7 +8,8 @@ from typing import Any
 
 from ftdrive.cell.config import FORMAT, RULES, SECTIONS, CellConfig, as_toml
 
-_WIDTH = 120
+WIDTH = 120
+"""Of the lines of a file."""
 
 
 def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
@@ -38,25 +39,27 @@ def document(
     *,
     head: Sequence[str] = (),
     active: Callable[[str], bool] = lambda _: True,
+    width: int = WIDTH,
 ) -> str:
     """Return values by key, such as "robot.host", as a file; those that are None or not active are commented out."""
     lines = [f'format = "{FORMAT}"', *head]
     for section, keys in groupby(values, lambda key: key.split(".")[0]):
-        lines += ["", f"# {getdoc(SECTIONS[section])}", f"[{section}]"]
+        about = wrap(getdoc(SECTIONS[section]) or "", width - 2)
+        lines += ["", *(f"# {part}" for part in about), f"[{section}]"]
         for key in keys:
-            lines += _entry(key.split(".")[1], values[key], comment(key), active(key))
+            lines += _entry(key.split(".")[1], values[key], comment(key), active(key), width)
     return "".join(f"{line}\n" for line in lines)
 
 
-def _entry(name: str, value: Any, comment: str, active: bool) -> Iterator[str]:
+def _entry(name: str, value: Any, comment: str, active: bool, width: int) -> Iterator[str]:
     """Yield the lines of one value: its comment behind it where there is room, else above it."""
     text = f"{name} =" if value is None else f"{name} = {as_toml(value)}"
     line = f"{text if active and value is not None else f'# {text}':<32} # {comment}".removesuffix(" # ").rstrip()
-    if len(line) <= _WIDTH:
+    if len(line) <= width:
         yield line
         return
-    yield from (f"# {part}" for part in wrap(comment, _WIDTH - 2))
-    if len(text) > _WIDTH and isinstance(value, tuple | list):
+    yield from (f"# {part}" for part in wrap(comment, width - 2))
+    if len(text) > width and isinstance(value, tuple | list):
         yield from (f"{name} = [", *(f"  {as_toml(row)}," for row in value), "]")
     else:
         yield line.removesuffix(f" # {comment}").rstrip()

@@ -20,7 +20,7 @@ from ftdrive.commands.common import (
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError
 from ftdrive.runs.bundle import write_bundle
-from ftdrive.terminal.console import answer, hanging, messages
+from ftdrive.terminal.console import beside, hanging
 
 
 @click.command()
@@ -61,7 +61,7 @@ def bundle(
         bundled = write_bundle(folder, path, transcripts)
     if as_json:
         write_json({"schema_version": 1, "file": str(path), **asdict(bundled)})
-    say = messages if as_json else answer
+    say = beside(as_json)
     counted = ", ".join(f"{count} {kind}" for kind, count in bundled.redacted.items()) or "nothing found"
     say.print(hanging(" redacted: ", counted, say))
     if bundled.left_out:

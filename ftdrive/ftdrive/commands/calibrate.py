@@ -100,7 +100,7 @@ def calibrate(
     from ftdrive.session.options import SessionOptions
     from ftdrive.session.rehearsal import described
     from ftdrive.session.session import calibrate as guide
-    from ftdrive.terminal.console import answer, messages
+    from ftdrive.terminal.console import beside, messages
     from ftdrive.terminal.report import print_result
     from ftdrive.terminal.screen import open_operator
 
@@ -128,7 +128,7 @@ def calibrate(
         with declined_aborts(), open_operator(as_json=as_json) as operator:
             outcome = guide(cell, operator, options)
     if outcome is None:
-        (messages if as_json else answer).print("Dry run: nothing has moved.")
+        beside(as_json).print("Dry run: nothing has moved.")
         return
     index_run(outcome.run.folder, None if simulate else cell)
     if as_json:

@@ -224,7 +224,7 @@ def declined_aborts() -> Iterator[None]:
 
 def write_json(value: Mapping[str, Any]) -> None:
     """Write one JSON object to stdout, on one line."""
-    echo(json.dumps(value))
+    echo(json.dumps(value), fold=False)
 
 
 def index_run(folder: Path, cell: "CellConfig | None" = None) -> None:

@@ -60,7 +60,7 @@ def compensate(
     from ftdrive.recording.compensation import compensated
     from ftdrive.recording.files import format_of
     from ftdrive.runs.source import read_calibration
-    from ftdrive.terminal.console import answer, messages
+    from ftdrive.terminal.console import beside
 
     if output is not None:
         format_of(output)
@@ -77,7 +77,7 @@ def compensate(
     else:
         echo("\n".join(_words(result, str(frame))))
     if output is not None:
-        (messages if as_json else answer).print(f" Saved {output}")
+        beside(as_json).print(f" Saved {output}")
 
 
 def _read(

@@ -1,6 +1,8 @@
 """`ftdrive config`: the values in force, and the origin of each."""
 
+import sys
 from pathlib import Path
+from shutil import get_terminal_size
 from typing import Any
 
 import click
@@ -27,7 +29,7 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
     default.
     """
     from ftdrive.cell.config import RULES, settings
-    from ftdrive.cell.template import document
+    from ftdrive.cell.template import WIDTH, document
 
     check_simulate(simulate, real={"--config": path}, emulated={"--sensor": sensor})
     if simulate:
@@ -47,4 +49,6 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
         write_json({"schema_version": 1, "config": values} | ({"origin": origins} if origin else {}))
         return
     comment = (lambda key: found[key].origin) if origin else (lambda key: RULES[key].description)
-    echo(document({key: setting.value for key, setting in found.items()}, comment), nl=False)
+    values_by_key = {key: setting.value for key, setting in found.items()}
+    width = min(WIDTH, get_terminal_size().columns) if sys.stdout.isatty() else WIDTH
+    echo(document(values_by_key, comment, width=width), nl=False, fold=False)

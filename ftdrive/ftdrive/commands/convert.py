@@ -18,14 +18,14 @@ def convert(source: Path, target: Path, as_json: bool) -> None:
     """
     from ftdrive.recording import read_recording, write_recording
     from ftdrive.recording.files import format_of
-    from ftdrive.terminal.console import answer, messages
+    from ftdrive.terminal.console import beside, messages
 
     format_of(target)
     recording = read_recording(source)
     write_recording(target, recording)
     if recording.cut:
         messages.print(f" {source} is incomplete ({recording.cut}): {recording.duration_s:.1f} s of it are readable.")
-    (messages if as_json else answer).print(f" Saved {target}")
+    beside(as_json).print(f" Saved {target}")
     if as_json:
         samples = {"samples": len(recording.rows), "duration_s": recording.duration_s, "gaps": recording.gaps}
         write_json({"schema_version": 1, "file": str(target), **samples, "complete": not recording.cut})

@@ -56,7 +56,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     from ftdrive.errors import ConfigError
     from ftdrive.exports import targets_csv, urscript
     from ftdrive.planning.plan import Plan
-    from ftdrive.terminal.console import messages
+    from ftdrive.terminal.console import beside
 
     check_simulate(simulate, real={"PLAN.json": path})
     if simulate:
@@ -68,12 +68,12 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     text = urscript.program(made, dwell_s=dwell_s) if target == "urscript" else targets_csv.table(made)
     if output is not None:
         write_new(output, text)
-        messages.print(f" Wrote {output}")
+        beside(as_json).print(f" Saved {output}")
     if as_json:
         about = {"format": target, "plan": made.sha256, "file": None if output is None else str(output)}
         write_json({"schema_version": 1, **about, "text": text})
     elif output is None:
-        echo(text, nl=False)
+        echo(text, nl=False, fold=False)
 
 
 @export.command()
@@ -160,7 +160,7 @@ def calibration(
     from ftdrive.exports.calibration.settings import Settings, recorded_sensor
     from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verification_record import marks_of, verification_near
-    from ftdrive.terminal.console import hanging, messages
+    from ftdrive.terminal.console import beside, hanging, messages
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})
     with _calibrated(source, sensor, simulate=simulate) as path:
@@ -184,7 +184,7 @@ def calibration(
         messages.print(hanging(" note: ", f"the last verification of this calibration failed: {verification.reason}"))
     if output is not None:
         write_new(output, made.text)
-        messages.print(f" Wrote {output}")
+        beside(as_json).print(f" Saved {output}")
     if as_json:
         write_json(
             {
@@ -201,7 +201,7 @@ def calibration(
             }
         )
     elif output is None:
-        echo(made.text, nl=False)
+        echo(made.text, nl=False, fold=False)
 
 
 @export.command()

@@ -72,7 +72,7 @@ def history(
         answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
-_TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "force bias, N", "verified", "run", "°C", "parent")
+_TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias, N", "run", "°C", "parent")
 _OPTIONAL = {"°C", "parent"}
 """Shown if a result has one."""
 
@@ -92,8 +92,8 @@ def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime)
         one.tool_in_words,
         one.verdict,
         f"{one.mass_kg:.4f}",
-        " ".join(f"{value:.2f}" for value in one.parameters.force_bias_N),
         verified,
+        " ".join(f"{value:.2f}" for value in one.parameters.force_bias_N),
         one.run,
         "" if one.temperature_C is None else f"{one.temperature_C:.0f}",
         f"{one.parent[:6]} ({one.update})" if one.parent else "",
@@ -108,7 +108,7 @@ def _print_table(rows: Sequence[Sequence[str]]) -> None:
     print_table(
         [_TITLES[n] for n in shown],
         [[row[n] for n in shown] for row in rows],
-        folding={"arm", "tool", "force bias, N", "verified", "run", "parent"},
+        folding={"arm", "tool", "verified", "run", "parent"},
     )
 
 

@@ -100,7 +100,7 @@ def init(
     from ftdrive.cell.template import cell_file
     from ftdrive.planning.cell_plan import require_possible
     from ftdrive.planning.geometry.arm_model import SHAPES
-    from ftdrive.terminal.console import messages
+    from ftdrive.terminal.console import beside, messages
     from ftdrivers.ur.kinematics import model_named
 
     check_simulate(simulate, real={"--robot": robot})
@@ -176,12 +176,11 @@ def init(
     if as_json:
         devices = {"robot": robot_words, "sensor": sensor_words}
         write_json({"schema_version": 1, "file": str(output), **devices, "config": cell.to_dict()})
+    words, end = ". Measure tool, planes and boxes, then set measured = true in it: nothing moves before.", ""
     if simulate:
-        _say(f"Wrote {output} for an emulated cell: commands with --simulate use it, all others refuse it.")
-        messages.print_next("ftdrive doctor --simulate", "ftdrive plan --simulate")
-    else:
-        _say(f"Wrote {output}. Measure tool, planes and boxes, then set measured = true in it: nothing moves before.")
-        messages.print_next("ftdrive doctor", "ftdrive plan")
+        words, end = " for an emulated cell: commands with --simulate use it, all others refuse it.", " --simulate"
+    beside(as_json).print(f"Wrote {output}{words}")
+    messages.print_next(f"ftdrive doctor{end}", f"ftdrive plan{end}")
 
 
 class Questions:
@@ -194,7 +193,7 @@ class Questions:
         """Return the option or the answer; `usual` is the answer of Enter and --yes, None where there is none."""
         from ftdrive.cell.config import RULES
         from ftdrive.errors import ConfigError
-        from ftdrive.terminal.console import in_whole_words
+        from ftdrive.terminal.text import in_whole_words
 
         option = RULES[key].option
         if given is None and not self.interactive:

@@ -2,7 +2,6 @@
 
 import json
 import shlex
-import sys
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +19,7 @@ from ftdrive.runs.push_receipt import Receipt
 from ftdrive.runs.source import read_calibration
 from ftdrive.session.operator import Question
 from ftdrive.session.settings_push import EFFECTS, WORDS, propose, restore, send
-from ftdrive.terminal.console import answer, in_whole_words, messages
+from ftdrive.terminal.console import answer, beside, messages
 from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
 from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.text import echo
@@ -81,9 +80,9 @@ def push(
         elif not (as_json or sends):
             answer.print("\n".join(proposal_in_lines(proposal)))
         elif not as_json and (asks or not messages.quiet):
-            echo(in_whole_words("\n".join(proposal_in_lines(proposal)), sys.stderr), err=True)
+            echo("\n".join(proposal_in_lines(proposal)), err=True)
         if not sends:
-            (messages if as_json else answer).print(
+            beside(as_json).print(
                 "Dry run: nothing was sent." if dry_run else "The controller agrees: nothing was sent."
             )
             return

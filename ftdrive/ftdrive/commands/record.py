@@ -159,12 +159,12 @@ def _so_far(recorder: "Recorder") -> str:
 
 
 def _report(recorder: "Recorder", frame: "WrenchFrame", name: str, *, as_json: bool) -> None:
-    from ftdrive.terminal.console import answer, messages
+    from ftdrive.terminal.console import beside
 
     rate = f"{recorder.rate_Hz:.0f} Hz"  # of all samples: that of the first half second may differ much
     for path in recorder.saved:
         samples = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, {rate}, gaps: {recorder.gaps}"
-        (messages if as_json else answer).print(f" Saved {path}: {samples}")
+        beside(as_json).print(f" Saved {path}: {samples}")
     if as_json:
         files = {
             "files": [str(path) for path in recorder.saved],

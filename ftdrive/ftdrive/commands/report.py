@@ -35,7 +35,7 @@ from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject
 from ftdrive.report.trust import trust
 from ftdrive.runs.bundle import unpacked
-from ftdrive.terminal.console import answer, hanging, messages, working
+from ftdrive.terminal.console import beside, hanging, messages, working
 from ftdrive.terminal.text import echo
 
 _SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up")
@@ -125,13 +125,13 @@ def report(
             text = written(facts, form)
     if output is not None:
         write_new(output, text)
-        say = messages if as_json else answer
+        say = beside(as_json)
         say.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}", say))
         say.print(f" Saved {output}")
     if as_json:
         write_json({**facts, "file": None if output is None else str(output)})
     elif output is None:
-        echo(text, nl=False)
+        echo(text, nl=False, fold=False)
 
 
 def _numbered(path: Path) -> Iterator[Path]:

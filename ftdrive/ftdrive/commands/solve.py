@@ -36,7 +36,7 @@ from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.source import read_source
-from ftdrive.terminal.console import answer, messages, working
+from ftdrive.terminal.console import beside, working
 from ftdrive.terminal.report import print_comparison, print_result
 from ftdrive.terminal.text import echo
 
@@ -149,7 +149,7 @@ def _solve_each(
                     stop_unless_accepted(result, to_be_saved=output is not None)
                 if output is not None:
                     result.save(output)
-                    (messages if as_json else answer).print(f" Saved {output}")
+                    beside(as_json).print(f" Saved {output}")
         except (AcceptanceError, DataError) as error:
             if len(sources) == 1:
                 raise

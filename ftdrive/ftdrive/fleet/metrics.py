@@ -52,7 +52,7 @@ OF_TOOL: Final[Mapping[str, tuple[str, Callable[[CellState], float | None]]]] = 
 """Metrics with the labels `TOOL`: what they mean, and their value; a value of None is left out."""
 TOOL: Final = ("cell", "tool")
 CELL_INFO: Final = "ftdrive_cell_info"
-CELL_INFO_LABELS: Final = (*TOOL, "arm_serial", "sensor_serial", "sensor_model", "calibration", "verdict")
+CELL_INFO_LABELS: Final = (*TOOL, "arm_serial", "sensor_serial", "sensor_model", "calibration", "verdict", "emulated")
 FINDING: Final = "ftdrive_finding"
 STORE_UP: Final = "ftdrive_store_up"
 STATE_TIME: Final = "ftdrive_state_timestamp_seconds"
@@ -132,7 +132,8 @@ class MetricsServer(Collector):
         info = GaugeMetricFamily(CELL_INFO, "1 for each tool of each cell.", labels=CELL_INFO_LABELS)
         for one in cells:
             about = (one.arm_serial, one.sensor_serial, one.sensor_model, one.calibration_id, one.verdict)
-            info.add_metric([one.cell, *(text or "" for text in (one.tool, *about))], 1)
+            marked = "true" if one.emulated else "false"
+            info.add_metric([one.cell, *(text or "" for text in (one.tool, *about)), marked], 1)
         yield info
         for name, (help_text, value_of) in OF_TOOL.items():
             family = GaugeMetricFamily(name, help_text, labels=TOOL)

@@ -1,19 +1,17 @@
 """Two consoles: `answer` prints what a command was asked for on stdout, `messages` all else on stderr."""
 
-import os
 import sys
-import textwrap
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, TextIO
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 
-from ftdrive.terminal.hints import as_typed
-from ftdrive.terminal.text import visible
+from ftdrive.terminal.command_names import as_typed
+from ftdrive.terminal.text import NARROWEST, visible
 
 
 class CommandConsole(Console):
@@ -38,7 +36,16 @@ class CommandConsole(Console):
         """Print what the user can do next: commands, each with why behind it."""
         self.print("Next", style="bold cyan")
         for command in commands:
-            self.print(f"   {command}")
+            self.print(self._next(command), soft_wrap=True)
+
+    def _next(self, text: str) -> str:
+        r"""Fold a command as a shell reads it, with \ before its last option, and what stands behind it."""
+        command, _, why = as_typed(text).partition("   ")
+        shown = f"   {command}"
+        if not self.soft_wrap and len(shown) > self.width:
+            shown = " \\\n      --".join(shown.rsplit(" --", 1))
+        fits = self.soft_wrap or len(shown.split("\n")[-1]) + 3 + len(why) <= self.width
+        return shown if not why else f"{shown}{'   ' if fits else chr(10) + ' ' * 6}{why}"
 
 
 messages = CommandConsole(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
@@ -48,13 +55,16 @@ answer = CommandConsole(highlight=False, markup=False, emoji=False, soft_wrap=no
 """On stdout: results, verdicts and where they were saved. `-q` does not silence it, `--json` replaces it."""
 
 
+def beside(as_json: bool) -> CommandConsole:
+    """Return where words about an answer go: to stdout, or to stderr if `--json` has its object there."""
+    return messages if as_json else answer
+
+
 def print_address(words: str, address: str) -> None:
-    """Print an address behind words: on one line, however narrow the terminal is, and as a link where it can."""
+    """Print an address behind words, or below if the line is too short; never broken, and as a link where it can."""
+    if not messages.soft_wrap and len(words + address) > messages.width >= len(f"   {address}"):
+        words = f"{words.rstrip()}\n   "
     messages.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
-
-
-_NARROWEST = 20
-"""Columns behind a head: with fewer, lines begin at the left."""
 
 
 def hanging(head: str | Text, words: str, console: Console = messages) -> Text:
@@ -62,38 +72,12 @@ def hanging(head: str | Text, words: str, console: Console = messages) -> Text:
     first = Text.assemble(head)
     text = Text(as_typed(words))
     width = console.width - first.cell_len
-    if console.soft_wrap or width < _NARROWEST:
+    if console.soft_wrap or width < NARROWEST:
         return first + text
     lines = text.wrap(console, width)
     for line in lines:
         line.rstrip()
     return first + Text("\n" + " " * first.cell_len).join(lines)
-
-
-def in_whole_words(text: str, file: TextIO, head: str = "") -> str:
-    """Break lines between words where they are longer than the terminal is wide, but not for a file or pipe.
-
-    For what is written without `messages`; control characters become visible. A word that is longer by itself, such as
-    a path, stays whole. Where `head` is what the text begins with, its lines go on behind it, as in `hanging`.
-    """
-    text = visible(as_typed(text))
-    try:
-        width = os.get_terminal_size(file.fileno()).columns
-    except (OSError, ValueError):  # no terminal; nothing of the system
-        return text
-    if width == 0:  # a terminal that does not know
-        return text
-    fold = textwrap.TextWrapper(
-        width,
-        subsequent_indent=" " * len(head) if width - len(head) >= _NARROWEST else "",
-        break_long_words=False,
-        break_on_hyphens=False,
-        replace_whitespace=False,
-    )
-    return "\n".join(
-        fold.fill(line) + line[len(line.rstrip()) :]
-        for line in text.split("\n")  # a prompt ends with a space
-    )
 
 
 @contextmanager

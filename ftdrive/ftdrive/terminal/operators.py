@@ -5,31 +5,30 @@ import sys
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from threading import Lock
-from typing import Any, TextIO
+from typing import Any, Final, TextIO
 
 from ftdrive.errors import Declined
 from ftdrive.session.events import SCHEMA_VERSION, Asked, Event
 from ftdrive.session.operator import Key, Question
-from ftdrive.terminal.console import in_whole_words
 from ftdrive.terminal.session_text import SessionText, TextLine
 from ftdrive.terminal.supervisor import Supervisor
-from ftdrive.terminal.text import visible
+from ftdrive.terminal.text import in_whole_words, visible
+
+_SAME: Final = {"y": "yes", "n": "no", "q": "quit", "quit": "q", "skip": "s", "redo": "r"}
+"""Letters and words of one meaning in every question. s and r stand for no word that moves an arm."""
 
 
 def match(question: Question, typed: str) -> str | None:
     """Find the answer that was typed; None for no answer.
 
-    In full, but for y and n, and for q and quit, which end here as on the live screen: no letter moves an arm. A word
-    that must be typed exactly can be refused with no, which raises `Declined`.
+    A word that must be typed exactly can be refused with no, which raises `Declined`.
     """
     typed = typed.strip()
     if typed in question.answers:
         return typed
     if len(question.answers) > 1:
-        meant = {"y": "yes", "n": "no", "q": "quit"}.get(typed.lower(), typed.lower())
-        if meant == "quit" and "quit" not in question.answers:
-            meant = "stop"
-        return meant if meant in question.answers else None
+        word = typed.lower()
+        return next((one for one in (word, _SAME.get(word)) if one in question.answers), None)
     if typed.lower() in {"n", "no"}:
         raise Declined(f"the answer was no: {question.text}")
     return None

@@ -37,8 +37,8 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.live_fit import GREEN
 from ftdrive.session.operator import Key, Operator, Question
+from ftdrive.terminal.command_names import as_typed
 from ftdrive.terminal.console import hanging, messages
-from ftdrive.terminal.hints import as_typed
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
 from ftdrive.terminal.report import drift_in_words

@@ -1,8 +1,10 @@
-"""A table on stdout: one line a row where it fits, long texts folded where the terminal is narrow."""
+"""A table on stdout: one line a row where it fits; else texts are folded, and the last columns begin a line."""
 
 import shutil
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from itertools import zip_longest
+from textwrap import wrap
 
 from ftdrive.terminal.text import echo, visible
 
@@ -22,28 +24,35 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: C
     """
     rows = [[visible(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
-    width = sum(widths) + len(GAP) * (len(widths) - 1)
-    narrowest = [
-        max(len(word) for text in column for word in (text.split() if title in folding else [text]) or [""])
-        for title, column in zip(titles, zip(titles, *rows, strict=True), strict=True)
-    ]
-    columns = shutil.get_terminal_size().columns
-    fits = sum(narrowest) + len(GAP) * (len(widths) - 1) <= columns
-    if not (sys.stdout.isatty() and fits) or width <= columns:  # a terminal may break lines, never words
-        head, *lines = (_line(row, widths) for row in (titles, *rows))
-        echo("\n".join(["", *lines]), bold=head)
-        return
-    from rich.table import Table
+    beside = len(titles)  # columns; the others are on a line of their own
+    if sys.stdout.isatty():
+        least = [
+            max(len(word) for text in column for word in (text.split() if title in folding else [text]) or [""])
+            for title, column in zip(titles, zip(titles, *rows, strict=True), strict=True)
+        ]
+        columns = shutil.get_terminal_size().columns
+        while beside > 1 and _width(least[:beside]) > columns:
+            beside -= 1
+        while _width(widths[:beside]) > columns and widths[:beside] != least[:beside]:
+            widest = max(range(beside), key=lambda k: (widths[k] > least[k], widths[k]))
+            widths[widest] -= 1
+    head, *lines = (line for row in (titles, *rows) for line in _lines(row, widths, beside))
+    echo("\n".join(["", *lines]), bold=head)
 
-    from ftdrive.terminal.console import answer
 
-    table = Table(box=None, pad_edge=False, padding=(0, len(GAP), 0, 0), header_style="bold")
-    for title, least in zip(titles, narrowest, strict=True):
-        table.add_column(title, no_wrap=title not in folding, overflow="fold", min_width=least)
-    for row in rows:
-        table.add_row(*row)
-    answer.print(table, width=columns, soft_wrap=False)
+def _width(widths: Sequence[int]) -> int:
+    return sum(widths) + len(GAP) * (len(widths) - 1)
+
+
+def _lines(row: Sequence[str], widths: Sequence[int], beside: int) -> Iterator[str]:
+    """Fold the texts of a row; those that stand on a line of their own keep their widths."""
+    texts = zip(row[:beside], widths, strict=False)
+    folded = [wrap(text, width, break_long_words=False, break_on_hyphens=False) for text, width in texts]
+    for parts in zip_longest(*folded, fillvalue=""):
+        yield _line(parts, widths)
+    if row[beside:]:
+        yield " " * len(GAP) + _line(row[beside:], widths[beside:])
 
 
 def _line(row: Sequence[str], widths: Sequence[int]) -> str:
-    return GAP.join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+    return GAP.join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip()

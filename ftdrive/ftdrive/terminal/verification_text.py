@@ -4,6 +4,7 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
+from ftcalib.rounding import to_place_of
 from ftdrive.runs.pose_hints import moved
 from ftdrive.runs.verified import FALSE_ALARMS, Verified
 from ftdrive.terminal.console import answer, hanging, messages
@@ -62,7 +63,7 @@ def _table(verified: Verified) -> Table:
             style = "bold yellow" if size > 3 * sigma else ""
             name = f"R{record.pose.number:02d} {unit}" if axes.start is None else f"    {unit}"
             values = (_vector(measured, digits), _vector(measured - residual, digits))
-            table.add_row(name, *values, Text(f"{size:.{digits}f}", style), f"{sigma:.{digits}f}")
+            table.add_row(name, *values, Text(to_place_of(size, sigma), style), to_place_of(sigma, sigma))
     return table
 
 

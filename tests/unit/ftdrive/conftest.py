@@ -1,10 +1,18 @@
 """What the unit tests share."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.solved_once import solved_once
 from tests.unit.ftdrive.fake_cell import Lab
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _solved_once() -> Iterator[None]:
+    with solved_once():
+        yield
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
@@ -12,9 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftcalib.assessment.observability import second_minimum
-from ftcalib.likelihood.rotation_minima import Minimum
-from ftcalib.model import Parameters
 from ftcalib.routine import Sampling
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
@@ -358,17 +355,6 @@ def planned_once(cell: CellConfig, certifier: Certifier, q_rad: Array, poses: in
     return _planned(cell, certifier.arm.name, tuple(q_rad.tolist()), poses)
 
 
-_second_minima: dict[bytes, tuple[float, Minimum | None]] = {}
-
-
-def second_minimum_once(R_base_flange: Array, parameters: Parameters) -> tuple[float, Minimum | None]:
-    """As `second_minimum`, but from memory: the tours of most tests have the same poses."""
-    key = R_base_flange.tobytes() + b"".join(value.tobytes() for value in astuple(parameters))
-    if key not in _second_minima:
-        _second_minima[key] = second_minimum(R_base_flange, parameters)
-    return _second_minima[key]
-
-
 class Lab:
     """A fake cell and what a test wants of it."""
 
@@ -391,7 +377,6 @@ class Lab:
         monkeypatch.setattr(session, "build_arm", lambda _: self.arm)
         monkeypatch.setattr(session, "build_sensor", lambda _: self.sensor)
         monkeypatch.setattr(task, "plan_for", planned_once)
-        monkeypatch.setattr("ftcalib.poses.information.second_minimum", second_minimum_once)
         monkeypatch.setattr(along_plan, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
         monkeypatch.setattr("os.fsync", lambda _: None)  # the disk may be slow

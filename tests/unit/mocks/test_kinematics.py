@@ -1,4 +1,4 @@
-"""Kinematics of the emulated arms against plain DH products, round trips, and the tour that fits every arm."""
+"""Kinematics of the emulated arms against plain DH products, and round trips."""
 
 import math
 
@@ -19,35 +19,10 @@ from ftmocks.kinematics import (
     pose_of,
     rotation,
     rotvec,
-    vector6,
 )
 
 angles = st.tuples(*[st.floats(-math.pi, math.pi)] * 6)
 models = st.sampled_from(sorted(MODELS))
-
-# psi = q2 + q3 + q4, q5 and q6 in degrees: one wrist table that shows all 24 rotations of the cube on every UR arm
-TOUR = {
-    1: (-90, 90, 45), 19: (-180, 45, 90), 12: (-180, -45, 90), 8: (-180, -45, 0), 16: (-180, -45, -90),
-    14: (-90, -90, -135), 5: (-90, -90, -45), 9: (-90, -90, 45), 2: (-90, -90, 135), 4: (-180, -45, 180),
-    17: (-180, 45, 180), 7: (-180, 135, 180), 15: (-180, 135, 90), 3: (-180, 135, 0), 11: (-180, 135, -90),
-    20: (-180, 45, -90), 18: (-180, 45, 0), 10: (-90, 90, -45), 6: (-90, 90, -135), 24: (0, 135, -90),
-    22: (0, 135, 0), 23: (0, 135, 90), 21: (0, 135, 180), 13: (-90, 90, 135),
-}  # fmt: skip
-
-# Rows of the 24 matrices of Yu et al. 2021, Fig. 3, as signed axes: flange orientation in base, transposed
-YU_ROWS = {
-    1: "+x+y+z", 2: "+x-y-z", 3: "+x-z+y", 4: "+x+z-y", 5: "-x+y-z", 6: "-x-y+z", 7: "-x+z+y", 8: "-x-z-y",
-    9: "+y+x-z", 10: "-y+x+z", 11: "+z+x+y", 12: "-z+x-y", 13: "+y-x+z", 14: "-y-x-z", 15: "-z-x+y", 16: "+z-x-y",
-    17: "+y+z+x", 18: "-y-z+x", 19: "-z+y+x", 20: "+z-y+x", 21: "+y-z-x", 22: "-y+z-x", 23: "+z+y-x", 24: "-z-y-x",
-}  # fmt: skip
-
-
-def matrix_from_rows(text: str) -> Array:
-    out = np.zeros((3, 3))
-    for row in range(3):
-        sign, axis = text[2 * row], text[2 * row + 1]
-        out[row, "xyz".index(axis)] = 1.0 if sign == "+" else -1.0
-    return out
 
 
 def dh_product(name: str, q: tuple[float, ...]) -> Array:
@@ -145,14 +120,3 @@ def test_poses_are_metres_and_a_rotation_vector() -> None:
     np.testing.assert_allclose(X[:3, :3] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
     assert pose_of(X) == pytest.approx([0.1, 0.2, 0.3, 0.0, 0.0, math.pi / 2])
     np.testing.assert_allclose(X @ inverse_matrix(X), np.eye(4), atol=1e-12)
-
-
-@pytest.mark.parametrize("name", sorted(MODELS))
-@pytest.mark.parametrize("shoulder", [(-100, 60), (-110, 80), (-90, 60)])
-def test_the_tour_shows_all_cube_rotations(name: str, shoulder: tuple[int, int]) -> None:
-    assert sorted(TOUR) == sorted(YU_ROWS) == list(range(1, 25))
-    for number, (psi, q5, q6) in TOUR.items():
-        q2, q3 = shoulder
-        q = vector6(np.radians([45, q2, q3, psi - q2 - q3, q5, q6]))
-        R = forward(MODELS[name], q)[:3, :3]
-        np.testing.assert_allclose(R.T, matrix_from_rows(YU_ROWS[number]), atol=1e-12)

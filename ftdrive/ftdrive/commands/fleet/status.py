@@ -32,7 +32,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     from ftcalib.files import write_new
     from ftdrive.fleet.observed import Observed
     from ftdrive.fleet.status import fleet_of
-    from ftdrive.terminal.console import answer, hanging, messages
+    from ftdrive.terminal.console import answer, beside, hanging, messages
 
     if page_path is not None:
         require_extra("fleet", "--html", "jinja2")
@@ -44,7 +44,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         from ftdrive.fleet.page import page
 
         write_new(page_path, page(fleet, observed, found.name))
-        (messages if as_json else answer).print(f" Saved {page_path}")
+        beside(as_json).print(f" Saved {page_path}")
     if as_json:
         write_json(_as_json(fleet, found.name, now))
     elif not fleet.cells:

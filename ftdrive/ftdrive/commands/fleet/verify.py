@@ -160,7 +160,6 @@ def _sentence(error: Exception) -> str:
 
 
 def _print(lines: Sequence[str]) -> None:
-    from ftdrive.terminal.console import in_whole_words
 
     for line in lines:
-        echo(in_whole_words(line, sys.stdout))
+        echo(line)

@@ -231,7 +231,7 @@ def _component(view: View, i: int, places: int) -> Line:
 
 
 def digits(sigma: float, places: int) -> str:
-    """Return a standard deviation as text; it is NaN until the noise is known."""
+    """Return a standard deviation, NaN until the noise is known, in fixed digits: no column jumps on a screen."""
     return "--" if np.isnan(sigma) else f"{sigma:.{places}f}"
 
 

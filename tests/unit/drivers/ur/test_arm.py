@@ -21,7 +21,6 @@ from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import HOST, ControlInMemory, Controller, MakeArm, away, no_guard
 
 on_ur_rtde = pytest.mark.parametrize("path", ["ur-rtde"], indirect=True)
-on_script = pytest.mark.parametrize("path", ["script"], indirect=True)
 
 
 @pytest.fixture(params=["ur-rtde", "script"])

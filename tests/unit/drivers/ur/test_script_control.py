@@ -151,15 +151,6 @@ def test_after_a_suspension_the_reason_is_reported(arm: UrArm, controller: Contr
     arm.move_to(away(controller), timeout_s=5, guard=no_guard)
 
 
-def test_a_lost_controller_is_reported_with_what_the_arm_does(
-    arm: UrArm, controller: Controller, clock: FakeClock
-) -> None:
-    controller.dashboard_answers = False
-    clock.at(0.3, lambda: setattr(controller, "silent", True))
-    with pytest.raises(DeviceTimeout, match=r"stood still .*begins to stop the arm by itself within 0\.3 s"):
-        arm.move_to(away(controller), timeout_s=5, guard=no_guard)
-
-
 # ---------------------------------------------------------------------- nothing moves late
 
 
@@ -210,13 +201,6 @@ def test_a_move_paused_by_a_protective_stop_does_not_go_on(
     assert controller.q_rad[5] == pytest.approx(where, abs=0.009)  # one cycle of the controller in memory
 
 
-def test_a_new_session_does_not_disturb_a_program_that_runs(make_arm: MakeArm, controller: Controller) -> None:
-    controller.program = 2  # another client's
-    with pytest.raises(ConnectError, match="another program is on"):
-        make_arm().open(control=True)
-    assert controller.did == []
-
-
 # ---------------------------------------------------------------------- the start
 
 
@@ -260,13 +244,6 @@ def test_the_error_of_another_program_is_not_ours(
     clock.at(0.3, lambda: setattr(controller, "program", 1))
     with pytest.raises(DeviceFault, match="stopped or paused from outside"):
         arm.move_to(away(controller), timeout_s=5, guard=no_guard)
-
-
-def test_registers_of_another_client_are_not_taken(make_arm: MakeArm, controller: Controller) -> None:
-    controller.registers_taken = True
-    with pytest.raises(ConnectError, match=r"input_int_register_32 and 13 more"):
-        make_arm().open(control=True)
-    assert controller.did == []
 
 
 # ---------------------------------------------------------------------- settings and questions

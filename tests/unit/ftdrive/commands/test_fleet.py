@@ -144,17 +144,3 @@ def test_a_cell_that_is_like_a_stored_one_is_refused(run: Callable[..., Ran], ce
     code, _, err = run("add", other)
     assert (code, "the cells twin and press have the same [robot] host 10.0.0.1" in err) == (2, True)
     assert len(json.loads(run("status", "--json")[1])["cells"]) == 2
-
-
-@pytest.mark.usefixtures("cells")
-@pytest.mark.parametrize("command", [("status",), ("add", "cells.toml"), ("remove", "press"), ("index", "runs")])
-def test_a_store_that_cannot_be_used_is_one_sentence(
-    run: Callable[..., Ran], tmp_path: Path, command: tuple[str, ...]
-) -> None:
-    (tmp_path / "runs").mkdir()
-    code, _, err = run(*command, "--store", "nonsense")
-    assert (code, err.startswith("error: ")) == (2, True)
-    (damaged := tmp_path / "damaged.sqlite").write_text("no database " * 100)
-    code, _, err = run(*command, "--store", f"sqlite:///{damaged}")
-    assert (code, err.startswith(f"error: the store {damaged} cannot be ")) == (6, True)
-    assert "Traceback" not in err

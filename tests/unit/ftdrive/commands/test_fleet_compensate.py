@@ -1,8 +1,6 @@
 """`fleet compensate` as a command; the work is done in this process."""
 
-import errno
 import json
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -11,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ftcalib.files import write_new
 from ftdrive.recording import Recorder
 from ftdrive.recording.files import read_recording
 from tests.unit.ftdrive.recorded import block, calibration, info
@@ -92,23 +89,3 @@ def test_a_mistake_is_refused_before_any_work(
     assert (code, out) == (6 if "--calibration" in arguments else 2, "")
     assert words in err
     assert not (tmp_path / "out").exists()
-
-
-def test_a_full_disk_leaves_whole_results_and_names_the_rest(
-    run: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    first, second = record(tmp_path / "in" / "a.mcap"), record(tmp_path / "in" / "b.mcap")
-
-    def full(path: Path, content: bytes) -> None:
-        if path.name == second.name:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        write_new(path, content)
-
-    monkeypatch.setattr("ftdrive.fleet.compensate.write_new", full)
-    code, out, _ = run(first, second, "-o", "out")
-    assert code == 7
-    assert out.splitlines()[0] == "2 recordings: 1 compensated now, 0 before, 1 failed; 3000 samples."
-    assert re.search(
-        r"failed: .*b\.mcap: out/b\.mcap is not written \(No space left on device\): make room in out", out
-    )
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["a.mcap"]

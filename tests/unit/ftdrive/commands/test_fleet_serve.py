@@ -1,7 +1,5 @@
 """`fleet serve`: what it prints, how it ends, and what it refuses at the start."""
 
-import sqlite3
-import sys
 import urllib.request
 from collections.abc import Callable
 from datetime import datetime
@@ -10,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from ftdrive import cli
-from ftdrive.errors import BadStore
 from ftdrive.fleet.state import Fleet
 from ftdrive.store.store import Store
 from tests.fake_clock import FakeClock
@@ -46,19 +43,6 @@ def answer_with(monkeypatch: pytest.MonkeyPatch, *answers: Fleet | BaseException
         return answer
 
     monkeypatch.setattr("ftdrive.fleet.status.fleet_state", fleet_state)
-
-
-def test_it_serves_until_ctrl_c_and_mentions_an_outage_once(
-    run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gone = BadStore("the store db cannot be read (connection refused)")
-    answer_with(monkeypatch, fleet(cell("A")), gone, gone, fleet())
-    code, said = run("--metrics", "127.0.0.1:0")
-    assert code == 130
-    assert "store.sqlite at http://127.0.0.1:" in said
-    assert said.count("the store db cannot be read") == said.count("The store can be read again.") == 1
-    assert "Unprotected" not in said
-    assert said.endswith("interrupted")
 
 
 def test_the_page_has_the_cells_as_long_as_it_serves(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,45 +82,3 @@ def test_another_address_is_said_to_be_unprotected(run: Callable[..., Ran], monk
 def test_a_wrong_address_is_refused(address: str, run: Callable[..., Ran]) -> None:
     code, said = run("--metrics", address)
     assert (code, f"--metrics is '{address}': give HOST:PORT, such as 127.0.0.1:10018" in said) == (2, True)
-
-
-@pytest.mark.parametrize("by", ["option", "environment"])
-def test_a_wrong_broker_is_refused_without_its_password(
-    by: str, run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    url = "mqtt://cell:secret@broker:x"
-    monkeypatch.setenv("FTDRIVE_MQTT", url if by == "environment" else "")
-    code, said = run("--metrics", "127.0.0.1:0", *(("--mqtt", url) if by == "option" else ()))
-    assert (code, "--mqtt is no address of a broker" in said, "secret" in said) == (2, True, False)
-
-
-@pytest.mark.parametrize("option", [True, False])
-def test_a_store_that_cannot_be_read_at_the_start_is_one_sentence(
-    option: bool, run: Callable[..., Ran], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with sqlite3.connect(tmp_path / "new.sqlite") as connection:
-        connection.execute("CREATE TABLE ftdrive_schema (version INTEGER PRIMARY KEY)")
-        connection.execute("INSERT INTO ftdrive_schema VALUES (99)")
-    connection.close()
-    url = f"sqlite:///{tmp_path / 'new.sqlite'}"
-    if not option:
-        monkeypatch.setenv("FTDRIVE_STORE_URL", url)
-    code, said = run("--metrics", "127.0.0.1:0", *(("--store", url) if option else ()))
-    assert (code, "error: the store" in said, "99" in said) == (6, True, True)
-    assert run("--metrics", "127.0.0.1:0", "--store", "mysql://u:secret@host/db")[0] == 2
-
-
-@pytest.mark.parametrize(
-    ("package", "module", "more"),
-    [
-        ("prometheus_client", "ftdrive.fleet.metrics", ()),
-        ("paho.mqtt.client", "ftdrive.fleet.mqtt", ("--mqtt", "mqtt://b")),
-    ],
-)
-def test_a_missing_package_is_one_sentence(
-    package: str, module: str, more: tuple[str, ...], run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delitem(sys.modules, module, raising=False)
-    monkeypatch.setitem(sys.modules, package, None)
-    code, said = run("--metrics", "127.0.0.1:0", *more)
-    assert (code, "pip install 'ftdrive[fleet]'" in said) == (2, True)

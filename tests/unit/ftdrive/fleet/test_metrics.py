@@ -96,8 +96,10 @@ def test_a_cell_that_disappears_disappears(server: MetricsServer) -> None:
 
 def test_tools_of_a_cell_are_distinguished_and_any_name_is_escaped(server: MetricsServer) -> None:
     name = 'Zelle "7"\\ü\n'
-    server.update(reading(cell(name, "gripper"), cell(name, "drill", mass_kg=2.0)))
+    server.update(reading(cell(name, "gripper"), cell(name, "drill", mass_kg=2.0, emulated=True)))
     families = {one.name: one for one in text_string_to_metric_families(scraped(server))}
+    marks = {tuple(one.labels[key] for key in ("tool", "emulated")) for one in families["ftdrive_cell_info"].samples}
+    assert marks == {("gripper", "false"), ("drill", "true")}
     masses = {tuple(one.labels.values()): one.value for one in families["ftdrive_tool_mass_kilograms"].samples}
     assert masses == {(name, "gripper"): 1.25, (name, "drill"): 2.0}
     assert families.keys() == set(NAMES)

@@ -39,13 +39,13 @@ def still(seconds: float, rate_Hz: float = 1000.0) -> Array:
     return np.tile(UPSIDE_DOWN, (round(seconds * rate_Hz), 1, 1))
 
 
-def processed(rows: Paired, *, block: int = 10, rate_Hz: float = 1000.0, **options: Any) -> tuple[Processor, Block]:
+def processed(rows: Paired, *, block: int = 50, rate_Hz: float = 1000.0, **options: Any) -> tuple[Processor, Block]:
     """Process in blocks; the block returned has all rows."""
     processor = Processor(info(calibrated(), rate_Hz), **options)
     return processor, run(processor, rows, block)
 
 
-def run(processor: Processor, rows: Paired, block: int = 10) -> Block:
+def run(processor: Processor, rows: Paired, block: int = 50) -> Block:
     blocks = [processor.process(rows.rows(slice(i, i + block))) for i in range(0, len(rows), block)]
     columns = ("t_host_ns", "wrench", "chi2", "in_contact", "seq")
     joined: dict[str, Any] = {name: np.concatenate([getattr(b, name) for b in blocks]) for name in columns}
@@ -333,7 +333,7 @@ def test_neither_the_filter_of_a_sensor_nor_drift_make_contacts_and_a_push_of_1_
     for start in starts:
         push[start : start + 250, rng.integers(3)] = 1.0
     R = np.broadcast_to(UPSIDE_DOWN, (n, 3, 3))
-    _, block = processed(paired(R, rate_Hz, push=noise + drift + push, noise=0.1), rate_Hz=rate_Hz)
+    _, block = processed(paired(R, rate_Hz, push=noise + drift + push, noise=0.1), block=200, rate_Hz=rate_Hz)
     onsets = np.flatnonzero(np.diff(block.in_contact, prepend=False) & block.in_contact)
     assert len(onsets) == len(starts)
     assert ((onsets > starts) & (onsets <= starts + 50)).all()

@@ -81,7 +81,7 @@ def test_fewer_poses_have_one_solution_and_say_what_they_cost(poses: int) -> Non
     assert document["motion_time_s"] < planned(certifier_of()).to_dict()["motion_time_s"]
 
 
-@pytest.mark.parametrize("pan_deg", [-120.0, 0.0, 33.0])
+@pytest.mark.parametrize("pan_deg", [-120.0, 33.0])
 def test_any_pan_serves(pan_deg: float) -> None:
     q = USUAL_POSTURE_RAD.copy()
     q[0] = np.radians(pan_deg)

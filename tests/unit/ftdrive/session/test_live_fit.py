@@ -85,26 +85,6 @@ def run(taken: list[PoseRecord], running: RunningFit | None = None) -> Estimated
     return running.add(taken[-1])
 
 
-@pytest.mark.slow
-def test_at_the_end_of_a_tour_the_running_fit_is_the_solvers() -> None:
-    running, taken = RunningFit(), tour()
-    events = [running.add(one) for one in taken]
-    expected = solve(dataset_from(taken, {}))
-    last = events[-1]
-    assert last.poses == 24
-    for name, sigma in expected.sigma.items():
-        np.testing.assert_array_equal(last.values[name], getattr(expected, name))
-        np.testing.assert_array_equal(last.sigma[name], sigma)
-    assert last.light == "green"
-    assert last.hint == ""
-    # The sigmas shrink as poses come in, and they match the error.
-    first = next(event for event in events if event.values)
-    assert last.sigma["mass_kg"] < 0.8 * first.sigma["mass_kg"]
-    assert (
-        abs(last.values["mass_kg"] - np.linalg.norm(TRUTH.gravity_force_base_N) / 9.80665) < 4 * last.sigma["mass_kg"]
-    )
-
-
 def test_one_pose_is_a_start() -> None:
     running = RunningFit()
     event = running.add(tour()[0])
@@ -238,21 +218,6 @@ def test_the_return_to_the_first_pose_changes_no_estimate_but_is_compared() -> N
     assert after.values["mass_kg"] == before.values["mass_kg"]
     assert after.residual_sigma is not None
     assert after.residual_sigma < 5
-
-
-@pytest.mark.slow
-def test_the_prediction_waits_until_it_can_be_trusted_and_is_then_right() -> None:
-    running, taken = RunningFit(), tour()
-    R = special([24])[0]
-    predictions = []
-    for one in taken:
-        running.add(one)
-        predictions.append(running.predict(R))
-    assert all(wrench is None for wrench in predictions[:5])
-    known = [wrench for wrench in predictions if wrench is not None]
-    assert len(known) >= 12
-    for wrench in known:
-        assert np.linalg.norm((wrench - predict(TRUTH, R))[:3]) < 0.1 * np.linalg.norm(TRUTH.gravity_force_base_N)
 
 
 def test_an_arm_on_a_wall_is_seen_as_such_once_the_fit_knows() -> None:

@@ -507,13 +507,6 @@ def test_a_cell_that_cannot_be_built_is_reported_before_its_sensor_opens(
         lab.calibrate()
 
 
-def test_a_run_of_another_sensor_is_not_gone_on_with(lab: Lab) -> None:
-    lab.calibrate()
-    lab.sensor.identify = lambda: DeviceInfo("fake", "S2", "1")  # type: ignore[method-assign]
-    with pytest.raises(PlanRefused, match="connected is fake, serial S2"):
-        lab.calibrate(resume=lab.run().folder)
-
-
 def test_what_the_sensor_went_through_is_written_down(lab: Lab) -> None:
     lab.sensor.events = ((17, "connected again"),)
     lab.calibrate()

@@ -79,14 +79,6 @@ def test_the_journal_records_unanswered_questions(lab: Lab) -> None:
     assert all(in_words(event).endswith(f"{event.answer} (--yes)") for event in lab.operator.of(Asked))
 
 
-@pytest.mark.parametrize("word", ["tool free", "ball", "emergency stop in reach", "MOVE"])
-def test_without_an_answer_nothing_moves(word: str, lab: Lab) -> None:
-    lab.operator.answers[word] = ["no"]
-    with pytest.raises(Declined):
-        lab.calibrate()
-    assert lab.arm.moves == []
-
-
 def test_the_first_run_is_slow_whatever_was_asked_and_the_second_may_be_fast(lab: Lab) -> None:
     lab.calibrate(fast=True)
     assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
@@ -156,15 +148,6 @@ def test_the_first_limit_of_contact_names_the_mass_it_assumes(lab: Lab) -> None:
         lab.calibrate()
 
 
-def test_a_run_that_was_ended_does_not_count_as_complete(lab: Lab) -> None:
-    lab.operator.answers["Begin"] = ["no"]
-    with pytest.raises(Declined):
-        lab.calibrate()
-    plan = Plan.load(lab.run().plan_path)
-    assert not has_completed("A1", str(plan.to_dict()["sha256"]))
-    assert len(lab.arm.moves) == 1
-
-
 def has_run(lab: Lab) -> bool:
     """Return whether the plan of the run counts as run to its end."""
     return has_completed("A1", str(Plan.load(lab.run().plan_path).to_dict()["sha256"]))
@@ -175,15 +158,6 @@ def test_a_run_without_interruption_counts_as_complete_and_nothing_is_said_of_it
     lab.calibrate(mode=mode)
     assert has_run(lab)
     assert "slow again" not in lab.said()
-
-
-def test_a_plan_that_moves_the_whole_arm_counts_as_complete_too(lab: Lab) -> None:
-    certifier = certifier_for(lab.cell, "UR5e")
-    path = lab.folder / "plan.json"
-    plan = plan_tour(certifier, USUAL_POSTURE_RAD, 6, speeds=Speeds.first_run(), guess=guess_of(certifier))
-    plan.save(path)
-    lab.calibrate(plan=path)
-    assert has_run(lab)
 
 
 def test_a_skipped_pose_counts_against_the_plan_though_resume_takes_it(lab: Lab) -> None:

@@ -15,7 +15,7 @@ from ftcalib import CalibrationResult
 from ftcalib.errors import NotObservable
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord
-from ftdrive.errors import ConfigError, Declined
+from ftdrive.errors import ConfigError
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Reading, Run
 from ftdrive.runs.verification_record import last_verification
@@ -212,14 +212,6 @@ def test_a_calibration_without_its_poses_is_verified_with_a_warning(
     take()
     assert any("poses of the calibration are unknown" in note.words for note in lab.operator.of(Noted) if note.warning)
     assert lab.operator.of(PoseTaken)
-
-
-def test_without_an_answer_nothing_moves(lab: Lab, take: Callable[..., Run]) -> None:
-    lab.arm.moves.clear()
-    lab.operator.answers["tool free"] = ["no"]
-    with pytest.raises(Declined):
-        take()
-    assert not lab.arm.moves
 
 
 def test_only_fresh_poses_count_by_hand(lab: Lab, calibration: CalibrationResult) -> None:

@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from errno import ENOSPC
+from errno import ENOSPC, EPIPE
 from pathlib import Path
 
 import pytest
@@ -18,18 +18,19 @@ from syrupy.assertion import SnapshotAssertion
 
 from ftdrive.checks.check import Check
 from ftdrive.cli import cli, in_a_sentence
+from ftdrive.cli import run as cli_run
 from ftdrive.commands.doctor import _print
 from ftdrive.errors import Declined
 from ftdrive.session import session
 from ftdrive.session.events import Noted
 from ftdrive.session.operator import Question
 from ftdrive.terminal import console
-from ftdrive.terminal.console import answer, hanging, in_whole_words, messages
+from ftdrive.terminal.console import answer, hanging, messages
 from ftdrive.terminal.live.view import Line
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.table import print_table
-from ftdrive.terminal.text import echo, visible
+from ftdrive.terminal.text import echo, in_whole_words, visible
 
 PLAN = ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal"]
 HELD = ["calibrate", "--robot", "10.0.0.1", "--sensor", "ati-can://can0"]
@@ -117,18 +118,42 @@ def test_errors_of_the_system_name_the_file_and_what_to_look_at(tmp_path: Path, 
 
 def test_an_address_stays_on_one_line_and_is_a_link_where_the_terminal_can(monkeypatch: pytest.MonkeyPatch) -> None:
     url = "https://app.foxglove.dev?ds=foxglove-websocket&ds.url=ws%3A%2F%2F127.0.0.1%3A34567"
-    for is_terminal in (True, False):
+    for is_terminal, width, lines in ((True, 40, 1), (True, 90, 2), (False, 40, 1)):
         file = io.StringIO()
         monkeypatch.setattr(
             console,
             "messages",
-            Console(file=file, width=40, force_terminal=is_terminal, color_system="standard" if is_terminal else None),
+            Console(
+                file=file,
+                width=width,
+                soft_wrap=not is_terminal,
+                force_terminal=is_terminal,
+                color_system="standard" if is_terminal else None,
+            ),
         )
         console.print_address("  In a browser:          ", url)
         shown = file.getvalue()
         assert url in shown
-        assert shown.count("\n") == 1
+        assert shown.count("\n") == lines
         assert (f";{url}\x1b\\" in shown) is is_terminal
+
+
+def test_80_columns_hold_whole_words_and_commands_that_a_shell_reads(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
+    monkeypatch.setattr(messages, "soft_wrap", False)
+    monkeypatch.setattr(messages, "_width", 80)
+    command, why = "ftdrive live --calibration runs/2026-11-23T135517Z-with-a-long-name --simulate", "(why it helps)"
+    messages.print_next(command, f"{command}   {why}")
+    echo("words " * 30)
+    echo(f'{{"words": "{"x " * 60}"}}', fold=False)
+    out, err = capfd.readouterr()
+    *lines, data = out.splitlines()
+    assert len(data) > 120
+    assert max(map(len, [*lines, *err.splitlines()])) <= 80
+    assert set(" ".join(lines).split()) == {"words"}
+    assert " ".join(err.replace("\\\n", "").split()) == f"Next {command} {command} {why}"
 
 
 NAME = "\x1b]0;owned\x07 gripper\x9b2J \u202epilf\r0\udcff\ttab\nline\r\n"
@@ -172,11 +197,20 @@ MAIN = "import sys; from ftdrive.cli import main; sys.exit(main())"
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
-@pytest.mark.parametrize(
-    "arguments", [["export", "formats"], ["devices"], ["config", "show"], ["--help"]], ids=" ".join
-)
+@pytest.mark.parametrize("arguments", [["export", "formats"], ["--help"]], ids=" ".join)
 def test_a_closed_pipe_ends_a_command_quietly(arguments: list[str]) -> None:
     assert ended(MAIN, *arguments) == (141, "")
+
+
+def test_a_broken_pipe_of_a_device_is_no_closed_output(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def lose(*_: object) -> None:
+        raise BrokenPipeError(EPIPE, "Broken pipe")
+
+    monkeypatch.setattr(session, "calibrate", lose)
+    assert cli_run(HELD) == 4
+    assert "closed its connection" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")

@@ -29,13 +29,13 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Operator, Question
-from ftdrive.terminal.console import in_whole_words
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match
+from ftdrive.terminal.text import in_whole_words
 
 FREE = Question("Is the tool free?", assumed="yes")
 MOVE = Question("Type MOVE to let the arm move", ("MOVE",))
 ASKED = Asked(question="?", answer="yes", by="--yes")
-STEP = Question("Next pose?", ("", "stop"))
+STEP = Question("Next pose?", ("", "s", "r", "q"))
 HELD = Question("What now?", ("resume", "skip", "back", "quit"))
 
 
@@ -84,11 +84,12 @@ POSE = PoseTaken(
         (MOVE, "M", None),
         (MOVE, "", None),
         (STEP, "\n", ""),
-        (STEP, "Stop", "stop"),
-        *((HELD, letter, answer) for letter, answer in (("q", "quit"), ("Quit", "quit"), ("s", None), ("p", None))),
-        (STEP, "q", "stop"),
+        *((STEP, word, word[0].lower()) for word in ("s", "r", "q", "Skip", "redo", "quit")),
+        *((HELD, word, word.lower()) for word in ("Resume", "skip", "back", "Quit")),
+        (HELD, "q", "quit"),
+        *((HELD, letter, None) for letter in "rsbp"),  # one letter moves no arm
+        (STEP, "p", None),
         (FREE, "q", None),
-        (Question("?", ("resume", "quit")), "r", None),  # one letter moves no arm
     ],
 )
 def test_what_counts_as_an_answer(question: Question, typed: str, answer: str | None) -> None:
@@ -230,7 +231,7 @@ def test_what_was_typed_before_a_question_is_no_answer_to_it() -> None:
         stdin = io.TextIOWrapper(io.BufferedReader(device), encoding="utf-8")
         stderr = io.TextIOWrapper(io.FileIO(program, "w", closefd=False), write_through=True)
         operator = PlainOperator(stdin=stdin, stderr=stderr)
-        for question, answer in ((STEP, "stop"), (FREE, "no"), (STEP, "")):
+        for question, answer in ((STEP, "s"), (FREE, "no"), (STEP, "")):
             printed.clear()
             os.write(person, b"\n\nyes\n")
             read_until(b"\n", 3)  # the terminal's echo: it has them all

@@ -43,3 +43,10 @@ def test_a_narrow_terminal_folds_only_what_may_be_folded(
         "         name",
         "b                       in 5 d",
     ]
+
+
+def test_the_last_columns_begin_a_line_where_the_terminal_is_too_narrow(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, *lines = (line.rstrip() for line in printed(capsys, monkeypatch, 18))
+    assert lines == ["  due", "press-4  a gripper", "         with a", "         long name", "  now", "b", "  in 5 d"]

@@ -7,10 +7,9 @@ from ftmocks.ur import primary
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import RobotMode
 from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.world import Truth, World
 from tests.unit.mocks.ur.primary_decoder import decoded, packages
-from tests.unit.mocks.ur.urscript_robot import HOME, new_robot, run, start
+from tests.unit.mocks.ur.urscript_robot import HOME, new_robot, start
 
 NEVER = 2**64 - 1
 
@@ -126,24 +125,6 @@ def test_a_run_time_error_is_heard_with_its_place_before_the_end() -> None:
     assert error["text"] == "movej: q must be a list of 6 numbers, not [0, 0]"
     assert error["timestamp"] == ended["timestamp"] != NEVER
     assert ended["title"] == "PROGRAM_XXX_STOPPED"
-
-
-def test_a_replaced_program_ends_before_the_new_one_begins() -> None:
-    robot = start("def f():\n  sleep(9)\nend\n")
-    start("def g():\n  sleep(9)\nend\n", robot)
-    assert [(m["title"], m["text"]) for m in heard(robot)] == [
-        ("PROGRAM_XXX_STARTED", "f"),
-        ("PROGRAM_XXX_STOPPED", "f"),
-        ("PROGRAM_XXX_STARTED", "g"),
-    ]
-
-
-def test_a_program_that_may_not_start_is_not_heard() -> None:
-    robot = new_robot()
-    robot.set_mode(RobotMode.IDLE)
-    start_upload(robot, Upload("f", "def f():\nend\n", secondary=False))
-    run(robot, 0.2)
-    assert heard(robot) == []
 
 
 def test_a_connection_that_can_only_read_is_answered_by_c210() -> None:

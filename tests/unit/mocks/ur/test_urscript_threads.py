@@ -10,22 +10,6 @@ from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot
 from tests.unit.mocks.ur.urscript_robot import HOME, end_of, failure, logged, new_robot, results, run, start
 
-TOUR = """
-# made for the test
-def tour():
-  textmsg("poses: ", 3)
-  local poses = [[0.785, -1.745, 1.047, -0.873, 1.571, 0.785], [0.785, -1.745, 1.047, -0.873, 1.571, 0.0]]
-  local i = 0
-  popup("Is the tool free?", title="Tour", blocking=True)
-  while i < 2:
-    movej(poses[i], a=1.4, v=1.05)
-    sleep(0.5)
-    textmsg("pose ", i + 1)
-    i = i + 1
-  end
-end
-"""
-
 GUARDED = """
 def segment():
   global done = False
@@ -56,21 +40,6 @@ def segment():
   write_output_integer_register(24, 1)
 end
 """
-
-
-def test_an_exported_tour_asks_moves_and_reports() -> None:
-    robot = start(TOUR)
-    run(robot, 1.0)
-    assert (robot.popup, logged(robot), robot.arm.at_rest) == ("Is the tool free?", ["poses: 3"], True)
-    asked = next(event for event in robot.events if event.what == "popup")
-    assert (asked.why, asked.detail["title"], asked.detail["blocking"]) == ("Is the tool free?", "Tour", True)
-    assert answer(robot, "close popup") == "closing popup"
-    run(robot, 0.1)
-    assert answer(robot, "programState") == "PLAYING tour"
-    run(robot, 6.0)
-    assert logged(robot)[1:] == ["pose 1", "pose 2"]
-    assert robot.arm.q[5] == 0.0
-    assert end_of(robot).why == "ended"
 
 
 def test_a_move_takes_its_speed_from_its_arguments() -> None:

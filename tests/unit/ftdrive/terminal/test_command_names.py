@@ -4,17 +4,13 @@ import pytest
 from click.testing import CliRunner
 
 from ftdrive import cli
+from ftdrive.terminal.command_names import as_typed
 from ftdrive.terminal.console import hanging
-from ftdrive.terminal.hints import COMMANDS, as_typed
 
 
 @pytest.fixture
 def _started_by_uv(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UV_RUN_RECURSION_DEPTH", "1")
-
-
-def test_all_commands_are_known() -> None:
-    assert set(COMMANDS) == set(cli._COMMANDS)
 
 
 def test_without_uv_nothing_changes() -> None:
