@@ -24,7 +24,8 @@ _VERDICTS: Final[Mapping[Severity, Verdict]] = {"reject": "rejected", "limit": "
 _PLACE: Final = re.compile(r"\{(\w+)(?::([^}]*))?\}")
 """Of a value in a template, with its form."""
 _UNITS: Final = {
-    "N": " N", "Nm": " N·m", "mNm": " mN·m", "kg": " kg", "m": " m", "mm": " mm", "deg": "°", "percent": " %",
+    "N": " N", "Nm": " N·m", "mNm": " mN·m", "kg": " kg", "m": " m", "s": " s", "mm": " mm", "deg": "°",
+    "percent": " %",
 }  # fmt: skip
 
 
@@ -191,7 +192,15 @@ def _order(channels: Sequence[str]) -> str:
     return f"x, y, z taken from ({', '.join(channels)})"
 
 
-_FORMS: Final[Mapping[str, Callable[[Any], str]]] = {"poses": _poses, "units": _units, "axes": _axes}
+def _orders(orders: Sequence[str]) -> str:
+    """Write the orders of quaternions that would make gravity point down."""
+    each = " or ".join(f"({order})" for order in orders)
+    return f", or for quaternions {each} that were read inverted and in another order" if orders else ""
+
+
+_FORMS: Final[Mapping[str, Callable[[Any], str]]] = {
+    "poses": _poses, "units": _units, "axes": _axes, "orders": _orders,
+}  # fmt: skip
 
 
 def _plain(value: Any) -> Any:
@@ -217,8 +226,14 @@ _LIMIT_OR_NOTE: Final = ("limit", "note")
 # fmt: off
 CODES: Final[Mapping[str, Code]] = {
     # Data that cannot be right
+    "other_recording": Code(_REJECT, "the wrench does not follow the poses: {left_percent:.0f} of its change remain "
+        "unexplained", "check that wrench and poses are of one recording on one clock, and the form of the rotations"),
     "stuck_channels": Code(_REJECT, "the reading of {channels} is the same in all poses",
         "check the sensor for a channel that is stuck"),
+    "quantised": Code(_LIMIT, "the readings come in steps of {step_N:.2g} and {step_Nm:.2g}",
+        "record the full resolution of the sensor, and the mean of many samples at each pose"),
+    "saturated": Code(_REJECT, "{channel} reads exactly the same extreme in {poses:poses}, as if it were saturated",
+        "use a larger measuring range or a lighter tool, and repeat these poses"),
     "repeated_poses": Code(_REJECT, "{poses:poses} have identical wrenches and orientations", "keep one of the copies"),
     "repeated_wrenches": Code(_REJECT, "{poses:poses} have identical wrenches in different orientations",
         "repeat these poses"),
@@ -227,9 +242,13 @@ CODES: Final[Mapping[str, Code]] = {
     "wrench_in_base": Code(_REJECT, "the wrench looks given in base axes (force residual {residual_N:.2g}, corrected "
         "{corrected_N:.2g})", "record it in the axes of the sensor"),
     "orientations_inverted": Code(_REJECT, "the orientations look inverted (force residual {residual_N:.2g}, "
-        "corrected {corrected_N:.2g})", "state that they map base to flange"),
+        "corrected {corrected_N:.2g}){also:?, or |}{also}", "state that they map base to flange"),
     "quaternion_order": Code(_REJECT, "the quaternions look like ({order}), but were read as ({read_as}) (force "
-        "residual {residual_N:.2g}, corrected {corrected_N:.2g})", "read them as ({order})"),
+        "residual {residual_N:.2g}, corrected {corrected_N:.2g}){also:?, or |}{also}", "read them as ({order})"),
+    "euler_angles": Code(_REJECT, "the Euler angles look {order}, but were read as {read_as} (force residual "
+        "{residual_N:.2g}, corrected {corrected_N:.2g}){also:?, or |}{also}", "read them as {order}"),
+    "columns_swapped": Code(_REJECT, "forces and torques look exchanged (force residual {residual_N:.2g}, corrected "
+        "{corrected_N:.2g})", "exchange the columns of force and torque"),
     "pairing_shifted": Code(_REJECT, "each wrench looks like that of the pose {neighbour} it (force residual "
         "{residual_N:.2g}, corrected {corrected_N:.2g})", "pair each wrench with the pose at which it was measured"),
     "pairing_or_rotations": Code(_REJECT, "the forces are those of a weight of {weight_N:.3g} to {radial_N:.2g}, but "
@@ -249,29 +268,42 @@ CODES: Final[Mapping[str, Code]] = {
     # Units, drift and changes of one session
     "payload_units": Code(_LIMIT, "the load is {load_kg:.2f}, but {expected_kg:.2f} by the payload in the "
         "controller{units:units}", "check the units of the sensor before you correct the payload"),
-    "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
-        "last", "let the sensor warm up and calibrate again"),
-    "com_shifted": Code(_REJECT_OR_NOTE, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
+    "com_shifted": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
         "load had shifted", "fix the load and calibrate again"),
-    "load_changed": Code(_REJECT_OR_NOTE, "from {pose:poses} on the weight has changed by {change_N:+.2g} and the "
+    "load_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the weight has changed by {change_N:+.2g} and the "
         "centre of mass by {shift_mm:.2g}", "check whether something was lost, picked up or shifted, and calibrate "
         "again"),
+    "bias_stepped": Code(_LIMIT, "from {pose:poses} on the bias differs by {force_N:.2g} and {torque_Nm:.2g}",
+        "check whether the sensor was zeroed or a cable pulls, and calibrate again"),
+    "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
+        "fasten its screws and calibrate again"),
+    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the readings are those of another sensor, turned by "
+        "{turn_deg:.2g}, whose bias differs by {force_N:.2g} and {torque_Nm:.2g}", "calibrate each sensor by itself"),
+    "sensors_alternate": Code(_REJECT, "every other pose reads like another sensor, turned by {turn_deg:.2g}, whose "
+        "bias differs by {force_N:.2g} and {torque_Nm:.2g}", "separate the readings of the sensors"),
+    "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
+        "last", "let the sensor warm up and calibrate again"),
     "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
-        "of {sigma_N:.2g}", "hang something heavier on the sensor, or record longer and in more orientations"),
+        "of {sigma_N:.2g}", "record the raw wrench if it is compensated already or zeroed "
+        "at each pose, or hang something heavier on the sensor"),
     "second_solution": Code(_REJECT, "a very different mounting of the sensor explains the data almost as well "
         "(probability {probability_percent:.2g})", "add poses with another angle between the tool and the vertical"),
+    "weight_compensated": Code(_LIMIT, "the weight is only {weight_N:.2g}, as if it were compensated already, "
+        "or the sensor were zeroed at each pose", "record the raw wrench, without compensation, and zero at most once, "
+        "before the first pose"),
     "weight_implausible": Code(_REJECT_OR_LIMIT, "the weight is {weight_N:.5g}{units:units}",
         "check the units of force and torque"),
-    "com_too_far": Code(_REJECT, "the centre of mass is {distance_m:.2f} from the sensor, farther than "
-        "{most_m:g}{units:units}", "check the units of force and torque"),
+    "com_too_far": Code(_REJECT_OR_LIMIT, "the centre of mass is {distance_m:.2f} from the sensor, farther than "
+        "{most_m:g}{units:units}", "check the units of force and torque, or describe the tool ([tool] cylinders_mm)"),
     "com_too_near": Code(_LIMIT, "the centre of mass is only {distance_mm:.2g} from the sensor, as if torques were "
         "1000 times too small or forces were in mN", "check the units of force and torque"),
     # Directions and signs
-    "gravity_off_mounting": Code(_LIMIT, "gravity is {off_deg:.0f} off the direction of the declared mounting",
+    "gravity_off_mounting": Code(_LIMIT, "gravity is {off_deg:.0f} off the direction of the declared mounting"
+        "{orders:orders}",
         "correct the mounting ([workcell] mounting, --up), here and in the controller, or check the order and the "
         "direction of the rotations"),
     "mounting_undeclared": Code(_LIMIT, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot "
-        "on a wall, but no mounting is declared",
+        "on a wall{orders:orders}, but no mounting is declared",
         "declare the mounting ([workcell] mounting, --up), or check the order and the direction of the rotations"),
     "weight_upwards": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down)",
         "set sign = -1 if the sensor reports the reaction, or correct axes that are reversed or swapped in forces "
@@ -280,8 +312,9 @@ CODES: Final[Mapping[str, Code]] = {
     "forces_reversed": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down) and the centre of mass lies "
         "on the robot's side of the sensor, as if the forces were reversed and the torques not, or the orientations "
         "mirrored", "reverse the forces, or give the orientations in right-handed axes"),
-    "torques_reversed": Code(_LIMIT, "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor",
-        "reverse the torques, unless the tool reaches back that far"),
+    "torques_reversed": Code(_LIMIT, "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor, as if "
+        "the torques were reversed, or the orientations mirrored", "reverse the torques, or give the orientations in "
+        "right-handed axes, unless the tool reaches back that far"),
     # The described cell
     "tool_mass_mismatch": Code(_LIMIT, "{load_kg:.3g} hang on the sensor, but the described tool has "
         "{tool_kg:.3g}{units:units}", "check the sensor's units and what is mounted, or correct [tool] mass_kg"),
@@ -292,6 +325,24 @@ CODES: Final[Mapping[str, Code]] = {
     "com_outside_tool": Code(_REJECT_OR_LIMIT, "the centre of mass, at {com_mm:.0f} from the {origin} in flange axes, "
         "lies {outside_mm:.0f} outside the described tool{units:units}",
         "check signs and units of forces and torques, then [tool] cylinders_mm"),
+    # Recordings in motion
+    "wrench_compensated": Code(_REJECT, "the load weighs {weight_N:.2g}, but has the inertia of {mass_kg:.2g}, as if a "
+        "controller had compensated or zeroed the wrench", "record the wrench as the sensor measures it"),
+    "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned through {range_deg:.0f} only, which leaves the mounting "
+        "{mounting_deg:.2g} and the weight {weight_N:.2g} uncertain (1 sigma)",
+        "turn wrist 2 and wrist 3 by 60° or more"),
+    "clock_offset": Code(_LIMIT, "the wrench follows the poses by {delay_s:.3f}", "correct the clock of one of the "
+        "two, or check that the times of both files mean the same"),
+    "positions_missing": Code(_LIMIT, "the poses have no positions, so only slow parts count ({share_percent:.0f}), "
+        "where the unknown acceleration adds up to {force_N:.2g}", "give the position of the flange too"),
+    "height_differs": Code(_LIMIT, "by the motion the sensor lies {height_mm:~sigma_mm} above the flange (sigma "
+        "{sigma_mm:~sigma_mm}), not {configured_mm:.3g}", "correct [sensor] height_mm, or check the positions"),
+    "mostly_contact": Code(_LIMIT, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
+        "{force_N:.2g}", "keep the tool free for most of the recording"),
+    "contacts_left_out": Code(_NOTE, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
+        "{force_N:.2g}"),
+    "motion_slow": Code(_NOTE, "the motion does not determine {names}", "turn the three wrist joints together, at "
+        "60 °/s or more"),
     # How well the data fit
     "force_error": Code(_REJECT_OR_LIMIT, "judged by the {source}, the force error is {share_percent:.1f} of the "
         "weight ({error_N:.2g}), more than {limit_percent:g}",
@@ -322,10 +373,6 @@ CODES: Final[Mapping[str, Code]] = {
         "likely from drift", "let the sensor warm up and mix the order of the poses"),
     "pose_deviates": Code(_NOTE, "{pose:poses} deviates from the others by {sigmas:.1f} sigma",
         "consider repeating it"),
-    "bias_stepped": Code(_NOTE, "from {pose:poses} on the bias differs by {force_N:.2g} and {torque_Nm:.2g}",
-        "check whether the sensor was tared or a cable pulls, and calibrate again"),
-    "sensor_turned": Code(_NOTE, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
-        "fasten its screws and calibrate again"),
     "gravity_tilted": Code(_NOTE, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot on a "
         "slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
     "base_leans": Code(_NOTE, "the base leans {lean_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) towards its {side}, "

@@ -18,14 +18,17 @@ from ftcalib.compensation import Compensator
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, is_changed, read_object, write_object
 from ftcalib.findings import Finding, Verdict, verdict_of
-from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
+from ftcalib.likelihood.gain_and_cross_talk import COMMON_GAIN, Response, hidden_covariance, predicted_covariance
 from ftcalib.model import PARAMETER_NAMES, Array, Parameters, Rotations, is_rotation, read_only
 from ftcalib.published.yu import weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
 
-COMMON_GAIN = float(np.sqrt(5 / 3 / 3))
-"""Sigma of the mean of three gains over that of one; five numbers determine that one, so 5/3 as in Student's t."""
+LEAST_COMMON_GAIN = 0.002
+"""Sigma of the gain common to all axes, where no gain was found: no orientation shows it, and no sensor is better."""
+
+INDEFINITE = -1e-6
+"""Eigenvalues of a correlation matrix below this are no rounding."""
 
 Method = Literal[
     "ml",
@@ -60,6 +63,58 @@ class DriftResult:
             object.__setattr__(self, name, value)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionResult:
+    """What a recording in motion gives beside the static model; arrays are read-only."""
+
+    inertia_kg_m2: Array
+    """(3, 3) of the load about its centre of mass, in sensor axes."""
+    delay_s: float
+    """Of the wrench after the poses."""
+    height_m: float
+    """Of the sensor origin above the flange face."""
+    covariance: Array
+    """(23, 23) of the 15 error coordinates, ixx, iyy, izz, ixy, ixz, iyz, height and delay."""
+    used_share: float
+    """Of the recording: the rest was contact, gaps, or too fast where the position is unknown."""
+    contacts: tuple[Mapping[str, float], ...] = ()
+    """Each with `t_s` after the first sample, `duration_s`, and the peaks `force_N` and `torque_Nm`, all filtered."""
+
+    def __post_init__(self) -> None:
+        for name, shape in (("inertia_kg_m2", (3, 3)), ("covariance", (23, 23))):
+            value = read_only(getattr(self, name))
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"the motion's {name} must be {shape} finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "contacts", tuple(MappingProxyType(dict(one)) for one in self.contacts))
+
+    @property
+    def sigma(self) -> dict[str, Array | float]:
+        """One standard deviation of each estimate, by its name."""
+        std = np.sqrt(np.diag(self.covariance)[15:])
+        inertia = std[[[0, 3, 4], [3, 1, 5], [4, 5, 2]]]
+        return {"inertia_kg_m2": inertia, "height_m": float(std[6]), "delay_s": float(std[7])}
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return what a calibration file and `--json` have of it."""
+        return {
+            "inertia_kg_m2": self.inertia_kg_m2.tolist(),
+            "delay_s": self.delay_s,
+            "height_m": self.height_m,
+            "used_share": self.used_share,
+            "contacts": [dict(one) for one in self.contacts],
+            "motion_covariance": self.covariance.tolist(),
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self | None:
+        """Build from `to_dict`; None for a calibration at rest."""
+        if "inertia_kg_m2" not in document:
+            return None
+        names = ("inertia_kg_m2", "delay_s", "height_m", "motion_covariance", "used_share", "contacts")
+        return cls(*(document[name] for name in names))
+
+
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
     """Estimates with their covariance; arrays are read-only. Frames and signs: docs/explanation/model.md.
@@ -69,7 +124,7 @@ class CalibrationResult:
     >>> import ftdrive
     >>> result = ftdrive.solve(ftdrive.read_dataset("poses.csv"))
     >>> f"{result.mass_kg:.4f} kg, sigma {result.sigma['mass_kg']:.4f} kg, {result.verdict}"
-    '1.2350 kg, sigma 0.0002 kg, good'
+    '1.2350 kg, sigma 0.0025 kg, good'
     """
 
     parameters: Parameters
@@ -84,7 +139,7 @@ class CalibrationResult:
     noise_source: NoiseSource
     """Source of the noise: the spread within each pose, or the residuals of the fit."""
     g_m_s2: float
-    method: Method
+    method: Method | Literal["motion"]
     findings: tuple[Finding, ...]
     """What gives the verdict, the first one to be fixed first; then notes."""
     provenance: Mapping[str, JSON] = field(default_factory=dict)
@@ -98,19 +153,24 @@ class CalibrationResult:
     """Standard deviations of the variance components, by name and unit: beyond the measured noise, or all of the noise
     if it was not measured. `walk_…` is the random walk of the bias per mean interval between poses, `slope_…` its
     linear change over the session, `rotation_rad` the error of each pose's orientation per axis, `gain` and
-    `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm."""
+    `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm, `hysteresis` the
+    share of its last swing by which each axis lags."""
     drift: DriftResult | None = None
     """None: no drift was found, or `drift="none"`."""
     response: Response | None = None
     """Gain and cross-talk of the sensor; None: none were found, or the method does not estimate them."""
     gain_sigma: float = 0.0
-    """Standard deviation of the gain entries that the data do not exclude."""
+    """Standard deviation of the entries of the gain, if one was found."""
     second_basin_chi2: float | None = None
     """Increase of chi2 at the second best solution, under the noise model; None: there is no other."""
     quality: Mapping[str, JSON] = field(default_factory=dict)
     """Statistics behind the verdict: `loo_force_rms_N` and `loo_torque_rms_Nm` (each pose predicted from all others),
+    `next_use_force_rms_N` and `next_use_torque_rms_Nm` (`likely_error`), `last_bias_offset` (6; bias at the last pose
+    minus that of the result, the mean of the tour), `bias_growth_per_min` (6; its change in the minute after),
     `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
     `correlations` (pairs of parameters above 0.9)."""
+    motion: MotionResult | None = None
+    """Of a recording in motion, whose rows count as poses; None = from poses at rest."""
 
     def __post_init__(self) -> None:
         for each in fields(Parameters):
@@ -136,6 +196,8 @@ class CalibrationResult:
         if isinstance(self.response, Mapping):
             given = self.response
             object.__setattr__(self, "response", Response(given["coefficients"], given["covariance"]))
+        joint = self.covariance if self.response is None else self.response.covariance
+        require_positive_definite(joint)
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
         found = (one if isinstance(one, Finding) else Finding.from_dict(one) for one in self.findings)
         object.__setattr__(self, "findings", tuple(found))
@@ -160,6 +222,8 @@ class CalibrationResult:
         numbers += [self.covariance.tolist(), self.gain_sigma, self.g_m_s2]
         if response is not None:
             numbers.append(response)
+        if self.motion is not None:
+            numbers += [self.motion.inertia_kg_m2.tolist(), self.motion.delay_s]
         return hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:12]
 
     @property
@@ -243,15 +307,32 @@ class CalibrationResult:
         return weight_and_tilt(self.gravity_force_base_N)[2]
 
     @property
+    def tool_covariance(self) -> Array:
+        """(15, 15) of mounting, weight and centre of mass of the tool itself, in the coordinates of `covariance`.
+
+        It includes what the gain and cross-talk that were found can hide in them. `covariance` does not, because
+        compensation needs only the sum of both.
+        """
+        if self.response is None:
+            return self.covariance
+        hidden = hidden_covariance(self.parameters, self.gain_sigma, self.response.cross_talk_sigma_m)
+        known = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)) < 1e-12
+        hidden[known], hidden[:, known] = 0.0, 0.0
+        return np.asarray(self.covariance + hidden)
+
+    @property
     def sigma(self) -> Mapping[str, Array | float]:
         """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes.
 
-        Those of weight and mass include the gain common to all axes, which no orientation reveals.
+        They are those of `tool_covariance`. Weight and mass have at least 0.2 %, unless they were known.
         """
-        std = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
-        weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, self.covariance[3:6, 3:6])
+        std = np.sqrt(np.maximum(np.diag(self.tool_covariance), 0.0))
+        cov = self.covariance[3:6, 3:6]
+        weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, cov)
         if weight > 1e-9 * self.weight_N:  # not exactly known
-            weight = float(np.hypot(weight, COMMON_GAIN * self.gain_sigma * self.weight_N))
+            lag = self.components.get("hysteresis", 0.0)
+            common = max(LEAST_COMMON_GAIN, float(np.hypot(COMMON_GAIN * self.gain_sigma, lag)))
+            weight = float(np.hypot(weight, common * self.weight_N))
         return {
             "R_flange_sensor": std[0:3],
             "gravity_force_base_N": std[3:6],
@@ -262,6 +343,7 @@ class CalibrationResult:
             "mass_kg": weight / self.g_m_s2,
             "tilt_alpha_rad": alpha,
             "tilt_beta_rad": beta,
+            **({} if self.motion is None else self.motion.sigma),
         }
 
     def compensate(self, wrench: ArrayLike, R_base_flange: Rotations, *, response: bool = True) -> Array:
@@ -309,20 +391,25 @@ class CalibrationResult:
 
     @property
     def noise_explains(self) -> bool:
-        """Whether the residuals agree with the noise model; True for an update, whose poses are too few for a test."""
-        return not self.quality or (self.p_value is not None and self.p_value >= SURE)
+        """Whether the residuals agree with the noise model.
+
+        True for an update, whose poses are too few for a test, and in motion, where each state has the noise of its
+        residuals.
+        """
+        return not self.quality or self.motion is not None or (self.p_value is not None and self.p_value >= SURE)
 
     def likely_error(self) -> Array:
-        """Root mean square error (2,) of compensating a free tool over all orientations, N and N·m.
+        """Root mean square error (2,) of compensating a free tool at the next use, N and N·m.
 
-        It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the larger of that and
-        of the error in predicting each pose from all others.
+        It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the error in predicting
+        each pose from all others, so it holds for orientations like those of the tour. In both it has the drift of the
+        bias from the mean of the tour to one minute after the last pose.
         """
-        predicted = np.array(self.predicted_error())
-        if self.noise_explains:
-            return predicted
-        left_out = [self.quality["loo_force_rms_N"], self.quality["loo_torque_rms_Nm"]]
-        return np.asarray(np.maximum(predicted, np.array(left_out, dtype=np.float64)))
+        if not self.quality:
+            return np.array(self.predicted_error())
+        # Files of version 0.1.0 and earlier have only the error of predicting each pose from all others.
+        keys = [f"{name}_{unit}" for name in ("next_use", "loo") for unit in ("force_rms_N", "torque_rms_Nm")]
+        return np.array([self.quality.get(keys[k], self.quality[keys[2 + k]]) for k in range(2)], dtype=np.float64)
 
     def residual_summary(self) -> dict[str, float]:
         """Root mean square and largest norm of the force and torque residuals over the poses."""
@@ -379,6 +466,7 @@ class CalibrationResult:
             "covariance": self.covariance.tolist(),
             "residuals": self.residuals.tolist(),
             "provenance": dict(self.provenance),
+            **({} if self.motion is None else self.motion.to_dict()),
         }
 
     @classmethod
@@ -397,9 +485,11 @@ class CalibrationResult:
         """
         check_format(document, FORMAT, BadCalibration)
         try:
+            plain = [field.name for field in fields(cls) if field.name not in {"parameters", "motion"}]
             result = cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
-                **{field.name: document[field.name] for field in fields(cls) if field.name != "parameters"},
+                **{name: document[name] for name in plain},
+                motion=MotionResult.from_dict(document),
             )
             derived = (("id", result._id(document.get("response"))), ("verdict", result.verdict))
             edited = is_changed(document) or any(document.get(name, value) != value for name, value in derived)
@@ -430,10 +520,20 @@ class CalibrationResult:
             raise BadCalibration(f"{Path(path).name}: {exc}") from exc
 
 
+def require_positive_definite(covariance: Array) -> None:
+    """Raise `ValueError` for a covariance with a negative eigenvalue; exactly known values have none."""
+    sigma = np.sqrt(np.abs(np.diag(covariance)))
+    free = sigma > 0
+    correlations = covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
+    least = float(np.linalg.eigvalsh(correlations)[0]) if free.any() else 0.0
+    if least < INDEFINITE:
+        raise ValueError(f"the covariance is not positive definite: its smallest normalised eigenvalue is {least:.2g}")
+
+
 def _require_known_words(result: CalibrationResult) -> None:
-    for name, words in (("method", Method), ("noise_source", NoiseSource)):
-        if getattr(result, name) not in get_args(words):
-            raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(get_args(words))}")
+    for name, choices in (("method", (*get_args(Method), "motion")), ("noise_source", get_args(NoiseSource))):
+        if getattr(result, name) not in choices:
+            raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(choices)}")
 
 
 def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ftcalib.assessment.contradictions import contradictions
 from ftcalib.assessment.cross_validation import AssessedFit, IndependentFit
-from ftcalib.assessment.faults import faults, other_poses
+from ftcalib.assessment.faults import faults, no_weight, other_poses
 from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from ftcalib.assessment.verdict import SIGNIFICANT_SIGMAS, judge
 from ftcalib.data.dataset import CalibrationDataset
@@ -21,7 +21,7 @@ from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters, predict
 from ftcalib.published.methods import PUBLISHED, Estimator, published
-from ftcalib.result import CalibrationResult, DriftResult, Method
+from ftcalib.result import CalibrationResult, DriftResult, Method, require_positive_definite
 from ftcalib.setup import NOTHING, Setup
 
 SIMULATIONS = 400
@@ -133,6 +133,11 @@ def solve(
             np.ones(len(dataset)),
             best.second_basin_chi2,
         )
+    try:
+        require_positive_definite(assessed.covariance)
+        require_positive_definite(assessed.covariance if assessed.response is None else assessed.response.covariance)
+    except ValueError as exc:
+        raise NotObservable(f"{exc}. Add poses with other orientations.") from exc
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
     unconstrained = best if estimator else None if known is None else _unconstrained(dataset, wrench_cov, drift)
     quality = judge(
@@ -168,6 +173,10 @@ def solve(
         quality={
             "loo_force_rms_N": quality.loo_force_rms_N,
             "loo_torque_rms_Nm": quality.loo_torque_rms_Nm,
+            "next_use_force_rms_N": quality.next_use_force_rms_N,
+            "next_use_torque_rms_Nm": quality.next_use_torque_rms_Nm,
+            "last_bias_offset": quality.ahead.offset.tolist(),
+            "bias_growth_per_min": quality.ahead.growth_per_min.tolist(),
             "worst_pose": quality.worst_pose + 1,
             "residual_sigma": quality.residual_sigma.tolist(),
             "lag1": quality.lag1,
@@ -205,7 +214,7 @@ def _mistakes(
 ) -> list[Finding]:
     """Find what explains that poses do not determine the parameters: wrong known values can leave no weight."""
     poses = dataset.R_base_flange, dataset.wrench
-    found = faults(*poses, setup.up) or other_poses(*poses)
+    found = faults(*poses, setup.up) or other_poses(*poses) or no_weight(*poses)
     if not found and known is not None and (free := _unconstrained(dataset, wrench_cov, drift)) is not None:
         found = contradictions(known, free.parameters, free.covariance, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
     return found

@@ -18,13 +18,13 @@ from ftcalib import Parameters, read_csv
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood import fit as likelihood
 from ftcalib.likelihood.explanation import Explanation, with_all_minima
-from ftcalib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, Response, predicted_covariance
+from ftcalib.likelihood.gain_and_cross_talk import COMMON_GAIN, CROSS_TALK_M, GAIN, Response, predicted_covariance
 from ftcalib.likelihood.session import Session, inverses
 from ftcalib.likelihood.session_noise import centred
 from ftcalib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, Kind, component
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, predict
 from ftcalib.published.yu import lrom
-from ftcalib.result import COMMON_GAIN
+from ftcalib.result import LEAST_COMMON_GAIN
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.accuracy import Lab, Row, band, most, run
 
@@ -166,12 +166,13 @@ def sensor_run(
     weight_N = float(np.linalg.norm(fit.parameters.gravity_force_base_N))
     along = fit.parameters.gravity_force_base_N / weight_N
     own = np.sqrt(along @ fit.covariance[3:6, 3:6] @ along)
+    own = np.hypot(own, max(LEAST_COMMON_GAIN, COMMON_GAIN * fit.gain_sigma) * weight_N)
     record: dict[str, object] = {
         "square": [np.mean(e[:, :3] ** 2), np.mean(e[:, 3:] ** 2)],
         "covered": np.mean(np.abs(e) < 1.96 * sigma, axis=0),
         "gain": "gain" in components,
         "cross_talk": "cross_talk" in components,
-        "mass": (weight_N - sim.WEIGHT_N) / np.hypot(own, COMMON_GAIN * fit.gain_sigma * weight_N),
+        "mass": (weight_N - sim.WEIGHT_N) / own,
         "rejected": np.mean(fit.weights == 0),
     }
     for split, halves in splits(n).items():

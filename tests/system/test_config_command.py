@@ -1,8 +1,6 @@
 """`ftdrive config show`, and a configuration as the other commands see it."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -109,13 +107,6 @@ def test_without_a_configuration_a_plan_needs_arm_and_tool(arguments: list[str],
     assert error is not None
     assert exit_code(error) == 2
     assert f"Give {said}" in str(error)
-
-
-@pytest.mark.parametrize("name", ["config", "export", "init", "plan"])
-def test_help_of_a_command_is_fast(name: str) -> None:
-    code = f"import sys, ftdrive.commands.{name}; print(sorted({{'numpy', 'rich', 'serial'}} & sys.modules.keys()))"
-    outcome = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert outcome.stdout.strip() == "[]"
 
 
 def test_settings_are_all_shown() -> None:

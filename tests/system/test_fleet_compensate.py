@@ -1,11 +1,12 @@
 """Recordings compensated in processes and on a Dask cluster: the same bytes."""
 
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from dask import config
 
-from ftdrive.fleet.compensate import compensate_all, compensated_file, task_of
+from ftdrive.fleet.compensate import compensate_all, compensated_bytes, task_of
 from ftdrive.fleet.workers import Workers, cluster_workers, local_workers
 from ftdrive.live.samples import WrenchFrame
 from ftdrive.recording import Recorder
@@ -35,9 +36,10 @@ def results(recordings: list[Path], folder: Path, workers: Workers) -> list[byte
 
 
 def test_processes_and_a_cluster_give_the_same_bytes(recordings: list[Path], tmp_path: Path) -> None:
-    here = [compensated_file(one.read_bytes(), one.name, TASK).rpartition(b"\n")[0] for one in recordings]
+    here = [compensated_bytes(one.read_bytes(), one.name, TASK).rpartition(b"\n")[0] for one in recordings]
     with local_workers(2) as workers:
         assert results(recordings, tmp_path / "processes", workers) == here
+    import_module("distributed")  # its defaults first: else all of them leave with the one that is changed here
     with dask_cluster() as cluster, config.set({"distributed.admin.large-graph-warning-threshold": "1kB"}):
         cluster.start_worker()
         with cluster_workers(cluster.address, timeout_s=60) as workers:

@@ -1,4 +1,7 @@
-"""What can be assessed: a fit, or estimates of another method with leave-one-out cross-validation of its poses."""
+"""What can be assessed: a fit, or estimates of another method with leave-one-out cross-validation of its poses.
+
+Cross-validation interpolates a drift, but a calibration is used after its tour: `drift_ahead` extrapolates it.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,7 +12,7 @@ import numpy as np
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.fit import Fit
 from ftcalib.likelihood.session_noise import CHUNK, Noise, summed_products
-from ftcalib.likelihood.variance_components import left_out
+from ftcalib.likelihood.variance_components import FORCE, TORQUE, component, left_out
 from ftcalib.model import Array, Parameters, jacobian, predict
 
 
@@ -85,3 +88,48 @@ def standardized(residuals: Array, covariance: Array) -> Array:
         part = slice(first, first + CHUNK)
         unit[part] = np.linalg.solve(np.linalg.cholesky(covariance[part]), residuals[part, :, None])[..., 0]
     return unit
+
+
+USUAL_INTERVAL_S = 10.0
+"""From pose to pose, if their times are not known."""
+NEXT_USE_S = 60.0
+"""From the last pose to the next use."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriftAhead:
+    """The bias at the next use, a minute after the last pose, less the mean bias of the tour; zero without drift."""
+
+    offset: Array
+    """(6,) at the last used pose, N and N·m."""
+    growth_per_min: Array
+    """(6,) change in the next minute: its size if the bias is linear in time, its standard deviation if it walks."""
+    square: Array
+    """(6,) expected square at the next use."""
+
+
+def drift_ahead(fit: AssessedFit, t_s: Array | None = None) -> DriftAhead:
+    """Extrapolate the drift of a fit.
+
+    Parameters
+    ----------
+    fit : AssessedFit
+    t_s : array, shape (n,), optional
+        When each pose was measured; without it, or with times that are not finite, one pose every 10 s in their order.
+    """
+    if fit.drift is None:
+        return DriftAhead(np.zeros(6), np.zeros(6), np.zeros(6))
+    n = len(fit.weights)
+    timed = t_s is not None and np.isfinite(t_s).all() and np.ptp(t_s) > 0
+    time = np.asarray(t_s if timed else USUAL_INTERVAL_S * np.arange(n), dtype=np.float64)
+    used = np.flatnonzero(fit.weights > 0)
+    first, last = used[np.argmin(time[used])], used[np.argmax(time[used])]
+    offset = fit.drift.bias[last]
+    intervals = NEXT_USE_S * (n - 1) / np.ptp(time)
+    walk = np.zeros(6)
+    for channels in (FORCE, TORQUE, *([c] for c in range(6))):
+        walk[channels] += intervals * fit.components.get(component("walk", channels).name, 0.0) ** 2
+    linear = np.where(walk > 0, 0.0, fit.drift.change * NEXT_USE_S / (time[last] - time[first]))
+    # The change from the first pose to the last has the errors of both ends.
+    square = (offset + linear) ** 2 + walk + fit.drift.sigma**2 / 2
+    return DriftAhead(offset, np.sqrt(walk + linear**2), square)

@@ -7,13 +7,13 @@ from typing import Final
 import numpy as np
 
 from ftcalib.assessment import units
+from ftcalib.assessment.units import FARTHEST_COM_M
 from ftcalib.findings import Finding
 from ftcalib.model import Array, Parameters
 from ftcalib.rounding import decimals
 from ftcalib.setup import Setup
 from ftcalib.sphere import axes_along, evenly_spread
 
-FARTHEST_COM_M = 0.5
 INSIDE_M = 0.01
 """A centre of mass may lie this far on the robot's side of the sensor origin, because adapter plates do."""
 REVERSED_TILT_DEG = 135.0
@@ -29,6 +29,8 @@ SURELY_OUTSIDE_M = 0.1
 """A centre of mass farther outside than this is wrong; nearer, the description may be."""
 FAR_COM_M = 0.1
 """Units are suspected where the centre of mass is outside and farther from the sensor than this."""
+NO_TOOL_SHARE = 0.1
+"""Less than this share of the described mass is a remainder, not a tool."""
 TOOL_KG, TOOL_SHARE = 0.1, 0.3
 """The mass of a tool is known to about the larger of this mass and this share."""
 PAYLOAD_KG, PAYLOAD_SHARE = 0.5, 0.3
@@ -60,13 +62,30 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup) -> list[
     if setup.up_in_base is None:
         if lean.is_other_mounting:
             code = "mounting_undeclared" if lean.deg > HANGING_DEG else "gravity_tilted"
-            found.append(Finding.of(code, off_deg=lean.deg, direction=along))
+            values = {"orders": other_orders(along, setup.up)} if code == "mounting_undeclared" else {}
+            found.append(Finding.of(code, off_deg=lean.deg, direction=along, **values))
     elif lean.is_other_mounting:
-        found.append(Finding.of("gravity_off_mounting", off_deg=lean.deg, direction=along))
+        orders = other_orders(along, setup.up)
+        found.append(Finding.of("gravity_off_mounting", off_deg=lean.deg, direction=along, orders=orders))
     elif lean.is_significant:
-        values = {"lean_deg": lean.deg, "sigma_deg": lean.sigma_deg, "side": lean.side}
-        found.append(Finding.of("base_leans", **values))
+        found.append(Finding.of("base_leans", lean_deg=lean.deg, sigma_deg=lean.sigma_deg, side=lean.side))
     return found
+
+
+def other_orders(gravity_direction_base: Array, up: Array) -> list[str]:
+    """Return the orders of quaternions with which gravity points down, had they been read inverted and in another.
+
+    Such orientations are `U R V` of the true ones with fixed rotations U and V, so they fit as well.
+    """
+    along = {order: -float(up @ U @ gravity_direction_base) for order, U in _OTHER_ORDERS.items()}
+    return [order for order, cosine in along.items() if cosine > np.cos(np.radians(OTHER_MOUNTING_DEG))]
+
+
+_OTHER_ORDERS: Final = {
+    "w, x, y, z": np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]),
+    "x, y, z, w": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+}
+"""From base axes as read to those in which the arm stands, for quaternions that are truly in this order."""
 
 
 def _inside_m(parameters: Parameters, covariance: Array) -> float:
@@ -158,7 +177,9 @@ def _mass(parameters: Parameters, covariance: Array, tool_kg: float | None, g_m_
     sigma_kg = np.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0)) / g_m_s2
     if tool_kg is None or abs(load_kg - tool_kg) <= max(TOOL_KG, TOOL_SHARE * tool_kg, _SIGNIFICANT * sigma_kg):
         return []
-    suspects = units.suspects(parameters, _units(load_kg, tool_kg))
+    suspects = units.suspects(parameters, units.by_mass(load_kg, tool_kg, UNIT_SHARE))
+    if not suspects and load_kg < NO_TOOL_SHARE * tool_kg:
+        return [Finding.of("weight_compensated", weight_N=weight_N)]
     return [Finding.of("tool_mass_mismatch", load_kg=load_kg, tool_kg=tool_kg, units=suspects)]
 
 

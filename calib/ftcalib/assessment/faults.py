@@ -1,69 +1,103 @@
 """Mistakes in the data of a bad fit: orientations, pairs, axes, units. Named only if undoing one helps."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from ftcalib.assessment import units
 from ftcalib.assessment.observability import RECOMMENDED_POSES
 from ftcalib.findings import Finding
 from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
-from ftcalib.model import UP_IN_BASE, Array
+from ftcalib.model import UP_IN_BASE, Array, Parameters, gravity_wrench, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
 ROUNDING = 1e-9
 """Of readings, relative to the largest: what is left at least."""
+READINGS = {
+    "orientations_inverted": "inverted orientations",
+    "quaternion_order": "quaternions in the order ({order})",
+    "euler_angles": "{order} Euler angles",
+}
+EQUAL = 0.1
+"""Scores that differ by less do not decide between two readings of the orientations."""
 COLLAPSE = 0.4
 """Accept a hypothesis if it reduces the residual to this share."""
 NO_WORSE = 1.2
 """The other residual may grow by this factor."""
-PLAUSIBLE_TILT_DEG = 60.0
+CORRECTED = 0.1
+"""Forces that a mistake explains leave no more than this share of the weight."""
 IMPLAUSIBLE = 1.0
-"""Penalty of a weight that does not pull downwards, in the logarithm of the residuals."""
+"""Penalty of a weight that pulls sideways, and of a tool inside the flange, in the logarithm of the residuals."""
 TIED = 1.3
 """Residuals that differ by less than this factor are equal: the simpler explanation is taken."""
-OTHER_POSES, OF_A_WEIGHT = 0.2, 0.1
+OTHER_POSES, OF_A_WEIGHT = 0.03, 0.1
 """Forces of a weight in other poses than given: large residuals, in shares of the weight, and little of them radial."""
 IN_BASE_RAD = np.deg2rad(10.0)
 """A constant force that points down this exactly is a weight in base axes."""
 STEADY = 0.05
 """A force that varies by less than this share of it is constant."""
+FEWEST_SATURATED = 3
+"""Poses with the same extreme reading of a channel."""
+CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
+FOR_STEPS = 1000
+"""Poses that show steps of the readings."""
+COARSE = 0.005
+"""Rounding matters if its standard deviation exceeds this share of the spread."""
+
+
+def rough_fit(R_base_flange: Array, wrench: Array) -> Parameters:
+    """Fit forces alone, then torques to them by linear least squares."""
+    n, force_N, torque_Nm = len(wrench), wrench[:, :3], wrench[:, 3:]
+    best = minima(force_cost(R_base_flange, force_N, np.ones(n)))[0]
+    F_b, F0 = given_rotation(best.R, R_base_flange, force_N, np.ones(n))
+    P, T0 = com_and_torque_bias((F_b @ R_base_flange) @ best.R.T, torque_Nm)
+    return Parameters(best.R.T, F_b, F0, P, T0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rough:
-    """A plain fit: forces alone, then torques to them by linear least squares."""
+    """A rough fit and what it leaves."""
 
-    R: Array
-    """(3, 3) flange to sensor."""
-    F_b: Array
+    parameters: Parameters
     weight_sensor_N: Array
     """(n, 3)"""
     force_rms_N: float
     torque_rms_Nm: float
+    shares: tuple[float, float]
+    """Residual of the forces relative to the weight, and of the torques relative to their spread."""
 
     @classmethod
     def of(cls, R_base_flange: Array, wrench: Array) -> Self:
         """Fit."""
-        n, force_N, torque_Nm = len(wrench), wrench[:, :3], wrench[:, 3:]
-        best = minima(force_cost(R_base_flange, force_N, np.ones(n)))[0]
-        F_b, _ = given_rotation(best.R, R_base_flange, force_N, np.ones(n))
-        weight_sensor_N = (F_b @ R_base_flange) @ best.R.T
-        P, T0 = com_and_torque_bias(weight_sensor_N, torque_Nm)
-        force_rms_N = float(np.sqrt(max(best.cost, 0.0) / n)) + ROUNDING * float(np.abs(force_N).max())
-        return cls(best.R, F_b, weight_sensor_N, force_rms_N, _torque_rms(weight_sensor_N, torque_Nm, P, T0))
+        p = rough_fit(R_base_flange, wrench)
+        gravity, torque_Nm = gravity_wrench(p, R_base_flange), wrench[:, 3:]
+        e = wrench - predict(p, R_base_flange)
+        force_rms_N, torque_rms_Nm = (
+            float(np.sqrt(np.mean(np.sum(part**2, axis=1)))) + ROUNDING * float(np.abs(read).max())
+            for part, read in zip(np.hsplit(e, 2), np.hsplit(wrench, 2), strict=True)
+        )
+        weight_N, spread_Nm = _length(p.gravity_force_base_N), _length(torque_Nm.std(axis=0))
+        shares = force_rms_N / (weight_N or 1.0), torque_rms_Nm / (spread_Nm or 1.0)
+        return cls(p, gravity[:, :3], force_rms_N, torque_rms_Nm, shares)
 
-    def tilt_deg(self, up_in_base: Array) -> float:
-        """Angle between the weight and where down should be."""
-        cosine = -float(self.F_b @ up_in_base) / float(np.linalg.norm(self.F_b) * np.linalg.norm(up_in_base) or 1.0)
-        return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    @property
+    def outwards(self) -> bool:
+        """Whether the centre of mass lies on the tool's side of the sensor."""
+        return bool(self.parameters.p_sensor_com_m @ self.parameters.R_flange_sensor[2] >= 0)
 
     def score(self, up_in_base: Array) -> float:
-        """Logarithm of the residuals plus the penalty; lower is better."""
-        implausible = self.tilt_deg(up_in_base) > PLAUSIBLE_TILT_DEG
+        """Logarithm of the residuals plus the penalty; lower is better.
+
+        Quaternions in another order often fit as well as inverted ones, with another mounting of robot and sensor.
+        """
+        F_b = self.parameters.gravity_force_base_N
+        cosine = -float(F_b @ up_in_base) / (_length(F_b) * _length(up_in_base) or 1.0)
+        implausible = (1 - cosine) / 2 + 0.5 * (not self.outwards)
         return float(np.log(self.force_rms_N * self.torque_rms_Nm)) + IMPLAUSIBLE * implausible
 
 
@@ -89,12 +123,16 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
     found = []
     for code, values, R, y in _readings(R_base_flange, wrench):
         trial = _Rough.of(R, y)
-        if trial.force_rms_N < COLLAPSE * as_read.force_rms_N and (
-            trial.torque_rms_Nm < NO_WORSE * as_read.torque_rms_Nm
-        ):
+        (force, torque), limit = trial.shares, min(COLLAPSE * as_read.shares[0], CORRECTED)
+        smaller = trial.force_rms_N < COLLAPSE * as_read.force_rms_N or code == "columns_swapped"
+        if smaller and force < limit and torque < NO_WORSE * as_read.shares[1]:
             found.append((trial.score(up), code, values, trial.force_rms_N))
     if found:
-        _, code, values, corrected_N = min(found, key=lambda each: each[0])
+        score, code, values, corrected_N = min(found, key=lambda each: each[0])
+        equal = [one for one in found if one[0] < score + EQUAL and one[1] in READINGS]
+        also = [READINGS[name].format(**own) for _, name, own, _ in equal if (name, own) != (code, values)]
+        if code in READINGS:
+            values = {**values, "also": also}
         return [Finding.of(code, **values, residual_N=as_read.force_rms_N, corrected_N=corrected_N)]
     return _axes(as_read, wrench[:, 3:], up)
 
@@ -121,6 +159,13 @@ def other_poses(R_base_flange: Array, wrench: Array) -> list[Finding]:
     return [Finding.of("pairing_or_rotations", weight_N=weight_N, radial_N=radial_rms_N, residual_N=residual_N)]
 
 
+def no_weight(R_base_flange: Array, wrench: Array) -> list[Finding]:
+    """Recognise a wrench without weight: compensated already, or zeroed at each pose."""
+    rough = _Rough.of(R_base_flange, wrench)
+    p = rough.parameters
+    return units.too_light(_length(p.gravity_force_base_N), _length(p.p_sensor_com_m), rough.force_rms_N)
+
+
 def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:
     """Recognise a weight in base axes that was recorded without bias: the force is the same in all poses."""
     mean, up = wrench[:, :3].mean(axis=0), np.asarray(up_in_base, dtype=np.float64)
@@ -135,6 +180,14 @@ def _readings(R: Array, wrench: Array) -> Iterator[tuple[str, Mapping[str, Any],
     """Yield each mistake as code and values, with the data as they are without it."""
     yield "orientations_inverted", {}, np.swapaxes(R, 1, 2), wrench
     quaternions = Rotation.from_matrix(R).as_quat()
+    yield "columns_swapped", {}, R, np.roll(wrench, 3, axis=1)
+    for read_as, order in (("intrinsic", "extrinsic"), ("extrinsic", "intrinsic")):
+        sequence: dict[str, Literal["XYZ", "xyz"]] = {"intrinsic": "XYZ", "extrinsic": "xyz"}
+        with warnings.catch_warnings():  # gimbal lock: one of the angles is arbitrary
+            warnings.simplefilter("ignore")
+            angles = Rotation.from_matrix(R).as_euler(sequence[read_as])
+        values = {"order": order, "read_as": read_as}
+        yield "euler_angles", values, Rotation.from_euler(sequence[order], angles).as_matrix(), wrench
     for shift, order, read_as in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
         values = {"order": order, "read_as": read_as}
         yield "quaternion_order", values, Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(), wrench
@@ -150,14 +203,14 @@ def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
     for Q in SPECIAL_R_flange_base:
         P, T0 = com_and_torque_bias(as_read.weight_sensor_N, torque_Nm @ Q.T)
         rms = _torque_rms(as_read.weight_sensor_N, torque_Nm @ Q.T, P, T0)
-        outside = 1.0 if P @ as_read.R[:, 2] >= 0 else -1.0  # the tool hangs outside the flange
+        outside = 1.0 if P @ as_read.parameters.R_flange_sensor[2] >= 0 else -1.0  # the tool hangs outside the flange
         changed = int(np.count_nonzero(np.diag(outside * Q) != 1)) + int(np.count_nonzero(np.diag(Q) == 0))
         fits.append((rms, changed, outside * Q))
     least = min(fits, key=lambda fit: fit[0])[0]
     rms, _, Q = min((fit for fit in fits if fit[0] <= TIED * least), key=lambda fit: fit[1])
     if rms >= COLLAPSE * as_read.torque_rms_Nm:
         return []
-    upwards, mirrored = bool(as_read.F_b @ up > 0), bool(np.linalg.det(Q) < 0)
+    upwards, mirrored = bool(as_read.parameters.gravity_force_base_N @ up > 0), bool(np.linalg.det(Q) < 0)
     by_force, by_torque = ("force", channels(Q.T)), ("torque", channels(Q))
     corrections = [by_torque] if mirrored or upwards else [by_torque, by_force]
     if mirrored and upwards:  # a mirrored force reads like a weight that pulls upwards
@@ -171,23 +224,48 @@ def channels(Q: Array) -> Sequence[str]:
     return [("-" if row[k] < 0 else "") + "xyz"[k] for row in Q for k in [int(np.abs(row).argmax())]]
 
 
+def _length(vector: Array) -> float:
+    return float(np.linalg.norm(vector))
+
+
 def _torque_rms(weight_sensor_N: Array, torque_Nm: Array, P: Array, T0: Array) -> float:
     e = torque_Nm - np.cross(P, weight_sensor_N) - T0
     return float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) + ROUNDING * float(np.abs(torque_Nm).max())
 
 
 def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
-    """Find channels that do not move and rows that were copied."""
-    names = ("fx", "fy", "fz", "tx", "ty", "tz")
+    """Find channels that do not move, that are coarse or that stop at a limit, and rows that were copied."""
     spread = np.ptp(wrench, axis=0)
     group = np.repeat([spread[:3].max(), spread[3:].max()], 3)
-    stuck = [name for name, own, all_ in zip(names, spread, group, strict=True) if own == 0 < all_]
+    stuck = [name for name, own, all_ in zip(CHANNELS, spread, group, strict=True) if own == 0 < all_]
     found = [Finding.of("stuck_channels", channels=stuck)] if stuck else []
-    if len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench):
-        return found
-    _, first, count = np.unique(wrench, axis=0, return_index=True, return_counts=True)
-    copied = [np.flatnonzero((wrench == wrench[row]).all(axis=1)) for row in np.sort(first[count > 1])]
+    coarse = [_coarse_step(part[:FOR_STEPS]) for part in np.hsplit(wrench, 2)]
+    if any(coarse):
+        return [*found, Finding.of("quantised", step_N=coarse[0], step_Nm=coarse[1])]
+    copied = _copies(wrench) if len(np.unique(wrench[:, np.argmax(spread)])) < len(wrench) else []
     for rows in copied:
         same = bool(np.ptp(R_base_flange[rows], axis=0).max() == 0)
         found.append(Finding.of("repeated_poses" if same else "repeated_wrenches", poses=rows + 1))
+    single = ~np.isin(np.arange(len(wrench)), [row for rows in copied for row in rows[1:]])
+    for k in np.flatnonzero(spread):
+        for limit in (wrench[:, k].min(), wrench[:, k].max()):
+            rows = np.flatnonzero((wrench[:, k] == limit) & single)
+            if len(rows) >= FEWEST_SATURATED:
+                found.append(Finding.of("saturated", channel=CHANNELS[k], poses=rows + 1))
     return found
+
+
+def _coarse_step(readings: Array) -> float:
+    """Return the step of which all differences of readings (n, 3) are multiples; 0 without one that matters."""
+    gaps = np.concatenate([np.diff(np.unique(channel)) for channel in readings.T])
+    if not gaps.size:
+        return 0.0
+    step, spread = float(gaps.min()), float(np.linalg.norm(readings.std(axis=0)))
+    even = np.abs(gaps / step - np.round(gaps / step)).max() < 1e-6
+    return step if even and step > np.sqrt(12) * COARSE * spread else 0.0
+
+
+def _copies(wrench: Array) -> list[NDArray[np.intp]]:
+    """Return the rows of each wrench that occurs more than once."""
+    _, first, count = np.unique(wrench, axis=0, return_index=True, return_counts=True)
+    return [np.flatnonzero((wrench == wrench[row]).all(axis=1)) for row in np.sort(first[count > 1])]

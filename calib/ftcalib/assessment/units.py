@@ -4,10 +4,18 @@ from collections.abc import Collection
 
 import numpy as np
 
+from ftcalib.findings import Finding, Severity
 from ftcalib.model import Parameters
 
 USUAL_COM_M = (0.02, 0.2)
-FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665, "mN": 1e-3, "kN": 1e3}
+FAR_COM_M, FARTHEST_COM_M = 0.25, 0.5
+"""A centre of mass farther than the first must be described, farther than the second is wrong."""
+NEAREST_COM_M = 5e-4
+LIGHTEST_N, HEAVIEST_N, IMPOSSIBLE_N = 0.3, 500.0, 2000.0
+"""Weights beyond these look like forces in another unit: 30 g, and more than any UR arm carries."""
+NOISY = 0.03
+"""Forces in another unit leave less than this share of the weight."""
+FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665, "gf": 9.80665e-3, "mN": 1e-3, "kN": 1e3}
 TORQUE_UNITS_NM = {
     "N·m": 1.0,
     "N·mm": 1e-3,
@@ -18,7 +26,7 @@ TORQUE_UNITS_NM = {
     "kN·m": 1e3,
 }
 UNITS = (
-    *(("N", "N·mm"), ("N", "lbf·in"), ("lbf", "N·m"), ("kgf", "N·m"), ("mN", "N·m"), ("kN", "N·m")),
+    *(("N", "N·mm"), ("N", "lbf·in"), ("lbf", "N·m"), ("kgf", "N·m"), ("gf", "N·m"), ("mN", "N·m"), ("kN", "N·m")),
     *(("lbf", "lbf·in"), ("lbf", "lbf·ft"), ("kgf", "kgf·cm"), ("kgf", "kgf·m"), ("mN", "N·mm"), ("kN", "kN·m")),
 )
 """The simplest mistake first."""
@@ -49,3 +57,38 @@ def suspects(found: Parameters, forces: Collection[str]) -> Suspects:
     """Return these units of force, with those of torque that give a usual centre of mass."""
     com_m = float(np.linalg.norm(found.p_sensor_com_m))
     return by_com(com_m, forces) or [(force, "N·m") for force in forces]
+
+
+def implausible(found: Parameters, residual_N: float, *, described: bool) -> list[Finding]:
+    """Find a weight or a centre of mass that no tool has, with the units that make it usual.
+
+    Parameters
+    ----------
+    found : Parameters
+    residual_N : float
+        Root mean square of the forces.
+    described : bool
+        Whether the shape of the tool is, which shows how far its centre of mass may be.
+    """
+    weight_N, com_m = (float(np.linalg.norm(x)) for x in (found.gravity_force_base_N, found.p_sensor_com_m))
+    findings = too_light(weight_N, com_m, residual_N)
+    if weight_N > HEAVIEST_N:
+        severity: Severity = "reject" if weight_N > IMPOSSIBLE_N else "limit"
+        names = [unit for unit in ("gf", "mN") if LIGHTEST_N < weight_N * FORCE_UNITS_N[unit] <= HEAVIEST_N]
+        findings.append(Finding.of("weight_implausible", severity, weight_N=weight_N, units=suspects(found, names)))
+    if com_m > (FARTHEST_COM_M if described else FAR_COM_M):
+        values = {"distance_m": com_m, "most_m": FARTHEST_COM_M if com_m > FARTHEST_COM_M else FAR_COM_M}
+        severity = "reject" if com_m > FARTHEST_COM_M else "limit"
+        findings.append(Finding.of("com_too_far", severity, **values, units=by_com(com_m)))
+    if com_m < NEAREST_COM_M:
+        findings.append(Finding.of("com_too_near", distance_mm=1e3 * com_m))
+    return findings
+
+
+def too_light(weight_N: float, com_m: float, residual_N: float) -> list[Finding]:
+    """Find a weight that is none: in kilonewtons, or already compensated, which leaves little but noise."""
+    if weight_N >= LIGHTEST_N:
+        return []
+    if residual_N < NOISY * weight_N and (pairs := by_com(com_m, ["kN"])):
+        return [Finding.of("weight_implausible", "limit", weight_N=weight_N, units=pairs)]
+    return [Finding.of("weight_compensated", "limit", weight_N=weight_N)]

@@ -11,22 +11,19 @@ from scipy.special import ndtr as normal_cdf
 
 from ftcalib.assessment import described_cell, units
 from ftcalib.assessment.contradictions import contradictions
-from ftcalib.assessment.cross_validation import AssessedFit, standardized
+from ftcalib.assessment.cross_validation import AssessedFit, DriftAhead, drift_ahead, standardized
 from ftcalib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, other_poses
-from ftcalib.assessment.load_shift import lasting_change
 from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
+from ftcalib.assessment.session_change import session_change
 from ftcalib.findings import Finding, Severity, Verdict, ordered, verdict_of
 from ftcalib.known import Known
-from ftcalib.likelihood.fit import DriftEstimate
+from ftcalib.likelihood.fit import DriftEstimate, Fit
 from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters
 from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftcalib.setup import NOTHING, Setup
 
 SIGNIFICANT_SIGMAS = 5.0
-NEAREST_COM_M = 5e-4
-LIGHTEST_N, HEAVIEST_N = 0.05, 2000.0
-"""Weights beyond these look like forces in another unit: 5 g, and far more than any UR arm carries."""
 NOISE_FACTOR = 3.0
 USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
 SENSELESS_SHARE = 0.5
@@ -58,6 +55,12 @@ class Quality:
     loo_force_rms_N: float
     """Cross-validated: root mean square error of predicting each used pose from all others."""
     loo_torque_rms_Nm: float
+    next_use_force_rms_N: float
+    """Of compensating a free tool a minute after the last pose: from noise alone if it explains the residuals, else
+    cross-validated; and the drift from the mean of the tour to then."""
+    next_use_torque_rms_Nm: float
+    ahead: DriftAhead
+    """That drift."""
     worst_pose: int
     """Row of the used pose with the largest cross-validated residual."""
     residual_sigma: Array
@@ -110,7 +113,9 @@ def judge(
     suspect = at.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
     broken = broken_channels(fit.wrench, fit.R_base_flange) if fit.chi2 > NOISELESS * fit.dof else []
     mistakes = _mistakes(fit, at.used, t_s, setup) if suspect else []
-    changed = _change(fit, at, measured_sigma, t_s)
+    changed = [] if mistakes else _change(unconstrained or fit, at, measured_sigma, t_s)
+    if suspect and not (mistakes or changed):
+        mistakes = _other_poses(fit, at.used, t_s)
     contradicted: list[Finding] = []
     if known is not None and unconstrained is not None:
         at_its_best = unconstrained.parameters, unconstrained.covariance
@@ -123,11 +128,11 @@ def judge(
         *at.errors,
         *_weight(fit, weight_N, setup),
         *_second_solution(fit),
-        *_implausible_units(parameters, weight_N),
+        *units.implausible(parameters, _rms(fit.residuals[at.used, :3]), described=bool(setup.cylinders_m)),
         *([] if contradicted or at.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
         *_noise(fit, at),
         *_poses(fit, at, "note" if few_rejected else "limit"),
-        *_drift(fit.drift, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
+        *_drift(fit.drift, at.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
         *_response(fit.response),
     ]
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
@@ -146,6 +151,9 @@ def judge(
         noise_factor=at.noise_factor,
         loo_force_rms_N=at.loo_force_rms_N,
         loo_torque_rms_Nm=at.loo_torque_rms_Nm,
+        next_use_force_rms_N=float(at.next_use_rms[0]),
+        next_use_torque_rms_Nm=float(at.next_use_rms[1]),
+        ahead=at.ahead,
         worst_pose=at.worst_pose,
         residual_sigma=at.residual_sigma,
         lag1=at.lag1,
@@ -170,12 +178,22 @@ class _Statistics:
     """Of force and torque, if they are too large."""
     loo_force_rms_N: float
     loo_torque_rms_Nm: float
+    expected_rms: Array
+    """(2,) from noise alone, over all orientations."""
+    ahead: DriftAhead
     noise_factor: float | None
     chi2_p: float | None
 
     @property
     def fits_measured_noise(self) -> bool:
         return self.chi2_p is not None and self.chi2_p >= SURE
+
+    @property
+    def next_use_rms(self) -> Array:
+        """(2,) N, N·m."""
+        left_out = np.array([self.loo_force_rms_N, self.loo_torque_rms_Nm])
+        error = self.expected_rms if self.fits_measured_noise else left_out
+        return np.asarray(np.sqrt(error**2 + self.ahead.square.reshape(2, 3).sum(axis=1)))
 
 
 def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
@@ -194,6 +212,8 @@ def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
         largest_share,
         errors,
         *left_out_rms,
+        np.array(expected_error(fit.parameters, fit.covariance, fit.response)),
+        drift_ahead(fit, t_s),
         noise_factor=float(np.sqrt(fit.measured_chi2 / fit.dof)) if measured else None,
         chi2_p=float(chi2_sf(fit.dof, fit.measured_chi2)) if measured else None,
     )
@@ -204,14 +224,24 @@ def _mistakes(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, setu
 
     A wrong pose or two were rejected; only the used poses show whether most of them are wrong.
     """
-    n = len(used)
-    order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
-    order = order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0]
+    order = _some_runs(t_s, len(used))
     found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
     order = order[used[order]]
     if not found and not used.all():
         found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
-    return found or other_poses(fit.R_base_flange[order], fit.wrench[order])
+    return found
+
+
+def _other_poses(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None) -> list[Finding]:
+    order = _some_runs(t_s, len(used))
+    order = order[used[order]]
+    return other_poses(fit.R_base_flange[order], fit.wrench[order])
+
+
+def _some_runs(t_s: Array | None, n: int) -> NDArray[np.intp]:
+    """Rows by time: all, or of many poses evenly spread runs."""
+    order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
+    return np.asarray(order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0])
 
 
 def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:
@@ -302,23 +332,6 @@ def _second_solution(fit: AssessedFit) -> list[Finding]:
     return [Finding.of("second_solution", probability_percent=100 * wrong_basin_probability(max(delta, 0.0)))]
 
 
-def _implausible_units(parameters: Parameters, weight_N: float) -> list[Finding]:
-    """Name the units that make an implausible weight or centre of mass usual."""
-    com_m, found = float(np.linalg.norm(parameters.p_sensor_com_m)), []
-    if not LIGHTEST_N <= weight_N <= HEAVIEST_N:
-        heavy = weight_N > HEAVIEST_N
-        suspects = units.suspects(parameters, ("mN" if heavy else "kN",))
-        found.append(
-            Finding.of("weight_implausible", "reject" if heavy else "limit", weight_N=weight_N, units=suspects)
-        )
-    if com_m > described_cell.FARTHEST_COM_M:
-        values = {"distance_m": com_m, "most_m": described_cell.FARTHEST_COM_M}
-        found.append(Finding.of("com_too_far", **values, units=units.by_com(com_m)))
-    if com_m < NEAREST_COM_M:
-        found.append(Finding.of("com_too_near", distance_mm=1e3 * com_m))
-    return found
-
-
 def _misfit_of_known_values(fit: AssessedFit, unconstrained: AssessedFit | None) -> list[Finding]:
     if unconstrained is None:
         return []
@@ -362,8 +375,11 @@ def _poses(fit: AssessedFit, at: _Statistics, severity_of_rejected: Severity) ->
     return found
 
 
-def _drift(drift: DriftEstimate | None, weight_N: float, *, is_cause: bool) -> list[Finding]:
-    """Name a significant drift, 0 where it is not; it limits the result if it is large and no consequence."""
+def _drift(drift: DriftEstimate | None, ahead: DriftAhead, weight_N: float, *, is_cause: bool) -> list[Finding]:
+    """Name a significant drift, 0 where it is not.
+
+    It limits the result if it is no consequence, and large from the first pose to the last or up to the next use.
+    """
     if drift is None:
         return []
     force_N, torque_Nm = (float(np.linalg.norm(drift.change[part])) for part in (slice(0, 3), slice(3, 6)))
@@ -373,7 +389,8 @@ def _drift(drift: DriftEstimate | None, weight_N: float, *, is_cause: bool) -> l
     significant = np.array([channels[:3].any(), channels[3:].any()])
     if not significant.any():
         return []
-    matters = is_cause and size_N > USABLE_SHARE * weight_N
+    next_N, next_Nm = np.sqrt(ahead.square.reshape(2, 3).sum(axis=1))
+    matters = is_cause and max(size_N, next_N, next_Nm / USUAL_LEVER_M) > USABLE_SHARE * weight_N
     values = {"force_N": force_N * significant[0], "torque_Nm": torque_Nm * significant[1]}
     return [Finding.of("drift", "limit" if matters else "note", **values)]
 
@@ -404,27 +421,14 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
 
 
 def _change(fit: AssessedFit, at: _Statistics, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
-    """Name a lasting change between two poses, which no white noise explains: all poses after it deviate alike.
-
-    Poses of two different loads have no result in common, unless all poses before the change were rejected.
-    """
-    if measured_sigma is None or at.chi2_p is None or (at.fits_measured_noise and at.used.all()):
+    """Name a lasting change, where the fit needs what could hide one: drift, more noise, or poses left out."""
+    kinds = ("walk", "slope") if at.chi2_p is None else ("walk", "slope", "white")
+    hides = any(name.startswith(kinds) for name in fit.components)
+    if not isinstance(fit, Fit) or not (at.errors or hides or not at.used.all()):
         return []
-    n = len(fit.wrench)
-    times = np.arange(n, dtype=np.float64) if t_s is None or not np.isfinite(t_s).all() else t_s
-    order = np.argsort(times, kind="stable")
-    change = lasting_change(
-        fit.parameters,
-        fit.R_base_flange[order],
-        fit.residuals[order],
-        measured_sigma,
-        times[order],
-        np.flatnonzero(np.isin(order, out_of_line(at.residual_sigma, at.used))).tolist(),
-    )
-    if change is None:
-        return []
-    two_loads = change.of_the_tool and at.used[order[: change.position]].any()
-    return [change.finding(int(order[change.position]) + 1, "reject" if two_loads else "note")]
+    if t_s is None or not np.isfinite(t_s).all():
+        t_s = np.arange(len(fit.wrench), dtype=np.float64)
+    return session_change(fit, np.argsort(t_s, kind="stable"), t_s, measured_sigma)
 
 
 def _rms(vectors: Array) -> float:

@@ -26,6 +26,7 @@ from ftcalib.data.pooling import pooled_covariance
 from ftcalib.extras.update import Update
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.gain_and_cross_talk import Response, response_columns
+from ftcalib.likelihood.hysteresis import hysteresis_columns
 from ftcalib.model import BIASES, Array, Parameters, jacobian
 from ftcalib.result import CalibrationResult
 
@@ -110,6 +111,9 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
             known = np.zeros_like(wrench_cov) if calibration.noise_source == "measured" else wrench_cov
             for k in c:
                 part[range(n), k, range(n), k] = np.maximum(sigma**2 - known[:, k, k], 0.0)
+        elif kind == "hysteresis":  # six shares, one for each axis
+            T = hysteresis_columns(calibration.parameters, R_base_flange).reshape(6 * n, -1)
+            part, freedom = (sigma**2 * T @ T.T).reshape(n, 6, n, 6), 6
         else:  # gain and cross-talk act through the response
             continue
         gap += since
@@ -131,9 +135,9 @@ def expected_with_inexact_orientations(
 ) -> list[Expected]:
     """Explain the fit by scaled measured noise and inexact orientations, for each ratio of both; weights sum to 1.
 
-    Drift is not part of it. Gain and cross-talk have the variance that the fit found. Empty if the noise was not
-    measured, for parameters that were known or not estimated by maximum likelihood, and for so many poses that the fit
-    finds all that matters.
+    Drift is not part of it. Gain, cross-talk and hysteresis have the variance that the fit found. Empty if the noise
+    was not measured, for parameters that were known or not estimated by maximum likelihood, and for so many poses that
+    the fit finds all that matters.
 
     Parameters
     ----------
@@ -161,22 +165,31 @@ def expected_with_inexact_orientations(
         )
     seen = np.flatnonzero(size)
     J, before = _columns(p, response, R)[..., seen], size[seen] ** -2
-    offset = np.zeros(15) if response is None else np.append(np.zeros(15), response.coefficients)
+    offset = (np.zeros(15) if response is None else np.append(np.zeros(15), response.coefficients))[seen]
+    known_by = len(seen)
+    if share := calibration.components.get("hysteresis"):
+        lag = hysteresis_columns(p, fitted.R_base_flange)[kept]
+        J, before = np.concatenate([J, lag], axis=2), np.append(before, np.full(lag.shape[2], share**-2))
+        offset = np.append(offset, np.zeros(lag.shape[2]))
+        lag_new = hysteresis_columns(p, R_base_flange).reshape(6 * len(R_base_flange), -1)
     found, likelihood = [], []
     for variance in USUAL_ERRORS_RAD**2:
         V = D + variance * turn
         W = np.linalg.inv(V)
         WJ = W @ J
         H = np.einsum("nij,nik->jk", J, WJ) + np.diag(before)
-        g = np.einsum("nij,ni->j", WJ, e) - before * offset[seen]
+        g = np.einsum("nij,ni->j", WJ, e) - before * offset
         scale = np.outer(column_scale(H), column_scale(H))
         C = np.zeros((len(size), len(size)))
-        C[np.ix_(seen, seen)] = np.linalg.inv(H / scale) / scale
-        rest = float(np.einsum("ni,nij,nj->", e, W, e) + before @ offset[seen] ** 2 - g @ C[np.ix_(seen, seen)] @ g)
+        inverse = np.linalg.inv(H / scale) / scale
+        C[np.ix_(seen, seen)] = inverse[:known_by, :known_by]
+        rest = float(np.einsum("ni,nij,nj->", e, W, e) + before @ offset**2 - g @ inverse @ g)
         logdet = float(np.linalg.slogdet(V)[1].sum() + np.linalg.slogdet(H)[1])
         likelihood.append(-0.5 * (logdet + dof * np.log(rest)))
         joint = None if response is None else replace(response, covariance=C)
         noise = np.asarray(block_diag(*(wrench_cov + variance * turn_new)))
+        if share:
+            noise = noise + share**2 * lag_new @ lag_new.T
         known = Update(p, C[:15, :15], 0.0, 0, response=joint)
         found.append(Expected(known, noise, dof, max(rest / dof, LEAST_FACTOR)))
     weights = np.exp(np.array(likelihood) - max(likelihood))

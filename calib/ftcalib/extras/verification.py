@@ -17,10 +17,11 @@ import numpy as np
 from ftcalib.data.dataset import CalibrationDataset, finite
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.extras.bias_change import BiasChange, bias_change
+from ftcalib.extras.expected_hysteresis import expected_with_hysteresis
 from ftcalib.extras.expected_readings import Expected, expected_as_found, expected_with_inexact_orientations
 from ftcalib.extras.update import BLOCKS, Update, reestimate
 from ftcalib.files import JSON
-from ftcalib.model import BIASES, Array, read_only
+from ftcalib.model import BIASES, Array, Parameters, gravity_wrench, read_only, skew
 from ftcalib.result import CalibrationResult
 
 Change = Literal["bias", "payload", "centre of mass", "mounting", "base", "several"]
@@ -101,7 +102,8 @@ def verify(
 ) -> Verification:
     """Test whether new poses agree with a calibration; on an alarm, name the change and propose the smallest update.
 
-    An alarm is a p-value below `false_alarms` under each explanation of what acted on the fit.
+    An alarm is a p-value below `false_alarms` under each explanation of what acted on the fit: the components that it
+    found, inexact orientations, hysteresis. The change is named under the one that makes the new readings likeliest.
 
     Each change is a model that estimates some parameters again and keeps the others with their uncertainty. It explains
     the readings unless its remaining misfit exceeds that of 999 in 1000 good fits. Of these changes, the one with the
@@ -136,59 +138,70 @@ def verify(
         raise ValueError(f"false_alarms is {false_alarms}, expected a share between 0 and 1")
     if fitted is not None and len(fitted) != calibration.n_poses:
         raise BadDataset(f"{len(fitted)} poses are not those of the calibration, which has {calibration.n_poses}.")
-    p_value, expected = _likeliest(calibration, fitted, R_base_flange, wrench, wrench_cov)
+    explanations = [[expected_as_found(calibration, R_base_flange, wrench_cov)]]
+    if fitted is not None:
+        for expected in (expected_with_inexact_orientations, expected_with_hysteresis):
+            if others := expected(calibration, fitted, R_base_flange, wrench_cov):
+                explanations.append(others)
+    p_values = [
+        sum(one.weight * one.p_value(one.distance(R_base_flange, wrench)[2], 6 * n) for one in kind)
+        for kind in explanations
+    ]
+    likeliest = [max(kind, key=lambda one: one.weight) for kind in explanations]
+    p_value = max(p_values)
+    if p_value >= false_alarms:
+        return _compared(likeliest[p_values.index(p_value)], p_value, R_base_flange, wrench, passed=True)
+    changes = [_changes(calibration, one, R_base_flange, wrench) for one in likeliest]
+    best = min(range(len(changes)), key=lambda k: min((cost for cost, _ in changes[k].values()), default=np.inf))
+    alarm = _compared(likeliest[best], p_value, R_base_flange, wrench, passed=False)
+    return _explained(alarm, calibration, changes[best])
+
+
+def _compared(expected: Expected, p_value: float, R_base_flange: Array, wrench: Array, *, passed: bool) -> Verification:
+    """Compare the readings with what is expected of an unchanged cell."""
     residual, sigma, chi2 = expected.distance(R_base_flange, wrench)
-    unchanged = Verification(
+    n = len(wrench)
+    return Verification(
         residual=residual,
         predicted_sigma=sigma,
         chi2=chi2,
         dof=6 * n,
         p_value=p_value,
-        passed=p_value >= false_alarms,
+        passed=passed,
         change=None,
         reason=f"the {n} poses agree with the calibration (chi2 {chi2:.0f} for {6 * n} readings, p {p_value:.2g})",
         bias_change=bias_change(expected, R_base_flange, wrench),
     )
-    if unchanged.passed:
-        return unchanged
-    return _explained(unchanged, calibration, expected, R_base_flange, wrench)
 
 
-def _likeliest(
-    calibration: CalibrationResult,
-    fitted: CalibrationDataset | None,
-    R_base_flange: Array,
-    wrench: Array,
-    wrench_cov: Array,
-) -> tuple[float, Expected]:
-    """Return the larger p-value of both explanations of the fit, and that explanation, where it is likeliest."""
-    found = expected_as_found(calibration, R_base_flange, wrench_cov)
-    others = []
-    if fitted is not None:
-        others = expected_with_inexact_orientations(calibration, fitted, R_base_flange, wrench_cov)
-    p_found, *p_others = (
-        one.p_value(one.distance(R_base_flange, wrench)[2], 6 * len(wrench)) for one in (found, *others)
-    )
-    p_other = sum(one.weight * p for one, p in zip(others, p_others, strict=True))
-    if p_other <= p_found:
-        return p_found, found
-    return p_other, max(others, key=lambda one: one.weight)
-
-
-def _explained(
-    alarm: Verification, calibration: CalibrationResult, expected: Expected, R_base_flange: Array, wrench: Array
-) -> Verification:
-    """Name the change, with the update that makes up for it."""
-    misfit = f"chi2 {alarm.chi2:.0f} for {alarm.dof} readings"
-    found: dict[str, tuple[float, Update]] = {}
+def _changes(
+    calibration: CalibrationResult, expected: Expected, R_base_flange: Array, wrench: Array
+) -> dict[str, tuple[float, Update]]:
+    """Find the changes that explain the readings: -2 log likelihood plus the cost of the parameters, and the update."""
+    dof = wrench.size
+    unchanged = expected.deviance(expected.distance(R_base_flange, wrench)[2], dof)
+    logdet = float(np.linalg.slogdet(expected.noise + expected.common(R_base_flange))[1])
+    logdet += dof * float(np.log(expected.factor))
+    found = {}
     for kind in (*SINGLE, *SEVERAL):
         try:
             update = reestimate(expected.calibration, R_base_flange, wrench, expected.noise, kind)
+            if "centre of mass" in BLOCKS[kind] and calibration.gain_sigma:
+                noise = expected.noise + _turned_shift(calibration, update.parameters, R_base_flange)
+                update = reestimate(expected.calibration, R_base_flange, wrench, noise, kind)
         except NotObservable:
             continue
-        cost = expected.deviance(update.chi2, alarm.dof) + COST * (alarm.dof - update.dof)
-        if cost < expected.deviance(alarm.chi2, alarm.dof) and expected.p_value(update.chi2, update.dof) > UNEXPLAINED:
-            found[kind] = cost, update
+        cost = expected.deviance(update.chi2, dof) + COST * (dof - update.dof)
+        if cost < unchanged and expected.p_value(update.chi2, update.dof) > UNEXPLAINED:
+            found[kind] = logdet + cost, update
+    return found
+
+
+def _explained(
+    alarm: Verification, calibration: CalibrationResult, found: Mapping[str, tuple[float, Update]]
+) -> Verification:
+    """Name the change, with the update that makes up for it."""
+    misfit = f"chi2 {alarm.chi2:.0f} for {alarm.dof} readings"
     single = sorted((kind for kind in found if kind in SINGLE), key=lambda kind: found[kind][0])
     if single:
         least, update = found[single[0]]
@@ -217,6 +230,19 @@ def _explained(
         f"{worst + 1} with {force_N:.2g} N and {torque_Nm:.2g} N·m): free tool and cables and verify again with 6 "
         "poses or more, or calibrate again",
     )
+
+
+def _turned_shift(calibration: CalibrationResult, new: Parameters, R_base_flange: Array) -> Array:
+    """Give the covariance (6n, 6n) of what the gain makes of a shift of the centre of mass.
+
+    The antisymmetric part a of the gain turns all forces as the mounting does, which the calibration cannot separate.
+    The torque does not turn with them: of a shift d it is d x (u - a x u), if u is the weight as the forces show it.
+    """
+    shift = skew(new.p_sensor_com_m - calibration.p_sensor_com_m)
+    columns = np.zeros((len(R_base_flange), 6, 3))
+    columns[:, 3:] = shift @ skew(gravity_wrench(new, R_base_flange)[:, :3])
+    columns = calibration.gain_sigma * columns.reshape(-1, 3)
+    return np.asarray(columns @ columns.T)
 
 
 def _in_words(calibration: CalibrationResult, update: Update) -> str:

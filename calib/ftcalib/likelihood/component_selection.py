@@ -22,6 +22,7 @@ from ftcalib.model import Array
 
 SURE = 20.0  # a gain or loss that no other component can regain
 WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
+SMALL_RESPONSE, USUAL_RESPONSE = 0.005, 0.02  # gain and cross-talk of real sensors
 
 
 def select(
@@ -62,6 +63,23 @@ def select(
             best, last = trial, len(together)
         waiting = [c for i, c in enumerate(waiting) if i not in together]
     return best if len(best.components) - needed <= last else _pruned(problem, best, needed)
+
+
+def with_response_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
+    """Try gain and cross-talk together in place of white noise as large as a small gain.
+
+    A mounting that fits the torques alone makes the forces look noisy, and the gain that would explain them useless.
+    """
+    added = [c for c in RESPONSE if c in candidates]
+    if not added or all(c.kind != "white" for c in best.components):
+        return best
+    if len(problem.r) * max(units(problem, best, added)) < SMALL_RESPONSE**2:
+        return best
+    rest = [k for k, c in enumerate(best.components) if c not in added and (k < needed or c.kind != "white")]
+    quiet = [best.theta[k] * (1e-2 if best.components[k].kind == "white" else 1.0) for k in rest]
+    start = np.append(quiet, np.full(len(added), USUAL_RESPONSE**2))
+    trial = _pruned(problem, maximise(problem, [*(best.components[k] for k in rest), *added], start), needed)
+    return trial if trial.worth > best.worth and not trial.too_large else best
 
 
 def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
@@ -107,7 +125,7 @@ def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
     while k < len(best.components):
         rest = [i for i in range(len(best.components)) if i != k]
         components, theta = [best.components[i] for i in rest], best.theta[rest]
-        without = point(problem, components, theta)  # the others can regain a part of what is lost
+        without = point(problem, components, theta, best)  # the others can regain a part of what is lost
         if best.loglik - without.loglik < SURE:
             without = maximise(problem, components, theta)
         if without.worth > best.worth:
@@ -121,7 +139,7 @@ def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Componen
     """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
     start = units(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * start])
-    at = point(problem, components, theta) if best.noise.walks else best
+    at = point(problem, components, theta) if best.own.walks else best
     slope, information = score(problem, at, components, theta)
     k = len(best.components)
     curvature, slope_k = np.diag(information)[k:], slope[k:]

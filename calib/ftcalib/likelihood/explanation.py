@@ -16,6 +16,7 @@ from ftcalib.likelihood.component_selection import (
     WORTH_A_TRY,
     predicted_gains,
     select,
+    with_response_instead,
     with_slopes_instead,
     with_walks_instead,
 )
@@ -60,7 +61,7 @@ class Explanation:
     @property
     def noise_moves(self) -> bool:
         """Whether the noise depends on the parameters."""
-        return not {"rotation", "gain", "cross_talk"}.isdisjoint(c.kind for c in self.components)
+        return not {"rotation", "gain", "cross_talk", "hysteresis"}.isdisjoint(c.kind for c in self.components)
 
 
 def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
@@ -115,7 +116,7 @@ def _explanations(session: Session, minima: list[Minimum], weights: Array) -> li
         problem, always = session.linearised(p, session.everything), session.always()
         at = maximise(problem, always, session.start(problem, always))
         if not session.measured:
-            weights = np.asarray(at.noise.W, dtype=np.float64)
+            weights = np.asarray(at.own.W, dtype=np.float64)
         distances = squared_length(*at.left_out())
         for scaled in (False, True):
             robust = _agreeing(session, weights, starts, distances, scaled=scaled)
@@ -131,6 +132,7 @@ def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
     at = select(problem, always, session.start(problem, always), candidates, len(always))
     best = Explanation(p, kept)
     for _ in range(ROUNDS):
+        at = with_response_instead(problem, at, candidates, len(always))
         if session.drift == "auto":
             at = with_walks_instead(problem, at, candidates, len(always))
             at = with_slopes_instead(problem, at, len(always))
@@ -160,7 +162,7 @@ def _settled(
 ) -> tuple[Parameters, Linearised, Point]:
     """Go down with the noise as it is and estimate its variances again, until they agree."""
     for _ in range(ROUNDS):
-        if float(at.step @ np.linalg.solve(at.C, at.step)) < SETTLED:
+        if at.squared_step < SETTLED:
             break
         p = session.descent.down(session.statistics(at.noise, p), p).parameters
         problem = session.linearised(p, kept)
@@ -179,12 +181,12 @@ def _membership(session: Session, kept: Kept, distances: Array, at: Point) -> Ke
 def _limit(session: Session, at: Point) -> float:
     """Squared distance of a good pose that one in a thousand exceeds."""
     estimated = any(c.kind == "white" for c in at.components)
-    return 6 * float(f_ppf(6, session.dof(at.noise.kept), 1 - FALSE_REJECTION)) if estimated else FARTHEST
+    return 6 * float(f_ppf(6, session.dof(at.problem.kept), 1 - FALSE_REJECTION)) if estimated else FARTHEST
 
 
 def _criterion(session: Session, at: Point, distances: Array) -> float:
     """A rejected pose has noise of its own size. At the limit it costs what it would if it counted."""
-    value, rejected, limit = -2 * at.worth, ~at.noise.kept, _limit(session, at)
+    value, rejected, limit = -2 * at.worth, ~at.problem.kept, _limit(session, at)
     if rejected.any():
         far = np.maximum(distances[rejected], limit)
         value += float(np.linalg.slogdet(at.left_out()[1][rejected])[1].sum())

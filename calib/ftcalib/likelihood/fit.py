@@ -12,10 +12,11 @@ from ftcalib.errors import NotObservable
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.descent import MAX_STEPS, Minimum, column_scale
 from ftcalib.likelihood.explanation import Explanation, explain, noise_under
-from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response, response_columns
-from ftcalib.likelihood.session import FEW_POSES_FOR_RESPONSE, Drift, Session
+from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response
+from ftcalib.likelihood.session import Drift, Session
 from ftcalib.likelihood.session_noise import Noise, summed_products
 from ftcalib.likelihood.variance_components import (
+    HYSTERESIS,
     POSES_THAT_SHOW_THE_NOISE,
     RESPONSE,
     Component,
@@ -75,6 +76,9 @@ class Fit:
     """(15, 15) zero along what is exactly known; without meaning where the information lacks rank."""
     response: Response | None
     """Gain and cross-talk of the sensor, best linear prediction; None where none was found."""
+    lag: tuple[Array, Array] | None
+    """Hysteresis (n, 6) of each pose, and its variance (n, 6, 6): compensation does not know it; None where none was
+    found."""
 
     @property
     def wrench_cov(self) -> Array:
@@ -103,44 +107,34 @@ class Fit:
         return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange) - added)
 
     @cached_property
-    def _pass(self) -> tuple[Array, Array, Array]:
-        """One pass over the poses: left-out residuals, their covariance, and the normal equations (27, 27).
-
-        These are of the 15 parameters, the residual and the 11 numbers of gain and cross-talk.
-        """
-        e, S, G = np.empty((len(self.order), 6)), np.empty((len(self.order), 6, 6)), np.zeros((27, 27))
+    def _left_out(self) -> tuple[Array, Array]:
+        """Left-out residuals and their covariance."""
+        e, S = np.empty((len(self.order), 6)), np.empty((len(self.order), 6, 6))
         for part, noise in self.noise.parts():
             rows = self.order[part]
             R = self.R_base_flange[rows]
             r = self.wrench[rows] - predict(self.parameters, R)
-            X = np.concatenate(
-                [jacobian(self.parameters, R), r[..., None], response_columns(self.parameters, R)], axis=2
-            )
-            WX = noise.solve(X)
-            G += summed_products(X, WX)
+            WX = noise.solve(np.concatenate([jacobian(self.parameters, R), r[..., None]], axis=2))
             # With a prior the best parameters leave some of J' W r.
             e[rows], S[rows] = left_out(noise, WX[..., :15], WX[..., 15], self.given_noise)
-        return e, S, G
+        if self.lag is not None:
+            e, S = e + self.lag[0], S + self.lag[1]
+        return e, S
 
-    @cached_property
+    @property
     def gain_sigma(self) -> float:
-        """Standard deviation of the entries of the gain: as found, else what the data leave room for, by moments."""
-        if "gain" in self.components or len(self.weights) < FEW_POSES_FOR_RESPONSE:
-            return self.components.get("gain", 0.0)
-        G, own = self._pass[2], slice(16, 21)
-        Tu, M = G[own, 15], G[own, own] - G[own, :15] @ self.given_noise @ G[:15, own]
-        excess = float(Tu @ np.linalg.lstsq(M, Tu, rcond=1e-9)[0]) - len(M)
-        return float(np.sqrt(max(excess, 0.0) / np.trace(M)))
+        """Standard deviation of the entries of the gain; 0 if none was found."""
+        return 0.0 if self.response is None else self.response.gain_sigma
 
     @property
     def left_out_residuals(self) -> Array:
-        """(n, 6) measured minus what all other poses predict for this one, drift and correlation included."""
-        return self._pass[0]
+        """(n, 6) measured minus what all other poses predict for this one, drift included, hysteresis not."""
+        return self._left_out[0]
 
     @property
     def left_out_cov(self) -> Array:
         """(n, 6, 6) covariance of these: noise of the pose and uncertainty of its prediction."""
-        return self._pass[1]
+        return self._left_out[1]
 
 
 def fit(
@@ -198,10 +192,16 @@ def fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2:
     found = dict(zip(e.components, e.theta, strict=True))
     Z = session.constraints.free(best.parameters)
     given_noise = covariance = np.asarray(Z @ _inverse(Z.T @ best.information @ Z) @ Z.T)
-    response = None
-    if found.keys() & set(RESPONSE) or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
+    response = lag = None
+    if found.keys() & {*RESPONSE, HYSTERESIS} or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
         problem = session.linearised(best.parameters, e.kept)
-        x, C = estimates_of_unknown_variances(problem, point(problem, e.components, e.theta))
+        at = point(problem, e.components, e.theta)
+        x, C = estimates_of_unknown_variances(problem, at)
+        if HYSTERESIS in found:
+            lag, square = np.empty((session.n, 6)), np.empty((session.n, 6, 6))
+            lag[session.order] = at.effect(HYSTERESIS)
+            T = problem.hysteresis
+            square[session.order] = found[HYSTERESIS] * T @ np.swapaxes(T, 1, 2)
         Z = block_diag(Z, np.eye(SIZE))
         covariance = (Z @ C @ Z.T)[:15, :15]
         response = Response(x[-SIZE:], Z @ C @ Z.T) if x[-SIZE:].any() else None
@@ -223,6 +223,7 @@ def fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2:
         given_noise=given_noise,
         covariance=covariance,
         response=response,
+        lag=None if lag is None else (lag, square),
     )
 
 
@@ -235,13 +236,16 @@ def _deviation(session: Session, c: Component, variance: float) -> float:
 def _drift(session: Session, best: Minimum, noise: Noise, C: Array, found: Mapping[Component, float]) -> DriftEstimate:
     """Best linear prediction of the bias at every pose, and the error of its change."""
     J, r = jacobian(best.parameters, session.R), session.wrench - predict(best.parameters, session.R)
-    T = response_columns(best.parameters, session.R)
-    variance = np.repeat([found.get(c, 0.0) for c in RESPONSE], [5, 6])[:, None]
+    problem = session.linearised(best.parameters, noise.kept)
+    others = [(problem.columns(c), value) for c, value in found.items() if c in (*RESPONSE, HYSTERESIS)]
 
     def not_drift(X: Array) -> Array:
         """Multiply by the covariance of all but the drift."""
-        Y = noise.D @ X
-        return np.asarray(Y + T @ (variance * summed_products(T, X)) if variance.any() else Y)
+        Y = np.asarray(noise.D @ X)
+        for columns, value in others:
+            T = problem.X[..., columns]
+            Y = Y + value * T @ summed_products(T, X)
+        return Y
 
     sorted_bias = r - not_drift(noise.solve(r[..., None]))[..., 0]
     if not noise.kept.all():

@@ -33,6 +33,14 @@ CROSS_TALK_M = LEVER_M * np.array([*(_symmetric(i, i) for i in range(3)), *_MIXE
 """(6, 3, 3) basis of the cross-talk, m."""
 SIZE = len(GAIN) + len(CROSS_TALK_M)
 
+_ENTRIES = np.array([1, 1, 2, 2, 2]) / 5, np.array([1, 1, 1, 2, 2, 2]) / 6
+"""Weights of the squared coefficients whose sum is the variance of one entry, if all nine are independent: the
+symmetric part of two entries has half their variance."""
+_FROM_5, _FROM_6 = 5 / 3, 6 / 4
+"""By which a variance that five or six numbers determine is too small: that of Student's distribution."""
+COMMON_GAIN = float(np.sqrt(_FROM_5 / 3))
+"""Sigma of the mean of three gains over that of one."""
+
 
 def response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
     """Give the derivative (..., 6, 11) of the wrench by the coefficients of gain and cross-talk."""
@@ -78,6 +86,20 @@ class Response:
             "cross_talk_m": np.sqrt(np.einsum("kij,kl,lij->ij", CROSS_TALK_M, C[5:, 5:], CROSS_TALK_M)),
         }
 
+    @property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the entries of the whole gain, of which the symmetric part without trace shows."""
+        return float(np.sqrt(_ENTRIES[0] @ self._squares[:5]))
+
+    @property
+    def cross_talk_sigma_m(self) -> float:
+        """The same of the cross-talk, N·m/N."""
+        return LEVER_M * float(np.sqrt(_ENTRIES[1] @ self._squares[5:]))
+
+    @property
+    def _squares(self) -> Array:
+        return np.asarray(self.coefficients**2 + np.diag(self.covariance)[15:])
+
     def wrench(self, parameters: Parameters, R_base_flange: Array) -> Array:
         """Give what gain and cross-talk add (..., 6) to the wrench of the weight."""
         return np.asarray(response_columns(parameters, R_base_flange) @ self.coefficients)
@@ -91,6 +113,26 @@ class Response:
             "coefficients": self.coefficients.tolist(),
             "covariance": self.covariance.tolist(),
         }
+
+
+def hidden_covariance(parameters: Parameters, gain_sigma: float, cross_talk_sigma_m: float) -> Array:
+    """Covariance (15, 15) of what gain and cross-talk hide in mounting, weight and centre of mass.
+
+    An antisymmetric gain is a rotation, an antisymmetric cross-talk a shift of the centre of mass, and a gain common to
+    all axes a weight, with a centre of mass that is as much nearer. No orientation reveals them, and the prediction of
+    the wrench does not need them. They are as large as what does show.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    gain_sigma, cross_talk_sigma_m : float
+        Standard deviation of the entries of both matrices, from 5 and 6 numbers.
+    """
+    hidden, common = np.zeros((15, 15)), np.zeros(15)
+    common[3:6], common[9:12] = parameters.gravity_force_base_N, -parameters.p_sensor_com_m
+    hidden[range(3), range(3)] = _FROM_5 * gain_sigma**2 / 2
+    hidden[range(9, 12), range(9, 12)] = _FROM_6 * cross_talk_sigma_m**2 / 2
+    return np.asarray(hidden + (COMMON_GAIN * gain_sigma) ** 2 * np.outer(common, common))
 
 
 def predicted_covariance(

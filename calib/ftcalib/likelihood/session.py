@@ -7,11 +7,22 @@ import numpy as np
 
 from ftcalib.known import Constraints
 from ftcalib.likelihood.descent import Descent, Minimum, column_scale
+from ftcalib.likelihood.gain_and_cross_talk import LEVER_M as CROSS_TALK_LEVER_M
 from ftcalib.likelihood.gain_and_cross_talk import response_columns
+from ftcalib.likelihood.hysteresis import hysteresis_columns
 from ftcalib.likelihood.outliers import Kept
 from ftcalib.likelihood.session_noise import Noise, pose_times
 from ftcalib.likelihood.sufficient_statistics import Statistics, coefficients, features
-from ftcalib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, Component, Linearised, component
+from ftcalib.likelihood.variance_components import (
+    FORCE,
+    HYSTERESIS,
+    RESPONSE,
+    ROTATION,
+    TORQUE,
+    Component,
+    Linearised,
+    component,
+)
 from ftcalib.model import Array, Parameters, jacobian, predict
 
 Drift = Literal["auto", "none", "linear", "random-walk"]
@@ -21,6 +32,7 @@ LEVER_M = 0.025  # usual ratio of torque noise to force noise
 FEW_POSES = 6  # fewer cannot separate force noise from torque noise: the usual ratio is taken
 FEW_POSES_FOR_RESPONSE = 7  # fewer cannot separate gain and cross-talk from noise
 FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot separate drift from unknown noise
+FEW_POSES_FOR_HYSTERESIS = 12  # fewer cannot separate it from gain and noise
 POSES_FOR_EACH_AXIS = 50  # fewer cannot separate the drifts of the axes of a group
 FLOOR = 1e-3  # of the residuals: the least white noise where it was not measured
 
@@ -106,8 +118,10 @@ class Session:
             A, residual = self.constraints.measurements(p)
             Z = self.constraints.free(p)
             J, H, g = J @ Z, Z.T @ A.T @ A @ Z, Z.T @ A.T @ residual
-        slope = np.full(6, np.inf) if self.drift == "linear" else None
-        return Linearised(J, r, (H, g), turn, self.cov, self.time, kept, slope, response_columns(p, self.R))
+        lever = float(np.linalg.norm(p.p_sensor_com_m)) / CROSS_TALK_LEVER_M
+        response = response_columns(p, self.R)
+        lag, linear = hysteresis_columns(p, self.R), self.drift == "linear"
+        return Linearised(J, r, (H, g), turn, self.cov, self.time, kept, linear, response, lag, lever)
 
     def _groups(self) -> list[range]:
         return [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]
@@ -130,6 +144,8 @@ class Session:
             white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
             walks = [component("walk", group) for group in self._groups()] if self.drift == "auto" else []
             found += [*white, ROTATION, *walks]
+        if self.n >= FEW_POSES_FOR_HYSTERESIS:
+            found.append(HYSTERESIS)
         return found
 
 

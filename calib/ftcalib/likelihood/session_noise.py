@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from ftcalib.model import Array
 
@@ -62,9 +62,9 @@ class Noise:
             self._add_walk(steps(time)[1:])
         if time is not None and slope is not None and slope.any():
             sloping = np.flatnonzero(slope)
-            self._add_effects(centred(time)[:, None, None] * np.eye(6)[:, sloping], slope[sloping] ** 2)
+            self.add_effects(centred(time)[:, None, None] * np.eye(6)[:, sloping], slope[sloping] ** 2)
         if effects is not None:
-            self._add_effects(*effects)
+            self.add_effects(*effects)
 
     @cached_property
     def W(self) -> Array:
@@ -97,7 +97,7 @@ class Noise:
                 banded[k - (b - a), :, b] = blocks[:, a, b]
         banded[0, 1:] = -stiffness[:, None]
         self._blocks, self._stiffness = blocks, stiffness
-        self._cholesky = cholesky_banded(banded.reshape(k + 1, -1), check_finite=False)
+        self._cholesky = np.asarray(dpbtrf(banded.reshape(k + 1, -1), overwrite_ab=1)[0])
         ones = np.zeros((n, k, k))
         ones[:, range(k), range(k)] = 1.0
         M_ones = self._solve_walk(ones)
@@ -107,7 +107,8 @@ class Noise:
         self._logdet += 2 * float(np.log(self._cholesky[-1]).sum()) + float(np.linalg.slogdet(mean)[1])
         self._logdet += k * (float(np.log(dt).sum()) - 2 * float(np.log(n)))
 
-    def _add_effects(self, T: Array, variance: Array) -> None:
+    def add_effects(self, T: Array, variance: Array) -> None:
+        """Add what acts on all poses at once: T (n, 6, k), and the variances (k,) with which it does."""
         Q = self.solve(T)
         core = np.diag(1 / variance) + summed_products(T, Q)
         self._low_rank.append((Q, -np.asarray(np.linalg.inv(core), dtype=np.float64)))
@@ -115,7 +116,7 @@ class Noise:
 
     def _solve_walk(self, X: Array) -> Array:
         """Give M^-1 X for X (n, k, m)."""
-        Z = cho_solve_banded((self._cholesky, False), X.reshape(-1, X.shape[2]), check_finite=False)
+        Z = dpbtrs(self._cholesky, X.reshape(-1, X.shape[2]))[0]
         return np.asarray(Z.reshape(X.shape))
 
     def solve(self, X: Array) -> Array:
@@ -196,7 +197,8 @@ def _transposed(X: Array) -> Array:
 
 def summed_products(X: Array, Y: Array) -> Array:
     """Sum of X_i' Y_i over the poses, shape (k, l), for X (n, m, k) and Y (n, m, l)."""
-    return np.asarray(X.reshape(-1, X.shape[-1]).T @ Y.reshape(-1, Y.shape[-1]))
+    rows = X.shape[0] * X.shape[1]
+    return np.asarray(X.reshape(rows, X.shape[2]).T @ Y.reshape(rows, Y.shape[2]))
 
 
 def pose_times(t_s: Array) -> Array:

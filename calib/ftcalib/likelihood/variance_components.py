@@ -6,26 +6,29 @@ the logarithms of the variances with average information (Gilmour, Thompson, Cul
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dpotrf, dtrtri
 
+from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.session_noise import Noise, centred, summed_products, walk_times
 from ftcalib.model import Array
 
 GAIN = 2.0
 """A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance."""
 GAIN_OF_RESPONSE = 3.0
-"""The same for gain and cross-talk of the sensor, whose 5 and 6 numbers come in by chance in 0.4 %."""
+"""The same for gain, cross-talk and hysteresis, whose 5 and 6 numbers come in by chance in 0.4 %."""
 SETTLED = 1e-4  # squared distance from the best variances, in their standard deviations
 NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
-LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2}
+LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2, "hysteresis": 0.03**2}
 """Variances that no arm or sensor in working order exceeds. A larger one has another cause."""
 POSES_THAT_SHOW_THE_NOISE = 1000  # fewer leave its size uncertain enough to matter
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
-Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk"]
+Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk", "hysteresis"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +43,7 @@ class Component:
     @property
     def needed(self) -> float:
         """The gain in log-likelihood that it must bring."""
-        return GAIN_OF_RESPONSE if self.kind in ("gain", "cross_talk") else GAIN
+        return GAIN_OF_RESPONSE if self.kind in ("gain", "cross_talk", "hysteresis") else GAIN
 
 
 def component(kind: Kind, channels: Sequence[int]) -> Component:
@@ -51,10 +54,11 @@ def component(kind: Kind, channels: Sequence[int]) -> Component:
 
 FORCE, TORQUE = range(3), range(3, 6)
 ROTATION = Component("rotation_rad", "rotation", (0.0,) * 6)
+HYSTERESIS = Component("hysteresis", "hysteresis", (0.0,) * 6)
 RESPONSE = tuple(Component(kind, kind, (0.0,) * 6) for kind in ("gain", "cross_talk"))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Linearised:
     """The estimation problem near its solution."""
 
@@ -72,35 +76,61 @@ class Linearised:
     """(n,) ascending, in mean intervals."""
     kept: NDArray[np.bool_]
     """(n,)"""
-    slope: Array | None
-    """(6,) as in `Noise`, for linear drift that is part of the model."""
+    slope: bool
+    """Whether a linear drift of unknown size is part of the model."""
     response: Array
     """(n, 6, 11) derivative by gain and cross-talk of the sensor."""
+    hysteresis: Array
+    """(n, 6, 6 or more) derivative by the shares of the last swing by which the axes lag."""
+    lever: float = 0.0
+    """Distance of the centre of mass, in levers of the cross-talk."""
 
-    def columns(self, c: Component) -> Array | None:
-        """(n, 6, k) derivative by what acts on all poses at once; None for what acts on each by itself."""
+    @cached_property
+    def X(self) -> Array:
+        """(n, 6, M) by parameters, slopes, gain, cross-talk, hysteresis: all that acts on all poses; then residuals."""
+        slopes = centred(self.time)[:, None, None] * np.eye(6)
+        return np.concatenate([self.J, slopes, self.response, self.hysteresis, self.r[..., None]], axis=2)
+
+    def columns(self, c: Component) -> NDArray[np.intp] | None:
+        """Columns of `X` whose coefficients have this variance; None for what acts on each pose by itself."""
+        m = self.J.shape[2]
         if c.kind == "slope":
-            return np.asarray(centred(self.time)[:, None, None] * np.eye(6)[:, np.flatnonzero(c.share)])
-        if c.kind == "gain":
-            return self.response[..., :5]
-        return self.response[..., 5:] if c.kind == "cross_talk" else None
+            return np.asarray(m + np.flatnonzero(c.share))
+        ends = {"gain": (6, 11), "cross_talk": (11, 17), "hysteresis": (17, 17 + self.hysteresis.shape[2])}.get(c.kind)
+        return None if ends is None else np.arange(m + ends[0], m + ends[1])
+
+    def largest(self, c: Component) -> float:
+        """Variance that no arm or sensor in working order exceeds.
+
+        An error of the gain acts on the torque of the weight too, as cross-talk at the lever of the centre of mass.
+        """
+        return LARGEST.get(c.kind, np.inf) * ((1 + self.lever) ** 2 if c.kind == "cross_talk" else 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Point:
-    """Restricted likelihood for given variances, and what it was made from."""
+    """Restricted likelihood for given variances, and what it was made from.
 
+    What acts on all poses at once is estimated with the parameters, as unknowns of mean zero and these variances.
+    """
+
+    problem: Linearised
     components: tuple[Component, ...]
     theta: Array
-    noise: Noise
-    WJ: Array
-    """(n, 6, m) inverse covariance times derivative."""
-    u: Array
-    """(n, 6) inverse covariance times residuals of the best parameters."""
+    of_poses: list[tuple[Component, float]]
+    """Components, with their variances, that act on each pose by itself or as a walk."""
+    own: Noise
+    """Covariance of these, with the measured noise."""
+    WX: Array
+    """(n, 6, M) inverse of that covariance times `Linearised.X`."""
+    G: Array
+    """(M, M) X' W X."""
+    unknown: NDArray[np.intp]
+    """(k,) columns of X that are estimated."""
     C: Array
-    """(m, m) covariance of the free parameters."""
-    step: Array
-    """(m,) from where the problem was linearised to the best parameters."""
+    """(k, k) covariance of these unknowns."""
+    x: Array
+    """(k,) from where the problem was linearised to the best unknowns."""
     loglik: float
 
     @property
@@ -111,11 +141,38 @@ class Point:
     @property
     def too_large(self) -> bool:
         """Whether a variance is at the limit of what has this cause."""
-        return any(v >= LARGEST.get(c.kind, np.inf) for c, v in zip(self.components, self.theta, strict=True))
+        return any(v >= self.problem.largest(c) for c, v in zip(self.components, self.theta, strict=True))
+
+    @property
+    def step(self) -> Array:
+        """(m,) of the free parameters."""
+        return self.x[: self.problem.J.shape[2]]
+
+    @property
+    def squared_step(self) -> float:
+        """That, in standard deviations of the estimates."""
+        m = len(self.step)
+        return float(self.step @ np.linalg.solve(self.C[:m, :m], self.step))
+
+    @property
+    def noise(self) -> Noise:
+        """All of it."""
+        return noise_of(self.problem, self.components, self.theta)
+
+    def weighted(self) -> tuple[Array, Array]:
+        """Inverse covariance times the unknowns' columns (n, 6, k), and times the residuals of the best ones (n, 6)."""
+        WX = self.WX[..., self.unknown]
+        return WX, self.WX[..., -1] - WX @ self.x
+
+    def effect(self, c: Component) -> Array:
+        """(n, 6) best linear prediction of what a component that acts on all poses does to each."""
+        columns = self.problem.columns(c)
+        own = np.arange(0) if columns is None else np.flatnonzero(np.isin(self.unknown, columns))
+        return np.asarray(self.problem.X[..., self.unknown[own]] @ self.x[own])
 
     def left_out(self) -> tuple[Array, Array]:
         """Residual (n, 6) of each pose when all others predict it, and its covariance (n, 6, 6)."""
-        return left_out(self.noise, self.WJ, self.u, self.C)
+        return left_out(self.own, *self.weighted(), self.C)
 
 
 def left_out(noise: Noise, WJ: Array, u: Array, C: Array) -> tuple[Array, Array]:
@@ -153,34 +210,56 @@ def squared_length(e: Array, S: Array) -> Array:
     return np.asarray((np.linalg.solve(S, e[..., None])[..., 0] * e).sum(axis=1))
 
 
-def point(problem: Linearised, components: Sequence[Component], theta: Array) -> Point:
-    """Evaluate the restricted likelihood."""
-    noise = noise_of(problem, components, theta)
-    m = problem.J.shape[2]
-    X = np.concatenate([problem.J, problem.r[..., None]], axis=2)
-    WX = noise.solve(X)
-    G = summed_products(X, WX)
-    H, g = G[:m, :m] + problem.prior[0], G[:m, m] + problem.prior[1]
-    scale = np.sqrt(np.diag(H))
-    value, vector = np.linalg.eigh(H / np.outer(scale, scale))
-    value = np.maximum(value, 1e-14 * value[-1])
-    root = vector / np.sqrt(value) / scale[:, None]
-    C = root @ root.T
-    step = C @ g
-    logdet = noise.logdet + float(np.log(value).sum() + 2 * np.log(scale).sum())
-    loglik = -0.5 * (logdet + float(G[m, m] - g @ step))
-    return Point(tuple(components), theta, noise, WX[..., :m], WX[..., m] - WX[..., :m] @ step, C, step, loglik)
-
-
-def noise_of(problem: Linearised, components: Sequence[Component], theta: Array) -> Noise:
-    """Give the covariance with these variances."""
-    D, walk, white, slope = problem.D, np.zeros(6), np.zeros(6), problem.slope
-    effects = []
+def point(problem: Linearised, components: Sequence[Component], theta: Array, near: Point | None = None) -> Point:
+    """Evaluate the restricted likelihood; a point `near` lends its sums if the noise of the poses is the same there."""
+    m, effects, of_poses = problem.J.shape[2], [], []
     for c, value in zip(components, theta, strict=True):
         columns = problem.columns(c)
-        if columns is not None:
-            effects.append((columns, np.full(columns.shape[2], value)))
-        elif c.kind == "walk":
+        if columns is None:
+            of_poses.append((c, value))
+        else:
+            effects.append((columns, value))
+    if near is None or near.problem is not problem or near.of_poses != of_poses:
+        own = own_noise_of(problem, of_poses)
+        WX = own.solve(problem.X)
+        G = summed_products(problem.X, WX)
+    else:
+        own, WX, G = near.own, near.WX, near.G
+    unknown = np.concatenate([np.arange(m + 6 * problem.slope), *(columns for columns, _ in effects)])
+    H, g = G[np.ix_(unknown, unknown)], G[unknown, -1]
+    H[:m, :m] += problem.prior[0]
+    g[:m] += problem.prior[1]
+    logdet, at = own.logdet, m + 6 * problem.slope
+    for columns, value in effects:
+        own_rows = np.arange(at, at + len(columns))
+        H[own_rows, own_rows] += 1 / value
+        logdet += len(columns) * float(np.log(value))
+        at += len(columns)
+    C, logdet_H = inverse_and_logdet(H)
+    x = C @ g
+    loglik = -0.5 * (logdet + logdet_H + float(G[-1, -1] - g @ x))
+    return Point(problem, tuple(components), theta, of_poses, own, WX, G, unknown, C, x, loglik)
+
+
+def inverse_and_logdet(H: Array) -> tuple[Array, float]:
+    """Invert an information matrix; what it leaves open gets a large variance."""
+    scale = column_scale(H)
+    scaled = H / np.outer(scale, scale)
+    L, failed = dpotrf(scaled, lower=1)
+    if not failed and np.diag(L).min() > 1e-7:
+        half = dtrtri(L, lower=1)[0] / scale
+        return np.asarray(half.T @ half), 2 * float(np.log(np.diag(L)).sum() + np.log(scale).sum())
+    value, vector = np.linalg.eigh(scaled)
+    value = np.maximum(value, 1e-14 * value[-1])
+    root = vector / np.sqrt(value) / scale[:, None]
+    return np.asarray(root @ root.T), float(np.log(value).sum() + 2 * np.log(scale).sum())
+
+
+def own_noise_of(problem: Linearised, of_poses: Sequence[tuple[Component, float]]) -> Noise:
+    """Give the covariance with these variances, of what acts on each pose by itself and of walks."""
+    D, walk, white = problem.D, np.zeros(6), np.zeros(6)
+    for c, value in of_poses:
+        if c.kind == "walk":
             walk += value * np.array(c.share)
         elif c.kind == "rotation":
             D = D + value * problem.turn @ np.swapaxes(problem.turn, 1, 2)
@@ -188,9 +267,20 @@ def noise_of(problem: Linearised, components: Sequence[Component], theta: Array)
             white += value * np.array(c.share)
     if white.any():
         D = D + np.diag(white) if D.strides[0] else np.broadcast_to(D[0] + np.diag(white), D.shape)
-    joined = [np.concatenate(parts, axis=-1) for parts in zip(*effects, strict=True)]
-    together = (joined[0], joined[1]) if joined else None
-    return Noise(D, problem.time, np.sqrt(walk), slope, together, problem.kept)
+    return Noise(D, problem.time, np.sqrt(walk), kept=problem.kept)
+
+
+def noise_of(problem: Linearised, components: Sequence[Component], theta: Array) -> Noise:
+    """Give the whole covariance with these variances."""
+    pairs = list(zip(components, theta, strict=True))
+    own = own_noise_of(problem, [pair for pair in pairs if problem.columns(pair[0]) is None])
+    found = [(columns, value) for c, value in pairs if (columns := problem.columns(c)) is not None]
+    if problem.slope:
+        m = problem.J.shape[2]
+        found.append((np.arange(m, m + 6), np.inf))
+    for columns, value in found:
+        own.add_effects(problem.X[..., columns], np.full(len(columns), value))
+    return own
 
 
 def score(problem: Linearised, at: Point, components: Sequence[Component], theta: Array) -> tuple[Array, Array]:
@@ -199,56 +289,56 @@ def score(problem: Linearised, at: Point, components: Sequence[Component], theta
     The noise at this point need not contain all of the components: for the others it is the derivative at zero, times
     `theta`.
     """
-    u, WJ, C, noise = at.u, at.WJ, at.C, at.noise
-    WJC = WJ @ C
-    P = noise.blocks - WJC @ np.swapaxes(WJ, 1, 2)
-    of_all = {c: T for c in components if (T := problem.columns(c)) is not None}
-    WT = {c: (noise.solve(T), summed_products(WJ, T)) for c, T in of_all.items()}
-    Ku = walk_times(problem.time, u) if any(c.kind == "walk" for c in components) else u
-    white_square, white_trace, walk_square = (u**2).sum(axis=0), np.einsum("ncc->c", P), (u * Ku).sum(axis=0)
-    kept = int(problem.kept.sum())
-    slope, Vu = [], np.empty((*u.shape, len(components)))
+    noise, C, G = at.own, at.C, at.G
+    WX, u = at.weighted()
+    WXC = WX @ C
+    P = noise.blocks - WXC @ np.swapaxes(WX, 1, 2)
+    of_poses = [k for k, c in enumerate(components) if problem.columns(c) is None]
+    Ku = walk_times(problem.time, u) if any(components[k].kind == "walk" for k in of_poses) else u
+    slope, Vu, E = np.empty(len(components)), np.empty((*u.shape, len(of_poses))), np.zeros((len(G), len(components)))
     for k, (c, variance) in enumerate(zip(components, theta, strict=True)):
-        share = np.array(c.share)
-        if c in of_all:
-            T = of_all[c]
-            along = np.tensordot(u, T, 2)
-            solved, JWT = WT[c]
-            square, trace = float(along @ along), float(np.vdot(T, solved) - np.vdot(JWT, C @ JWT))
-            Vu[..., k] = variance * (T @ along)
-        elif c.kind == "white":
-            square, trace = float(white_square @ share), float(white_trace @ share)
-            Vu[..., k] = variance * share * u
+        columns = problem.columns(c)
+        if columns is not None:  # moments of the coefficients
+            along = G[columns, -1] - G[np.ix_(columns, at.unknown)] @ at.x
+            between = G[np.ix_(columns, at.unknown)]
+            trace = float(np.trace(G[np.ix_(columns, columns)]) - np.vdot(between, between @ C))
+            E[columns, k] = variance * along
+            slope[k] = variance * (float(along @ along) - trace) / 2
+            continue
+        share, part = np.array(c.share), Vu[..., of_poses.index(k)]
+        if c.kind == "white":
+            part[...] = variance * share * u
+            trace = float(np.einsum("ncc,c->", P, share))
         elif c.kind == "rotation":
-            turned = (u[:, None] @ problem.turn)[:, 0]
-            square, trace = float((turned**2).sum()), float(np.vdot(problem.turn, P @ problem.turn))
-            Vu[..., k] = variance * (problem.turn @ turned[..., None])[..., 0]
+            part[...] = variance * (problem.turn @ (u[:, None] @ problem.turn).swapaxes(1, 2))[..., 0]
+            trace = float(np.vdot(problem.turn, P @ problem.turn))
         else:
-            square = float(walk_square @ share)
+            part[...] = variance * share * Ku
             own = np.flatnonzero(share)
             if c in at.components:
-                # K P = (V - D - effects) P, and V P = 1 - J C J' W.
-                others = np.einsum("nck,nck->", problem.J[:, own], WJC[:, own])
+                # K P = (V - D) P, and V P = 1 - X C X' W.
+                others = np.einsum("nck,nck->", problem.X[:, own[:, None], at.unknown], WXC[:, own])
                 others += np.einsum("ncd,ndc->", noise.D[:, own], P[:, :, own])
-                for other, value in zip(components, theta, strict=True):
-                    if other in of_all:
-                        solved, JWT = WT[other]
-                        others += value * np.vdot(of_all[other][:, own], solved[:, own] - WJC[:, own] @ JWT)
-                trace = (kept * len(own) - float(others)) / variance
+                trace = (int(problem.kept.sum()) * len(own) - float(others)) / variance
             else:
-                trace = noise.walk_trace(problem.time, own, (WJ, -C))
-            Vu[..., k] = variance * share * Ku
-        slope.append(variance * (square - trace) / 2)
-    JWX = summed_products(WJ, Vu)
-    information = (summed_products(Vu, noise.solve(Vu)) - JWX.T @ C @ JWX) / 2
-    return np.array(slope), np.asarray(information)
+                trace = noise.walk_trace(problem.time, own, (WX, -C))
+        slope[k] = (float(np.vdot(u, part)) - variance * trace) / 2
+    GE = G @ E
+    XV = summed_products(at.WX, Vu)
+    square = E.T @ GE
+    square[:, of_poses] += E.T @ XV
+    square[of_poses] += XV.T @ E
+    square[np.ix_(of_poses, of_poses)] += summed_products(Vu, noise.solve(Vu))
+    known = GE[at.unknown]
+    known[:, of_poses] += XV[at.unknown]
+    return slope, np.asarray(square - known.T @ C @ known) / 2
 
 
 def maximise(problem: Linearised, components: Sequence[Component], theta: Array) -> Point:
     """Climb to the best variances from these (k,), all positive."""
     if not components:
         return point(problem, components, theta)
-    most = np.array([LARGEST.get(c.kind, np.inf) for c in components])
+    most = np.array([problem.largest(c) for c in components])
     best = point(problem, components, np.minimum(theta, most))
     least = np.minimum(1e-3 * NEGLIGIBLE * units(problem, best, components), most)
     caution = 1e-3
@@ -284,20 +374,12 @@ def estimates(problem: Linearised, at: Point) -> tuple[Array, Array]:
         Step of the free parameters; best linear prediction of the coefficients, zero where none were found.
     covariance : array, shape (m + 11, m + 11)
     """
-    m, size = len(at.C), problem.response.shape[2]
-    found = dict(zip(at.components, at.theta, strict=True))
-    variance = np.repeat([found.get(c, 0.0) for c in RESPONSE], [5, 6])
-    values, covariance = np.zeros(m + size), np.zeros((m + size, m + size))
-    values[:m], covariance[:m, :m] = at.step, at.C
-    if variance.any():
-        T = problem.response
-        TWJ = summed_products(T, at.WJ)
-        TPT = summed_products(T, at.noise.solve(T)) - TWJ @ at.C @ TWJ.T
-        values[m:] = variance * np.tensordot(at.u, T, 2)
-        covariance[m:, :m] = -variance[:, None] * TWJ @ at.C
-        covariance[:m, m:] = covariance[m:, :m].T
-        covariance[m:, m:] = np.diag(variance) - variance[:, None] * TPT * variance
-    return values, covariance
+    m, size = problem.J.shape[2], problem.response.shape[2]
+    every = problem.X.shape[2] - 1
+    values, covariance = np.zeros(every), np.zeros((every, every))
+    values[at.unknown], covariance[np.ix_(at.unknown, at.unknown)] = at.x, at.C
+    shown = np.r_[:m, m + 6 : m + 6 + size]
+    return values[shown], covariance[np.ix_(shown, shown)]
 
 
 def estimates_of_unknown_variances(problem: Linearised, at: Point) -> tuple[Array, Array]:
@@ -313,7 +395,7 @@ def estimates_of_unknown_variances(problem: Linearised, at: Point) -> tuple[Arra
     _, information = score(problem, at, at.components, at.theta)
     uncertainty = np.linalg.pinv(information, rcond=1e-6, hermitian=True)
     k, h = len(at.theta), 1e-3
-    around = [estimates(problem, point(problem, at.components, at.theta * np.exp(h * row))) for row in np.eye(k)]
+    around = [estimates(problem, point(problem, at.components, at.theta * np.exp(h * row), at)) for row in np.eye(k)]
     moves, changes = ([(part[i] - own) / h for part in around] for i, own in enumerate((x, C)))
     scale = np.sqrt(np.diag(C))
     scale[scale == 0] = 1.0
@@ -325,12 +407,12 @@ def estimates_of_unknown_variances(problem: Linearised, at: Point) -> tuple[Arra
 def units(problem: Linearised, best: Point, components: Sequence[Component]) -> Array:
     """Variances (k,) at which each component is about as large as the white noise."""
     kept, n = problem.kept, int(problem.kept.sum())
-    variance = np.einsum("ncc,n->c", best.noise.D, kept) / n
+    variance = np.einsum("ncc,n->c", best.own.D, kept) / n
     units = []
     for c in components:
-        columns = problem.columns(c) if c.kind != "slope" else None
-        if columns is not None or c.kind == "rotation":
-            columns = problem.turn if columns is None else np.sqrt(n) * columns
+        found = problem.columns(c) if c.kind != "slope" else None
+        if found is not None or c.kind == "rotation":
+            columns = problem.turn if found is None else np.sqrt(n) * problem.X[..., found]
             square = np.einsum("ncd,ncd,n->c", columns, columns, kept.astype(np.float64)) / (n * columns.shape[2])
             units.append(float(1 / np.max(square / variance)))
         else:

@@ -65,8 +65,8 @@ def flange_load(
     jacobian[:, 3:6] = np.outer(by_mass, result.gravity_force_base_N / (result.weight_N * result.g_m_s2))
     jacobian[1:, 0:3] = share * skew(arm_m)
     jacobian[1:, 9:12] = share * result.R_flange_sensor
-    covariance = jacobian @ result.covariance @ jacobian.T
-    gain_variance = float(np.square(result.sigma["mass_kg"])) - covariance[0, 0]  # common to all axes, see `sigma`
+    covariance = jacobian @ result.tool_covariance @ jacobian.T
+    gain_variance = float(np.square(result.sigma["mass_kg"])) - covariance[0, 0]  # see `sigma`
     covariance += max(gain_variance, 0.0) * np.outer(by_mass, by_mass)
     if p_flange_sensor_com_m is None:
         covariance[3, 3] += ((1 - share) * height_m) ** 2 / 12

@@ -12,7 +12,7 @@ from ftdrive.terminal.text import echo
 if TYPE_CHECKING:
     from ftcalib import CalibrationResult
     from ftdrive.live.samples import Axes
-    from ftdrive.recording import Recording
+    from ftdrive.recording.recording import Source
 
 _EXISTING = click.Path(exists=True, path_type=Path)
 CALIBRATION = click.option(
@@ -60,27 +60,31 @@ def compensate(
     from ftdrive.recording.compensation import compensated
     from ftdrive.recording.files import format_of
     from ftdrive.runs.source import read_calibration
-    from ftdrive.terminal.console import beside
+    from ftdrive.terminal.console import beside, messages, working
 
     if output is not None:
         format_of(output)
     frame = read_frame(axes, about)
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
-    recording, found = _read(path, calibration, loaded, wrench, orientation_file, delay, everything=output is not None)
-    result = {
-        **compensated(recording, frame, output, estimate_bias=bias == "estimate"),
-        "delay_s": found,
-        "file": None if output is None else str(output),
-    }
+    with working("Reading") as show:
+        source, found = _open(path, calibration, loaded, wrench, orientation_file, delay, everything=output is not None)
+        numbers, failure = compensated(source, frame, output, estimate_bias=bias == "estimate", show=show)
+    result = {**numbers, "delay_s": found or numbers["delay_s"], "file": None if output is None else str(output)}
+    if result["cut"]:
+        what = path or wrench
+        messages.print(f" {what} is incomplete ({result['cut']}): {result['duration_s']:.1f} s of it are used.")
     if as_json:
         write_json({"schema_version": 1, **result})
     else:
         echo("\n".join(_words(result, str(frame))))
     if output is not None:
-        beside(as_json).print(f" Saved {output}")
+        short = "" if failure is None else f": the first {result['samples']} samples"
+        beside(as_json).print(f" Saved {output}{short}")
+    if failure is not None:
+        raise failure
 
 
-def _read(
+def _open(
     path: Path | None,
     calibration: Path | None,
     loaded: "CalibrationResult | None",
@@ -89,27 +93,22 @@ def _read(
     delay: str | None,
     *,
     everything: bool,
-) -> tuple["Recording", dict[str, float] | None]:
-    """Return the recording with the calibration, and the delay of the wrench with one sigma, where it is known."""
+) -> tuple["Source", dict[str, float] | None]:
+    """Return the recording with the calibration, and the delay of a pair of files with one sigma."""
     from ftdrive.errors import ConfigError
     from ftdrive.recording.compensation import NEEDED, read_with_calibration
-    from ftdrive.recording.csv_pair import read_pair
+    from ftdrive.recording.csv_pair import CsvPair
     from ftdrive.recording.recording import ROW
-    from ftdrive.terminal.console import messages
 
     if path is None:
         if wrench is None or orientation is None or loaded is None:
             raise ConfigError("no recording: give its file, or --wrench, --orientation-file and --calibration")
         delay_s = None if delay in (None, "auto") else numbers("--delay", str(delay), ",", [1])[0]
-        return read_pair(wrench, orientation, loaded, str(calibration), delay_s)
+        pair = CsvPair(wrench, orientation, loaded, str(calibration), delay_s)
+        return pair, {"value": pair.delay_s, "sigma": pair.delay_sigma_s}
     if wrench or orientation or delay:
         raise ConfigError("--wrench, --orientation-file and --delay do not go with RECORDING: leave it or them out")
-    columns = ROW.names or () if everything else NEEDED
-    recording = read_with_calibration(path, loaded, str(calibration), columns)
-    if recording.cut:
-        messages.print(f" {path} is incomplete: {recording.duration_s:.1f} s of it are used.")
-    delays = [event.values for event in recording.events if event.kind == "delay"]
-    return recording, {name: delays[-1][name] for name in ("value", "sigma")} if delays else None
+    return read_with_calibration(path, loaded, str(calibration), ROW.names or () if everything else NEEDED), None
 
 
 def _words(result: dict[str, Any], frame: str) -> Iterator[str]:

@@ -16,16 +16,20 @@ def convert(source: Path, target: Path, as_json: bool) -> None:
 
     IN may also be the .partial of a recording that was interrupted; OUT is complete then.
     """
-    from ftdrive.recording import read_recording, write_recording
-    from ftdrive.recording.files import format_of
-    from ftdrive.terminal.console import beside, messages
+    from ftdrive.recording.files import RecordingReader, format_of
+    from ftdrive.recording.recorder import converted
+    from ftdrive.terminal.console import beside, messages, working
 
     format_of(target)
-    recording = read_recording(source)
-    write_recording(target, recording)
-    if recording.cut:
-        messages.print(f" {source} is incomplete ({recording.cut}): {recording.duration_s:.1f} s of it are readable.")
-    beside(as_json).print(f" Saved {target}")
+    with working("Converting") as show:
+        reader = RecordingReader(source)
+        found, failure = converted(reader, target, show)
+    cut = reader.cut if failure is None else str(failure) or "interrupted"
+    if cut:
+        messages.print(f" {source} is incomplete ({cut}): {found['duration_s']:.1f} s of it are saved.")
+    short = "" if failure is None else f": the first {found['samples']} samples"
+    beside(as_json).print(f" Saved {target}{short}")
     if as_json:
-        samples = {"samples": len(recording.rows), "duration_s": recording.duration_s, "gaps": recording.gaps}
-        write_json({"schema_version": 1, "file": str(target), **samples, "complete": not recording.cut})
+        write_json({"schema_version": 1, "file": str(target), **found, "complete": not cut})
+    if failure is not None:
+        raise failure

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -31,6 +32,7 @@ from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Axes, StreamInfo, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.recording import Recorder, read_recording
+from ftdrive.recording.recording import with_calibration
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import read_calibration
 from ftdrive.terminal.console import answer, messages
@@ -124,7 +126,7 @@ def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed
         return replay_run(Run(path), loaded, str(calibration), frame=frame, speed=speed)
     recording = read_recording(path)
     if loaded is not None:
-        recording = recording.with_calibration(loaded, str(calibration))
+        recording = replace(recording, header=with_calibration(recording.header, loaded, str(calibration)))
     return ReplayedStream(recording.header.info, recording.paired(), frame=frame, speed=speed)
 
 

@@ -18,9 +18,10 @@ from ftcalib.errors import AcceptanceError, DataError
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import UP_IN_BASE
 from ftcalib.result import Method
-from ftcalib.routine import drift_check
+from ftcalib.routine import PoseRecord, drift_check
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
+    FILE,
     JSON,
     NewFile,
     Number,
@@ -33,6 +34,7 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
+from ftdrive.recording.in_motion import is_recording, solve_recording
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.source import read_source
@@ -79,6 +81,11 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
 @click.option(
     "--up", metavar="X,Y,Z", help="Up direction in base axes, such as 0,0,1 on a floor; declares the mounting."
 )
+@click.option("--wrench", metavar="FILE", type=FILE, help="In motion: CSV with t,fx,fy,fz,tx,ty,tz.")
+@click.option(
+    "--orientation-file", metavar="FILE", type=FILE, help="With --wrench: CSV with t, the orientation and x,y,z in m."
+)
+@click.option("--point-mass", is_flag=True, help="In motion: the load is known to have no inertia of its own.")
 @click.option("--output", "-o", type=NewFile(), help="Save the calibration as a new file.")
 @click.option("--force", is_flag=True, help="Save a rejected result too; it stays marked as rejected.")
 @simulate("Solve a short run of an emulated cell.")
@@ -93,6 +100,9 @@ def solve(
     level_deg: float | None,
     mounting_deg: str | None,
     up: str | None,
+    wrench: Path | None,
+    orientation_file: Path | None,
+    point_mass: bool,
     output: Path | None,
     force: bool,
     simulate: bool,
@@ -103,8 +113,15 @@ def solve(
 
     A CSV has a header with r11..r33, qx,qy,qz,qw or rx,ry,rz in rad, fx,fy,fz,tx,ty,tz in N and N·m, and optionally
     t in seconds and sigma_fx..sigma_tz, the standard error of each pose's mean. With --json, one object a line.
+
+    A DATASET may also be a recording of `ftdrive record`: the load is then estimated from its motion, with inertia and
+    delay. Recordings of other programs come as --wrench and --orientation-file on one clock, each at its own rate.
     """
-    check_simulate(simulate, real={"DATASET": sources}, emulated={"--sensor": sensor})
+    check_simulate(simulate, real={"DATASET": sources, "--wrench": wrench}, emulated={"--sensor": sensor})
+    if (wrench is None) != (orientation_file is None) or (wrench is not None and sources):
+        raise ConfigError("--wrench and --orientation-file are one recording: give both, and no DATASET")
+    pair = None if wrench is None or orientation_file is None else (wrench, orientation_file)
+    sources = sources if pair is None else pair[:1]
     if not (sources or simulate):
         raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
     if output is not None and (len(sources) > 1 or method == "all"):
@@ -114,8 +131,9 @@ def solve(
         "known": known_values(mass_kg, level_deg, mounting_deg),
         "up_in_base": upward(up),
     }
+    motion = {"pair": pair, "point_mass": point_mass}
     with rehearsed_run(sensor) if simulate else nullcontext() as run:
-        _solve_each(sources if run is None else [run], method, drift, read, output, force, as_json)
+        _solve_each(sources if run is None else [run], method, drift, read, motion, output, force, as_json)
     if output is not None and sources and sources[0].is_dir():
         index_run(sources[0])  # the result, if it was saved in the run
 
@@ -125,6 +143,7 @@ def _solve_each(
     method: str,
     drift: Drift,
     read: dict[str, Any],
+    motion: dict[str, Any],
     output: Path | None,
     force: bool,
     as_json: bool,
@@ -133,18 +152,16 @@ def _solve_each(
     for source in sources:
         try:
             with unpacked(source) as place:
-                data = read_source(place, **read)
-                if method == "all":
+                if method == "all" and motion["pair"] is None and not is_recording(place):
+                    data = read_source(place, **read)
                     _show_all(source, data.dataset, {"drift": drift, **data.circumstances}, as_json)
                     continue
-                options = {"drift": drift, **data.circumstances, "provenance": data.provenance}
-                with working("Solving"):
-                    result = _solve(data.dataset, method, options)
+                result, records = _result_of(place, method, drift, read, motion)
                 if as_json:
-                    found = [one.to_dict() for one in hints(result, data.records)]
+                    found = [one.to_dict() for one in hints(result, records)]
                     write_json({"source": str(source), "hints": found, **result.to_dict()})
                 else:
-                    print_result(result, drift=drift_check(data.records), records=data.records)
+                    print_result(result, drift=drift_check(records) if records else None, records=records)
                 if not force:
                     stop_unless_accepted(result, to_be_saved=output is not None)
                 if output is not None:
@@ -159,6 +176,21 @@ def _solve_each(
             echo(f"error: {source}: {error}", err=True)
     if first_failure is not None:
         raise SystemExit(exit_code(first_failure))
+
+
+def _result_of(
+    place: Path, method: str, drift: Drift, read: dict[str, Any], motion: dict[str, Any]
+) -> tuple[CalibrationResult, Sequence[PoseRecord]]:
+    """Solve a recording in motion, or poses; also return the records of a run."""
+    if motion["pair"] is not None or is_recording(place):
+        if method != "ml":
+            raise ConfigError(f"--method {method} is for poses at rest: leave it out for a recording")
+        with working("Solving"):
+            return solve_recording(place, **motion, known=read["known"], up_in_base=read["up_in_base"]), ()
+    data = read_source(place, **read)
+    options = {"drift": drift, **data.circumstances, "provenance": data.provenance}
+    with working("Solving"):
+        return _solve(data.dataset, method, options), data.records
 
 
 def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) -> CalibrationResult:

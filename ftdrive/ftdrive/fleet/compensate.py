@@ -6,8 +6,9 @@ FOLDER/<name of the recording>   the result, in the format of the recording
 import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from os import fsdecode
 from pathlib import Path
-from tempfile import TemporaryDirectory, gettempdir
+from tempfile import TemporaryDirectory, gettempdir, mkdtemp
 from typing import Any
 
 from ftcalib import CalibrationResult
@@ -18,6 +19,7 @@ from ftdrive.fleet.workers import OtherVersion, Workers, answers, in_words, requ
 from ftdrive.live.samples import WrenchFrame
 from ftdrive.recording.compensation import compensated, read_with_calibration
 from ftdrive.recording.files import ENDINGS, format_of
+from ftdrive.recording.growing_file import publish
 from ftdrive.recording.recording import frame_of
 from ftdrive.runs.source import read_calibration
 
@@ -78,10 +80,10 @@ def task_of(calibration: Path | None, frame: WrenchFrame, bias: str, *, accept_e
     return json.dumps({"version": __version__, **given}).encode()
 
 
-def compensated_file(recording: bytes, name: str, task: bytes) -> bytes:
-    """Return the file of the result and a line of JSON: a pure function of its arguments and the installed versions.
+def compensated_file(source: Path, folder: Path, task: bytes) -> bytes:
+    """Compensate a recording into a new file below a folder, in blocks; return its path and a line of JSON.
 
-    The line has what `ftdrive.recording.compensation.compensated` returns, and `cut` of the recording.
+    The line has the numbers of `ftdrive.recording.compensation.compensated`.
 
     Raises
     ------
@@ -90,31 +92,34 @@ def compensated_file(recording: bytes, name: str, task: bytes) -> bytes:
     ConfigError, DataError
         The recording cannot be compensated in this way.
     OSError
-        The temporary folder of the worker cannot be written.
+        The result cannot be written.
     """
     given: dict[str, Any] = json.loads(task)
     require_version(given["version"])
-    try:
-        with TemporaryDirectory(prefix="ftdrive-compensate-") as folder:
-            source, output = Path(folder) / name, Path(folder) / f"result{Path(name).suffix}"
-            source.write_bytes(recording)
-            try:
-                numbers = _compensated(source, output, given)
-            except BadRecording as error:  # the temporary folder means nothing to a user
-                raise BadRecording(error.problem) from error
-            with output.open("ab") as file:
-                file.write(b"\n" + json.dumps(numbers).encode())
-            return output.read_bytes()
-    except OSError as error:
-        raise OSError(f"{gettempdir()} on the worker: {error}: make room there, or set TMPDIR") from error
-
-
-def _compensated(source: Path, output: Path, given: dict[str, Any]) -> dict[str, Any]:
     document = given["calibration"]
     calibration = None if document is None else CalibrationResult.from_dict(document)
-    recording = read_with_calibration(source, calibration, given["calibration_name"])
-    numbers = compensated(recording, frame_of(given), output, estimate_bias=given["bias"] == "estimate")
-    return {**numbers, "cut": recording.cut}
+    try:
+        reader = read_with_calibration(source, calibration, given["calibration_name"])
+        output = Path(mkdtemp(dir=folder)) / f"result{source.suffix}"
+        numbers, _ = compensated(reader, frame_of(given), output, estimate_bias=given["bias"] == "estimate")
+    except BadRecording as error:  # the report names the recording, which here may be a temporary file
+        raise BadRecording(error.problem) from error
+    return f"{output}\n{json.dumps(numbers)}".encode()
+
+
+def compensated_bytes(recording: bytes, name: str, task: bytes) -> bytes:
+    """Return the file of the result and a line of JSON, on a computer that does not have the recording.
+
+    A pure function of its arguments and the installed versions. Raises as `compensated_file`.
+    """
+    try:
+        with TemporaryDirectory(prefix="ftdrive-compensate-") as folder:
+            source = Path(folder) / name
+            source.write_bytes(recording)
+            output, _, line = compensated_file(source, Path(folder), task).rpartition(b"\n")
+            return Path(fsdecode(output)).read_bytes() + b"\n" + line
+    except OSError as error:
+        raise OSError(f"{gettempdir()} on the worker: {error}: make room there, or set TMPDIR") from error
 
 
 def compensate_all(
@@ -122,33 +127,45 @@ def compensate_all(
 ) -> Iterator[tuple[Path, dict[str, Any] | str]]:
     """Compensate recordings into a folder; yield each as it comes with its numbers, or why it failed.
 
-    A file is written whole or not at all, so everything that was yielded remains when the caller stops. Two recordings
-    for each worker are in memory at a time.
+    A file is written whole or not at all, so everything that was yielded remains when the caller stops. Processes of
+    this computer read and write the files themselves; to a cluster they travel as bytes, two for each worker at a time.
 
     Raises
     ------
     OtherVersion
         A worker has another version.
     """
-
-    def arguments(recording: Path) -> tuple[bytes, str, bytes]:
-        return recording.read_bytes(), recording.name, task
-
     alone = replace(workers, group=1)  # a recording is large
-    for recording, answer in answers(compensated_file, arguments, recordings, alone):
-        if isinstance(answer, OtherVersion):
-            raise answer
-        if isinstance(answer, BaseException):
-            yield recording, in_words(answer)
-        else:
-            yield recording, _saved(folder / recording.name, answer)
+    with TemporaryDirectory(prefix=".unfinished-", dir=folder) as unfinished:
+
+        def paths(recording: Path) -> tuple[Path, Path, bytes]:
+            return recording, Path(unfinished), task
+
+        def content(recording: Path) -> tuple[bytes, str, bytes]:
+            return recording.read_bytes(), recording.name, task
+
+        found = (
+            answers(compensated_file, paths, recordings, alone)
+            if workers.share_files
+            else answers(compensated_bytes, content, recordings, alone)
+        )
+        for recording, answer in found:
+            if isinstance(answer, OtherVersion):
+                raise answer
+            if isinstance(answer, BaseException):
+                yield recording, in_words(answer)
+            else:
+                yield recording, _saved(folder / recording.name, answer, is_path=workers.share_files)
 
 
-def _saved(path: Path, answer: bytes) -> dict[str, Any] | str:
-    """Write a result; return its numbers, or why it cannot be written."""
+def _saved(path: Path, answer: bytes, *, is_path: bool) -> dict[str, Any] | str:
+    """Give a result its name, or write it; return its numbers, or why that is impossible."""
     content, _, line = answer.rpartition(b"\n")
     try:
-        write_new(path, content)
+        if is_path:
+            publish(Path(fsdecode(content)), path)
+        else:
+            write_new(path, content)
     except OSError as error:
         return f"{path} is not written ({error.strerror or error}): make room in {path.parent}, then repeat"
     numbers: dict[str, Any] = json.loads(line)

@@ -74,6 +74,8 @@ class Workers:
     """Of a future whose worker ended without an answer."""
     group: int = 1
     """Calls that a worker gets at once."""
+    share_files: bool = False
+    """Whether a path means the same file to each worker."""
 
 
 @contextmanager
@@ -93,7 +95,7 @@ def local_workers(count: int | None = None) -> Iterator[Workers]:
         env=_ONE_THREAD,
     )
     try:
-        yield Workers(count, lambda *call: executor().submit(*call), BrokenExecutor)
+        yield Workers(count, lambda *call: executor().submit(*call), BrokenExecutor, share_files=True)
     finally:
         executor().shutdown(kill_workers=True)
 

@@ -1,6 +1,7 @@
 """Delay of the wrench after the pose, found from the force of a moving tool."""
 
 from collections import deque
+from collections.abc import Iterable
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +14,7 @@ from ftdrivers.interfaces import Array
 
 MOST_DELAY_S = 0.1
 
-_PERIOD_S = 0.008
+PERIOD_S = 0.008
 """Samples are averaged over this time."""
 _BATCH_S = 1.0
 _REACH = 2
@@ -75,33 +76,38 @@ class DelayEstimator:
         """One standard deviation of the estimate."""
 
     def add(self, paired: Paired) -> None:
-        """Learn from samples that were paired with `delay_s`."""
+        """Learn from samples that were paired with `delay_s`, and improve it."""
+        pieces = self._whole_seconds(paired)
+        if pieces and self._settling:  # part of it was paired with another delay
+            self._settling = False
+        elif sum(map(self._learn, pieces)):
+            self._apply()
+
+    def learn(self, recording: Iterable[Paired]) -> None:
+        """Forget what was learnt; improve the delay once, from blocks of a recording that were paired with it."""
+        self._seconds.clear()
+        self._pending = []
+        if sum(self._learn(piece) for paired in recording for piece in self._whole_seconds(paired)):
+            self._apply()
+
+    def _whole_seconds(self, paired: Paired) -> list[Paired]:
+        """Add samples; return the seconds that are complete."""
         self._pending.append(paired)
         begin_ns = int(self._pending[0].t_host_ns[0])
         seconds = int((paired.t_host_ns[-1] - begin_ns) * 1e-9 / _BATCH_S)
         if not seconds:
-            return
+            return []
         rows = Paired.concatenate(self._pending)
         cuts = np.searchsorted(rows.t_host_ns, begin_ns + np.arange(1, seconds + 1) * round(_BATCH_S * 1e9)).tolist()
         self._pending = [rows.rows(slice(cuts[-1], None))] if cuts[-1] < len(rows) else []
-        if self._settling:  # part of it was paired with another delay
-            self._settling = False
-            return
-        learnt = [self._learn(rows.rows(slice(*piece))) for piece in pairwise([0, *cuts])]
-        if any(learnt):
-            self._apply()
-
-    def restart(self) -> None:
-        """Forget what was learnt, and keep the delay; for another pass over a recording."""
-        self._seconds.clear()
-        self._pending, self._settling = [], False
+        return [rows.rows(slice(*piece)) for piece in pairwise([0, *cuts])]
 
     def _learn(self, paired: Paired) -> bool:
         """Add the information of one second; return whether it has any."""
         if len(paired) < 2:
             return False
         seconds = (paired.t_host_ns - paired.t_host_ns[0]) * 1e-9
-        size = max(1, round(_PERIOD_S * (len(seconds) - 1) / max(seconds[-1], 1e-9)))
+        size = max(1, round(PERIOD_S * (len(seconds) - 1) / max(seconds[-1], 1e-9)))
         groups = len(seconds) // size
         if groups < 4 * _REACH + 2:
             return False

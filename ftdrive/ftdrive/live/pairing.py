@@ -8,6 +8,7 @@ motion.
 
 import math
 from collections import deque
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -30,11 +31,14 @@ _FAR_NS, _FASTEST_SLEW = 2e8, 0.9
 _SCALED_S, _SCALED = 0.2, 0.05
 """A clock is no clock of seconds if it differs by so much over this time."""
 _PASSES = 4
-"""A recording is paired so often until its delay has converged."""
+_CONVERGED_S = 1e-8
+"""A recording is paired so often until its delay changes by less."""
 _STEP_BUCKETS, _STEP_NS = 8, 5e6
 """If so many buckets in a row are later than this, and alike, the line before them is no longer true."""
 _MOST_AHEAD_NS = 10_000_000
 """A pose is extrapolated at most so far: one interval of a CB3 controller, with some delay."""
+_KEEP_NS = 2_000_000_000
+"""Of poses, for samples that are late."""
 _LOST_S = 1.0
 """A device whose count is so far from the line has restarted."""
 
@@ -134,15 +138,9 @@ class PoseTrack:
     """Poses of the flange over time, interpolated to any time between the first and the last.
 
     Positions and joint angles are interpolated linearly, orientations by slerp: constant angular velocity.
-
-    Parameters
-    ----------
-    keep_s : float
-        Older poses are dropped.
     """
 
-    def __init__(self, keep_s: float = math.inf) -> None:
-        self._keep_s = keep_s
+    def __init__(self) -> None:
         self._t_ns = np.empty(0, np.int64)
         self._room = np.empty(0, np.int64), np.empty((0, 14))
         """Both, with room for more."""
@@ -178,11 +176,13 @@ class PoseTrack:
         quat[1:] *= np.cumprod(side)[:, None]
         chord = np.sqrt(np.square(quat[1:] - quat[:-1]).sum(axis=1))
         columns[start:-1, 13] = np.maximum(2 * np.arcsin(np.minimum(chord / 2, 1.0)), 1e-9)
-        keep = 0
-        if math.isfinite(self._keep_s):
-            keep = int(np.searchsorted(t_ns, t_ns[-1] - round(self._keep_s * 1e9)))
+        self._t_ns, self._columns = t_ns, columns
+
+    def forget(self, t_ns: int) -> None:
+        """Drop the poses that no time from `t_ns` on needs."""
+        keep = max(int(np.searchsorted(self._t_ns, t_ns, "right")) - 1, 0)
         self._room = self._room[0][keep:], self._room[1][keep:]
-        self._t_ns, self._columns = t_ns[keep:], columns[keep:]
+        self._t_ns, self._columns = self._t_ns[keep:], self._columns[keep:]
 
     def _make_room(self, rows: int) -> None:
         """Move the poses to the beginning of arrays with room for as many again."""
@@ -225,7 +225,7 @@ class Pairing:
         self._rate_Hz = sensor_rate_Hz
         self._sensor: Timeline | None = None
         self._arm: Timeline | None = None
-        self._poses = PoseTrack(keep_s=2.0)
+        self._poses = PoseTrack()
         self._waiting: list[tuple[FtSamples, Ns]] = []
         self._delay_s = 0.0 if isinstance(delay, DelayEstimator) else delay
 
@@ -260,6 +260,7 @@ class Pairing:
                 self._arm = _clock_of(states)
             t_ns = self._arm.stamp(states.t_device_s, t_ns)
         self._poses.add(t_ns, states.q_rad, states.R_base_flange, states.p_base_flange_m)
+        self._poses.forget(int(t_ns[-1]) - _KEEP_NS)
 
     def add_samples(self, samples: FtSamples) -> None:
         """Add what the sensor has sent."""
@@ -298,7 +299,7 @@ class Pairing:
     def forget(self) -> None:
         """Drop what waits, after an interruption of either link."""
         self._waiting = []
-        self._poses = PoseTrack(keep_s=2.0)
+        self._poses = PoseTrack()
         for line in (self._sensor, self._arm):
             if line is not None:
                 line.restart()
@@ -318,36 +319,45 @@ def paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:
     return Paired(t_ns, samples.t_device_s, samples.seq, samples.status, samples.wrench, *poses.at(t_ns))
 
 
-def pair_recording(samples: FtSamples, states: ArmStates, delay: DelayEstimator | float) -> Paired:
-    """Pair a recording whose times are those of measurement; both are sorted by time.
+def paired_blocks(samples: Iterable[FtSamples], states: Iterable[ArmStates], delay_s: float) -> Iterator[Paired]:
+    """Pair a recording whose times are those of measurement, in blocks; both are sorted by time.
 
     Parameters
     ----------
     samples, states
         Samples before the first and after the last state are dropped.
-    delay : DelayEstimator or float
-        An estimator with a window as long as the recording, which then has the result; or the delay of the wrench after
-        the pose in s.
+    delay_s : float
+        Of the wrench after the pose.
 
     Raises
     ------
     BadDataset
         The two do not overlap.
     """
-    poses = PoseTrack()
-    poses.add(states.t_host_ns, states.q_rad, states.R_base_flange, states.p_base_flange_m)
-
-    def paired(delay_s: float) -> Paired:
-        t_ns = samples.t_host_ns - round(delay_s * 1e9)
+    poses, coming, found = PoseTrack(), iter(states), False
+    for block in samples:
+        t_ns = block.t_host_ns - round(delay_s * 1e9)
+        poses.forget(int(t_ns[0]))
+        while poses.span_ns is None or poses.span_ns[1] < t_ns[-1]:
+            if (more := next(coming, None)) is None:
+                break
+            poses.add(more.t_host_ns, more.q_rad, more.R_base_flange, more.p_base_flange_m)
         span_ns = poses.span_ns or (0, -1)
         inside = slice(*np.searchsorted(t_ns, [span_ns[0], span_ns[1] + 1]).tolist())
-        if not len(t_ns[inside]):
-            raise BadDataset("wrench and pose have no time in common: give files of the same recording and one clock")
-        return paired_with(poses, t_ns[inside], samples.rows(inside))
+        if len(t_ns[inside]):
+            found = True
+            yield paired_with(poses, t_ns[inside], block.rows(inside))
+    if not found:
+        raise BadDataset("wrench and pose have no time in common: give files of the same recording and one clock")
 
-    if not isinstance(delay, DelayEstimator):
-        return paired(delay)
+
+def estimate_delay(samples: Iterable[FtSamples], states: Iterable[ArmStates], estimator: DelayEstimator) -> None:
+    """Estimate the delay of a recording as `paired_blocks` takes it, with a window as long as the recording.
+
+    Both are read several times. Raises `BadDataset`.
+    """
     for _ in range(_PASSES):
-        delay.restart()
-        delay.add(paired(delay.delay_s))
-    return paired(delay.delay_s)
+        before_s = estimator.delay_s
+        estimator.learn(paired_blocks(samples, states, before_s))
+        if abs(estimator.delay_s - before_s) < _CONVERGED_S:
+            break

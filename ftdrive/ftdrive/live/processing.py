@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from threading import RLock
 
 import numpy as np
@@ -80,7 +80,7 @@ class Processor:
         self._tares: list[tuple[Calibrated, int]] = [(calibration, 0)]
         likely_error = calibration.likely_error()
         self._usual_error_N = float(likely_error[0])
-        beyond = np.repeat((likely_error**2 - np.square(calibration.predicted_error())) / 3, 3)
+        beyond = np.repeat((likely_error**2 - np.square(calibration.predicted_error())).clip(0.0) / 3, 3)
         self._motion = self._motion_tracker()
         self._noise = NoiseEstimator(info.sensor_rate_Hz)
         self._noise_is_learnt = False
@@ -156,7 +156,7 @@ class Processor:
                 return self._process(paired, last)
             chunks = [paired.rows(slice(i, i + _CHUNK_ROWS)) for i in range(0, len(paired), _CHUNK_ROWS)]
             if self._noise.of(Motion.REST) is None:
-                self.learn_noise(paired)
+                self.learn_noise([paired])
             return Block.concatenate([self._process(chunk, last and chunk is chunks[-1]) for chunk in chunks])
 
     def _process(self, paired: Paired, last: bool) -> Block:
@@ -181,15 +181,16 @@ class Processor:
             self._report_contacts(self._tracker.end())
         return block
 
-    def learn_noise(self, paired: Paired) -> None:
-        """Learn the noise from all of a recording, before it is processed and instead of during that."""
+    def learn_noise(self, recording: Iterable[Paired]) -> None:
+        """Learn the noise from blocks of a recording, before it is processed and instead of during that."""
         with self._lock:
             self._noise_is_learnt = True
             motion = self._motion_tracker()
-            for i in range(0, len(paired), _CHUNK_ROWS):
-                rows = paired.rows(slice(i, i + _CHUNK_ROWS))
-                moving, wrenches = motion.follow(rows.R_base_flange, rows.p_base_flange_m)
-                self._noise.add(self._free(rows)[0] - wrenches[0], moving)
+            for block in recording:
+                for i in range(0, len(block), _CHUNK_ROWS):
+                    rows = block.rows(slice(i, i + _CHUNK_ROWS))
+                    moving, wrenches = motion.follow(rows.R_base_flange, rows.p_base_flange_m)
+                    self._noise.add(self._free(rows)[0] - wrenches[0], moving)
 
     def _motion_tracker(self) -> MotionTracker:
         calibration = self.info.calibration

@@ -67,7 +67,7 @@ class ReplayedStream(ProcessedStream):
         self._seconds = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
         self.clock = clock
         self._processor = Processor(info, frame, stages, false_alarm_rate=false_alarm_rate)
-        self._processor.learn_noise(rows)
+        self._processor.learn_noise([rows])
         self._speed = speed
         self._next = 0
         """The first row that was not read."""

@@ -18,6 +18,9 @@ from ftdrivers.interfaces import Array
 RAW, COMPENSATED, POSE, JOINTS = "/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states"
 TRANSFORMS = "/tf"
 
+Messages = NDArray[np.void]
+"""(n,) messages, all of one length; `tolist` makes bytes of them."""
+
 ENCODING = b"\0\1\0\0"
 """The first bytes of a message: CDR, little endian."""
 
@@ -105,28 +108,28 @@ def frame_id(frame: WrenchFrame) -> str:
     return f"{frame.axes}_at_{'_'.join(f'{x:g}' for x in frame.about)}_m"
 
 
-def pack_wrenches(t_utc_ns: NDArray[np.int64], wrench: Array, frame: str) -> list[bytes]:
+def pack_wrenches(t_utc_ns: NDArray[np.int64], wrench: Array, frame: str) -> Messages:
     """Pack (n, 6) wrenches, N and N·m, as WrenchStamped."""
     return _pack(t_utc_ns, _strings(frame), wrench)
 
 
-def pack_poses(t_utc_ns: NDArray[np.int64], R_base_flange: Array, p_base_flange_m: Array) -> list[bytes]:
+def pack_poses(t_utc_ns: NDArray[np.int64], R_base_flange: Array, p_base_flange_m: Array) -> Messages:
     """Pack poses (n, 3, 3) and (n, 3) of the flange in base as PoseStamped."""
     return pack_pose_numbers(t_utc_ns, np.concatenate([p_base_flange_m, quaternions(R_base_flange)], axis=1))
 
 
-def pack_pose_numbers(t_utc_ns: NDArray[np.int64], pose: Array) -> list[bytes]:
+def pack_pose_numbers(t_utc_ns: NDArray[np.int64], pose: Array) -> Messages:
     """Pack (n, 7) poses, position in m and quaternion x, y, z, w, as PoseStamped."""
     return _pack(t_utc_ns, _strings("base"), pose)
 
 
-def pack_joints(t_utc_ns: NDArray[np.int64], q_rad: Array) -> list[bytes]:
+def pack_joints(t_utc_ns: NDArray[np.int64], q_rad: Array) -> Messages:
     """Pack (n, 6) joint angles as JointState without velocity and effort."""
     names = _strings("", len(JOINT_NAMES), *JOINT_NAMES, q_rad.shape[1])
     return _pack(t_utc_ns, names, q_rad, struct.pack("<II", 0, 0))
 
 
-def pack_transforms(t_utc_ns: NDArray[np.int64], transforms: Sequence[tuple[str, str, Array, Array]]) -> list[bytes]:
+def pack_transforms(t_utc_ns: NDArray[np.int64], transforms: Sequence[tuple[str, str, Array, Array]]) -> Messages:
     """Pack transforms as TFMessage.
 
     Parameters
@@ -145,8 +148,7 @@ def pack_transforms(t_utc_ns: NDArray[np.int64], transforms: Sequence[tuple[str,
         pose[:, :3], pose[:, 3:] = p_m, quaternions(R.reshape(-1, 3, 3))
         values += [stamp, _column(n, np.void(names)), pose.view("V56")[:, 0]]
     parts = [np.ascontiguousarray(value).view(np.uint8).reshape(n, value.itemsize) for value in values]
-    packed: list[bytes] = np.hstack(parts).view(f"V{sum(part.shape[1] for part in parts)}")[:, 0].tolist()
-    return packed
+    return np.asarray(np.hstack(parts).view(f"V{sum(part.shape[1] for part in parts)}")[:, 0])
 
 
 def _column(n: int, value: np.void) -> NDArray[np.void]:
@@ -165,7 +167,7 @@ def _strings(*fields: str | int, start: int = 0) -> bytes:
     return packed + bytes(-(start + len(packed)) % 8)
 
 
-def _pack(t_utc_ns: NDArray[np.int64], same: bytes, numbers: Array, end: bytes = b"") -> list[bytes]:
+def _pack(t_utc_ns: NDArray[np.int64], same: bytes, numbers: Array, end: bytes = b"") -> Messages:
     n, width = numbers.shape
     layout = [
         ("encoding", "V4"),
@@ -175,12 +177,11 @@ def _pack(t_utc_ns: NDArray[np.int64], same: bytes, numbers: Array, end: bytes =
         ("numbers", "<f8", (width,)),
         ("end", f"V{len(end)}"),
     ]
-    records = np.zeros(n, layout)
+    records = np.empty(n, layout)
     records["encoding"] = np.void(ENCODING)
     records["sec"], records["nanosec"] = np.divmod(t_utc_ns, 1_000_000_000)
     records["same"] = np.void(same)
     records["numbers"] = numbers
     if end:
         records["end"] = np.void(end)
-    packed: list[bytes] = records.view(f"V{records.itemsize}").tolist()
-    return packed
+    return records.view(f"V{records.itemsize}")

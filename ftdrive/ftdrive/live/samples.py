@@ -154,6 +154,8 @@ class Block:
     @classmethod
     def concatenate(cls, blocks: Sequence[Self]) -> Self:
         """Join blocks of one frame and stages in the order given; sigma is that of the last."""
+        if len(blocks) == 1:
+            return blocks[0]
         columns: dict[str, Any] = {
             item.name: getattr(blocks[-1], item.name)
             if item.name in _ALIKE

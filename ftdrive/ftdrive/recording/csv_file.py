@@ -19,7 +19,7 @@ import csv
 import io
 import json
 import zlib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import IO
@@ -32,9 +32,11 @@ from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.recording.recording import (
     COLUMNS,
     FORMAT,
+    NUMBERS,
+    PIECE_ROWS,
     ROW,
     Header,
-    Recording,
+    Piece,
     Rows,
     event_of,
     event_text,
@@ -91,58 +93,71 @@ class CsvFile(GrowingFile):
             super().complete()
 
 
-def read_csv(path: Path, _columns: Collection[str] = ()) -> Recording:
-    """Read a recording. Raises `BadRecording` or `OSError`."""
+def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str]:
+    """Read a recording in pieces; return why it ends early. Raises `BadRecording` or `OSError`."""
+    size = path.stat().st_size
     with path.open("rb") as file:
         if not file.readline().startswith(f"# {FORMAT.partition('/')[0]}/".encode()):
             raise BadRecording(f"the first line is not '# {FORMAT}'")
         file.seek(0)
-        _, given = next(lines := _lines(file), ""), next(lines, "")
-        if not given.startswith(_HEADER):
+        parts = _checked(file)
+        first = next(parts, [])
+        if len(first) < 3 or not first[1].startswith(_HEADER):
             raise BadRecording("the header is missing: the file was cut within its first lines")
-        header = Header.from_dict(_parsed(given.removeprefix(_HEADER)))
-        names = next(lines, "").rstrip("\n").split(",")
+        header = Header.from_dict(_parsed(first[1].removeprefix(_HEADER)))
+        names = first[2].rstrip("\n").split(",")
         if missing := [name for name in COLUMNS.names or () if name not in names]:
             raise BadRecording(f"the column {missing[0]} is missing")
-        events: list[StreamEvent] = []
-        ended: list[str] = []
+        wanted = [name for name in ROW.names or () if name in columns]
+        numbers = np.dtype([(one, COLUMNS[one]) for name in wanted for one in NUMBERS[name]])
+        order = [names.index(name) for name in numbers.names or ()]
+        kind = np.dtype([(name, ROW[name]) for name in wanted])
+        lines, events, ended, failure = list[str](), list[StreamEvent](), False, None
 
-        def table() -> Iterator[str]:
-            for line in lines:
-                if line.startswith(_EVENT):
-                    events.append(event_of(line.removeprefix(_EVENT)))
-                elif line.startswith(_END):
-                    ended.append(line)
-                else:
-                    yield line
+        def piece() -> Piece:
+            rows = np.zeros(0, numbers)
+            if lines:
+                rows = np.loadtxt(lines, numbers, delimiter=",", usecols=order, ndmin=1, comments=None)
+            return Piece(header, rows.view(kind), events, file.tell() / size)
 
-        order = [names.index(name) for name in COLUMNS.names or ()]
-        rows, loaded = table(), np.zeros(0, COLUMNS)
+        yield Piece(header, np.zeros(0, kind), [], 0.0)
         try:
-            if first := next(rows, ""):
-                loaded = np.loadtxt(chain([first], rows), COLUMNS, delimiter=",", usecols=order, ndmin=1, comments=None)
+            try:
+                for part in chain([first[3:]], parts):
+                    events += [event_of(line.removeprefix(_EVENT)) for line in part if line.startswith(_EVENT)]
+                    lines += [line for line in part if not line.startswith((_EVENT, _END))]
+                    ended = part[-1:] == [f"{_END}\n"]
+                    if len(lines) >= PIECE_ROWS:
+                        yield piece()
+                        lines, events = [], []
+            except BadRecording as error:  # what was checked before counts
+                failure = error
+            yield piece()
         except ValueError as error:
             raise BadRecording(f"a line cannot be read ({error}): the file is damaged") from error
-    cut = "" if ended else "the last line is not '# end'"
-    return Recording(header, loaded.view(ROW), events, cut)
+        if failure is not None:
+            raise failure
+        return "" if ended else "the last line is not '# end'"
 
 
-def _lines(file: IO[bytes]) -> Iterator[str]:
-    """Give the lines whose checksum follows, and the end."""
+def _checked(file: IO[bytes]) -> Iterator[list[str]]:
+    """Give the lines of each checksum that fits them, and the end."""
     crc, waiting = 0, list[str]()
-    for number, line in enumerate(file, 1):
+    number = 0
+    while line := file.readline():  # an iteration would hide the place in the file
+        number += 1
         if not line.endswith(b"\n"):
             break
         if line.startswith(_CRC.encode()):
             if line != _crc_line(crc):
                 raise BadRecording(f"line {number} is not the checksum of the lines before it: the file is damaged")
-            yield from waiting
+            yield waiting
             waiting = []
         else:
             waiting.append(line.decode(errors="replace"))
         crc = zlib.crc32(line, crc)
     if waiting[:1] == [f"{_END}\n"]:
-        yield waiting[0]
+        yield waiting[:1]
     elif f"{_END}\n" in waiting:
         raise BadRecording("its last samples have no checksum: the file is damaged")
 

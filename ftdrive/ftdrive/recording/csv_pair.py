@@ -1,8 +1,11 @@
 """Wrench and orientation of another program, as two CSV files on one clock, each at its own rate."""
 
 import csv
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import chain
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +15,17 @@ from ftcalib import CalibrationResult
 from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns, rotations_of
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
-from ftdrive.live.delay import DelayEstimator
-from ftdrive.live.pairing import pair_recording
-from ftdrive.live.samples import Stages, StreamInfo, WrenchFrame, mean_rate_Hz
+from ftdrive.live.delay import PERIOD_S, DelayEstimator
+from ftdrive.live.pairing import estimate_delay, paired_blocks
+from ftdrive.live.samples import Paired, Stages, StreamInfo, WrenchFrame
 from ftdrive.recording.compensation import free_samples
-from ftdrive.recording.recording import Header, Recording, rows_of
+from ftdrive.recording.recording import PIECE_ROWS, Header, Measured
 from ftdrive.runs.run import versions
 from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtSamples
 
 _WHOLE = 10**6
 """Seconds: the delay is estimated from all of a recording."""
+_READ_BYTES, _LONGEST_LINE = 1 << 21, 1 << 14
 _NEAR = 100
 """Samples before and after a step that show whether it is a gap."""
 _ROUNDS = 20
@@ -29,10 +33,8 @@ _REGULAR = 0.2
 """Largest distance of regular times from multiples of their period, in periods."""
 
 
-def read_pair(
-    wrench: Path, orientation: Path, calibration: CalibrationResult, name: str, delay_s: float | None
-) -> tuple[Recording, dict[str, float]]:
-    """Read and pair two files.
+class CsvPair:
+    """Two files as one recording of any length; the devices are unknown.
 
     Parameters
     ----------
@@ -42,55 +44,113 @@ def read_pair(
     name : str
         Of the calibration.
     delay_s : float, optional
-        Of the wrench after the orientation; None estimates it.
-
-    Returns
-    -------
-    recording : Recording
-        The devices are unknown.
-    delay : dict
-        `value` in s and `sigma`, one standard deviation, which is 0 if the delay was given.
+        Of the wrench after the orientation; None estimates it in a pass of its own.
 
     Raises
     ------
     BadDataset
         A file cannot be used, or the two have no time in common.
     """
-    samples, states = read_wrench(wrench), read_orientation(orientation)
-    unknown, sigma_s = np.full(3, np.nan), 0.0
-    sensor_rate_Hz = mean_rate_Hz(samples.t_host_ns)
-    if delay_s is None:  # from the samples without contact, which would be taken for a delay
-        first = pair_recording(samples, states, 0.0)
-        free = free_samples(calibration.compensate(first.raw, first.R_base_flange), sensor_rate_Hz)
-        estimator = DelayEstimator(calibration, unknown, window=_WHOLE)
-        pair_recording(samples.rows(np.isin(samples.seq, first.seq[free])), states, estimator)
-        delay_s, sigma_s = estimator.delay_s, estimator.sigma_s
-    paired = pair_recording(samples, states, delay_s)
-    info = StreamInfo(
-        calibration=calibration,
-        calibration_name=name,
-        arm=DeviceInfo("unknown", NOT_REPORTED, NOT_REPORTED),
-        sensor=DeviceInfo("unknown", NOT_REPORTED, NOT_REPORTED),
-        tool="",
-        utc_offset_ns=0,
-        sensor_rate_Hz=sensor_rate_Hz,
-        arm_rate_Hz=mean_rate_Hz(states.t_host_ns),
-        p_flange_sensor_m=unknown,
-        R_flange_tcp=np.eye(3),
-        p_flange_tcp_m=unknown,
-        versions=versions(),
-    )
-    recording = Recording(Header(info, WrenchFrame(), Stages()), rows_of(paired), [])
-    return recording, {"value": delay_s, "sigma": sigma_s}
+
+    cut = ""
+
+    def __init__(
+        self, wrench: Path, orientation: Path, calibration: CalibrationResult, name: str, delay_s: float | None
+    ) -> None:
+        self._wrench, self._states = wrench, _Again(partial(read_orientation, orientation))
+        rate_Hz, unknown = _rate_Hz(wrench, CHANNELS), np.full(3, np.nan)
+        info = StreamInfo(
+            calibration=calibration,
+            calibration_name=name,
+            arm=DeviceInfo("unknown", NOT_REPORTED, NOT_REPORTED),
+            sensor=DeviceInfo("unknown", NOT_REPORTED, NOT_REPORTED),
+            tool="",
+            utc_offset_ns=0,
+            sensor_rate_Hz=rate_Hz,
+            arm_rate_Hz=_rate_Hz(orientation, ()),
+            p_flange_sensor_m=unknown,
+            R_flange_tcp=np.eye(3),
+            p_flange_tcp_m=unknown,
+            versions=versions(),
+        )
+        self.header = Header(info, WrenchFrame(), Stages())
+        self.delay_s, self.delay_sigma_s = self._estimated_delay() if delay_s is None else (delay_s, 0.0)
+
+    def blocks(self) -> Iterator[Measured]:
+        """Give the samples in blocks, each with its pose. Raises `BadDataset` behind the last valid one."""
+        size = self._wrench.stat().st_size
+        share = [0.0]
+
+        def samples() -> Iterator[FtSamples]:
+            for block, place in read_wrench(self._wrench):
+                share[0] = place / size
+                yield from (block.rows(slice(i, i + PIECE_ROWS)) for i in range(0, len(block), PIECE_ROWS))
+
+        waiting: list[Paired] = []
+        for paired in paired_blocks(samples(), self._states, self.delay_s):
+            rows = Paired.concatenate([*waiting, paired])
+            if len(rows) >= PIECE_ROWS:  # as of other recordings, because the contact test goes in steps
+                yield Measured(rows.rows(slice(PIECE_ROWS)), (), share[0])
+            waiting = [rows.rows(slice(PIECE_ROWS if len(rows) >= PIECE_ROWS else 0, None))]
+        if any(map(len, waiting)):
+            yield Measured(waiting[0], (), 1.0)
+
+    def _estimated_delay(self) -> tuple[float, float]:
+        """Return the delay and its sigma, from means over `PERIOD_S` without contact, which would look like a delay."""
+        info = self.header.info
+        size = max(1, round(PERIOD_S * info.sensor_rate_Hz))
+        means = [FtSamples.concatenate(list(_means(self._wrench, size)))]
+        paired = Paired.concatenate(list(paired_blocks(means, self._states, 0.0)))
+        left = info.calibration.compensate(paired.raw, paired.R_base_flange)
+        free = paired.seq[free_samples(left, info.sensor_rate_Hz / size)]
+        means = [means[0].rows(np.isin(means[0].seq, free))]
+        estimator = DelayEstimator(info.calibration, info.p_flange_sensor_m, window=_WHOLE)
+        estimate_delay(means, self._states, estimator)
+        return estimator.delay_s, estimator.sigma_s
 
 
-def read_wrench(path: Path) -> FtSamples:
-    """Read columns t in s, fx, fy, fz in N, tx, ty, tz in N·m. Raises `BadDataset`.
+class _Again:
+    """What a function yields, as often as it is asked."""
 
-    Samples are numbered by their times, see `numbers_of`.
+    def __init__(self, states: Callable[[], Iterator[ArmStates]]) -> None:
+        self._states = states
+
+    def __iter__(self) -> Iterator[ArmStates]:
+        return self._states()
+
+
+def _means(path: Path, size: int) -> Iterator[FtSamples]:
+    """Yield the mean wrench of each so many samples, numbered, at their mean time."""
+    t_s, wrench, count = np.empty(0), np.empty((0, 6)), 0
+    for part in _table(path, CHANNELS):
+        t_s, wrench = np.concatenate([t_s, part.t_s]), np.concatenate([wrench, part.numbers])
+        n = len(t_s) // size
+        t_ns = _ns(t_s[: n * size].reshape(n, size).mean(axis=1))
+        means = wrench[: n * size].reshape(n, size, 6).mean(axis=1)
+        yield FtSamples.of(t_ns, np.arange(count, count + n), means)
+        t_s, wrench, count = t_s[n * size :], wrench[n * size :], count + n
+
+
+def read_wrench(path: Path) -> Iterator[tuple[FtSamples, int]]:
+    """Read columns t in s, fx, fy, fz in N, tx, ty, tz in N·m; yield samples and how many bytes they end behind.
+
+    Samples are numbered by their times, see `numbers_of`. Raises `BadDataset`.
     """
-    t_s, wrench, _ = _table(path, lambda _: CHANNELS, ", ".join(CHANNELS))
-    return FtSamples.of(_ns(t_s), numbers_of(t_s), wrench)
+    known, number = 0, 0
+    t_s, wrench, place = np.empty(0), np.empty((0, 6)), 0
+    for part in chain(_table(path, CHANNELS), [None]):
+        if part is not None:
+            t_s, wrench, place = np.concatenate([t_s, part.t_s]), np.concatenate([wrench, part.numbers]), part.place
+            if len(t_s) <= known + 2 * _NEAR:
+                continue
+        numbers = numbers_of(t_s)
+        numbers += number - numbers[max(known - 1, 0)]
+        end = len(t_s) if part is None else len(t_s) - _NEAR  # what follows shows whether a step is a gap
+        if end > known:
+            yield FtSamples.of(_ns(t_s[known:end]), numbers[known:end], wrench[known:end]), place
+            number = int(numbers[end - 1])
+        start = max(end - 2 * _NEAR, 0)
+        t_s, wrench, known = t_s[start:], wrench[start:], end - start
 
 
 def numbers_of(t_s: Array) -> NDArray[np.int64]:
@@ -130,41 +190,87 @@ def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
     return number
 
 
-def read_orientation(path: Path) -> ArmStates:
+def read_orientation(path: Path) -> Iterator[ArmStates]:
     """Read columns t in s and the orientation of the flange in base; position and joints are NaN. Raises `BadDataset`.
 
     The orientation is a matrix r11..r33, a quaternion qx, qy, qz, qw, or a rotation vector rx, ry, rz in rad.
     """
-    t_s, numbers, columns = _table(path, orientation_columns, ORIENTATION_FORMS)
-    try:
-        R = rotations_of(columns, numbers)
-    except BadDataset as error:
-        raise BadDataset(f"{path.name}: {error}") from error
-    unknown = np.full((len(t_s), 6), np.nan)
-    return ArmStates(_ns(t_s), unknown[:, 0], unknown, unknown, R, unknown[:, :3])
+    for part in _table(path, ()):
+        try:
+            R = rotations_of(part.names, part.numbers)
+        except BadDataset as error:
+            raise BadDataset(f"{path.name}: {error}") from error
+        unknown = np.full((len(R), 6), np.nan)
+        yield ArmStates(_ns(part.t_s), unknown[:, 0], unknown, unknown, R, unknown[:, :3])
 
 
 def _ns(t_s: Array) -> NDArray[np.int64]:
     return np.rint(t_s * 1e9).astype(np.int64)
 
 
-def _table(
-    path: Path, columns_of: Callable[[Sequence[str]], Sequence[str]], wanted: str
-) -> tuple[Array, Array, Sequence[str]]:
-    """Return times (n,), the columns that are chosen by the names of all (n, k), and their names."""
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
-        names = [name.strip() for name in next(csv.reader(file), [])]
-        found = columns_of(names)
-        if not {"t", *found} <= set(names):
-            raise BadDataset(f"{path.name}: the first row must name t and {wanted}; it names {', '.join(names)}")
-        try:
-            table = np.loadtxt(file, delimiter=",", usecols=[names.index(name) for name in ("t", *found)], ndmin=2)
-        except ValueError as error:
-            raise BadDataset(f"{path.name}: {error}: correct this line") from error
-    if len(table) < 2:
-        raise BadDataset(f"{path.name}: it has {len(table)} rows: at least 2 are needed")
-    wrong = ~np.isfinite(table).all(axis=1) | (np.diff(table[:, 0], prepend=table[0, 0]) < 0)
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise BadDataset(f"{path.name}: row {row + 1}: a number is not finite, or t = {table[row, 0]:g} goes back")
-    return table[:, 0], table[:, 1:], found
+class _Part(NamedTuple):
+    """Consecutive rows of a table."""
+
+    t_s: Array
+    """(n,)"""
+    numbers: Array
+    """(n, k)"""
+    names: Sequence[str]
+    place: int
+    """Bytes of the file up to the end of these rows."""
+
+
+def _columns(path: Path, head: bytes, wanted: Sequence[str]) -> tuple[list[str], Sequence[str]]:
+    """Return the names of all columns, and the wanted ones; those of an orientation if `wanted` is empty."""
+    names = [name.strip() for name in next(csv.reader([head.decode("utf-8-sig", "replace")]), [])]
+    found = wanted or orientation_columns(names)
+    if not {"t", *found} <= set(names):
+        words = ", ".join(wanted) or ORIENTATION_FORMS
+        raise BadDataset(f"{path.name}: the first row must name t and {words}; it names {', '.join(names)}")
+    return names, found
+
+
+def _table(path: Path, wanted: Sequence[str]) -> Iterator[_Part]:
+    """Read some columns in parts. Raises `BadDataset` behind the last valid part."""
+    count, last_s = 0, -np.inf
+    with path.open("rb") as file:
+        names, found = _columns(path, file.readline(), wanted)
+        use = [names.index(name) for name in ("t", *found)]
+        while lines := file.readlines(_READ_BYTES):
+            try:
+                table = _numbers(lines, use)
+            except ValueError as error:
+                raise BadDataset(f"{path.name}: {error}: correct this line") from error
+            wrong = ~np.isfinite(table).all(axis=1) | (np.diff(table[:, 0], prepend=last_s) < 0)
+            if wrong.any():
+                row = int(np.argmax(wrong))
+                where = f"row {count + row + 1}: a number is not finite, or t = {table[row, 0]:g} goes back"
+                raise BadDataset(f"{path.name}: {where}")
+            if len(table):
+                count, last_s = count + len(table), float(table[-1, 0])
+                yield _Part(table[:, 0], table[:, 1:], found, file.tell())
+
+
+def _numbers(lines: Sequence[bytes], use: Sequence[int]) -> Array:
+    """Parse some columns. Raises `ValueError`."""
+    return np.loadtxt([line.decode(errors="replace") for line in lines], delimiter=",", usecols=use, ndmin=2)
+
+
+def _rate_Hz(path: Path, wanted: Sequence[str]) -> float:
+    """Return the mean rate of the rows of a file, by its first and last row and the number of its lines."""
+    with path.open("rb") as file:
+        names, _ = _columns(path, file.readline(), wanted)
+        first, lines = file.readline(), 1
+        last = tail = first
+        while part := file.read(_READ_BYTES):
+            lines += part.count(b"\n")
+            tail = (tail + part)[-_LONGEST_LINE:]
+    *_, last = [first, *(line for line in tail.splitlines() if line.strip())]
+    count = lines + (not tail.endswith(b"\n")) if first.strip() else 0
+    if count < 2:
+        raise BadDataset(f"{path.name}: it has {count} rows: at least 2 are needed")
+    try:
+        begin, end = (_numbers([line], [names.index("t")]) for line in (first, last))
+    except ValueError as error:
+        raise BadDataset(f"{path.name}: {error}: correct this line") from error
+    return (count - 1) / max(float((end - begin)[0, 0]), 1e-9)

@@ -1,9 +1,12 @@
 """The file formats by their endings."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from contextlib import closing
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple, Protocol
+
+import numpy as np
 
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.samples import StreamEvent
@@ -11,9 +14,15 @@ from ftdrive.recording.csv_file import CsvFile, read_csv
 from ftdrive.recording.growing_file import partial_of
 from ftdrive.recording.mcap_file import McapFile, read_mcap
 from ftdrive.recording.parquet_file import ParquetFile, read_parquet
-from ftdrive.recording.recording import ROW, Header, Recording, Rows
-
-_PIECE_ROWS = 7000
+from ftdrive.recording.recording import (
+    ROW,
+    Header,
+    Measured,
+    Piece,
+    Recording,
+    Rows,
+    measured,
+)
 
 
 class RecordingFile(Protocol):
@@ -43,7 +52,8 @@ class Format(NamedTuple):
     """A file format."""
 
     new: Callable[[Path, Header], RecordingFile]
-    read: Callable[[Path, Collection[str]], Recording]
+    read: Callable[[Path, Collection[str]], Generator[Piece, None, str]]
+    """Gives the header first, with a piece without samples."""
     package: str
     """Needed for it."""
 
@@ -51,7 +61,7 @@ class Format(NamedTuple):
 _FORMATS = {
     ".mcap": Format(McapFile, read_mcap, "mcap"),
     ".csv": Format(CsvFile, read_csv, "csv"),
-    ".parquet": Format(ParquetFile, read_parquet, "duckdb"),
+    ".parquet": Format(ParquetFile, read_parquet, "zstandard"),
 }
 ENDINGS = tuple(_FORMATS)
 
@@ -77,15 +87,71 @@ def require_new_recordings(paths: Sequence[Path]) -> None:
         raise ConfigError("two outputs name the same file: leave one out")
 
 
+class RecordingReader:
+    """A recording on disk, read in blocks, also the `.partial` of one that was interrupted.
+
+    Parameters
+    ----------
+    path : Path
+        Its ending names the format: .mcap, .csv or .parquet.
+    columns : collection of str
+        Fields of `Recording.rows` that are needed. Others may be missing, which makes reading faster.
+
+    Raises
+    ------
+    ConfigError
+        Another ending, or the package for the format is missing.
+    BadRecording
+        The header is damaged, or of another program.
+    OSError
+        The file does not exist or cannot be read.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from ftdrive.recording import RecordingReader
+    >>> for samples, events, _ in RecordingReader(Path("peg.csv")).blocks():
+    ...     t_ns, wrench, R_base_flange = samples.t_host_ns, samples.raw, samples.R_base_flange
+    >>> wrench.shape[1:], R_base_flange.shape[1:]
+    ((6,), (3, 3))
+    """
+
+    def __init__(self, path: Path, columns: Collection[str] = ROW.names or ()) -> None:
+        self.path, self.cut = path, ""
+        """Why it ends early, once it was read; empty if it is complete."""
+        self._columns, self._read = columns, format_of(path).read
+        with closing(self._pieces()) as pieces:
+            self.header = next(pieces).header
+
+    def pieces(self) -> Iterator[Piece]:
+        """Give the samples as stored. Raises `BadRecording` behind the last piece that is intact."""
+        count = 0
+        for piece in self._pieces():
+            count += len(piece.rows)
+            yield piece
+        if not count:
+            raise BadRecording("it contains no sample: the file was cut, or the stream ended at once", self.path)
+
+    def blocks(self) -> Iterator[Measured]:
+        """Give the samples as measured: wrench and pose with their times. Raises as `pieces`."""
+        return measured(self.pieces())
+
+    def _pieces(self) -> Generator[Piece, None, None]:
+        try:
+            self.cut = yield from self._read(self.path, self._columns)
+        except BadRecording as error:
+            raise BadRecording(error.problem, self.path) from error
+
+
 def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
-    """Read a recording, also the `.partial` of one that was interrupted.
+    """Read a recording into memory, also the `.partial` of one that was interrupted.
 
     Parameters
     ----------
     path : str or Path
         Its ending names the format: .mcap, .csv or .parquet.
     columns : collection of str
-        Fields of `Recording.rows` that are needed. Others may be missing, which makes reading Parquet faster.
+        Fields of `Recording.rows` that are needed. Others may be missing, which makes reading faster.
 
     Raises
     ------
@@ -104,15 +170,10 @@ def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ())
     >>> table["fz"].shape, table["raw_fz"].shape
     ((3000,), (3000,))
     """
-    path = Path(path)
-    file_format = format_of(path)
-    try:
-        recording = file_format.read(path, columns)
-    except BadRecording as error:
-        raise BadRecording(error.problem, path) from error
-    if not len(recording.rows):
-        raise BadRecording("it contains no sample: the file was cut, or the stream ended at once", path)
-    return recording
+    reader = RecordingReader(Path(path), columns)
+    pieces = list(reader.pieces())
+    events = [event for piece in pieces for event in piece.events]
+    return Recording(reader.header, np.concatenate([piece.rows for piece in pieces]), events, reader.cut)
 
 
 def write_recording(path: str | Path, recording: Recording) -> None:
@@ -141,8 +202,8 @@ def write_recording(path: str | Path, recording: Recording) -> None:
     path = Path(path)
     file = format_of(path).new(path, recording.header)
     try:
-        for rows, events, _ in recording.pieces(_PIECE_ROWS):
-            file.append(rows, events)
+        for piece in recording.pieces():
+            file.append(piece.rows, piece.events)
         file.complete()
     except BaseException:
         file.discard()

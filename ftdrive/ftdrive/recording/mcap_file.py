@@ -4,7 +4,7 @@ Channels of CDR messages: those of `ftdrive.live.ros2`, `/ft_sample` with the ot
 viewers. All times are UTC. The attachments `calibration.json` and `recording.json` hold the header. Each chunk, each
 attachment and the whole data section have a CRC-32.
 
-The samples of about a second are packed as one array and become one chunk. The writer of the package `mcap` takes
+Some thousand samples are packed as one array and become one chunk. The writer of the package `mcap` takes
 messages one by one, which costs half a core at 7 kHz. The format: https://mcap.dev/spec
 """
 
@@ -13,9 +13,8 @@ import json
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
@@ -29,7 +28,7 @@ from ftdrive.live.frames import frames_in_flange
 from ftdrive.live.quaternions import matrices
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.growing_file import GrowingFile
-from ftdrive.recording.recording import ROW, Header, Recording, Rows, changed
+from ftdrive.recording.recording import ROW, Header, Piece, Rows, changed
 
 if TYPE_CHECKING:
     from mcap.records import McapRecord
@@ -68,6 +67,8 @@ _HEAD: Final = np.dtype(
 )
 """What precedes the body of a message."""
 _LARGEST: Final = 1 << 32
+LEVEL: Final = -5
+"""Of zstd: numbers with noise in their last digits hardly shrink, at any level."""
 _NONE: Final = np.zeros(0, np.int64)
 
 
@@ -115,9 +116,9 @@ class McapFile(GrowingFile):
         content, tables = self._messages(rows, events)
         if not tables:
             return
-        times = np.concatenate([table[:, 0] for table in tables.values()])
-        first_ns, last_ns = int(times.min()), int(times.max())
-        packed = compress(content, 1)
+        first_ns = min(int(table[:, 0].min()) for table in tables.values())
+        last_ns = max(int(table[:, 0].max()) for table in tables.values())
+        packed = compress(content, LEVEL)
         chunk = _bytes(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(content), len(content)))
         indexes, places = b"", {}
         for number, table in tables.items():
@@ -143,30 +144,30 @@ class McapFile(GrowingFile):
     def _messages(self, rows: Rows, events: Sequence[StreamEvent]) -> tuple[bytes, dict[int, NDArray[np.uint64]]]:
         """Return the messages of a chunk, and for each channel (n, 2) times and places in it."""
         offset_ns = self._header.info.utc_offset_ns
-        content, tables = b"", {}
+        content, tables = list[bytes | memoryview](), {}
+        size = 0
         if len(rows):
             t_ns = rows["t_host_ns"] + offset_ns
             bodies = _bodies(rows, t_ns, ros2.frame_id(self._header.frame))
-            parts = [_records(_CHANNELS[topic], t_ns, rows["seq"], body) for topic, body in bodies.items()]
-            content = np.hstack(parts).tobytes()
-            *starts, width = np.cumsum([0, *(part.shape[1] for part in parts)]).tolist()
-            for topic, start in zip(bodies, starts, strict=True):
+            width = sum(_HEAD.itemsize + body.itemsize for body in bodies.values())
+            samples, start = np.empty((len(rows), width), np.uint8), 0
+            for topic, body in bodies.items():
+                end = start + _HEAD.itemsize + body.itemsize
+                _fill(samples[:, start:end], _CHANNELS[topic], t_ns, rows["seq"], body)
                 tables[_CHANNELS[topic]] = _table(t_ns, start + width * np.arange(len(rows)))
+                start = end
             some = np.flatnonzero(np.diff(t_ns // _TRANSFORMS_STEP_NS, prepend=0))
-            placed = _records(_CHANNELS[ros2.TRANSFORMS], t_ns[some], 0, self._transforms(rows[some], t_ns[some]))
-            tables[_CHANNELS[ros2.TRANSFORMS]] = _table(
-                t_ns[some], len(content) + placed.shape[1] * np.arange(len(some))
-            )
-            content += placed.tobytes()
+            placed = _records(_CHANNELS[ros2.TRANSFORMS], t_ns[some], self._transforms(rows[some], t_ns[some]))
+            places = samples.size + placed.shape[1] * np.arange(len(some))
+            tables[_CHANNELS[ros2.TRANSFORMS]] = _table(t_ns[some], places)
+            content, size = [samples.data, placed.data], samples.size + placed.size
         if events:
             times = np.array([event.t_host_ns for event in events]) + offset_ns
-            logs = [
-                _records(_CHANNELS[EVENTS], t, 0, _log(event, int(t))) for t, event in zip(times, events, strict=True)
-            ]
-            places = len(content) + np.cumsum([0, *(log.size for log in logs)])
+            logs = [_records(_CHANNELS[EVENTS], t, _log(event, int(t))) for t, event in zip(times, events, strict=True)]
+            places = size + np.cumsum([0, *(log.size for log in logs)])
             tables[_CHANNELS[EVENTS]] = _table(times, places[:-1])
-            content += b"".join(log.tobytes() for log in logs)
-        return content, tables
+            content += [log.data for log in logs]
+        return b"".join(content), tables
 
     def _transforms(self, rows: Rows, t_ns: NDArray[np.int64]) -> NDArray[np.void]:
         """Pack the frames that the messages name: flange in base, and the others in flange."""
@@ -174,7 +175,7 @@ class McapFile(GrowingFile):
         frames = frames_in_flange(self._header.frame, self._header.info, R_base_flange)
         placed = [("base", "flange", np.nan_to_num(rows["p_base_flange_m"]), R_base_flange)]
         placed += [("flange", name, p_m, R) for name, (R, p_m) in frames.items()]
-        return _array(ros2.pack_transforms(t_ns, placed))
+        return ros2.pack_transforms(t_ns, placed)
 
     def complete(self) -> None:
         """Write the summary and give the file its name. Raises `OSError`."""
@@ -206,28 +207,31 @@ def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArra
     for name, _ in _SAMPLE:
         sample[name] = rows[name]
     pose = np.hstack([rows["p_base_flange_m"], rows["quaternion_base_flange"]])
-    packed = {
+    return {
         ros2.RAW: ros2.pack_wrenches(t_ns, rows["raw"], "sensor"),
         ros2.COMPENSATED: ros2.pack_wrenches(t_ns, rows["wrench"], frame),
         ros2.POSE: ros2.pack_pose_numbers(t_ns, pose),
         ros2.JOINTS: ros2.pack_joints(t_ns, rows["q_rad"]),
+        SAMPLE: sample.view(f"V{sample.itemsize}"),
     }
-    bodies = {topic: _array(each) for topic, each in packed.items()}
-    return bodies | {SAMPLE: sample.view(f"V{sample.itemsize}")}
 
 
-def _array(bodies: Sequence[bytes]) -> NDArray[np.void]:
-    return np.frombuffer(b"".join(bodies), f"V{len(bodies[0])}")
+def _records(channel: int, t_ns: ArrayLike, bodies: ros2.Messages) -> NDArray[np.uint8]:
+    """Return message records without a sequence number as bytes (n, size)."""
+    records = np.empty((len(bodies), _HEAD.itemsize + bodies.itemsize), np.uint8)
+    _fill(records, channel, t_ns, 0, bodies)
+    return records
 
 
-def _records(channel: int, t_ns: ArrayLike, sequence: ArrayLike, bodies: NDArray[np.void]) -> NDArray[np.uint8]:
-    """Return message records as bytes (n, size)."""
-    records = np.zeros(len(bodies), [*_HEAD.descr, ("body", bodies.dtype)])
-    records["opcode"], records["length"] = _MESSAGE, _HEAD.itemsize - 9 + bodies.itemsize
-    records["channel"], records["sequence"] = channel, np.bitwise_and(sequence, 0xFFFFFFFF)
-    records["log"] = records["publish"] = t_ns
-    records["body"] = bodies
-    return records.view(np.uint8).reshape(len(bodies), records.itemsize)
+def _fill(
+    records: NDArray[np.uint8], channel: int, t_ns: ArrayLike, sequence: ArrayLike, bodies: ros2.Messages
+) -> None:
+    """Write message records into bytes (n, size)."""
+    fields = records.view([*_HEAD.descr, ("body", bodies.dtype)])[:, 0]
+    fields["opcode"], fields["length"] = _MESSAGE, _HEAD.itemsize - 9 + bodies.itemsize
+    fields["channel"], fields["sequence"] = channel, np.bitwise_and(sequence, 0xFFFFFFFF)
+    fields["log"] = fields["publish"] = t_ns
+    fields["body"] = bodies
 
 
 def _table(t_ns: ArrayLike, places: ArrayLike) -> NDArray[np.uint64]:
@@ -263,42 +267,57 @@ def _bytes(*records: "McapRecord") -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]  # mcap has no types here
 
 
-def read_mcap(path: Path, _columns: Collection[str] = ()) -> Recording:
-    """Read a recording, also one that was interrupted. Raises `BadRecording` or `OSError`."""
-    from mcap.data_stream import ReadDataStream
-    from mcap.records import Attachment
+def read_mcap(path: Path, columns: Collection[str]) -> Generator[Piece, None, str]:
+    """Read a recording in pieces; return why it ends early. Raises `BadRecording` or `OSError`."""
     from zstandard import ZstdError
 
     documents: dict[str, Any] = {}
-    content = _Content()
-    cut = "its last record is incomplete"
+    content: _Content | None = None
+    size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise BadRecording("the first bytes are not those of MCAP")
         try:
             for opcode, data in _data_section(file):
-                if opcode == _INDEX:
-                    content.index(data)
-                    continue
-                content.close_chunk()
                 if opcode == _ATTACHMENT:
-                    _require_crc(data[:-4], data[-4:])
-                    attachment = Attachment.read(ReadDataStream(io.BytesIO(data)))
-                    documents[attachment.name] = json.loads(attachment.data)
-                elif opcode == _CHUNK:
+                    _add_document(data, documents)
+                elif opcode in (_CHUNK, _INDEX, _DATA_END):
+                    if content is None:
+                        content = _Content(_header(documents), columns)
+                        yield content.piece(0.0)
+                    if opcode == _INDEX:
+                        content.index(data)
+                        continue
+                    if content.close_chunk():
+                        yield content.piece(file.tell() / size)
+                    if opcode == _DATA_END:
+                        return ""
                     content.open_chunk(data)
-                elif opcode == _DATA_END:
-                    cut = ""
-            if cut:
-                _require_no_end(file)
-            if not {"calibration.json", "recording.json"} <= documents.keys():
-                raise BadRecording("the header is missing: the file was cut within it, or another program wrote it")
-            header = Header.from_dict(documents["recording.json"] | {"calibration": documents["calibration.json"]})
+            _require_no_end(file)
+            if content is None:
+                content = _Content(_header(documents), columns)
+                yield content.piece(0.0)
             with suppress(ValueError):  # the last chunk of an interrupted file may lack the end of its index
                 content.close_chunk()
-            return Recording(header, *content.on_the_clock_of(header), cut)
+            yield content.piece(1.0)
         except (MemoryError, OverflowError, TypeError, ValueError, ZstdError, struct.error) as error:
             raise BadRecording(f"a record cannot be read ({error!r}): the file is damaged") from error
+    return "its last record is incomplete"
+
+
+def _add_document(data: bytes, documents: dict[str, Any]) -> None:
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Attachment
+
+    _require_crc(data[:-4], data[-4:])
+    attachment = Attachment.read(ReadDataStream(io.BytesIO(data)))
+    documents[attachment.name] = json.loads(attachment.data)
+
+
+def _header(documents: Mapping[str, Any]) -> Header:
+    if not {"calibration.json", "recording.json"} <= documents.keys():
+        raise BadRecording("the header is missing: the file was cut within it, or another program wrote it")
+    return Header.from_dict(documents["recording.json"] | {"calibration": documents["calibration.json"]})
 
 
 def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
@@ -334,10 +353,12 @@ def _require_no_end(file: IO[bytes]) -> None:
 
 
 class _Content:
-    """Columns and events as read so far, with times in UTC."""
+    """What the last chunk has added: columns and events, with the times of the cell."""
 
-    def __init__(self) -> None:
-        self._columns: defaultdict[str, list[NDArray[Any]]] = defaultdict(list)
+    def __init__(self, header: Header, columns: Collection[str]) -> None:
+        self._header = header
+        self._kind = np.dtype([(name, ROW[name]) for name in ROW.names or () if name in columns])
+        self._columns: dict[str, list[NDArray[Any]]] = {name: [] for name in ("t_host_ns", *(self._kind.names or ()))}
         self._events: list[StreamEvent] = []
         self._messages = b""
         self._indexes: list[bytes] = []
@@ -355,8 +376,8 @@ class _Content:
         """Take the index of one channel in the chunk; other programs may have divided the file into other chunks."""
         self._indexes.append(data)
 
-    def close_chunk(self) -> None:
-        """Take the messages of the chunk; raises `ValueError` unless the indexes name each of them.
+    def close_chunk(self) -> bool:
+        """Take the messages of the chunk; return whether there is one. Raises `ValueError` unless all are indexed.
 
         The CRC of a chunk covers its messages, not their indexes.
         """
@@ -367,27 +388,30 @@ class _Content:
             np.concatenate([_NONE, *(places for _, _, places, _ in found)]),
             np.concatenate([_NONE, *(ends for *_, ends in found)]),
         )
+        offset_ns = self._header.info.utc_offset_ns
         for channel, t_ns, places, ends in found:
             if channel == _CHANNELS[EVENTS]:
-                for t, place, end in zip(t_ns.tolist(), places.tolist(), ends.tolist(), strict=True):
+                for t, place, end in zip((t_ns - offset_ns).tolist(), places.tolist(), ends.tolist(), strict=True):
                     self._events.append(_event(messages[place + _HEAD.itemsize : end], t))
             elif channel in _COLUMNS:
                 kind, behind = _COLUMNS[channel]
                 values = _at(messages, ends - behind - kind.itemsize, kind)
-                for name in kind.names:
-                    self._columns[name].append(values[name].copy())
+                for name in self._columns.keys() & set(kind.names):
+                    self._columns[name].append(values[name])
                 if channel == _CHANNELS[SAMPLE]:
-                    self._columns["t_host_ns"].append(t_ns)
+                    self._columns["t_host_ns"].append(t_ns - offset_ns)
+        return bool(messages)
 
-    def on_the_clock_of(self, header: Header) -> tuple[Rows, list[StreamEvent]]:
-        """Return samples and events with the times of the cell."""
-        names = ROW.names or ()
-        rows = np.zeros(min(sum(map(len, self._columns[name])) for name in names), ROW)
-        for name in names if len(rows) else ():
-            rows[name] = np.concatenate(self._columns.pop(name))[: len(rows)]
-        offset_ns = header.info.utc_offset_ns
-        rows["t_host_ns"] -= offset_ns
-        return rows, [replace(event, t_host_ns=event.t_host_ns - offset_ns) for event in self._events]
+    def piece(self, share: float) -> Piece:
+        """Return the samples that are complete and the events; samples whose columns still lack some wait for these."""
+        columns = {name: np.concatenate([np.empty(0, ROW[name]), *parts]) for name, parts in self._columns.items()}
+        rows = np.empty(min(map(len, columns.values())), self._kind)
+        for name, column in columns.items():
+            if name in (self._kind.names or ()):
+                rows[name] = column[: len(rows)]
+            self._columns[name] = [column[len(rows) :]] if len(column) > len(rows) else []
+        events, self._events = self._events, []
+        return Piece(self._header, rows, events, share)
 
 
 def _indexed(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -402,7 +426,7 @@ def _indexed(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDA
 
 def _require_complete(messages: bytes, places: NDArray[np.int64], ends: NDArray[np.int64]) -> None:
     """Raise `ValueError` unless there is nothing but schemas and channels between the indexed messages."""
-    order = np.argsort(places)
+    order = np.argsort(places, kind="stable")  # that of each channel is in order
     begins, stops = np.append(places[order], len(messages)), np.insert(ends[order], 0, 0)
     for stop, begin in zip(stops[stops != begins].tolist(), begins[stops != begins].tolist(), strict=True):
         place = stop
@@ -419,7 +443,7 @@ def _at(data: bytes, places: NDArray[np.int64], kind: np.dtype[Any]) -> NDArray[
     """Return the values at these places; without a copy if they are equally far apart."""
     if len(places) and (places.min() < 0 or places.max() + kind.itemsize > len(data)):
         raise ValueError("an index points out of its chunk")
-    steps = np.unique(np.diff(places))
-    if len(steps) == 1:
+    steps = np.diff(places)
+    if len(steps) and (steps == steps[0]).all():
         return np.ndarray(len(places), kind, data, int(places[0]), (int(steps[0]),))
     return np.array([np.frombuffer(data, kind, 1, place)[0] for place in places.tolist()], kind)

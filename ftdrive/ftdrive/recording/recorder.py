@@ -1,8 +1,8 @@
-"""The recorder: a consumer of a stream that writes files."""
+"""Writers of recordings: files that grow together, a stream recorded in them, and a recording converted."""
 
 import signal
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -11,12 +11,98 @@ from typing import Any
 import numpy as np
 
 from ftcalib.files import JSON
+from ftdrive.errors import BadRecording
 from ftdrive.live.samples import Block, StreamEvent, StreamInfo
-from ftdrive.recording.files import RecordingFile, format_of, require_new_recordings
-from ftdrive.recording.recording import ROW, Header, rows_of
+from ftdrive.recording.files import RecordingFile, RecordingReader, format_of, require_new_recordings
+from ftdrive.recording.recording import ROW, Header, Rows, divided, rows_of
 
 _FLUSH_NS = 200_000_000
 """Writing takes a few ms, in which the stream waits."""
+
+
+class RecordingFiles:
+    """New files that grow together, each with all samples.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        The ending chooses the format: .mcap, .csv or .parquet.
+    header : Header
+
+    Raises
+    ------
+    ConfigError
+        An ending is unknown, or the package for a format is missing.
+    OSError
+        A file exists, or its folder does not.
+    """
+
+    def __init__(self, paths: Sequence[Path], header: Header) -> None:
+        self.saved: list[Path] = []
+        """Files that are complete."""
+        self.partial: dict[Path, int] = {}
+        """Files that could not be completed, and how many samples each of them keeps."""
+        self._paths, self._files = paths, list[RecordingFile]()
+        with ExitStack() as stack:
+            stack.callback(self.discard)
+            for path in paths:
+                self._files.append(format_of(path).new(path, header))
+            stack.pop_all()
+
+    def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
+        """Write samples of one frame, and the events since the samples before.
+
+        Raises
+        ------
+        OSError
+            A file cannot be written. None will be completed, and the error names what remains in which `.partial`.
+        """
+        with _uninterrupted():
+            try:
+                for file in self._files:
+                    file.append(rows, events)
+            except BaseException as error:
+                files, self._files = self._files, []
+                for file in files:
+                    file.keep()
+                    if not file.samples:
+                        file.discard()
+                self.partial = {file.partial: file.samples for file in files if file.samples}
+                if isinstance(error, OSError):
+                    raise self._named(error) from error
+                raise
+
+    def complete(self) -> None:
+        """Complete all files that hold every sample.
+
+        Raises
+        ------
+        OSError
+            A file could not be completed; the others were. It names what remains in which `.partial`.
+        """
+        files, self._files, failure = self._files, [], None
+        with _uninterrupted():
+            for path, file in zip(self._paths, files, strict=False):  # after an error there is no file
+                try:
+                    file.complete()
+                    self.saved.append(path)
+                except OSError as error:
+                    self.partial[file.partial] = file.samples
+                    failure = failure or error
+        if failure is not None:
+            raise self._named(failure)
+
+    def discard(self) -> None:
+        """Delete what was written and is not complete."""
+        for file in self._files:
+            file.discard()
+        self._files = []
+
+    def _named(self, error: OSError) -> OSError:
+        """Return an error of the same kind that names what is safe."""
+        kept = " and ".join(f"{path} keeps {samples} samples" for path, samples in self.partial.items())
+        kept = f"{kept}, which `ftdrive convert` saves as a complete file" if kept else "no sample is kept"
+        return type(error)(f"{error.strerror or error}: {kept}")
 
 
 class Recorder:
@@ -43,16 +129,22 @@ class Recorder:
     def __init__(self, paths: Sequence[Path], info: StreamInfo, configuration: Mapping[str, JSON]) -> None:
         self.samples, self.gaps, self.lost = 0, 0, 0
         self.first_ns = self.last_ns = 0
-        self.saved: list[Path] = []
-        """Files that are complete."""
-        self.partial: dict[Path, int] = {}
-        """Files that could not be completed, and how many samples each of them keeps."""
         require_new_recordings(paths)
         self._paths, self._info, self._configuration = paths, info, configuration
-        self._files: list[RecordingFile] = []
+        self._files: RecordingFiles | None = None
         self._header: Header | None = None
         self._blocks: list[Block] = []
         self._events: list[StreamEvent] = []
+
+    @property
+    def saved(self) -> Sequence[Path]:
+        """Files that are complete."""
+        return self._files.saved if self._files else ()
+
+    @property
+    def partial(self) -> Mapping[Path, int]:
+        """Files that could not be completed, and how many samples each of them keeps."""
+        return self._files.partial if self._files else {}
 
     @property
     def duration_s(self) -> float:
@@ -98,35 +190,20 @@ class Recorder:
             A file could not be completed; the others were. It names what remains in which `.partial`.
         """
         self._flush()
-        files, self._files, failure = self._files, [], None
-        with _uninterrupted():
-            for path, file in zip(self._paths, files, strict=False):  # without a sample there is no file
-                try:
-                    file.complete()
-                    self.saved.append(path)
-                except OSError as error:
-                    self.partial[file.partial] = file.samples
-                    failure = failure or error
-        if failure is not None:
-            raise self._named(failure)
+        if self._files:
+            self._files.complete()
 
     def discard(self) -> None:
         """Delete what was written."""
-        for file in self._files:
-            file.discard()
-        self._files = []
+        if self._files:
+            self._files.discard()
 
     def _follow(self, block: Block) -> None:
         """Begin with the first block; record a change of frame or stages."""
         t_ns = int(block.t_host_ns[0])
         if self._header is None:
-            header = Header(self._info, block.frame, block.stages, self._configuration)
-            with ExitStack() as stack:
-                stack.callback(self.discard)
-                for path in self._paths:
-                    self._files.append(format_of(path).new(path, header))
-                stack.pop_all()
-            self._header, self.first_ns = header, t_ns
+            self._header, self.first_ns = Header(self._info, block.frame, block.stages, self._configuration), t_ns
+            self._files = RecordingFiles(self._paths, self._header)
         changes = []
         if block.frame != self._header.frame:
             text = f"The compensated wrench is in {block.frame}"
@@ -141,26 +218,58 @@ class Recorder:
     def _flush(self) -> None:
         blocks, self._blocks = self._blocks, []
         events, self._events = self._events, []
-        if not self._files or (not blocks and not events):
-            return
-        rows = rows_of(Block.concatenate(blocks)) if blocks else np.zeros(0, ROW)
-        with _uninterrupted():
-            try:
-                for file in self._files:
-                    file.append(rows, events)
-            except BaseException as error:
-                files, self._files = self._files, []
-                for file in files:
-                    file.keep()
-                self.partial = {file.partial: file.samples for file in files}
-                if isinstance(error, OSError):
-                    raise self._named(error) from error
-                raise
+        if self._files and (blocks or events):
+            self._files.append(rows_of(Block.concatenate(blocks)) if blocks else np.zeros(0, ROW), events)
 
-    def _named(self, error: OSError) -> OSError:
-        """Return an error of the same kind that names what is safe."""
-        kept = " and ".join(f"{path} keeps {samples} samples" for path, samples in self.partial.items())
-        return type(error)(f"{error.strerror or error}: {kept}, which `ftdrive convert` saves as a complete file")
+
+def converted(
+    reader: RecordingReader, target: Path, show: Callable[[str], object] = lambda _: None
+) -> tuple[dict[str, Any], BaseException | None]:
+    """Write a recording of any length as a new file, in blocks.
+
+    Parameters
+    ----------
+    reader : RecordingReader
+    target : Path
+        Its ending names the format.
+    show : callable
+        Gets in words how much is done.
+
+    Returns
+    -------
+    numbers : dict
+        samples, duration_s, gaps.
+    failure : exception or None
+        A file that is damaged and Ctrl-C end the recording behind the last valid piece.
+
+    Raises
+    ------
+    BadRecording
+        The first piece is damaged.
+    OSError
+        The file cannot be written; the error names what was kept.
+    """
+    files = RecordingFiles([target], reader.header)
+    failure: BaseException | None = None
+    samples = gaps = first_ns = last_ns = seq = 0
+    with ExitStack() as stack:
+        stack.callback(files.discard)
+        try:
+            for piece in reader.pieces():
+                for rows, events in divided(piece):
+                    if len(rows):
+                        if not samples:
+                            first_ns, seq = int(rows["t_host_ns"][0]), int(rows["seq"][0]) - 1
+                        gaps += int(np.count_nonzero(np.diff(rows["seq"], prepend=seq) != 1))
+                        samples, last_ns, seq = samples + len(rows), int(rows["t_host_ns"][-1]), int(rows["seq"][-1])
+                    files.append(rows, events)
+                show(f"Converting: {piece.share:.0%}")
+        except (BadRecording, KeyboardInterrupt) as error:
+            if not samples:
+                raise
+            failure = error
+        files.complete()
+    return {"samples": samples, "duration_s": (last_ns - first_ns) * 1e-9, "gaps": gaps}, failure
 
 
 @contextmanager

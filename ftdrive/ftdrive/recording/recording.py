@@ -4,19 +4,19 @@ The pose is stored as a quaternion, so that all formats hold the same bits.
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import accumulate, pairwise
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format
 from ftdrive.errors import BadRecording
+from ftdrive.live.quaternions import matrices, quaternions
 from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame
 from ftdrive.runs.verification_record import VerificationRecord
 from ftdrivers.interfaces import DeviceInfo, Fact
@@ -25,6 +25,8 @@ FORMAT: Final = "ftdrive.recording/1"
 
 Rows = NDArray[np.void]
 """(n,) records of the type `ROW`."""
+PIECE_ROWS: Final = 1 << 13
+"""Samples of a piece, which stay in the cache."""
 
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 _GROUPS: Mapping[str, tuple[str, Sequence[str]]] = {
@@ -82,8 +84,21 @@ def rows_of(samples: Block | Paired) -> Rows:
         if hasattr(samples, name):
             rows[name] = getattr(samples, name)
     if len(rows):
-        rows["quaternion_base_flange"] = Rotation.from_matrix(samples.R_base_flange).as_quat()
+        rows["quaternion_base_flange"] = quaternions(samples.R_base_flange)
     return rows
+
+
+def paired_of(rows: Rows) -> Paired:
+    """Return samples as measured, each with its pose; columns that were not read are 0."""
+    read = rows.dtype.names or ()
+    names = [item.name for item in fields(Paired) if item.name != "R_base_flange"]
+    columns = {
+        name: np.ascontiguousarray(rows[name])
+        if name in read
+        else np.zeros((len(rows), *ROW[name].shape), ROW[name].base)
+        for name in names
+    }
+    return Paired(R_base_flange=matrices(rows["quaternion_base_flange"]), **columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,6 +187,47 @@ def event_of(text: str) -> StreamEvent:
         raise ValueError(f"an event without {error}") from error
 
 
+class Piece(NamedTuple):
+    """Consecutive samples of a recording, as they are stored."""
+
+    header: Header
+    rows: Rows
+    events: Sequence[StreamEvent]
+    """Since the piece before."""
+    share: float
+    """Of the recording up to the end of this piece, 0 to 1."""
+
+
+class Measured(NamedTuple):
+    """Consecutive samples of a recording as measured: wrench and pose with their times."""
+
+    samples: Paired
+    events: Sequence[StreamEvent]
+    share: float
+    """As in `Piece`."""
+
+
+class Source(Protocol):
+    """A recording of any length."""
+
+    @property
+    def header(self) -> Header:
+        """Of the whole."""
+
+    @property
+    def cut(self) -> str:
+        """Why it ends early, once it was read; empty if it is complete."""
+
+    def blocks(self) -> Iterator[Measured]:
+        """Give all samples in blocks; each call begins again. Raises `BadRecording` behind the last valid block."""
+
+
+def with_calibration(header: Header, calibration: CalibrationResult, name: str) -> Header:
+    """Return a header with another calibration."""
+    info = replace(header.info, calibration=calibration, calibration_name=name, verification=None, calibration_state="")
+    return replace(header, info=info)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
     """A recording in memory.
@@ -201,34 +257,21 @@ class Recording:
         """Number of places where samples are missing."""
         return int(np.count_nonzero(np.diff(self.rows["seq"]) != 1))
 
-    def paired(self, which: slice = slice(None)) -> Paired:
-        """Return samples as measured, each with its pose; columns that were not read are 0."""
-        rows = self.rows[which]
-        R_base_flange = Rotation.from_quat(rows["quaternion_base_flange"]).as_matrix()
-        read = rows.dtype.names or ()
-        names = [item.name for item in fields(Paired) if item.name != "R_base_flange"]
-        columns = {name: rows[name] if name in read else np.zeros(len(rows), ROW[name]) for name in names}
-        return Paired(R_base_flange=R_base_flange, **columns)
+    def paired(self) -> Paired:
+        """Return the samples as measured, each with its pose; columns that were not read are 0."""
+        return paired_of(self.rows)
 
-    def with_calibration(self, calibration: CalibrationResult, name: str) -> Self:
-        """Return the recording with another calibration in its header."""
-        info = replace(
-            self.header.info, calibration=calibration, calibration_name=name, verification=None, calibration_state=""
-        )
-        return replace(self, header=replace(self.header, info=info))
-
-    def pieces(self, length: int) -> Iterator[tuple[Rows, Sequence[StreamEvent], Header]]:
+    def pieces(self) -> Iterator[Piece]:
         """Give samples in pieces of one frame, the events since the piece before, and the header that holds there."""
-        header, n = self.header, len(self.rows)
-        events = sorted(self.events, key=lambda event: event.t_host_ns)
-        at = places_of(events, self.rows)
-        changes = [row for row, event in zip(at, events, strict=True) if event.kind in ("frame", "stages")]
-        ends = sorted({*range(length, n, length), *changes, n} - {0})
-        for start, end in pairwise([0, *ends]):
-            found = [event for row, event in zip(at, events, strict=True) if start <= row < end or row == end == n]
-            for event in found:
+        header = self.header
+        for rows, events in divided(Piece(header, self.rows, self.events, 1.0)):
+            for event in events:
                 header = changed(header, event)
-            yield self.rows[start:end], found, header
+            yield Piece(header, rows, events, 1.0)
+
+    def blocks(self) -> Iterator[Measured]:
+        """Give the samples as measured, in blocks."""
+        return measured(self.pieces())
 
 
 def changed(header: Header, event: StreamEvent) -> Header:
@@ -236,3 +279,39 @@ def changed(header: Header, event: StreamEvent) -> Header:
     if event.kind == "frame":
         return replace(header, frame=frame_of(event.values))
     return replace(header, stages=Stages(**event.values)) if event.kind == "stages" else header
+
+
+def divided(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
+    """Divide samples where frame or stages change, and into `PIECE_ROWS`; events stay in front of what follows them."""
+    n = len(piece.rows)
+    events = sorted(piece.events, key=lambda event: event.t_host_ns)
+    at = places_of(events, piece.rows)
+    changes = [row for row, event in zip(at, events, strict=True) if event.kind in ("frame", "stages")]
+    ends = sorted({*range(PIECE_ROWS, n, PIECE_ROWS), *changes, n} - {0}) or [0]
+    for start, end in pairwise([0, *ends]):
+        yield (
+            piece.rows[start:end],
+            [e for row, e in zip(at, events, strict=True) if start <= row < end or row == end == n],
+        )
+
+
+def measured(pieces: Iterable[Piece]) -> Iterator[Measured]:
+    """Give samples as measured in blocks of `PIECE_ROWS`, however they are stored, up to an error."""
+    waiting, events, share, failure = list[Rows](), list[StreamEvent](), 0.0, None
+    try:
+        for piece in pieces:
+            waiting.append(piece.rows)
+            events += piece.events
+            share = piece.share
+            if sum(map(len, waiting)) >= PIECE_ROWS:
+                rows = np.concatenate(waiting)
+                for end in range(PIECE_ROWS, len(rows) + 1, PIECE_ROWS):
+                    yield Measured(paired_of(rows[end - PIECE_ROWS : end]), events, share)
+                    events = []
+                waiting = [rows[len(rows) // PIECE_ROWS * PIECE_ROWS :]]
+    except BadRecording as error:
+        failure = error
+    if events or any(map(len, waiting)):
+        yield Measured(paired_of(np.concatenate(waiting)), events, share)
+    if failure is not None:
+        raise failure

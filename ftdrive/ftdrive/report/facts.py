@@ -22,7 +22,7 @@ from ftdrive.report.subject import Subject
 from ftdrive.runs.pose_hints import hints, names_of
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification_record import MARKS, marks_of
-from ftdrive.terminal.report import drift_in_words, error_in_words
+from ftdrive.terminal.report import drift_in_use, drift_in_words, error_in_words
 
 FORMAT = "ftdrive.report/1"
 NEXT_STEP = {
@@ -156,6 +156,7 @@ def _drift(subject: Subject) -> dict[str, Any]:
         "components": {k: v for k, v in result.components.items() if k.startswith(("walk", "slope"))},
         "first_pose_again": None if again is None else {"words": drift_in_words(again)[0], **again.to_dict()},
         "lag1": result.quality.get("lag1"),
+        "in_use": drift_in_use(result),
     }
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ftcalib.rounding import to_place_of
 from ftdrive.report.document import Figure, Section, Table
 from ftdrive.report.words import capital, in_words, label_of, rounded, shown_poses
-from ftdrive.terminal.report import QUANTITIES, values_of
+from ftdrive.terminal.report import SIGMA_OF_THE_TOOL, axes_of, quantities_of, values_of
 
 Facts = Mapping[str, Any]
 
@@ -37,6 +37,7 @@ def estimates(facts: Facts) -> Section:
     )
     tables = [Table("", ("quantity", "estimate", "± 1 sigma"), list(_estimate_rows(result)))]
     if result["response"] is not None:
+        text.append(f"Sigma: {SIGMA_OF_THE_TOOL}.")
         columns = ("entry", "value", "± 1 sigma")
         tables.append(Table("Gain and cross-talk of the sensor", columns, _response(result), folded=True))
     return Section("estimates", "Estimates", text, [figure], tables)
@@ -44,10 +45,10 @@ def estimates(facts: Facts) -> Section:
 
 def _estimate_rows(result: Facts) -> Iterator[tuple[str, str, str]]:
     fixed_below = _ROUNDED * float(np.sqrt(np.diag(result["covariance"]).max()))
-    for label, scale, unit, key in QUANTITIES:
+    for label, scale, unit, key in quantities_of(result):
         values, sigmas = (values_of(source[key], key) * scale for source in (result, result["sigma"]))
         fixed = sigmas <= fixed_below * scale
-        for axis, value, sigma, known in zip(_AXES, values, sigmas, fixed, strict=False):
+        for axis, value, sigma, known in zip(axes_of(len(values)), values, sigmas, fixed, strict=True):
             name = f"{label} {axis}, {unit}" if len(values) > 1 else f"{label}, {unit}"
             spread = 0.0 if known else float(sigma)
             yield name, to_place_of(value, spread), "fixed" if known else to_place_of(spread, spread)
@@ -74,12 +75,12 @@ def error(facts: Facts) -> Section:
     """Show the predicted error over all orientations, and its worst direction."""
     force, torque = facts["error_map"]["force_N"], facts["error_map"]["torque_Nm"]
     text = [
-        f"Compensation error of a free tool: {facts['error']['words']}.",
+        f"Compensation error of a free tool at the next use: {facts['error']['words']}.",
         f"Worst direction of the tool axis for the force: {force['words']}, {rounded(force['largest'])} N.",
         f"Worst direction for the torque: {torque['words']}, {rounded(torque['largest'])} N·m.",
     ]
     trust = (
-        "The map shows the stated uncertainty only: the cross-validated error above is larger."
+        "The map shows the stated uncertainty only: the error above has what the model lacks."
         if facts["error"]["cross_validated"]
         else "The measured noise explains the residuals, so the map can be trusted."
     )
@@ -222,6 +223,8 @@ def drift(facts: Facts) -> Section:
     else:
         model = "random walk" if any(name.startswith("walk") for name in seen["components"]) else "linear"
         text.append(f"The fit includes a drift of the bias ({model}), listed below. Good: within 3 sigma.")
+    if seen["in_use"] is not None:
+        text.append(f"{capital(seen['in_use'])}. Tare before use.")
     rows = [
         (
             f"{name}, {unit}",

@@ -10,7 +10,7 @@ from ftcalib.model import Array
 from ftcalib.routine import MOVED_RAD, DriftCheck, PoseRecord, drift_check, is_return, turned_rad
 
 _SIGNIFICANT = 4.0
-_CHANGES = {"com_shifted", "load_changed", "bias_stepped", "sensor_turned"}
+_CHANGES = {"com_shifted", "load_changed", "bias_stepped", "sensor_turned", "sensor_changed"}
 """Findings of a result that changed between two poses."""
 
 

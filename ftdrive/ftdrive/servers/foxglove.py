@@ -163,13 +163,13 @@ class FoxgloveServer:
         """Send a block; never waits."""
         t_ns = block.t_host_ns + self._info.utc_offset_ns
         frame = ros2.frame_id(block.frame)
-        self._send(ros2.RAW, t_ns, lambda: ros2.pack_wrenches(t_ns, block.raw, "sensor"))
-        self._send(ros2.COMPENSATED, t_ns, lambda: ros2.pack_wrenches(t_ns, block.wrench, frame))
+        self._send(ros2.RAW, t_ns, lambda: ros2.pack_wrenches(t_ns, block.raw, "sensor").tolist())
+        self._send(ros2.COMPENSATED, t_ns, lambda: ros2.pack_wrenches(t_ns, block.wrench, frame).tolist())
         if (rows := self._arm.rows(t_ns)).any():  # the poses between are interpolated
             poses, t_arm_ns = block.rows(rows), t_ns[rows]
             R, p = poses.R_base_flange, poses.p_base_flange_m
-            self._send(ros2.POSE, t_arm_ns, lambda: ros2.pack_poses(t_arm_ns, R, p))
-            self._send(ros2.JOINTS, t_arm_ns, lambda: ros2.pack_joints(t_arm_ns, poses.q_rad))
+            self._send(ros2.POSE, t_arm_ns, lambda: ros2.pack_poses(t_arm_ns, R, p).tolist())
+            self._send(ros2.JOINTS, t_arm_ns, lambda: ros2.pack_joints(t_arm_ns, poses.q_rad).tolist())
         newest = t_ns[-1:]
         if self._scene.rows(newest).any():
             self._send(TRANSFORMS, newest, lambda: [scene.transforms(block, self._info, int(newest[0]))])

@@ -27,6 +27,12 @@ _DERIVED = {"gravity_force_base_N"}
 """Rows that follow from mass and tilt: printed only with -v."""
 
 
+SIGMA_OF_THE_TOOL = (
+    "that of mounting, weight and centre of mass includes what gain and cross-talk of the sensor hide in them; the "
+    "compensation error does not, because there they cancel"
+)
+
+
 def print_result(
     result: CalibrationResult,
     *,
@@ -53,8 +59,11 @@ def print_result(
     saved : Path, optional
         The calibration file, printed in the last line.
     """
-    answer.print(Text.assemble(("Result", "bold cyan"), f"  {result.n_poses} poses, method {result.method}"))
+    amount = f"{result.n_poses} poses" if result.motion is None else f"{100 * result.motion.used_share:.0f} % used"
+    answer.print(Text.assemble(("Result", "bold cyan"), f"  {amount}, method {result.method}"))
     answer.print(_table(result, truth))
+    if result.response is not None:
+        answer.print(hanging(" sigma: ", SIGMA_OF_THE_TOOL, answer))
     head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
     answer.print(hanging(head, f"compensation error {error_in_words(result)}", answer))
     if truth is not None:
@@ -66,7 +75,10 @@ def print_result(
         answer.print(hanging(" truth: ", words, answer))
     for finding in result.findings:
         answer.print(hanging("   ", finding.words, answer))
-    if messages.verbose or result.verdict != "good":
+    for contact in () if result.motion is None else result.motion.contacts:
+        words = "{t_s:.1f} s for {duration_s:.1f} s, up to {force_N:.1f} N, {torque_Nm:.2f} N·m".format(**contact)
+        answer.print(hanging(" contact: at ", words, answer))
+    if result.motion is None and (messages.verbose or result.verdict != "good"):
         _print_fit(result, names_of(records))
     _print_drift(result, drift)
     for hint in hints(result, records) if hinted or messages.verbose else ():
@@ -83,13 +95,13 @@ def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
             table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
-    for label, scale, unit, key in QUANTITIES:
+    for label, scale, unit, key in quantities_of(data):
         if key in _DERIVED and not messages.verbose:
             continue
         estimates, sigmas = (values_of(source[key], key) * scale for source in (data, data["sigma"]))
         truths = None if truth is None else values_of(truth[key], key) * scale
         fixed = sigmas <= fixed_below * scale
-        for i, axis in enumerate(" " if len(estimates) == 1 else "xyz"):
+        for i, axis in enumerate(axes_of(len(estimates))):
             sigma = 0.0 if fixed[i] else float(sigmas[i])
             spread = "fixed" if fixed[i] else to_place_of(sigma, sigma)
             known = [] if truths is None else [to_place_of(truths[i], sigma)]
@@ -127,16 +139,38 @@ def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
             f"{with_sigma(np.linalg.norm(change[3:]), np.max(sigma[3:]))} N·m from the first pose to the last"
         )
         answer.print(hanging(" drift in the fit: ", words, answer))
+        if (ahead := drift_in_use(result)) is not None:
+            answer.print(hanging(" next use: ", f"{ahead}. Tare before use.", answer))
 
 
 def error_in_words(result: CalibrationResult) -> str:
-    """Describe the compensation error of a free tool, N and N·m, and its source."""
-    words = "{:.4f} N, {:.5f} N·m".format(*result.predicted_error())
-    if result.noise_explains:
-        return f"{words} rms (predicted)"
-    seen = "{:.4f} N, {:.5f} N·m".format(*result.likely_error())
-    why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
-    return f"{seen} rms (cross-validated, as {why}; predicted: {words})"
+    """Describe the compensation error of a free tool at the next use, N and N·m, and its source."""
+    predicted, likely = (
+        "{:.4f} N, {:.5f} N·m".format(*error) for error in (result.predicted_error(), result.likely_error())
+    )
+    if result.noise_explains and likely == predicted:
+        return f"{predicted} rms (predicted)"
+    sources = []
+    if not result.noise_explains:
+        why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
+        sources.append(f"cross-validated, as {why}")
+    if any(result.quality.get("last_bias_offset", ())):
+        sources.append("a minute after the tour, with the drift")
+    return f"{likely} rms ({'; '.join(sources)}; predicted: {predicted})"
+
+
+def drift_in_use(result: CalibrationResult) -> str | None:
+    """Describe how far the bias was from that of the result at the last pose, and how it moves; None without drift."""
+    offset, growth = (np.array(result.quality.get(k, np.zeros(6))) for k in ("last_bias_offset", "bias_growth_per_min"))
+    if not offset.any():
+        return None
+    (off_N, off_Nm), (grow_N, grow_Nm) = (
+        [float(np.linalg.norm(part)) for part in np.split(values, 2)] for values in (offset, growth)
+    )
+    return (
+        f"at the last pose the bias was {off_N:.2g} N, {off_Nm:.2g} N·m off its mean, which the result has; "
+        f"it moves {grow_N:.2g} N, {grow_Nm:.2g} N·m a minute"
+    )
 
 
 def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:
@@ -170,6 +204,22 @@ QUANTITIES: Sequence[tuple[str, float, str, str]] = (
     ("base tilt beta", 180 / np.pi, "deg", "tilt_beta_rad"),
 )
 """Label, factor from the unit of the file to that of the screen, unit on the screen, key in the file."""
+_IN_MOTION: Sequence[tuple[str, float, str, str]] = (
+    ("inertia", 1e3, "g·m²", "inertia_kg_m2"),
+    ("wrench after pose", 1e3, "ms", "delay_s"),
+    ("sensor above flange", 1e3, "mm", "height_m"),
+)
+_INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
+
+
+def quantities_of(document: Mapping[str, Any]) -> Sequence[tuple[str, float, str, str]]:
+    """Return the quantities of the content of a calibration file as `QUANTITIES`, those of a motion included."""
+    return [*QUANTITIES, *_IN_MOTION] if "inertia_kg_m2" in document else QUANTITIES
+
+
+def axes_of(count: int) -> Sequence[str]:
+    """Return the names of the elements of a number, a vector, or a symmetric tensor."""
+    return {1: ("",), 3: tuple("xyz"), 6: _INERTIA}[count]
 
 
 def values_of(value: Any, key: str) -> Array:
@@ -177,6 +227,8 @@ def values_of(value: Any, key: str) -> Array:
     values = np.asarray(value, dtype=np.float64)
     if key == "R_flange_sensor" and values.ndim == 2:  # shown as a rotation vector
         values = Rotation.from_matrix(values).as_rotvec()
+    if key == "inertia_kg_m2":
+        values = values[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     return np.atleast_1d(values)
 
 

@@ -182,23 +182,6 @@ def test_a_frozen_sensor_repeats_itself_until_it_measures_again() -> None:
     assert len(np.unique(world.measure(50), axis=0)) == 50
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_a_seed_draws_a_plausible_cell(seed: int) -> None:
-    truth = Truth.drawn(seed)
-    assert 0.5 <= truth.mass_kg <= 2.5
-    distance = np.linalg.norm(truth.p_sensor_com_m)
-    assert 0.030 <= distance <= 0.100
-    assert truth.p_sensor_com_m[2] > 0.7 * distance
-    np.testing.assert_allclose(truth.R_flange_sensor @ truth.R_flange_sensor.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(truth.R_flange_sensor) > 0
-    assert math.degrees(math.acos(truth.R_flange_sensor[2, 2])) <= 3.0
-    assert math.degrees(math.hypot(truth.tilt_alpha_rad, truth.tilt_beta_rad)) <= 2.0
-    assert np.abs(truth.force_bias_N).max() <= 15
-    assert np.abs(truth.torque_bias_Nm).max() <= 1
-    assert truth.to_json() == Truth.drawn(seed).to_json()
-    assert truth.to_json() != Truth.drawn(seed + 1).to_json()
-
-
 def test_readers_in_other_threads_never_see_half_a_posture() -> None:
     """Wrench magnitude is the same in all postures; a mixed one would differ."""
     world = World(plain(), DH, POSTURE)

@@ -154,7 +154,8 @@ def test_a_centre_of_mass_far_outside_is_rejected_and_units_are_named() -> None:
     result = solve(far, setup=Setup(**TOOL))
     assert (result.verdict, codes(result)[0]) == ("rejected", "com_outside_tool")
     assert ["lbf", "N·m"] in result.findings[0].values["units"]
-    assert solve(far).verdict == "good"
+    undescribed = solve(far)
+    assert (undescribed.verdict, undescribed.findings[0].code) == ("usable", "com_too_far")
 
 
 def test_reversed_torques_come_before_what_they_put_outside() -> None:

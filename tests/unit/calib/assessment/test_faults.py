@@ -1,6 +1,7 @@
 """What was mixed up is named, and undoing it helps."""
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from ftcalib import (
 from ftcalib.known import Known
 from ftcalib.model import Array, predict
 
+Sequence = Literal["xyz", "XYZ"]
 SIGMA = np.repeat([0.05, 0.00125], 3)
 SWAP = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
 CYCLE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
@@ -59,6 +61,50 @@ def test_the_order_of_quaternions_is_named(shift: int, order: str, seed: int) ->
     assert (finding.code, finding.values["order"]) == ("quaternion_order", order)
     assert finding.values["corrected_N"] < 0.4 * finding.values["residual_N"]
     assert solved(R, wrench).mass_kg == pytest.approx(np.linalg.norm(p.gravity_force_base_N) / 9.80665, rel=0.01)
+
+
+@pytest.mark.parametrize(("read", "written"), [("xyz", "XYZ"), ("XYZ", "xyz")])
+def test_the_order_of_euler_angles_is_named(read: Sequence, written: Sequence) -> None:
+    _, R, wrench = session(1)
+    angles = Rotation.from_matrix(R).as_euler(written)
+    finding = first(Rotation.from_euler(read, angles).as_matrix(), wrench)
+    assert (finding.code, finding.values["order"]) == ("euler_angles", "extrinsic" if written == "xyz" else "intrinsic")
+
+
+def test_readings_of_the_orientations_that_fit_alike_are_all_named() -> None:
+    """On a wall along y, quaternions in one order fit like inverted ones in the other."""
+    _, R, wrench = session(1)
+    on_wall = Rotation.from_rotvec([np.pi / 2, 0, 0]).as_matrix() @ R
+    quaternions = np.roll(Rotation.from_matrix(on_wall).as_quat(), 1, axis=1)
+    n = len(R)
+    dataset = CalibrationDataset(
+        Rotation.from_quat(quaternions).as_matrix(), wrench, None, np.zeros(n, np.int64), np.arange(float(n))
+    )
+    finding = solve(dataset, setup=Setup(up_in_base=(0, -1, 0))).findings[0]
+    assert "w, x, y, z" in finding.words
+
+
+def test_columns_of_force_and_torque_that_were_exchanged_are_named() -> None:
+    _, R, wrench = session(1)
+    assert first(R, np.roll(wrench, 3, axis=1)).code == "columns_swapped"
+
+
+def test_coarse_and_saturated_readings_are_named() -> None:
+    _, R, wrench = session(1)
+    coarse = first(R, np.round(wrench))
+    assert (coarse.code, coarse.values["step_N"]) == ("quantised", 1)
+    limit = np.sort(wrench[:, 0])[-4]
+    wrench[:, 0] = np.minimum(wrench[:, 0], limit)
+    saturated = first(R, wrench)
+    rows = (np.flatnonzero(wrench[:, 0] == limit) + 1).tolist()
+    assert (saturated.code, saturated.values["channel"], saturated.values["poses"]) == ("saturated", "fx", rows)
+    assert "quantised" not in {one.code for one in solved(R, np.round(session(1)[2], 3)).findings}
+
+
+def test_a_wrench_that_is_compensated_already_has_no_weight() -> None:
+    p, R, wrench = session(1)
+    left = wrench - 0.99 * (predict(p, R) - np.concatenate([p.force_bias_N, p.torque_bias_Nm]))
+    assert first(R, left).code in {"weight_compensated", "weight_insignificant"}
 
 
 @pytest.mark.parametrize("by", [1, -1])
@@ -101,6 +147,7 @@ def test_orientations_in_left_handed_axes_are_named(S: Array) -> None:
 @pytest.mark.parametrize(
     ("force", "torque", "pair"),
     [
+        (9.80665e-3, 1.0, ["gf", "N·m"]),
         (1e-3, 1e-3, ["mN", "N·mm"]),
         (1e-3, 1.0, ["mN", "N·m"]),
         (1e3, 1e3, ["kN", "kN·m"]),

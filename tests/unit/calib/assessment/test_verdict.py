@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Parameters, Setup, solve
-from ftcalib.assessment.cross_validation import IndependentFit, standardized
+from ftcalib.assessment.cross_validation import DriftAhead, IndependentFit, standardized
 from ftcalib.assessment.faults import faults
 from ftcalib.assessment.verdict import (
     Quality,
@@ -425,8 +425,38 @@ def test_wrong_units_of_torque_are_detected(
 
 def test_a_drift_of_rounding_size_is_no_drift() -> None:
     change, sigma = np.array([0.0, 0.1, 0.0, 0.0, 0.0, 3e-20]), np.array([0.01] * 3 + [1e-21] * 3)
-    (finding,) = _drift(DriftEstimate(change, sigma, np.zeros((2, 6))), 20.0, is_cause=True)
-    assert (finding.severity, finding.values) == ("note", {"force_N": 0.1, "torque_Nm": 0.0})
+    drift, zero = DriftEstimate(change, sigma, np.zeros((2, 6))), np.zeros(6)
+    for at_next_use_N, severity in ((0.3, "note"), (0.5, "limit")):  # of 20 N, 2 % are 0.4
+        ahead = DriftAhead(zero, zero, np.array([0.0, at_next_use_N**2, 0, 0, 0, 0]))
+        (finding,) = _drift(drift, ahead, 20.0, is_cause=True)
+        assert (finding.severity, finding.values) == (severity, {"force_N": 0.1, "torque_Nm": 0.0})
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_a_linear_drift_goes_on_for_the_next_minute(timed: bool) -> None:
+    ramp = np.linspace(-1, 1, 24)[:, None] * [0.3, 0, 0.4, 0, 0.01, 0]
+    times = 20.0 * np.arange(24, dtype=np.float64) if timed else np.full(24, np.nan)
+    noise = 0.01 * np.random.default_rng(26).normal(size=(24, 6)) * SIGMA / SIGMA[0]
+    wrench = predict(TRUTH, R24) + ramp + noise
+    result = solve(CalibrationDataset(R24, wrench, None, np.zeros(24, np.int64), times), drift="linear")
+    steps = 3 if timed else 6  # of 20 s; of 10 s where no time is known
+    at_the_end = np.array([0.3, 0, 0.4, 0, 0.01, 0])
+    np.testing.assert_allclose(result.quality["last_bias_offset"], at_the_end, atol=0.02)
+    np.testing.assert_allclose(result.quality["bias_growth_per_min"], steps * at_the_end * 2 / 23, atol=0.02)
+    np.testing.assert_allclose(result.likely_error(), (1 + steps * 2 / 23) * np.array([0.5, 0.01]), rtol=0.1)
+
+
+def test_the_likely_error_is_that_of_the_next_use_where_the_bias_walks() -> None:
+    walk, rng, ratios = np.repeat([0.1, 0.003], 3), np.random.default_rng(27), []
+    times = 10.0 * np.arange(24, dtype=np.float64)
+    for _ in range(12):
+        moved = np.cumsum(rng.normal(size=(30, 6)) * walk, axis=0)  # six more in the minute after
+        wrench = noisy(rng, R24) + moved[:24]
+        result = solve(CalibrationDataset(R24, wrench, white(24), np.full(24, 500), times))
+        error = result.compensate(predict(TRUTH, R24) + moved[-1], R24)
+        ratios.append(np.mean(np.sum(error.reshape(-1, 2, 3) ** 2, axis=2), axis=0) / result.likely_error() ** 2)
+        assert result.likely_error()[0] > 1.5 * result.quality["loo_force_rms_N"]
+    assert 0.6 < np.sqrt(np.mean(ratios)) < 1.3
 
 
 def test_a_real_session_is_usable_and_one_with_drift_is_never_good(real_data: Path) -> None:

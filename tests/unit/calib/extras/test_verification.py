@@ -252,6 +252,37 @@ def test_a_change_is_found_all_the_same() -> None:
     assert (found.passed, found.change) == (False, "bias")
 
 
+@pytest.mark.parametrize("poses", [24, 6])
+def test_hysteresis_is_no_false_alarm_and_hides_no_change(poses: int) -> None:
+    R, new = special(range(1, 25)) if poses == 24 else special(SUBSET_6), orientations(6)
+    lag = 0.002
+    for seed in range(2):
+        y, y_new = readings(TRUTH, R, seed), readings(TRUTH, new, seed + 100)
+        y[1:] -= lag * np.diff(predict(TRUTH, R), axis=0)
+        moved = -lag * np.diff(predict(TRUTH, np.concatenate([R[-1:], new])), axis=0)
+        fitted = CalibrationDataset(R, y, noise_of(poses), np.zeros(poses, np.int64), np.full(poses, np.nan))
+        calibration = solve(fitted)
+        assert verify(calibration, new, y_new + moved, noise_of(6), fitted=fitted).passed
+        for what in ("bias", "payload", "centre of mass"):
+            changed = readings(CHANGED[what], new, seed + 100) + moved
+            assert verify(calibration, new, changed, noise_of(6), fitted=fitted).change == what
+
+
+def test_a_shifted_centre_of_mass_is_named_although_the_gain_turns_the_forces() -> None:
+    """The antisymmetric part of a gain is taken for a turn of the sensor, which the torques do not make."""
+    R, new, turn = special(range(1, 25)), orientations(6), Rotation.from_rotvec([0.02, -0.02, 0.02]).as_matrix()
+
+    def read(parameters: Parameters, R: Array, seed: int) -> Array:
+        y = readings(parameters, R, seed, COEFFICIENTS)
+        y[:, :3] = (y[:, :3] - parameters.force_bias_N) @ turn.T + parameters.force_bias_N
+        return y
+
+    fitted = CalibrationDataset(R, read(TRUTH, R, 2), noise_of(24), np.zeros(24, np.int64), np.full(24, np.nan))
+    moved = read(CHANGED["centre of mass"], new, 3)
+    found = verify(solve(fitted), new, moved, noise_of(6), fitted=fitted)
+    assert (found.change, found.alternatives) == ("centre of mass", ())
+
+
 def test_gain_and_cross_talk_keep_the_size_that_the_fit_found() -> None:
     R = special(range(1, 25))
     wrench = readings(TRUTH, R, 2, COEFFICIENTS)

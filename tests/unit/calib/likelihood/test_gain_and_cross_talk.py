@@ -1,6 +1,7 @@
 """Gain and cross-talk of the sensor: found where they are, applied, kept in the file."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from ftcalib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, LEVER_M, 
 from ftcalib.likelihood.session import Session
 from ftcalib.likelihood.variance_components import FORCE, RESPONSE, component, maximise
 from ftcalib.model import Array, gravity_wrench, predict
+from ftcalib.result import require_positive_definite
 
 SIGMA = np.repeat([0.05, 0.00125], 3)
 WHITE = np.diag(SIGMA**2)
@@ -113,6 +115,26 @@ def test_white_noise_hides_no_walk_and_gain() -> None:
     assert "white_force_N" not in found
 
 
+@pytest.mark.parametrize("seed", [5, 11])
+def test_the_joint_covariance_is_positive_definite_where_the_noise_is_unknown(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    _, R, wrench, _, _ = session(rng, 24, 0.02, 0.01)
+    best = fit(R, wrench + np.cumsum(2 * SIGMA * rng.normal(size=(24, 6)), axis=0), None)
+    assert best.response is not None
+    require_positive_definite(best.response.covariance)
+
+
+def test_a_far_centre_of_mass_is_no_reason_against_gain_and_cross_talk() -> None:
+    rng = np.random.default_rng(3)
+    p, R = truth(rng), np.asarray(Rotation.random(24, rng=rng).as_matrix())
+    p = replace(p, p_sensor_com_m=np.array([0.0, 0.0, 0.2]))
+    M, L = 0.03 * rng.normal(size=(3, 3)), 0.01 * LEVER_M * rng.normal(size=(3, 3))
+    best = fit(R, read(p, R, M, L) + SIGMA * rng.normal(size=(24, 6)), WHITE)
+    assert {"gain", "cross_talk"} <= best.components.keys()
+    elsewhere = Rotation.random(50, rng=rng).as_matrix()
+    assert np.sqrt(np.mean((predicted(best, elsewhere) - read(p, elsewhere, M, L)) ** 2)) < SIGMA[0]
+
+
 def test_six_poses_are_too_few_to_look_for_it() -> None:
     _, R, wrench, _, _ = session(np.random.default_rng(2), 6, 0.03, 0.03)
     assert fit(R, wrench, WHITE).response is None
@@ -145,15 +167,50 @@ def test_it_is_kept_in_the_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(document["response"]["force_gain"], result.response.force_gain)
 
 
-@pytest.mark.slow
-def test_the_mass_is_uncertain_by_the_gain_common_to_all_axes() -> None:
-    z = []
-    for seed in range(12):
+@pytest.mark.parametrize("seeds", [12, pytest.param(100, marks=pytest.mark.slow)])
+def test_sigmas_of_the_tool_include_what_gain_and_cross_talk_hide(seeds: int) -> None:
+    z, compensation = [], []
+    for seed in range(seeds):
         rng = np.random.default_rng(seed)
-        p, R, wrench, _, _ = session(rng, 24, 0.02, 0.0)
+        p, R, wrench, M, L = session(rng, 24, 0.02, 0.02)
         result = solve(CalibrationDataset(R, wrench, np.tile(WHITE, (24, 1, 1)), np.zeros(24, int), np.arange(24.0)))
-        z.append((result.weight_N - np.linalg.norm(p.gravity_force_base_N)) / result.sigma["weight_N"])
-    assert 0.3 < np.sqrt(np.mean(np.square(z))) < 1.3
+        error = np.append(result.parameters.difference(p), result.weight_N - np.linalg.norm(p.gravity_force_base_N))
+        stated = [result.sigma[name] for name in ("R_flange_sensor", "gravity_force_base_N", "force_bias_N")]
+        stated += [result.sigma[name] for name in ("p_sensor_com_m", "torque_bias_Nm", "weight_N")]
+        z.append(error / np.hstack(stated))
+        e = result.compensate(read(p, R[:1], M, L), R[:1])[0]
+        compensation.append(e @ np.linalg.solve(result.wrench_covariance(R[:1])[0], e) / 6)
+    ratio = np.sqrt([np.mean(part**2) for part in np.split(np.array(z), [3, 6, 9, 12, 15], axis=1)])
+    np.testing.assert_allclose(ratio, 1, atol=0.25 + 1.5 / np.sqrt(seeds))
+    assert np.sqrt(np.mean(compensation)) == pytest.approx(1, abs=0.15 + 1 / np.sqrt(seeds))
+
+
+def test_only_a_found_response_widens_the_sigmas_of_a_calibration() -> None:
+    _, R, wrench, _, _ = session(np.random.default_rng(0), 24, 0.0, 0.0)
+    result = solve(CalibrationDataset(R, wrench, np.tile(WHITE, (24, 1, 1)), np.zeros(24, int), np.arange(24.0)))
+    assert result.response is None
+    np.testing.assert_array_equal(result.tool_covariance, result.covariance)
+    assert 0.002 * result.weight_N < result.sigma["weight_N"] < 0.003 * result.weight_N
+
+
+def test_a_known_mounting_hides_no_gain() -> None:
+    p, R, wrench, _, _ = session(np.random.default_rng(0), 24, 0.02, 0.02)
+    cov = np.tile(WHITE, (24, 1, 1))
+    known = Known(R_flange_sensor=p.R_flange_sensor)
+    result = solve(CalibrationDataset(R, wrench, cov, np.zeros(24, int), np.arange(24.0)), known=known)
+    assert result.response is not None
+    np.testing.assert_array_equal(result.sigma["R_flange_sensor"], 0)
+    assert np.min(result.sigma["p_sensor_com_m"]) > 1.5 * np.sqrt(np.diag(result.covariance)[9:12].max())
+
+
+@pytest.mark.parametrize("seed", [53, 112])
+def test_forces_are_not_called_noisy_where_the_torques_alone_determine_the_mounting(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    p = replace(truth(rng), p_sensor_com_m=np.array([0.03, 0.03, 0.15]))
+    R = Rotation.from_euler("xyz", 60 * rng.uniform(-1, 1, (12, 3)), degrees=True).as_matrix()
+    M, L = 0.03 * rng.normal(size=(3, 3)), 0.01 * LEVER_M * rng.normal(size=(3, 3))
+    best = fit(R, read(p, R, M, L) + 0.2 * SIGMA * rng.normal(size=(12, 6)), None)
+    assert best.components["white_force_N"] < SIGMA[0]
 
 
 def test_it_is_found_along_the_axes_that_have_it() -> None:

@@ -119,7 +119,16 @@ def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...],
     r = (np.linalg.cholesky(V) @ rng.normal(size=(n, 6, 1)))[..., 0]
     r += np.cumsum(rng.normal(size=(n, 6)) * walk, axis=0)
     return Linearised(
-        J, r, (np.zeros((8, 8)), np.zeros(8)), turn, D, time, np.ones(n, bool), None, np.zeros((n, 6, 11))
+        J,
+        r,
+        (np.zeros((8, 8)), np.zeros(8)),
+        turn,
+        D,
+        time,
+        np.ones(n, bool),
+        False,
+        np.zeros((n, 6, 11)),
+        np.zeros((n, 6, 12)),
     )
 
 
@@ -234,7 +243,7 @@ def test_unknown_noise_widens_sigma_like_students_distribution() -> None:
     x, C = estimates_of_unknown_variances(p, at)
     nu = 6 * 8 - 8
     np.testing.assert_allclose(x[:8], at.step)
-    np.testing.assert_allclose(C[:8, :8], at.C * (1 + (1.96**2 + 1) / (2 * nu)), rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(C[:8, :8], at.C[:8, :8] * (1 + (1.96**2 + 1) / (2 * nu)), rtol=1e-3, atol=1e-9)
     assert stats.t.ppf(0.975, nu) / 1.96 == pytest.approx(np.sqrt(C[0, 0] / at.C[0, 0]), rel=2e-3)
 
 

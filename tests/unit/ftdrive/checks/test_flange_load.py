@@ -70,6 +70,9 @@ def test_sigma_agrees_with_numerical_derivatives() -> None:
         ]
     ).T
     expected = np.diag(jacobian @ covariance @ jacobian.T).copy()
+    common_gain = np.zeros(15)
+    common_gain[3:6] = 0.002 * result.gravity_force_base_N
+    expected += (jacobian @ common_gain) ** 2
     expected[3] += (0.3 / 1.6 * 0.04) ** 2 / 12
     load = flange_load(result, 0.3, 0.04)
     assert [load.sigma_kg, *load.sigma_m] == pytest.approx(np.sqrt(expected), rel=1e-6)

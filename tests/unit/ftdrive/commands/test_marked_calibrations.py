@@ -11,6 +11,7 @@ import pytest
 from ftcalib import CalibrationResult
 from ftdrive import cli
 from ftdrive.recording import Recorder, read_recording
+from ftdrive.recording.recording import with_calibration
 from ftdrive.runs.bundle import write_bundle
 from ftdrive.runs.run import Run
 from tests.calibrated_runs import calibrated_run
@@ -139,7 +140,7 @@ def test_a_recording_of_an_emulated_cell_says_so_whatever_its_calibration(tmp_pa
     recorder.close()
     found = read_recording(path)
     assert found.header.info.marks == ("EMULATED",)
-    assert found.with_calibration(calibration(), "c.json").header.info.marks == ("EMULATED",)
+    assert with_calibration(found.header, calibration(), "c.json").info.marks == ("EMULATED",)
 
 
 def test_a_bundle_names_an_emulated_run(tmp_path: Path) -> None:

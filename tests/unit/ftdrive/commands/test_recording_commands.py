@@ -20,6 +20,7 @@ from ftdrive.cell.config import CellConfig
 from ftdrive.commands.record import Duration
 from ftdrive.live.samples import Block, StreamEvent
 from ftdrive.recording import Recorder, read_recording
+from ftdrive.recording import recorder as recorder_module
 from ftdrive.recording.growing_file import GrowingFile
 from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.recorded import UTC_OFFSET_NS, block, calibration, info
@@ -272,6 +273,48 @@ def test_compensate_prints_a_table(recorded: Path, capsys: pytest.CaptureFixture
     assert "bias change ± 1 sigma" in out
     assert "compensated: sensor axes, about the sensor origin" in out
     assert max(map(len, out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("command", ["compensate", "convert"])
+@pytest.mark.parametrize("ending", [".mcap", ".csv", ".parquet"])
+def test_damage_and_control_c_keep_what_was_before(
+    command: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path, target = Path(f"a{ending}"), Path(f"b{ending}")
+    recorder = Recorder([path], info(), {})
+    for start in range(0, 24_600, 8200):
+        recorder.write(block(8200, start, step_ns=2_000_000))
+    recorder.close()
+    call = [command, str(path), *(["-o"] if command == "compensate" else []), str(target), "--json"]
+    append = recorder_module.RecordingFiles.append
+    written = [0]
+
+    def interrupted(*given: Any) -> None:
+        append(*given)
+        written[0] += len(given[1])
+        if written[0] > 8_000:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(recorder_module.RecordingFiles, "append", interrupted)
+    assert cli.run(call) == 130
+    kept = json.loads(capsys.readouterr().out)["samples"]
+    assert len(read_recording(target).rows) == written[0] == kept
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    target.unlink()
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content)
+    assert cli.run(call) == 6
+    out, err = capsys.readouterr()
+    kept = json.loads(out)["samples"]
+    assert f"Saved {target}: the first {kept} samples" in err
+    assert "is incomplete" in err
+    found = read_recording(target)
+    assert (len(found.rows), found.cut) == (kept, "")
+    assert 8192 <= kept <= 16_400
+    np.testing.assert_array_equal(found.rows["seq"], (1 << 33) + np.arange(kept))
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from ftdrive import __version__
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.compensate import (
     compensate_all,
+    compensated_bytes,
     compensated_file,
     recordings_of,
     require_own_results,
@@ -45,12 +46,14 @@ def at_once(function: Callable[..., list[Answer]], *arguments: Any) -> "Future[l
 @pytest.mark.parametrize("ending", [".mcap", ".csv", ".parquet"])
 def test_the_bytes_are_those_of_the_same_work_without_workers_and_come_again(ending: str, tmp_path: Path) -> None:
     source = record(tmp_path / f"a{ending}")
-    numbers = compensated(read_recording(source), FRAME, tmp_path / f"b{ending}")
+    numbers, _ = compensated(read_recording(source), FRAME, tmp_path / f"b{ending}")
     task = task_of(None, FRAME, "keep")
-    content, _, line = compensated_file(source.read_bytes(), source.name, task).rpartition(b"\n")
+    content, _, line = compensated_bytes(source.read_bytes(), source.name, task).rpartition(b"\n")
     assert content == (tmp_path / f"b{ending}").read_bytes()
-    assert json.loads(line) == {**numbers, "cut": ""}
-    again = compensated_file(source.read_bytes(), "renamed" + ending, task)
+    assert json.loads(line) == numbers
+    path, _, here = compensated_file(source, tmp_path, task).rpartition(b"\n")
+    assert (Path(path.decode()).read_bytes(), here) == (content, line)
+    again = compensated_bytes(source.read_bytes(), "renamed" + ending, task)
     assert again == content + b"\n" + line
     assert tempfile.gettempdir().encode() not in again
 
@@ -61,14 +64,15 @@ def test_calibration_and_bias_are_those_of_the_options(tmp_path: Path) -> None:
     run.mkdir()
     calibration().save(run / "calibration.json")
     task = task_of(run, FRAME, "estimate")
-    found = json.loads(compensated_file(source.read_bytes(), source.name, task).rpartition(b"\n")[2])
+    found = json.loads(compensated_bytes(source.read_bytes(), source.name, task).rpartition(b"\n")[2])
     assert found["calibration"] == f"{run}, bias estimated"
     assert (found["axes"], found["about"]) == ("base", "sensor")
     assert max(map(abs, found["bias_change"]["value"])) < 0.05
     assert 0 < max(found["bias_change"]["sigma"]) < 0.05
 
 
-def test_each_recording_is_one_call_and_a_failure_concerns_one(tmp_path: Path) -> None:
+@pytest.mark.parametrize("share_files", [True, False])
+def test_each_recording_is_one_call_and_a_failure_concerns_one(share_files: bool, tmp_path: Path) -> None:
     fine, few = (record(tmp_path / "in" / name) for name in ("fine.csv", "few.csv"))
     empty = tmp_path / "in" / "empty.mcap"
     read = read_recording(fine)
@@ -89,16 +93,16 @@ def test_each_recording_is_one_call_and_a_failure_concerns_one(tmp_path: Path) -
 
     recordings = [fine, few, empty, damaged, lost, cut]
     task = task_of(None, FRAME, "keep")
-    found = dict(compensate_all(recordings, output, task, Workers(1, submit, BrokenExecutor, 8)))
+    found = dict(compensate_all(recordings, output, task, Workers(1, submit, BrokenExecutor, 8, share_files)))
     assert set(calls) <= {0, 1}
-    assert sum(calls) == 5
+    assert sum(calls) == 6 - (not share_files)
     assert isinstance(good := found[fine], dict)
     assert (good["samples"], good["cut"]) == (400, "")
     assert isinstance(short := found[cut], dict)
     assert "'# end'" in short["cut"]
     assert "exists already and is never overwritten" in str(found[few])
     assert str(found[empty]).startswith("it contains no sample")
-    assert "damaged or was cut" in str(found[damaged])
+    assert "it was cut within it" in str(found[damaged])
     assert "No such file" in str(found[lost])
     assert not any("ftdrive-compensate-" in str(one) for one in found.values())
     assert sorted(one.name for one in output.iterdir()) == ["cut.csv", "few.csv", "fine.csv"]
@@ -110,7 +114,7 @@ def test_a_recording_of_other_devices_and_a_short_one_are_refused(tmp_path: Path
     other = replace(calibration(), provenance={"devices": {"sensor": {"model": "Mini45", "serial": "FT9"}}})
     other.save(tmp_path / "other.json")
     with pytest.raises(ConfigError, match=r"^a\.csv is of other devices than the calibration: .*FT9"):
-        compensated_file(source.read_bytes(), source.name, task_of(tmp_path / "other.json", FRAME, "keep"))
+        compensated_bytes(source.read_bytes(), source.name, task_of(tmp_path / "other.json", FRAME, "keep"))
     (tmp_path / "out").mkdir()
     task = task_of(None, FRAME, "estimate")
     found = dict(compensate_all([source], tmp_path / "out", task, Workers(1, at_once, BrokenExecutor)))
@@ -121,7 +125,7 @@ def test_a_recording_of_other_devices_and_a_short_one_are_refused(tmp_path: Path
 def test_a_full_temporary_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
     with pytest.raises(OSError, match=r"missing on the worker: .* or set TMPDIR"):
-        compensated_file(b"", "a.csv", task_of(None, FRAME, "keep"))
+        compensated_bytes(b"", "a.csv", task_of(None, FRAME, "keep"))
 
 
 def test_a_worker_of_another_version_ends_it(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ftcalib.errors import BadDataset
 from ftcalib.model import angle_between
 from ftdrive.live.delay import DelayEstimator
-from ftdrive.live.pairing import RATE_TOLERANCE, Pairing, PoseTrack, Timeline, pair_recording
+from ftdrive.live.pairing import RATE_TOLERANCE, Pairing, PoseTrack, Timeline, estimate_delay, paired_blocks
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, T0_NS, Motion, calibrated
 
@@ -73,7 +73,7 @@ def test_orientations_are_interpolated_as_by_scipy(seed: int, step_rad: float) -
 
 
 def test_positions_and_joints_are_interpolated_between_neighbours() -> None:
-    poses = PoseTrack(keep_s=1.0)
+    poses = PoseTrack()
     t_ns = T0_NS + np.arange(2000) * 2_000_000
     x = np.arange(2000.0)
     poses.add(t_ns, np.outer(x, np.ones(6)), np.tile(np.eye(3), (2000, 1, 1)), np.outer(x, [1, 2, 3]))
@@ -81,7 +81,8 @@ def test_positions_and_joints_are_interpolated_between_neighbours() -> None:
     np.testing.assert_allclose(q[0], 1997.25)
     np.testing.assert_allclose(p[0], np.array([1, 2, 3]) * 1997.25)
     np.testing.assert_allclose(R[0], np.eye(3), atol=1e-15)
-    assert poses.span_ns == (t_ns[-501], t_ns[-1])  # the rest was dropped
+    poses.forget(int(t_ns[-500]) - 1)
+    assert poses.span_ns == (t_ns[-501], t_ns[-1])
 
 
 def test_a_sample_waits_for_the_pose_unless_the_next_one_is_due() -> None:
@@ -147,14 +148,16 @@ def recording(delay_s: float, scale: float = 1.0, touch: bool = False) -> tuple[
 @pytest.mark.parametrize(("delay_s", "touch"), [(0.0, False), (0.02, False), (-0.015, False), (0.01, True)])
 def test_the_delay_between_the_links_is_found_from_motion(delay_s: float, touch: bool) -> None:
     estimator = DelayEstimator(calibrated(6), P_FLANGE_SENSOR_M, window=60)
-    pair_recording(*recording(delay_s, touch=touch), estimator)
+    samples, states = recording(delay_s, touch=touch)
+    estimate_delay([samples], [states], estimator)
     assert estimator.delay_s == pytest.approx(delay_s, abs=max(6 * estimator.sigma_s, 5e-5))
     assert estimator.sigma_s < 2e-4
 
 
 def test_an_unknown_height_of_the_sensor_is_not_taken_for_a_delay() -> None:
     estimator = DelayEstimator(calibrated(), np.full(3, np.nan), window=60)
-    pair_recording(*recording(0.01), estimator)
+    samples, states = recording(0.01)
+    estimate_delay([samples], [states], estimator)
     assert estimator.delay_s == pytest.approx(0.01, abs=max(6 * estimator.sigma_s, 1e-4))
 
 
@@ -162,20 +165,21 @@ def test_a_wrong_bias_is_not_taken_for_a_delay() -> None:
     samples, states = recording(0.005)
     drifted = FtSamples.of(samples.t_host_ns, samples.seq, samples.wrench + np.array([1.0, -1.0, 2.0, 0, 0, 0]))
     estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M, window=60)
-    pair_recording(drifted, states, estimator)
+    estimate_delay([drifted], [states], estimator)
     assert estimator.delay_s == pytest.approx(0.005, abs=max(6 * estimator.sigma_s, 1e-4))
 
 
 def test_an_arm_at_rest_shows_no_delay() -> None:
     estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M)
-    pair_recording(*recording(0.02, scale=0.0), estimator)
+    samples, states = recording(0.02, scale=0.0)
+    estimate_delay([samples], [states], estimator)
     assert (estimator.delay_s, estimator.sigma_s) == (0.0, 0.05)
 
 
 def test_recordings_of_different_times_are_rejected() -> None:
     samples, states = recording(0.0)
     with pytest.raises(BadDataset, match="no time in common"):
-        pair_recording(samples, states, 100.0)
+        list(paired_blocks([samples], [states], 100.0))
 
 
 def test_a_busy_computer_at_the_beginning_does_not_bend_the_line() -> None:

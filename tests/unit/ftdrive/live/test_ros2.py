@@ -18,10 +18,10 @@ NUMBERS = np.random.default_rng(1).normal(size=(N, 6))
 ORIENTATIONS = Rotation.random(N, random_state=1)
 
 PACKED = {
-    ros2.RAW: ros2.pack_wrenches(T_NS, NUMBERS, "sensor"),
-    ros2.COMPENSATED: ros2.pack_wrenches(T_NS, NUMBERS, "base_at_tcp"),
-    ros2.POSE: ros2.pack_poses(T_NS, ORIENTATIONS.as_matrix(), NUMBERS[:, :3]),
-    ros2.JOINTS: ros2.pack_joints(T_NS, NUMBERS),
+    ros2.RAW: ros2.pack_wrenches(T_NS, NUMBERS, "sensor").tolist(),
+    ros2.COMPENSATED: ros2.pack_wrenches(T_NS, NUMBERS, "base_at_tcp").tolist(),
+    ros2.POSE: ros2.pack_poses(T_NS, ORIENTATIONS.as_matrix(), NUMBERS[:, :3]).tolist(),
+    ros2.JOINTS: ros2.pack_joints(T_NS, NUMBERS).tolist(),
 }
 
 
@@ -41,7 +41,7 @@ def test_rosbags_writes_the_same_bytes(store: Typestore, topic: str) -> None:
 
 @pytest.mark.parametrize("length", range(1, 10))
 def test_numbers_stay_aligned_after_a_frame_name_of_any_length(store: Typestore, length: int) -> None:
-    packed = ros2.pack_wrenches(T_NS, NUMBERS, "x" * length)[-1]
+    packed = ros2.pack_wrenches(T_NS, NUMBERS, "x" * length).tolist()[-1]
     message: Any = store.deserialize_cdr(packed, "geometry_msgs/msg/WrenchStamped")
     force, torque = message.wrench.force, message.wrench.torque
     assert message.header.frame_id == "x" * length
@@ -66,7 +66,7 @@ def test_the_schema_alone_is_enough_to_read_a_message(topic: str) -> None:
 
 
 def test_no_samples_are_no_messages() -> None:
-    assert ros2.pack_joints(T_NS[:0], NUMBERS[:0]) == []
+    assert ros2.pack_joints(T_NS[:0], NUMBERS[:0]).tolist() == []
 
 
 @pytest.mark.parametrize(

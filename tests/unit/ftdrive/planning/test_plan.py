@@ -10,7 +10,7 @@ import pytest
 
 from ftcalib.poses.information import special
 from ftdrive.errors import ConfigError, PlanRefused
-from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.scene import Box, Plane, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s, tips
@@ -200,21 +200,6 @@ def test_a_tour_has_two_groups_at_least() -> None:
     assert tour is not None
     assert sorted(tour) == [0, 1, 2]
     assert shortest_tour(np.ones((1, 1)), np.arange(1), everything[:1, :1]) is None
-
-
-@pytest.mark.slow
-def test_random_plans_sampled_at_half_a_degree_are_clear() -> None:
-    rng = np.random.default_rng(7)
-    made = 0
-    for model in SHAPES:
-        certifier = certifier_of(model, TOOLS[rng.integers(4)])
-        q = USUAL_POSTURE_RAD + np.concatenate([rng.uniform(-0.4, 0.4, 3), np.zeros(3)])
-        tour = np.array([step.q_rad for step in planned(certifier, q, 6 if made % 3 else 24).steps])
-        share = np.linspace(0, 1, 361)[:, None, None]
-        path = (1 - share) * tour + share * np.roll(tour, -1, axis=0)
-        assert certifier.free(path.reshape(-1, 6)).all()  # farther away than the margins of 20 and 30 mm
-        made += 1
-    assert made == 8
 
 
 def test_posture_that_cannot_be_is_refused() -> None:

@@ -13,8 +13,8 @@ from ftcalib.model import predict
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
 from ftdrive.recording import Header, Recording, read_recording
-from ftdrive.recording.compensation import compensated, with_estimated_bias
-from ftdrive.recording.csv_pair import numbers_of, read_pair
+from ftdrive.recording.compensation import compensated, estimated_bias
+from ftdrive.recording.csv_pair import CsvPair, numbers_of
 from ftdrive.recording.recording import rows_of
 from ftdrivers.interfaces import Array
 from tests.unit.ftdrive.recorded import NOISE, TRUTH, calibration, info
@@ -67,7 +67,8 @@ def recording(parameters: Parameters = TRUTH, seconds: float = 8.0) -> Recording
 
 def test_the_push_is_found_and_the_weight_is_gone(tmp_path: Path) -> None:
     source, output = recording(), tmp_path / "a.csv"
-    result = compensated(source, WrenchFrame("flange", "sensor"), output)
+    result, failure = compensated(source, WrenchFrame("flange", "sensor"), output)
+    assert failure is None
     assert (result["samples"], result["gaps"]) == (4000, 0)
     assert result["duration_s"] == pytest.approx(7.998)
     assert result["raw"]["force_rms_N"] == pytest.approx(np.sqrt((source.rows["raw"][:, :3] ** 2).sum() / 4000))
@@ -97,20 +98,20 @@ def test_a_frame_that_is_not_configured_leaves_no_file(tmp_path: Path) -> None:
 def test_the_bias_of_a_zeroed_sensor_is_estimated_with_an_honest_sigma() -> None:
     source = recording(ZEROED, seconds=10.0)
     old, new = calibration().parameters, np.r_[ZEROED.force_bias_N, ZEROED.torque_bias_Nm]
-    estimated, change = with_estimated_bias(source)
-    found = estimated.header.info.calibration.parameters
+    header, change = estimated_bias(source)
+    estimated, found = replace(source, header=header), header.info.calibration.parameters
     before = np.r_[old.force_bias_N, old.torque_bias_Nm]
     np.testing.assert_allclose(np.r_[found.force_bias_N, found.torque_bias_Nm], before + change["value"])
     error = before + change["value"] - new
     assert (np.abs(error) < 6 * np.array(change["sigma"])).all()
     assert (np.array(change["sigma"]) < 0.3 * NOISE).all()
-    assert compensated(estimated, WrenchFrame())["compensated"]["force_max_N"] == pytest.approx(6, abs=0.3)
-    assert compensated(source, WrenchFrame())["compensated"]["force_max_N"] > 14
+    assert compensated(estimated, WrenchFrame()).numbers["compensated"]["force_max_N"] == pytest.approx(6, abs=0.3)
+    assert compensated(source, WrenchFrame()).numbers["compensated"]["force_max_N"] > 14
 
 
 def test_a_short_recording_shows_no_bias() -> None:
     with pytest.raises(BadDataset, match="too short"):
-        with_estimated_bias(recording(seconds=1.0))
+        estimated_bias(recording(seconds=1.0))
 
 
 def write_pair(folder: Path, delay_s: float, orientation: str) -> tuple[Path, Path]:
@@ -134,14 +135,14 @@ def write_pair(folder: Path, delay_s: float, orientation: str) -> tuple[Path, Pa
 @pytest.mark.parametrize("orientation", ["r11,r12,r13,r21,r22,r23,r31,r32,r33", "qx,qy,qz,qw", "rx,ry,rz"])
 def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(orientation: str, tmp_path: Path) -> None:
     files = write_pair(tmp_path, 0.012, orientation)
-    found, delay = read_pair(*files, calibration(), "c", None)
-    assert delay["value"] == pytest.approx(0.012, abs=1e-3)
-    assert 0 < delay["sigma"] < 1e-3
-    rms = compensated(found, WrenchFrame())["compensated"]["torque_rms_Nm"]
-    fixed, given = read_pair(*files, calibration(), "c", 0.0)
-    assert given == {"value": 0.0, "sigma": 0.0}
+    found = CsvPair(*files, calibration(), "c", None)
+    assert found.delay_s == pytest.approx(0.012, abs=1e-3)
+    assert 0 < found.delay_sigma_s < 1e-3
+    rms = compensated(found, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"]
+    fixed = CsvPair(*files, calibration(), "c", 0.0)
+    assert (fixed.delay_s, fixed.delay_sigma_s) == (0.0, 0.0)
     assert rms < 1.2 * np.sqrt(3) * 0.002
-    assert compensated(fixed, WrenchFrame())["compensated"]["torque_rms_Nm"] > 1.5 * rms
+    assert compensated(fixed, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"] > 1.5 * rms
 
 
 @pytest.mark.parametrize(
@@ -165,7 +166,7 @@ def test_files_that_cannot_be_used_are_named_with_the_fault(
     for file, text in (good | {name: content}).items():
         (tmp_path / file).write_text(text)
     with pytest.raises(BadDataset, match=words):
-        read_pair(tmp_path / "wrench", tmp_path / "poses", calibration(), "c", 0.0)
+        list(CsvPair(tmp_path / "wrench", tmp_path / "poses", calibration(), "c", 0.0).blocks())
 
 
 RNG = np.random.default_rng(8)
@@ -202,6 +203,6 @@ def test_a_pause_of_another_program_is_a_gap(tmp_path: Path) -> None:
     table = np.c_[t_s, np.tile(np.arange(6.0), (98, 1))]
     np.savetxt(tmp_path / "w", table, delimiter=",", header="t,fx,fy,fz,tx,ty,tz", comments="")
     (tmp_path / "p").write_text("t,rx,ry,rz\n0,0,0,0\n1,0,0,0\n")
-    found, _ = read_pair(tmp_path / "w", tmp_path / "p", calibration(), "c", 0.0)
-    assert found.gaps == 1
-    assert found.rows["seq"][-1] == 99
+    ((samples, _, share),) = CsvPair(tmp_path / "w", tmp_path / "p", calibration(), "c", 0.0).blocks()
+    assert np.count_nonzero(np.diff(samples.seq) != 1) == 1
+    assert (samples.seq[-1], share) == (99, 1.0)

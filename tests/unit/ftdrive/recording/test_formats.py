@@ -64,9 +64,9 @@ def test_all_formats_hold_the_same_bits(paths: Sequence[Path]) -> None:
 
 def test_a_recording_holds_what_was_measured(paths: Sequence[Path]) -> None:
     recording = read_recording(paths[0])
-    frames = [(len(rows), header.frame, header.stages) for rows, _, header in recording.pieces(10_000)]
+    frames = [(len(one.rows), one.header.frame, one.header.stages) for one in recording.pieces()]
     assert frames == [(1500, BASE_TCP, Stages()), (1100, PUSH, Stages(lowpass_Hz=40.0))]
-    measured, found = block(100, 300), recording.paired(slice(300, 400))
+    measured, found = block(100, 300), recording.paired().rows(slice(300, 400))
     for name in ("t_host_ns", "t_device_s", "seq", "status", "raw", "q_rad", "p_base_flange_m"):
         np.testing.assert_array_equal(getattr(found, name), getattr(measured, name))
     for name in ("wrench", "chi2", "in_contact"):

@@ -31,23 +31,6 @@ def test_crc_check_value() -> None:
 
 
 @pytest.mark.parametrize(
-    "frame",
-    [
-        "0A 6A AA FF 1D",
-        "0A 6A 01 BE A2",
-        "0A 6A 18 7F 68",
-        "0A 46 55 A3 9D",
-        "0A 46 01 A2 62",
-        "0A 46 00 63 A2",
-        "0A 03 00 1D 00 01 15 77",
-        "0A 83 02 B1 33",
-    ],
-)
-def test_documented_crcs(frame: str) -> None:
-    assert with_crc(bytes.fromhex(frame)[:-2]) == bytes.fromhex(frame)
-
-
-@pytest.mark.parametrize(
     ("gauges", "error", "record"),
     [
         (V1, False, "00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50"),

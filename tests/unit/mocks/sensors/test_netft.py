@@ -5,7 +5,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from ftmocks.sensors.netft import RECORD, Calibration, NetFtBox, rdt_records
+from ftmocks.sensors.netft import Calibration, NetFtBox, rdt_records
 
 WRENCH = [1.5, -2.25, 10, 0.1, -0.05, 0.025]
 VECTOR = "00000001 000003E8 00000000 0016E360 FFDDAAF0 00989680 000186A0 FFFF3CB0 000061A8"
@@ -95,7 +95,3 @@ def test_saturation_clips_at_the_rating(box: NetFtBox) -> None:
     counts, saturated = box._counts(1)
     assert counts[0, 3] == 10e6
     assert saturated.all()
-
-
-def test_record_size() -> None:
-    assert RECORD.itemsize == 36

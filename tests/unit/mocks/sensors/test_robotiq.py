@@ -28,10 +28,6 @@ def read(box: RobotiqBox, first: int, count: int) -> tuple[int, ...]:
     return struct.unpack(f">{count}H", answer[3:-2])
 
 
-def test_crc_check_value() -> None:
-    assert crc16(b"123456789") == bytes.fromhex("37 4B")
-
-
 def test_documented_frame() -> None:
     frame = stream_frame(raw_values(WRENCH[None])[0].tolist())
     assert frame == bytes.fromhex("20 4E D2 04 C9 FD 10 27 96 00 E7 FF E8 03 86 DC")

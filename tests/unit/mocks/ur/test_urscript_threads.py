@@ -42,6 +42,17 @@ end
 """
 
 
+def test_a_program_waits_for_the_answer_to_its_popup() -> None:
+    robot = start('def f():\n  popup("Is the tool free?", title="Tour", blocking=True)\n  textmsg("yes")\nend\n')
+    run(robot, 1.0)
+    assert (robot.popup, logged(robot)) == ("Is the tool free?", [])
+    asked = next(event for event in robot.events if event.what == "popup")
+    assert (asked.why, asked.detail["title"], asked.detail["blocking"]) == ("Is the tool free?", "Tour", True)
+    assert answer(robot, "close popup") == "closing popup"
+    run(robot, 0.1)
+    assert logged(robot) == ["yes"]
+
+
 def test_a_move_takes_its_speed_from_its_arguments() -> None:
     robot = start("def f():\n  movej([0.785, -1.745, 1.047, -0.873, 1.571, 1.785], a=100, v=0.5)\nend\n")
     run(robot, 1.0)

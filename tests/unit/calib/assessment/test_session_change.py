@@ -1,4 +1,4 @@
-"""A load that shifts in mid-run: found, named, and refused where poses of both loads were used."""
+"""A change in mid-session is found, named, and refused where poses of both kinds were used."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
-from ftcalib.assessment.load_shift import lasting_change
+from ftcalib.assessment.session_change import likeliest_change
 from ftcalib.likelihood.gain_and_cross_talk import SIZE, response_columns
 from ftcalib.model import Parameters, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
@@ -29,16 +29,35 @@ LIGHTER = replace(TOOL, gravity_force_base_N=0.97 * TOOL.gravity_force_base_N)
 TARED = replace(TOOL, force_bias_N=TOOL.force_bias_N - 0.3)
 
 
-def session(after: Parameters, position: int, seed: int, rows: NDArray[np.int64] | None = None) -> CalibrationResult:
+def turned(parameters: Parameters, angle_deg: float) -> Parameters:
+    turn = Rotation.from_rotvec([0, 0, angle_deg], degrees=True).as_matrix()
+    com = turn.T @ parameters.p_sensor_com_m
+    return replace(parameters, R_flange_sensor=parameters.R_flange_sensor @ turn, p_sensor_com_m=com)
+
+
+TURNED = turned(TOOL, 5)
+OTHER = replace(turned(TOOL, 70), force_bias_N=np.array([-1.0, 2.0, 1.0]))
+
+
+def session(
+    after: Parameters,
+    which: int | slice,
+    seed: int,
+    rows: NDArray[np.int64] | None = None,
+    *,
+    added: Array | float = 0.0,
+    measured: bool = True,
+) -> CalibrationResult:
     """24 poses, the later ones of another tool; `rows`: the pose in each row of the dataset."""
-    wrench = predict(TOOL, ORIENTATIONS)
-    wrench[position:] = predict(after, ORIENTATIONS[position:])
+    which = slice(which, None) if isinstance(which, int) else which
+    wrench = predict(TOOL, ORIENTATIONS) + added
+    wrench[which] += predict(after, ORIENTATIONS[which]) - predict(TOOL, ORIENTATIONS[which])
     wrench += np.random.default_rng(seed).normal(0, SIGMA, wrench.shape)
     order = np.arange(24) if rows is None else rows
     dataset = CalibrationDataset(
         R_base_flange=ORIENTATIONS[order],
         wrench=wrench[order],
-        wrench_cov=np.broadcast_to(np.diag(SIGMA**2), (24, 6, 6)),
+        wrench_cov=np.broadcast_to(np.diag(SIGMA**2), (24, 6, 6)) if measured else None,
         n_samples=np.full(24, 200),
         t_s=np.arange(24.0)[order] * 3,
     )
@@ -73,24 +92,47 @@ def test_poses_count_as_they_were_taken_not_as_they_stand() -> None:
     assert result.findings[0].values["pose"] == np.flatnonzero(rows == 12)[0] + 1
 
 
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize(
+    ("after", "code"), [(TARED, "bias_stepped"), (TURNED, "sensor_turned"), (OTHER, "sensor_changed")]
+)
+def test_other_changes_are_named_before_the_drift_that_they_look_like(
+    after: Parameters, code: str, *, measured: bool
+) -> None:
+    result = session(after, 13, seed=4, measured=measured)
+    first = result.findings[0]
+    assert (first.code, first.values["pose"]) == (code, 14)
+    assert (result.verdict == "rejected") == (code != "bias_stepped")
+
+
+def test_rows_of_two_sensors_are_named() -> None:
+    assert session(OTHER, slice(1, None, 2), seed=1).findings[0].code == "sensors_alternate"
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("after", [TOOL, TARED])
 def test_a_quiet_run_and_one_that_was_tared_are_not_refused(after: Parameters, seed: int) -> None:
     result = session(after, 12, seed)
-    assert result.verdict != "rejected"
+    assert result.verdict == ("good" if after is TOOL else "usable")
     sure = [0, 1, 2, 3, 4, 5, 9, 10, 11]  # the bias is that of no single moment
     assert np.abs(sigmas(result, TOOL)[sure]).max() < 4.5
 
 
+@pytest.mark.parametrize("measured", [True, False])
 @pytest.mark.parametrize("seed", range(3))
-def test_gain_and_cross_talk_of_a_fit_hide_no_part_of_a_change(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_a_random_walk_is_no_step(seed: int, *, measured: bool) -> None:
+    walk = np.cumsum(10 * SIGMA * np.random.default_rng(seed).normal(size=(24, 6)), axis=0)
+    found = {one.code for one in session(TOOL, 12, seed, added=walk, measured=measured).findings}
+    assert not found & {"bias_stepped", "com_shifted", "load_changed", "sensor_turned", "sensor_changed"}
+
+
+def test_gain_and_cross_talk_of_a_fit_hide_no_part_of_a_change() -> None:
+    rng = np.random.default_rng(0)
     wrench = np.where(np.arange(24)[:, None] < 14, predict(TOOL, ORIENTATIONS), predict(LIGHTER, ORIENTATIONS))
-    residuals = wrench + rng.normal(0, SIGMA, wrench.shape) - predict(TOOL, ORIENTATIONS)
-    residuals -= response_columns(TOOL, ORIENTATIONS) @ rng.normal(0, 0.01, SIZE)
-    change = lasting_change(TOOL, ORIENTATIONS, residuals, SIGMA, np.arange(24.0))
+    wrench += rng.normal(0, SIGMA, wrench.shape) + response_columns(TOOL, ORIENTATIONS) @ rng.normal(0, 0.01, SIZE)
+    change = likeliest_change(TOOL, ORIENTATIONS, wrench, SIGMA)
     assert change is not None
-    assert (change.what, change.position) == ("load", 14)
+    assert (change.code, change.first) == ("load_changed", 14)
     # Beside 15 free parameters the sigma of a step between two halves is about that of a mean of 4 poses.
     lighter_N = np.linalg.norm(LIGHTER.gravity_force_base_N) - np.linalg.norm(TOOL.gravity_force_base_N)
-    assert change.step[0] == pytest.approx(lighter_N, abs=3 * SIGMA[0] / 2)
+    assert change.values["change_N"] == pytest.approx(lighter_N, abs=3 * SIGMA[0] / 2)

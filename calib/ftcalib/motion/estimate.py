@@ -1,0 +1,356 @@
+"""The load that explains rows in motion: Gauss-Newton from each mounting that forces allow, contact left out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, cho_factor, cho_solve
+from scipy.special import chdtri as chi2_isf
+from scipy.special import ndtri
+
+from ftcalib.known import Constraints, Known
+from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
+from ftcalib.model import Array, Parameters, angle_between, nearest_rotation
+from ftcalib.motion.model import CROSS_TALK, DELAY, GAINS, HEIGHT, INERTIA, SIZE, Load, jacobian, wrench_of
+from ftcalib.motion.noise import Noise, runs, states
+from ftcalib.motion.samples import Rows
+from ftcalib.published.yu import com_and_torque_bias
+
+GYRATION_M, HEIGHT_M, DELAY_S = 0.15, 0.3, 0.3
+"""What is expected of a tool before any data, one sigma: radius of gyration, sensor height, delay beyond the rows."""
+CONTACT = float(chi2_isf(6, 1e-7))
+"""Squared distance of a row in contact."""
+QUIET = 0.4
+"""Share of the rows of a state that is free of contact."""
+MOST_CONTACT = 0.8
+"""Share of rows; beyond it the model does not fit at all."""
+MARGIN = 2
+"""Rows left out on both sides of a contact, which the filter spreads."""
+KNOT_S, MOST_KNOTS = 5.0, 25
+"""Distance and number of the knots of the bias."""
+RIDGE = 1e-12
+"""Keeps what is not determined finite: its sigma becomes a million times as large as its scale."""
+WORTH = 4.0
+"""A component is kept if it lowers -2 log restricted likelihood by this."""
+
+ROUGH: Mapping[str, float] = {"gain": 0.02, "cross_talk": 0.02}
+"""Sizes of components at first."""
+_ROUGH_ROWS = 600
+_CHUNK = 1000
+_MANY = 1000
+"""Rows beside which what the fit absorbs is small."""
+_SAME_RAD = 0.2
+_STAGES, _CHOICES = 6, (1, 2, 4)
+"""Solutions, each with the noise and the contacts of the one before, and those before which components are chosen."""
+_SIZES: Mapping[str, Array] = {
+    "gain": np.geomspace(5e-4, 5e-2, 9),
+    "cross_talk": np.geomspace(5e-4, 2e-1, 11),
+    "walk_N": np.geomspace(3e-4, 3e-1, 10),
+    "walk_Nm": np.geomspace(6e-6, 6e-3, 10),
+}
+"""That are tried: of the entries of gain and cross-talk, and of the walk of the bias in a second."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionFit:
+    """The best fit."""
+
+    load: Load
+    covariance: Array
+    """(34, 34)"""
+    kept: NDArray[np.bool_]
+    """(n,) rows without contact."""
+    residuals: Array
+    """(n, 6) of all rows, drift included in the prediction."""
+    sigma: Array
+    """(n, 6) of a row's noise."""
+    distance: Array
+    """(n,) squared, of each residual from 0: chi2 with 6 degrees of freedom without contact."""
+    drift: Array
+    """(n, 6) bias of each row minus that of the load."""
+    drift_change: tuple[Array, Array] | None
+    """(6,) from the first row to the last, and its sigma."""
+    components: Mapping[str, float] = field(default_factory=dict)
+    second_basin_chi2: float | None = None
+    chi2: float = 0.0
+    """Of the kept rows, made independent: about 6 a row."""
+
+    @property
+    def prior_share(self) -> Array:
+        """Sigma (8,) of inertia, height and delay, in that of what is expected of any tool."""
+        expected = np.r_[np.full(6, max(self.load.mass_kg, 0.1) * GYRATION_M**2), HEIGHT_M, DELAY_S]
+        return np.asarray(np.sqrt(np.diag(self.covariance)[15:23]) / expected)
+
+
+class _Problem:
+    """Rows with what is known of their load."""
+
+    def __init__(self, rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool) -> None:
+        self.rows, self.g_m_s2 = rows, g_m_s2
+        self.constraints = Constraints(known or Known(), g_m_s2)
+        self.duration_s = float(np.ptp(rows.t_s))
+        self.fixed = np.zeros(SIZE, bool)
+        self.fixed[INERTIA] = point_mass
+        count = int(np.clip(round(self.duration_s / KNOT_S), 1, MOST_KNOTS - 1)) + 1
+        self.knots = np.linspace(rows.t_s[0], rows.t_s[-1], count)
+        centred = np.linalg.svd(np.ones((1, count)))[2][1:].T  # a drift of mean 0: the bias is that of the mean
+        steps = np.diff(np.eye(count), axis=0) @ centred
+        self.walk = steps.T @ steps / (self.knots[1] - self.knots[0])
+        self.centred = np.kron(centred, np.eye(6))
+
+    def hats(self, t_s: Array) -> Array:
+        """Weight (n, knots) of each knot."""
+        step = self.knots[1] - self.knots[0]
+        return np.asarray(np.maximum(1 - np.abs(t_s[:, None] - self.knots) / step, 0))
+
+    def predicted(self, load: Load, rows: Rows) -> Array:
+        return wrench_of(load, rows.motion.earlier(load.delay_s, rows.rate))
+
+    def prior(self, load: Load) -> tuple[Array, Array]:
+        """Precision (34,) of the values that are not static, beside that of the components, and the present values."""
+        sigma = np.full(SIZE, np.inf)
+        sigma[INERTIA] = max(load.mass_kg, 0.1) * GYRATION_M**2
+        sigma[HEIGHT], sigma[DELAY] = HEIGHT_M, DELAY_S
+        return 1 / sigma**2, load.vector
+
+    def starts(self) -> list[Load]:
+        """Loads for each mounting that explains the forces as a weight."""
+        rows = self.rows[:: max(1, len(self.rows) // _ROUGH_ROWS)]
+        R, force, ones = nearest_rotation(rows.motion.R_base_flange), rows.wrench[:, :3], np.ones(len(rows))
+        cost = force_cost(R, force, ones)
+        found = []
+        for Q in self.constraints.rotations([one.R.T for one in minima(cost)], cost)[:4]:
+            F_b, bias = given_rotation(Q.T, R, force, ones)
+            c, torque_bias = com_and_torque_bias(F_b @ R @ Q, rows.wrench[:, 3:])
+            start = self.constraints.satisfied(Parameters(Q, F_b, bias, c, torque_bias))
+            found.append(Load(start, self.g_m_s2))
+        return found
+
+    def free(self, load: Load) -> Array:
+        """Basis (34, m) of what is estimated, without the response."""
+        Z = block_diag(self.constraints.free(load.static), np.eye(SIZE - 15))
+        return np.asarray(Z[:, ~np.concatenate([np.zeros(Z.shape[1] - (SIZE - 15), bool), self.fixed[15:]])])
+
+    def rough(self, load: Load) -> tuple[Load, float]:
+        """Fit robustly with white noise; return the load and the logarithm of its residuals' size."""
+        rows = self.rows[:: max(1, len(self.rows) // _ROUGH_ROWS)]
+        limit, no_drift = np.inf, np.zeros((len(self.knots), 6))
+        nothing = np.zeros(6 * len(self.walk))
+        for _ in range(40):
+            r = rows.wrench - self.predicted(load, rows)
+            scale = 1.4826 * np.array([np.median(np.abs(r[:, :3])), np.median(np.abs(r[:, 3:]))]) + 1e-12
+            unit = r / np.repeat(scale, 3)
+            distance = np.sum(unit**2, axis=1)
+            limit = max(min(limit, float(distance.max())) / 2, 22.0)
+            weight = (limit / (limit + distance)) ** 2
+            J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / np.repeat(scale, 3)[:, None]
+            weighted = (J * weight[:, None, None]).reshape(-1, SIZE)
+            H, b = block_diag(weighted.T @ J.reshape(-1, SIZE), np.diag(nothing)), weighted.T @ unit.ravel()
+            step = self.solved(ROUGH, (H, np.append(b, nothing), 0.0), load, no_drift).step
+            load = load.moved(step[:SIZE])
+            if limit == 22.0 and np.abs(step[:6]).max() < 1e-6:
+                break
+        return load, float(np.log(scale).sum())
+
+    def sums(
+        self, load: Load, drift: Array, noise: Noise, kept: NDArray[np.bool_], state: NDArray[np.intp]
+    ) -> tuple[Array, Array, float]:
+        """Information, gradient and chi2 of load and drift, over kept rows as the noise weighs them."""
+        rows, order = self.rows[kept], noise.filters.shape[0] - 1
+        state, place, knots = state[kept], runs(rows.t_s), len(self.knots)
+        size = SIZE + 6 * knots
+        H, b, chi2 = np.zeros((size, size)), np.zeros(size), 0.0
+        for start in range(0, len(rows), _CHUNK):
+            part = slice(max(start - order, 0), start + _CHUNK)
+            some, hats = rows[part], self.hats(rows.t_s[part])
+            near = np.flatnonzero(hats.any(axis=0))
+            r = some.wrench - self.predicted(load, some) - hats @ drift
+            J = jacobian(load, some.motion.earlier(load.delay_s, some.rate), some.rate)
+            on_knots = np.einsum("nk,ij->nikj", hats[:, near], np.eye(6)).reshape(len(some), 6, -1)
+            X = noise.whitened(np.concatenate([J, on_knots, r[:, :, None]], axis=2), state[part], place[part])
+            X = X[start - part.start :].reshape(-1, X.shape[2])
+            places = np.concatenate([np.arange(SIZE), SIZE + (6 * near[:, None] + np.arange(6)).ravel()])
+            gram = X.T @ X
+            H[np.ix_(places, places)] += gram[:-1, :-1]
+            b[places] += gram[:-1, -1]
+            chi2 += float(gram[-1, -1])
+        T = block_diag(np.eye(SIZE), self.centred)
+        return T.T @ H @ T, T.T @ b, chi2
+
+    def absorbed(self, load: Load, rows: Rows, solved: "_Step") -> Array:
+        """Root (n, 6, k) of the covariance of the prediction; none before the first solution, nor for so many rows."""
+        if not solved.step.size or len(rows) > _MANY:
+            return np.zeros((len(rows), 6, 0))
+        basis, inverse_root = solved.root
+        J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate)
+        on_knots = np.einsum("nk,ij->nikj", self.hats(rows.t_s), np.eye(6)).reshape(len(rows), 6, -1) @ self.centred
+        return np.asarray(np.concatenate([J, on_knots], axis=2) @ basis @ inverse_root)
+
+    def components(self, sizes: Mapping[str, float], load: Load) -> tuple[Array, Array, float]:
+        """Prior precision of response and drift, which of them are estimated, and -log det of the precision."""
+        total = SIZE + self.centred.shape[1]
+        P, on, log_det = np.zeros((total, total)), np.ones(total, bool), 0.0
+        for name, places in (("gain", GAINS), ("cross_talk", CROSS_TALK)):
+            if size := sizes.get(name, 0.0):
+                count = places.stop - places.start
+                P[places, places] = np.eye(count) / size**2
+                log_det += 2 * count * float(np.log(size))
+            else:
+                on[places] = False
+        at = SIZE + np.arange(len(self.walk) * 6).reshape(-1, 6)
+        for name, channels in (("walk_N", range(3)), ("walk_Nm", range(3, 6))):
+            size = sizes.get(name, 0.0)
+            for channel in channels:
+                knots = at[:, channel]
+                if size:
+                    P[np.ix_(knots, knots)] = self.walk / size**2
+                    log_det -= float(np.linalg.slogdet(self.walk / size**2)[1])
+                else:
+                    on[knots] = False
+        precision, _ = self.prior(load)
+        P[:SIZE, :SIZE] += np.diag(precision)
+        return P, on, log_det
+
+    def solved(self, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: Load, drift: Array) -> "_Step":
+        """Solve the sums for load and drift with these sizes of the components."""
+        H, b, chi2 = sums
+        P, on, log_det = self.components(sizes, load)
+        value = np.concatenate([load.vector, self.centred.T @ drift.ravel()])
+        removed = np.where(on, 0.0, -value)  # a component that is off goes to 0
+        chi2 += float(removed @ H @ removed - 2 * b @ removed)
+        b, value = b - H @ removed, np.where(on, value, 0.0)
+        rows, residuals = self.constraints.measurements(load.static)
+        H, b = H + P, b - P @ value
+        H[:15, :15] += rows.T @ rows
+        b[:15] += rows.T @ residuals
+        Z = block_diag(self.free(load), np.eye(len(P) - SIZE))
+        Z = Z[:, on[np.argmax(np.abs(Z), axis=0)]]
+        H = Z.T @ H @ Z
+        scale = np.sqrt(np.diag(H))
+        factor = cho_factor(H / np.outer(scale, scale) + RIDGE * np.eye(len(H)))
+        step = Z @ (cho_solve(factor, Z.T @ b / scale) / scale)
+        criterion = chi2 + float(value @ P @ value - b @ step) + log_det
+        criterion += 2 * float(np.log(np.diag(factor[0]) * scale).sum())
+        return _Step(step + removed, criterion, Z / scale, factor)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    step: Array
+    criterion: float
+    basis: Array
+    factor: tuple[Array, bool]
+
+    @classmethod
+    def none(cls) -> Self:
+        """Before the first one."""
+        nothing = np.zeros((0, 0))
+        return cls(np.zeros(0), 0.0, nothing, (nothing, False))
+
+    @property
+    def root(self) -> tuple[Array, Array]:
+        """Two matrices; their product times its transpose is the covariance."""
+        return self.basis, np.asarray(np.linalg.inv(np.triu(self.factor[0])))
+
+    @property
+    def covariance(self) -> Array:
+        return np.asarray(self.basis @ cho_solve(self.factor, self.basis.T))
+
+
+def fit(rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = False) -> MotionFit:
+    """Fit all unknowns to rows.
+
+    Parameters
+    ----------
+    rows : Rows
+    known : Known, optional
+        As for `ftcalib.solve`.
+    g_m_s2 : float
+    point_mass : bool
+        Whether the inertia about the centre of mass is known to be 0.
+    """
+    problem = _Problem(rows, known, g_m_s2, point_mass=point_mass)
+    roughs = sorted((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])
+    load, _ = roughs[0]
+    kept, state = _first_kept(problem, load)
+    drift, sizes = np.zeros((len(problem.knots), 6)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
+    solved = _Step.none()
+    for stage in range(_STAGES):
+        r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
+        absorbed = problem.absorbed(load, rows[kept], solved)
+        noise = Noise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept]))
+        sums = problem.sums(load, drift, noise, kept, state)
+        if stage in _CHOICES:
+            sizes = _chosen(problem, sizes, sums, load, drift)
+        solved = problem.solved(sizes, sums, load, drift)
+        load = load.moved(solved.step[:SIZE])
+        drift = drift + (problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
+        r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
+        distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
+        kept = _without_contact(distance)
+        state = states(rows.speed_rad_s, kept)
+    chi2, others = problem.sums(load, drift, noise, kept, state)[2], []
+    for other, _ in roughs[1:]:
+        if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
+            there = problem.sums(other, drift, noise, kept, state)
+            others.append(there[2] - float(there[1] @ problem.solved(sizes, there, other, drift).step) - chi2)
+    change = None
+    if sizes.get("walk_N") or sizes.get("walk_Nm"):
+        ends = np.zeros((6, SIZE + 6 * len(problem.knots)))
+        ends[:, -6:] += np.eye(6)
+        ends[:, SIZE : SIZE + 6] -= np.eye(6)
+        ends = ends @ block_diag(np.eye(SIZE), problem.centred)
+        change = drift[-1] - drift[0], np.sqrt(np.einsum("ij,jk,ik->i", ends, solved.covariance, ends))
+    return MotionFit(
+        load,
+        solved.covariance[:SIZE, :SIZE],
+        kept,
+        r,
+        noise.scale[state],
+        distance,
+        problem.hats(rows.t_s) @ drift,
+        change,
+        {name: size for name, size in sizes.items() if size},
+        max(min(others), 0.0) if others else None,
+        chi2,
+    )
+
+
+def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
+    """Delay of the wrench beyond that of the rows, by a robust fit."""
+    problem = _Problem(rows, known, g_m_s2, point_mass=False)
+    return min((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])[0].delay_s
+
+
+def _first_kept(problem: _Problem, load: Load) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+    """Rows without contact, by the quiet rows of each state; at rest there is no more noise than in motion."""
+    rows = problem.rows
+    r = rows.wrench - problem.predicted(load, rows)
+    state = states(rows.speed_rad_s, np.ones(len(rows), bool))
+    size = np.abs(r).reshape(-1, 2, 3)
+    quiet = np.array([np.quantile(size[state == k], QUIET, axis=(0, 2)) for k in np.unique(state)])
+    scale = np.minimum.accumulate(quiet[::-1], axis=0)[::-1] / ndtri((1 + QUIET) / 2) + 1e-12
+    distance = np.sum((r / np.repeat(scale, 3, axis=1)[state]) ** 2, axis=1)
+    kept = _without_contact(distance / 2)
+    return kept, states(rows.speed_rad_s, kept)
+
+
+def _without_contact(distance: Array) -> NDArray[np.bool_]:
+    near = distance > CONTACT
+    for _ in range(MARGIN):
+        near = near | np.append(near[1:], False) | np.append(False, near[:-1])
+    return ~near if near.mean() < MOST_CONTACT else np.ones(len(near), bool)  # nothing fits: all is of no use alike
+
+
+def _chosen(
+    problem: _Problem, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: Load, drift: Array
+) -> dict[str, float]:
+    """Choose the sizes of the components by restricted likelihood, one after the other."""
+    chosen = dict(sizes)
+    for name, tried in _SIZES.items():
+        values = [problem.solved({**chosen, name: size}, sums, load, drift).criterion for size in (0.0, *tried)]
+        best = int(np.argmin(values[1:]))
+        chosen[name] = float(tried[best]) if values[1 + best] < values[0] - WORTH else 0.0
+    return chosen

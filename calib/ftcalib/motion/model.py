@@ -1,0 +1,143 @@
+"""The wrench of a moving load, as a linear function of its motion.
+
+With R = R_base_flange, a the acceleration of the flange origin and Omega = [alpha]x + [omega]x², both in flange axes,
+Q = R_flange_sensor, c = p_sensor_com_m, l = (0, 0, height) + Q c from the flange to the centre of mass, m = weight / g,
+and S the second moment of mass about the centre, S = tr(J) / 2 - J for the inertia J:
+
+    u         = Q^T (R^T F_b - m (a + Omega l))             the force, in sensor axes
+    force_N   = (1 + gain) u + force_bias_N
+    torque_Nm = c x u - vee(Q^T Omega Q S) + cross_talk u + torque_bias_Nm
+
+vee(M) = (M21 - M12, M02 - M20, M10 - M01): the sum of r x (Omega r) over the mass is vee(Omega S), which are Euler's
+equations. At rest this is the static model. The delay moves the motion to an earlier time.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+
+from ftcalib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN
+from ftcalib.model import Array, Parameters, skew
+from ftcalib.motion.samples import Motion
+
+INERTIA_NAMES = ("xx", "yy", "zz", "xy", "xz", "yz")
+NAMES = (*(f"inertia_kg_m2.{axes}" for axes in INERTIA_NAMES), "height_m", "delay_s")
+"""Of what motion adds to the 15 static coordinates."""
+INERTIA, HEIGHT, DELAY, GAINS, CROSS_TALK = slice(15, 21), 21, 22, slice(23, 28), slice(28, 34)
+"""Places in an error vector."""
+SIZE = 34
+
+_PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+_BASIS = np.zeros((6, 3, 3))
+for _k, (_i, _j) in enumerate(_PLACES):
+    _BASIS[_k, _i, _j] = _BASIS[_k, _j, _i] = 1.0
+_SECOND_MOMENTS = np.trace(_BASIS, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - _BASIS
+_TURNS = skew(np.eye(3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Load:
+    """All that is estimated from motion."""
+
+    static: Parameters
+    g_m_s2: float
+    inertia: Array = field(default_factory=lambda: np.zeros(6))
+    """(6,) in the order of `INERTIA_NAMES`, about the centre of mass, in sensor axes."""
+    height_m: float = 0.0
+    """Of the sensor origin above the flange face."""
+    delay_s: float = 0.0
+    """Of the wrench, beyond that of the rows."""
+    response: Array = field(default_factory=lambda: np.zeros(11))
+    """Coefficients of gain and cross-talk."""
+
+    def moved(self, step: Array) -> Self:
+        """Apply an error vector (34,): 15 as in `Parameters.moved`, as `NAMES`, then the response."""
+        return replace(
+            self,
+            static=self.static.moved(step[:15]),
+            inertia=self.inertia + step[INERTIA],
+            height_m=self.height_m + float(step[HEIGHT]),
+            delay_s=self.delay_s + float(step[DELAY]),
+            response=self.response + step[GAINS.start :],
+        )
+
+    @property
+    def vector(self) -> Array:
+        """(34,) values for priors about zero; the static ones are 0."""
+        return np.concatenate([np.zeros(15), self.inertia, [self.height_m, self.delay_s], self.response])
+
+    @property
+    def mass_kg(self) -> float:
+        """Weight divided by gravity."""
+        return float(np.linalg.norm(self.static.gravity_force_base_N)) / self.g_m_s2
+
+    @property
+    def inertia_kg_m2(self) -> Array:
+        """The inertia as a matrix (3, 3)."""
+        return np.asarray(np.tensordot(self.inertia, _BASIS, 1))
+
+
+def wrench_of(load: Load, motion: Motion, *, bias: bool = True) -> Array:
+    """Wrench (n, 6) that the sensor reads without contact.
+
+    Parameters
+    ----------
+    load : Load
+        Its delay is not applied: `Motion.earlier` does that.
+    motion : Motion
+    bias : bool
+        Whether to add the bias.
+    """
+    static, Q = load.static, load.static.R_flange_sensor
+    u = _force(load, motion) @ Q
+    torque = np.cross(static.p_sensor_com_m, u)
+    torque -= _vee(Q.T @ motion.Omega_rad2_s2 @ Q @ np.tensordot(load.inertia, _SECOND_MOMENTS, 1))
+    K, X = np.tensordot(load.response[:5], GAIN, 1), np.tensordot(load.response[5:], CROSS_TALK_M, 1)
+    wrench = np.hstack([u + u @ K, torque + u @ X])
+    return wrench + np.concatenate([static.force_bias_N, static.torque_bias_Nm]) if bias else wrench
+
+
+def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:
+    """Derivative (n, 6, 34) of the wrench by the error vector of `Load.moved`, at the motion that the delay gives."""
+    static, m, Q = load.static, load.mass_kg, load.static.R_flange_sensor
+    Qt, F_b, c = Q.T, static.gravity_force_base_N, static.p_sensor_com_m
+    lever = np.array([0.0, 0.0, load.height_m]) + Q @ c
+    second = np.tensordot(load.inertia, _SECOND_MOMENTS, 1)
+    force = _force(load, motion)
+    R, Omega = motion.R_base_flange, motion.Omega_rad2_s2
+    accelerated = motion.acceleration_m_s2 + Omega @ lever
+    u, Omega_S = force @ Q, Qt @ Omega @ Q
+    direction = F_b / max(float(np.linalg.norm(F_b)), 1e-12) / load.g_m_s2
+
+    J = np.zeros((len(R), 6, SIZE))
+    dU, dT = J[:, :3], J[:, 3:]
+    dU[:, :, 0:3] = -Qt @ skew(force) - m * Qt @ Omega @ skew(Q @ c)
+    dU[:, :, 3:6] = Qt @ np.swapaxes(R, 1, 2) - (accelerated @ Q)[:, :, None] * direction
+    dU[:, :, 9:12] = -m * Omega_S
+    dU[:, :, HEIGHT] = -m * Omega[:, :, 2] @ Q
+    dT[:] = skew(c) @ dU
+    for k, turn in enumerate(_TURNS):
+        dT[:, :, k] -= _vee(Qt @ (turn @ Omega - Omega @ turn) @ Q @ second)
+    dT[:, :, 9:12] -= skew(u)
+    for k, basis in enumerate(_SECOND_MOMENTS):
+        dT[:, :, 15 + k] = -_vee(Omega_S @ basis)
+    K, X = np.tensordot(load.response[:5], GAIN, 1), np.tensordot(load.response[5:], CROSS_TALK_M, 1)
+    dT += X @ dU
+    dU += K @ dU
+    dU[:, :, 6:9] = dT[:, :, 12:15] = np.eye(3)
+    J[:, :, DELAY] = -wrench_of(load, rate, bias=False)
+    dU[:, :, GAINS] = np.einsum("kij,nj->nik", GAIN, u)
+    dT[:, :, CROSS_TALK] = np.einsum("kij,nj->nik", CROSS_TALK_M, u)
+    return J
+
+
+def _force(load: Load, motion: Motion) -> Array:
+    """Force (n, 3) of the load in flange axes."""
+    lever = np.array([0.0, 0.0, load.height_m]) + load.static.R_flange_sensor @ load.static.p_sensor_com_m
+    weight = load.static.gravity_force_base_N @ motion.R_base_flange
+    return np.asarray(weight - load.mass_kg * (motion.acceleration_m_s2 + motion.Omega_rad2_s2 @ lever))
+
+
+def _vee(M: Array) -> Array:
+    return np.stack([M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]], axis=-1)

@@ -1,0 +1,228 @@
+"""Samples of sensor and arm in motion, reduced while they are read to what the estimator needs.
+
+Two steps. `Means` averages each stream over 10 ms, in constant memory a second of recording. `rows_of` puts both on one
+clock, differentiates the poses, and passes wrench and motion through the same zero-phase filter to 8 rows a second.
+
+The wrench is linear in the orientation R, the acceleration a of the flange origin and `Omega` = [alpha]x + [omega]x²
+(all in flange axes). Products of poses are taken before the filter, so what it cuts, it cuts on both sides alike.
+"""
+
+from dataclasses import dataclass
+from itertools import permutations
+from typing import Self
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ftcalib.errors import BadDataset
+from ftcalib.model import Array, skew
+
+MEAN_S = 0.01
+ROW_S = 0.12
+BAND_HZ = 4.7
+"""Of the rows, at half amplitude: below the ripple of gears and the vibration of an arm, above its motion. White noise
+of the sensor is white in the rows."""
+GAP_S = 0.06
+"""Rows whose filter spans a longer gap, or one of three periods of a slower stream, are left out."""
+
+_STEP = round(ROW_S / MEAN_S)
+_LAGS_S = MEAN_S * np.arange(-40, 41)
+_KERNEL = np.sinc(2 * BAND_HZ * _LAGS_S) * np.kaiser(81, 6.0)
+_KERNEL /= _KERNEL.sum()
+_RATE_KERNEL = np.convolve(_KERNEL, [-0.5 / MEAN_S, 0.0, 0.5 / MEAN_S])
+"""Filters and differentiates."""
+_WIDE_KERNEL = np.pad(_KERNEL, 1)
+_FIT = np.linalg.pinv(np.vander(_LAGS_S[35:46], 5, increasing=True))[:3].T * [1.0, 1.0, 2.0]
+"""(11, 3) value and two derivatives of a quartic through 110 ms: flat over the band."""
+_REACH = len(_WIDE_KERNEL) // 2 + len(_FIT) // 2
+_CHUNK = 600
+"""Rows that are filtered at once."""
+_LEVER_M = 0.5
+"""Translation counts as a rotation about a point this far away."""
+
+
+class Means:
+    """Means of one stream over 10 ms, added piece by piece."""
+
+    def __init__(self) -> None:
+        self._parts: list[tuple[NDArray[np.int64], Array]] = []
+        self._last_s = -np.inf
+        self.samples = 0
+
+    def add(self, t_s: Array, values: Array) -> None:
+        """Add samples.
+
+        Parameters
+        ----------
+        t_s : array, shape (n,)
+            Not before those added earlier.
+        values : array, shape (n, k)
+
+        Raises
+        ------
+        BadDataset
+            The time goes back, or a number is not finite.
+        """
+        if not len(t_s):
+            return
+        if t_s[0] < self._last_s or (np.diff(t_s) < 0).any():
+            raise BadDataset("the time goes back: give the samples in the order of their times")
+        if not (np.isfinite(t_s).all() and np.isfinite(values).all()):
+            raise BadDataset("a time or a value is not a finite number: remove these samples")
+        self._last_s, self.samples = float(t_s[-1]), self.samples + len(t_s)
+        cell = np.floor(t_s / MEAN_S).astype(np.int64)
+        first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
+        sums = np.add.reduceat(np.column_stack([np.ones(len(t_s)), t_s, values]), first)
+        self._parts.append((cell[first], sums))
+
+    def result(self) -> tuple[Array, Array]:
+        """Return the mean time (m,) and the means (m, k) of each 10 ms that have samples."""
+        if not self._parts:
+            raise BadDataset("there are no samples")
+        cell = np.concatenate([cells for cells, _ in self._parts])
+        first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))  # a cell of two pieces
+        sums = np.add.reduceat(np.concatenate([sums for _, sums in self._parts]), first)
+        return sums[:, 1] / sums[:, 0], sums[:, 2:] / sums[:, :1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """What the wrench of a load depends on, n rows; linear filters apply to each number."""
+
+    R_base_flange: Array
+    """(n, 3, 3)"""
+    acceleration_m_s2: Array
+    """(n, 3) of the flange origin, in flange axes, gravity not included."""
+    Omega_rad2_s2: Array
+    """(n, 3, 3) skew(angular acceleration) + skew(angular velocity)², in flange axes."""
+
+    def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Self:
+        """Return some rows."""
+        return type(self)(self.R_base_flange[rows], self.acceleration_m_s2[rows], self.Omega_rad2_s2[rows])
+
+    def earlier(self, by_s: float, rate: "Motion") -> "Motion":
+        """Return the motion a little before, from its rate of change."""
+        return Motion(
+            self.R_base_flange - by_s * rate.R_base_flange,
+            self.acceleration_m_s2 - by_s * rate.acceleration_m_s2,
+            self.Omega_rad2_s2 - by_s * rate.Omega_rad2_s2,
+        )
+
+    def columns(self) -> Array:
+        """Return all 21 numbers of each row."""
+        n = len(self.acceleration_m_s2)
+        return np.hstack([self.R_base_flange.reshape(n, 9), self.acceleration_m_s2, self.Omega_rad2_s2.reshape(n, 9)])
+
+    @classmethod
+    def of_columns(cls, columns: Array) -> Self:
+        """Build from `columns`."""
+        return cls(columns[:, :9].reshape(-1, 3, 3), columns[:, 9:12], columns[:, 12:].reshape(-1, 3, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """Wrench and motion on one clock, filtered alike, 8 rows a second where both are complete."""
+
+    t_s: Array
+    wrench: Array
+    """(n, 6)"""
+    motion: Motion
+    rate: Motion
+    """Of change, per second."""
+    speed_rad_s: Array
+    """(n,) angular speed, plus that of the flange origin at 0.5 m: the state of motion."""
+    delay_s: float
+    """Assumed delay of the wrench after the poses."""
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+    def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Self:
+        """Return some rows."""
+        parts = self.t_s[rows], self.wrench[rows], self.motion[rows], self.rate[rows], self.speed_rad_s[rows]
+        return type(self)(*parts, self.delay_s)
+
+
+def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: float = 0.0) -> Rows:
+    """Put wrench and poses on one clock.
+
+    Parameters
+    ----------
+    wrench : tuple of array, shapes (n,) and (n, 6)
+        Times and wrenches, `Means.result`.
+    poses : tuple of array, shapes (m,) and (m, 9) or (m, 12)
+        Times, R_base_flange row by row, and the position of the flange where it is known. Without it the acceleration
+        counts as 0.
+    delay_s : float
+        Of the wrench after the pose at which it arose.
+
+    Raises
+    ------
+    BadDataset
+        The two have less than a second in common.
+    """
+    t_w, t_p = wrench[0], poses[0] + delay_s
+    first, last = max(t_w[0], t_p[0]), min(t_w[-1], t_p[-1])
+    count = int((last - first) / MEAN_S) - 2 * _REACH
+    if count < 1 / MEAN_S:
+        raise BadDataset(
+            f"wrench and poses have {max(last - first, 0):.1f} s in common: give files of one recording, on one clock"
+        )
+    quaternion = Rotation.from_matrix(poses[1][:, :9].reshape(-1, 3, 3)).as_quat()
+    turned = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
+    quaternion[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
+    poses = t_p, np.hstack([quaternion, poses[1][:, 9:]])
+    parts = [
+        _chunk((t_w, wrench[1]), poses, first + MEAN_S * np.arange(start * _STEP, end * _STEP + 2 * _REACH))
+        for start in range(0, count // _STEP, _CHUNK)
+        for end in [min(start + _CHUNK, count // _STEP)]
+    ]
+    t, y, columns, rates, speed = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return Rows(t, y, Motion.of_columns(columns), Motion.of_columns(rates), speed, delay_s)
+
+
+def _chunk(wrench: tuple[Array, Array], poses: tuple[Array, Array], grid: Array) -> tuple[Array, ...]:
+    """Return time, wrench, columns of the motion, their rates and the speed, where no gap is near."""
+    (y, whole_w), (pose, whole_p) = _at(grid, *wrench), _at(grid, *poses)
+    fits = np.einsum("nkw,wd->dnk", sliding_window_view(pose, len(_FIT), axis=0), _FIT)
+    length = np.linalg.norm(fits[0, :, :4], axis=1, keepdims=True)
+    unit = fits[:, :, :4] / length
+    R = Rotation.from_quat(unit[0]).as_matrix()
+    omega, alpha = (2 * _conjugate_product(unit[0], unit[k]) for k in (1, 2))
+    velocity, acceleration = (fits[k, :, 4:] if pose.shape[1] > 4 else np.zeros((len(R), 3)) for k in (1, 2))
+    W = skew(omega)
+    Omega = skew(alpha) + W @ W
+    a = np.einsum("nji,nj->ni", R, acceleration)
+    motion = Motion(R + MEAN_S**2 / 24 * R @ Omega, a, Omega)  # R as its mean over 10 ms, like the wrench
+    speed = np.linalg.norm(omega, axis=1) + np.linalg.norm(velocity, axis=1) / _LEVER_M
+    inner = slice(len(_FIT) // 2, len(grid) - len(_FIT) // 2)
+    windows = sliding_window_view(motion.columns(), len(_WIDE_KERNEL), axis=0)[::_STEP]
+    whole = np.all(sliding_window_view((whole_w & whole_p)[inner], len(_WIDE_KERNEL))[::_STEP], axis=1)
+    return (
+        grid[_REACH:-_REACH:_STEP][: len(whole)][whole],
+        (sliding_window_view(y[inner], len(_WIDE_KERNEL), axis=0)[::_STEP] @ _WIDE_KERNEL)[whole],
+        (windows @ _WIDE_KERNEL)[whole],
+        (windows @ _RATE_KERNEL)[whole],
+        sliding_window_view(speed, len(_WIDE_KERNEL))[::_STEP].mean(axis=1)[whole],
+    )
+
+
+def _at(grid: Array, t_s: Array, values: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Interpolate with the cubic through the four samples around each time, and say where no gap is."""
+    steps = np.diff(t_s)
+    after = np.clip(np.searchsorted(t_s, grid), 1, len(t_s) - 1)
+    whole = steps[after - 1] < max(GAP_S, 3 * float(np.median(steps)))
+    around = np.clip(after, 2, len(t_s) - 2)[:, None] + [-2, -1, 0, 1]
+    x = grid[:, None] - t_s[around]
+    weights = np.ones_like(x)
+    for i, j in permutations(range(4), 2):
+        weights[:, i] *= x[:, j] / (t_s[around[:, j]] - t_s[around[:, i]]) * -1
+    return np.einsum("nk,nkc->nc", weights, values[around]), whole
+
+
+def _conjugate_product(q: Array, r: Array) -> Array:
+    """Vector part (n, 3) of conj(q) r for quaternions x, y, z, w."""
+    v, w = q[:, :3], q[:, 3:]
+    return np.asarray(w * r[:, :3] - r[:, 3:] * v - np.cross(v, r[:, :3]))

@@ -1,0 +1,327 @@
+"""A calibration from a recording in motion."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftcalib.assessment.cross_validation import IndependentFit
+from ftcalib.assessment.observability import assess
+from ftcalib.assessment.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, expected_error, judge
+from ftcalib.errors import BadDataset, NotObservable
+from ftcalib.findings import Finding, Severity, ordered, verdict_of
+from ftcalib.known import Known
+from ftcalib.likelihood.gain_and_cross_talk import Response
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
+from ftcalib.motion.estimate import MotionFit, fit, rough_delay
+from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
+from ftcalib.motion.samples import ROW_S, Means, Rows, rows_of
+from ftcalib.result import CalibrationResult, DriftResult, MotionResult
+from ftcalib.setup import NOTHING, Setup
+
+LEAST_S = 5.0
+FARTHEST_S = 1.5
+"""Largest delay that is found."""
+OFFSET_S = 0.1
+"""A longer delay is a mistake of a clock."""
+LINEAR_S = 2e-3
+"""So far from the delay of the rows the model is linear in it."""
+SLOW_RAD_S = 0.15
+"""Of the parts that count without positions."""
+REACH_M = 1.0
+"""Radius at which an arm swings the flange: bounds the acceleration that is unknown without positions."""
+NARROW_DEG = 45.0
+MEASURED = 0.3
+"""A parameter is determined if its sigma is below this share of what is expected of any tool."""
+WRONG_HEIGHT_M = 3e-3
+MOSTLY = 0.5
+"""Share of contact that limits a result."""
+_UNEXPLAINED = 0.3
+"""Share of the change of the force that a wrong recording leaves."""
+_MISTAKES = frozenset(
+    ("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree")
+)
+_COMPENSATED = 0.5
+"""Of the inertial mass: less weight than this was subtracted."""
+_JUDGED_ROWS = 300
+_OF_POSES = frozenset(("noise_unknown", "poses_unchecked", "pose_deviates", "residuals_alike", "few_poses"))
+"""Findings about single poses, which rows in motion are not."""
+
+
+def solve_motion(
+    wrench: Means,
+    poses: Means,
+    *,
+    known: Known | None = None,
+    point_mass: bool = False,
+    height_m: float | None = None,
+    g_m_s2: float = STANDARD_GRAVITY_M_S2,
+    setup: Setup = NOTHING,
+    provenance: Mapping[str, Any] | None = None,
+) -> CalibrationResult:
+    """Calibrate from a free tool in motion.
+
+    Parameters
+    ----------
+    wrench : Means
+        Of fx, fy, fz, tx, ty, tz in N and N·m, as measured, in the sensor frame.
+    poses : Means
+        Of R_base_flange row by row, and of the position of the flange in base, m, if it is known: 12 or 9 columns. Both
+        on one clock, s, each at its own rate.
+    known : Known, optional
+        Known mounting, direction of gravity and mass.
+    point_mass : bool
+        Whether the inertia of the load about its centre of mass is known to be 0.
+    height_m : float, optional
+        Of the sensor origin above the flange face, as configured, to be checked.
+    g_m_s2 : float
+    setup : Setup
+        The described cell, for the verdict.
+    provenance : mapping, optional
+        Stored with the result. Must be valid JSON.
+
+    Raises
+    ------
+    BadDataset
+        Too short, or without a common time.
+    NotObservable
+        The motion does not determine the parameters; the message names what is missing.
+    """
+    data = wrench.result(), poses.result()
+    positions = data[1][1].shape[1] == 12
+    delay_s = _coarse_delay(rows_of(*data))
+    rows = rows_of(*data, delay_s)
+    delay_s += rough_delay(_used(rows, positions), known, g_m_s2)
+    for _ in range(3):
+        rows = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)))
+        used = _used(rows, positions)
+        best = fit(used, known, g_m_s2, point_mass=point_mass or not positions)
+        delay_s = rows.delay_s + best.load.delay_s
+        if abs(best.load.delay_s) < LINEAR_S:
+            break
+    _require_determined(used, best, known)
+    duration_s = float(np.ptp(data[0][0]))
+    contacts = _contacts(used, best, data[0][0][0]) if positions else ()
+    motion = MotionResult(
+        best.load.inertia_kg_m2,
+        delay_s,
+        best.load.height_m,
+        best.covariance[:23, :23],
+        min(best.kept.sum() * ROW_S / duration_s, 1.0),
+        contacts,
+    )
+    quality, judged = _judged(used, best, setup, known, g_m_s2)
+    found = [one for one in quality.findings if one.code not in _OF_POSES]
+    mistakes = _mistakes(used, best, found)
+    found += mistakes + _narrow(used, best, explained=verdict_of(mistakes + found) == "rejected")
+    found += _findings(rows, used, best, motion, height_m, positions=positions)
+    estimated = best.components.keys() & {"gain", "cross_talk"}
+    places = np.r_[0:15, 23:34]
+    return CalibrationResult(
+        parameters=best.load.static,
+        covariance=best.covariance[:15, :15],
+        residuals=best.residuals[judged],
+        chi2=best.chi2,
+        dof=max(6 * int(best.kept.sum()) - 23, 1),
+        noise_source="residuals",
+        g_m_s2=g_m_s2,
+        method="motion",
+        findings=ordered(found),
+        provenance=provenance or {},
+        components=best.components,
+        drift=None if best.drift_change is None else DriftResult(*best.drift_change),
+        response=Response(best.load.response, best.covariance[np.ix_(places, places)]) if estimated else None,
+        gain_sigma=best.components.get("gain", 0.0),
+        second_basin_chi2=best.second_basin_chi2,
+        quality={
+            "loo_force_rms_N": quality.loo_force_rms_N,
+            "loo_torque_rms_Nm": quality.loo_torque_rms_Nm,
+            "worst_pose": quality.worst_pose + 1,
+            "residual_sigma": quality.residual_sigma.tolist(),
+            "lag1": quality.lag1,
+            "correlations": [list(pair) for pair in quality.correlations],
+        },
+        motion=motion,
+    )
+
+
+def _coarse_delay(rows: Rows) -> float:
+    """Delay, in whole rows, at which a linear function of the motion explains the wrench best."""
+    if len(rows) * ROW_S < LEAST_S:
+        raise BadDataset(f"{len(rows) * ROW_S:.1f} s of motion without a gap are too short: record 20 s or more")
+    index = np.round((rows.t_s - rows.t_s[0]) / ROW_S).astype(np.int64)
+    place = np.full(index[-1] + 1, -1)
+    place[index] = np.arange(len(rows))
+    features = np.column_stack([np.ones(len(rows)), rows.motion.columns()])
+    y = rows.wrench / np.maximum(rows.wrench.std(axis=0), 1e-12)
+    farthest = min(round(FARTHEST_S / ROW_S), len(place) // 4)
+    left = {}
+    for shift in range(-farthest, farthest + 1):
+        at = np.arange(max(shift, 0), min(len(place) + shift, len(place)))
+        both = (place[at] >= 0) & (place[at - shift] >= 0)
+        X, target = features[place[at - shift][both]], y[place[at][both]]
+        if len(X) > 2 * features.shape[1]:
+            residual = target - X @ np.linalg.lstsq(X, target, rcond=1e-9)[0]
+            left[shift] = float(np.median(np.abs(residual)))
+    best = min(left, key=lambda shift: left[shift], default=0)
+    return rows.delay_s + best * ROW_S if left and left[best] < 0.8 * left[0] else rows.delay_s
+
+
+def _used(rows: Rows, positions: bool) -> Rows:
+    """Return the rows that count: without positions the slow ones."""
+    if positions:
+        return rows
+    slow = rows[rows.speed_rad_s < SLOW_RAD_S]
+    if len(slow) * ROW_S < LEAST_S:
+        raise BadDataset(
+            f"without positions only slow parts count, and these are {len(slow) * ROW_S:.1f} s long: give the position "
+            "of the flange (x, y, z), or record a slower motion"
+        )
+    return slow
+
+
+def _require_determined(rows: Rows, best: MotionFit, known: Known | None) -> None:
+    """Raise `NotObservable` where the error over all orientations would be as large as the weight."""
+    mounting_rad = float(np.sqrt(np.diag(best.covariance)[:3].max()))
+    weight_N = float(np.linalg.norm(best.load.static.gravity_force_base_N))
+    sigma_N = float(np.sqrt(np.diag(best.covariance)[3:6].max()))
+    if mounting_rad < 0.3 and sigma_N < 0.5 * weight_N:
+        return
+    if known is not None:
+        return  # the verdict names it
+    found = assess(_orientations(rows), best.load.static)
+    if found.ambiguities:
+        reason = ": ".join(found.ambiguities[:2])
+        raise NotObservable(f"{reason}; turn wrist 1 and wrist 2 by 60° or more, wrist 3 too, and record again.")
+
+
+def _orientations(rows: Rows) -> Array:
+    return nearest_rotation(rows.motion.R_base_flange[:: max(1, len(rows) // _JUDGED_ROWS)])
+
+
+def _static_wrench(rows: Rows, best: MotionFit, weight_N: float) -> Array:
+    """Wrench (n, 6) at rest in the orientation of each row.
+
+    A fit that fails has the wrong share of the motion. Then the linear function of the motion that fits best has it,
+    whatever axes and signs are.
+    """
+    static = predict(best.load.static, nearest_rotation(rows.motion.R_base_flange)) + best.residuals
+    kept = best.residuals[best.kept, :3]
+    if float(np.sqrt(np.mean(np.sum(kept**2, axis=1)))) < 2 * USABLE_SHARE * weight_N:
+        return np.asarray(static)
+    X = np.column_stack([np.ones(len(rows)), rows.motion.columns()])
+    linear = np.linalg.lstsq(X, rows.wrench, rcond=1e-9)[0]
+    return np.asarray(rows.wrench - X[:, 10:] @ linear[10:])
+
+
+def _judged(
+    rows: Rows, best: MotionFit, setup: Setup, known: Known | None, g_m_s2: float
+) -> tuple[Quality, NDArray[np.intp]]:
+    """Judge some kept rows as if they were poses; also return their places."""
+    places = np.flatnonzero(best.kept)
+    places = places[:: max(1, len(places) // _JUDGED_ROWS)]
+    weight_N = float(np.linalg.norm(best.load.static.gravity_force_base_N))
+    poses = IndependentFit(
+        best.load.static,
+        best.covariance[:15, :15],
+        nearest_rotation(rows.motion.R_base_flange[places]),
+        _static_wrench(rows, best, weight_N)[places],
+        best.sigma[places, :, None] ** 2 * np.eye(6),
+        False,
+        np.ones(len(places)),
+        best.second_basin_chi2,
+    )
+    return judge(poses, t_s=rows.t_s[places], setup=setup, known=known, g_m_s2=g_m_s2), places
+
+
+def _findings(
+    rows: Rows, used: Rows, best: MotionFit, motion: MotionResult, height_m: float | None, *, positions: bool
+) -> list[Finding]:
+    """Findings that only a recording in motion has."""
+    sigma, found = np.sqrt(np.diag(best.covariance)), list[Finding]()
+    if abs(motion.delay_s) > OFFSET_S:
+        found.append(Finding.of("clock_offset", delay_s=motion.delay_s))
+    if not positions:
+        turned = np.linalg.norm(used.motion.Omega_rad2_s2, ord=2, axis=(1, 2))
+        bound_N = best.load.mass_kg * REACH_M * float(np.sqrt(np.mean(turned**2)))
+        share = len(used) / max(len(rows), 1)
+        found.append(Finding.of("positions_missing", share_percent=100 * share, force_N=bound_N))
+    elif height_m is not None and abs(best.load.height_m - height_m) > max(5 * sigma[HEIGHT], WRONG_HEIGHT_M):
+        values = {"height_mm": 1e3 * best.load.height_m, "sigma_mm": 1e3 * sigma[HEIGHT]}
+        found.append(Finding.of("height_differs", **values, configured_mm=1e3 * height_m))
+    if motion.contacts:
+        share = 1 - float(best.kept.mean())
+        largest_N = max(one["force_N"] for one in motion.contacts)
+        values = {"count": len(motion.contacts), "share_percent": 100 * share, "force_N": largest_N}
+        found.append(Finding.of("mostly_contact" if share > MOSTLY else "contacts_left_out", **values))
+    weak = best.prior_share > MEASURED
+    weak[:6] &= sigma[INERTIA] > 0
+    if positions and weak.any():
+        found.append(Finding.of("motion_slow", names=_named([NAMES[k] for k in np.flatnonzero(weak)])))
+    return found
+
+
+def _mistakes(rows: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
+    """Name a wrench that follows the acceleration but not gravity, or that does not follow the motion at all."""
+    X, y = np.column_stack([np.ones(len(rows)), rows.motion.columns()]), rows.wrench[:, :3]
+    linear, _, rank, _ = np.linalg.lstsq(X, y, rcond=1e-9)
+    variance = np.mean((y - X @ linear) ** 2) * len(X) / max(len(X) - rank, 1)
+    weight_N, mass_kg = (float(np.linalg.norm(linear[part]) / np.sqrt(3)) for part in (slice(1, 10), slice(10, 13)))
+    sigma_kg = float(np.sqrt(max(np.trace(np.linalg.pinv(X.T @ X)[10:13, 10:13]) * variance, 0.0)))
+    follows = variance < _UNEXPLAINED**2 * np.mean(y.var(axis=0))
+    light = weight_N < _COMPENSATED * mass_kg * best.load.g_m_s2
+    if follows and light and mass_kg > SIGNIFICANT_SIGMAS * sigma_kg:
+        return [Finding.of("wrench_compensated", weight_N=weight_N, mass_kg=mass_kg)]
+    free = best.kept
+    left = float(np.sqrt(np.mean(best.residuals[free, :3] ** 2) / np.mean(y[free].var(axis=0))))
+    if left > _UNEXPLAINED and not any(one.code in _MISTAKES for one in named):
+        return [Finding.of("other_recording", left_percent=100 * min(left, 1.0))]
+    return []
+
+
+def _narrow(rows: Rows, best: MotionFit, *, explained: bool) -> list[Finding]:
+    """Name too little motion: by its range, or where nothing else explains a large uncertainty."""
+    sigma, range_deg = np.sqrt(np.diag(best.covariance)), _range_deg(rows)
+    weight_N = float(np.linalg.norm(best.load.static.gravity_force_base_N))
+    error = expected_error(best.load.static, best.covariance[:15, :15])[0] / max(weight_N, 1e-9)
+    if range_deg >= NARROW_DEG and (explained or error < USABLE_SHARE):
+        return []
+    severity: Severity = "reject" if error > REJECTED_SHARE else "limit"
+    mounting_deg = min(float(np.degrees(sigma[:3].max())), 180.0)
+    values = {"range_deg": range_deg, "mounting_deg": mounting_deg, "weight_N": sigma[3:6].max()}
+    return [Finding.of("motion_narrow", severity, **values)]
+
+
+def _range_deg(rows: Rows) -> float:
+    """Largest angle between the orientation in the middle of the motion and the others, doubled."""
+    R = _orientations(rows)
+    turned = np.einsum("ji,njk->nik", nearest_rotation(R.mean(axis=0)), R)
+    cosine = np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1)
+    return float(min(2 * np.degrees(np.arccos(cosine)).max(), 360.0))
+
+
+def _contacts(rows: Rows, best: MotionFit, first_s: float) -> tuple[Mapping[str, float], ...]:
+    """Segments that do not fit, without the rows at both sides that the filter or the margin adds."""
+    touched = np.flatnonzero(~best.kept)
+    segments = np.split(touched, np.flatnonzero(np.diff(touched) > 1) + 1) if len(touched) else []
+    found = []
+    for rows_of_one in segments:
+        force, torque = (np.linalg.norm(best.residuals[rows_of_one, k : k + 3], axis=1) for k in (0, 3))
+        within = rows_of_one[(force > force.max() / 2) | (torque > torque.max() / 2)]
+        start_s, end_s = rows.t_s[within[0]] - ROW_S / 2, rows.t_s[within[-1]] + ROW_S / 2
+        found.append(
+            {
+                "t_s": float(start_s - first_s),
+                "duration_s": float(end_s - start_s),
+                "force_N": float(force.max()),
+                "torque_Nm": float(torque.max()),
+            }
+        )
+    return tuple(found)
+
+
+def _named(names: Sequence[str]) -> str:
+    axes = [name.partition(".")[2] for name in names if name.startswith("inertia")]
+    rest = [name.removesuffix("_m").removesuffix("_s") for name in names if not name.startswith("inertia")]
+    return ", ".join(([f"the inertia ({', '.join(axes)})"] if axes else []) + [f"the {name}" for name in rest])

@@ -1,0 +1,158 @@
+"""A calibration in motion from files, read piece by piece: a recording, or two CSV files of another program."""
+
+import csv
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, replace
+from itertools import islice
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult, Known, Setup
+from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns, rotations_of
+from ftcalib.data.dwell_mean import CHANNELS
+from ftcalib.errors import BadDataset
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
+from ftcalib.motion.samples import Means
+from ftcalib.motion.solve import solve_motion
+from ftdrive.recording.compensation import NEEDED
+from ftdrive.recording.files import ENDINGS, read_recording
+from ftdrive.recording.recording import FORMAT, Header
+from ftdrive.runs.run import made_now
+
+_PIECE = 1 << 16
+_POSITION = ("x", "y", "z")
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is a recording of `ftdrive record`, by its ending; a CSV by its first line."""
+    ending = Path(path.name.removesuffix(".partial")).suffix
+    if ending == ".csv" and path.is_file():
+        with path.open("rb") as file:
+            return file.readline(100).startswith(f"# {FORMAT.partition('/')[0]}/".encode())
+    return ending in ENDINGS and ending != ".csv"
+
+
+def solve_recording(
+    path: Path,
+    pair: tuple[Path, Path] | None = None,
+    *,
+    known: Known | None,
+    point_mass: bool,
+    up_in_base: Sequence[float] | None,
+) -> CalibrationResult:
+    """Calibrate from a recording in motion.
+
+    Parameters
+    ----------
+    path : Path
+        A recording of `ftdrive record`.
+    pair : tuple of Path, optional
+        Instead of it: CSV files of the wrench and of the poses, on one clock.
+    known : Known, optional
+        A known direction of gravity means a base that is level with respect to `up_in_base`.
+    point_mass : bool
+        Whether the load is known to have no inertia about its centre of mass.
+    up_in_base : sequence of float, optional
+        (3,) declared up direction.
+
+    Raises
+    ------
+    BadDataset, BadRecording, ConfigError, OSError
+        A file cannot be used.
+    NotObservable
+        The motion does not determine the parameters.
+    """
+    provenance, height_m, g_m_s2 = made_now(), None, STANDARD_GRAVITY_M_S2
+    if pair is None:
+        wrench, poses, header = read_in_motion(path)
+        devices = {"arm": asdict(header.info.arm), "sensor": asdict(header.info.sensor)}
+        provenance |= {"recording": path.name, "devices": devices}
+        g_m_s2 = header.info.calibration.g_m_s2
+        height_m = float(header.info.p_flange_sensor_m[2])
+    else:
+        wrench, poses = read_wrench_file(pair[0]), read_pose_file(pair[1])
+        provenance |= {"wrench": pair[0].name, "orientation": pair[1].name}
+    setup = Setup(up_in_base=up_in_base)
+    if known is not None and known.gravity_direction_base is not None:
+        known = replace(known, gravity_direction_base=-setup.up)
+    return solve_motion(
+        wrench,
+        poses,
+        known=known,
+        point_mass=point_mass,
+        height_m=height_m if height_m is not None and isfinite(height_m) else None,
+        g_m_s2=g_m_s2,
+        setup=setup,
+        provenance=provenance,
+    )
+
+
+def read_in_motion(path: Path) -> tuple[Means, Means, Header]:
+    """Read a recording of `ftdrive record`; without positions where it has none. Raises as `read_recording`."""
+    recording = read_recording(path, NEEDED)
+    rows, wrench, poses = recording.rows, Means(), Means()
+    start_ns = int(rows["t_host_ns"][0])
+    with_position = bool(np.isfinite(rows["p_base_flange_m"][0]).all())
+    for start in range(0, len(rows), _PIECE):
+        some = rows[start : start + _PIECE]
+        t_s = (some["t_host_ns"] - start_ns) * 1e-9
+        R = Rotation.from_quat(some["quaternion_base_flange"]).as_matrix().reshape(-1, 9)
+        wrench.add(t_s, some["raw"])
+        poses.add(t_s, np.hstack([R, some["p_base_flange_m"]]) if with_position else R)
+    return wrench, poses, recording.header
+
+
+def read_wrench_file(path: Path) -> Means:
+    """Read columns t in s, fx, fy, fz in N, tx, ty, tz in N·m. Raises `BadDataset` or `OSError`."""
+    means = Means()
+    for t_s, numbers, _ in _pieces(path, lambda _: CHANNELS, ", ".join(CHANNELS)):
+        _add(means, path, t_s, numbers)
+    return means
+
+
+def read_pose_file(path: Path) -> Means:
+    """Read columns t in s, the orientation of the flange in base and, if they are there, x, y, z in m.
+
+    The orientation is r11..r33, qx, qy, qz, qw, or rx, ry, rz in rad. Raises `BadDataset` or `OSError`.
+    """
+
+    def wanted(names: Sequence[str]) -> Sequence[str]:
+        return [*orientation_columns(names), *(_POSITION if set(_POSITION) <= set(names) else ())]
+
+    means = Means()
+    for t_s, numbers, names in _pieces(path, wanted, ORIENTATION_FORMS):
+        of_orientation = tuple(name for name in names if name not in _POSITION)
+        try:
+            R = rotations_of(of_orientation, numbers[:, : len(of_orientation)]).reshape(-1, 9)
+        except BadDataset as error:
+            raise BadDataset(f"{path.name}: {error}") from error
+        _add(means, path, t_s, np.hstack([R, numbers[:, len(of_orientation) :]]))
+    return means
+
+
+def _add(means: Means, path: Path, t_s: Array, values: Array) -> None:
+    try:
+        means.add(t_s, values)
+    except BadDataset as error:
+        raise BadDataset(f"{path.name}: {error}") from error
+
+
+def _pieces(
+    path: Path, columns_of: Callable[[Sequence[str]], Sequence[str]], wanted: str
+) -> Iterator[tuple[Array, Array, Sequence[str]]]:
+    """Give times (n,), the columns that are chosen by the names of all (n, k), and their names."""
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        names = [name.strip() for name in next(csv.reader(file), [])]
+        found = columns_of(names)
+        if not {"t", *found} <= set(names):
+            raise BadDataset(f"{path.name}: the first row must name t and {wanted}; it names {', '.join(names)}")
+        order = [names.index(name) for name in ("t", *found)]
+        while lines := list(islice(file, _PIECE)):
+            try:
+                table = np.loadtxt(lines, delimiter=",", usecols=order, ndmin=2)
+            except ValueError as error:
+                raise BadDataset(f"{path.name}: {error}: correct this line") from error
+            yield table[:, 0], table[:, 1:], found

@@ -1,0 +1,166 @@
+"""Calibration from motion: the model against its derivatives and a simulated arm, and what may be wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ftcalib import CalibrationResult, Known, NotObservable
+from ftcalib.errors import BadDataset
+from ftcalib.model import Parameters
+from ftcalib.motion.model import SIZE, Load, jacobian, wrench_of
+from ftcalib.motion.samples import Means, Motion, rows_of
+from ftcalib.motion.solve import solve_motion
+from tests.moving_load import Recorded, Truth, means_of, programme, record, sweep
+
+TRUTH = Truth()
+QUIET = Truth(noise=(0, 0), vibration=(0, 0), joint_noise_rad=0)
+SWEEP_S = 12.0
+
+
+@pytest.fixture(scope="module")
+def swept() -> Recorded:
+    return record(TRUTH, sweep(SWEEP_S), SWEEP_S, 1)
+
+
+@pytest.fixture(scope="module")
+def result(swept: Recorded) -> CalibrationResult:
+    return solve_motion(*means_of(swept), height_m=TRUTH.height_m)
+
+
+def load_of(truth: Truth, response: object = 0.0) -> Load:
+    inertia = truth.inertia_kg_m2[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+    static = Parameters(**truth.to_dict())
+    return Load(static, 9.80665, inertia, truth.height_m, 0.0, np.zeros(11) + np.asarray(response))
+
+
+def test_rows_follow_the_model_of_point_masses() -> None:
+    wrench, poses = means_of(record(QUIET, sweep(SWEEP_S), SWEEP_S, 1))
+    rows = rows_of(wrench.result(), poses.result(), QUIET.delay_s)
+    left = rows.wrench - wrench_of(load_of(QUIET), rows.motion)
+    assert np.abs(left[:, :3]).max() < 2e-3
+    assert np.abs(left[:, 3:]).max() < 2e-4
+
+
+def test_jacobian_is_the_derivative() -> None:
+    rng = np.random.default_rng(0)
+    motion, rate = (Motion.of_columns(rng.standard_normal((4, 21))) for _ in range(2))
+    load = load_of(TRUTH, 0.1 * rng.standard_normal(11))
+
+    def read(step: np.ndarray) -> np.ndarray:
+        moved = load.moved(step)
+        return wrench_of(moved, motion.earlier(moved.delay_s, rate))
+
+    steps = 1e-6 * np.eye(SIZE)
+    numeric = np.stack([(read(step) - read(-step)) / 2e-6 for step in steps], axis=2)
+    np.testing.assert_allclose(jacobian(load, motion, rate), numeric, atol=1e-6)
+
+
+def test_a_sweep_gives_all_that_motion_shows(result: CalibrationResult) -> None:
+    motion = result.motion
+    assert motion is not None
+    assert result.verdict == "good"
+    assert abs(result.mass_kg - TRUTH.mass_kg) < 4 * float(result.sigma["mass_kg"]) < 1e-3
+    error = (motion.inertia_kg_m2 - TRUTH.inertia_kg_m2) / motion.sigma["inertia_kg_m2"]
+    assert np.abs(error).max() < 4
+    assert abs(motion.delay_s - TRUTH.delay_s) < 1e-4
+    assert abs(motion.height_m - TRUTH.height_m) < 4 * float(motion.sigma["height_m"])
+    step = Parameters(**TRUTH.to_dict()).difference(result.parameters) / np.sqrt(np.diag(result.covariance))
+    assert np.abs(step).max() < 4
+
+
+def test_the_file_keeps_the_motion(result: CalibrationResult) -> None:
+    again = CalibrationResult.from_dict(result.to_dict())
+    assert again.id == result.id
+    assert again.motion is not None
+    assert result.motion is not None
+    np.testing.assert_array_equal(again.motion.inertia_kg_m2, result.motion.inertia_kg_m2)
+    assert again.sigma["delay_s"] == result.sigma["delay_s"]
+
+
+def test_gain_and_cross_talk_are_found() -> None:
+    gain = np.diag([0.03, -0.02, -0.01])
+    truth = replace(TRUTH, gain=gain, cross_talk_m=np.diag([1e-3, -5e-4, 5e-4]))
+    found = solve_motion(*means_of(record(truth, sweep(SWEEP_S), SWEEP_S, 2)))
+    assert found.response is not None
+    np.testing.assert_allclose(found.response.force_gain, gain, atol=2e-3)
+
+
+def test_contact_is_left_out_and_listed() -> None:
+    joints, stops = programme(4, 30.0)
+    touched = {(start + 0.1, end): np.r_[0, 0, -6.0, 0.1, 0, 0] for start, end in stops[1::2]}
+    result = solve_motion(*means_of(record(TRUTH, joints, 30.0, 4, contacts=touched)))
+    motion = result.motion
+    assert motion is not None
+    assert result.verdict == "good"
+    assert abs(result.mass_kg - TRUTH.mass_kg) < 4 * float(result.sigma["mass_kg"])
+    starts = [start for start, _ in touched if start < 29]
+    assert [one["t_s"] for one in motion.contacts] == pytest.approx(starts, abs=0.2)
+    assert all(4 < one["force_N"] < 8 for one in motion.contacts)
+    assert "contacts_left_out" in {one.code for one in result.findings}
+
+
+def compensated(swept: Recorded) -> Recorded:
+    weight = np.einsum("nji,j->ni", swept.R_base_flange @ TRUTH.R_flange_sensor, TRUTH.mass_kg * TRUTH.gravity_m_s2)
+    return replace(swept, wrench=swept.wrench - np.hstack([weight, np.cross(TRUTH.p_sensor_com_m, weight)]))
+
+
+def other_poses(swept: Recorded) -> Recorded:
+    other = record(TRUTH, sweep(SWEEP_S, hz=(0.17, 0.11, 0.27), phase=(2.0, 0.3, 4.0)), SWEEP_S, 1)
+    return replace(swept, R_base_flange=other.R_base_flange, p_base_flange_m=other.p_base_flange_m)
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (lambda s: replace(s, t_pose_s=s.t_pose_s + 0.5), "clock_offset"),
+        (compensated, "wrench_compensated"),
+        (other_poses, "other_recording"),
+        (lambda s: replace(s, wrench=s.wrench * [1, -1, 1, -1, 1, -1]), "forces_reversed"),
+        (lambda _: record(TRUTH, sweep(SWEEP_S, (0.17, 0.17, 0.17)), SWEEP_S, 1), "motion_narrow"),
+    ],
+)
+def test_wrong_data_are_named(swept: Recorded, change: object, code: str) -> None:
+    found = solve_motion(*means_of(change(swept)))  # type: ignore[operator]
+    assert code in {one.code for one in found.findings if one.severity != "note"}
+    assert found.verdict != "good"
+
+
+def test_a_motion_about_one_axis_determines_nothing() -> None:
+    with pytest.raises(NotObservable, match=r"last joint.*turn wrist 1"):
+        solve_motion(*means_of(record(TRUTH, sweep(SWEEP_S, (0, 0, 1.5)), SWEEP_S, 1)))
+
+
+def test_known_values_determine_what_the_motion_does_not() -> None:
+    about_one_axis = record(TRUTH, sweep(SWEEP_S, (0.0, 1.3, 0.0)), SWEEP_S, 1)
+    known = Known(R_flange_sensor=TRUTH.R_flange_sensor, gravity_direction_base=TRUTH.gravity_m_s2)
+    found = solve_motion(*means_of(about_one_axis), known=known, point_mass=True)
+    assert abs(found.mass_kg - TRUTH.mass_kg) < 0.01
+    assert found.motion is not None
+    assert not found.motion.inertia_kg_m2.any()
+
+
+def test_without_positions_slow_parts_count() -> None:
+    joints, _ = programme(3, 40.0)
+    found = solve_motion(*means_of(record(TRUTH, joints, 40.0, 3), positions=False))
+    assert found.verdict == "usable"
+    assert abs(found.mass_kg - TRUTH.mass_kg) < 5e-3
+    assert "positions_missing" in {one.code for one in found.findings}
+
+
+def test_means_are_those_of_all_pieces_together() -> None:
+    rng = np.random.default_rng(0)
+    t, values = np.sort(rng.uniform(0, 1, 997)), rng.standard_normal((997, 2))
+    whole, pieces = Means(), Means()
+    whole.add(t, values)
+    for some in np.array_split(np.arange(997), 13):
+        pieces.add(t[some], values[some])
+    for one, other in zip(whole.result(), pieces.result(), strict=True):
+        np.testing.assert_allclose(one, other)
+    with pytest.raises(BadDataset, match="time goes back"):
+        pieces.add(t[:1], values[:1])
+
+
+def test_recordings_without_a_common_time_are_refused(swept: Recorded) -> None:
+    with pytest.raises(BadDataset, match="in common"):
+        solve_motion(*means_of(replace(swept, t_pose_s=swept.t_pose_s + 100)))
