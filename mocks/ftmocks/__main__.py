@@ -4,9 +4,11 @@ import argparse
 import math
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 from ftmocks.arrays import Array
+from ftmocks.imperfections import Imperfections
 from ftmocks.kinematics import MODELS
 from ftmocks.sensors.catalogue import CHOICES
 from ftmocks.station import Station, parse_vector
@@ -64,6 +66,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--host", help="loopback address to listen on (default: a free 127.x.y.z)")
     add("--time-scale", type=_positive, default=1.0, metavar="K", help="the arm moves K times faster than real")
     add("--sensor", choices=CHOICES, default="can", metavar="NAME", help=f"{', '.join(CHOICES)} (default can)")
+    add(
+        "--imperfections",
+        default="",
+        metavar="NAME=VALUE,…",
+        help="what a real cell does beside the model, none: nothing; "
+        + ", ".join(f"{field.name} ({field.default:g})" for field in fields(Imperfections)),
+    )
     add("--sensor-delay-ms", type=float, metavar="D", help="time between the measurement of a sample and its sending")
     add("--rtde-delay-ms", type=float, metavar="D", help="the same for the samples of the arm")
     add("--recording", type=Path, metavar="FILE.csv", help="serve the raw wrench and the joints of a recording")

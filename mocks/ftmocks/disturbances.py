@@ -48,6 +48,33 @@ class Push:
 
 
 @dataclass(frozen=True)
+class Ramp:
+    """A force at a point of the tool that changes evenly, and then stays.
+
+    Parameters
+    ----------
+    before_N, after_N
+        (3,) in base axes.
+    p_sensor_m
+        The point, (3,) in the sensor frame.
+    start_s, seconds
+        When it changes, on the cell's clock.
+    """
+
+    before_N: Array
+    after_N: Array
+    p_sensor_m: Array
+    start_s: float
+    seconds: float
+
+    def wrench(self, now_s: float, _q: Vector6, R_base_sensor: Array) -> Array | None:
+        """See `Contact`."""
+        share = min(1.0, max(0.0, (now_s - self.start_s) / self.seconds))
+        force_N = R_base_sensor.T @ (self.before_N + share * (self.after_N - self.before_N))
+        return np.concatenate((force_N, cross(self.p_sensor_m, force_N)))
+
+
+@dataclass(frozen=True)
 class Cable:
     """A cable that pulls at a point of the tool when it is taut.
 

@@ -1,6 +1,7 @@
 """The inertia of a payload: a body of one mass, and the wrench that it exerts when it is moved."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +10,25 @@ from ftmocks.kinematics import FlangeMotion, rotation
 
 SYMMETRIC = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
 """Where the six elements ixx, iyy, izz, ixy, ixz, iyz of an inertia tensor stand."""
+
+
+class Body(NamedTuple):
+    """A body: mass, centre of mass (3,) in the sensor frame, inertia tensor per mass about it, (3, 3), sensor axes."""
+
+    mass_kg: float
+    p_sensor_com_m: Array
+    gyration_m2: Array
+
+    def joined(self, other: "Body") -> "Body":
+        """Return both as one."""
+        mass_kg = self.mass_kg + other.mass_kg
+        shares = [(body, body.mass_kg / (mass_kg or 1.0)) for body in (self, other)]
+        com_m = sum((share * body.p_sensor_com_m for body, share in shares), np.zeros(3))
+        gyration_m2 = np.zeros((3, 3))
+        for body, share in shares:
+            arm_m = body.p_sensor_com_m - com_m
+            gyration_m2 += share * (body.gyration_m2 + arm_m @ arm_m * np.eye(3) - np.outer(arm_m, arm_m))
+        return Body(mass_kg, com_m, gyration_m2)
 
 
 def drawn_gyration(rng: np.random.Generator, reach_m: float) -> Array:

@@ -142,7 +142,7 @@ class RecordedWorld(World):
 
     def _true_wrenches(self, t_s: Array) -> Array:
         now_s = float(t_s[-1])
-        return self.recording.wrench(t_s) + self.contact_wrench(now_s) + self._bias(now_s)
+        return self.recording.wrench(t_s) + self.contact_wrench(now_s) + self.bias(now_s)
 
 
 class RecordedArm(Arm):

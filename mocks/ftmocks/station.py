@@ -12,13 +12,14 @@ import signal
 import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 from ftmocks.arrays import Array
 from ftmocks.clock import CellClock
+from ftmocks.imperfections import Imperfections
 from ftmocks.inertia import inertia_tensor
 from ftmocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
 from ftmocks.recording import RecordedArm, RecordedWorld, Recording
@@ -152,7 +153,8 @@ class Station:
         truth = truth_from(options)
         self._recording = recording = _recording(options)
         if recording is None:
-            self.world = World(truth, dh, start_posture(options), options.seed, self._clock)
+            imperfections = Imperfections().changed(options.imperfections)
+            self.world = World(truth, dh, start_posture(options), options.seed, self._clock, imperfections)
         else:
             self.world = RecordedWorld(recording, truth, dh, options.seed, self._clock)
         self.robot = Robot(
@@ -225,7 +227,8 @@ class Station:
     def _start_sensors(self) -> None:
         wanted = {"both": ("can", "serial"), "none": ()}.get(self._options.sensor, (self._options.sensor,))
         if WRIST in wanted:
-            self.robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, self.robot.cycle_s))
+            robot = self.robot
+            robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, robot.cycle_s)) + robot.wrist_error()
         for name in wanted:
             self._sensors[name] = Sensor(
                 name, self.world.measure_at, seed=self._options.seed, host=self.server.host, clock=self._clock
@@ -250,7 +253,7 @@ class Station:
         """Return what is known about the cell: its truth, or the recording, whose truth is unknown."""
         recording = self._recording
         if recording is None:
-            return {"truth": self.world.truth.to_json()}
+            return {"truth": self.world.truth.to_json(), "imperfections": asdict(self.world.imperfections)}
         played = {"file": str(self._options.recording), "samples": len(recording), "duration_s": recording.duration_s}
         return {"truth": None, "recording": played}
 

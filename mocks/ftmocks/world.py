@@ -16,7 +16,8 @@ import numpy as np
 from ftmocks.arrays import Array
 from ftmocks.clock import CellClock
 from ftmocks.disturbances import Contact, SensorDrift
-from ftmocks.inertia import drawn_gyration, moved_load
+from ftmocks.imperfections import IDEAL, Imperfections, Ripple
+from ftmocks.inertia import Body, drawn_gyration, moved_load
 from ftmocks.kinematics import Dh, FlangeMotion, JointState, Vector6, cross, flange_motion, forward, rotation
 
 MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
@@ -26,7 +27,7 @@ AHEAD_S = 0.02
 """The arm of a controller that has run no cycle for so long stands still."""
 BURST_GAP_S = 0.001
 """A burst begins so soon behind the last one, where it is measured from: half the work."""
-REMEMBERED = 8
+REMEMBERED = 16
 """Control cycles whose motion is known: a sensor may be later than the controller."""
 _MINUTE_S = 60.0
 _NOTHING: Array = np.zeros(6)
@@ -114,6 +115,13 @@ class Truth:
         moment = self.mass_kg * p_flange_tool_m + self.sensor_mass_kg * self.p_flange_sensor_com_m
         return moment / (self.payload_kg or 1.0)
 
+    def holding(self, part: Body) -> "Truth":
+        """Return the cell with a part in the gripper."""
+        own_m2 = self.gyration_m2
+        tool = Body(self.mass_kg, self.p_sensor_com_m, np.zeros((3, 3)) if own_m2 is None else own_m2)
+        mass_kg, com_m, gyration_m2 = tool.joined(part)
+        return replace(self, mass_kg=mass_kg, p_sensor_com_m=com_m, gyration_m2=None if own_m2 is None else gyration_m2)
+
     def to_json(self) -> dict[str, Any]:
         """The truth as plain numbers and row-major lists."""
         return {
@@ -174,15 +182,27 @@ class World:
     q
         Joint angles (rad) to start with.
     seed
-        Seed of the noise.
+        Seed of the noise and of the imperfections.
     clock
         Of the cell, for drift and pushes, whatever the speed of the arm; None makes one.
+    imperfections
+        What the arm and its sensors do beside the model.
     """
 
-    def __init__(self, truth: Truth, dh: Dh, q: Vector6, seed: int = 0, clock: CellClock | None = None) -> None:
+    def __init__(
+        self,
+        truth: Truth,
+        dh: Dh,
+        q: Vector6,
+        seed: int = 0,
+        clock: CellClock | None = None,
+        imperfections: Imperfections = IDEAL,
+    ) -> None:
         self.clock = clock or CellClock()
         self.truth = truth
         self.dh = dh
+        self.seed = seed
+        self.imperfections = imperfections
         self.q = q
         self.contacts: dict[str, Contact] = {}
         """What touches the tool, by name."""
@@ -190,6 +210,7 @@ class World:
         """Drifts of the zero besides the drift of the truth."""
         self._t0_s = self.now_s
         self._lock = threading.Lock()
+        self._ripple = Ripple(imperfections, seed)
         self._noise = np.random.default_rng([seed, 2])
         self._noise_sd = np.repeat([truth.noise_force_N, truth.noise_torque_Nm], 3)
         self._still: tuple[Vector6, Truth, tuple[Array, Array]] | None = None
@@ -211,12 +232,14 @@ class World:
     @q.setter
     def q(self, q: Vector6) -> None:
         self._cycles: tuple[Cycle, ...] = (Cycle(-math.inf, q, None),)
+        self._joints_at: dict[float, tuple[JointState, bool]] = {}
 
     def move(self, t_s: float, q: Vector6, motion: Callable[[float], JointState] | None) -> None:
         """Set what the arm does from a control cycle on, see `Cycle`."""
         last = self._cycles[-1]
         if motion is not None or last.motion is not None or last.q is not q:
             self._cycles = (*self._cycles[1 - REMEMBERED :], Cycle(t_s, q, motion))
+            self._joints_at = {}
 
     def true_wrench(self, t_s: float | None = None) -> Array:
         """Return the wrench on the sensor without noise, (6,): N and N·m, sensor axes, bias and drift included.
@@ -227,9 +250,14 @@ class World:
             On the cell's clock, near the present; None for now.
         """
         t_s = self.now_s if t_s is None else t_s
-        return self.load_wrench(t_s) + self.contact_wrench(t_s) + self._bias(t_s)
+        wrench: Array = self._without_ripple(t_s) + self.ripple_wrench(np.array([t_s]))[0]
+        return wrench
 
-    def _bias(self, t_s: float) -> Array:
+    def _without_ripple(self, t_s: float) -> Array:
+        return self.load_wrench(t_s) + self.contact_wrench(t_s) + self.bias(t_s)
+
+    def bias(self, t_s: float) -> Array:
+        """Return the bias with its drift, (6,), sensor axes; time as above."""
         truth = self.truth
         minutes = (t_s - self._t0_s) / _MINUTE_S
         force_bias_N = truth.force_bias_N + minutes * truth.force_drift_N_min
@@ -237,8 +265,16 @@ class World:
         return np.concatenate((force_bias_N, torque_bias_Nm)) + sum((d.at(t_s) for d in self.drifts), _NOTHING)
 
     def _joints(self, t_s: float) -> tuple[JointState, bool]:
-        """Return the joints at a time, and whether they move."""
-        cycles = self._cycles
+        """Return the joints at a time, and whether they move; several parts of a wrench need them."""
+        known = self._joints_at
+        if t_s not in known:
+            if len(known) >= REMEMBERED:
+                self._joints_at = known = {}
+            known[t_s] = self._joints_of(self._cycles, t_s)
+        return known[t_s]
+
+    @staticmethod
+    def _joints_of(cycles: tuple[Cycle, ...], t_s: float) -> tuple[JointState, bool]:
         cycle = next((cycle for cycle in reversed(cycles) if cycle.t_s <= t_s), cycles[0])
         if cycle.motion is None or t_s > cycle.t_s + AHEAD_S:
             return JointState(cycle.q), False
@@ -261,6 +297,19 @@ class World:
             truth.gyration_m2,
         )
         return load
+
+    def ripple_wrench(self, t_s: Array) -> Array:
+        """Return the wrench of the vibration that turning joints cause, (n, 6) or (1, 6), at rising times (n,)."""
+        first_s, last_s = float(t_s[0]), float(t_s[-1])
+        (first, moved), (last, moves) = self._joints(first_s), self._joints(last_s)
+        if not (self.imperfections.ripple and (moved or moves)):
+            return _NOTHING[None]
+        share = ((t_s - first_s) / ((last_s - first_s) or 1.0))[:, None]
+        q, qd = (np.array(a) + share * np.subtract(b, a) for a, b in zip(first[:2], last[:2], strict=True))
+        x, y, z = self.truth.p_sensor_com_m.tolist()
+        force_and_torque = [[1, 0, 0, 0, z, -y], [0, 1, 0, -z, 0, x], [0, 0, 1, y, -x, 0]]
+        wrenches: Array = self._ripple.at(q, qd) @ np.multiply(force_and_torque, self.truth.mass_kg)
+        return wrenches
 
     def sensor_load(self, t_s: float) -> Array:
         """Return the wrench of sensor and adapter on the flange, (6,), its axes and origin; time as above."""
@@ -312,33 +361,42 @@ class World:
         Parameters
         ----------
         t_s
-            (n,) on the cell's clock. The truth is exact at the ends of a burst, and linear in between.
+            (n,) on the cell's clock. The truth without ripple is exact at the ends of a burst, linear in between.
         """
         override = self._override
         if override is not None:
             return np.tile(override, (len(t_s), 1))
+        t_s = t_s - self.imperfections.wrench_delay_s
         with self._lock:
             noise = self._noise.standard_normal((len(t_s), 6))
-        readings: Array = self._true_wrenches(t_s) + noise * self._noise_sd
+            readings: Array = self._true_wrenches(t_s) + noise * self._noise_sd
         return readings
 
     def _true_wrenches(self, t_s: Array) -> Array:
         """Return the wrench on the sensor at these times, (n, 6), or (6,) where it is the same."""
         first_s, last_s = float(t_s[0]), float(t_s[-1])
-        last = self.true_wrench(last_s)
-        if first_s == last_s or not (self._joints(last_s)[1] or self.contacts):
+        last = self._without_ripple(last_s)
+        if first_s == last_s:
+            return last + self.ripple_wrench(t_s)
+        if not (self._joints(last_s)[1] or self.contacts):
             return last
         known_s, known = self._known
         if not 0.0 <= first_s - known_s < BURST_GAP_S:
-            known_s, known = first_s, self.true_wrench(first_s)
+            known_s, known = first_s, self._without_ripple(first_s)
         self._known = (last_s, last)
         wrenches: Array = known + np.outer((t_s - known_s) / (last_s - known_s), last - known)
-        return wrenches
+        return wrenches + self.ripple_wrench(t_s)
 
     def touch(self, name: str, contact: Contact | None) -> None:
         """Set the contact of that name; None removes it."""
         others = {key: value for key, value in self.contacts.items() if key != name}
         self.contacts = others if contact is None else {**others, name: contact}
+
+    def change_load(self, truth: Truth, name: str, contact: Contact) -> None:
+        """Set truth and contact at once: a part that is grasped is still carried by what it lies on."""
+        with self._lock:
+            self.truth = truth
+            self.touch(name, contact)
 
     def shift_payload(self, mass_kg: float | None, p_sensor_com_m: Array | None) -> None:
         """Change the true payload from now on, as when a part is lost, added or slips."""

@@ -13,7 +13,7 @@ from ftdrive.live.stream import CompensatedStream
 from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.live.simulated import calibrated_from
 
-OPTIONS = ("--time-scale", "1", "--sensor-origin", "0,0,0.03", "--inertia", "0,0,0,0,0,0")
+OPTIONS = ("--time-scale", "1", "--sensor-origin", "0,0,0.03", "--inertia", "0,0,0,0,0,0", "--imperfections", "none")
 
 
 def read(stream: CompensatedStream, seconds: float) -> Array:

@@ -16,10 +16,10 @@ ROOT = Path(__file__).parents[2]
 
 
 class StationProcess:
-    """`python -m ftmocks station`, without a sensor unless the options say otherwise."""
+    """`python -m ftmocks station`, without a sensor and imperfections unless the options say otherwise."""
 
     def __init__(self, *options: str) -> None:
-        self._options = options if "--sensor" in options else ("--sensor", "none", *options)
+        self._options = ("--sensor", "none", "--imperfections", "none", *options)
         self.host = ""
         self.start()
 

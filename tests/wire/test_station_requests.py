@@ -13,6 +13,7 @@ import pytest
 
 from ftmocks.__main__ import main
 from ftmocks.sensors.netft import RECORD, NetFtBox
+from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import StationProcess
 from tests.wire.waiting import LIMIT_S
 
@@ -178,6 +179,24 @@ def test_a_program_swings_the_arm_and_inertia_comes_and_goes() -> None:
         assert inertia_N(state) < 1e-6
 
 
+def test_a_production_runs_beside_a_reader_and_writes_its_truth(tmp_path: Path) -> None:
+    file, noise_rad = tmp_path / "truth.jsonl", 1e-2
+    scene = json.dumps({"do": "production", "file": str(file), "parts_kg": [1, 1]})
+    settings = ("--time-scale", "20", "--do", scene, "--imperfections", f"none,joint_noise_rad={noise_rad}")
+    with StationProcess(*settings) as station, RtdeSocket(station.host) as reader:
+        reader.ask("O", struct.pack(">d", 500.0) + b"actual_q,target_q,runtime_state")
+        reader.ask("S")
+        seen = [struct.unpack(">12dI", reader.answer()[4:]) for _ in range(500)]
+        assert "the arm moves" in station.refusal("production")
+        assert station.hello["imperfections"]["joint_noise_rad"] == noise_rad
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert {line["part_kg"] for line in lines} == {0, 1}
+    assert lines[0]["event"] == "start"
+    q, target_q, runtime = np.split(np.array(seen), [6, 12], axis=1)
+    assert (runtime == 2).mean() > 0.9
+    assert np.std((q - target_q)[:, 1]) == pytest.approx(noise_rad, rel=0.2), "joint 2 is hardly late"
+
+
 def test_the_truth_names_the_inertia_and_the_sensor_origin(station: StationProcess) -> None:
     drawn = station.hello["truth"]
     assert (np.linalg.eigvalsh(drawn["inertia_kg_m2"]) > 1e-4).all()
@@ -245,6 +264,7 @@ def test_requests_to_begin_with() -> None:
         (["--sensor", "ur-ft", "--sensor-mass-kg", "0.2"], "leave --sensor-mass-kg out"),
         (["--sensor", "lab"], "invalid choice"),
         (["--inertia", "1,1,3,0,0,0"], "no body has"),
+        (["--imperfections", "ripples=1"], "no setting of a real cell"),
         (["--recording", "missing.csv"], "cannot read the recording"),
         (["--recording", "README.md", "--time-scale", "2"], "leave --time-scale"),
         (["--sensor", "ur-ft", "--sensor-delay-ms", "5"], "no wire of its own"),

@@ -2,8 +2,13 @@
 
 A path is a function of *path time*, which runs slower when the speed slider is down and stands still while the program
 is paused. A motion that meets a moving arm first brings it to rest: position and velocity never jump.
+
+Chosen here, where the script manual is silent: `Servo` is a spring of stiffness `gain` (1/s²), damped so that the
+set-point is `lookahead_time` behind a target that moves evenly. The speed slider does not act on it. A target that a
+joint cannot reach in its time at its largest speed is a protective stop.
 """
 
+import cmath
 import math
 from collections import deque
 from collections.abc import Generator, Sequence
@@ -12,6 +17,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ftmocks.arrays import Array
+from ftmocks.imperfections import IDEAL
 from ftmocks.kinematics import (
     ZERO6,
     Dh,
@@ -27,9 +33,6 @@ from ftmocks.kinematics import (
     rotvec,
     vector6,
 )
-
-FOLLOW_TIME_S = 0.005
-"""Time constant with which the joints follow the set-point."""
 
 SETTLED_RAD = 1e-9
 """Joints that are so near to a set-point at rest are there."""
@@ -196,6 +199,102 @@ class LineMove:
         return JointState(q, qd, vector6(np.linalg.solve(J, rest).tolist()))
 
 
+def damped(off: float, speed: float, stiffness: float, damping: float, t: float) -> tuple[float, float]:
+    """Return distance from rest and speed of ``x'' = -damping x' - stiffness x`` after `t` seconds."""
+    half = damping / 2
+    root = cmath.sqrt(half * half - stiffness) or 1e-9
+    near, turned = cmath.cosh(root * t), cmath.sinh(root * t) / root
+    left = math.exp(-half * t)
+    pull = -stiffness * off - half * speed
+    return (
+        left * (off * near + (speed + half * off) * turned).real,
+        left * (speed * near + pull * turned).real,
+    )
+
+
+class Command(NamedTuple):
+    """A target of servoj."""
+
+    q: Vector6
+    seconds: float
+    """In which the target moves there from the one before."""
+    lookahead_s: float
+    gain: float
+
+
+class Servo:
+    """servoj: the set-point follows targets that the program commands one after the other.
+
+    Parameters
+    ----------
+    q
+        The first target, rad.
+    """
+
+    real_time = False
+    duration_s = math.inf
+
+    def __init__(self, dh: Dh, q: Vector6) -> None:
+        self._dh, self.target, self._from = dh, q, q
+        self._commands: deque[Command] = deque()
+        self._into_s = self._t = 0.0
+        self._gain, self._lookahead_s = 1.0, 1.0
+
+    @property
+    def ahead_s(self) -> float:
+        """How much time the commanded targets will still take."""
+        return sum(command.seconds for command in self._commands) - self._into_s
+
+    def command(self, command: Command) -> None:
+        """Go on to a target.
+
+        Raises
+        ------
+        CannotFollow
+            When a joint cannot be so fast.
+        """
+        for joint, (a, b, limit) in enumerate(zip(self.target, command.q, self._dh.max_speed, strict=True), 1):
+            if abs(b - a) > limit * command.seconds * (1 + 1e-9):
+                jump = f"the target of joint {joint} jumps by {b - a:.4f} rad in {command.seconds:.3f} s"
+                raise CannotFollow(f"servoj: {jump}, at most {limit * command.seconds:.4f} rad are possible")
+        self._commands.append(command)
+        self.target = command.q
+
+    def begin(self, q: Vector6, qd: Vector6, /) -> None:
+        """See `Path`."""
+        self._state = JointState(q, qd)
+
+    def at(self, t: float) -> JointState:
+        """See `Path`."""
+        left_s, self._t = t - self._t, t
+        while self._commands and left_s > 0.0:
+            goal, seconds, self._lookahead_s, self._gain = self._commands[0]
+            passed_s = min(left_s, seconds - self._into_s)
+            rate = vector6([(b - a) / seconds for a, b in zip(self._from, goal, strict=True)])
+            begun = vector6([a + v * self._into_s for a, v in zip(self._from, rate, strict=True)])
+            self._pass(passed_s, begun, rate)
+            left_s -= passed_s
+            self._into_s += passed_s
+            if seconds - self._into_s < 1e-9:
+                self._commands.popleft()
+                self._from, self._into_s = goal, 0.0
+        if left_s > 0.0:
+            self._pass(left_s, self._from, ZERO6)
+        return self._state
+
+    def _pass(self, t: float, target: Vector6, rate: Vector6) -> None:
+        """Let time pass in which the target moves evenly."""
+        gain, damping = self._gain, self._gain * self._lookahead_s
+        states = []
+        for q, v, goal, u in zip(*self._state[:2], target, rate, strict=True):
+            off, speed = damped(q - goal + self._lookahead_s * u, v - u, gain, damping, t)
+            if u == 0.0 and abs(off) + abs(speed) < SETTLED_RAD:
+                off = speed = 0.0
+            at_s = t - self._lookahead_s
+            states.append((goal + u * at_s + off, u + speed, -damping * speed - gain * off))
+        self._state = JointState(*(vector6(values) for values in zip(*states, strict=True)))
+
+
 class HandMove(JointMove):
     """The operator pushes the arm: as movej, but slider and limiter do not act on it."""
 
@@ -231,24 +330,26 @@ class Following(NamedTuple):
 
     Parameters
     ----------
+    lag_s
+        Time constant with which they follow.
     target
         The set-point in that cycle.
     qd
-        Speeds of the joints in that cycle, rad/s, with which they are `FOLLOW_TIME_S` behind the set-point.
+        Speeds of the joints in that cycle, rad/s, with which they are `lag_s` behind the set-point.
     off_rad
         How far the joints are pushed off.
     """
 
+    lag_s: float
     target: JointState
     qd: Vector6
     off_rad: Vector6 = ZERO6
 
     def at(self, t: float) -> JointState:
         """Return the actual joints `t` seconds later, or earlier; exact as long as the acceleration stays."""
-        T = FOLLOW_TIME_S
-        left = math.exp(-t / T)
+        T = self.lag_s
         target_qd = [v + c * t for v, c in zip(self.target.qd, self.target.qdd, strict=True)]
-        qd = _followed(self.qd, self.target.qd, target_qd, self.target.qdd, left)
+        qd = _followed(self.qd, self.target.qd, target_qd, self.target.qdd, t, T)
         q = [
             p + (v + 0.5 * c * t) * t + off - T * own
             for p, v, c, off, own in zip(*self.target, self.off_rad, qd, strict=True)
@@ -266,13 +367,16 @@ class Arm:
         The real arm.
     q
         Joint angles (rad) to start with.
+    lag_s
+        Time constant with which the joints follow the set-point.
     """
 
     obstacle: str | None = None
     """Why this arm cannot be moved."""
 
-    def __init__(self, dh: Dh, q: Vector6) -> None:
+    def __init__(self, dh: Dh, q: Vector6, lag_s: float = IDEAL.servo_lag_s) -> None:
         self.dh = dh
+        self.lag_s = lag_s
         self.q = self.actual_q = q
         self.qd = self.actual_qd = self.qdd = ZERO6
         self.motion: Following | None = None
@@ -289,7 +393,9 @@ class Arm:
         """Present speed of path time, without the slider: `scaling` running, 0 paused, between while it changes."""
         self.still_s = 0.0
         """How long the set-point has stood still."""
-        self._slider = self._rate = 1.0
+        self._slider = 1.0
+        self._rates = (1.0, 1.0)
+        """Of path time: for servoj, and for all other paths, on which the slider acts."""
         self._off_rad = ZERO6
         self._paths: deque[Path] = deque()
         self._planned: Path | None = None
@@ -316,6 +422,25 @@ class Arm:
         """
         self._seize(owner)
         self._follow([self._rundown(), path] if not self.at_rest else [path])
+
+    def servo(self, command: Command, owner: str) -> Servo:
+        """Follow a target of servoj, from the present motion on.
+
+        Raises
+        ------
+        MotionError
+            When another thread of the program controls the arm.
+        CannotFollow
+            When the target jumps; the arm goes on to the last one.
+        """
+        self._seize(owner)
+        if not isinstance(servo := self._paths[-1] if self._paths else None, Servo):
+            servo = Servo(self.dh, self.q)
+            servo.command(command)
+            self._follow([servo])
+        else:
+            servo.command(command)
+        return servo
 
     def stop_joints(self, deceleration: float, owner: str) -> None:
         """stopj: the fastest joint slows down by `deceleration` (rad/s²)."""
@@ -351,11 +476,11 @@ class Arm:
         change = dt / PAUSE_TIME_S
         self.pace = _towards(0.0 if self.paused else self.scaling, self.pace, change)
         self._slider = _towards(self.speed_fraction, self._slider, change)
-        before_rate, self._rate = self._rate, self.pace * self._slider
+        before_rates, self._rates = self._rates, (self.pace, self.pace * self._slider)
         state, before_qd = JointState(self.q), self.qd
         if self._paths:
             try:
-                state = self._along(dt, before_rate)
+                state = self._along(dt, before_rates)
             except CannotFollow:
                 self._paths.clear()
                 self.qd = self.qdd = ZERO6
@@ -384,13 +509,14 @@ class Arm:
         self._seize(owner)
         self._follow([Stop(speed / deceleration)] if not self.at_rest else [])
 
-    def _along(self, dt: float, before: float) -> JointState:
-        """Let path time pass, whose rate changed evenly from `before` in this cycle; return the new set-point."""
+    def _along(self, dt: float, before_rates: tuple[float, float]) -> JointState:
+        """Let path time pass, whose rates changed evenly in this cycle; return the new set-point."""
         path = self._paths[0]
+        others = not isinstance(path, Servo)
         if path is not self._planned:
             path.begin(self.q, self.qd)
             self._planned, self._t = path, 0.0
-        before, rate = (1.0, 1.0) if path.real_time else (before, self._rate)
+        before, rate = (1.0, 1.0) if path.real_time else (before_rates[others], self._rates[others])
         self._t = min(self._t + 0.5 * (before + rate) * dt, path.duration_s)
         state = path.at(self._t)
         if self._t >= path.duration_s:
@@ -408,19 +534,19 @@ class Arm:
         if self.motion is None and self.qd is ZERO6 and before_qd is ZERO6 and self._off_rad is self.pushed_rad:
             self.actual_qd = ZERO6
             return
-        left = math.exp(-dt / FOLLOW_TIME_S)
+        lag_s = self.lag_s
         qdd = [(new - old) / dt for new, old in zip(self.qd, before_qd, strict=True)]
-        qd = vector6(_followed(self.motion.qd if self.motion else ZERO6, before_qd, self.qd, qdd, left))
-        off_rad = self._yielded(left)
+        qd = vector6(_followed(self.motion.qd if self.motion else ZERO6, before_qd, self.qd, qdd, dt, lag_s))
+        off_rad = self._yielded(math.exp(-dt / lag_s))
         pushed = [(new - old) / dt for new, old in zip(off_rad, self._off_rad, strict=True)]
         self._off_rad = off_rad
-        if self.qd is ZERO6 and FOLLOW_TIME_S * max(map(abs, qd)) < SETTLED_RAD:
+        if self.qd is ZERO6 and lag_s * max(map(abs, qd)) < SETTLED_RAD:
             qd, self.motion = ZERO6, None
         else:
-            self.motion = Following(JointState(self.q, self.qd, self.qdd), qd, off_rad)
+            self.motion = Following(lag_s, JointState(self.q, self.qd, self.qdd), qd, off_rad)
         behind = zip(self.q, off_rad, qd, strict=True)
         settled = self.motion is None and off_rad is ZERO6
-        self.actual_q = self.q if settled else vector6([q + off - FOLLOW_TIME_S * v for q, off, v in behind])
+        self.actual_q = self.q if settled else vector6([q + off - lag_s * v for q, off, v in behind])
         self.actual_qd = vector6([v + push for v, push in zip(qd, pushed, strict=True)])
 
     def _yielded(self, left: float) -> Vector6:
@@ -430,7 +556,9 @@ class Arm:
         return goal if max(abs(off - g) for off, g in zip(after, goal, strict=True)) < SETTLED_RAD else after
 
 
-def _followed(qd: Vector6, before: Vector6, target: Sequence[float], qdd: Sequence[float], left: float) -> list[float]:
+def _followed(
+    qd: Vector6, before: Vector6, target: Sequence[float], qdd: Sequence[float], t: float, lag_s: float
+) -> list[float]:
     """Return the speeds of joints that follow a set-point for a time.
 
     Parameters
@@ -439,10 +567,10 @@ def _followed(qd: Vector6, before: Vector6, target: Sequence[float], qdd: Sequen
         Speeds of the joints before.
     before, target, qdd
         Speeds of the set-point before and now, and its acceleration meanwhile.
-    left
-        exp(-time / `FOLLOW_TIME_S`).
+    t, lag_s
+        The time, and the time constant with which they follow.
     """
-    T = FOLLOW_TIME_S
+    T, left = lag_s, math.exp(-t / lag_s)
     return [v - T * c + (own - old + T * c) * left for own, old, v, c in zip(qd, before, target, qdd, strict=True)]
 
 

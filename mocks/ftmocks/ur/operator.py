@@ -8,6 +8,7 @@ from ftmocks.kinematics import ZERO6, vector3, vector6
 from ftmocks.ur import dashboard
 from ftmocks.ur.hand import REST_S, guided_by_hand, pendant_program
 from ftmocks.ur.modes import PERMITTED, RobotMode, Runtime, SafetyMode
+from ftmocks.ur.production import Job, Production
 from ftmocks.ur.robot import INSTALLED_G_M_S2, Robot
 from ftmocks.ur.server import UrServer
 from ftmocks.ur.swing import Swing, SwingProgram
@@ -51,6 +52,7 @@ class Operator:
             "hand-guide": self._hand_guide,
             "pendant-program": self._pendant_program,
             "swing": self._swing,
+            "production": self._production,
             "push-joint": self._push_joint,
             "slider": self._slider,
             "speed-scaling": self._speed_scaling,
@@ -156,6 +158,15 @@ class Operator:
         swing = Swing(robot.arm.dh, robot.arm.q, float(request["seconds"]), **limits)
         accepted = robot.start_soon(SwingProgram(robot, swing), by="operator", obstacle=robot.obstacle)
         return {"accepted": accepted, "seconds": swing.duration_s, "period_s": swing.period_s}
+
+    def _production(self, request: Request) -> dict[str, Any]:
+        robot = self._robot
+        given = {name: request[name] for name in ("parts_kg", "contacts", "slip_m") if name in request}
+        job = Job(request.get("file"), int(request.get("seed", robot.world.seed)), **given)
+        if not robot.arm.at_rest:
+            raise ValueError("the arm moves: let it stand first")
+        accepted = robot.start_soon(Production(robot, job), by="operator", obstacle=robot.obstacle)
+        return {"accepted": accepted}
 
     def _foreign_program(self, request: Request) -> dict[str, Any]:
         does = f"sleep({float(request.get('seconds', FOREIGN_PROGRAM_S))})"

@@ -150,7 +150,7 @@ def _joint_data(robot: Robot) -> bytes:
     arm, mode = robot.arm, JOINT_MODES.get(robot.robot_mode, JOINT_POWER_OFF)
     return b"".join(
         struct.pack(">3d4fB", actual, target, speed, 0.0, 48.0, 28.0, 0.0, mode)
-        for actual, target, speed in zip(arm.actual_q, arm.q, arm.actual_qd, strict=True)
+        for actual, target, speed in zip(robot.measured_q, arm.q, arm.actual_qd, strict=True)
     )
 
 

@@ -5,6 +5,7 @@ as much in it (clock, motion, settling, the waiting times of the controller). Th
 keeps the cell's time, and so does the controller's clock when the arm's own sensor is the station's sensor.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,20 @@ from typing import Any
 import numpy as np
 
 from ftmocks.arrays import Array
-from ftmocks.kinematics import ZERO6, Dh, Vector3, Vector6, cross, forward, jacobian, matrix_of, pose_of, vector6
+from ftmocks.imperfections import FRICTION_RAD_S, Ringing, wrist_drift
+from ftmocks.kinematics import (
+    ZERO6,
+    Dh,
+    JointState,
+    Vector3,
+    Vector6,
+    cross,
+    forward,
+    jacobian,
+    matrix_of,
+    pose_of,
+    vector6,
+)
 from ftmocks.ur.controller_program import ControllerProgram, Place, ScriptError, error_at
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import PAUSING, PERMITTED, POWERED, POWERLESS, RobotMode, Runtime, SafetyMode
@@ -28,6 +42,7 @@ COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
 STOP_SCRIPT = 255
 """The command in such a register that ends the control script."""
 HAND_ACCELERATION_RAD_S2 = 1.5
+NO_ERROR: Array = np.zeros(6)
 INSTALLED_G_M_S2 = 9.82
 """Gravity in an installation, wherever on earth."""
 
@@ -110,7 +125,11 @@ class Robot:
         self.world = world
         self.clock = world.clock
         self.settings = settings
-        self.arm = arm or Arm(world.dh, world.q)
+        imperfections = world.imperfections
+        self.arm = arm or Arm(world.dh, world.q, imperfections.servo_lag_s)
+        self._ringing = Ringing.at_rest(imperfections, world.seed)
+        self._joint_noise = np.random.default_rng([world.seed, 9])
+        self._wrist_drift = wrist_drift(imperfections, world.seed, world.now_s)
         self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
         self.frequency_hz = 125 if settings.polyscope[0] <= 3 else 500
         self.period_s = 1.0 / self.frequency_hz
@@ -149,6 +168,7 @@ class Robot:
         self._watchdog: tuple[str, float] | None = None
         self._watchdog_age_s = 0.0
         self._ft_zero = np.zeros(6)
+        self._measured: tuple[int, Vector6] | None = None
         self._reading: tuple[int, Vector6] | None = None
         self._wrench: tuple[tuple[object, ...], Vector6] | None = None
         self._poses: dict[str, tuple[Vector6, Vector6, Vector6]] = {}
@@ -187,13 +207,33 @@ class Robot:
             self.protective_stop("safety limit reached")
         if stood != self.arm.at_rest:
             self.note("arm", "moves" if stood else "stands", q_rad=list(self.arm.q))
-        self._move_world()
+        self._move_world(dt)
 
-    def _move_world(self) -> None:
-        """Let the world follow the arm, whose time runs `time_scale` times faster."""
-        begun_s, scale, motion = self.cycle_s, self.settings.time_scale, self.arm.motion
-        at = None if motion is None else lambda t_s: motion.at((t_s - begun_s) * scale)
-        self.world.move(begun_s, self.arm.actual_q, at)
+    def _move_world(self, dt: float) -> None:
+        """Let the world follow the arm, whose time runs `time_scale` times faster, and let its links ring."""
+        begun_s, scale, motion, q = self.cycle_s, self.settings.time_scale, self.arm.motion, self.arm.actual_q
+        ringing = self._ringing = self._ringing.after(dt, ZERO6 if motion is None else motion.at(0.0).qdd)
+
+        def at(t_s: float) -> JointState:
+            t = (t_s - begun_s) * scale
+            state = JointState(q) if motion is None else motion.at(t)
+            if ringing.amplitudes is None:
+                return state
+            return state._replace(qdd=vector6([a + b for a, b in zip(state.qdd, ringing.at(t).tolist(), strict=True)]))
+
+        self.world.move(begun_s, q, None if motion is None and ringing.amplitudes is None else at)
+
+    @property
+    def measured_q(self) -> Vector6:
+        """Joint angles that the controller reports as actual, rad: a new reading in every cycle."""
+        sd_rad = self.world.imperfections.joint_noise_rad
+        if not sd_rad:
+            return self.arm.actual_q
+        if self._measured is None or self._measured[0] != self.cycle:
+            noise = self._joint_noise.normal(scale=sd_rad, size=6).tolist()
+            measured = vector6([q + n for q, n in zip(self.arm.actual_q, noise, strict=True)])
+            self._measured = (self.cycle, measured)
+        return self._measured[1]
 
     def note(self, by: str, what: str, *, accepted: bool = True, why: str = "", **detail: Any) -> None:
         """Add an entry to the event log."""
@@ -457,7 +497,7 @@ class Robot:
 
     def tcp_pose(self, which: str) -> Vector6:
         """UR pose in base of the active TCP, at the "actual" joints or at their "target"."""
-        q = self.arm.actual_q if which == "actual" else self.arm.q
+        q = self.measured_q if which == "actual" else self.arm.q
         known = self._poses.get(which)
         if known is None or known[0] is not q or known[1] is not self._tcp_offset:
             known = (q, self._tcp_offset, pose_of(forward(self.arm.dh, q) @ self.X_flange_tcp))
@@ -485,11 +525,21 @@ class Robot:
         What hangs on the flange are the tool and the station's sensor.
         """
         truth = self.world.truth
-        felt = self.world.load_wrench(self.cycle_s) + self.world.contact_wrench(self.cycle_s)
+        world, t_s = self.world, self.cycle_s
+        felt = world.load_wrench(t_s) + world.contact_wrench(t_s) + world.ripple_wrench(np.array([t_s]))[0]
         force = truth.R_flange_sensor @ felt[:3]
         torque = truth.R_flange_sensor @ felt[3:] + cross(truth.p_flange_sensor_m, force)
         wrench: Array = np.concatenate((force, torque)) + self.world.sensor_load(self.cycle_s)
-        return wrench
+        return wrench + self.wrist_error()
+
+    def wrist_error(self) -> Array:
+        """Return what friction and drift add to the arm's own sensor, (6,), flange axes."""
+        if not (self.world.imperfections.wrist_drift_N or self.arm.actual_qd[5]):
+            return NO_ERROR
+        turning = math.tanh(self.arm.actual_qd[5] / FRICTION_RAD_S)
+        friction = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -turning * self.world.imperfections.wrist_friction_Nm])
+        error: Array = self._wrist_drift.at(self.cycle_s) + friction
+        return error
 
     def raw_wrench(self) -> Vector6:
         """ft_raw_wrench: a new reading in every cycle, flange axes."""
@@ -502,7 +552,8 @@ class Robot:
     def tcp_wrench(self) -> Vector6:
         """actual_TCP_force: payload-compensated and zeroed, base axes, at the TCP, exerted on the tool."""
         world = self.world
-        felt_now = (world.q, world.load_wrench(self.cycle_s), world.contact_wrench(self.cycle_s))
+        load, contact = world.load_wrench(self.cycle_s), world.contact_wrench(self.cycle_s)
+        felt_now = (world.q, load, contact, self.wrist_error())
         assumed = (self.payload_kg, self.payload_cog_m, self.target_gravity_m_s2)
         key = (*felt_now, *assumed, self._tcp_offset, self._ft_zero)
         if self._wrench is None or any(a is not b for a, b in zip(self._wrench[0], key, strict=True)):

@@ -42,7 +42,7 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     "target_qdd": ("VECTOR6D", lambda r: r.arm.qdd),
     "target_current": ("VECTOR6D", _fixed(ZERO6)),
     "target_moment": ("VECTOR6D", _fixed(ZERO6)),
-    "actual_q": ("VECTOR6D", lambda r: r.arm.actual_q),
+    "actual_q": ("VECTOR6D", lambda r: r.measured_q),
     "actual_qd": ("VECTOR6D", lambda r: r.arm.actual_qd),
     "actual_current": ("VECTOR6D", _fixed(ZERO6)),
     "actual_current_as_torque": ("VECTOR6D", _fixed(ZERO6)),

@@ -4,7 +4,8 @@ Source: Universal Robots, "The URScript Programming Language", modules motion, i
 Python signature of each function, behind the program, is its signature in URScript.
 
 Chosen here: the period of `get_steptime` is that of the cell's clock whatever ``--time-scale`` is, so a program that
-counts cycles to watch its client keeps the cell's time. `sleep` and motions keep the time of the arm.
+counts cycles to watch its client keeps the cell's time. `sleep` and motions keep the time of the arm: where that is K
+times faster, a loop of `servoj` without `sync` runs K times in a cycle.
 
 Does not model: every other function (its name is a compile error), blends (a radius is taken as 0), goals as poses.
 URScript has no ``abs``: `norm` of a number is its absolute value.
@@ -15,13 +16,16 @@ from collections.abc import Callable, Generator, Mapping
 from typing import Any, Protocol
 
 from ftmocks.kinematics import Vector6, vector3, vector6
-from ftmocks.ur.motion import JointMove, Path
+from ftmocks.ur.controller_program import ScriptError
+from ftmocks.ur.motion import CannotFollow, Command, JointMove, Path
 from ftmocks.ur.robot import Robot
 from ftmocks.ur.urscript.values import Pose, Value, joints, number, numbers, text_of, whole_number
 
 Cycles = Generator[None, None, None]
 """Takes as many control cycles as it yields."""
 
+LOOKAHEAD_S, GAIN = (0.03, 0.2), (100, 2000)
+"""What servoj accepts."""
 LAST_REGISTER = 47
 RAMP_SHARE = 0.2
 """Share of its time in which a move with a given time speeds up, and again slows down."""
@@ -37,6 +41,9 @@ class Caller(Protocol):
     @property
     def owner(self) -> str:
         """Name of the thread that calls: only one thread at a time may move the arm."""
+
+    def begin_cycle(self) -> None:
+        """Let the thread that calls compute as much as in a cycle."""
 
 
 def movej(program: Caller, q: Value, a: Value = 1.4, v: Value = 1.05, t: Value = 0, r: Value = 0) -> Cycles:
@@ -58,6 +65,35 @@ def _pace(start: Vector6, goal: Vector6, seconds: float) -> tuple[float, float]:
 def _followed(program: Caller, path: Path) -> Cycles:
     program.robot.arm.start(path, program.owner)
     yield from program.robot.arm.until_finished(program.owner)
+
+
+def servoj(
+    program: Caller,
+    q: Value,
+    a: Value = 0,
+    v: Value = 0,
+    t: Value = 0.002,
+    lookahead_time: Value = 0.1,
+    gain: Value = 300,
+) -> Cycles:
+    """Follow a target for `t` (s); a and v have no effect."""
+    number(a, "servoj: a")
+    number(v, "servoj: v")
+    robot, goal, seconds = program.robot, joints(q, "servoj: q"), number(t, "servoj: t")
+    lookahead_s, stiffness = number(lookahead_time, "servoj: lookahead_time"), number(gain, "servoj: gain")
+    within = LOOKAHEAD_S[0] <= lookahead_s <= LOOKAHEAD_S[1] and GAIN[0] <= stiffness <= GAIN[1]
+    if not (within and seconds > 0):
+        raise ScriptError(f"servoj: t={seconds}, lookahead_time={lookahead_s} or gain={stiffness} is out of range")
+    try:
+        servo = robot.arm.servo(Command(goal, seconds, lookahead_s, stiffness), program.owner)
+    except CannotFollow as error:
+        robot.protective_stop(str(error))
+        yield  # paused from here on
+        return
+    cycle_s = robot.period_s * robot.settings.time_scale
+    while servo.ahead_s > cycle_s - 1e-9:
+        yield
+    program.begin_cycle()
 
 
 def stopj(program: Caller, a: Value) -> Cycles:
@@ -102,7 +138,7 @@ def popup(
 
 def get_actual_joint_positions(program: Caller) -> list[float]:
     """Return the joint angles, rad."""
-    return list(program.robot.arm.actual_q)
+    return list(program.robot.measured_q)
 
 
 def get_target_joint_positions(program: Caller) -> list[float]:
@@ -203,8 +239,31 @@ def floor(_program: Caller, f: Value) -> int:
     return math.floor(number(f, "floor: f"))
 
 
+def sin(_program: Caller, f: Value) -> float:
+    """Return the sine of an angle, rad."""
+    return math.sin(number(f, "sin: f"))
+
+
+def cos(_program: Caller, f: Value) -> float:
+    """Return the cosine of an angle, rad."""
+    return math.cos(number(f, "cos: f"))
+
+
+def sqrt(_program: Caller, f: Value) -> float:
+    """Return the square root of a number."""
+    return math.sqrt(number(f, "sqrt: f"))
+
+
+def length(_program: Caller, v: Value) -> int:
+    """Return the number of elements of a list or text."""
+    if not isinstance(v, list | str):
+        raise ScriptError(f"length: {text_of(v)} is no list")
+    return len(v)
+
+
 Built_in = Callable[..., Any]
-_FUNCTIONS: tuple[Built_in, ...] = (movej, stopj, sync, sleep, textmsg, popup, norm, floor)
+_FUNCTIONS: tuple[Built_in, ...] = (movej, servoj, stopj, sync, sleep, textmsg, popup)
+_FUNCTIONS += (norm, floor, sin, cos, sqrt, length)
 _FUNCTIONS += (get_actual_joint_positions, get_target_joint_positions, get_target_joint_speeds, get_tcp_offset)
 _FUNCTIONS += (get_steptime, is_steady, is_within_safety_limits, zero_ftsensor)
 _FUNCTIONS += (set_payload, set_target_payload, set_gravity, read_output_integer_register)

@@ -9,8 +9,9 @@ Chosen here, where the manual is silent:
 
 * The main program runs first in a cycle, then the threads in the order of their start. A thread runs in the cycle in
   which it is started.
-* ``kill`` takes the arm from a thread that moves it. The arm then slows down by itself, and a ``stopj`` in the same
-  cycle replaces that. A motion command while another thread moves the arm is a run-time error.
+* ``kill`` takes the arm from a thread that moves it, and so does the end of the thread. The arm then slows down by
+  itself, and a ``stopj`` in the same cycle replaces that. A motion command while another thread moves the arm is a
+  run-time error.
 * A critical section changes nothing, because a thread is never interrupted before it waits. It does not hold others
   while it waits: the external control program of the client library moves the arm in one, and is stopped meanwhile.
 * Everything ends with the main program. ``return`` ends a thread, whatever its value is.
@@ -90,6 +91,10 @@ class Program(ControllerProgram):
         """Where the thread that runs now is in the text."""
         return self._current.place
 
+    def begin_cycle(self) -> None:
+        """Let the thread that runs now compute as much as in a cycle."""
+        self._left = STATEMENTS_PER_CYCLE
+
     def step(self) -> bool:
         """Run one control cycle; return False when the program has ended.
 
@@ -100,13 +105,15 @@ class Program(ControllerProgram):
         """
         for thread in self._threads:  # a thread started in this cycle runs in it
             self._current = thread
-            self._left = STATEMENTS_PER_CYCLE
+            self.begin_cycle()
             try:
                 thread.step()
             except Halt:
                 return False
             except RecursionError:
                 raise ScriptError("functions call each other, or expressions are nested, without end") from None
+            if thread.is_done:
+                self.robot.arm.release(thread.name)
         self._threads = [thread for thread in self._threads if not thread.is_done]
         return not self._main.is_done
 
@@ -175,6 +182,7 @@ class Program(ControllerProgram):
                     raise ScriptError(f"{word} needs another thread, not {text_of(value)}")
                 if word == "kill":
                     value.kill()
+                    self.robot.arm.release(value.name)
                 while not value.is_done:
                     yield
 

@@ -1,0 +1,177 @@
+"""What a real arm and its sensors do beside the model: vibration, noise, delay, friction. The values are settings.
+
+Sources: sizes and spectrum of the ripple are those of a recording of an LBR with .93 kg on an ATI Gamma, which turns
+at .78 rad/s. It has 1.4, .6 and .4 N rms on x, y and z, at rest no more than the noise. Its 40, 80 and 120 Hz move with
+the speed, as ``sin(k N q)`` does with the gear ratio N and k = 2, 4, 6. Less than 3 % of the power lie below 3 Hz, and
+the torques are those of a force at the centre of mass. Wrists of Universal Robots ring at 8 to 20 Hz for .3 s after a
+stop. Their joint angles have 1e-5 to 3e-5 rad of noise, and their joints follow some ms behind the set-point. Friction
+of wrist 3 adds .15 N·m to the z torque of the built-in sensor, whose zero drifts by several N in 10 minutes after a
+start.
+
+Chosen here, where the sources are silent:
+
+* The gear ratio is 101. The shares of k = 2, 4, 6 in the power are 60, 30 and 10 %.
+* The ripple is an acceleration of the tool along the axes of the sensor, whatever the tool's mass. It has its full size
+  however many joints turn, in shares of their speed, and fades below .3 rad/s with the square of the speed.
+* Each joint rings behind its encoder, as a mass on a spring that follows the joint. The seed draws the frequency.
+* The noise of joint angles is white, also at rest; joint speeds have none.
+* The sensor's delay is that of its filter, 3 ms. The wires of the emulated cell add their own delay and jitter.
+* Friction opposes the turn. The drift is even, in a direction that the seed draws, with .05 N·m for each N; the arm
+  was started long ago unless `wrist_drift_N` is set.
+* The ripple does not shake the sensor's own mass.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftmocks.arrays import Array
+from ftmocks.disturbances import SensorDrift
+from ftmocks.kinematics import Vector6
+
+RIPPLE_M_S2 = (1.5, 0.7, 0.45)
+"""Root of the mean square on the axes of the sensor."""
+HARMONICS, POWERS = (2, 4, 6), (0.6, 0.3, 0.1)
+FULL_SPEED_RAD_S = 0.3
+RING_HZ = (8.0, 20.0)
+RING_DECAY_S = 0.1
+"""Time constant: 5 % are left after .3 s."""
+RUNG_OUT_RAD_S2 = 1e-3
+FRICTION_RAD_S = 0.01
+"""Friction has its full size above this speed, about."""
+DRIFT_S = 600.0
+DRIFT_M = 0.05
+
+
+@dataclass(frozen=True)
+class Imperfections:
+    """Settings of a cell, with the values of a real one; `IDEAL` has none of them.
+
+    Parameters
+    ----------
+    ripple, ring
+        Vibration while joints turn and after they accelerate, as multiples of the size above.
+    gear_ratio
+        Turns of the motor for one of the joint.
+    servo_lag_s
+        Time constant with which the joints follow the set-point; also of the ideal cell.
+    joint_noise_rad
+        Standard deviation of a joint angle that the controller reports.
+    wrench_delay_s
+        How long before it is sent a sensor measures, beside the delay of its link.
+    wrist_friction_Nm
+        Of wrist 3 in the built-in sensor.
+    wrist_drift_N
+        Drift of the built-in sensor in the first 10 minutes.
+    """
+
+    ripple: float = 1.0
+    ring: float = 1.0
+    gear_ratio: float = 101.0
+    servo_lag_s: float = 0.005
+    joint_noise_rad: float = 2e-5
+    wrench_delay_s: float = 0.003
+    wrist_friction_Nm: float = 0.15
+    wrist_drift_N: float = 0.0
+
+    def changed(self, text: str) -> Self:
+        """Return the settings with those of ``name=value,…`` changed; "none" changes them to those of `IDEAL`.
+
+        Raises
+        ------
+        ValueError
+            When a name is unknown, or a value is negative or no number.
+        """
+        changes: dict[str, float] = {}
+        for part in text.split(",") if text else ():
+            name, sign, value = part.partition("=")
+            if part == "none":
+                changes = {field.name: getattr(IDEAL, field.name) for field in fields(self)}
+            elif not sign or name not in {field.name for field in fields(self)}:
+                known = ", ".join(field.name for field in fields(self))
+                raise ValueError(f"{part!r} is no setting of a real cell: give none, or NAME=VALUE with {known}")
+            else:
+                changes[name] = float(value)
+        if not all(0.0 <= value < math.inf for value in changes.values()) or changes.get("servo_lag_s") == 0.0:
+            raise ValueError(f"settings of a real cell are not negative, and servo_lag_s is positive: {text!r}")
+        return replace(self, **changes)
+
+
+IDEAL = Imperfections(
+    ripple=0.0, ring=0.0, joint_noise_rad=0.0, wrench_delay_s=0.0, wrist_friction_Nm=0.0, wrist_drift_N=0.0
+)
+
+
+def wrist_drift(settings: Imperfections, seed: int, start_s: float) -> SensorDrift:
+    """Return the drift of the built-in sensor after a start of the arm."""
+    direction = np.random.default_rng([seed, 10]).normal(size=3)
+    drift_N = settings.wrist_drift_N * direction / np.linalg.norm(direction)
+    return SensorDrift(np.concatenate((drift_N, DRIFT_M * drift_N)), start_s, DRIFT_S)
+
+
+class Ripple:
+    """Vibration of the tool that the gears of turning joints cause; phases by `seed`."""
+
+    def __init__(self, settings: Imperfections, seed: int) -> None:
+        self._orders = settings.gear_ratio * np.array(HARMONICS)
+        phases = np.random.default_rng([seed, 7]).uniform(0.0, 2 * np.pi, (6, len(HARMONICS), 3))
+        sizes = settings.ripple * np.sqrt(2.0 * np.array(POWERS))[:, None] * RIPPLE_M_S2
+        self._waves = (sizes * np.exp(1j * phases)).reshape(-1, 3)
+
+    def at(self, q_rad: Array, qd_rad_s: Array) -> Array:
+        """Return accelerations of the tool, (n, 3) in m/s², sensor axes, for joints (n, 6) and their speeds."""
+        speed = np.linalg.norm(qd_rad_s, axis=1, keepdims=True)
+        shares = qd_rad_s * (-np.expm1(-((speed / FULL_SPEED_RAD_S) ** 2)) / np.maximum(speed, 1e-12))
+        turns = np.exp(1j * q_rad[:, :, None] * self._orders) * shares[:, :, None]
+        return np.asarray((turns.reshape(len(q_rad), -1) @ self._waves).real)
+
+
+class Ringing(NamedTuple):
+    """How the links ring from one control cycle on: each is a mass on a spring behind its joint.
+
+    Its distance from where the joint's acceleration holds it is the real part of ``amplitudes exp(rates t)``.
+
+    Parameters
+    ----------
+    rates
+        (6,) complex, 1/s.
+    size
+        Multiple of the acceleration of the joints that moves the links.
+    amplitudes
+        (6,) complex, rad; None while the links rest.
+    held_rad
+        (6,) where the joints' acceleration holds the links.
+    """
+
+    rates: NDArray[np.complex128]
+    size: float
+    amplitudes: NDArray[np.complex128] | None = None
+    held_rad: Array | float = 0.0
+
+    @classmethod
+    def at_rest(cls, settings: Imperfections, seed: int) -> "Ringing":
+        """Return links that rest."""
+        hertz = np.random.default_rng([seed, 8]).uniform(*RING_HZ, 6)
+        rates = np.empty(6, np.complex128)
+        rates.real, rates.imag = -1.0 / RING_DECAY_S, 2 * np.pi * hertz
+        return cls(rates, settings.ring)
+
+    def at(self, t: float) -> Array:
+        """Return the acceleration of the links beside that of their joints `t` seconds later, (6,) rad/s²."""
+        if self.amplitudes is None:
+            return np.zeros(6)
+        return np.asarray((self.amplitudes * self.rates**2 * np.exp(self.rates * t)).real)
+
+    def after(self, t: float, qdd: Vector6) -> "Ringing":
+        """Return how they ring `t` seconds later, when the joints accelerate by `qdd` (rad/s²) from there on."""
+        if self.size == 0.0 or (self.amplitudes is None and not any(qdd)):
+            return self
+        held = -self.size * np.array(qdd) / np.abs(self.rates) ** 2
+        moved = (self.held_rad - held) * (1.0 + 1j * self.rates.real / self.rates.imag)  # at the same speed
+        amplitudes = moved if self.amplitudes is None else moved + self.amplitudes * np.exp(self.rates * t)
+        if not any(qdd) and float(np.abs(amplitudes * self.rates**2).max()) < RUNG_OUT_RAD_S2:
+            return self._replace(amplitudes=None, held_rad=0.0)
+        return self._replace(amplitudes=amplitudes, held_rad=held)

@@ -1,0 +1,169 @@
+"""What a real cell does beside the model: sizes and spectrum of the vibration, noise, delay, friction and drift."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ftmocks.clock import CellClock
+from ftmocks.imperfections import IDEAL, Imperfections, Ringing
+from ftmocks.kinematics import MODELS, ZERO6, vector6
+from ftmocks.ur.motion import JointMove
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.world import Truth, World
+from tests.unit.mocks.real_time import RealTime
+
+Array = NDArray[np.float64]
+
+HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
+TRUTH = replace(Truth.drawn(3), mass_kg=0.93, noise_force_N=0.0, noise_torque_Nm=0.0)
+SPEED_RAD_S, RATE_HZ, CYCLE_S = 0.78, 1000, 0.002
+
+
+def cell(imperfections: Imperfections, truth: Truth = TRUTH) -> Robot:
+    return Robot(World(truth, MODELS["UR5e"], HOME, 3, CellClock(RealTime()), imperfections), RobotSettings())
+
+
+def cycles(robot: Robot, seconds: float) -> Iterator[float]:
+    """Run control cycles; the time of each."""
+    for _ in range(round(seconds / CYCLE_S)):
+        robot.tick(robot.cycle_s + CYCLE_S)
+        yield robot.cycle_s
+
+
+@cache
+def recorded(imperfections: Imperfections, joint: int, seconds: float = 4.0) -> Array:
+    """Readings (n, 6) at `RATE_HZ` while a joint turns by 2 rad, and behind that."""
+    robot = cell(imperfections)
+    goal = np.add(HOME, 2.0 * np.eye(6)[joint])
+    robot.arm.start(JointMove(robot.arm.dh, vector6(goal), SPEED_RAD_S, 1.4), "test")
+    readings = []
+    for t_s in cycles(robot, seconds):
+        readings.append(robot.world.measure_at(t_s + np.array([0.0, 1 / RATE_HZ])))
+    return np.vstack(readings)
+
+
+def vibration(joint: int, **changes: float) -> Array:
+    """What an imperfection adds to the readings, (n, 6)."""
+    added: Array = recorded(replace(IDEAL, **changes), joint) - recorded(IDEAL, joint)
+    return added
+
+
+EVEN, ENDED = slice(700, 2500), slice(3200, None)
+"""Samples at even speed, and behind the stop, which ends at 3.12 s."""
+
+
+@pytest.mark.parametrize("joint", [0, 4])
+def test_turning_joints_make_a_ripple_as_large_as_that_of_a_real_arm(joint: int) -> None:
+    ripple = vibration(joint, ripple=1.0)
+    size = ripple[EVEN].std(axis=0)
+    np.testing.assert_allclose(size[:3], [1.4, 0.65, 0.42], rtol=0.15)
+    np.testing.assert_allclose(ripple[EVEN, 3:], np.cross(TRUTH.p_sensor_com_m, ripple[EVEN, :3]), atol=1e-9)
+    assert not ripple[ENDED].any()
+
+
+def test_the_ripple_has_the_lines_of_the_motor_and_little_below_3_Hz() -> None:
+    ripple = vibration(4, ripple=1.0)[EVEN, 0]
+    power = np.abs(np.fft.rfft(ripple * np.hanning(len(ripple)))) ** 2
+    hertz = np.fft.rfftfreq(len(ripple), 1 / RATE_HZ)
+    motor_hz = 101 * SPEED_RAD_S / (2 * np.pi)
+    lines = np.any([np.abs(hertz - k * motor_hz) < 1.5 for k in (2, 4, 6)], axis=0)
+    assert power[lines].sum() > 0.98 * power.sum()
+    whole = vibration(4, ripple=1.0)[:3200, 0]
+    power, hertz = np.abs(np.fft.rfft(whole)) ** 2, np.fft.rfftfreq(len(whole), 1 / RATE_HZ)
+    assert power[hertz < 3].sum() < 0.03 * power.sum(), "speeding up and slowing down included"
+
+
+def test_links_ring_after_a_stop_for_0_3_s() -> None:
+    ring = vibration(4, ring=1.0)
+    stop = ring[3160:, :3] @ np.linalg.svd(ring[3160:, :3], full_matrices=False)[2][0]
+    peaks = [np.abs(stop[a : a + 100]).max() for a in (0, 300, 600)]
+    assert 0.05 < peaks[0] < 1.0
+    assert peaks[1] < 0.1 * peaks[0]
+    assert peaks[2] < 0.005 * peaks[0]
+    assert not ring[-1].any()
+    crossings_s = np.flatnonzero(np.diff(np.sign(stop[:300]))) / RATE_HZ
+    assert 8 < 0.5 / np.diff(crossings_s).mean() < 20
+
+
+def test_a_ringing_link_is_a_damped_mass_on_a_spring() -> None:
+    """Against steps of 20 µs; half a cycle later it is where the next would have it."""
+    rng = np.random.default_rng(0)
+    pulls = np.repeat(rng.normal(size=(20, 6)), 10, axis=0)
+    ringing = Ringing.at_rest(replace(IDEAL, ring=1.0), 4)
+    off, speed, rates = np.zeros(6), np.zeros(6), np.abs(ringing.rates)
+    for pull in pulls:
+        ringing = ringing.after(CYCLE_S, vector6(pull))
+        for k in range(100):
+            acceleration = -20.0 * speed - rates**2 * off - pull
+            if k == 50:
+                np.testing.assert_allclose(ringing.at(CYCLE_S / 2), acceleration, atol=0.01)
+            speed = speed + acceleration * CYCLE_S / 100
+            off = off + speed * CYCLE_S / 100
+    for _ in range(1000):
+        ringing = ringing.after(CYCLE_S, ZERO6)
+    assert ringing.amplitudes is None
+
+
+def test_a_still_cell_is_as_an_ideal_one() -> None:
+    real, ideal = (cell(one, Truth.drawn(1)) for one in (Imperfections(), IDEAL))
+    np.testing.assert_array_equal(real.world.measure(50), ideal.world.measure(50))
+    np.testing.assert_array_equal(real.raw_wrench(), ideal.raw_wrench())
+
+
+def test_the_controller_reports_noisy_angles_of_a_still_arm() -> None:
+    robot = cell(Imperfections())
+    q = np.array([robot.measured_q for _ in cycles(robot, 2.0)])
+    np.testing.assert_allclose(q.mean(axis=0), HOME, atol=3e-6)
+    np.testing.assert_allclose(q.std(axis=0), 2e-5, rtol=0.1)
+    assert robot.arm.actual_q is HOME
+
+
+def test_a_sensor_measures_before_it_sends() -> None:
+    robot = cell(replace(IDEAL, wrench_delay_s=0.003))
+    robot.arm.start(JointMove(robot.arm.dh, vector6(np.add(HOME, 1.0)), 1.0, 2.0), "test")
+    for t_s in cycles(robot, 0.5):
+        measured = robot.world.measure_at(np.array([t_s]))[0]
+        np.testing.assert_allclose(measured, robot.world.true_wrench(t_s - 0.003), atol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [1.0, -1.0])
+def test_friction_of_wrist_3_opposes_its_turn_in_the_built_in_sensor(turn: float) -> None:
+    robot = cell(replace(IDEAL, wrist_friction_Nm=0.15))
+    for joint, friction_Nm in ((4, 0.0), (5, -0.15 * turn)):
+        goal = vector6(np.add(robot.arm.q, turn * np.eye(6)[joint]))
+        robot.arm.start(JointMove(robot.arm.dh, goal, 1.0, 2.0), "test")
+        list(cycles(robot, 0.8))
+        np.testing.assert_allclose(robot.wrist_error(), [0, 0, 0, 0, 0, friction_Nm], atol=1e-3)
+        list(cycles(robot, 2.0))
+    assert not robot.wrist_error().any()
+
+
+def test_the_built_in_sensor_drifts_for_10_minutes_after_a_start() -> None:
+    robot = cell(replace(IDEAL, wrist_drift_N=4.0))
+    began_s, before = robot.cycle_s, np.array(robot.raw_wrench())
+    for minutes, drift_N in ((5, 2.0), (10, 4.0), (60, 4.0)):
+        robot.tick(began_s + 60 * minutes)
+        assert np.linalg.norm((robot.raw_wrench() - before)[:3]) == pytest.approx(drift_N, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("", Imperfections()),
+        ("none", IDEAL),
+        ("none,ripple=2", replace(IDEAL, ripple=2.0)),
+        ("servo_lag_s=0.01,ring=0", Imperfections(servo_lag_s=0.01, ring=0.0)),
+    ],
+)
+def test_settings_are_read_from_the_command_line(text: str, expected: Imperfections) -> None:
+    assert Imperfections().changed(text) == expected
+
+
+@pytest.mark.parametrize("text", ["ripples=1", "ripple", "ripple=-1", "ring=nan", "servo_lag_s=0", "ring=x"])
+def test_settings_of_no_cell_are_refused(text: str) -> None:
+    with pytest.raises(ValueError, match=r"setting|float"):
+        Imperfections().changed(text)

@@ -1,0 +1,141 @@
+"""servoj: a program that evaluates a curve every cycle, how the arm follows it, and what the controller stops."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ftmocks.ur.modes import Runtime, SafetyMode
+from ftmocks.ur.robot import Robot
+from tests.unit.mocks.ur.urscript_robot import HOME, end_of, failure, logged, new_robot, run, start
+
+TURN_RAD_S, LOOKAHEAD_S, SERVO_LAG_S = 1.5, 0.1, 0.005
+SWEEP = """def sweep():
+  def target(t):
+    local q = [0, 0, 0, 0, 0, 0]
+    local i = 0
+    while i < length(q):
+      q[i] = home[i]
+      i = i + 1
+    end
+    q[4] = q[4] + 0.4 * sin(1.5 * t) * sin(1.5 * t)
+    q[5] = q[5] - 0.8 * (1 - cos(1.5 * t))
+    return q
+  end
+  thread mover():
+    local k = 0
+    while k * get_steptime() < 5:
+      if k * get_steptime() < 8 * 3.141592653589793 / 6:
+        servoj(target(k * get_steptime()), t=get_steptime(), lookahead_time=0.1, gain=300)
+      else:
+        servoj(home, t=get_steptime(), lookahead_time=0.1, gain=300)
+      end
+      k = k + 1
+    end
+    stopj(4)
+    textmsg("swept")
+  end
+  home = get_target_joint_positions()
+  local moving = run mover()
+  while read_input_integer_register(24) == 0:
+    sync()
+  end
+  kill moving
+  stopj(4)
+  textmsg("stopped")
+end
+"""
+
+
+def curve(t: NDArray[np.float64]) -> NDArray[np.float64]:
+    turn = TURN_RAD_S * np.clip(t, 0.0, 2 * math.pi / TURN_RAD_S)
+    return np.array([HOME[4] + 0.4 * np.sin(turn) ** 2, HOME[5] - 0.8 * (1 - np.cos(turn))]).T
+
+
+def follow(robot: Robot, seconds: float) -> dict[str, NDArray[np.float64]]:
+    """What the robot does in each cycle; `t` is the time of the arm."""
+    rows: dict[str, list[object]] = {name: [] for name in ("t", "q", "qd", "qdd", "actual_q")}
+    for _ in range(round(seconds * robot.frequency_hz / robot.settings.time_scale)):
+        robot.tick()
+        rows["t"].append(robot.timestamp_s)
+        for name in ("q", "qd", "qdd", "actual_q"):
+            rows[name].append(getattr(robot.arm, name))
+    return {name: np.array(values, dtype=float) for name, values in rows.items()}
+
+
+@pytest.mark.parametrize("scale", [1.0, 20.0])
+def test_the_arm_follows_behind_by_the_lookahead_and_its_servo_lag(scale: float) -> None:
+    robot = new_robot(time_scale=scale)
+    robot.arm.speed_fraction = 0.5  # the slider does not act on servoj
+    start(SWEEP, robot)
+    did = follow(robot, 6.5)
+    assert logged(robot) == ["swept"]
+    assert did["q"][-1] == pytest.approx(HOME, abs=1e-5)
+    dt, t = robot.period_s * scale, did["t"]
+    rate, change = np.gradient(did["q"], dt, axis=0), np.gradient(did["qd"], dt, axis=0)
+    np.testing.assert_allclose(did["qd"][2:-2], rate[2:-2], atol=5e-3 * scale)
+    np.testing.assert_allclose(did["qdd"][2:-2], change[2:-2], atol=0.1 * scale)
+    assert np.ptp(did["q"][:, 5]) == pytest.approx(1.6, abs=0.05)
+    if scale > 1.0:
+        return  # its cycles are too coarse for what follows
+
+    def lag_s(of: NDArray[np.float64], behind: NDArray[np.float64]) -> float:
+        tried_s = np.arange(0.0, 0.2, 0.001)
+        return float(tried_s[np.argmin([np.ptp(np.interp(t - s, t, of)[500:] - behind[500:]) for s in tried_s])])
+
+    wanted = curve(t - t[0] + 0.022)  # a program starts 0.1 s after its upload; `start` waited for 0.12 s
+    for joint in (0, 1):
+        assert lag_s(wanted[:, joint], did["q"][:, 4 + joint]) == pytest.approx(LOOKAHEAD_S, abs=0.005)
+    assert lag_s(did["q"][:, 5], did["actual_q"][:, 5]) == pytest.approx(SERVO_LAG_S, abs=0.001)
+
+
+def test_another_thread_stops_the_sweep() -> None:
+    robot = start(SWEEP)
+    run(robot, 1.5)
+    assert max(map(abs, robot.arm.qd)) > 0.3
+    robot.write_inputs({"input_int_register_24": 1})
+    run(robot, 0.5)
+    assert logged(robot) == ["stopped"]
+    assert robot.arm.at_rest
+    assert robot.runtime == Runtime.STOPPED
+
+
+def test_a_thread_that_ends_leaves_the_arm_to_others() -> None:
+    robot = start("""def f():
+  thread t():
+    q = get_target_joint_positions()
+    q[5] = q[5] + 0.005
+    servoj(q, t=0.002)
+  end
+  local mover = run t()
+  join mover
+  movej([0, -1.5, 1, 0, 1, 0], v=1)
+end
+""")
+    run(robot, 5.0)
+    assert end_of(robot).why == "ended"
+    assert robot.arm.q == (0, -1.5, 1, 0, 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("step_rad", "stops"), [(math.radians(180) * 0.002 * 0.99, False), (math.radians(180) * 0.002 * 1.01, True)]
+)
+def test_a_target_beyond_the_speed_of_the_joint_is_a_protective_stop(step_rad: float, stops: bool) -> None:
+    robot = start(
+        "def f():\n  q = get_target_joint_positions()\n  k = 0\n"
+        "  while k < 100:\n    q[5] = q[5] - 0.002\n    servoj(q, t=0.002)\n    k = k + 1\n  end\n"
+        f"  q[5] = q[5] - {step_rad}\n  servoj(q, t=0.002)\n  sleep(1)\n  stopj(4)\nend\n"
+    )
+    run(robot, 0.6)
+    assert (robot.safety_mode == SafetyMode.PROTECTIVE_STOP) is stops
+    if stops:
+        (stop,) = [event for event in robot.events if event.by == "safety"]
+        assert "joint 6 jumps by -0.0063 rad in 0.002 s" in stop.why
+        assert robot.runtime == Runtime.PAUSED
+        assert robot.arm.at_rest
+
+
+@pytest.mark.parametrize("given", ["t=0", "gain=50", "lookahead_time=0.3"])
+def test_an_argument_out_of_range_ends_the_program(given: str) -> None:
+    assert "out of range" in failure(f"  servoj(get_target_joint_positions(), {given})").why
