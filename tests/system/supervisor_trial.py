@@ -123,6 +123,42 @@ def trial(kind: Kind, station: Station, ftdrive: CommandLine, *, moving: bool) -
     return Seen(code, said, moved, rest_s, trips, resumed.returncode)
 
 
+def verify_trial(station: Station, ftdrive: CommandLine, run: Path) -> Seen:
+    """Kill the reader of `verify --json` while the arm moves; then resume."""
+    config = ftdrive.connect(station)
+    supervised = Supervised("reader killed", ftdrive, "verify", "--config", config, "--calibration", run)
+    process, before = supervised.process, set((ftdrive.folder / "runs").iterdir())
+    wait_until(lambda: len(set((ftdrive.folder / "runs").iterdir()) - before) == 1, process)
+    (folder,) = set((ftdrive.folder / "runs").iterdir()) - before
+    wait_until(lambda: any(e["event"] == "pose-taken" for e in events(folder)), process)
+    station.control(do="slider", fraction=_SLOW)
+    wait_until(lambda: bool(station.control(do="state")["moving"]), process)
+    moved, rest_s, (code, said) = _watched(station, supervised.leave, supervised.end)
+    trips = tuple(e["words"] for e in events(folder) if e["event"] == "guard-tripped" and e["hazard"] == 27)
+    station.control(do="slider", fraction=1.0)
+    resumed = ftdrive.run("verify", "--config", config, "--resume", folder, "--update", "no", typed=ANSWERS)
+    return Seen(code, said, moved, rest_s, trips, resumed.returncode)
+
+
+def push_trial(station: Station, ftdrive: CommandLine, run: Path) -> tuple[int, str, bool]:
+    """Close the answers of `push` at its question; return exit code, standard error, and whether something was sent."""
+    config = ftdrive.connect(station)
+    text = config.read_text(encoding="utf-8")
+    config.write_text(text.replace("[sensor]\n", "[sensor]\nmass_kg = 0.25\nheight_mm = 40.0\n"), encoding="utf-8")
+    before = station.control(do="state")["payload_kg"]
+    process = ftdrive.start("push", run, "--config", config, "--json")
+    assert process.stdout is not None
+    assert process.stdin is not None
+    for line in process.stdout:
+        if '"question"' in line:
+            break
+    process.stdin.close()
+    process.stdin = None
+    _, said = process.communicate(timeout=60)
+    sent = station.control(do="state")["payload_kg"] != before or any(run.glob("push*"))
+    return process.returncode, said, sent
+
+
 def events(run: Path) -> Iterator[dict[str, Any]]:
     """Yield the events on disk so far."""
     path = run / "events.ndjson"

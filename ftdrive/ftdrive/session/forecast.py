@@ -8,6 +8,7 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftcalib.poses.information import predicted_sigma
+from ftcalib.result import LEAST_COMMON_GAIN
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
@@ -87,9 +88,10 @@ def prediction(averages: Averages, mass_kg: float | None, *, assumed: bool) -> s
     force_N, torque_Nm = averages.rms_sigma
     guess = replace(guess_of(averages.certifier, mass_kg), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
     found = predicted_sigma(np.array([step.R_base_flange for step in averages.plan.steps]), guess)
+    mass_g = 1e3 * np.hypot(found.sigma["mass_kg"], LEAST_COMMON_GAIN * guess.mass_kg)
     mass = f"{guess.mass_kg:g} kg" + (" (assumed: [tool] mass_kg is not set)" if assumed else "")
     return (
-        f"{averages}; predicted from that for {mass}, one sigma: mass {1e3 * float(found.sigma['mass_kg']):.2g} g, "
+        f"{averages}; predicted from that for {mass}, one sigma: mass {mass_g:.2g} g, "
         f"force bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
         f"{found.torque_rms_Nm:.2g} N·m"
     )
