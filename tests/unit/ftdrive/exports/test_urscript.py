@@ -39,7 +39,8 @@ class Pendant:
             "norm": norm,
             "get_actual_joint_positions": lambda _: list(self.q_rad),
         }
-        robot = cast(Robot, SimpleNamespace(settings=RobotSettings()))
+        arm = SimpleNamespace(release=lambda thread: None)
+        robot = cast(Robot, SimpleNamespace(settings=RobotSettings(), arm=arm))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("ftmocks.ur.urscript.program.functions", lambda _: known)
             assert not Program(robot, "ftdrive_tour", text).step()
