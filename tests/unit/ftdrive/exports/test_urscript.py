@@ -39,7 +39,7 @@ class Pendant:
             "norm": norm,
             "get_actual_joint_positions": lambda _: list(self.q_rad),
         }
-        arm = SimpleNamespace(release=lambda thread: None)
+        arm = SimpleNamespace(release=lambda _: None)
         robot = cast(Robot, SimpleNamespace(settings=RobotSettings(), arm=arm))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("ftmocks.ur.urscript.program.functions", lambda _: known)
