@@ -274,6 +274,8 @@ def test_wrong_options_are_exit_code_2(
     options: list[str], why: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["ftmocks", "station", *options])
+    for setting in ("signal.signal", "sys.setswitchinterval"):  # of the whole process, so of all tests that follow
+        monkeypatch.setattr(setting, lambda *_: None)
     with pytest.raises(SystemExit) as ended:
         raise SystemExit(main())
     answer = capsys.readouterr()
