@@ -22,8 +22,7 @@ FIRST_MOTION = "MOVE\nyes\n"
 
 @pytest.fixture
 def station() -> Iterator[Station]:
-    # With noise in the joint angles, the session asks to resume once more in half of the runs.
-    options = ["--seed", "5", "--payload", "1.5", "--imperfections", "joint_noise_rad=0"]
+    options = ["--seed", "5", "--payload", "1.5"]
     with Station("serial", options) as station:
         yield station
 

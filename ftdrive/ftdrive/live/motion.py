@@ -11,10 +11,10 @@ from ftdrivers.interfaces import Array
 READING_S = 0.02
 """A reading is the mean of the samples of this time: contact is judged by readings."""
 
-_STILL_RAD, _STILL_M = 1e-4, 1e-4
-"""Largest motion of the flange between two readings at rest."""
-_BEGINS = 0.1
-"""Share of it from which the wrench of a motion counts, which is felt before the motion is seen."""
+_STILL_RAD, _STILL_M = 2e-4, 2e-4
+"""Largest motion at rest, from the mean of one reading to the next: beyond joint noise of 3e-5 rad."""
+_FELT_M = 4e-5
+"""Motion of the centre of mass from which its wrench counts, which is felt before the motion is seen."""
 _HOLD_S = 0.3
 """A stopped arm rings so long."""
 _DELAY_S = 0.01
@@ -34,7 +34,7 @@ def samples_in_reading(rate_Hz: float) -> int:
 
 
 class MotionTracker:
-    """State of motion at each sample, by the poses one reading apart; rest begins when it has lasted 0.3 s.
+    """State of motion at each sample, by the mean poses of successive readings; rest begins when it has lasted 0.3 s.
 
     Parameters
     ----------
@@ -70,21 +70,22 @@ class MotionTracker:
         wrenches = np.zeros((2, n, 6))
         if not n:
             return np.zeros(0, np.bool_), wrenches
-        poses = np.concatenate([R_base_flange.reshape(n, 9), p_base_flange_m], axis=1)
+        p_base_com_m = np.nan_to_num(p_base_flange_m) + R_base_flange @ self._p_flange_com_m
+        poses = np.concatenate([R_base_flange.reshape(n, 9), p_base_com_m], axis=1)
         if self._earlier is None:
             self._earlier = np.repeat(poses[:1], 2 * k, axis=0)
         poses = np.concatenate([self._earlier, poses])
         self._earlier = poses[n:]
-        moved = np.abs(poses[2 * k :] - poses[k:-k])
+        sums = np.cumsum(poses, axis=0)  # means, because joint noise in single poses looks like motion
+        moved = np.abs(sums[2 * k :] - 2 * sums[k:-k] + sums[: -2 * k]) / k
         moves = (moved[:, :9] > _STILL_RAD).any(axis=1) | (moved[:, 9:] > _STILL_M).any(axis=1)
         newest = np.maximum.accumulate(np.where(moves, np.arange(n), -1 - self._since))
         self._since = int(n - 1 - newest[-1])
         moving = np.asarray(np.arange(n) - newest < self._hold)
-        felt = (moved > _BEGINS * _STILL_M).any(axis=1) | moving
+        felt = (np.linalg.norm(moved[:, 9:], axis=1) > _FELT_M) | moving
         if felt.any():
             R = poses[:, :9].reshape(-1, 3, 3)
-            p_base_com_m = np.nan_to_num(poses[:, 9:]) + R @ self._p_flange_com_m
-            second = p_base_com_m[2 * k :] - 2 * p_base_com_m[k:-k] + p_base_com_m[: -2 * k]
+            second = (poses[2 * k :] - 2 * poses[k:-k] + poses[: -2 * k])[:, 9:]
             inertial_N = -self._mass_kg / self._step_s**2 * second
             late_N = (
                 _DELAY_S

@@ -72,6 +72,18 @@ def test_a_plan_that_has_run_before_does_not_excuse_a_wound_cable(lab: Lab) -> N
         lab.calibrate(plan=lab.run().folder / "plan.json")
 
 
+@pytest.mark.parametrize(("outside_rad", "state"), [(1e-4, "ok"), (0.05, "failed")])
+def test_wrist_3_at_the_end_of_its_range_may_be_outside_it_by_its_joint_noise(outside_rad: float, state: str) -> None:
+    low, high = np.radians([-90.0, 180.0])
+    for stands in (low - outside_rad, high + outside_rad):
+        arm = SimpleNamespace(state=lambda q6=stands: SimpleNamespace(q_rad=np.array([0.0] * 5 + [q6])))
+        steps = [SimpleNamespace(q_rad=(0.0,) * 5 + (q6,)) for q6 in (low, high)]
+        before = SimpleNamespace(
+            cell=SimpleNamespace(arm=arm), plan=SimpleNamespace(steps=steps), known=False, resumed=True
+        )
+        assert preflight.check_cable(cast("preflight.Before", before)).state == state
+
+
 def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:
     lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=3.0))
     refuse(lab, "payload 1.50 kg .* sensor and tool are 3.00 kg")
