@@ -119,7 +119,10 @@ def test_an_adapter_that_another_program_reads_is_left_alone(start: Callable[...
             serial.Serial(port, exclusive=True)
         assert len(sensor.collect(0.2))
         assert sensor.health().stale == sensor.health().lost == 0
-    with serial.Serial(port, exclusive=True), pytest.raises(PortInUse):
-        probe_can(port, interface="slcan", clock=cell_time.of_drivers, bitrate=250_000)
+    with serial.Serial(port, exclusive=True, timeout=30) as line:
+        line.write(b"V\r")
+        assert line.read_until(b"V1013\r").endswith(b"V1013\r")  # behind all that the driver was still sent
+        with pytest.raises(PortInUse):
+            probe_can(port, interface="slcan", clock=cell_time.of_drivers, bitrate=250_000)
     (answer,) = probe_can(port, interface="slcan", clock=cell_time.of_drivers, bitrate=250_000)
     assert answer.url
