@@ -44,14 +44,15 @@ def test_columns_are_the_lag_of_each_axis_behind_its_last_swing() -> None:
 
 @pytest.mark.parametrize("seeds", [6, pytest.param(60, marks=pytest.mark.slow)])
 def test_it_is_found_and_the_sigmas_hold(seeds: int) -> None:
-    z = []
+    z, shares = [], []
     for seed in range(seeds):
         result = solved(seed, 0.002)
-        assert result.components["hysteresis"] == pytest.approx(0.002, rel=0.4)
+        shares.append(result.components["hysteresis"])  # of six axes, so one session tells it to about 40 %
         error = result.parameters.difference(TRUTH)
         z.append(error / np.sqrt(np.diag(result.covariance)))
     ratio = np.sqrt([np.mean(part**2) for part in np.split(np.array(z), 5, axis=1)])
     np.testing.assert_allclose(ratio, 1, atol=0.2 + 1.2 / np.sqrt(seeds))
+    assert np.median(shares) == pytest.approx(0.002, rel=0.2 + 0.5 / np.sqrt(seeds))
 
 
 def test_the_mass_is_uncertain_by_the_share_that_no_pose_shows() -> None:
