@@ -18,7 +18,7 @@ from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
 from ftdrive.recording.compensation import NEEDED
-from ftdrive.recording.files import ENDINGS, read_recording
+from ftdrive.recording.files import ENDINGS, RecordingReader
 from ftdrive.recording.recording import FORMAT, Header
 from ftdrive.runs.run import made_now
 
@@ -91,18 +91,18 @@ def solve_recording(
 
 
 def read_in_motion(path: Path) -> tuple[Means, Means, Header]:
-    """Read a recording of `ftdrive record`; without positions where it has none. Raises as `read_recording`."""
-    recording = read_recording(path, NEEDED)
-    rows, wrench, poses = recording.rows, Means(), Means()
-    start_ns = int(rows["t_host_ns"][0])
-    with_position = bool(np.isfinite(rows["p_base_flange_m"][0]).all())
-    for start in range(0, len(rows), _PIECE):
-        some = rows[start : start + _PIECE]
-        t_s = (some["t_host_ns"] - start_ns) * 1e-9
-        R = Rotation.from_quat(some["quaternion_base_flange"]).as_matrix().reshape(-1, 9)
-        wrench.add(t_s, some["raw"])
-        poses.add(t_s, np.hstack([R, some["p_base_flange_m"]]) if with_position else R)
-    return wrench, poses, recording.header
+    """Read a recording of `ftdrive record`; without positions where it has none. Raises as `RecordingReader.pieces`."""
+    reader, wrench, poses = RecordingReader(path, NEEDED), Means(), Means()
+    start_ns, with_position = None, False
+    for rows in (piece.rows for piece in reader.pieces() if len(piece.rows)):
+        if start_ns is None:
+            start_ns = int(rows["t_host_ns"][0])
+            with_position = bool(np.isfinite(rows["p_base_flange_m"][0]).all())
+        t_s = (rows["t_host_ns"] - start_ns) * 1e-9
+        R = Rotation.from_quat(rows["quaternion_base_flange"]).as_matrix().reshape(-1, 9)
+        wrench.add(t_s, rows["raw"])
+        poses.add(t_s, np.hstack([R, rows["p_base_flange_m"]]) if with_position else R)
+    return wrench, poses, reader.header
 
 
 def read_wrench_file(path: Path) -> Means:
