@@ -14,6 +14,7 @@ DISCOVERY_S: Final = 3.0
 _SAME_CLOCK_MS: Final = 2.0
 _LONGEST_WAY_MS: Final = 30.0
 """A stamp that is older by the clock of this computer was given by another clock."""
+_UNNAMED: Final = "NAME_UNKNOWN"
 _UNNUMBERED: Final = (1 << 64) - 1
 
 
@@ -104,11 +105,14 @@ def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool
     found: list[Any] = []
     for _ in clock.looks(DISCOVERY_S):
         found = ros.node.get_publishers_info_by_topic(topic)
-        if found:
+        if found and not any(_UNNAMED in one.node_name for one in found):  # names arrive later
             break
         clock.sleep(0.05)
     kinds = sorted({one.topic_type for one in found})
-    names = sorted(f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in found)
+    names = sorted(
+        "a program without a node" if _UNNAMED in one.node_name else f"{one.node_namespace.rstrip('/')}/{one.node_name}"
+        for one in found
+    )
     if not found:
         same = [name for name, types in ros.node.get_topic_names_and_types() if kind in types and name != topic]
         others = f"topics of this type: {', '.join(same)}" if same else "no topic has this type"

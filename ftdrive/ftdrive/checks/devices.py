@@ -163,8 +163,8 @@ def _who_answers(address: SensorAddress) -> str:
     return "ftdrive doctor again" if address.place is None else f"ftdrive devices --probe {shlex.quote(address.place)}"
 
 
-def check_compensated(wrench: ArrayLike, cell: CellConfig) -> Check:
-    """Check that a topic's wrench (n, 6) at rest has the weight of the tool in it, or a bias: both are rarely near 0."""
+def check_compensated(wrench: Array, cell: CellConfig) -> Check:
+    """Check that a topic's wrench (n, 6) at rest has the weight of the tool or a bias in it, and is not near 0."""
     name, mass_kg = "sensor.compensated", cell.tool.mass_kg
     if mass_kg is None:
         return Check(name, "skipped", "[tool] mass_kg is not set: whether the topic is compensated is not known")
@@ -172,7 +172,7 @@ def check_compensated(wrench: ArrayLike, cell: CellConfig) -> Check:
     found = f"the wrench has {force_N:.1f} N at rest, the tool weighs {weight_N:.1f} N"
     if force_N > _COMPENSATED * weight_N:
         return Check(name, "ok", found)
-    fix = "give the topic of the raw wrench, or switch the compensation of its driver off; a constant zeroing does no harm"
+    fix = "give the topic of the raw wrench, or switch the compensation off; a zeroing that stays does no harm"
     return Check(name, "warning", f"{found}: this wrench is already compensated or zeroed", fix)
 
 
