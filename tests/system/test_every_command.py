@@ -37,6 +37,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "init": ("--yes", "--height", "33", "--tool", "0:60:90"),
     "calibrate": ("--minimal", "--yes"),
     "live": ("--once",),
+    "weigh": ("--once",),
     "export calibration": ("--format", "json"),
     "export plan": ("--format", "csv"),
     "report": ("--format", "md"),
@@ -74,6 +75,7 @@ SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "report": lambda answer: answer["result"]["n_poses"] >= 6 and answer["tour"]["emulated"] and answer["file"] is None,
     "solve": lambda answer: answer["n_poses"] >= 6,
     "transcript play": lambda answer: answer["played"]["samples"] > 1000,
+    "weigh": lambda answer: not answer["is_something"] and answer["refused"] is None,
     "verify": lambda answer: answer["passed"] and len(answer["poses"]) == 2,
     "transcript record": lambda answer: answer["recorded"]["error"] is None,
 }
