@@ -143,6 +143,7 @@ def test_every_command_works_with_simulate_and_json(
     works_with_simulate_and_json(command, ftdrive, capfd)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", REHEARSED)
 def test_a_command_that_needs_a_run_works_with_simulate_and_json(
     command: str,
@@ -213,6 +214,7 @@ def test_no_command_is_forgotten() -> None:
     assert ANSWERED.keys() | ELSEWHERE == set(names(cli))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ANSWERED)
 def test_a_file_gets_the_answer_and_a_reader_that_ends_ends_the_command(
     command: str, demo: dict[str, Any], ftdrive: CommandLine, monkeypatch: pytest.MonkeyPatch
