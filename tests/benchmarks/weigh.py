@@ -2,9 +2,10 @@
 
     uv run python -m tests.benchmarks.weigh [--weights 200] [--others 20]
 
-A sensor of 200 Hz with noise of 0.05 N, its wires, the stream and one pose of half a second for each weight. The calibration
-has 24 poses. Rows: parts of 0 to 3 kg after a zero in the same pose; without a zero, after drift of 0.5 N; a cable of
-0.1 N·m, of random direction and point; a push by hand that trembles; two parts, counted; a part that slips meanwhile.
+A sensor of 200 Hz with noise of 0.05 N, its wires, the stream and one pose of half a second for each weight. The
+calibration has 24 poses. Rows: parts of 0 to 3 kg after a zero in the same pose; without a zero, after drift of 0.5 N;
+a cable of 0.1 N·m, of random direction and point; a push by hand that trembles; two parts, counted; a part that slips
+meanwhile.
 Exit code: 1 if a target is missed.
 """
 
