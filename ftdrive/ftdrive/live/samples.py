@@ -234,6 +234,7 @@ EventKind = Literal[
     "stale",
     "recovered",
     "tool",
+    "load",
     "mark",
 ]
 
