@@ -28,7 +28,7 @@ HEIGHT_M = 0.03
 class Turns(ControllerProgram):
     """Moves of all joints, mostly of the wrist, between random postures, with rests."""
 
-    def __init__(self, robot: Robot, seed: int, speed_rad_s: float, rest_s: tuple[float, float] = (0.2, 1.0)) -> None:
+    def __init__(self, robot: Robot, seed: int, speed_rad_s: float, rest_s: tuple[float, float] = (0.8, 2.0)) -> None:
         super().__init__("turns")
         self._robot, self._rng, self._speed, self._rest_s = robot, np.random.default_rng([seed, 3]), speed_rad_s, rest_s
         self._steps = self._run()

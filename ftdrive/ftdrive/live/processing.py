@@ -179,7 +179,19 @@ class Processor:
         self._newest_ns = int(paired.t_host_ns[-1])
         buffer = paired if self._buffer is None else Paired.concatenate([self._buffer, paired])
         found = self._motion.follow(paired.R_base_flange, paired.p_base_flange_m)
-        states, felt = np.concatenate([self._states[0], found[0]]), np.concatenate([self._states[1], found[1]])
+        self._states = np.concatenate([self._states[0], found[0]]), np.concatenate([self._states[1], found[1]])
+        return self._advance(buffer, last)
+
+    def finish(self) -> Block:
+        """Process the samples that wait for poses after them: there are none at the end of a recording."""
+        with self._lock:
+            if self._buffer is None or not len(self._buffer):
+                raise ValueError("no samples were processed")
+            return self._advance(self._buffer, last=True)
+
+    def _advance(self, buffer: Paired, last: bool) -> Block:
+        """Process the rows of the buffer that have neighbours on both sides; keep those that others need."""
+        states, felt = self._states
         end, inertial = len(buffer), None
         neighbours = self._reach * self._stride
         positions = bool(np.isfinite(buffer.p_base_flange_m[-1]).all())
@@ -445,7 +457,7 @@ class Processor:
     @property
     def rest_sigma(self) -> Array | None:
         """(6,) standard deviation of one sample at rest; None until it is known."""
-        noise = self._noise.of(Motion.REST)
+        noise = self._noise.of(REST)
         return None if noise is None else np.sqrt(np.diag(noise.sample))
 
     def undo_tare(self) -> StreamEvent:
