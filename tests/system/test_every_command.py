@@ -57,7 +57,7 @@ REHEARSED = ("bundle", "replay", "report", "solve", "export calibration")
 GUIDED = ("calibrate", "verify")
 """They print their events too: test_session.py and test_verify.py."""
 
-ELSEWHERE = {"demo", "serve-load", "verify", "stream", "weigh", "fleet serve", "fleet verify"}
+ELSEWHERE = {"demo", "ros2", "serve-load", "verify", "stream", "weigh", "fleet serve", "fleet verify"}
 """Long sessions, servers without an answer, and a question at a terminal: see their tests."""
 
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
