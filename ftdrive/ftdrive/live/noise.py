@@ -75,8 +75,9 @@ class NoiseEstimator:
         if state == REST or other is None:
             return other
         if known is None or known.dof < _ENOUGH_DOF:
-            if faster := [self._known[k] for k in range(state + 1, STATES) if k in self._known]:
-                return faster[0] if faster[0].dof >= _ENOUGH_DOF else faster[-1]
+            learnt = (one for k, one in sorted(self._known.items()) if k > state and one.dof >= _ENOUGH_DOF)
+            if (faster := next(learnt, None)) is not None:
+                return faster
             reading = _FIRST_MOTION**2 * other.reading if rest else other.reading
             return replace(other, sample=other.sample + self._first, reading=reading + self._first)
         return known if rest is None else replace(known, wander=rest.wander)
