@@ -19,6 +19,8 @@ class SessionOptions:
     runs: Path
     name: str = "calibrate"
     poses: int = 24
+    seconds: float = 20.0
+    """Of a sweep, at the planned speed."""
     mode: Mode = "auto"
     """With `resume`, "auto" means the mode of that run."""
     dry_run: bool = False
@@ -50,6 +52,8 @@ class SessionOptions:
 def with_recorded_mode(options: SessionOptions) -> SessionOptions:
     """Return options with the mode of the resumed run; raises `ConfigError` for options that exclude each other."""
     begun = options.mode if options.resume is None else Run(options.resume).header().get("mode", "auto")
+    if options.resume is not None and begun == "sweep":
+        raise ConfigError(f"{options.resume} is a sweep, which is not continued: start again with --sweep")
     if options.mode != "auto" and (begun in _BY_HAND) != options.by_hand:
         way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
         raise ConfigError(f"{options.resume} was started {way} and only continues so: leave out --{options.mode}")
