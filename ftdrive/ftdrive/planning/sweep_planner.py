@@ -29,27 +29,30 @@ from ftdrive.planning.plan import PROOF_S, Plan, Step, ball_of, description_of, 
 from ftdrive.planning.search.constant_tour import constant_tour
 from ftdrive.planning.search.nodes import WRIST_6_RAD
 from ftdrive.planning.search.postures import with_room
-from ftdrivers.sweep import WAVES, WRISTS, Sweep
+from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
 SECONDS = (10.0, 120.0)
-RAMP_S = 2.0
+RAMP_S = 3.0
 STEP_S = 0.2
 """Between two steps of the plan."""
 SMOOTHED_S = 0.1
 """The `lookahead_time` of the controller."""
-CANDIDATES = 120
-PROVEN = 30
-"""So many of them, the best ones, are tried at one posture."""
-POSTURES = 20
+RANDOM, CHANGED = 24, 40
+"""Curves that are tried."""
+PROVEN = 6
+"""So many of them, the best ones, are tried at one posture, in each of the sizes."""
+SIZES = (1.0, 0.8, 0.6)
+POSTURES = 6
 SLOW_HZ, QUICK_HZ = (0.06, 0.16), (0.3, 0.9)
 """Of the two sines of each joint: the slow one turns far, the quick one shows the inertia."""
 MOST_RAD = 1.5
 _MODEL_STEP_S = 0.01
+_COARSE = 5
+"""Of the points of the proof, one in so many is looked at first."""
 _ROW_S = 0.12
-_INERTIA_WORTH = 0.2
+_INERTIA_WORTH = 0.5
 """Of the logarithm of its sigma, beside that of the compensation error."""
-_SIZES = (1.0, 0.7, 0.45)
 
 
 def plan_sweep(
@@ -91,11 +94,12 @@ def plan_sweep(
         if not certifier.free(centre)[0]:
             continue
         tried += 1
-        candidates = [one for one in _candidates(certifier.arm, centre, seconds, speeds, guess) if one is not None]
-        for _, sweep in sorted(candidates, key=lambda one: one[0])[:PROVEN]:
-            off_rad = _off_curve(sweep, stop_rad_s2)
-            if certifier.keeping(certifier.reach_m(off_rad)).clear_around(sweep.at(_times(sweep, PROOF_S))):
-                return _plan(certifier, sweep, certifier.reach_m(off_rad), q_now, speeds, guess)
+        best = _candidates(certifier.arm, centre, seconds, speeds, guess)[:PROVEN]
+        for sweep in (one.smaller(size) for size in SIZES for _, one in best):
+            off_m = certifier.reach_m(_off_curve(sweep, stop_rad_s2))
+            keeping, path = certifier.keeping(off_m), sweep.at(_times(sweep, PROOF_S))
+            if keeping.free(path[::_COARSE]).all() and keeping.clear_around(path):
+                return _plan(certifier, sweep, off_m, q_now, speeds, guess)
         if tried == POSTURES:
             break
     raise PlanRefused(
@@ -117,17 +121,36 @@ def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
 
 def _candidates(
     arm: ArmModel, centre: Array, seconds: float, speeds: Speeds, guess: Guess
-) -> Iterator[tuple[float, Sweep] | None]:
-    """Curves with their scores, the smaller the better; None for one that cannot be made slow enough."""
-    rng = np.random.default_rng(0)
-    for k in range(CANDIDATES):
-        hertz = np.stack([rng.uniform(*SLOW_HZ, 3), rng.uniform(*QUICK_HZ, 3)], axis=1)
-        quick = rng.uniform(0.1, 0.6, 3)  # of the speed
-        amplitude = MOST_RAD * np.stack([1 - quick, quick * SLOW_HZ[0] / hertz[:, 1]], axis=1)
-        phase = rng.uniform(0, 2 * np.pi, (len(WRISTS), WAVES))
-        whole = Sweep(centre.tolist(), amplitude, 2 * np.pi * hertz, phase, seconds, RAMP_S)
-        sweep = _within(arm, whole.smaller(_SIZES[k % len(_SIZES)]), speeds)
-        yield None if sweep is None else (_score(arm, sweep, guess), sweep)
+) -> list[tuple[float, Sweep]]:
+    """Curves with their scores, the best first: random ones, then changes of the best one."""
+    rng, found = np.random.default_rng(0), list[tuple[float, Sweep]]()
+    best, least = _drawn(rng), np.inf
+    for k in range(RANDOM + CHANGED):
+        tried = _drawn(rng)
+        if k >= RANDOM:
+            share = rng.choice([0.1, 0.3])
+            tried = (1 - share) * best + share * tried
+        sweep = _within(arm, _curve(tried, centre, seconds), speeds)
+        if sweep is None:
+            continue
+        found.append((_score(arm, sweep, guess), sweep))
+        if found[-1][0] < least:
+            least, best = found[-1][0], tried
+    return sorted(found, key=lambda one: one[0])
+
+
+def _drawn(rng: np.random.Generator) -> Array:
+    """Return numbers (3, 6) from 0 to 1: of each wrist, its size, the share of its quick sine, frequencies, phases."""
+    return rng.uniform(size=(len(WRISTS), 6))
+
+
+def _curve(drawn: Array, centre: Array, seconds: float) -> Sweep:
+    hertz = np.stack([low + (high - low) * drawn[:, k] for k, (low, high) in enumerate((SLOW_HZ, QUICK_HZ))], axis=1)
+    quick = 0.1 + 0.8 * drawn[:, 2]  # of the acceleration
+    strength = np.stack([1 - quick, quick], axis=1) / (2 * np.pi * hertz) ** 2
+    size = (0.2 + 0.8 * drawn[:, 3]) * MOST_RAD
+    amplitude = size[:, None] * strength / strength.sum(axis=1, keepdims=True)
+    return Sweep(centre.tolist(), amplitude, 2 * np.pi * hertz, 2 * np.pi * drawn[:, 4:], seconds, RAMP_S)
 
 
 def _within(arm: ArmModel, sweep: Sweep, speeds: Speeds) -> Sweep | None:
@@ -201,9 +224,7 @@ def _motion(arm: ArmModel, sweep: Sweep) -> tuple[Motion, Motion]:
     return Motion.of_columns(columns[1]), Motion.of_columns((columns[2] - columns[0]) / (2 * h))
 
 
-def _plan(
-    certifier: Certifier, sweep: Sweep, off_curve_m: float, q_now: Array, speeds: Speeds, guess: Guess
-) -> Plan:
+def _plan(certifier: Certifier, sweep: Sweep, off_curve_m: float, q_now: Array, speeds: Speeds, guess: Guess) -> Plan:
     arm, q = certifier.arm, sweep.at(_times(sweep, STEP_S))
     following = np.roll(q, -1, axis=0)
     certificate = certifier.keeping(off_curve_m).certify(q, following)

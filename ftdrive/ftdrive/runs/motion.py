@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import math
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -32,13 +33,16 @@ class MotionRecording:
 
     samples: FtSamples
     states: ArmStates
+    nominal_rate_Hz: float = math.nan
+    """Of a sensor that sends at an even rate; NaN for one that is polled."""
 
     def save(self, path: Path) -> None:
         """Write a new file; returns when it is on disk."""
         buffer = io.BytesIO()
         wrench = {f"wrench_{name}": getattr(self.samples, name) for name in _WRENCH}
         poses = {f"pose_{name}": getattr(self.states, name) for name in _POSES}
-        np.savez(buffer, format=np.array(FORMAT), **wrench, **poses)
+        rate = np.array(self.nominal_rate_Hz)
+        np.savez(buffer, format=np.array(FORMAT), nominal_rate_Hz=rate, **wrench, **poses)
         write_new(path, buffer.getvalue())
 
     @classmethod
@@ -55,6 +59,7 @@ class MotionRecording:
             return cls(
                 FtSamples(*(data[f"wrench_{name}"] for name in _WRENCH)),
                 ArmStates(*(data[f"pose_{name}"] for name in _POSES)),
+                float(data["nominal_rate_Hz"]),
             )
         except (KeyError, OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
             raise BadDataset(f"{path} is not a recording in motion ({error}): take it from a copy") from error
@@ -63,12 +68,20 @@ class MotionRecording:
         """Return both streams as the estimator takes them, on the host's clock in s since the first sample."""
         start_ns = int(min(self.samples.t_host_ns[0], self.states.t_host_ns[0]))
         wrench, poses = Means(), Means()
-        count = self.samples.t_device_s if np.isfinite(self.samples.t_device_s).all() else self.samples.seq
-        wrench.add(measured_s(count, self.samples.t_host_ns, start_ns), self.samples.wrench)
+        wrench.add(self._wrench_s(start_ns), self.samples.wrench)
         rotations = self.states.R_base_flange.reshape(-1, 9)
         t_s = measured_s(self.states.t_device_s, self.states.t_host_ns, start_ns)
         poses.add(t_s, np.hstack([rotations, self.states.p_base_flange_m]))
         return wrench, poses
+
+    def _wrench_s(self, start_ns: int) -> Array:
+        """Return the times of the wrenches by the sensor's clock, or its count; a polled one has neither."""
+        samples = self.samples
+        if np.isfinite(samples.t_device_s).all():
+            return measured_s(samples.t_device_s, samples.t_host_ns, start_ns)
+        if math.isfinite(self.nominal_rate_Hz):
+            return measured_s(samples.seq, samples.t_host_ns, start_ns)
+        return np.asarray((samples.t_host_ns - start_ns) * 1e-9)
 
 
 def measured_s(count: Any, t_host_ns: Any, start_ns: int) -> Array:

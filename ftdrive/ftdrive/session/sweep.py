@@ -60,7 +60,8 @@ class SweepTour(Tour):
             duration_s = clock.now_s() - began_s
             self._now.standing = True
             self._rest(centre)
-            recording = MotionRecording(wrench.read(_READ_S), poses.read(_READ_S))
+            rate_Hz = self._sensor.health().nominal_rate_Hz
+            recording = MotionRecording(wrench.read(_READ_S), poses.read(_READ_S), rate_Hz)
         self._guarded.load.judge(recording.samples.wrench)
         path = self._book.run.new_path("motion", ".npz")
         recording.save(path)

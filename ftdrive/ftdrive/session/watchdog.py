@@ -77,9 +77,7 @@ class Watcher:
         self.check()
         self._last = None
         self._looked_s = self.clock.now_s()
-        motion = self._motion = ExpectedMotion(
-            np.asarray(start_rad), np.asarray(goal_rad), moving, curve_rad
-        )
+        motion = self._motion = ExpectedMotion(np.asarray(start_rad), np.asarray(goal_rad), moving, curve_rad)
         self._wake.set()
         try:
             while self._seen is not motion:

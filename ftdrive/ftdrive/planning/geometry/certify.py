@@ -78,9 +78,7 @@ class Certifier:
 
     def keeping(self, more_m: float) -> "Certifier":
         """Return a certifier that keeps so much more distance: to what is that near a move, the margins remain."""
-        return Certifier(
-            self.arm, self.scene, Margins(self.margins.self_m + more_m, self.margins.scene_m + more_m)
-        )
+        return Certifier(self.arm, self.scene, Margins(self.margins.self_m + more_m, self.margins.scene_m + more_m))
 
     def free(self, q_rad: ArrayLike) -> NDArray[np.bool_]:
         """Return (n,) whether the margins are kept at joint vectors (n, 6)."""

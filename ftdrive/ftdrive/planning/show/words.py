@@ -89,9 +89,7 @@ def _sweep_table(sweep: Sweep) -> list[str]:
     lines = [f"Joints in degrees, within {sweep.duration_s:.0f} s:", f"{'':10}begin  from    to  °/s  °/s²"]
     for j in WRISTS:
         low, high = q_deg[:, j].min(), q_deg[:, j].max()
-        lines.append(
-            f"  {JOINTS[j]:8}{q_deg[0, j]:5.0f}{low:6.0f}{high:6.0f}{speed[j]:5.0f}{acceleration[j]:6.0f}"
-        )
+        lines.append(f"  {JOINTS[j]:8}{q_deg[0, j]:5.0f}{low:6.0f}{high:6.0f}{speed[j]:5.0f}{acceleration[j]:6.0f}")
     return lines
 
 
