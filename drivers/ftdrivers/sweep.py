@@ -6,6 +6,7 @@ The window is the polynomial of fifth degree, so speed and acceleration are zero
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Final, Self
 
 import numpy as np
@@ -131,5 +132,5 @@ def _window(x: Array, derivative: int) -> Array:
 def _binomials(order: int) -> list[int]:
     row = [1]
     for _ in range(order):
-        row = [1, *(a + b for a, b in zip(row, row[1:], strict=False)), 1]
+        row = [1, *(a + b for a, b in pairwise(row)), 1]
     return row

@@ -54,15 +54,19 @@ class MotionRecording:
                     name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
                     for name in file.namelist()
                 }
-            if str(data.get("format")) != FORMAT:
-                raise ValueError(f"its format is {data.get('format')}, this version reads {FORMAT}")
-            return cls(
-                FtSamples(*(data[f"wrench_{name}"] for name in _WRENCH)),
-                ArmStates(*(data[f"pose_{name}"] for name in _POSES)),
-                float(data["nominal_rate_Hz"]),
-            )
+            return cls._of(data)
         except (KeyError, OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
             raise BadDataset(f"{path} is not a recording in motion ({error}): take it from a copy") from error
+
+    @classmethod
+    def _of(cls, data: Mapping[str, Any]) -> "MotionRecording":
+        if str(data.get("format")) != FORMAT:
+            raise ValueError(f"its format is {data.get('format')}, this version reads {FORMAT}")
+        return cls(
+            FtSamples(*(data[f"wrench_{name}"] for name in _WRENCH)),
+            ArmStates(*(data[f"pose_{name}"] for name in _POSES)),
+            float(data["nominal_rate_Hz"]),
+        )
 
     def means(self) -> tuple[Means, Means]:
         """Return both streams as the estimator takes them, on the host's clock in s since the first sample."""

@@ -150,8 +150,8 @@ class AlongPlan:
         total_s = moves_s(driven, todo, before.approach)
         total_s += len(todo) * (sampling.average_s + 0.6)
         cell.note(
-            f"{len(todo)} stops left, at most {np.degrees(driven.top_speed_rad_s):.0f}°/s: about {total_s / 60:.1f} min; "
-            f"{taken} poses taken before"
+            f"{len(todo)} stops left, at most {np.degrees(driven.top_speed_rad_s):.0f}°/s: "
+            f"about {total_s / 60:.1f} min; {taken} poses taken before"
         )
         window = int(len(before.quiet) * min(1.0, sampling.average_s / LISTEN_S))
         return Pace(

@@ -76,7 +76,7 @@ class FreeTool(Guard):
         if self._moving_s < KNOWN_S:
             return None
         x = self._features(R_base_flange)
-        if _NOISE_N * float(np.sqrt(max(x @ self._covariance @ x, 0.0))) > _UNSURE_N:
+        if float(x @ self._covariance @ x) > (_UNSURE_N / _NOISE_N) ** 2:
             return None
         return np.asarray(x @ self._coefficients)
 

@@ -19,8 +19,6 @@ class SessionOptions:
     runs: Path
     name: str = "calibrate"
     poses: int = 24
-    seconds: float = 20.0
-    """Of a sweep, at the planned speed."""
     mode: Mode = "auto"
     """With `resume`, "auto" means the mode of that run."""
     dry_run: bool = False
@@ -40,6 +38,8 @@ class SessionOptions:
     questions: bool = True
     yes: bool = False
     """Answer the safety questions automatically, never the first motion."""
+    seconds: float = 20.0
+    """Of a sweep, at the planned speed."""
     description: Mapping[str, Any] = field(default_factory=dict)
     """Goes into run.json."""
 

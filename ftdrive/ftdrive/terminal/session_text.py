@@ -152,11 +152,8 @@ def head_and_words(event: Event) -> tuple[str, str]:
             return "", "\n".join(filter(None, (plan_in_words(event.plan), event.stop_words, event.way_words)))
         case Noted():
             return "! " if event.warning else "", event.words
-        case PoseTaken():
-            return "", pose_in_words(event)
-        case MotionRecorded():
-            words = f"recorded {event.samples} samples of the sensor, {event.states} of the arm"
-            return "", f"{words}; the sweep took {event.duration_s:.1f} s"
+        case PoseTaken() | MotionRecorded():
+            return "", pose_in_words(event) if isinstance(event, PoseTaken) else motion_in_words(event)
         case Estimated():
             return "  ", estimate_in_words(event)
         case Compared():
@@ -168,6 +165,12 @@ def head_and_words(event: Event) -> tuple[str, str]:
             return "", f"{event.question}{colon} {event.answer}{' (--yes)' if event.by == '--yes' else ''}"
         case _:
             return "", ""
+
+
+def motion_in_words(event: MotionRecorded) -> str:
+    """Describe what was recorded in motion."""
+    words = f"recorded {event.samples} samples of the sensor, {event.states} of the arm"
+    return f"{words}; the sweep took {event.duration_s:.1f} s"
 
 
 def pose_in_words(event: PoseTaken) -> str:

@@ -56,5 +56,5 @@ def test_a_slower_sweep_has_the_same_path() -> None:
 @pytest.mark.parametrize("wrong", [{"duration_s": 3.0}, {"centre_rad": CENTRE[:5]}, {"ramp_s": float("nan")}])
 def test_an_impossible_sweep_is_refused(wrong: dict[str, object]) -> None:
     good = Sweep(CENTRE, [[0.5, 0.1]] * 3, [[0.6, 3.0]] * 3, [[0.0, 1.0]] * 3, 10.0, 2.0).to_dict()
-    with pytest.raises(ValueError, match="sweep|ramps"):
+    with pytest.raises(ValueError, match=r"sweep|ramps"):
         Sweep.from_dict({**good, **wrong})

@@ -89,7 +89,7 @@ class Registers:
                 far.stopJ(4.0)
                 self._moving = not far.stopping_works
         elif name == "wave":
-            self.waves[round(numbers[0])] = tuple(numbers[1:4])
+            self.waves[round(numbers[0])] = (numbers[1], numbers[2], numbers[3])
         elif name == "sweep":
             if self._moving or not np.allclose(numbers[:6], far.q_rad, atol=1e-3):
                 return False

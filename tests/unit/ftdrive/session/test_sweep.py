@@ -1,25 +1,39 @@
 """A sweep on the fake cell: what is asked, its speed, the hazards of the tour, and what is kept."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array
+from ftdrive.cell.config import CellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, SupervisorGone
 from ftdrive.planning import sweep_planner
+from ftdrive.planning.cell_plan import certifier_for, sweep_for
+from ftdrive.planning.plan import Plan
 from ftdrive.runs.motion import MotionRecording
+from ftdrive.session import sweeping
 from ftdrive.session.events import Event, GuardTripped, MotionRecorded, State, StateChanged
 from ftdrive.session.free_tool import FreeTool
 from ftdrive.session.guards import ExpectedMotion, Seen
 from ftdrive.session.operator import Key
 from ftdrive.session.options import SessionOptions, with_recorded_mode
 from ftdrive.session.sweeping import on_script_path
+from ftdrivers.clock import REAL
+from ftdrivers.interfaces import ArmState
 from tests.unit.ftdrive.fake_cell import STATUS, Lab
 from tests.unit.ftdrive.session.test_stops import FAULTS
 
-LATE_S = 6.0
+LATE_S = 4.5
 """Then the tool is known."""
+
+
+@cache
+def planned(q_rad: tuple[float, ...], cell: CellConfig, seconds: float) -> Plan:
+    return sweep_for(cell, certifier_for(cell, "UR5e"), np.array(q_rad), seconds)
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +41,13 @@ def _short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sweep_planner, "RANDOM", 2)
     monkeypatch.setattr(sweep_planner, "CHANGED", 0)
 
+    def planned_once(cell: CellConfig, _: object, q_rad: Array, seconds: float) -> Plan:
+        return planned(tuple(q_rad.tolist()), replace(cell, clock=REAL), seconds)
 
+    monkeypatch.setattr(sweeping, "sweep_for", planned_once)
+
+
+@pytest.mark.slow
 def test_the_first_run_is_slow_and_the_second_is_not(lab: Lab) -> None:
     for _ in range(2):
         assert lab.sweep() is not None
@@ -51,6 +71,7 @@ def test_everything_is_kept_in_one_file(lab: Lab) -> None:
     assert State.SWEEP in lab.operator.states()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_in_a_sweep_stops_the_arm_and_resume_starts_again(fault: str, lab: Lab) -> None:
     hazard, inject, repair, _ = FAULTS[fault]
@@ -94,6 +115,7 @@ def test_a_slider_that_moves_stops_the_arm(lab: Lab) -> None:
     assert lab.operator.of(GuardTripped)[0].hazard == 22
 
 
+@pytest.mark.slow
 def test_a_sweep_starts_at_the_speed_of_the_slider(lab: Lab) -> None:
     lab.arm.set_status(speed_slider=0.8)
     lab.sweep(real=False)
@@ -127,8 +149,6 @@ def test_a_sweep_is_not_continued(lab: Lab) -> None:
 
 
 def test_the_other_control_path_is_refused_at_once(lab: Lab) -> None:
-    from dataclasses import replace
-
     cell = replace(lab.cell, robot=replace(lab.cell.robot, control="ur-rtde"))
     with pytest.raises(ConfigError, match="--control script"):
         on_script_path(cell)
@@ -137,8 +157,6 @@ def test_the_other_control_path_is_refused_at_once(lab: Lab) -> None:
 
 def seen(t_s: float, R: Array, wrench: Array, sample: int, curve: Array | None) -> Seen:
     motion = ExpectedMotion(np.zeros(6), np.zeros(6), True, curve)
-    from ftdrivers.interfaces import ArmState
-
     state = ArmState(0, 0.0, np.zeros(6), np.zeros(6), R, np.zeros(3))
     return Seen(t_s, 0.01, motion, state, STATUS, wrench, sample, 0.0)
 
@@ -149,7 +167,7 @@ def test_the_weight_is_learned_from_three_seconds_on(orientation: Callable[[floa
 
     def wrench(R: Array) -> Array:
         force = R.T @ [0, 0, -12.0]
-        return np.r_[force, np.cross([0.01, 0, 0.06], force)] + [1, 2, 3, 0.1, 0.2, 0.3]
+        return np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
 
     tool.begin(seen(0.0, np.eye(3), np.zeros(6), 0, curve))
     for k in range(1500):
@@ -165,6 +183,4 @@ def test_the_weight_is_learned_from_three_seconds_on(orientation: Callable[[floa
 
 @pytest.fixture
 def orientation() -> Callable[[float], Array]:
-    from scipy.spatial.transform import Rotation
-
     return lambda t_s: Rotation.from_euler("xyz", [np.sin(0.5 * t_s), np.sin(0.7 * t_s), 0.4 * t_s]).as_matrix()
