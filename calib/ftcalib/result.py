@@ -330,9 +330,7 @@ class CalibrationResult:
         cov = self.covariance[3:6, 3:6]
         weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, cov)
         if weight > 1e-9 * self.weight_N:  # not exactly known
-            lag = self.components.get("hysteresis", 0.0)
-            common = max(LEAST_COMMON_GAIN, float(np.hypot(COMMON_GAIN * self.gain_sigma, lag)))
-            weight = float(np.hypot(weight, common * self.weight_N))
+            weight = float(np.hypot(weight, self.scale_sigma * self.weight_N))
         return {
             "R_flange_sensor": std[0:3],
             "gravity_force_base_N": std[3:6],
@@ -345,6 +343,12 @@ class CalibrationResult:
             "tilt_beta_rad": beta,
             **({} if self.motion is None else self.motion.sigma),
         }
+
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the gain common to all axes, which no orientation shows."""
+        lag = self.components.get("hysteresis", 0.0)
+        return max(LEAST_COMMON_GAIN, float(np.hypot(COMMON_GAIN * self.gain_sigma, lag)))
 
     def compensate(self, wrench: ArrayLike, R_base_flange: Rotations, *, response: bool = True) -> Array:
         """Subtract weight and bias to give the contact wrench.

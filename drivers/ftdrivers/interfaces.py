@@ -276,6 +276,13 @@ class _Device(ABC):
     def identify(self) -> DeviceInfo:
         """Return model, serial number and firmware, as read when the device was opened."""
 
+    def diagnose(self) -> list[Diagnosis]:
+        """Check what only this kind of device has and a program needs, such as the ports of a controller.
+
+        Only reads. The default has nothing to check.
+        """
+        return []
+
     def __enter__(self) -> Self:
         self.open()
         return self
@@ -410,13 +417,6 @@ class RobotArm(_Device):
     def reported_program(self) -> str | None:
         """Return the program that runs, as the controller reports it; None where it does not."""
         return None
-
-    def diagnose(self) -> list[Diagnosis]:
-        """Check what only this kind of controller has and a program needs, such as its ports.
-
-        Only reads. Errors become findings. The default has nothing to check.
-        """
-        return []
 
     @abstractmethod
     def within_safety_limits(self, q_rad: Sequence[float]) -> bool:

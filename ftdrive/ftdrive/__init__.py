@@ -10,6 +10,7 @@ Modules behind them may move; these names stay.
 | keep and read results | `read_calibration`, `Run`, `read_recording`, `write_recording` |
 | compensate | `CalibrationResult.compensate`, `Compensator`, `predict`, `Parameters` |
 | live | `open_stream`, `WrenchFrame`, `Stages`, `Contact` |
+| weigh | `weigh`, `Weight`, `CannotWeigh` |
 | devices | `open_sensor`, `open_arm`, `ForceTorqueSensor`, `RobotArm`, `FtSamples`, `ArmState`, `DeviceInfo` |
 | own drivers | `StreamingSensor`, `ReadOnlyArm` |
 | plan | `plan_tour` |
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from ftcalib.compensation import Compensator
     from ftcalib.data.dataset import CalibrationDataset
     from ftcalib.errors import AcceptanceError, DataError, DeviceError, FtdriveError, UsageError
+    from ftcalib.extras.weighing import Weight
     from ftcalib.findings import Finding
     from ftcalib.known import Known
     from ftcalib.model import Parameters, predict
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
     from ftdrive.library import open_arm, open_sensor, open_stream, plan_tour
     from ftdrive.live.contact import Contact
     from ftdrive.live.samples import Stages, WrenchFrame
+    from ftdrive.live.weighing import CannotWeigh, weigh
     from ftdrive.recording.files import read_recording, write_recording
     from ftdrive.runs.run import Run
     from ftdrive.runs.source import read_calibration, read_dataset
@@ -47,6 +50,7 @@ __all__ = [
     "ArmState",
     "CalibrationDataset",
     "CalibrationResult",
+    "CannotWeigh",
     "Compensator",
     "Contact",
     "DataError",
@@ -65,6 +69,7 @@ __all__ = [
     "Stages",
     "StreamingSensor",
     "UsageError",
+    "Weight",
     "WrenchFrame",
     "compare",
     "open_arm",
@@ -76,6 +81,7 @@ __all__ = [
     "read_dataset",
     "read_recording",
     "solve",
+    "weigh",
     "write_recording",
 ]
 
@@ -84,6 +90,7 @@ _MODULES = {
     "ftcalib.compensation": ("Compensator",),
     "ftcalib.data.dataset": ("CalibrationDataset",),
     "ftcalib.errors": ("AcceptanceError", "DataError", "DeviceError", "FtdriveError", "UsageError"),
+    "ftcalib.extras.weighing": ("Weight",),
     "ftcalib.findings": ("Finding",),
     "ftcalib.known": ("Known",),
     "ftcalib.model": ("Parameters", "predict"),
@@ -93,6 +100,7 @@ _MODULES = {
     "ftdrive.library": ("open_arm", "open_sensor", "open_stream", "plan_tour"),
     "ftdrive.live.contact": ("Contact",),
     "ftdrive.live.samples": ("Stages", "WrenchFrame"),
+    "ftdrive.live.weighing": ("CannotWeigh", "weigh"),
     "ftdrive.recording.files": ("read_recording", "write_recording"),
     "ftdrive.runs.run": ("Run",),
     "ftdrive.runs.source": ("read_calibration", "read_dataset"),

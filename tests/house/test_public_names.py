@@ -27,9 +27,9 @@ ERRORS = ["AcceptanceError", "DataError", "DeviceError", "FtdriveError", "UsageE
 RESULTS = ["CalibrationDataset", "CalibrationResult", "Compensator", "Finding", "Known", "Parameters", "Run", "Setup"]
 FUNCTIONS = ["compare", "predict", "read_calibration", "read_dataset", "read_recording", "solve", "write_recording"]
 DEVICES = ["ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "ReadOnlyArm", "RobotArm", "StreamingSensor"]
-LIVE = ["Contact", "Stages", "WrenchFrame"]
+LIVE = ["CannotWeigh", "Contact", "Stages", "Weight", "WrenchFrame", "weigh"]
 OPENED = ["open_arm", "open_sensor", "open_stream", "plan_tour"]
-EMULATED = {"ForceTorqueSensor", "RobotArm", "open_arm", "open_sensor", "open_stream"}
+EMULATED = {"ForceTorqueSensor", "RobotArm", "Weight", "open_arm", "open_sensor", "open_stream", "weigh"}
 
 
 def test_the_names_are_these() -> None:

@@ -11,6 +11,8 @@ import pytest
 from ftdrive.cell.emulated import Station
 from tests.system.command_line import CommandLine, assert_demo_found_the_truth
 
+pytestmark = pytest.mark.slow
+
 
 def test_demo_recovers_the_truth(demo: dict[str, Any]) -> None:
     assert_demo_found_the_truth(demo)

@@ -53,6 +53,7 @@ def checks_of(outcome: subprocess.CompletedProcess[str]) -> dict[str, dict[str, 
     return {check["name"]: check for check in json.loads(outcome.stdout)["checks"]}
 
 
+@pytest.mark.slow
 def test_a_healthy_cell(ftdrive: CommandLine) -> None:
     answer = ftdrive.json("doctor", "--simulate", "--push")
     checks = {check["name"]: check for check in answer["checks"]}
@@ -68,6 +69,7 @@ def test_a_healthy_cell(ftdrive: CommandLine) -> None:
     assert re.search(r"answers within [0-9]+ ms", checks["robot.link"]["found"])
 
 
+@pytest.mark.slow
 def test_a_stopped_arm_in_local_control(ftdrive: CommandLine) -> None:
     with ill_station() as station:
         station.control(do="protective-stop")
@@ -104,6 +106,7 @@ def test_a_controller_without_dashboard_server(ftdrive: CommandLine) -> None:
     assert outcome.run.header()["devices"]["arm"]["facts"]["control"]["value"].startswith("script")
 
 
+@pytest.mark.slow
 def test_an_old_controller_needs_its_model(ftdrive: CommandLine) -> None:
     with Station("serial", ["--time-scale", "1", "--polyscope", "5.4.0"]) as station:
         ftdrive.keep_time_of(station)

@@ -37,6 +37,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
     "init": ("--yes", "--height", "33", "--tool", "0:60:90"),
     "calibrate": ("--minimal", "--yes"),
     "live": ("--once",),
+    "weigh": ("--once",),
     "export calibration": ("--format", "json"),
     "export plan": ("--format", "csv"),
     "report": ("--format", "md"),
@@ -51,7 +52,7 @@ OFFLINE = ("convert", "compensate", "history", "diff", "export formats", *FLEET)
 """They know no cell, or many."""
 
 REHEARSED = ("bundle", "replay", "report", "solve", "export calibration")
-"""They calibrate an emulated cell first, as do live, push (test_push.py) and demo (test_demo.py)."""
+"""They calibrate an emulated cell first, as do live, weigh, push (test_push.py) and demo (test_demo.py)."""
 
 GUIDED = ("calibrate", "verify")
 """They print their events too: test_session.py and test_verify.py."""
@@ -74,6 +75,7 @@ SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "report": lambda answer: answer["result"]["n_poses"] >= 6 and answer["tour"]["emulated"] and answer["file"] is None,
     "solve": lambda answer: answer["n_poses"] >= 6,
     "transcript play": lambda answer: answer["played"]["samples"] > 1000,
+    "weigh": lambda answer: not answer["is_something"] and answer["refused"] is None,
     "verify": lambda answer: answer["passed"] and len(answer["poses"]) == 2,
     "transcript record": lambda answer: answer["recorded"]["error"] is None,
 }
@@ -132,7 +134,7 @@ def test_a_full_disk_is_no_crash() -> None:
     [
         name
         for name in names(cli)
-        if name not in ("demo", "live", "push", "record", "stream", *GUIDED, *REHEARSED, *OFFLINE)
+        if name not in ("demo", "live", "push", "record", "stream", "weigh", *GUIDED, *REHEARSED, *OFFLINE)
     ],
 )
 def test_every_command_works_with_simulate_and_json(
@@ -141,6 +143,7 @@ def test_every_command_works_with_simulate_and_json(
     works_with_simulate_and_json(command, ftdrive, capfd)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", REHEARSED)
 def test_a_command_that_needs_a_run_works_with_simulate_and_json(
     command: str,
@@ -155,7 +158,7 @@ def test_a_command_that_needs_a_run_works_with_simulate_and_json(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["live"])
+@pytest.mark.parametrize("command", ["live", "weigh"])
 def test_a_command_that_needs_a_calibration_makes_one(
     command: str, ftdrive: CommandLine, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -211,6 +214,7 @@ def test_no_command_is_forgotten() -> None:
     assert ANSWERED.keys() | ELSEWHERE == set(names(cli))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ANSWERED)
 def test_a_file_gets_the_answer_and_a_reader_that_ends_ends_the_command(
     command: str, demo: dict[str, Any], ftdrive: CommandLine, monkeypatch: pytest.MonkeyPatch

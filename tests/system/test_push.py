@@ -11,6 +11,8 @@ import pytest
 from ftdrive.cell.emulated import Station
 from tests.system.command_line import CommandLine
 
+pytestmark = pytest.mark.slow
+
 SENSOR_KG, HEIGHT_MM = 0.25, 40.0
 
 

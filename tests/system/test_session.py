@@ -50,6 +50,7 @@ def programs_of(station: Station) -> list[str]:
     return asked + [event["what"] for event in diary if event["by"] in {"program", "script port"}]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dry", [True, False], ids=["dry-run", "calibrate"])
 def test_a_program_of_another_client_and_its_move_go_on(
     dry: bool, station: Station, config: Path, ftdrive: CommandLine
@@ -72,6 +73,7 @@ def test_a_program_of_another_client_and_its_move_go_on(
     assert not (ftdrive.folder / "runs").exists()
 
 
+@pytest.mark.slow
 def test_a_dry_run_shows_everything_and_moves_nothing(station: Station, config: Path, ftdrive: CommandLine) -> None:
     path = ftdrive.folder / "tour.json"
     outcome = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)

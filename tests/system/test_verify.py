@@ -13,6 +13,8 @@ from ftdrive.commands.emulated_run import rehearse
 from ftdrive.terminal.report import compensation_error
 from tests.system.command_line import CommandLine
 
+pytestmark = pytest.mark.slow
+
 ANSWERS = "yes\nyes\nyes\nMOVE\nyes\n"
 """Three safety questions, the word for the first motion, the beginning of the tour."""
 
@@ -34,7 +36,6 @@ def test_the_cell_of_a_calibration_passes(demo: dict[str, Any], ftdrive: Command
     assert [len(pose["residual"]) for pose in answer["poses"]] == [6, 6]
 
 
-@pytest.mark.slow
 def test_a_bias_step_and_another_payload_are_named(station: Station, ftdrive: CommandLine) -> None:
     calibrated = rehearse(station, ftdrive.folder / "runs", "calibrate", poses=6)
     config, parent = ftdrive.connect(station), calibrated.run.calibration_path

@@ -48,21 +48,22 @@ def select(
     needed = len(components) if needed is None else needed
     best = _pruned(problem, maximise(problem, components, theta), needed)
     waiting = [c for c in candidates if c not in best.components]
-    last = len(best.components)  # how many came in at once
     while waiting:
         gains, start = predicted_gains(problem, best, waiting)
         k = int(np.argmax(gains))
         if gains[k] < WORTH_A_TRY:
             break
-        # What is as good as certain comes in together with others of its kind: each acts on its own channels.
-        together = [i for i, c in enumerate(waiting) if i == k or (c.kind == waiting[k].kind and gains[i] > SURE)]
-        trial = maximise(
-            problem, [*best.components, *(waiting[i] for i in together)], np.append(best.theta, start[together])
-        )
-        if trial.loglik > best.loglik + waiting[k].needed and not trial.too_large:
-            best, last = trial, len(together)
+        # What is as good as certain comes in together: the needless among them are dropped in the end.
+        wanted = best.loglik + waiting[k].needed
+        for together in ([int(i) for i in np.argsort(-gains) if i == k or gains[i] > SURE], [k]):
+            components = [*best.components, *(waiting[i] for i in together)]
+            trial = maximise(problem, components, np.append(best.theta, start[together]), wanted)
+            if not trial.too_large:
+                break
+        if trial.loglik > wanted and not trial.too_large:
+            best = trial
         waiting = [c for i, c in enumerate(waiting) if i not in together]
-    return best if len(best.components) - needed <= last else _pruned(problem, best, needed)
+    return best if len(best.components) - needed <= 1 else _pruned(problem, best, needed)
 
 
 def with_response_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
@@ -78,8 +79,7 @@ def with_response_instead(problem: Linearised, best: Point, candidates: Sequence
     rest = [k for k, c in enumerate(best.components) if c not in added and (k < needed or c.kind != "white")]
     quiet = [best.theta[k] * (1e-2 if best.components[k].kind == "white" else 1.0) for k in rest]
     start = np.append(quiet, np.full(len(added), USUAL_RESPONSE**2))
-    trial = _pruned(problem, maximise(problem, [*(best.components[k] for k in rest), *added], start), needed)
-    return trial if trial.worth > best.worth and not trial.too_large else best
+    return _better(problem, best, [*(best.components[k] for k in rest), *added], start, needed)
 
 
 def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
@@ -90,15 +90,14 @@ def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Co
     for group in (FORCE, TORQUE):
         walk = component("walk", group)
         drifts = any(c.kind in ("walk", "slope") and c.share[group[0]] for c in best.components)
-        if walk not in candidates or drifts or len(best.components) == needed:
+        noisy = any(c.kind == "white" and c.share[group[0]] for c in best.components)
+        if walk not in candidates or drifts or not noisy or len(best.components) == needed:
             continue
         rest = [k for k, c in enumerate(best.components) if k < needed or c.kind != "white" or not c.share[group[0]]]
         kept = [best.components[k] for k in rest]
         added = [walk, *(c for c in RESPONSE if c in candidates and c not in kept)]
         start = np.append(best.theta[rest], units(problem, best, added))
-        trial = _pruned(problem, maximise(problem, [*kept, *added], start), needed)
-        if trial.worth > best.worth and not trial.too_large:
-            best = trial
+        best = _better(problem, best, [*kept, *added], start, needed)
     return best
 
 
@@ -114,20 +113,39 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
         len(problem.r) * max(best.theta[k] for k in walks if any(best.components[k].share[c] for c in g))
         for g in groups
     ]
+    # Without the walk white noise is larger.
+    noise = [
+        best.theta[k] + sum(best.theta[w] for w in walks if np.dot(best.components[w].share, best.components[k].share))
+        for k in rest
+    ]
     components = [*(best.components[k] for k in rest), *slopes]
-    trial = maximise(problem, components, np.append(best.theta[rest], start))
+    trial = maximise(problem, components, np.append(noise, start), best.loglik)
     return _pruned(problem, trial, needed) if trial.loglik > best.loglik else best
 
 
+def _better(problem: Linearised, best: Point, components: Sequence[Component], theta: Array, needed: int) -> Point:
+    """Try other components; keep what is worth more."""
+    trial = maximise(problem, components, theta, best.worth)
+    if trial.loglik > best.worth:
+        trial = _pruned(problem, trial, needed)
+    return trial if trial.worth > best.worth and not trial.too_large else best
+
+
 def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
-    """Drop components that raise the likelihood too little, one at a time."""
+    """Drop components that raise the likelihood too little: those without effect at once, then one at a time."""
+    if best.components:
+        seen = best.theta >= NEGLIGIBLE * units(problem, best, best.components)
+        seen[:needed] = True
+        if not seen.all():
+            without = point(problem, [best.components[i] for i in np.flatnonzero(seen)], best.theta[seen], best)
+            best = without if without.worth > best.worth else best
     k = needed
     while k < len(best.components):
         rest = [i for i in range(len(best.components)) if i != k]
         components, theta = [best.components[i] for i in rest], best.theta[rest]
         without = point(problem, components, theta, best)  # the others can regain a part of what is lost
         if best.loglik - without.loglik < SURE:
-            without = maximise(problem, components, theta)
+            without = maximise(problem, components, theta, best.loglik - best.components[k].needed)
         if without.worth > best.worth:
             best, k = without, needed
         else:

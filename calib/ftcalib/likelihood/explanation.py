@@ -40,6 +40,7 @@ SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked 
 LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
 ROUNDS = 20  # of the outer loop; it ends after a few
 SETTLED = 1e-4  # squared step, in standard deviations of the estimates
+FAR = 1000.0  # a minimum with chi2 higher by this is not the answer under any noise
 MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
 
 
@@ -118,10 +119,13 @@ def _explanations(session: Session, minima: list[Minimum], weights: Array) -> li
         if not session.measured:
             weights = np.asarray(at.own.W, dtype=np.float64)
         distances = squared_length(*at.left_out())
+        tried = [(p, session.everything), (found[0].parameters, found[0].kept)]
         for scaled in (False, True):
             robust = _agreeing(session, weights, starts, distances, scaled=scaled)
-            if robust is not None:
-                found.append(_explained(session, *robust))
+            if robust is None or any(session.descent.same(robust[0], q) and (robust[1] == k).all() for q, k in tried):
+                continue
+            found.append(_explained(session, *robust))
+            tried += [robust, (found[-1].parameters, found[-1].kept)]
     return found
 
 
@@ -132,6 +136,7 @@ def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
     at = select(problem, always, session.start(problem, always), candidates, len(always))
     best = Explanation(p, kept)
     for _ in range(ROUNDS):
+        chosen = set(at.components)
         at = with_response_instead(problem, at, candidates, len(always))
         if session.drift == "auto":
             at = with_walks_instead(problem, at, candidates, len(always))
@@ -142,7 +147,7 @@ def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
         if criterion < best.criterion - 1e-3:
             if kept.all() and _are_gaussian(session, distances):
                 return Explanation(p, kept, at.components, at.theta, criterion, noise=at.noise)
-            noise_found = {c.kind for c in at.components[len(always) :]} - {"walk", "slope"}
+            noise_found = {"white", "rotation"} & {c.kind for c in at.components[len(always) :]}
             noticed = session.n >= FEWEST_TO_REJECT_FROM and (bool(noise_found) or _stand_out(session, distances))
             best = Explanation(p, kept, at.components, at.theta, criterion, noticed, at.noise)
             kept = _membership(session, kept, distances, at)
@@ -150,6 +155,8 @@ def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
                 problem = session.linearised(p, kept)
                 at = maximise(problem, at.components, at.theta)
                 continue
+        if set(at.components) == chosen:  # all others have been tried
+            break
         again = select(problem, at.components, at.theta, candidates, len(always))
         if set(again.components) == set(at.components):
             break
@@ -198,17 +205,21 @@ def with_all_minima(session: Session, e: Explanation, others: list[Minimum]) -> 
     """Find the minima again, under the noise of the explanation."""
     noise = noise_under(session, e, e.parameters)
     statistics, logdet = session.statistics(noise, e.parameters), noise.logdet
-    ends = []
-    for start in (e.parameters, *(minimum.parameters for minimum in others)):
-        q = start
-        for _ in range(3 if e.noise_moves else 1):
-            if e.noise_moves:
-                noise = noise_under(session, e, q)
-                statistics = session.statistics(noise, q)
-            end = session.descent.down(statistics, q)
-            q = end.parameters
-        ends.append(replace(end, chi2=end.chi2 + noise.logdet - logdet))
+    ends = [
+        session.descent.down(statistics, start) for start in (e.parameters, *(minimum.parameters for minimum in others))
+    ]
+    if e.noise_moves:  # and matters for the minima between which it may decide
+        least = ends[0].chi2
+        ends = [_under_own_noise(session, e, end, logdet) if end.chi2 < least + FAR else end for end in ends]
     return session.descent.distinct(ends)
+
+
+def _under_own_noise(session: Session, e: Explanation, end: Minimum, logdet: float) -> Minimum:
+    """Descend with the noise that an explanation has at the minimum; its logarithm less `logdet` counts as chi2."""
+    for _ in range(2):
+        noise = noise_under(session, e, end.parameters)
+        end = session.descent.down(session.statistics(noise, end.parameters), end.parameters)
+    return replace(end, chi2=end.chi2 + noise.logdet - logdet)
 
 
 def noise_under(session: Session, e: Explanation, p: Parameters) -> Noise:

@@ -21,7 +21,9 @@ GAIN = 2.0
 """A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance."""
 GAIN_OF_RESPONSE = 3.0
 """The same for gain, cross-talk and hysteresis, whose 5 and 6 numbers come in by chance in 0.4 %."""
-SETTLED = 1e-4  # squared distance from the best variances, in their standard deviations
+SETTLED = 1e-2  # squared distance from the best variances, in their standard deviations
+CAREFUL = 0.3  # damping that shortens a step; less hardly does
+HOPE = 10.0  # a climb gains no more than this many times what slope and curvature promise
 NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
 LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2, "hysteresis": 0.03**2}
 """Variances that no arm or sensor in working order exceeds. A larger one has another cause."""
@@ -98,6 +100,13 @@ class Linearised:
             return np.asarray(m + np.flatnonzero(c.share))
         ends = {"gain": (6, 11), "cross_talk": (11, 17), "hysteresis": (17, 17 + self.hysteresis.shape[2])}.get(c.kind)
         return None if ends is None else np.arange(m + ends[0], m + ends[1])
+
+    def size(self, c: Component) -> float:
+        """Count the independent numbers that have this variance."""
+        columns = self.columns(c)
+        if columns is not None:
+            return float(len(columns))
+        return int(self.kept.sum()) * (2.0 if c.kind == "rotation" else float(np.count_nonzero(c.share)))
 
     def largest(self, c: Component) -> float:
         """Variance that no arm or sensor in working order exceeds.
@@ -334,30 +343,34 @@ def score(problem: Linearised, at: Point, components: Sequence[Component], theta
     return slope, np.asarray(square - known.T @ C @ known) / 2
 
 
-def maximise(problem: Linearised, components: Sequence[Component], theta: Array) -> Point:
-    """Climb to the best variances from these (k,), all positive."""
+def maximise(problem: Linearised, components: Sequence[Component], theta: Array, worse_than: float = -np.inf) -> Point:
+    """Climb to the best variances from these (k,), all positive; or until a log-likelihood seems out of reach."""
     if not components:
         return point(problem, components, theta)
     most = np.array([problem.largest(c) for c in components])
     best = point(problem, components, np.minimum(theta, most))
     least = np.minimum(1e-3 * NEGLIGIBLE * units(problem, best, components), most)
+    size = np.array([problem.size(c) for c in components])
     caution = 1e-3
     for _ in range(60):
         slope, information = score(problem, best, best.components, best.theta)
-        if float(slope @ np.linalg.lstsq(information, slope)[0]) < SETTLED:
+        promised = float(slope @ np.linalg.lstsq(information, slope)[0])
+        if promised < SETTLED or best.loglik + HOPE * promised < worse_than:
             break
         gained = 0.0
         while caution < 1e6:
             damped = information + np.diag(caution * (np.diag(information) + 1e-3))
             step = np.clip(np.linalg.solve(damped, slope), -2.5, 2.5)
+            if caution < CAREFUL:  # far below the best variance a step of expectation and maximisation is longer
+                step = np.where(slope > 0, np.maximum(step, np.log1p(2 * np.maximum(slope, 0) / size)), step)
             trial = point(problem, components, np.clip(best.theta * np.exp(step), least, most))
             gained = trial.loglik - best.loglik
             if gained >= 0 or np.abs(step).max() < 1e-4:
                 break
-            caution *= 10
+            caution = max(10 * caution, CAREFUL)
         if gained > 0:
             best, caution = trial, max(caution / 10, 1e-6)
-        if (gained < 1e-3 and np.abs(step).max() < 0.05) or gained < 1e-6:
+        if gained < 1e-3 or (gained < 1e-2 and np.abs(step).max() < 0.05):
             break
         # A variance that sinks without changing the likelihood will be dropped.
         if gained < 1e-2 and (slope < 0.05).all():

@@ -18,12 +18,14 @@ def build_arm(cell: CellConfig) -> RobotArm:
     """Build the arm's driver, not yet open; it moves at the speed of the cell unless a move names its own."""
     robot = cell.robot
     try:
-        build = cast("Callable[..., RobotArm]", arm_class(robot.driver))
+        by_topic = robot.driver == "ur" and robot.host.startswith("ros2:")
+        driver = "ros2" if by_topic else robot.driver
+        build = cast("Callable[..., RobotArm]", arm_class(driver))
     except BadUrl as error:
         raise ConfigError(f"[robot] driver: {error}") from error
     # Only an emulated arm takes a clock: an arm of another package may not know it.
     more: dict[str, Any] = {"clock": cell.clock} if cell.is_emulated else {}
-    if robot.driver == "ur":
+    if driver == "ur":
         timing = UrTiming.emulated() if cell.is_emulated else STRICT
         stop_rad_s2 = radians(robot.stop_deceleration_deg_s2)
         more |= {"control": robot.control, "stop_rad_s2": stop_rad_s2, "api_port": robot.api_port, "timing": timing}

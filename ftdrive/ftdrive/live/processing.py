@@ -390,6 +390,23 @@ class Processor:
             self._set_tare([*self._tares, (update, self._newest_ns)])
             return self.note("tare", text, values)
 
+    def recent(self) -> Paired | None:
+        """Return the samples of the last half second; None before the first."""
+        with self._lock:
+            return Paired.concatenate(list(self._recent)) if self._recent else None
+
+    def reference(self) -> tuple[Calibrated, float]:
+        """Return the empty tool, and how many seconds ago it was tared; infinite without a tare."""
+        with self._lock:
+            current, t_ns = self._tares[-1]
+            return current, (self._newest_ns - t_ns) * 1e-9 if len(self._tares) > 1 else float("inf")
+
+    @property
+    def rest_sigma(self) -> Array | None:
+        """(6,) standard deviation of one sample at rest; None until it is known."""
+        noise = self._noise.of(Motion.REST)
+        return None if noise is None else np.sqrt(np.diag(noise.sample))
+
     def undo_tare(self) -> StreamEvent:
         """Take the last tare back."""
         with self._lock:
@@ -468,6 +485,23 @@ class ProcessedStream(ABC):
     def undo_tare(self) -> StreamEvent:
         """Take the last tare back."""
         return self._processor.undo_tare()
+
+    def recent(self) -> Paired | None:
+        """Return the samples of the last half second; None before the first."""
+        return self._processor.recent()
+
+    def reference(self) -> tuple[Calibrated, float]:
+        """Return the empty tool, and how many seconds ago it was tared; infinite without a tare."""
+        return self._processor.reference()
+
+    @property
+    def rest_sigma(self) -> Array | None:
+        """(6,) standard deviation of one sample at rest; None until it is known."""
+        return self._processor.rest_sigma
+
+    def note(self, kind: EventKind, text: str, values: Mapping[str, JSON]) -> StreamEvent:
+        """Add an event at the time of the newest sample."""
+        return self._processor.note(kind, text, values)
 
     def mark(self, text: str) -> StreamEvent:
         """Add a mark to the events."""

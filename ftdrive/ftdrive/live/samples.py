@@ -225,6 +225,7 @@ EventKind = Literal[
     "stale",
     "recovered",
     "tool",
+    "load",
     "mark",
 ]
 

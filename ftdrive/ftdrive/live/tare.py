@@ -44,9 +44,8 @@ def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Map
     again = "tare again when arm and tool have rested for half a second"
     if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.5e9 * TARE_S:
         return None, f"tare refused: only {len(rows)} samples; {again}", {}
-    R, p = rows.R_base_flange[-1:], rows.p_base_flange_m[-1]
-    # as `not <=`, so that an unknown position is still
-    if np.abs(rows.R_base_flange - R).max() > _STILL_RAD or (np.abs(rows.p_base_flange_m - p) > _STILL_M).any():
+    R = rows.R_base_flange[-1:]
+    if not is_still(rows):
         return None, f"tare refused: the arm moves; {again}", {}
     dwell = mean_and_covariance(rows.raw)
     (change,), (sigmas,) = bias_change(
@@ -68,3 +67,11 @@ def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Map
         why = f"{found} from the free tool, more than drift explains"
         return None, f"tare refused: {why}; take hand or contact away, or calibrate again", values
     return update, f"tare: the bias has changed by {found}", values
+
+
+def is_still(rows: Paired) -> bool:
+    """Check whether the arm rests; an unknown position counts as still."""
+    R, p = rows.R_base_flange[-1:], rows.p_base_flange_m[-1]
+    return not (
+        np.abs(rows.R_base_flange - R).max() > _STILL_RAD or (np.abs(rows.p_base_flange_m - p) > _STILL_M).any()
+    )

@@ -18,7 +18,7 @@ from ftdrive.live.processing import Processor
 from ftdrive.live.samples import Block, Paired, StreamEvent, WrenchFrame
 from ftdrive.recording.files import RecordingReader
 from ftdrive.recording.recorder import Recorder
-from ftdrive.recording.recording import ROW, Header, Source, with_calibration
+from ftdrive.recording.recording import ROW, Header, Source, ahead, with_calibration
 from ftdrivers.interfaces import Array
 
 _NOISE_S = 30.0
@@ -130,7 +130,7 @@ def compensated(
             recorder = Recorder([output], info, header.configuration)
             stack.callback(recorder.discard)
         try:
-            for samples, events, share in source.blocks():
+            for samples, events, share in ahead(source.blocks()):
                 block = processor.process(samples) if len(samples) else None
                 found.add(block, [one for one in events if one.kind in _KEPT], processor.take_events(), recorder)
                 show(f"Compensating: {share:.0%}")
@@ -247,7 +247,7 @@ def estimated_bias(
     readings, orientations = [np.empty((0, 6))], [np.empty((0, 3, 3))]
     waiting: list[Paired] = []
     with suppress(BadRecording):  # the pass that follows ends there too
-        for samples, _, share in source.blocks():
+        for samples, _, share in ahead(source.blocks()):
             show(f"Estimating the bias: {share:.0%}")
             paired = Paired.concatenate([*waiting, samples])
             whole = len(paired) // size * size

@@ -33,7 +33,7 @@ from ftdrive.recording.recording import ROW, Header, Piece, Rows, changed
 if TYPE_CHECKING:
     from mcap.records import McapRecord
 
-SAMPLE, EVENTS = "/ft_sample", "/events"
+SAMPLE, EVENTS, LOAD = "/ft_sample", "/events", "/ftdrive/load"
 _SCHEMAS: Final[Mapping[str, ros2.Schema]] = {
     **ros2.SCHEMAS,
     SAMPLE: ros2.Schema(
@@ -45,6 +45,10 @@ _SCHEMAS: Final[Mapping[str, ros2.Schema]] = {
         f"\n{'=' * 80}\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec",
     ),
     ros2.TRANSFORMS: ros2.TRANSFORMS_SCHEMA,
+    LOAD: ros2.Schema(
+        "ftdrive_msgs/msg/Load",
+        "float64 mass_kg\nfloat64 mass_sigma_kg\nfloat64[3] p_sensor_com_m\nfloat64[3] p_sensor_com_sigma_m",
+    ),
 }
 _CHANNELS: Final = {topic: number for number, topic in enumerate(_SCHEMAS, 1)}
 _SAMPLE: Final = [("t_device_s", "<f8"), ("chi2", "<f8"), ("seq", "<i8"), ("status", "<u4"), ("in_contact", "?")]
@@ -167,6 +171,13 @@ class McapFile(GrowingFile):
             places = size + np.cumsum([0, *(log.size for log in logs)])
             tables[_CHANNELS[EVENTS]] = _table(times, places[:-1])
             content += [log.data for log in logs]
+            size += sum(log.size for log in logs)
+            loads = [event for event in events if event.kind == "load"]
+            if loads:
+                times = np.array([event.t_host_ns for event in loads]) + offset_ns
+                packed = _records(_CHANNELS[LOAD], times, np.array([_load(event) for event in loads]))
+                tables[_CHANNELS[LOAD]] = _table(times, size + packed.shape[1] * np.arange(len(loads)))
+                content.append(packed.data)
         return b"".join(content), tables
 
     def _transforms(self, rows: Rows, t_ns: NDArray[np.int64]) -> NDArray[np.void]:
@@ -246,6 +257,14 @@ def _log(event: StreamEvent, t_ns: int) -> NDArray[np.void]:
         packed += struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
     packed += struct.pack("<I", 0)
     return np.frombuffer(packed, f"V{len(packed)}")
+
+
+def _load(event: StreamEvent) -> np.void:
+    """Pack a weighing, which the events have too; what is not known is NaN."""
+    values, nowhere = event.values, [np.nan] * 3
+    numbers = [values["mass_kg"], values["mass_sigma_kg"]]
+    numbers += [*(values["p_sensor_com_m"] or nowhere), *(values["p_sensor_com_sigma_m"] or nowhere)]
+    return np.void(ros2.ENCODING + struct.pack("<8d", *numbers))
 
 
 def _event(body: bytes, t_host_ns: int) -> StreamEvent:

@@ -5,9 +5,10 @@ The pose is stored as a quaternion, so that all formats hold the same bits.
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import accumulate, pairwise
-from typing import Any, Final, NamedTuple, Protocol, Self
+from typing import Any, Final, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,7 @@ from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo,
 from ftdrive.runs.verification_record import VerificationRecord
 from ftdrivers.interfaces import DeviceInfo, Fact
 
+T = TypeVar("T")
 FORMAT: Final = "ftdrive.recording/1"
 
 Rows = NDArray[np.void]
@@ -293,6 +295,15 @@ def divided(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
             piece.rows[start:end],
             [e for row, e in zip(at, events, strict=True) if start <= row < end or row == end == n],
         )
+
+
+def ahead(items: Iterator[T]) -> Iterator[T]:
+    """Give items of which a thread always makes the next one; errors come in their place."""
+    with ThreadPoolExecutor(1) as reader:
+        following = reader.submit(next, items, None)
+        while (item := following.result()) is not None:
+            following = reader.submit(next, items, None)
+            yield item
 
 
 def measured(pieces: Iterable[Piece]) -> Iterator[Measured]:

@@ -99,7 +99,7 @@ def test_rosbags_reads_the_messages(paths: Sequence[Path]) -> None:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
         assert counts == dict.fromkeys(
             ["/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states", "/ft_sample"], 2600
-        ) | {"/events": 4, "/tf": counts["/tf"]}
+        ) | {"/events": 4, "/ftdrive/load": 0, "/tf": counts["/tf"]}
         seen: dict[str, list[Any]] = {topic: [] for topic in counts}
         for connection, t_ns, data in reader.messages():
             message: Any = reader.deserialize(data, connection.msgtype)
@@ -179,6 +179,23 @@ def test_mcap_ros2_reads_the_messages(paths: Sequence[Path]) -> None:
     assert summary.statistics.message_start_time == rows["t_host_ns"][0] + UTC_OFFSET_NS
     assert len(summary.chunk_indexes) == 11  # fifths of a second; the new frame ends one early
     assert [decoded.wrench.force.x for *_, decoded in found] == rows["wrench"][1400:, 0].tolist()
+
+
+def test_a_weighing_is_an_event_and_a_message(tmp_path: Path) -> None:
+    values = {"mass_kg": 1.25, "mass_sigma_kg": 0.0005, "p_sensor_com_m": None, "p_sensor_com_sigma_m": None}
+    recorder = Recorder([tmp_path / "a.mcap"], info(), CONFIGURATION)
+    for start, com_m in ((0, None), (300, [0.01, 0.02, 0.15])):
+        recorder.write(block(300, start))
+        given = {**values, "p_sensor_com_m": com_m, "p_sensor_com_sigma_m": com_m}
+        recorder.event(StreamEvent(int(block(1, start).t_host_ns[0]), "load", "1.25 kg", given))
+    recorder.close()
+    assert [event.kind for event in read_recording(tmp_path / "a.mcap").events] == ["load", "load"]
+    with (tmp_path / "a.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        first, second = (decoded for *_, decoded in reader.iter_decoded_messages(["/ftdrive/load"]))
+    assert (first.mass_kg, first.mass_sigma_kg) == (1.25, 0.0005)
+    assert np.isnan(first.p_sensor_com_m).all()
+    assert list(second.p_sensor_com_m) == [0.01, 0.02, 0.15]
 
 
 def test_a_plain_reader_of_the_format_finds_no_fault(paths: Sequence[Path]) -> None:

@@ -1,0 +1,98 @@
+"""`ftdrive weigh`: what the gripper holds beyond its calibrated tool."""
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ftdrive.commands.common import CALIBRATION_OR_TOOL, CELL, JSON, NewFile, Number, simulate, write_json
+from ftdrive.commands.live_source import open_source
+from ftdrive.live.processing import SENSOR_FRAME
+from ftdrive.live.samples import StreamInfo
+from ftdrive.live.weighing import CannotWeigh, load_values
+from ftdrive.recording import Recorder
+from ftdrive.terminal.console import messages
+from ftdrive.terminal.text import echo
+from ftdrive.terminal.weighing import PATIENCE_S, Shown, Weighing, line_of
+
+
+@click.command()
+@CALIBRATION_OR_TOOL
+@CELL
+@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@click.option(
+    "--zero", is_flag=True, help="First tare the empty gripper: then drift since the calibration is no error."
+)
+@click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Rests of one load to join.")
+@click.option("--count", "part_kg", type=Number(0, min_open=True), metavar="KG", help="Mass of one part: count parts.")
+@click.option("--once", is_flag=True, help="Print one weight, then end; with --zero wait for a part.")
+@click.option("-o", "--output", type=NewFile(), help="Record samples and weighings: .mcap, .csv or .parquet.")
+@JSON
+def weigh(
+    path: Path | None,
+    tool: str | None,
+    force: bool,
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    simulate: bool,
+    zero: bool,
+    poses: int,
+    part_kg: float | None,
+    once: bool,
+    output: Path | None,
+    as_json: bool,
+) -> None:
+    """Weigh what the gripper holds beyond its calibrated tool, in half a second at rest.
+
+    One pose gives the mass, and the centre of mass but for its place along gravity. The answer has one sigma of each,
+    and the smallest mass that differs from zero. Contact, cables and moving parts are named and not weighed. The arm is
+    only read, never moved. Ctrl-C ends.
+    """
+    with ExitStack() as stack:
+        stream = open_source(
+            path, tool, config, robot, sensor, force=force, simulate=simulate, frame=SENSOR_FRAME, stack=stack
+        )
+        recorder = None
+        if output is not None:
+            recorder = Recorder([output], stream.info, stream.cell.to_dict())
+            stack.callback(recorder.close)
+        weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg)
+        if zero:
+            messages.print(" Zero: the gripper must be empty.")
+            weighing.zero()
+        if once or as_json or not sys.stdout.isatty():
+            _print(weighing, once=once, waits=zero, poses=poses, as_json=as_json)
+        else:
+            from ftdrive.terminal.weigh_screen import run_weigh
+
+            run_weigh(weighing)
+
+
+def answer_of(shown: Shown, info: StreamInfo) -> dict[str, Any]:
+    """Return a state as JSON."""
+    values: dict[str, Any] = {"schema_version": 1, "calibration_id": info.calibration.id, "marks": list(info.marks)}
+    values |= {} if shown.weight is None else load_values(shown.weight, info)
+    return values | {"count": shown.count, "refused": shown.refusal}
+
+
+def _print(weighing: Weighing, *, once: bool, waits: bool, poses: int, as_json: bool) -> None:
+    """Print each new weight or fault as a line; with `once` end with the first weight."""
+    clock = weighing.stream.clock
+    begin_s = clock.now_s()
+    for shown, is_new in weighing.states(raises=once):
+        if once and not waits and clock.now_s() - begin_s > PATIENCE_S:
+            raise CannotWeigh(shown.refusal or "samples", shown.weight)
+        weight = shown.weight
+        if not is_new or (once and (shown.refusal is not None or weight is None or weight.poses < poses)):
+            continue
+        if once and waits and weight is not None and not weight.is_something:
+            continue
+        if as_json:
+            write_json(answer_of(shown, weighing.stream.info))
+        else:
+            echo(line_of(shown))
+        if once:
+            return

@@ -1,0 +1,260 @@
+"""Weigh what the gripper holds, from half a second of a stream at rest."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Final, get_args
+
+import numpy as np
+
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_stationary, mean_and_covariance, restless_channels
+from ftcalib.errors import AcceptanceError
+from ftcalib.extras import weighing
+from ftcalib.extras.weighing import Fault, Weight, drift_since
+from ftcalib.files import JSON
+from ftcalib.model import angle_between
+from ftdrive.live.processing import ProcessedStream
+from ftdrive.live.replay import ReplayedStream
+from ftdrive.live.samples import Paired, StreamEvent, StreamInfo
+from ftdrive.live.stream import CompensatedStream
+from ftdrive.live.tare import TARE_S, is_still
+from ftdrivers.clock import Clock
+from ftdrivers.interfaces import Array
+
+WEIGH_S: Final = TARE_S
+"""A weighing averages so long."""
+_NEW_POSE_RAD: Final = 0.17
+"""Poses farther apart than this show more of the centre of mass."""
+_WHOLE: Final = 0.1
+"""So far from a whole number of parts is no number of parts."""
+
+WORDS: Final[Mapping[str, str]] = {
+    "samples": "too few samples: wait half a second",
+    "moving": "the arm moves: weigh when it has rested for half a second",
+    "unsteady": "the reading changes: wait until the part hangs still, and take hands away",
+    "contact": "a force across gravity: contact, hand or cable; free the part",
+    "cable": "a torque that no weight in the gripper exerts: cable, hose or contact; let it hang free",
+    "changed": "the poses do not agree on one weight: the part slipped, a cable pulls, or the load has changed",
+    "lifted": "less than the empty tool: contact from below, or the gripper was not empty at the zero",
+    "not-empty": "the reading is too far from that of the empty tool for a zero: empty the gripper, or calibrate again",
+    "count": "no whole number of parts: check the mass of one part, and the gripper",
+}
+"""Why nothing was weighed, and what to do, by `CannotWeigh.code`."""
+FAULTS: Final[tuple[Fault, ...]] = get_args(Fault)
+
+
+class CannotWeigh(AcceptanceError):
+    """The reading is not that of one weight at rest.
+
+    Parameters
+    ----------
+    code : str
+        One of `WORDS`.
+    weight : Weight, optional
+        What was found all the same, of a reading at rest.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> print(ftdrive.CannotWeigh("moving"))
+    not weighed: the arm moves: weigh when it has rested for half a second
+    """
+
+    def __init__(self, code: str, weight: Weight | None = None) -> None:
+        super().__init__(f"not weighed: {WORDS[code]}")
+        self.code = code
+        self.weight = weight
+
+
+class Scale:
+    """Weighs what the gripper of a stream holds beyond its calibrated tool.
+
+    The reference is the calibration, or the last tare of the stream, which is the better the younger it is.
+
+    Parameters
+    ----------
+    stream : CompensatedStream or ReplayedStream
+    """
+
+    def __init__(self, stream: ProcessedStream) -> None:
+        self._stream = stream
+        self._readings: list[tuple[Array, PoseMean]] = []
+        self._quietest = np.full(6, np.inf)
+        """Noise of a sample at rest: steps of the load make it look louder for a while."""
+
+    def weigh(self, since_ns: int = 0, *, more: bool = False) -> Weight:
+        """Weigh the last half second.
+
+        Parameters
+        ----------
+        since_ns : int
+            Earlier samples do not count, clock of the cell.
+        more : bool
+            Join this pose to those before, of the same load.
+
+        Raises
+        ------
+        CannotWeigh
+            The arm or the reading is not at rest, or the reading is not that of one weight.
+        """
+        stream = self._stream
+        R, mean = self._rest(since_ns)
+        kept = [one for one in self._readings if angle_between(one[0], R) > _NEW_POSE_RAD] if more else []
+        self._readings = [*kept, (R, mean)]
+        reference, since_s = stream.reference()
+        calibration = stream.info.calibration
+        weight = weighing.weigh(
+            reference,
+            np.array([one[0] for one in self._readings]),
+            np.array([one[1].mean for one in self._readings]),
+            np.array([one[1].covariance for one in self._readings]) + np.diag(_unexplained(stream.info)),
+            drift=drift_since(since_s),
+            g_m_s2=calibration.g_m_s2,
+            p_sensor_near_m=near(stream.info),
+            orientation_sigma_rad=calibration.components.get("rotation_rad", 0.0),
+        )
+        weight = replace(weight, scale_sigma=calibration.scale_sigma)
+        if weight.fault is not None:
+            raise CannotWeigh(weight.fault, weight)
+        return weight
+
+    def zero(self, since_ns: int = 0) -> StreamEvent:
+        """Tare the empty gripper by the last half second: the drift of the bias up to now is no error any more.
+
+        Raises
+        ------
+        CannotWeigh
+            The arm or the reading is not at rest, or too far from that of the empty tool.
+        """
+        self._rest(since_ns)
+        event = self._stream.tare()
+        if event.kind != "tare":
+            raise CannotWeigh("not-empty")
+        self._readings = []
+        return event
+
+    def _rest(self, since_ns: int) -> tuple[Array, PoseMean]:
+        rows = self._stream.recent()
+        if rows is None:
+            raise CannotWeigh("samples")
+        rows = rows.rows(rows.t_host_ns >= max(since_ns, int(rows.t_host_ns[-1]) - round(WEIGH_S * 1e9)))
+        if self._stream.rest_sigma is not None:
+            self._quietest = np.minimum(self._quietest, self._stream.rest_sigma)
+        return _reading(rows, self._quietest)
+
+
+def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, PoseMean]:
+    if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.95e9 * WEIGH_S:
+        raise CannotWeigh("samples")
+    if not is_still(rows):
+        raise CannotWeigh("moving")
+    if not is_stationary(rows.raw) or restless_channels(rows.raw, rest_sigma).any():
+        raise CannotWeigh("unsteady")
+    return rows.R_base_flange[-1], mean_and_covariance(rows.raw)
+
+
+def _unexplained(info: StreamInfo) -> Array:
+    """Variance (6,) of a reading beyond noise and calibration, where these do not explain the residuals of the fit."""
+    calibration = info.calibration
+    if calibration.noise_explains:
+        return np.zeros(6)
+    excess = np.square(calibration.likely_error()) - np.square(calibration.predicted_error())
+    return np.repeat(np.maximum(excess, 0.0) / 3, 3)
+
+
+def near(info: StreamInfo) -> Array:
+    """Return where the gripper holds parts, (3,) sensor frame: the TCP, or the tool's centre of mass without one."""
+    p_flange_m = info.p_flange_tcp_m - info.p_flange_sensor_m
+    if np.isfinite(p_flange_m).all() and info.p_flange_tcp_m.any():
+        return np.asarray(info.calibration.R_flange_sensor.T @ p_flange_m)
+    return info.calibration.p_sensor_com_m
+
+
+def weigh(stream: CompensatedStream | ReplayedStream, *, poses: int = 1, timeout_s: float = 10.0) -> Weight:
+    """Wait until arm and reading rest, and weigh what the gripper holds beyond its calibrated tool.
+
+    Call `stream.tare()` at the empty gripper just before it grasps: that cancels the drift of the bias.
+
+    Parameters
+    ----------
+    stream : CompensatedStream
+        Open; it is read here.
+    poses : int
+        One gives the mass, and the centre of mass but for its place along gravity. From two on, another program turns
+        the arm meanwhile, and each rest that is 10° from the others counts.
+    timeout_s : float
+        For each pose.
+
+    Returns
+    -------
+    Weight
+        With `mass_kg`, `mass_sigma_kg`, `least_kg`, `p_sensor_com_m`, `com_covariance`, `line`.
+
+    Raises
+    ------
+    CannotWeigh
+        Nothing could be weighed in this time; its `code` is the reason of the last attempt.
+    DeviceError
+        The stream has failed.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> with ftdrive.open_stream(simulate=True) as stream:
+    ...     weight = ftdrive.weigh(stream)
+    >>> weight.mass_kg < weight.least_kg  # the gripper is empty
+    True
+    """
+    clock: Clock = stream.clock
+    scale, since_ns = Scale(stream), 0
+    weight: Weight | None = None
+    while weight is None or weight.poses < poses:
+        refusal = CannotWeigh("samples")
+        before = 0 if weight is None else weight.poses
+        for _ in clock.looks(timeout_s):
+            rows = stream.read()
+            since_ns = since_ns or int(rows.t_host_ns[-1])
+            try:
+                found = scale.weigh(since_ns, more=True)
+            except CannotWeigh as error:
+                refusal = error
+            else:
+                weight = found
+                if weight.poses > before:
+                    break
+                refusal = CannotWeigh("moving")
+        else:
+            raise refusal
+    return weight
+
+
+def load_values(weight: Weight, info: StreamInfo) -> dict[str, JSON]:
+    """Return a weight as JSON, in the axes of sensor and flange; what is not known is None."""
+    R = info.calibration.R_flange_sensor
+    known = weight.is_something
+    p_flange_m = info.p_flange_sensor_m + R @ weight.p_sensor_com_m
+    C_flange = R @ weight.com_covariance @ R.T
+    placed = known and bool(np.isfinite(p_flange_m).all())
+    return {
+        "mass_kg": weight.mass_kg,
+        "mass_sigma_kg": weight.mass_sigma_kg,
+        "scale_sigma": weight.scale_sigma,
+        "least_kg": weight.least_kg,
+        "is_something": known,
+        "p_sensor_com_m": weight.p_sensor_com_m.tolist() if known else None,
+        "p_sensor_com_sigma_m": weight.com_sigma_m.tolist() if known else None,
+        "p_flange_com_m": p_flange_m.tolist() if placed else None,
+        "p_flange_com_sigma_m": np.sqrt(np.diag(C_flange)).tolist() if placed else None,
+        "line_sensor": weight.line.tolist() if known and weight.line is not None else None,
+        "poses": weight.poses,
+        "fault": weight.fault,
+    }
+
+
+def count_of(weight: Weight, part_kg: float) -> int:
+    """Return how many parts of `part_kg` are held. Raises `CannotWeigh`."""
+    parts = weight.mass_kg / part_kg
+    whole = round(parts)
+    sigma = float(np.hypot(weight.mass_sigma_kg, weight.scale_sigma * weight.mass_kg)) / part_kg
+    if sigma > _WHOLE or abs(parts - whole) > max(_WHOLE, 2 * sigma):
+        raise CannotWeigh("count", weight)
+    return whole

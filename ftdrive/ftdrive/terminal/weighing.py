@@ -1,0 +1,146 @@
+"""What `ftdrive weigh` shows: the state of the scale, ten times a second, and in words."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from ftcalib.extras.weighing import Weight
+from ftcalib.rounding import with_sigma
+from ftdrive.errors import NotAccepted
+from ftdrive.live.stream import CompensatedStream
+from ftdrive.live.weighing import FAULTS, WEIGH_S, WORDS, CannotWeigh, Scale, count_of, load_values
+from ftdrive.recording import Recorder
+from ftdrivers.errors import DeviceError
+
+RECOVER_S = 10.0
+"""So long a device may be silent."""
+PATIENCE_S = 10.0
+"""So long a zero, or the only weight, may take."""
+_STEP_S = 0.1
+"""Between two weighings, each of the last half second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """The present state of the scale."""
+
+    weight: Weight | None
+    refusal: str | None
+    """A key of `WORDS`; "contact" and the like have a weight too."""
+    count: int | None = None
+    stale: str = ""
+
+
+class Weighing:
+    """Reads a stream, records it, and weighs ten times a second.
+
+    Parameters
+    ----------
+    stream : CompensatedStream
+    recorder : Recorder, optional
+    joins : bool
+        Join the poses of one load.
+    part_kg : float, optional
+        Mass of one part.
+    """
+
+    def __init__(
+        self, stream: CompensatedStream, recorder: Recorder | None, *, joins: bool, part_kg: float | None
+    ) -> None:
+        self.stream, self.part_kg = stream, part_kg
+        self.joins = joins
+        self._recorder = recorder
+        self._scale = Scale(stream)
+        self._last: Weight | None = None
+        """Of the load that is held, or None since the reading was not at rest."""
+
+    def zero(self) -> None:
+        """Tare the empty gripper, within some seconds. Raises `NotAccepted`."""
+        end_s = self.stream.clock.now_s() + PATIENCE_S
+        while True:
+            self._read_for(WEIGH_S)
+            try:
+                self._scale.zero()
+            except CannotWeigh as refusal:
+                if refusal.code == "not-empty" or self.stream.clock.now_s() > end_s:
+                    raise NotAccepted(f"no zero: {WORDS[refusal.code]}") from None
+            else:
+                self._last = None
+                return
+
+    def _read_for(self, seconds: float) -> None:
+        end_s = self.stream.clock.now_s() + seconds
+        while self.stream.clock.now_s() < end_s:
+            block = self.stream.read()
+            if self._recorder is not None:
+                self._recorder.write(block)
+                for event in self.stream.take_events():
+                    self._recorder.event(event)
+
+    def states(self, *, raises: bool = False) -> Iterator[tuple[Shown, bool]]:
+        """Yield the state ten times a second, and whether it is a new weight or fault.
+
+        Raises `DeviceError` if a device has failed for some seconds, or at once with `raises`.
+        """
+        failing_since_s: float | None = None
+        fault_since_s = 0.0
+        fault: str | None = None
+        while True:
+            try:
+                self._read_for(_STEP_S)
+            except DeviceError as error:
+                now_s = self.stream.clock.now_s()
+                failing_since_s = now_s if failing_since_s is None else failing_since_s
+                if raises or now_s - failing_since_s > RECOVER_S:
+                    raise
+                self._last = None
+                yield Shown(None, None, stale=str(error)), False
+                continue
+            failing_since_s = None
+            shown = self._weighed()
+            now_s = self.stream.clock.now_s()
+            if shown.refusal != fault:
+                fault, fault_since_s = shown.refusal, now_s
+            lasts = shown.refusal in (*FAULTS, "count") and now_s - fault_since_s > WEIGH_S
+            if lasts:
+                fault_since_s = float("inf")  # reported once
+            yield shown, lasts or (shown.refusal is None and self._is_new(shown))
+
+    def _weighed(self) -> Shown:
+        try:
+            weight = self._scale.weigh(more=self.joins)
+            return Shown(weight, None, None if self.part_kg is None else count_of(weight, self.part_kg))
+        except CannotWeigh as refusal:
+            if refusal.code not in ("unsteady", "samples"):  # then it may be the same load as before
+                self._last = None
+            return Shown(refusal.weight, refusal.code)
+
+    def _is_new(self, shown: Shown) -> bool:
+        """Note a weight as an event if it is another one than the last; the same one is followed."""
+        weight, last = shown.weight, self._last
+        if weight is None:
+            return False
+        if last is not None:
+            if abs(weight.mass_kg - last.mass_kg) < weight.least_kg and weight.poses == last.poses:
+                return False
+            if abs(weight.mass_kg - last.mass_kg) >= weight.least_kg:
+                self._scale = Scale(self.stream)  # another load
+        self._last = weight
+        self.stream.note("load", line_of(shown), load_values(weight, self.stream.info) | {"count": shown.count})
+        return True
+
+
+def line_of(shown: Shown) -> str:
+    """Return a state as one line."""
+    if shown.stale:
+        return f"stale: {shown.stale}"
+    if shown.refusal is not None:
+        return f"not weighed: {WORDS[shown.refusal]}"
+    weight = shown.weight
+    assert weight is not None  # noqa: S101 - without a refusal there is a weight
+    if not weight.is_something:
+        return f"nothing: {with_sigma(weight.mass_kg, weight.mass_sigma_kg)} kg, less than {weight.least_kg:.2g} kg"
+    parts = "" if shown.count is None else f"{shown.count} part{'' if shown.count == 1 else 's'}, "
+    com = ", ".join(
+        with_sigma(1e3 * x, 1e3 * s) for x, s in zip(weight.p_sensor_com_m, weight.com_sigma_m, strict=True)
+    )
+    return f"{parts}{with_sigma(weight.mass_kg, weight.mass_sigma_kg)} kg at ({com}) mm from the sensor origin"

@@ -1,0 +1,180 @@
+"""Weighing: sigmas that hold, faults that are named, and a tool with a part as one load."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ftcalib.data.dwell_mean import mean_and_covariance
+from ftcalib.errors import BadDataset
+from ftcalib.extras.tare import tare
+from ftcalib.extras.update import Calibrated
+from ftcalib.extras.weighing import Weight, drift_since, holding, weigh
+from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
+from ftcalib.model import Array, Parameters, predict
+from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, G, calibrated
+
+NEAR = 2 * TRUTH.p_sensor_com_m
+NEVER = float("inf")
+
+
+class Gripper:
+    """A tool that holds a part; readings of half a second."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.mass_kg, self.com_m = float(self.rng.uniform(0.2, 3)), NEAR + self.rng.uniform(-0.04, 0.04, 3)
+        self.extra = np.zeros(6)
+
+    def turn(self) -> Array:
+        return np.asarray(Rotation.random(rng=self.rng).as_matrix())
+
+    def part(self, R_base_flange: Array) -> Array:
+        down = TRUTH.gravity_force_base_N / np.linalg.norm(TRUTH.gravity_force_base_N)
+        force_N = self.mass_kg * G * down @ (R_base_flange @ TRUTH.R_flange_sensor)
+        return np.concatenate([force_N, np.cross(self.com_m, force_N)])
+
+    def dwell(self, R_base_flange: Array, *, empty: bool = False, n: int = 250) -> Array:
+        wrench = predict(TRUTH, R_base_flange) + self.extra + (0 if empty else self.part(R_base_flange))
+        return np.asarray(wrench + NOISE * self.rng.normal(size=(n, 6)))
+
+    def weigh(self, reference: Calibrated, *R: Array, since_s: float = 1.0, **options: Any) -> Weight:
+        means = [mean_and_covariance(self.dwell(one)) for one in R]
+        return weigh(
+            reference,
+            np.array(R),
+            np.array([one.mean for one in means]),
+            np.array([one.covariance for one in means]),
+            **{"drift": drift_since(since_s), "g_m_s2": G, "p_sensor_near_m": NEAR, **options},
+        )
+
+
+def test_sigmas_hold_after_a_zero_in_the_same_pose() -> None:
+    errors, com = [], []
+    for seed in range(100):
+        gripper = Gripper(seed)
+        R = gripper.turn()
+        gripper.extra = gripper.rng.normal(size=6) * np.repeat([0.3, 0.01], 3)  # drift before the zero
+        weight = gripper.weigh(tare(calibrated(12, seed % 20), R[None], [gripper.dwell(R, empty=True)]), R)
+        assert weight.fault is None
+        assert weight.mass_sigma_kg < 1e-3
+        errors.append((weight.mass_kg - gripper.mass_kg) / weight.mass_sigma_kg)
+        off_m = weight.p_sensor_com_m - gripper.com_m
+        com.append(off_m @ np.linalg.solve(weight.com_covariance, off_m) / 3)
+        assert weight.line is not None
+        force_N = gripper.part(R)[:3]
+        assert abs(weight.line @ force_N) == pytest.approx(np.linalg.norm(force_N), rel=1e-2)
+    assert 0.85 < np.sqrt(np.mean(np.square(errors))) < 1.15
+    assert np.abs(errors).max() < 4
+    assert np.mean(com) < 1.2  # along gravity it is assumed, and mostly nearer
+
+
+def test_without_a_zero_the_sigma_covers_half_a_newton_of_drift() -> None:
+    for seed in range(30):
+        gripper = Gripper(seed)
+        drift = gripper.rng.normal(size=3)
+        gripper.extra[:3] = 0.5 * drift / np.linalg.norm(drift)
+        weight = gripper.weigh(calibrated(12, seed % 20), gripper.turn(), since_s=NEVER)
+        assert weight.fault is None
+        assert abs(weight.mass_kg - gripper.mass_kg) < 2 * weight.mass_sigma_kg
+        assert weight.least_kg > 0.2
+
+
+def test_several_poses_show_the_whole_centre_of_mass() -> None:
+    z = []
+    for seed in range(40):
+        gripper = Gripper(seed)
+        weight = gripper.weigh(calibrated(12, seed % 20), *(gripper.turn() for _ in range(3)))
+        assert weight.line is None
+        assert weight.com_sigma_m.max() < 2e-3
+        z += ((weight.p_sensor_com_m - gripper.com_m) / weight.com_sigma_m).tolist()
+    assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.2
+
+
+def test_what_is_no_weight_is_named() -> None:
+    gripper = Gripper(1)
+    R = np.array(Rotation.from_euler("x", 180, degrees=True).as_matrix())
+    u = gripper.part(R)[:3] / np.linalg.norm(gripper.part(R)[:3])
+    aside = np.cross(u, [0.3, 1.0, 0.2])
+
+    def fault(wrench: Array) -> str | None:
+        gripper.extra = np.zeros(6)
+        reference = tare(calibrated(), R[None], [gripper.dwell(R, empty=True)])
+        gripper.extra = np.asarray(wrench)
+        return gripper.weigh(reference, R).fault
+
+    assert fault(np.zeros(6)) is None
+    assert fault(np.concatenate([0.1 * aside / np.linalg.norm(aside), np.zeros(3)])) == "contact"
+    assert fault(np.concatenate([np.zeros(3), 0.02 * u])) == "cable"
+    assert fault(np.concatenate([-40 * u, np.zeros(3)])) == "lifted"
+    gripper.mass_kg = 0.02
+    assert fault(np.concatenate([np.zeros(3), 0.3 * aside])) == "cable"  # a centre of mass far outside
+
+
+def test_poses_that_disagree_are_named() -> None:
+    gripper = Gripper(2)
+    poses = [gripper.turn() for _ in range(3)]
+    means = []
+    for R in poses:
+        means.append(mean_and_covariance(gripper.dwell(R)))
+        gripper.com_m = gripper.com_m + np.array([0.01, 0, 0])  # it slips
+    weight = weigh(
+        calibrated(),
+        np.array(poses),
+        np.array([one.mean for one in means]),
+        np.array([one.covariance for one in means]),
+        drift=drift_since(1.0),
+        g_m_s2=G,
+        p_sensor_near_m=NEAR,
+    )
+    assert weight.fault == "changed"
+
+
+def test_a_gain_that_was_found_acts_on_the_part() -> None:
+    coefficients = np.array([0.01, -0.008, 0.004, 0.0, 0.006, *np.full(6, 0.01)])
+    covariance = np.zeros((26, 26))
+    covariance[:15, :15] = calibrated().covariance
+    response = Response(coefficients, covariance)
+    gripper = Gripper(3)
+    reference = holding(calibrated(), Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1), G)
+    with_gain = type(reference)(TRUTH, reference.covariance, response)
+    R = np.array([gripper.turn() for _ in range(3)])
+    part = Parameters(
+        TRUTH.R_flange_sensor,
+        TRUTH.gravity_force_base_N * (gripper.mass_kg * G / np.linalg.norm(TRUTH.gravity_force_base_N)),
+        np.zeros(3),
+        gripper.com_m,
+        np.zeros(3),
+    )
+    read = predict(TRUTH, R) + response.wrench(TRUTH, R) + predict(part, R) + response.wrench(part, R)
+    noise = np.tile(np.diag(NOISE**2) / 250, (3, 1, 1))
+    weight = weigh(with_gain, R, read, noise, drift=np.zeros(6), g_m_s2=G, p_sensor_near_m=gripper.com_m)
+    assert weight.mass_kg == pytest.approx(gripper.mass_kg, abs=1e-9)
+    np.testing.assert_allclose(weight.p_sensor_com_m, gripper.com_m, atol=1e-9)
+
+
+def test_a_tool_with_a_part_predicts_both() -> None:
+    z2 = []
+    for seed in range(40):
+        gripper = Gripper(seed)
+        empty = calibrated(12, seed % 20)
+        weight = gripper.weigh(empty, *(gripper.turn() for _ in range(4)))
+        load = holding(empty, weight, G)
+        R = gripper.turn()
+        off = predict(load.parameters, R) - predict(TRUTH, R) - gripper.part(R)
+        C = predicted_covariance(load.parameters, load.covariance, load.response, R)
+        z2.append(off @ np.linalg.solve(C, off) / 6)
+    assert 0.4 < np.mean(z2) < 1.3
+
+
+def test_a_tool_without_weight_has_no_direction_of_gravity() -> None:
+    nothing = Parameters(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    reference = holding(calibrated(), Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1), G)
+    with pytest.raises(BadDataset, match="no weight"):
+        Gripper(0).weigh(type(reference)(nothing, reference.covariance, None), np.eye(3))
+
+
+def test_drift_grows_and_ends() -> None:
+    assert drift_since(36.0)[0] == pytest.approx(0.05)
+    assert drift_since(NEVER).tolist() == [1.0] * 3 + [0.03] * 3

@@ -1,0 +1,114 @@
+"""Weighing a stream: rest, refusals, tare as the zero, poses, parts."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import ftdrive
+from ftcalib.model import Array
+from ftdrive.live.replay import ReplayedStream
+from ftdrive.live.samples import Paired
+from ftdrive.live.weighing import WORDS, CannotWeigh, Scale, count_of, load_values
+from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, TRUTH, G, calibrated, info, paired
+
+POSE = Rotation.from_euler("xz", [170, 25], degrees=True).as_matrix()
+COM_M = np.array([0.01, 0.02, 0.15])
+NOTHING = np.zeros(6)
+
+
+def part(R: Array, mass_kg: float) -> Array:
+    """Wrench (6,) of a part."""
+    down = TRUTH.gravity_force_base_N / np.linalg.norm(TRUTH.gravity_force_base_N)
+    force_N = mass_kg * G * down @ (R @ TRUTH.R_flange_sensor)
+    return np.concatenate([force_N, np.cross(COM_M, force_N)])
+
+
+def rests(*each: tuple[Array, Array], seconds: float = 1.0) -> Paired:
+    """Rest in each pose with a wrench on the tool."""
+    n = round(1000 * seconds)
+    R = np.concatenate([np.tile(R, (n, 1, 1)) for R, _ in each])
+    return paired(R, push=np.concatenate([np.tile(wrench, (n, 1)) for _, wrench in each]))
+
+
+def stream(rows: Paired) -> ReplayedStream:
+    return ReplayedStream(info(calibrated()), rows, speed=float("inf"))
+
+
+def read(source: ReplayedStream, seconds: float) -> None:
+    n = 0
+    while n < 1000 * seconds and not source.has_ended:
+        n += len(source.read())
+
+
+def test_a_tare_is_the_zero() -> None:
+    drift = np.array([0.2, -0.1, 0.3, 0.002, 0.001, 0])
+    source = stream(rests((POSE, drift), (POSE, drift + part(POSE, 0.8))))
+    read(source, 0.98)
+    Scale(source).zero()
+    read(source, 1.0)
+    weight = Scale(source).weigh()
+    assert weight.mass_kg == pytest.approx(0.8, abs=4 * weight.mass_sigma_kg)
+    assert weight.mass_sigma_kg < 2e-3
+    values = load_values(weight, source.info)
+    p_flange_m = P_FLANGE_SENSOR_M + TRUTH.R_flange_sensor @ weight.p_sensor_com_m
+    np.testing.assert_allclose(values["p_flange_com_m"], p_flange_m, atol=1e-4)
+
+
+def test_the_library_waits_for_rest_and_joins_poses() -> None:
+    poses = [POSE, Rotation.from_euler("x", 90, degrees=True).as_matrix(), np.eye(3)]
+    source = stream(rests(*((R, part(R, 1.5)) for R in poses)))
+    weight = ftdrive.weigh(source, poses=3)
+    assert (weight.poses, weight.line) == (3, None)
+    np.testing.assert_allclose(weight.p_sensor_com_m, COM_M, atol=4 * weight.com_sigma_m.max())
+
+
+def test_what_moves_is_refused() -> None:
+    turning = Rotation.from_rotvec(np.outer(np.arange(600) * 1e-3, [0.0, 0.0, 0.1])) * Rotation.from_matrix(POSE)
+    cases = {
+        "moving": paired(turning.as_matrix()),
+        "unsteady": rests((POSE, NOTHING), (POSE, part(POSE, 1.0)), seconds=0.7),
+        "samples": rests((POSE, NOTHING), seconds=0.3),
+        "contact": rests((POSE, np.array([2.0, 8.0, 0, 0, 0, 0]))),
+    }
+    for code, rows in cases.items():
+        source = stream(rows)
+        read(source, 1.0)
+        with pytest.raises(CannotWeigh) as refusal:
+            Scale(source).weigh()
+        assert refusal.value.code == code
+        assert str(refusal.value) == f"not weighed: {WORDS[code]}"
+
+
+def test_a_trembling_hand_is_unsteady() -> None:
+    t_s = np.arange(3000) * 1e-3
+    hand = np.where(t_s < 2, 0.0, 0.4 * np.sin(2 * np.pi * 9 * t_s))
+    source = stream(paired(np.tile(POSE, (3000, 1, 1)), push=np.outer(hand, [0, 0, 1, 0, 0, 0])))
+    read(source, 3.0)
+    with pytest.raises(CannotWeigh) as refusal:
+        Scale(source).weigh()
+    assert refusal.value.code == "unsteady"
+
+
+def test_a_zero_needs_an_empty_gripper_at_rest() -> None:
+    for code, wrench in (("unsteady", part(POSE, 0.1)), ("not-empty", part(POSE, 1.0))):
+        source = stream(rests((POSE, NOTHING), (POSE, wrench)))
+        read(source, 1.02 if code == "unsteady" else 2.0)
+        with pytest.raises(CannotWeigh) as refusal:
+            Scale(source).zero()
+        assert refusal.value.code == code
+        assert source.reference()[1] == float("inf")
+
+
+def test_parts_are_counted_or_not() -> None:
+    source = stream(rests((POSE, NOTHING), (POSE, part(POSE, 1.0))))
+    read(source, 0.98)
+    Scale(source).zero()
+    read(source, 1.0)
+    weight = Scale(source).weigh()
+    assert count_of(weight, 0.5) == 2
+    assert count_of(weight, 1.0) == 1
+    with pytest.raises(CannotWeigh) as refusal:
+        count_of(weight, 0.4)
+    assert refusal.value.code == "count"
+    with pytest.raises(CannotWeigh):
+        count_of(weight, 0.001)  # sigma does not tell so small parts apart
