@@ -444,6 +444,7 @@ class RobotArm(_Device):
 
         `guard` and early ends as in `move_to`. The default raises `DeviceFault`.
         """
+        guard()
         raise DeviceFault(
             f"the driver of this arm cannot follow a sweep of {sweep.duration_s:g} s", "calibrate without --sweep"
         )

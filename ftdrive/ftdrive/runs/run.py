@@ -313,6 +313,11 @@ class Run:
         return sorted(int(name) for name in names if name.isdecimal())
 
 
+def in_motion(place: Path) -> bool:
+    """Whether a place is a run folder with a recording in motion instead of poses."""
+    return place.is_dir() and Run(place).in_motion
+
+
 def event_of(line: str) -> dict[str, Any] | None:
     """Return the event in a line of events.ndjson; None if it is damaged."""
     try:

@@ -55,7 +55,7 @@ class RunOpened(Event):
 
     folder: str
     resume: str
-    """The command that continues it."""
+    """The command that continues it; empty for a sweep, which starts again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -141,7 +141,9 @@ def head_and_words(event: Event) -> tuple[str, str]:
     """Return the mark an event begins with, under which its lines are not continued, and its words."""
     match event:
         case RunOpened():
-            return "", f"kept in {event.folder}; to continue after a stop: {event.resume}"
+            return "", f"kept in {event.folder}" + (
+                f"; to continue after a stop: {event.resume}" if event.resume else ""
+            )
         case StateChanged(state=State.HOLD):  # repeats the words of STOP
             return "", f"{event.state.upper()}: {event.words}"
         case StateChanged(state=State.PREFLIGHT | State.APPROACH | State.SWEEP | State.CLOSE):
