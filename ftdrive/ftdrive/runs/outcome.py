@@ -31,8 +31,9 @@ def solve_and_save(run: Run) -> Outcome:
         if outcome.result.verdict != "rejected":
             outcome.result.save(run.new_path("calibration"))
     except OSError as error:
+        kept = "all poses are" if outcome.dataset is not None else "the recording is"
         raise OSError(
-            f"{error.strerror or error}: the result is not saved, but all data are. Make room in {run.folder}, then "
+            f"{error.strerror or error}: the result is not saved, but {kept}. Make room in {run.folder}, then "
             f"{run.solve_command} --output FILE"
         ) from error
     return outcome

@@ -42,7 +42,6 @@ from ftdrivers.errors import DeviceError, DeviceFault
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import (
     ArmState,
-    ArmStates,
     ArmStatus,
     DeviceInfo,
     ForceTorqueSensor,
@@ -188,9 +187,6 @@ class FakeArm(RobotArm):
             self.q = sweep.at(t_s)[0]
             self.clock.sleep(0.02)
         self.q = np.array(sweep.centre_rad)
-
-    def follow(self) -> AbstractContextManager[Follow[ArmStates]]:
-        return nullcontext(Follow(lambda _: ArmStates.of([self.state(), self.state()])))
 
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
         assert timeout_s > 0
