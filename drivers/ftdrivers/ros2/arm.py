@@ -63,7 +63,7 @@ class Ros2Arm(ReadOnlyArm):
         clock: Clock = REAL,
     ) -> None:
         self._host, self._model, self._clock = host, model, clock
-        self._reader = _reader_of(host)  # also finds wrong options
+        self._reader = pose_reader_of(host)  # also finds wrong options
         self._ros: Node | None = None
         self._publishers: dict[str, str] = {}
         self._changed = threading.Condition()
@@ -80,7 +80,7 @@ class Ros2Arm(ReadOnlyArm):
             if self._failure is None and self._age_s() < _STALE_S:
                 return
             self.close()
-        self._reader, self._failure, self._newest, self._dropped = _reader_of(self._host), None, None, 0
+        self._reader, self._failure, self._newest, self._dropped = pose_reader_of(self._host), None, None, 0
         self._recent.clear()
         self._ros = Node("ftdrive_arm")
         self._ros.spin()
@@ -239,7 +239,7 @@ def _no_states() -> ArmStates:
     return ArmStates(np.zeros(0, np.int64), np.zeros(0), nothing, nothing, np.zeros((0, 3, 3)), np.zeros((0, 3)))
 
 
-def _reader_of(host: str) -> PoseReader:
+def pose_reader_of(host: str) -> PoseReader:
     """Return what turns the messages of an address into poses. Raises `BadUrl`."""
     parts = split_url(host)
     options = Options(host, parts.query)

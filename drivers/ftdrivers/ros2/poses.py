@@ -69,11 +69,11 @@ class Joints:
 
     def __init__(self, topic: str, chain: Chain) -> None:
         self.topics = {topic: "sensor_msgs/msg/JointState"}
-        self._chain = chain
+        self.chain = chain
         self._seen: set[str] = set()
 
-    def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
-        """Give the pose of a message that has all joints."""
+    def positions(self, topic: str, message: Any) -> dict[str, float] | None:
+        """Return the joints of the chain; None for a message of others. Raises `ProtocolError`."""
         if len(message.position) != len(message.name):
             raise ProtocolError(
                 f"a message of {topic} has {len(message.name)} names and {len(message.position)} positions",
@@ -81,15 +81,21 @@ class Joints:
             )
         self._seen |= set(message.name)
         found = dict(zip(message.name, map(float, message.position), strict=True))
-        if not all(name in found for name in self._chain.names):
-            return
-        if not is_finite(*(found[name] for name in self._chain.names)):
+        if not all(name in found for name in self.chain.names):
+            return None
+        if not is_finite(*(found[name] for name in self.chain.names)):
             raise ProtocolError(f"a joint of {topic} is not finite", "check its driver")
-        yield StampedPose(stamp_s(message.header, topic), *self._chain.pose(found))
+        return {name: found[name] for name in self.chain.names}
+
+    def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
+        """Give the pose of a message that has all joints."""
+        if (found := self.positions(topic, message)) is not None:
+            R, p = self.chain.poses({name: np.array([value]) for name, value in found.items()})
+            yield StampedPose(stamp_s(message.header, topic), R[0], p[0])
 
     def missing(self) -> str:
         """Return which joints no message had."""
-        lacking = [name for name in self._chain.names if name not in self._seen]
+        lacking = [name for name in self.chain.names if name not in self._seen]
         has = ", ".join(sorted(self._seen)) or "none"
         return f"no message of {next(iter(self.topics))} has all joints; missing {', '.join(lacking)}, found {has}"
 

@@ -77,6 +77,13 @@ def CALIBRATION_OR_TOOL(command: F) -> F:
     return CALIBRATION(tool(force(command)))
 
 
+def BAG_TOPICS(command: F) -> F:
+    """Add the options --wrench-topic and --pose-topic, which `recording.bag.as_csv_pair` takes."""
+    poses = "Of a bag of ROS 2: topic of PoseStamped, tf?base=B&flange=F, or /joint_states?urdf=FILE&flange=F."
+    command = click.option("--pose-topic", metavar="TOPIC", help=poses)(command)
+    return click.option("--wrench-topic", metavar="TOPIC", help="Of a bag of ROS 2: topic of WrenchStamped.")(command)
+
+
 class Number(click.FloatRange):
     """A finite number within a range; `click` alone accepts nan."""
 
