@@ -177,7 +177,7 @@ def _poses(reader: "AnyReader", pose_topic: str | None) -> tuple[NDArray[np.int6
     if isinstance(named, Joints):
         return _from_joints(reader, named)
     found = [
-        (round(pose.t_s * 1e9), pose.R_base_flange, pose.p_base_flange_m)
+        (pose.t_ns, pose.R_base_flange, pose.p_base_flange_m)
         for topic, kind, data in _static_first(reader, named)
         for pose in named.read(topic, reader.deserialize(data, kind))
     ]
