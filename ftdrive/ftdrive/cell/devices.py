@@ -11,6 +11,7 @@ from ftdrive.errors import ConfigError
 from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrivers.registry import arm_class, sensor_from_url
+from ftdrivers.ur.program_registers import ProgramRegisters
 from ftdrivers.ur.timing import STRICT, UrTiming
 
 
@@ -46,3 +47,18 @@ def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
     sensor = sensor_from_url(url, sign=cell.sensor.sign, clock=clock)
     _fits: Sensor = sensor
     return sensor
+
+
+def program_registers(cell: CellConfig, first: int, integers: int, doubles: int) -> ProgramRegisters:
+    """Claim registers for answers to the program on the controller.
+
+    Raises
+    ------
+    ConfigError
+        The arm has none.
+    ConnectError
+        Nothing answers, or another client or a fieldbus owns a register.
+    """
+    if cell.robot.driver != "ur":
+        raise ConfigError(f"[robot] driver {cell.robot.driver} has no registers: serve-load needs a UR")
+    return ProgramRegisters(cell.robot.host, first, integers, doubles, clock=cell.clock)

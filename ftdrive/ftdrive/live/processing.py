@@ -10,6 +10,7 @@ import numpy as np
 from ftcalib.compensation import Compensator
 from ftcalib.extras.inertia import REACH_S, inertial_wrench, motion_of_poses
 from ftcalib.extras.update import Calibrated
+from ftcalib.extras.weighing import Weight, holding
 from ftcalib.files import JSON
 from ftcalib.rounding import with_sigma
 from ftdrive.errors import ConfigError
@@ -77,7 +78,12 @@ class Processor:
         calibration = info.calibration
         self._compensator: Compensator = calibration.compensator
         self._inertia = inertia_com_kg_m2
+        self._held: Weight | None = None
+        self.reading = np.zeros(6)
+        """Mean of the newest 20 ms minus the load, sensor axes, about its origin."""
         self._tares: list[tuple[Calibrated, int]] = [(calibration, 0)]
+        self._expected: Calibrated = calibration
+        """The load after tares, with a part that is held."""
         likely_error = calibration.likely_error()
         self._usual_error_N = float(likely_error[0])
         beyond = np.repeat((likely_error**2 - np.square(calibration.predicted_error())).clip(0.0) / 3, 3)
@@ -192,11 +198,24 @@ class Processor:
                     moving, wrenches = motion.follow(rows.R_base_flange, rows.p_base_flange_m)
                     self._noise.add(self._free(rows)[0] - wrenches[0], moving)
 
+    def hold(self, weight: Weight | None) -> None:
+        """Count a part that was weighed as part of the tool from now on; None empties the gripper."""
+        with self._lock:
+            self._report_contacts(self._tracker.end())
+            self._held = weight
+            load = self._loaded(self.info.calibration)
+            self._compensator = Compensator(load.parameters, response=load.response)
+            self._expected = self._loaded(self._tares[-1][0])
+            self._motion = self._motion_tracker()
+            self._test.restart()
+
+    def _loaded(self, empty: Calibrated) -> Calibrated:
+        return empty if self._held is None else holding(empty, self._held, self.info.calibration.g_m_s2)
+
     def _motion_tracker(self) -> MotionTracker:
-        calibration = self.info.calibration
-        return MotionTracker(
-            self.info.sensor_rate_Hz, calibration.mass_kg, calibration.parameters, self.info.p_flange_sensor_m
-        )
+        load, g_m_s2 = self._loaded(self.info.calibration).parameters, self.info.calibration.g_m_s2
+        mass_kg = float(np.linalg.norm(load.gravity_force_base_N)) / g_m_s2
+        return MotionTracker(self.info.sensor_rate_Hz, mass_kg, load, self.info.p_flange_sensor_m)
 
     def _free(self, rows: Paired) -> tuple[Array, Array, Array]:
         """Return the residual of a free tool at rest, (n, 6), its weight (n, 6) and the bias (6,)."""
@@ -211,7 +230,7 @@ class Processor:
         knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]  # a coarse clock repeats times
         if len(knots) < 2 * self._reach + 2:
             return np.zeros((len(buffer), 6)), 0
-        parameters = self.info.calibration.parameters
+        parameters = self._loaded(self.info.calibration).parameters
         motion = motion_of_poses(
             t_s[knots],
             buffer.R_base_flange[knots],
@@ -220,7 +239,7 @@ class Processor:
             p_flange_sensor_m=self.info.p_flange_sensor_m,
             reach=self._reach,
         )
-        mass_kg = self.info.calibration.mass_kg
+        mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / self.info.calibration.g_m_s2
         at_knots = inertial_wrench(mass_kg, parameters.p_sensor_com_m, motion, self._inertia)
         wrench = np.stack([np.interp(t_s, motion.t_s, column) for column in at_knots.T], axis=1)
         return wrench, int(knots[-1 - self._reach]) + 1
@@ -235,9 +254,11 @@ class Processor:
             wrenches[0] = 0.0
         if not self._noise_is_learnt:
             self._noise.add(residual - wrenches[0], moving)
-        current = self._tares[-1][0]
+        current = self._expected
         self._test.expect((current.parameters, current.covariance, current.response))
         readings, chi2, beyond = self._test.judge(residual, rows.R_base_flange, (moving, wrenches), self._noise)
+        if n:
+            self.reading = readings[-1]
         readings = self._transform(readings, rows.R_base_flange)
         in_contact, contacts = self._tracker.follow(rows.t_host_ns, beyond, readings)
         self._report_contacts(contacts)
@@ -419,6 +440,7 @@ class Processor:
     def _set_tare(self, tares: list[tuple[Calibrated, int]]) -> None:
         before, self._tares = self.tare_wrench, tares
         now = np.zeros(6) if self.tare_wrench is None else self.tare_wrench
+        self._expected = self._loaded(tares[-1][0])
         self._drift.shift(now - (np.zeros(6) if before is None else before))
         self._test.restart()
         self._filter = self._filter_of(self._stages)
@@ -498,6 +520,14 @@ class ProcessedStream(ABC):
     def rest_sigma(self) -> Array | None:
         """(6,) standard deviation of one sample at rest; None until it is known."""
         return self._processor.rest_sigma
+
+    def hold(self, weight: Weight | None) -> None:
+        """Count a part that was weighed as part of the tool from now on; None empties the gripper."""
+        self._processor.hold(weight)
+
+    def contact_reading(self) -> Array:
+        """Return the mean (6,) of the newest 20 ms minus the load, sensor axes, about its origin."""
+        return self._processor.reading
 
     def note(self, kind: EventKind, text: str, values: Mapping[str, JSON]) -> StreamEvent:
         """Add an event at the time of the newest sample."""
