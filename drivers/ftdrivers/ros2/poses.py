@@ -11,7 +11,8 @@ from ftdrivers.interfaces import Array
 from ftdrivers.ros2.kinematics import Chain
 from ftdrivers.ros2.subscription import is_finite, stamp_ns
 
-_UNIT_TOLERANCE: Final = 1e-3
+UNIT_TOLERANCE: Final = 1e-3
+"""Of the length of a quaternion."""
 _SPREAD_NS: Final = 100_000_000
 """The parts of a chain of tf may differ by so much in time."""
 
@@ -43,7 +44,7 @@ def pose_of(position: Any, quaternion: Any, what: str) -> tuple[Array, Array]:
     q = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     if not is_finite(*p, *q):
         raise ProtocolError(f"{what} is not finite", "check its driver")
-    if abs(float(np.linalg.norm(q)) - 1) > _UNIT_TOLERANCE:
+    if abs(float(np.linalg.norm(q)) - 1) > UNIT_TOLERANCE:
         raise ProtocolError(f"{what} has a quaternion of length {np.linalg.norm(q):.3g}", "normalize it in its driver")
     return Rotation.from_quat(q).as_matrix(), np.array(p)
 

@@ -53,7 +53,7 @@ def CELL(command: F) -> F:
     """Add the options --config, --robot and --sensor, which `read_cell` takes."""
     sensor_help = "Address, such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0."
     command = click.option("--sensor", metavar="URL", help=sensor_help)(command)
-    return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
+    return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller, or ros2:/TOPIC.")(command))
 
 
 EDITED = "that was edited by hand; every output then says so"

@@ -62,7 +62,7 @@ def compensate(
     as r11..r33, qx,qy,qz,qw or rx,ry,rz in rad; or as a rosbag2 folder or an MCAP file of ROS 2.
     """
     from ftdrive.errors import ConfigError
-    from ftdrive.recording.bag import as_csv_pair, is_bag
+    from ftdrive.recording.bag import as_csv_pair, is_bag, read_bag
     from ftdrive.recording.compensation import compensated
     from ftdrive.recording.files import format_of
     from ftdrive.runs.source import read_calibration
@@ -74,7 +74,8 @@ def compensate(
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     with working("Reading") as show, ExitStack() as stack:
         if path is not None and is_bag(path):
-            wrench, orientation_file = stack.enter_context(as_csv_pair(path, wrench_topic, pose_topic))
+            bag = read_bag(path, wrench_topic, pose_topic)
+            wrench, orientation_file = stack.enter_context(as_csv_pair(bag, path.name))
             path = None
         elif wrench_topic or pose_topic:
             raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS 2: leave them out")

@@ -35,7 +35,7 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
-from ftdrive.recording.bag import as_csv_pair, is_bag
+from ftdrive.recording.bag import bag_means, is_bag, read_bag
 from ftdrive.recording.in_motion import is_recording, solve_recording
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.pose_hints import hints
@@ -195,9 +195,10 @@ def _result_of(
     if motion["pair"] is not None or from_bag or is_recording(place):
         if method != "ml":
             raise ConfigError(f"--method {method} is for poses at rest: leave it out for a recording")
-        with working("Solving"), as_csv_pair(place, *topics) if from_bag else nullcontext(motion["pair"]) as pair:
-            options = {"pair": pair, "point_mass": motion["point_mass"], "known": read["known"]}
-            return solve_recording(place, **options, up_in_base=read["up_in_base"]), ()
+        options = {"point_mass": motion["point_mass"], "known": read["known"], "up_in_base": read["up_in_base"]}
+        with working("Solving"):
+            means = bag_means(read_bag(place, *topics)) if from_bag else None
+            return solve_recording(place, motion["pair"], means, **options), ()
     data = read_source(place, **read)
     options = {"drift": drift, **data.circumstances, "provenance": data.provenance}
     with working("Solving"):

@@ -1,28 +1,29 @@
 """Recordings of other programs in ROS 2: rosbag2 folders, and MCAP files without our header. Needs the extra `ros2`.
 
-Wrench and pose become the two CSV files that `csv_pair` and `in_motion` read, so that a bag is solved and compensated
-as the CSV files of the same data: docs/decisions/0242-a-bag-is-read-as-two-csv-files.md.
+`compensate` reads them as two CSV files, as it does recordings of any other program: decision 242. `solve`
+takes the same numbers without files, so that both agree with the CSV files of the same data.
 """
 
 import struct
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib.data.dwell_mean import CHANNELS
-from ftcalib.errors import BadDataset
+from ftcalib.errors import BadDataset, UsageError
+from ftcalib.motion.samples import Means
 from ftdrive.errors import ConfigError
 from ftdrivers.errors import ProtocolError
 from ftdrivers.interfaces import Array
 from ftdrivers.ros2.arm import SCHEME, pose_reader_of
-from ftdrivers.ros2.poses import Joints, PoseReader, Poses
+from ftdrivers.ros2.poses import UNIT_TOLERANCE, Joints, PoseReader, Poses
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -30,7 +31,8 @@ if TYPE_CHECKING:
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 _POSES: Final = "geometry_msgs/msg/PoseStamped"
 _MAGIC: Final = b"\x89MCAP0\r\n"
-_UNIT_TOLERANCE: Final = 1e-3
+_Column = tuple[NDArray[np.int64], Array]
+"""Times in ns, and numbers."""
 
 
 def is_bag(path: Path) -> bool:
@@ -49,11 +51,21 @@ def is_bag(path: Path) -> bool:
     return start.startswith(_MAGIC) and not start[25 + profile : 25 + profile + library].startswith(b"ftdrive")
 
 
-@contextmanager
-def as_csv_pair(path: Path, wrench_topic: str | None, pose_topic: str | None) -> Iterator[tuple[Path, Path]]:
-    """Give the CSV files of wrench and pose of a bag, as long as the block lasts.
+class Bag(NamedTuple):
+    """Wrench and pose of a bag, in the order of their stamps, in s from the earliest of both."""
 
-    Times are those of the headers, from the earliest of both topics.
+    t_wrench_s: Array
+    """(n,)"""
+    wrench: Array
+    """(n, 6)"""
+    t_pose_s: Array
+    """(m,)"""
+    pose: Array
+    """(m, 7) quaternion x, y, z, w of the flange in base, then its position."""
+
+
+def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> Bag:
+    """Read wrench and pose; times are those of the headers.
 
     Parameters
     ----------
@@ -72,31 +84,54 @@ def as_csv_pair(path: Path, wrench_topic: str | None, pose_topic: str | None) ->
         The bag is damaged, or a message cannot be used.
     """
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise ConfigError(f"{path.name} needs rosbags: pip install 'ftdrive[ros2]'") from None
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            wrench = _wrenches(reader, _chosen(reader, WRENCH, wrench_topic, "--wrench-topic"))
-            poses = _poses(reader, pose_topic)
-    except (ConfigError, BadDataset):
+            wrenches = _chosen(reader, WRENCH, wrench_topic, "--wrench-topic")
+            named = _pose_reader(reader, pose_topic)
+            messages = _messages(reader, [wrenches, *named.topics])
+            wrench = _numbers(wrenches, messages[wrenches], 6)
+            poses = _poses(reader, named, messages)
+    except (UsageError, BadDataset):
         raise
     except ProtocolError as error:
         raise BadDataset(f"{path.name}: {error}") from error
-    except (AnyReaderError, OSError, ValueError, KeyError, IndexError, RuntimeError, struct.error) as error:
-        raise BadDataset(f"{path.name} cannot be read ({error}): the bag is damaged, or of another version") from error
-    except Exception as error:  # rosbags raises the errors of SQLite, zstd and others
-        raise BadDataset(f"{path.name} cannot be read ({error!r}): the bag is damaged") from error
-    origin_ns = min(int(wrench[0][0]), int(poses[0][0]))
+    except Exception as error:  # rosbags raises those of SQLite, zstd, YAML and its own
+        raise BadDataset(f"{path.name} cannot be read ({error}): it is damaged, or of another version") from error
+    origin_ns = min(int(wrench[0].min()), int(poses[0].min()))
+    return Bag(*_sorted(wrench, origin_ns), *_sorted(poses, origin_ns))
+
+
+def _sorted(column: _Column, origin_ns: int) -> tuple[Array, Array]:
+    t_ns, values = column
+    order = np.argsort(t_ns, kind="stable")
+    return np.asarray((t_ns - origin_ns)[order] * 1e-9), values[order]
+
+
+@contextmanager
+def as_csv_pair(bag: Bag, name: str) -> Iterator[tuple[Path, Path]]:
+    """Give the CSV files of wrench and pose of a bag, as long as the block lasts."""
     with TemporaryDirectory(prefix="ftdrive-bag-") as folder:
-        files = Path(folder) / f"{path.name}-wrench.csv", Path(folder) / f"{path.name}-poses.csv"
-        names = ("qx", "qy", "qz", "qw", "x", "y", "z")
-        for file, (t_ns, values), columns in zip(files, (wrench, poses), (CHANNELS, names), strict=True):
-            order = np.argsort(t_ns, kind="stable")
-            table = np.column_stack([(t_ns - origin_ns)[order] * 1e-9, values[order]])
-            np.savetxt(file, table, "%.17g", ",", header=",".join(("t", *columns)), comments="")
+        files = Path(folder) / f"{name}-wrench.csv", Path(folder) / f"{name}-poses.csv"
+        for file, t_s, values, names in (
+            (files[0], bag.t_wrench_s, bag.wrench, CHANNELS),
+            (files[1], bag.t_pose_s, bag.pose, ("qx", "qy", "qz", "qw", "x", "y", "z")),
+        ):
+            header = ",".join(("t", *names))
+            np.savetxt(file, np.column_stack([t_s, values]), "%.17g", ",", header=header, comments="")
         yield files
+
+
+def bag_means(bag: Bag) -> tuple[Means, Means]:
+    """Return the means of wrench and pose, as `solve_recording` takes them."""
+    wrench, poses = Means(), Means()
+    wrench.add(bag.t_wrench_s, bag.wrench)
+    R = Rotation.from_quat(bag.pose[:, :4]).as_matrix().reshape(-1, 9)
+    poses.add(bag.t_pose_s, np.hstack([R, bag.pose[:, 4:]]))
+    return wrench, poses
 
 
 def _chosen(reader: "AnyReader", kind: str, topic: str | None, option: str) -> str:
@@ -113,14 +148,16 @@ def _chosen(reader: "AnyReader", kind: str, topic: str | None, option: str) -> s
     return topic or of_kind[0]
 
 
-def _raw(reader: "AnyReader", topics: Sequence[str]) -> Iterator[tuple[str, str, bytes]]:
-    """Give topic, type and bytes of each message in order."""
+def _messages(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[bytes]]:
+    """Return the messages of each topic as bytes, in one pass."""
     chosen = [one for one in reader.connections if one.topic in topics]
+    found: dict[str, list[bytes]] = {topic: [] for topic in topics}
     for connection, _, data in reader.messages(connections=chosen):
-        yield connection.topic, connection.msgtype, bytes(data)
+        found[connection.topic].append(bytes(data))
+    return found
 
 
-def _numbers(topic: str, messages: Sequence[bytes], count: int) -> tuple[NDArray[np.int64], Array]:
+def _numbers(topic: str, messages: Sequence[bytes], count: int) -> _Column:
     """Return stamps (n,) in ns and the numbers (n, count) behind the header of messages in CDR.
 
     Raises `BadDataset` for no message, a stamp of zero, a number that is not finite, or frames that differ.
@@ -143,7 +180,7 @@ def _numbers(topic: str, messages: Sequence[bytes], count: int) -> tuple[NDArray
     return _checked(topic, t_ns, numbers)
 
 
-def _checked(topic: str, t_ns: NDArray[np.int64], numbers: Array) -> tuple[NDArray[np.int64], Array]:
+def _checked(topic: str, t_ns: NDArray[np.int64], numbers: Array) -> _Column:
     if (t_ns <= 0).any():
         raise BadDataset(f"{topic}: a message has the stamp 0: set header.stamp in its driver and record again")
     if not np.isfinite(numbers).all():
@@ -152,53 +189,51 @@ def _checked(topic: str, t_ns: NDArray[np.int64], numbers: Array) -> tuple[NDArr
     return t_ns, numbers
 
 
-def _wrenches(reader: "AnyReader", topic: str) -> tuple[NDArray[np.int64], Array]:
-    return _numbers(topic, [data for _, _, data in _raw(reader, [topic])], 6)
-
-
-def _poses(reader: "AnyReader", pose_topic: str | None) -> tuple[NDArray[np.int64], Array]:
-    """Return times (m,) in ns, and quaternions x, y, z, w and positions (m, 7)."""
+def _pose_reader(reader: "AnyReader", pose_topic: str | None) -> PoseReader:
+    """Return what turns messages into poses. Raises `ConfigError` or `BadUrl`."""
     if pose_topic is None:
-        named: PoseReader = Poses(_chosen(reader, _POSES, None, "--pose-topic"))
-    else:
-        named = pose_reader_of(SCHEME + pose_topic.removeprefix(SCHEME))
+        return Poses(_chosen(reader, _POSES, None, "--pose-topic"))
+    named = pose_reader_of(SCHEME + pose_topic.removeprefix(SCHEME))
     if isinstance(named, Poses):
-        topic = _chosen(reader, _POSES, next(iter(named.topics)), "--pose-topic")
-        t_ns, numbers = _numbers(topic, [data for _, _, data in _raw(reader, [topic])], 7)
-        position, quaternion = numbers[:, :3], numbers[:, 3:]
-        lengths = np.linalg.norm(quaternion, axis=1)
-        if (np.abs(lengths - 1) > _UNIT_TOLERANCE).any():
-            wrong = lengths[np.argmax(np.abs(lengths - 1))]
-            raise BadDataset(f"{topic}: a quaternion has the length {wrong:.3g}: normalize it in its driver")
-        return t_ns, np.hstack([quaternion, position])
+        _chosen(reader, _POSES, next(iter(named.topics)), "--pose-topic")
     missing = [topic for topic in named.topics if topic not in reader.topics and topic != "/tf_static"]
     if missing:
         raise ConfigError(f"--pose-topic {pose_topic}: the bag has no topic {missing[0]}")
+    return named
+
+
+def _poses(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[bytes]]) -> _Column:
+    """Return times (m,) in ns, and quaternions x, y, z, w and positions (m, 7)."""
+    if isinstance(named, Poses):
+        (topic,) = named.topics
+        t_ns, numbers = _numbers(topic, messages[topic], 7)
+        position, quaternion = numbers[:, :3], numbers[:, 3:]
+        lengths = np.linalg.norm(quaternion, axis=1)
+        if (np.abs(lengths - 1) > UNIT_TOLERANCE).any():
+            wrong = lengths[np.argmax(np.abs(lengths - 1))]
+            raise BadDataset(f"{topic}: a quaternion has the length {wrong:.3g}: normalize it in its driver")
+        return t_ns, np.hstack([quaternion, position])
     if isinstance(named, Joints):
-        return _from_joints(reader, named)
+        return _from_joints(reader, named, messages)
     found = [
         (pose.t_ns, pose.R_base_flange, pose.p_base_flange_m)
-        for topic, kind, data in _static_first(reader, named)
-        for pose in named.read(topic, reader.deserialize(data, kind))
+        for topic in sorted(named.topics, key=lambda topic: topic != "/tf_static")  # a bag may have latched ones late
+        for data in messages[topic]
+        for pose in named.read(topic, reader.deserialize(data, named.topics[topic]))
     ]
     if not found:
         raise BadDataset(f"the bag has no pose: {named.missing()}")
-    t_ns, R, p = (np.array(column) for column in zip(*found, strict=True))
-    return t_ns, np.hstack([Rotation.from_matrix(R).as_quat(), p])
+    times, R, p = (np.array(column) for column in zip(*found, strict=True))
+    return times, np.hstack([Rotation.from_matrix(R).as_quat(), p])
 
 
-def _static_first(reader: "AnyReader", named: PoseReader) -> Iterator[tuple[str, str, bytes]]:
-    """Give the messages of tf, the latched ones first, which a bag may have late."""
-    for topics in (["/tf_static"], [topic for topic in named.topics if topic != "/tf_static"]):
-        yield from _raw(reader, topics)
-
-
-def _from_joints(reader: "AnyReader", named: Joints) -> tuple[NDArray[np.int64], Array]:
+def _from_joints(reader: "AnyReader", named: Joints, messages: Mapping[str, list[bytes]]) -> _Column:
     """Return what `_poses` does, from all messages at once."""
+    (topic,) = named.topics
     t_ns: list[int] = []
     positions: defaultdict[str, list[float]] = defaultdict(list)
-    for topic, kind, data in _raw(reader, list(named.topics)):
-        message: Any = reader.deserialize(data, kind)
+    for data in messages[topic]:
+        message: Any = reader.deserialize(data, named.topics[topic])
         if (found := named.positions(topic, message)) is not None:
             stamp = message.header.stamp
             t_ns.append(stamp.sec * 1_000_000_000 + stamp.nanosec)
@@ -207,5 +242,4 @@ def _from_joints(reader: "AnyReader", named: Joints) -> tuple[NDArray[np.int64],
     if not t_ns:
         raise BadDataset(f"the bag has no pose: {named.missing()}")
     R, p = named.chain.poses({name: np.array(values) for name, values in positions.items()})
-    numbers = np.hstack([Rotation.from_matrix(R).as_quat(), p])
-    return _checked(next(iter(named.topics)), np.array(t_ns), numbers)
+    return _checked(topic, np.array(t_ns), np.hstack([Rotation.from_matrix(R).as_quat(), p]))

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
@@ -15,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import FtdriveError
-from ftdrive.recording.bag import as_csv_pair, is_bag
+from ftdrive.recording.bag import as_csv_pair, bag_means, is_bag, read_bag
 from ftdrive.recording.in_motion import solve_recording
 from tests.ros2.seven_joints import JOINTS, TRUTH, URDF, flange, sway, wrench
 
@@ -117,8 +116,8 @@ def bag(
 
 
 def solved(path: Path, *topics: str | None) -> Any:
-    with as_csv_pair(path, *(topics or (None, None))) as pair:
-        return solve_recording(path, pair, known=None, point_mass=True, up_in_base=None)
+    means = bag_means(read_bag(path, *(topics or (None, None))))
+    return solve_recording(path, None, means, known=None, point_mass=True, up_in_base=None)
 
 
 def numbers(result: Any) -> Any:
@@ -165,6 +164,15 @@ def test_a_bag_is_solved_as_the_csv_of_the_same_data(
     assert np.allclose(numbers(result), numbers(expected), rtol=0, atol=1e-9)
     assert abs(result.motion.delay_s - 0.04) < 1e-3
     assert abs(result.mass_kg - TRUTH["mass_kg"]) < 3 * result.sigma["mass_kg"]
+
+
+def test_the_files_of_a_bag_hold_the_same_numbers(tmp_path: Path) -> None:
+    found = read_bag(bag(tmp_path / "bag", rows=100), None, None)
+    with as_csv_pair(found, "bag") as (wrench_file, pose_file):
+        wrenches, poses = (np.loadtxt(file, delimiter=",", skiprows=1) for file in (wrench_file, pose_file))
+    assert np.array_equal(wrenches, np.column_stack([found.t_wrench_s, found.wrench]))
+    assert np.array_equal(poses, np.column_stack([found.t_pose_s, found.pose]))
+    assert not wrench_file.exists()
 
 
 def changed(topic: str, change: Callable[[Any], object], every: int = 50) -> Spoil:
@@ -237,8 +245,8 @@ def test_a_bag_that_cannot_be_used_is_one_sentence(
     path = bag(tmp_path / "bag", **made, rows=300)
     if damage is not None:
         damage(path)
-    with pytest.raises(FtdriveError) as error, ExitStack() as stack:
-        stack.enter_context(as_csv_pair(path, wrench_topic, pose_topic))
+    with pytest.raises(FtdriveError) as error:
+        read_bag(path, wrench_topic, pose_topic)
     assert re.search(words, str(error.value))
     assert "\n" not in str(error.value)
 
