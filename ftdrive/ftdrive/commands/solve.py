@@ -38,7 +38,9 @@ from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.recording.bag import bag_means, is_bag, read_bag
 from ftdrive.recording.in_motion import is_recording, solve_recording
 from ftdrive.runs.bundle import unpacked
+from ftdrive.runs.outcome import solve_in_motion
 from ftdrive.runs.pose_hints import hints
+from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import read_source
 from ftdrive.terminal.console import beside, working
 from ftdrive.terminal.report import print_comparison, print_result
@@ -158,7 +160,8 @@ def _solve_each(
     for source in sources:
         try:
             with unpacked(source) as place:
-                if method == "all" and motion["pair"] is None and not (is_recording(place) or is_bag(place)):
+                is_motion = is_recording(place) or is_bag(place) or in_motion(place)
+                if method == "all" and motion["pair"] is None and not is_motion:
                     data = read_source(place, **read)
                     _show_all(source, data.dataset, {"drift": drift, **data.circumstances}, as_json)
                     continue
@@ -192,9 +195,12 @@ def _result_of(
     from_bag = motion["pair"] is None and is_bag(place)
     if any(topics) and not from_bag:
         raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS 2: leave them out")
-    if motion["pair"] is not None or from_bag or is_recording(place):
+    if motion["pair"] is not None or from_bag or is_recording(place) or in_motion(place):
         if method != "ml":
             raise ConfigError(f"--method {method} is for poses at rest: leave it out for a recording")
+        if in_motion(place):
+            with working("Solving"):
+                return solve_in_motion(Run(place), read["known"], point_mass=motion["point_mass"]), ()
         options = {"point_mass": motion["point_mass"], "known": read["known"], "up_in_base": read["up_in_base"]}
         with working("Solving"):
             means = bag_means(read_bag(place, *topics)) if from_bag else None
