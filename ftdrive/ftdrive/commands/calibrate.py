@@ -31,12 +31,13 @@ if TYPE_CHECKING:
     from ftdrive.runs.outcome import Outcome
     from ftdrive.runs.run import Mode
 
+_LONGEST_SWEEP_S = 120
 _OF_A_PLAN = ("--quick", "--minimal", "--output", "--png", "--view")
 _EXCLUDE_ONE_ANOTHER = (
-    ("--step", "--manual", "--listen", "--sweep"),
-    ("--quick", "--minimal", "--plan", "--resume", "--sweep"),
-    ("--fast", "--sweep"),
-    *((hand, option) for hand in ("--manual", "--listen") for option in _OF_A_PLAN),
+    ("--step", "--manual", "--listen", "--sweep", "--passive"),
+    ("--quick", "--minimal", "--plan", "--resume", "--sweep", "--passive"),
+    ("--fast", "--sweep", "--passive"),
+    *((hand, option) for hand in ("--manual", "--listen", "--passive") for option in _OF_A_PLAN),
     *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
 )
 
@@ -55,7 +56,12 @@ _EXCLUDE_ONE_ANOTHER = (
 @click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
 @click.option("--sweep", is_flag=True, help="Calibrate in one smooth motion of the wrist, with inertia and delay.")
 @click.option(
-    "--seconds", type=Number(10, 120), default=20.0, show_default=True, help="With --sweep: its duration at full speed."
+    "--passive", is_flag=True, help="No motion commands: read beside any program or freedrive until it is good."
+)
+@click.option(
+    "--seconds",
+    type=Number(10, 3600),
+    help="Duration of --sweep at full speed (20, at most 120), or the longest of --passive (600).",
 )
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
 @click.option(
@@ -87,6 +93,8 @@ def calibrate(
     quick: bool,
     minimal: bool,
     sweep: bool,
+    passive: bool,
+    seconds: float | None,
     step: bool,
     manual: bool,
     listen: bool,
@@ -103,6 +111,7 @@ def calibrate(
     """
     from ftdrive.cell.emulated import REAL_PACE, Station
     from ftdrive.commands.emulated_run import start_mover
+    from ftdrive.errors import ConfigError
     from ftdrive.runs.run import Run
     from ftdrive.session.options import SessionOptions
     from ftdrive.session.rehearsal import described
@@ -112,15 +121,17 @@ def calibrate(
     from ftdrive.terminal.screen import open_operator
 
     _refuse_contradictions(click.get_current_context())
+    if seconds is not None and (seconds > _LONGEST_SWEEP_S if sweep else not passive):
+        raise ConfigError(f"--seconds {seconds:g} goes with --passive, or up to {_LONGEST_SWEEP_S} with --sweep")
     require_viz(as_session["png"], view=as_session["view"])
-    chosen: dict[Mode, bool] = {"sweep": sweep, "step": step, "manual": manual, "listen": listen}
+    chosen: dict[Mode, bool] = {"sweep": sweep, "passive": passive, "step": step, "manual": manual, "listen": listen}
     mode: Mode = next((name for name, given in chosen.items() if given), "auto")
     with ExitStack() as stack:
         description: dict[str, Any] = {}
         made_by = None if resume is None else Run(resume).header_to_resume().get("station")
         simulate = simulate or bool(made_by and not (config or robot or tool))  # a resumed run keeps its cell
         if simulate:
-            pace = REAL_PACE if sweep else ()
+            pace = REAL_PACE if sweep or passive else ()
             station = stack.enter_context(Station.of(made_by, sensor, pace, control_path=control))
             cell = station.cell
             description = described(station)
@@ -130,7 +141,14 @@ def calibrate(
             cell = said.cell() if resume is None else _cell_to_resume(resume, said)
         poses = 6 if minimal else 12 if quick else 24
         options = SessionOptions(
-            runs, poses=poses, mode=mode, resume=resume, real=not simulate, description=description, **as_session
+            runs,
+            poses=poses,
+            mode=mode,
+            seconds=seconds or (600.0 if passive else 20.0),
+            resume=resume,
+            real=not simulate,
+            description=description,
+            **as_session,
         )
         if simulate:
             start_mover(station, options)
