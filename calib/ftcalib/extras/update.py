@@ -34,8 +34,6 @@ BLOCKS: Mapping[str, tuple[Block, ...]] = {
     "mounting": ("mounting",),
     "base": ("gravity direction",),
     "bias and payload": ("weight", "centre of mass", "bias"),
-    "tool and mounting": ("weight", "centre of mass", "bias", "mounting"),
-    "tool and base": ("weight", "centre of mass", "bias", "gravity direction"),
     "all": ("weight", "centre of mass", "bias", "gravity direction", "mounting"),
 }
 """Kinds of update, and what each estimates."""

@@ -34,6 +34,7 @@ _OF_A_PLAN = ("--quick", "--minimal", "--output", "--png", "--view")
 _EXCLUDE_ONE_ANOTHER = (
     ("--step", "--manual", "--listen"),
     ("--quick", "--minimal", "--plan", "--resume"),
+    ("--from", "--resume"),
     *((hand, option) for hand in ("--manual", "--listen") for option in _OF_A_PLAN),
     *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
 )
@@ -51,6 +52,13 @@ _EXCLUDE_ONE_ANOTHER = (
 @simulate()
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
+@click.option(
+    "--from",
+    "earlier",
+    metavar="RESULT",
+    type=click.Path(exists=True, path_type=Path),
+    help="A new tool: take mounting, base and gain from this result of the same sensor; 6 poses unless --quick.",
+)
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
 @click.option(
     "--fast", is_flag=True, help="Full speed of the plan (60 °/s, 250 mm/s at most), after one complete slow run."
@@ -80,6 +88,7 @@ def calibrate(
     simulate: bool,
     quick: bool,
     minimal: bool,
+    earlier: Path | None,
     step: bool,
     manual: bool,
     listen: bool,
@@ -119,7 +128,11 @@ def calibrate(
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool, control)
             description = {"said": asdict(said)}
             cell = said.cell() if resume is None else _cell_to_resume(resume, said)
-        poses = 6 if minimal else 12 if quick else 24
+        if earlier is not None:
+            from ftdrive.runs.source import read_calibration
+
+            description["earlier"] = read_calibration(earlier).to_dict()
+        poses = 12 if quick else 6 if minimal or earlier is not None else 24
         options = SessionOptions(
             runs, poses=poses, mode=mode, resume=resume, real=not simulate, description=description, **as_session
         )
@@ -146,7 +159,8 @@ def calibrate(
 def _refuse_contradictions(context: click.Context) -> None:
     from ftdrive.errors import ConfigError
 
-    given = [f"--{name.replace('_', '-')}" for name, value in context.params.items() if value]
+    params = {"from" if name == "earlier" else name: value for name, value in context.params.items()}
+    given = [f"--{name.replace('_', '-')}" for name, value in params.items() if value]
     for group in _EXCLUDE_ONE_ANOTHER:
         both = [option for option in group if option in given]
         if len(both) > 1:

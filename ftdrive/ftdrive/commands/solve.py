@@ -209,8 +209,8 @@ def _result_of(
             raise ConfigError(f"--method {method} is for poses at rest: leave it out for a recording")
         with working("Solving"):
             return solve_recording(place, **motion, known=read["known"], up_in_base=read["up_in_base"]), ()
-    earlier = read.get("earlier")
-    data = read_source(place, **{key: value for key, value in read.items() if key != "earlier"})
+    data = read_source(place, **{key: value for key, value in read.items() if key not in ("earlier", "alone")})
+    earlier = None if read.get("alone") else read.get("earlier") or data.earlier
     if earlier is not None:
         require_same_cell(earlier, data.provenance)
         return new_tool(earlier, data.dataset, data.provenance), data.records
@@ -228,6 +228,7 @@ def _solve_together(
     as_json: bool,
 ) -> None:
     results = []
+    read = {**read, "alone": True}  # a result from another one would count that twice
     for source in sources:
         with unpacked(source) as place:
             results.append(_result_of(place, "ml", drift, read, {"pair": None, "point_mass": False})[0])

@@ -19,7 +19,9 @@ OTHER = replace(
     p_sensor_com_m=np.array([-0.02, 0.01, 0.11]),
     torque_bias_Nm=TRUTH.torque_bias_Nm + np.array([0.01, 0.0, -0.02]),
 )
-FOUR = Rotation.from_euler("xyz", [[180, 0, 0], [90, 0, 30], [180, 80, 0], [120, -60, 90]], degrees=True).as_matrix()
+_TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
+FOUR = np.array([Rotation.align_vectors([[0, 0, -1.0]], [down])[0].as_matrix() for down in _TETRAHEDRON])
+"""Gravity points evenly in all directions of the flange."""
 
 
 def poses(truth: Parameters, R: Array, seed: int) -> CalibrationDataset:
