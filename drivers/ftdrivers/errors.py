@@ -12,7 +12,8 @@ DeviceError
 └── DeviceFault       the device reports a fault of its own
     └── Frozen
 UsageError
-└── BadUrl
+├── BadUrl
+└── NoRos2
 DataError
 └── BadTranscript
 """
@@ -32,6 +33,7 @@ __all__ = [
     "Frozen",
     "ModelUnknown",
     "NoDashboard",
+    "NoRos2",
     "PortInUse",
     "ProtocolError",
     "StreamBroken",
@@ -84,6 +86,10 @@ class Frozen(DeviceFault):
 
 class BadUrl(UsageError):
     """An address that no driver understands: an error in the configuration, not in the device."""
+
+
+class NoRos2(UsageError):
+    """rclpy, or messages that are needed, cannot be imported, or the arguments of ROS cannot be read."""
 
 
 class BadTranscript(DataError):

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftdrivers.errors import DeviceFault
 from ftdrivers.follow import Follow
+from ftdrivers.sweep import Sweep
 
 Array = NDArray[np.float64]
 
@@ -25,6 +26,8 @@ Guard = Callable[[], None]
 
 NOT_REPORTED: Final = "not reported"
 """Stands for a serial number or a firmware version that a device does not report."""
+WRIST_SENSOR: Final = "UR e-Series wrist sensor (ft_raw_wrench)"
+"""Model of the sensor in the wrist of an arm, which feels the friction of the last joint."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,6 +278,13 @@ class _Device(ABC):
     def identify(self) -> DeviceInfo:
         """Return model, serial number and firmware, as read when the device was opened."""
 
+    def diagnose(self) -> list[Diagnosis]:
+        """Check what only this kind of device has and a program needs, such as the ports of a controller.
+
+        Only reads. The default has nothing to check.
+        """
+        return []
+
     def __enter__(self) -> Self:
         self.open()
         return self
@@ -410,13 +420,6 @@ class RobotArm(_Device):
         """Return the program that runs, as the controller reports it; None where it does not."""
         return None
 
-    def diagnose(self) -> list[Diagnosis]:
-        """Check what only this kind of controller has and a program needs, such as its ports.
-
-        Only reads. Errors become findings. The default has nothing to check.
-        """
-        return []
-
     @abstractmethod
     def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
         """Ask the controller whether it would accept these joint angles (6,). Needs control."""
@@ -437,6 +440,16 @@ class RobotArm(_Device):
         least 20 times a second while the arm moves. Whatever ends the wait early (an exception of the guard, a fault,
         the time-out, Ctrl-C) stops the arm first and is raised afterwards.
         """
+
+    def sweep(self, sweep: Sweep, *, guard: Guard) -> None:
+        """Follow a sweep from the posture where it begins, and return when the arm stands there again. Needs control.
+
+        `guard` and early ends as in `move_to`. The default raises `DeviceFault`.
+        """
+        guard()
+        raise DeviceFault(
+            f"the driver of this arm cannot follow a sweep of {sweep.duration_s:g} s", "calibrate without --sweep"
+        )
 
     @abstractmethod
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:

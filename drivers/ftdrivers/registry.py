@@ -29,9 +29,10 @@ SENSORS: Mapping[str, str] = {
     "robotiq-ft300": "ftdrivers.robotiq.sensor:RobotiqFt300",
     "robotous-can": "ftdrivers.robotous.can:RobotousCan",
     "robotous-serial": "ftdrivers.robotous.serial:RobotousSerial",
+    "ros2": "ftdrivers.ros2.sensor:Ros2Sensor",
     "ur-ft": "ftdrivers.ur.sensor:UrWristSensor",
 }
-ARMS: Mapping[str, str] = {"ur": "ftdrivers.ur.arm:UrArm"}
+ARMS: Mapping[str, str] = {"ros2": "ftdrivers.ros2.arm:Ros2Arm", "ur": "ftdrivers.ur.arm:UrArm"}
 
 _EXTRAS: Mapping[str, str] = {"pynetft": "netft"}
 """The optional part of ftdrive that installs a library."""
@@ -172,7 +173,8 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
     if entry is None:
         known = ", ".join(_names("ftdrive.sensors", SENSORS))
         raise BadUrl(f"{url}: unknown sensor '{parts.scheme}'; known: {known}, as in {_EXAMPLES[0]}")
-    if not parts.address or parts.fragment or not url.lower().startswith(f"{parts.scheme}://"):
+    begins = (f"{parts.scheme}://", "ros2:/")  # a topic is a path, without a host
+    if not parts.address.strip("/") or parts.fragment or not url.lower().startswith(begins):
         raise BadUrl(f"{url}: names no device; write it like {', '.join(_EXAMPLES)}")
     driver = _load(entry)
     if not hasattr(driver, "from_url"):

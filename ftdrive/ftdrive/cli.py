@@ -59,7 +59,8 @@ class _LazyGroup(click.Group):
         if cmd_name not in COMMANDS:
             return None
         # Imported only when the command is called: help is fast.
-        command: click.Command = getattr(importlib.import_module(f"ftdrive.commands.{cmd_name}"), cmd_name)
+        name = cmd_name.replace("-", "_")
+        command: click.Command = getattr(importlib.import_module(f"ftdrive.commands.{name}"), name)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -57,6 +57,9 @@ REHEARSED = ("bundle", "replay", "report", "solve", "export calibration")
 GUIDED = ("calibrate", "verify")
 """They print their events too: test_session.py and test_verify.py."""
 
+ELSEWHERE = {"demo", "ros2", "serve-load", "verify", "stream", "weigh", "fleet serve", "fleet verify"}
+"""Long sessions, servers without an answer, and a question at a terminal: see their tests."""
+
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {
     "bundle": lambda answer: answer["file"].endswith(".zip") and not answer["left_out"],
     "calibrate": lambda answer: answer["verdict"] != "rejected",
@@ -134,7 +137,8 @@ def test_a_full_disk_is_no_crash() -> None:
     [
         name
         for name in names(cli)
-        if name not in ("demo", "live", "push", "record", "stream", "weigh", *GUIDED, *REHEARSED, *OFFLINE)
+        if name
+        not in ("demo", "live", "push", "record", "serve-load", "stream", "weigh", *GUIDED, *REHEARSED, *OFFLINE)
     ],
 )
 def test_every_command_works_with_simulate_and_json(
@@ -194,6 +198,7 @@ ANSWERED: Mapping[str, tuple[str, str]] = {
     "fleet status": ("", "never calibrated"),
     "history": ("{run}/..", "verdict"),
     "init": ("--simulate --yes --height 33 --tool 0:60:90 -o {n}.toml", "Wrote "),
+    "export urscript": ("", "def ftd_weigh():"),
     "live": ("--replay {csv} --once", "N·m"),
     "plan": ("--simulate", "Predicted for"),
     "push": ("{run} --simulate --dry-run", "nothing was sent"),
@@ -205,9 +210,6 @@ ANSWERED: Mapping[str, tuple[str, str]] = {
     "transcript record": ("--simulate -o {n}.jsonl --duration 0.2", " samples, mean "),
 }
 """What each prints on stdout without --json, also with -q."""
-
-ELSEWHERE = {"demo", "verify", "stream", "fleet serve", "fleet verify"}
-"""Long sessions, servers without an answer, and a question at a terminal: see their tests."""
 
 
 def test_no_command_is_forgotten() -> None:

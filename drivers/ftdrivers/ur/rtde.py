@@ -306,6 +306,12 @@ class Subscription:
         if taken := recipe.taken(tuple(inputs)):
             self.close()
             raise registers_taken(host, taken)
+        if "NOT_FOUND" in recipe.types:
+            version = ".".join(map(str, self.version[:3]))
+            raise ConnectError(
+                f"PolyScope {version} on {host} has no input registers 24 to 47 for RTDE clients",
+                "update the controller to 3.9, 5.3 or later",
+            )
         if recipe.types != tuple(inputs.values()):
             raise ProtocolError(f"{', '.join(inputs)} have the types {', '.join(recipe.types)}")
         self._input_recipe = recipe.id

@@ -11,6 +11,7 @@ from ftdrive.errors import ConfigError
 from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrivers.registry import arm_class, sensor_from_url
+from ftdrivers.ur.program_registers import ProgramRegisters
 from ftdrivers.ur.timing import STRICT, UrTiming
 
 
@@ -18,12 +19,14 @@ def build_arm(cell: CellConfig) -> RobotArm:
     """Build the arm's driver, not yet open; it moves at the speed of the cell unless a move names its own."""
     robot = cell.robot
     try:
-        build = cast("Callable[..., RobotArm]", arm_class(robot.driver))
+        by_topic = robot.driver == "ur" and robot.host.startswith("ros2:")
+        driver = "ros2" if by_topic else robot.driver
+        build = cast("Callable[..., RobotArm]", arm_class(driver))
     except BadUrl as error:
         raise ConfigError(f"[robot] driver: {error}") from error
     # Only an emulated arm takes a clock: an arm of another package may not know it.
     more: dict[str, Any] = {"clock": cell.clock} if cell.is_emulated else {}
-    if robot.driver == "ur":
+    if driver == "ur":
         timing = UrTiming.emulated() if cell.is_emulated else STRICT
         stop_rad_s2 = radians(robot.stop_deceleration_deg_s2)
         more |= {"control": robot.control, "stop_rad_s2": stop_rad_s2, "api_port": robot.api_port, "timing": timing}
@@ -44,3 +47,18 @@ def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
     sensor = sensor_from_url(url, sign=cell.sensor.sign, clock=clock)
     _fits: Sensor = sensor
     return sensor
+
+
+def program_registers(cell: CellConfig, first: int, integers: int, doubles: int) -> ProgramRegisters:
+    """Claim registers for answers to the program on the controller.
+
+    Raises
+    ------
+    ConfigError
+        The arm has none.
+    ConnectError
+        Nothing answers, or another client or a fieldbus owns a register.
+    """
+    if cell.robot.driver != "ur":
+        raise ConfigError(f"[robot] driver {cell.robot.driver} has no registers: serve-load needs a UR")
+    return ProgramRegisters(cell.robot.host, first, integers, doubles, clock=cell.clock)

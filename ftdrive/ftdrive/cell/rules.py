@@ -118,7 +118,8 @@ reject_record = unless(lambda s: s == 0 or s >= 3, "give 3 or more, or 0 for non
 
 def reject_host(value: str) -> str | None:
     """Reject a URL where a host is meant."""
-    return "give name or IPv4 address alone, such as 192.168.0.10" if "/" in value else reject_empty(value)
+    is_url = "/" in value and not value.startswith("ros2:")
+    return "give name or IPv4 address alone, such as 192.168.0.10" if is_url else reject_empty(value)
 
 
 def reject_model(value: str) -> str | None:

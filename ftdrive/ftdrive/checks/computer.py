@@ -52,7 +52,8 @@ class SensorAddress:
         """Its serial port, also that of an slcan adapter."""
         if self.scheme.endswith("-can") and self.options.get("interface") == "slcan":
             return Path(self.address.split("@")[0])
-        return Path(self.address) if self.scheme in _ON_SERIAL or self.address.startswith("/") else None
+        is_path = self.address.startswith("/") and self.scheme != "ros2"
+        return Path(self.address) if self.scheme in _ON_SERIAL or is_path else None
 
     @property
     def can_interface(self) -> str | None:

@@ -46,6 +46,8 @@ _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs o
 _RATE_TOLERANCE = 0.1
 _MUCH_NOISE: Final = 2.0
 _LOAD: Final = 0.8
+_COMPENSATED: Final = 0.1
+"""A smaller share of the weight at rest is likely to be compensated or zeroed."""
 _PAYLOAD_MM: Final = 100.0
 """The centre of the payload may be this far outside the described tool."""
 _LINK_S: Final = 0.5
@@ -159,6 +161,19 @@ def _who_answers(address: SensorAddress) -> str:
     if address.host is not None:
         return f"ping {address.host}"
     return "ftdrive doctor again" if address.place is None else f"ftdrive devices --probe {shlex.quote(address.place)}"
+
+
+def check_compensated(wrench: Array, cell: CellConfig) -> Check:
+    """Check that a topic's wrench (n, 6) at rest has the weight of the tool or a bias in it, and is not near 0."""
+    name, mass_kg = "sensor.compensated", cell.tool.mass_kg
+    if mass_kg is None:
+        return Check(name, "skipped", "[tool] mass_kg is not set: whether the topic is compensated is not known")
+    force_N, weight_N = float(np.linalg.norm(np.mean(wrench, axis=0)[:3])), mass_kg * cell.site.g_m_s2
+    found = f"the wrench has {force_N:.1f} N at rest, the tool weighs {weight_N:.1f} N"
+    if force_N > _COMPENSATED * weight_N:
+        return Check(name, "ok", found)
+    fix = "give the topic of the raw wrench, or switch the compensation off; a zeroing that stays does no harm"
+    return Check(name, "warning", f"{found}: this wrench is already compensated or zeroed", fix)
 
 
 def check_stream(samples: FtSamples, health: Health, address: SensorAddress, duration_s: float) -> list[Check]:
@@ -302,10 +317,10 @@ def check_arm(info: DeviceInfo, robot: RobotConfig) -> Check:
     return Check(name, "ok", who(info))
 
 
-def check_diagnosis(diagnosis: Diagnosis) -> Check:
-    """Return what an arm's driver found when it checked its own device."""
+def check_diagnosis(diagnosis: Diagnosis, device: str = "robot") -> Check:
+    """Return what the driver of a robot or a sensor found when it checked its own device."""
     state: State = "ok" if diagnosis.passed else "failed"
-    return Check(f"robot.{diagnosis.name}", state, diagnosis.found, diagnosis.fix or None)
+    return Check(f"{device}.{diagnosis.name}", state, diagnosis.found, diagnosis.fix or None)
 
 
 def check_remote(arm: RobotArm) -> Check:

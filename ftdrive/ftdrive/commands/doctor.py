@@ -190,6 +190,7 @@ def _examine_sensor(
         info = device.identify()
         found += devices.check_identity(info)
         name = "sensor.stream"
+        found += [devices.check_diagnosis(one, "sensor") for one in device.diagnose()]
         samples = device.collect(_LOOK_S)
         health = device.health()
     except DeviceError as error:
@@ -198,6 +199,7 @@ def _examine_sensor(
     return [
         *found,
         devices.check_load(None if limits is None else limits.value, cell),
+        *([devices.check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
         *devices.check_stream(samples, health, address, _LOOK_S),
         *devices.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg),
     ], True

@@ -205,6 +205,32 @@ def calibration(
 
 
 @export.command()
+@click.option("--first", type=click.IntRange(24, 33), default=24, show_default=True, help="As `serve-load --first`.")
+@click.option("--example", is_flag=True, help="Append a program that weighs a part and sets the payload.")
+@click.option("-o", "--output", type=NewFile(), help="Save as a new file instead of printing to stdout.")
+@simulate("Accepted for symmetry: the functions are the same.")
+@JSON
+def urscript(first: int, example: bool, output: Path | None, simulate: bool, as_json: bool) -> None:  # noqa: ARG001
+    """Write the functions with which a UR program uses `ftdrive serve-load`.
+
+    ftd_zero, ftd_weigh, ftd_wrench, ftd_alive, ftd_status and ftd_payload. Each waits with a time limit and returns a
+    state, never an old number.
+    """
+    from ftcalib.files import write_new
+    from ftdrive.exports.program_functions import functions
+    from ftdrive.terminal.console import beside
+
+    text = functions(first, example=example)
+    if output is not None:
+        write_new(output, text)
+        beside(as_json).print(f" Saved {output}")
+    if as_json:
+        write_json({"schema_version": 1, "file": None if output is None else str(output), "text": text})
+    elif output is None:
+        echo(text, nl=False, fold=False)
+
+
+@export.command()
 @JSON
 def formats(as_json: bool) -> None:
     """List the formats of `ftdrive export calibration`."""

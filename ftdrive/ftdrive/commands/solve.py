@@ -36,7 +36,9 @@ from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.recording.in_motion import is_recording, solve_recording
 from ftdrive.runs.bundle import unpacked
+from ftdrive.runs.outcome import solve_in_motion
 from ftdrive.runs.pose_hints import hints
+from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import read_source
 from ftdrive.terminal.console import beside, working
 from ftdrive.terminal.report import print_comparison, print_result
@@ -152,7 +154,7 @@ def _solve_each(
     for source in sources:
         try:
             with unpacked(source) as place:
-                if method == "all" and motion["pair"] is None and not is_recording(place):
+                if method == "all" and motion["pair"] is None and not (is_recording(place) or in_motion(place)):
                     data = read_source(place, **read)
                     _show_all(source, data.dataset, {"drift": drift, **data.circumstances}, as_json)
                     continue
@@ -182,9 +184,12 @@ def _result_of(
     place: Path, method: str, drift: Drift, read: dict[str, Any], motion: dict[str, Any]
 ) -> tuple[CalibrationResult, Sequence[PoseRecord]]:
     """Solve a recording in motion, or poses; also return the records of a run."""
-    if motion["pair"] is not None or is_recording(place):
+    if motion["pair"] is not None or is_recording(place) or in_motion(place):
         if method != "ml":
             raise ConfigError(f"--method {method} is for poses at rest: leave it out for a recording")
+        if in_motion(place):
+            with working("Solving"):
+                return solve_in_motion(Run(place), read["known"], point_mass=motion["point_mass"]), ()
         with working("Solving"):
             return solve_recording(place, **motion, known=read["known"], up_in_base=read["up_in_base"]), ()
     data = read_source(place, **read)

@@ -1,6 +1,7 @@
 """Weigh what the gripper holds, from half a second of a stream at rest."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from typing import Final, get_args
 
@@ -16,7 +17,7 @@ from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Paired, StreamEvent, StreamInfo
 from ftdrive.live.stream import CompensatedStream
-from ftdrive.live.tare import TARE_S, is_still
+from ftdrive.live.tare import TARE_S, is_still, try_tare
 from ftdrivers.clock import Clock
 from ftdrivers.interfaces import Array
 
@@ -131,6 +132,14 @@ class Scale:
             raise CannotWeigh("not-empty")
         self._readings = []
         return event
+
+    def warm_up(self) -> None:
+        """Compute once what a weighing and a zero compute: the first time takes ten times as long as later ones."""
+        rows = self._stream.recent()
+        if rows is not None and len(rows) >= LEAST_SAMPLES:
+            try_tare(rows, self._stream.reference()[0])
+            with suppress(CannotWeigh):
+                self.weigh()
 
     def _rest(self, since_ns: int) -> tuple[Array, PoseMean]:
         rows = self._stream.recent()

@@ -261,7 +261,7 @@ def test_a_driver_that_is_no_stream_of_ours_takes_no_options_of_ours(install: In
 def test_arms() -> None:
     assert arm_class() is UrArm
     assert arm_class("ur") is UrArm
-    with pytest.raises(BadUrl, match=r"unknown arm 'kuka'; known: ur$"):
+    with pytest.raises(BadUrl, match=r"unknown arm 'kuka'; known: ros2, ur$"):
         arm_class("kuka")
 
 

@@ -1,0 +1,123 @@
+"""A force/torque sensor of any make, as a topic of ROS 2.
+
+Ref: geometry_msgs/msg/WrenchStamped; REP 103 (SI units), REP 105 (frames), REP 107 (stamps).
+Checked on hardware: no. Verified against: tests/ros2.
+
+The wrench must be as measured: not compensated for a payload and not filtered for contact. A zeroing that does not
+change while ftdrive runs is a part of the bias. Whether it is compensated, `doctor` and the calibration show.
+"""
+
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import ConnectError, ProtocolError
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Diagnosis, Fact, FtSamples
+from ftdrivers.ros2.middleware import Node
+from ftdrivers.ros2.subscription import Received, clock_diagnosis, stamp_s, subscribe
+from ftdrivers.streaming.sensor import NOTHING, StreamingSensor
+
+if TYPE_CHECKING:
+    from ftdrivers.registry import Options
+
+_TYPE = "geometry_msgs/msg/WrenchStamped"
+_WAIT_S = 0.05
+
+
+class Ros2Sensor(StreamingSensor):
+    """The WrenchStamped of a topic.
+
+    `t_device_s` is the stamp of the header, `seq` the number that the publisher's middleware gave, so that lost
+    messages are gaps. `counts` are empty and `status` is 0. The rate is that of the topic; none is nominal.
+
+    Parameters
+    ----------
+    topic : str
+        Such as ``/ft_sensor/wrench``.
+    reliable : bool
+        Request reliable delivery; the publisher must offer it.
+    sign : int
+        -1 for a sensor that reports the reaction.
+    """
+
+    def __init__(self, topic: str, *, reliable: bool = False, sign: int = 1, clock: Clock = REAL) -> None:
+        super().__init__(f"ROS 2 topic {topic}", sign=sign, clock=clock)
+        self._topic, self._reliable = topic, reliable
+        self._ros: Node | None = None
+        self._queue: SimpleQueue[Received] = SimpleQueue()
+        self._frame_id: str | None = None
+
+    @classmethod
+    def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
+        """Build from ``ros2:/topic?reliable=0``."""
+        topic = "/" + address.lstrip("/")
+        return cls(topic, reliable=bool(options.integer("reliable", 0, 0, 1)), sign=sign, clock=clock)
+
+    def _connect(self) -> DeviceInfo:
+        self._queue, self._frame_id = SimpleQueue(), None
+        self._ros = Node("ftdrive_sensor")
+        self._ros.spin()
+        publisher = subscribe(self._ros, self._topic, _TYPE, self._queue.put, self._clock, reliable=self._reliable)
+        frame_id = self._first_frame()
+        facts = {"publisher": Fact(publisher, "device"), "frame_id": Fact(frame_id, "device")}
+        return DeviceInfo(f"{self.name}, frame {frame_id}", NOT_REPORTED, NOT_REPORTED, facts)
+
+    def _first_frame(self) -> str:
+        """Return the frame of the first message and drop it."""
+        try:
+            first = self._queue.get(timeout=self._limits.first_sample_s)
+        except Empty:
+            raise ConnectError(f"no message of {self._topic} arrived", self._silence_fix()) from None
+        self._check_frame({first.message.header.frame_id})
+        return str(first.message.header.frame_id)
+
+    def _read_block(self) -> FtSamples:
+        if self._ros is not None:
+            self._ros.check()
+        try:
+            received = [self._queue.get(timeout=_WAIT_S)]
+        except Empty:
+            return NOTHING
+        while not self._queue.empty():
+            received.append(self._queue.get_nowait())
+        messages = [one.message for one in received]
+        self._check_frame({message.header.frame_id for message in messages})
+        numbers = np.array([one.number for one in received])
+        newest = int(self._newest.seq[-1]) if len(self._newest) else int(numbers[0]) - 1
+        self._lost += max(0, int(numbers[-1]) - newest - len(numbers))
+        return FtSamples.of(
+            [one.t_host_ns for one in received],
+            numbers,
+            [
+                [getattr(part, axis) for part in (one.wrench.force, one.wrench.torque) for axis in "xyz"]
+                for one in messages
+            ],
+            t_device_s=[stamp_s(message.header, self._topic) for message in messages],
+        )
+
+    def _check_frame(self, frames: set[str]) -> None:
+        """Raise `ProtocolError` for another frame: the wrench would be in other axes."""
+        self._frame_id = self._frame_id or min(frames)
+        if frames != {self._frame_id}:
+            other = ", ".join(sorted(frames - {self._frame_id}))
+            raise ProtocolError(
+                f"{self.name}: the frame changed from {self._frame_id!r} to {other!r}", "give each frame its own topic"
+            )
+
+    def _disconnect(self) -> None:
+        ros, self._ros = self._ros, None
+        if ros is not None:
+            ros.close()
+
+    def diagnose(self) -> list[Diagnosis]:
+        """Report who publishes in which frame, and by how much the stamps differ from the clock of this computer."""
+        facts = self.identify().facts
+        found = f"published by {facts['publisher'].value}, frame {facts['frame_id'].value!r}"
+        topic = Diagnosis("topic", bool(facts["frame_id"].value), found, "set header.frame_id in its driver")
+        newest = self.latest(timeout_s=1.0)
+        return [topic, *([clock_diagnosis(self._ros, float(newest.t_device_s[0]))] if self._ros else [])]
+
+    def _silence_fix(self) -> str:
+        return "check that its driver runs"

@@ -1,0 +1,144 @@
+"""One topic of another program: who publishes it, and each message with its stamp, number and time of receipt."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple
+
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, ProtocolError
+from ftdrivers.interfaces import Diagnosis
+from ftdrivers.ros2.middleware import Node, ros2_module
+
+DISCOVERY_S: Final = 3.0
+"""Until the publishers of a topic are known."""
+_SAME_CLOCK_MS: Final = 2.0
+_LONGEST_WAY_MS: Final = 30.0
+"""A stamp that is older by the clock of this computer was given by another clock."""
+_UNNAMED: Final = "NAME_UNKNOWN"
+_UNNUMBERED: Final = (1 << 64) - 1
+
+
+class Received(NamedTuple):
+    """A message with what is known of its way."""
+
+    message: Any
+    t_host_ns: int
+    number: int
+    """Of its publisher, so that lost messages are gaps; counted here where the middleware gives none."""
+
+
+def subscribe(
+    ros: Node, topic: str, kind: str, on_message: Callable[[Received], None], clock: Clock, *, reliable: bool = False
+) -> str:
+    """Wait for the one publisher of a topic, and receive its messages from now on, in the thread of the node.
+
+    Parameters
+    ----------
+    ros : Node
+    topic : str
+    kind : str
+        Such as "geometry_msgs/msg/WrenchStamped".
+    reliable : bool
+        Request reliable delivery, which the publisher must offer.
+
+    Returns
+    -------
+    str
+        Name of the publishing node.
+
+    Raises
+    ------
+    ConnectError
+        Nobody publishes the topic, two nodes do, its type is another one, or it offers best effort alone.
+    """
+    package, _, name = kind.partition("/msg/")
+    message_type = getattr(ros2_module(f"{package}.msg"), name)
+    publisher = _publisher(ros, topic, kind, clock, reliable=reliable)
+    qos = ros2_module("rclpy.qos")
+    reliability = qos.ReliabilityPolicy.RELIABLE if reliable else qos.ReliabilityPolicy.BEST_EFFORT
+    profile = qos.QoSProfile(depth=1000, reliability=reliability)
+    count = 0
+
+    def received(message: Any, info: Any) -> None:
+        nonlocal count
+        t_host_ns = clock.now_ns()
+        count += 1
+        number = _number(info)
+        on_message(Received(message, t_host_ns, count if number is None else number))
+
+    ros.node.create_subscription(message_type, topic, received, profile)
+    return publisher
+
+
+def subscribe_to_tf(ros: Node, topic: str, on_message: Callable[[Received], None], clock: Clock) -> None:
+    """Receive /tf or /tf_static, which many nodes publish. Raises `NoRos2` where tf2_msgs is missing."""
+    qos = ros2_module("rclpy.qos")
+    is_static = topic == "/tf_static"
+    profile = qos.QoSProfile(
+        depth=1000,
+        reliability=qos.ReliabilityPolicy.RELIABLE if is_static else qos.ReliabilityPolicy.BEST_EFFORT,
+        durability=qos.DurabilityPolicy.TRANSIENT_LOCAL if is_static else qos.DurabilityPolicy.VOLATILE,
+    )
+    message_type = ros2_module("tf2_msgs.msg").TFMessage
+    ros.node.create_subscription(
+        message_type, topic, lambda message: on_message(Received(message, clock.now_ns(), 0)), profile
+    )
+
+
+def clock_diagnosis(ros: Node, newest_s: float) -> Diagnosis:
+    """Compare the newest stamp with the clock of this computer."""
+    behind_ms = 1e3 * (ros.node.get_clock().now().nanoseconds * 1e-9 - newest_s)
+    if -_SAME_CLOCK_MS < behind_ms < _LONGEST_WAY_MS:
+        return Diagnosis("clock", True, f"the newest stamp is {behind_ms:.1f} ms old by the clock of this computer")
+    where = f"{behind_ms:.0f} ms behind" if behind_ms > 0 else f"{-behind_ms:.0f} ms ahead of"
+    found = f"another clock: the stamps are {where} that of this computer; the delay is estimated from motion"
+    return Diagnosis("clock", True, found)
+
+
+def _number(info: Any) -> int | None:
+    """Return the number that the publisher gave a message; rclpy passes a mapping, or before Jazzy an object."""
+    found = info.get("publication_sequence_number") if isinstance(info, Mapping) else None
+    return None if found is None or found >= _UNNUMBERED else int(found)
+
+
+def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool) -> str:
+    found: list[Any] = []
+    for _ in clock.looks(DISCOVERY_S):
+        found = ros.node.get_publishers_info_by_topic(topic)
+        if found and not any(_UNNAMED in one.node_name for one in found):  # names arrive later
+            break
+        clock.sleep(0.05)
+    kinds = sorted({one.topic_type for one in found})
+    names = sorted(
+        "a program without a node" if _UNNAMED in one.node_name else f"{one.node_namespace.rstrip('/')}/{one.node_name}"
+        for one in found
+    )
+    if not found:
+        same = [name for name, types in ros.node.get_topic_names_and_types() if kind in types and name != topic]
+        others = f"topics of this type: {', '.join(same)}" if same else "no topic has this type"
+        domain = "check the name, ROS_DOMAIN_ID and that its driver runs"
+        raise ConnectError(f"no node publishes {topic} ({kind}); {others}", domain)
+    if kinds != [kind]:
+        raise ConnectError(f"{topic} has the type {', '.join(kinds)}, needed is {kind}", "give another topic")
+    if len(found) > 1:
+        raise ConnectError(f"{len(found)} nodes publish {topic}: {', '.join(names)}", "stop all but one of them")
+    best_effort = ros2_module("rclpy.qos").ReliabilityPolicy.BEST_EFFORT
+    if reliable and found[0].qos_profile.reliability == best_effort:
+        raise ConnectError(f"{topic} is offered with best effort alone", "leave the option reliable out")
+    return names[0]
+
+
+def stamp_s(header: Any, topic: str) -> float:
+    """Return the time of a header in seconds. Raises `ProtocolError` for one that was not set."""
+    seconds = header.stamp.sec + 1e-9 * header.stamp.nanosec
+    if seconds <= 0:
+        raise ProtocolError(
+            f"the messages of {topic} have the stamp {seconds:g}, so they cannot be paired",
+            "set header.stamp to the time of measurement in its driver",
+        )
+    return float(seconds)
+
+
+def is_finite(*values: float) -> bool:
+    """Return whether all are numbers."""
+    return all(map(math.isfinite, values))

@@ -1,0 +1,91 @@
+"""`ftdrive ros2`: the compensated wrench as topics of ROS 2."""
+
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, cast
+
+import click
+
+from ftdrive.commands.common import CALIBRATION_OR_TOOL, CELL, FRAME, check_simulate, read_cell, read_frame, simulate
+from ftdrive.errors import ConfigError
+from ftdrive.live.samples import Axes
+from ftdrive.live.stream import CompensatedStream
+from ftdrive.runs.source import read_calibration
+from ftdrive.session.rehearsal import short_calibration, station_of
+from ftdrive.terminal.console import messages
+from ftdrive.terminal.screen import open_operator
+from ftdrivers.ros2.middleware import ros2_module
+
+_ROS_ARGS = "--ros-args"
+
+
+class _RosCommand(click.Command):
+    """Keeps the arguments of ROS, which begin with `--ros-args`, from click."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        start = args.index(_ROS_ARGS) if _ROS_ARGS in args else len(args)
+        rest = super().parse_args(ctx, args[:start])
+        ctx.params["ros_args"] = tuple(args[start:])
+        return rest
+
+
+@click.command(cls=_RosCommand)
+@CALIBRATION_OR_TOOL
+@CELL
+@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@FRAME
+@click.option(
+    _ROS_ARGS,
+    "ros_args",
+    metavar="...",
+    help="Arguments of ROS until the end of the line: -r __ns:=/cell_1, -p rate:=100.0, --params-file FILE.",
+)
+def ros2(
+    path: Path | None,
+    tool: str | None,
+    force: bool,
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    simulate: bool,
+    axes: Axes,
+    about: str,
+    ros_args: Sequence[str],
+) -> None:
+    """Publish the raw and the compensated wrench as topics of ROS 2.
+
+    The node has ~/wrench_raw, ~/wrench, ~/contact, ~/status, /diagnostics and the services ~/tare and ~/undo_tare.
+    `ros2 param describe` explains each parameter. While a device is silent or the calibration does not fit, no wrench
+    is published and /diagnostics has the reason. The arm is only read, never moved. Ctrl-C ends.
+    """
+    ros2_module("rclpy")  # before any work
+    from ftdrive.servers.ros2.node import Ros2Node
+
+    check_simulate(simulate, real={"--tool": tool, "--config": config, "--robot": robot})
+    if path is not None and tool is not None:
+        raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
+    frame = read_frame(axes, about)
+    calibration = None if path is None else read_calibration(path, accept_edited=force)
+    cell = None if simulate else read_cell(config, robot, sensor)
+    try:
+        with closing(Ros2Node(ros_args, frame=frame, tool=tool or "")) as node:
+            if simulate and calibration is None:
+                with open_operator() as operator:
+                    calibration = short_calibration(operator, sensor)
+            if calibration is None and not node.parameters.tool:
+                raise ConfigError("no calibration: give --calibration PATH or --tool NAME, or --simulate")
+
+            def open_stream() -> CompensatedStream:
+                source = station_of(calibration, sensor) if cell is None and calibration is not None else cell
+                name = "temporary calibration" if path is None else str(path)
+                chosen = node.parameters.tool or calibration
+                return CompensatedStream(cast(Any, source), cast(Any, chosen), name=name, force=force)
+
+            messages.print(
+                f"Node {node.name} publishes {node.name}/wrench in {node.parameters.frame}, at most "
+                f"{node.fixed.rate:g} Hz, {'reliable' if node.fixed.reliable else 'best effort'}. Ctrl-C ends."
+            )
+            node.serve(open_stream)
+    except KeyboardInterrupt:
+        messages.print("The node has ended.")

@@ -1,0 +1,73 @@
+"""`ftdrive serve-load`: weight and contact wrench for the program that runs on the controller."""
+
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+
+import click
+
+from ftdrive.cell.devices import program_registers
+from ftdrive.commands.common import CALIBRATION_OR_TOOL, CELL, read_frame, simulate
+from ftdrive.commands.live_source import open_source
+from ftdrive.errors import ConfigError
+from ftdrive.live.samples import Axes
+from ftdrive.servers.program import DOUBLES, INTEGERS, ProgramService
+from ftdrive.terminal.console import messages
+from ftdrivers.ur.program_registers import FIRST, LAST
+
+
+@click.command()
+@CALIBRATION_OR_TOOL
+@CELL
+@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@click.option(
+    "--axes",
+    type=click.Choice(["sensor", "flange", "base", "tcp"]),
+    default="base",
+    show_default=True,
+    help="Axes of the wrench.",
+)
+@click.option(
+    "--about",
+    default="tcp",
+    show_default=True,
+    metavar="POINT",
+    help="Reference point of the torque: sensor, flange, tcp, or x,y,z in m from the flange along its axes.",
+)
+@click.option("--first", type=int, default=FIRST, show_default=True, help="First register of each kind.")
+def serve_load(
+    path: Path | None,
+    tool: str | None,
+    force: bool,
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    simulate: bool,
+    axes: Axes,
+    about: str,
+    first: int,
+) -> None:
+    """Answer the program on the controller: weigh a part, zero, and the contact wrench all the time.
+
+    Any program may run. It requests in two output registers and reads input registers, with the functions of `ftdrive
+    export urscript`. Nothing else is sent, and the arm is never moved. Ctrl-C ends.
+    """
+    last = LAST + 1 - max(len(INTEGERS), len(DOUBLES))
+    if not FIRST <= first <= last:
+        raise ConfigError(
+            f"--first is {first}: give {FIRST} to {last}, because fieldbuses and PLCs own the registers below {FIRST}, "
+            f"and {LAST} is the last one"
+        )
+    frame = read_frame(axes, about)
+    with ExitStack() as stack:
+        stream = open_source(
+            path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
+        )
+        if stream.cell.sensor.height_mm is None:
+            raise ConfigError("the centre of mass of a part needs [sensor] height_mm: set it, see `ftdrive init`")
+        connect = partial(program_registers, stream.cell, first, len(INTEGERS), len(DOUBLES))
+        service = ProgramService(stream, connect, messages.print)
+        messages.print(
+            f"Serving weight and wrench ({stream.frame}) in the registers from {first}; {stream.info.calibration_name}."
+        )
+        service.run()

@@ -1,0 +1,1 @@
+"""The compensated wrench as topics of ROS 2."""

@@ -1,0 +1,303 @@
+"""The node of `ftdrive ros2`: a compensated stream as topics, services, parameters and diagnostics.
+
+Conventions are those of REP 103, 105 and 107: SI units, a `frame_id` whose axes and origin a wrench has, stamps of the
+time of measurement. A fault is a missing message and a diagnostic, never an old or a zero wrench.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from queue import Empty, SimpleQueue
+from threading import Event
+from typing import Any, Final
+
+from ftdrive.errors import ConfigError
+from ftdrive.live import ros2
+from ftdrive.live.processing import SENSOR_FRAME
+from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
+from ftdrive.live.stream import CompensatedStream
+from ftdrive.servers.averaged import Averaged
+from ftdrive.servers.ros2.diagnostics import Level, Report, not_open, reports_of
+from ftdrive.servers.ros2.parameters import NodeParameters
+from ftdrive.servers.ros2.transforms import Transforms
+from ftdrivers.errors import DeviceError
+from ftdrivers.ros2.middleware import Node, ros2_module
+
+NAME: Final = "ftdrive"
+REPORT_S: Final = 0.4
+"""Between two reports; a fault is reported at once."""
+_CONTACT_S: Final = 0.1
+_DISCOVERY_S: Final = 1.0
+"""Until the nodes of this computer and its network are known."""
+_RETRY_S: Final = 2.0
+"""After a device did not open."""
+_RETRY_CONFIG_S: Final = 10.0
+"""After the calibration did not fit: somebody has to calibrate, or to choose another tool."""
+_HISTORY_S: Final = 10.0
+"""Of a reliable topic: Fast DDS asks for what was lost every 3 s."""
+_TOOL_S: Final = 5.0
+_WARNINGS: Final = ("tare-refused", "drift", "gap", "stale")
+
+
+class Ros2Node:
+    """Publishes a stream until it is closed.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        Of ROS, such as ``("--ros-args", "-r", "__ns:=/cell_1", "-p", "axes:=base")``.
+    frame : WrenchFrame
+        Of `~/wrench`, if the arguments of ROS set no other one.
+    tool : str
+        Name of the tool; empty if a calibration is given.
+
+    Raises
+    ------
+    NoRos2
+        rclpy cannot be imported, or does not understand the arguments.
+    ConfigError
+        A parameter cannot be used, or another node of this name runs.
+    """
+
+    def __init__(self, arguments: Sequence[str] = (), *, frame: WrenchFrame = SENSOR_FRAME, tool: str = "") -> None:
+        self._wrench = ros2_module("geometry_msgs.msg").WrenchStamped
+        self._bool = ros2_module("std_msgs.msg").Bool
+        self._diagnostics = ros2_module("diagnostic_msgs.msg")
+        self._trigger = ros2_module("std_srvs.srv").Trigger
+        self._ros = Node(NAME, arguments)
+        self.node = self._ros.node
+        try:
+            self._set_up(frame, tool)
+        except BaseException:
+            self._ros.close()
+            raise
+
+    def _set_up(self, frame: WrenchFrame, tool: str) -> None:
+        node = self.node
+        self._log = node.get_logger()
+        self.parameters = NodeParameters(node, frame, tool)
+        self.fixed = self.parameters.fixed
+        self._require_alone()
+        sensor_data = self._quality()
+        self._raw = node.create_publisher(self._wrench, "~/wrench_raw", sensor_data)
+        self._compensated = node.create_publisher(self._wrench, "~/wrench", sensor_data)
+        self._contact = node.create_publisher(self._bool, "~/contact", 10)
+        self._status = node.create_publisher(self._diagnostics.DiagnosticStatus, "~/status", 10)
+        self._overall = node.create_publisher(self._diagnostics.DiagnosticArray, "/diagnostics", 10)
+        node.create_service(self._trigger, "~/tare", self._tare)
+        node.create_service(self._trigger, "~/undo_tare", self._undo_tare)
+        self._transforms = Transforms(node, self.fixed)
+        self._stream: CompensatedStream | None = None
+        self._averaged: Averaged | None = None
+        self._wanted: SimpleQueue[tuple[str, list[str], Event]] = SimpleQueue()
+        """Tools that clients request: name, where the reason of a refusal goes, when it is decided."""
+        self._failure, self._reported, self._reported_s, self._lost = "", list[Report](), 0.0, 0
+        self._in_contact, self._contact_s, self.sent = False, 0.0, 0
+        self._ros.spin()
+
+    def _quality(self) -> Any:
+        """Return the quality of service of the wrench topics."""
+        qos = ros2_module("rclpy.qos")
+        if not self.fixed.reliable:
+            return qos.qos_profile_sensor_data
+        depth = max(10, round(_HISTORY_S * self.fixed.rate))
+        return qos.QoSProfile(depth=depth, reliability=qos.ReliabilityPolicy.RELIABLE)
+
+    def _require_alone(self) -> None:
+        """Raise `ConfigError` if another node of this name reports; one that was killed may still be listed."""
+        received = Event()
+        subscription = self.node.create_subscription(
+            self._diagnostics.DiagnosticStatus, "~/status", lambda _: received.set(), 10
+        )
+        begin_s = time.monotonic()
+        while not received.is_set():
+            self._ros.spin_once(0.05)
+            waited_s = time.monotonic() - begin_s
+            is_listed = self.node.count_publishers(subscription.topic_name) > 0
+            if waited_s > (_DISCOVERY_S + 3 * REPORT_S if is_listed else _DISCOVERY_S):
+                break
+        self.node.destroy_subscription(subscription)
+        if received.is_set():
+            name = self.node.get_fully_qualified_name()
+            raise ConfigError(
+                f"another node {name} runs already: stop it, or give this one a name: --ros-args -r __node:={NAME}_2"
+            )
+
+    @property
+    def name(self) -> str:
+        """With its namespace."""
+        return str(self.node.get_fully_qualified_name())
+
+    def close(self) -> None:
+        """Leave the graph of ROS."""
+        self._ros.close()
+
+    # -------------------------------------------------------------------------------------------------------- serving
+
+    def serve(self, open_stream: Callable[[], AbstractContextManager[CompensatedStream]]) -> None:
+        """Open the stream and publish it, again after each failure, until an exception such as Ctrl-C ends it."""
+        while True:
+            try:
+                self._report(not_open("the devices are being opened", Level.STALE))
+                with open_stream() as stream:
+                    self.begin(stream)
+                    while True:
+                        self._turn(stream)
+            except (ConfigError, DeviceError) as error:
+                self.end()
+                self._fail(error)
+                wait_s = _RETRY_S if isinstance(error, DeviceError) else _RETRY_CONFIG_S
+                until_s = time.monotonic() + wait_s
+                while time.monotonic() < until_s:
+                    self._report(not_open(str(error), Level.ERROR))
+                    time.sleep(REPORT_S)
+            finally:
+                self.end()
+
+    def begin(self, stream: CompensatedStream) -> None:
+        """Publish this stream from now on."""
+        self._stream = stream
+        self._lost = stream.status().sensor.lost
+        self._averaged = Averaged(stream.info.sensor_rate_Hz, self.fixed.rate)
+        self._transforms.use(stream.info)
+        stream.frame, stream.stages = self.parameters.frame, self.parameters.stages
+        self.parameters.apply = self._apply
+        if self._failure:
+            self._failure = ""
+            self._log.info("The devices are open.")
+
+    def end(self) -> None:
+        """Publish no stream."""
+        self._stream = self._averaged = self.parameters.apply = None
+
+    def _turn(self, stream: CompensatedStream) -> None:
+        self._ros.check()
+        self._change_tool(stream)
+        try:
+            block = stream.read()
+        except DeviceError as error:
+            if self._averaged is not None:
+                self._averaged.restart()
+            self._fail(error)
+            self.report()
+        else:
+            self._failure = ""
+            self.write(block)
+        for event in stream.take_events():
+            self.event(event)
+
+    def write(self, block: Block) -> None:
+        """Publish the means that are complete with a block."""
+        if self._stream is None or self._averaged is None:
+            return
+        means = self._averaged.add(block)
+        info = self._stream.info
+        if len(means.t_host_ns):
+            t_ns = means.t_host_ns + info.utc_offset_ns
+            frame_id = self._transforms.frame_id(block.frame)
+            for publisher, wrench, frame in (
+                (self._raw, means.raw, self.fixed.sensor_frame),
+                (self._compensated, means.wrench, frame_id),
+            ):
+                for message in ros2.pack_wrenches(t_ns, wrench, frame).tolist():
+                    publisher.publish(message)
+            self.sent += len(t_ns)
+            self._publish_contact(bool(means.in_contact[-1]))
+            self._transforms.publish(block, info, int(t_ns[-1]))
+        if time.monotonic() - self._reported_s >= REPORT_S:
+            self.report()
+
+    def event(self, event: StreamEvent) -> None:
+        """Log an event."""
+        (self._log.warning if event.kind in _WARNINGS else self._log.info)(event.text)
+
+    def _publish_contact(self, in_contact: bool) -> None:
+        now_s = time.monotonic()
+        if in_contact != self._in_contact or now_s - self._contact_s >= _CONTACT_S:
+            self._in_contact, self._contact_s = in_contact, now_s
+            self._contact.publish(self._bool(data=in_contact))
+
+    # ------------------------------------------------------------------------------------------------------- reporting
+
+    def _fail(self, error: Exception) -> None:
+        """Log a failure once, however often it is tried again."""
+        if (text := str(error)) != self._failure:
+            self._failure = text
+            self._log.error(text)
+
+    def report(self) -> None:
+        """Publish the state of the stream in diagnostics and status."""
+        if self._stream is not None:
+            reports = reports_of(self._stream, self._stream.warnings, self._lost, self.sent)
+            self._lost = self._stream.status().sensor.lost
+            self._report(reports)
+
+    def _report(self, reports: list[Report]) -> None:
+        """Publish reports, at once if a level has changed."""
+        now_s = time.monotonic()
+        levels, before = ([(one.part, one.level) for one in some] for some in (reports, self._reported))
+        if levels == before and now_s - self._reported_s < 0.9 * REPORT_S:
+            return
+        self._reported, self._reported_s = reports, now_s
+        messages = [report.message(self.node.get_name()) for report in reports]
+        array = self._diagnostics.DiagnosticArray(status=messages)
+        array.header.stamp = self.node.get_clock().now().to_msg()
+        self._overall.publish(array)
+        self._status.publish(messages[0])
+
+    # ---------------------------------------------------------------------------------------- what clients may request
+
+    def _tare(self, _: Any, response: Any) -> Any:
+        return self._answer(response, lambda stream: stream.tare())
+
+    def _undo_tare(self, _: Any, response: Any) -> Any:
+        return self._answer(response, lambda stream: stream.undo_tare())
+
+    def _answer(self, response: Any, action: Callable[[CompensatedStream], StreamEvent]) -> Any:
+        """Do what a service requests, in the thread of the node."""
+        stream = self._stream
+        if stream is None or self._failure:
+            why = self._failure or "the devices are being opened"
+            response.success, response.message = False, f"refused: {why}"
+        else:
+            event = action(stream)
+            response.success, response.message = event.kind != "tare-refused", event.text
+        return response
+
+    def _apply(self, frame: WrenchFrame, stages: Stages, tool: str) -> None:
+        """Apply parameters, in the thread of the node. Raises `ConfigError`; then none has changed."""
+        stream = self._stream
+        if stream is None:
+            return
+        before = stream.frame, stream.stages
+        try:
+            stream.frame, stream.stages = frame, stages
+            if tool != self.parameters.tool:
+                self._request_tool(tool)
+        except ConfigError:
+            stream.frame, stream.stages = before
+            raise
+
+    def _request_tool(self, tool: str) -> None:
+        if not tool:
+            raise ConfigError("tool cannot be empty while the node runs: set the name of a tool")
+        refusal, decided = list[str](), Event()
+        self._wanted.put((tool, refusal, decided))
+        if not decided.wait(_TOOL_S):
+            raise ConfigError(f"tool {tool!r} was not applied within {_TOOL_S:g} s, because no samples arrive")
+        if refusal:
+            raise ConfigError(refusal[0])
+
+    def _change_tool(self, stream: CompensatedStream) -> None:
+        """Change to the tool that a client requests, between two reads."""
+        try:
+            tool, refusal, decided = self._wanted.get_nowait()
+        except Empty:
+            return
+        try:
+            stream.use_tool(tool)
+            self._transforms.use(stream.info)
+        except (ConfigError, DeviceError) as error:
+            refusal.append(str(error))
+        finally:
+            decided.set()

@@ -1,0 +1,115 @@
+"""The service for a program: which registers it writes, and how it answers."""
+
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from ftdrive.live.replay import ReplayedStream
+from ftdrive.live.samples import WrenchFrame
+from ftdrive.servers.program import DOUBLES, INTEGERS, ProgramService
+from ftdrivers.errors import StreamBroken
+from tests.unit.ftdrive.live.simulated import calibrated, info
+from tests.unit.ftdrive.live.test_weighing import NOTHING, POSE, part, rests
+
+WEIGH, ZERO, STATUS = 1, 2, 3
+
+
+class FakeRegisters:
+    def __init__(self) -> None:
+        self.request: tuple[int, int] | None = (5, WEIGH)
+        """Of a program before."""
+        self.written: list[dict[str, float]] = []
+        self.broken = False
+
+    def write(self, integers: list[int], doubles: list[float]) -> None:
+        if self.broken:
+            raise StreamBroken("the cable is cut")
+        self.written.append(dict(zip((*INTEGERS, *DOUBLES), [*integers, *doubles], strict=True)))
+
+    def close(self) -> None:
+        pass
+
+
+class Cell:
+    """A service on a recording."""
+
+    def __init__(self, *each: Any, seconds: float = 1.0) -> None:
+        self.stream = ReplayedStream(
+            info(calibrated()), rests(*each, seconds=seconds), frame=WrenchFrame("base", "tcp"), speed=float("inf")
+        )
+        self.registers = FakeRegisters()
+        self.said: list[str] = []
+        self.service = ProgramService(cast("Any", self.stream), lambda: self.registers, self.said.append)
+
+    def run(self, seconds: float) -> dict[str, float]:
+        n = 0
+        while n < round(1000 * seconds) and not self.stream.has_ended:
+            block = self.stream.read()
+            n += len(block)
+            self.service.take(block)
+        return self.registers.written[-1]
+
+    def ask(self, number: int, command: int, seconds: float = 0.7) -> dict[str, float]:
+        self.registers.request = number, command
+        return self.run(seconds)
+
+
+def test_a_request_is_answered_once_and_an_old_one_never() -> None:
+    cell = Cell((POSE, NOTHING))
+    first = cell.run(0.1)
+    assert (first["state"], first["number"], first["mass"]) == (1, 5, 0), "that of a program before"
+    assert cell.ask(6, STATUS, 0.02)["number"] == 6
+    assert cell.ask(7, 99, 0.02)["code"] == 9
+    busy = cell.ask(8, WEIGH, 0.3)
+    assert (busy["state"], busy["number"], busy["code"]) == (2, 8, 0)
+    done = cell.run(0.3)
+    assert (done["state"], done["number"], done["code"], done["mass"]) == (1, 8, 0, 0)
+    assert 0 < done["least_mass"] < 1.0
+    lives = [one["live"] for one in cell.registers.written]
+    assert np.diff(lives).tolist() == [1] * (len(lives) - 1)
+
+
+def test_a_cycle_weighs_the_part_and_takes_it_out_of_the_wrench() -> None:
+    cell = Cell((POSE, NOTHING), (POSE, part(POSE, 0.8)), (POSE, part(POSE, 0.8)), (POSE, NOTHING))
+    cell.run(0.2)
+    assert cell.ask(6, ZERO)["state"] == 1
+    loaded = cell.run(0.3)
+    assert loaded["condition"] == 2
+    assert loaded["fz"] == pytest.approx(-0.8 * 9.80665, abs=0.5)
+    weighed = cell.ask(7, WEIGH)
+    assert weighed["mass"] == pytest.approx(0.8, abs=4 * weighed["mass_sigma"])
+    assert weighed["mass_sigma"] < 2e-3
+    carried = cell.run(0.8)
+    assert carried["condition"] == 0
+    assert np.linalg.norm([carried[name] for name in ("fx", "fy", "fz")]) < 0.5
+    released = cell.run(0.5)
+    assert released["condition"] == 2
+    assert released["fz"] > 6
+    assert cell.ask(8, WEIGH)["mass"] == 0
+    assert cell.run(0.2)["condition"] == 0
+    assert [event.kind for event in cell.stream.take_events()].count("load") == 2
+
+
+def test_a_push_is_a_contact_and_its_weight_is_refused() -> None:
+    cell = Cell((POSE, NOTHING), (POSE, np.array([5.0, 8.0, 0, 0, 0, 0])))
+    cell.run(0.2)
+    cell.ask(6, ZERO)
+    cell.run(0.2)
+    pushed = cell.ask(7, WEIGH, 0.8)
+    assert (pushed["condition"], pushed["state"], pushed["code"], pushed["mass"]) == (1, 3, 4, 0)
+
+
+def test_a_zero_with_a_part_is_refused() -> None:
+    cell = Cell((POSE, part(POSE, 2.0)))
+    cell.run(0.1)
+    assert cell.ask(6, ZERO, 0.8)["code"] == 8
+
+
+def test_a_lost_controller_is_reported_once() -> None:
+    cell = Cell((POSE, NOTHING))
+    cell.run(0.1)
+    cell.registers.broken = True
+    cell.run(0.1)
+    assert len(cell.said) == 1
+    assert "cable is cut" in cell.said[0]
