@@ -25,6 +25,8 @@ Guard = Callable[[], None]
 
 NOT_REPORTED: Final = "not reported"
 """Stands for a serial number or a firmware version that a device does not report."""
+WRIST_SENSOR: Final = "UR e-Series wrist sensor (ft_raw_wrench)"
+"""Model of the sensor in the wrist of an arm, which feels the friction of the last joint."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import EMULATED, Station, emulated_cell
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact
-from ftdrive.live.processing import SENSOR_FRAME, STANDARD
+from ftdrive.live.processing import SENSOR_FRAME
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.planning.cell_plan import certifier_for, plan_for
@@ -96,7 +96,7 @@ def open_stream(
     sensor: ForceTorqueSensor | None = None,
     arm: RobotArm | None = None,
     frame: WrenchFrame = SENSOR_FRAME,
-    stages: Stages = STANDARD,
+    stages: Stages | None = None,
     on_contact: Callable[[Contact], object] | None = None,
     force: bool = False,
 ) -> CompensatedStream:
@@ -121,7 +121,7 @@ def open_stream(
     stages : Stages
         What is done to the raw wrench.
     on_contact : callable
-        Called with each `Contact` when it has lasted 60 to 80 ms, and again when it is over (`contact.over`), by the
+        Called with each `Contact` when it has lasted 40 to 60 ms, and again when it is over (`contact.over`), by the
         thread that reads. `CompensatedStream.on_contact` may be set at any time.
     force : bool
         Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`, or one that

@@ -23,8 +23,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib.model import predict
-from ftdrive.live.processing import STANDARD
-from ftdrive.live.samples import Block, WrenchFrame
+from ftdrive.live.samples import Block, Stages, WrenchFrame
 from ftdrive.recording import Recorder, RecordingReader
 from ftdrivers.interfaces import Array
 from tests.unit.ftdrive.recorded import NOISE, TRUTH, calibration, info
@@ -70,7 +69,7 @@ def block(start: int, n: int) -> Block:
         p_base_flange_m=0.1 * np.sin(np.outer(t_s, [0.4, 0.3, 0.2])),
         sigma=NOISE,
         frame=WrenchFrame(),
-        stages=STANDARD,
+        stages=Stages(),
     )
 
 

@@ -17,9 +17,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from ftcalib.model import Array, skew
 
-REACH_S = 0.01
-"""Half the time over which `motion_of_poses` fits: the acceleration of trapezoidal moves keeps its edges."""
-
 
 class Motion(NamedTuple):
     """Motion of the flange and the sensor against the base, n samples."""

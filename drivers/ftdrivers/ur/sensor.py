@@ -16,7 +16,7 @@ import numpy as np
 
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError, ProtocolError, StreamBroken
-from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
+from ftdrivers.interfaces import NOT_REPORTED, WRIST_SENSOR, DeviceInfo, FtSamples
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.ur.rtde import Subscription
 from ftdrivers.ur.timing import STRICT
@@ -80,7 +80,7 @@ class UrWristSensor(StreamingSensor):
         self._seq: int | None = None
         self._nominal_Hz = _RATE_Hz
         return DeviceInfo(
-            model="UR e-Series wrist sensor (ft_raw_wrench)",
+            model=WRIST_SENSOR,
             serial=NOT_REPORTED,
             firmware=version,
             facts=self._facts,

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from enum import Enum
 from itertools import pairwise
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.special import chdtri, fdtri
 
 from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from ftcalib.model import Array, Parameters
-from ftdrive.live.motion import Motion, samples_in_reading
+from ftdrive.live.motion import READING_S, REST, accelerated, samples_in_reading
 from ftdrive.live.noise import Noise, NoiseEstimator
 from ftdrive.live.samples import Ns
 from ftdrive.live.tare import TARE_DRIFT_N, TARE_DRIFT_NM
@@ -23,10 +24,28 @@ _GAIN = 0.1
 """Share of the difference that one step takes away: the offset follows within 2 s."""
 _DRIFT = np.repeat([TARE_DRIFT_N, TARE_DRIFT_NM], 3)
 """The offset follows no farther than this beyond three sigmas of the prediction."""
-_INEXACT = 1.5
-"""The wrench of a motion may be larger than that by poses 20 ms apart."""
-_OF_LAST, _ENOUGH = 5, 4
-"""So many of the last readings begin or end a contact."""
+_UNKNOWN_M_S2, _COARSE_M_S2, _UNKNOWN_RAD_S2 = 1.0, 0.3, 2.5
+"""Acceleration of an arm in motion, one sigma, without positions; its error without the poses that follow; rotation."""
+_GYRATION_M = 0.08
+"""Radius of gyration of a tool, where its inertia is not known."""
+_INEXACT_S = 0.005
+"""Error of the time of a predicted wrench, beside that of the delay: accelerations are means over as long."""
+_FRICTION_NM = 0.15
+"""Of wrist 3, in the arm's own sensor."""
+_IN_A_ROW = 3
+"""So many readings begin or end a contact."""
+_LAG_S, _SHORT_LAG_S = READING_S, READING_S / 2
+"""From one of them to the next; the shorter one where inertia is subtracted, which needs the poses that follow."""
+
+
+class Inertia(Enum):
+    """How well the prediction of a free tool has its inertia."""
+
+    UNKNOWN = 0
+    COARSE = 1
+    """From the poses before."""
+    EXACT = 2
+    """From poses on both sides."""
 
 
 class ContactTest:
@@ -34,6 +53,8 @@ class ContactTest:
 
     A reading is the mean of the samples of the last `READING_S` seconds, so each sample ends one; independent are those
     without common samples. The distance of a free tool follows Hotelling's T², because the noise is estimated too.
+    Noise is that of the present state of motion. In motion, the error of the delay and, where inertia is not
+    subtracted, an unknown acceleration are in the covariance too.
 
     At rest the test follows the offset of the free tool, so that neither drift nor the error of the calibration in this
     orientation is a contact. A load that grows by less than the limit within 2 s counts as drift, up to 0.5 N and
@@ -47,13 +68,22 @@ class ContactTest:
         Share of independent readings of a free tool that exceed `limit`.
     beyond : array, shape (6,)
         Variance beyond what the calibration predicts, N² and (N·m)².
+    friction_axis : array, shape (3,), optional
+        Axis of wrist 3 in sensor axes, if the sensor feels its friction.
     """
 
-    def __init__(self, rate_Hz: float, false_alarm_rate: float, beyond: Array) -> None:
+    def __init__(
+        self, rate_Hz: float, false_alarm_rate: float, beyond: Array, friction_axis: Array | None = None
+    ) -> None:
         self.false_alarm_rate = false_alarm_rate
         self._size = samples_in_reading(rate_Hz)
         self._beyond = np.diag(beyond)
+        self._friction = np.zeros((6, 6))
+        if friction_axis is not None:
+            self._friction[3:, 3:] = _FRICTION_NM**2 * np.outer(friction_axis, friction_axis)
         self._calibration: tuple[Parameters, Array, Response | None] | None = None
+        self._unknown = dict.fromkeys(Inertia, np.zeros((6, 6)))
+        """Covariance of what inertia leaves."""
         self.uncertainty = np.zeros((6, 6))
         """Covariance of the prediction at the newest orientation, sensor axes."""
         self.limit = float(chdtri(6, false_alarm_rate))
@@ -63,57 +93,104 @@ class ContactTest:
     def restart(self) -> None:
         """Forget earlier samples and the offset."""
         self._earlier = np.zeros((self._size - 1, 6))
+        self._predicted: Array | None = None
+        """The predictions of the last `READING_S` seconds."""
         self._R: Array | None = None
         self._offset = np.zeros(6)
         self._share = 1.0
         """Of the variance of the prediction that the offset still has."""
         self._sum, self._count, self._is_free = np.zeros(6), 0, True
         """Of the samples since the last step of the offset."""
-        self._whitening: tuple[tuple[Noise, float], Array] | None = None
+        self._whitening: tuple[tuple[Noise, float, Inertia | None], Array] | None = None
 
-    def expect(self, calibration: tuple[Parameters, Array, Response | None]) -> None:
-        """Set parameters, covariance and response of the calibration, which predict a free tool."""
+    def expect(
+        self, calibration: tuple[Parameters, Array, Response | None], mass_kg: float, *, tensor_known: bool
+    ) -> None:
+        """Set the calibration of a free tool: parameters, covariance, response, mass, and whether it has a tensor."""
         if self._calibration is None or calibration[0] is not self._calibration[0]:
             self._R = None
+            B = accelerated(mass_kg, calibration[0].p_sensor_com_m)
+            turned = np.diag(np.repeat([0.0, (mass_kg * _GYRATION_M**2 * _UNKNOWN_RAD_S2) ** 2], 3))
+            self._unknown = {
+                Inertia.UNKNOWN: _UNKNOWN_M_S2**2 * B @ B.T + turned,
+                Inertia.COARSE: _COARSE_M_S2**2 * B @ B.T + turned,
+                Inertia.EXACT: np.zeros((6, 6)) if tensor_known else turned,
+            }
         self._calibration = calibration
 
     def judge(
         self,
         residual: Array,
+        predicted: Array,
         R_base_flange: Array,
-        motion: tuple[NDArray[np.bool_], Array],
+        motion: tuple[NDArray[np.int8], Array],
         noise: NoiseEstimator,
+        *,
+        delay_sigma_s: float,
+        inertia: Inertia,
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return the readings (n, 6), their squared distances (n,), and whether each is beyond the limit (n,).
+        """Judge n samples.
 
-        The distances are NaN until the noise is known. `motion` is that of `MotionTracker.follow`: a free tool
-        may differ by its wrenches.
+        Parameters
+        ----------
+        residual, predicted : array, shape (n, 6)
+            Measured minus predicted wrench, and the prediction.
+        R_base_flange : array, shape (n, 3, 3)
+        motion : tuple of array, shapes (n,) and (n, 6)
+            As `MotionTracker.follow` returns it.
+        noise : NoiseEstimator
+        delay_sigma_s : float
+            Of the wrench after the pose.
+        inertia : Inertia
+            How well the prediction has it.
+
+        Returns
+        -------
+        readings : array, shape (n, 6)
+        chi2 : array, shape (n,)
+            NaN until the noise is known.
+        beyond : array, shape (n,)
+            Whether each is beyond the limit.
         """
-        moving, wrenches = motion
+        states, felt = motion
+        n = len(residual)
         rows = np.concatenate([self._earlier, residual])
-        self._earlier = rows[len(residual) :]
+        self._earlier = rows[n:]
         sums = np.cumsum(np.concatenate([np.zeros((1, 6)), rows]), axis=0)
         readings = (sums[self._size :] - sums[: -self._size]) / self._size
-        chi2, beyond = np.full(len(readings), np.nan), np.zeros(len(readings), np.bool_)
-        for part in self._parts(R_base_flange, moving):
+        inexact = np.where((states == REST)[:, None], felt, self._change(predicted, delay_sigma_s))
+        chi2, beyond = np.full(n, np.nan), np.zeros(n, np.bool_)
+        for part in self._parts(R_base_flange, states):
             self._turn(R_base_flange[part.start])
-            state = Motion.MOVING if moving[part.start] else Motion.REST
+            state = int(states[part.start])
             if (known := noise.of(state)) is not None:
-                W = self._whiten(known)
-                distance = np.linalg.norm((readings[part] - self._offset) @ W.T, axis=1)
-                distance -= _INEXACT * np.linalg.norm(wrenches[:, part] @ W.T, axis=2).sum(axis=0)
-                chi2[part] = np.square(np.maximum(distance, 0.0))
+                W = self._whiten(known, state, inertia)
+                distance = (readings[part] - self._offset) @ W.T
+                direction = inexact[part] @ W.T
+                along, length = (distance * direction).sum(axis=1), np.square(direction).sum(axis=1)
+                chi2[part] = np.square(distance).sum(axis=1) - along**2 / (1 + length)
                 beyond[part] = chi2[part] > self.limit
                 self._follow_offset(residual[part], state, is_free=not beyond[part].any())
         return readings, chi2, beyond
 
-    def _parts(self, R_base_flange: Array, moving: NDArray[np.bool_]) -> Iterator[slice]:
+    def _change(self, predicted: Array, delay_sigma_s: float) -> Array:
+        """Return the change of the prediction (n, 6) within one sigma of its time."""
+        if not len(predicted):
+            return predicted
+        if self._predicted is None:
+            self._predicted = np.repeat(predicted[:1], self._size, axis=0)
+        rows = np.concatenate([self._predicted, predicted])
+        self._predicted = rows[len(predicted) :]
+        share = np.hypot(delay_sigma_s, _INEXACT_S) / READING_S
+        return np.asarray(share * (rows[self._size :] - rows[: -self._size]))
+
+    def _parts(self, R_base_flange: Array, states: NDArray[np.int8]) -> Iterator[slice]:
         """Yield parts of one orientation, one state of motion and one offset."""
         turned = np.sqrt(np.square(np.diff(R_base_flange, axis=0, prepend=R_base_flange[:1])).sum(axis=(1, 2)) / 2)
         cell = np.floor(np.cumsum(turned) / _TURN_RAD)
-        step = (self._count + np.arange(len(moving))) // (_STEP * self._size)
-        edges = np.flatnonzero(np.diff(cell) + np.diff(step) + np.diff(moving)) + 1
-        for start, stop in pairwise([0, *edges.tolist(), len(moving)] if len(moving) else []):
+        step = (self._count + np.arange(len(states))) // (_STEP * self._size)
+        edges = np.flatnonzero((np.diff(cell) != 0) | (np.diff(step) != 0) | (np.diff(states) != 0)) + 1
+        for start, stop in pairwise([0, *edges.tolist(), len(states)] if len(states) else []):
             yield slice(start, stop)
 
     def _turn(self, R_base_flange: Array) -> None:
@@ -125,20 +202,22 @@ class ContactTest:
         self._share = 2.0 if self._offset.any() else 1.0
         self._whitening = None
 
-    def _whiten(self, noise: Noise) -> Array:
+    def _whiten(self, noise: Noise, state: int, inertia: Inertia) -> Array:
         """Return the matrix that makes the readings of a free tool white."""
-        key = noise, self._share
+        key = noise, self._share, None if state == REST else inertia
         if self._whitening is None or self._whitening[0] != key:
             covariance = self._share * self.uncertainty + noise.reading + noise.wander
+            if state != REST:
+                covariance = covariance + self._friction + self._unknown[inertia]
             self._whitening = key, np.linalg.inv(np.linalg.cholesky(covariance))
             self.limit = _hotelling(self.false_alarm_rate, noise.dof)
         return self._whitening[1]
 
-    def _follow_offset(self, residual: Array, state: Motion, *, is_free: bool) -> None:
+    def _follow_offset(self, residual: Array, state: int, *, is_free: bool) -> None:
         """Take samples of one step of the offset into account."""
         self._sum = self._sum + residual.sum(axis=0)
         self._count += len(residual)
-        self._is_free &= is_free and state is Motion.REST
+        self._is_free &= is_free and state == REST
         if self._count < _STEP * self._size:
             return
         if self._is_free:
@@ -201,7 +280,7 @@ class Contact:
 
 
 class ContactTracker:
-    """Joins readings beyond the limit to contacts: four of the last five begin one, and four that are not end it.
+    """Joins readings beyond the limit to contacts: three in a row begin one, and three that are not end it.
 
     Parameters
     ----------
@@ -210,15 +289,17 @@ class ContactTracker:
     """
 
     def __init__(self, rate_Hz: float) -> None:
-        self._lag = samples_in_reading(rate_Hz)
+        self._lag, self._short_lag = (max(1, round(lag_s * rate_Hz)) for lag_s in (_LAG_S, _SHORT_LAG_S))
         self._forget()
 
     def _forget(self) -> None:
-        n = (_OF_LAST - 1) * self._lag
+        n = (_IN_A_ROW - 1) * self._lag
         self.open: Contact | None = None
         self._earlier = np.zeros(n, np.int64), np.zeros(n, np.bool_), np.zeros((n, 6))
 
-    def follow(self, t_ns: Ns, beyond: NDArray[np.bool_], readings: Array) -> tuple[NDArray[np.bool_], list[Contact]]:
+    def follow(
+        self, t_ns: Ns, beyond: NDArray[np.bool_], readings: Array, soon: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_], list[Contact]]:
         """Add readings, each of which ends at a sample.
 
         Parameters
@@ -228,6 +309,8 @@ class ContactTracker:
             Whether they are beyond the limit.
         readings : array, shape (n, 6)
             In the frame of the stream.
+        soon : array, shape (n,)
+            Whether a contact may begin sooner, because the poses that follow show rest.
 
         Returns
         -------
@@ -240,15 +323,18 @@ class ContactTracker:
         beyond = np.concatenate([self._earlier[1], beyond])
         readings = np.concatenate([self._earlier[2], readings])
         self._earlier = t_ns[n:], beyond[n:], readings[n:]
-        count = np.sum([beyond[k * self._lag :][:n] for k in range(_OF_LAST)], axis=0)
-        begins = count >= _ENOUGH
-        newest = np.maximum.accumulate(np.where(begins | (count <= _OF_LAST - _ENOUGH), np.arange(n), -1))
+        in_a_row, at_once = (
+            np.array([beyond[before - k * lag :][:n] for k in range(_IN_A_ROW)]) for lag in (self._lag, self._short_lag)
+        )
+        begins, ends = in_a_row.all(axis=0) | (at_once.all(axis=0) & soon), ~in_a_row.any(axis=0)
+        newest = np.maximum.accumulate(np.where(begins | ends, np.arange(n), -1))
         in_contact = np.where(newest < 0, self.open is not None, begins[newest])
         changes = list[Contact]()
         if n and self.open is not None and not in_contact[0]:
             changes += self._over()
         for start, stop in np.flatnonzero(np.diff(in_contact, prepend=False, append=False)).reshape(-1, 2):
-            first = start + before if self.open is not None else start  # it has begun within the last readings
+            lag = self._short_lag if soon[start] else self._lag
+            first = start + before - (0 if self.open is not None else (_IN_A_ROW - 1) * lag)  # it has begun before
             at = first + np.flatnonzero(beyond[first : before + stop])
             if not len(at):
                 continue

@@ -23,7 +23,8 @@ _USABLE_S = 1e-3
 """The estimate is applied from this sigma on."""
 _SLOWEST_RAD_S = 0.02
 """Slower, a tool does not show the delay."""
-_PRIOR_S = 0.05
+_PRIOR_S, _SAME_LINKS_S = 0.05, 0.005
+"""Of the delay before the first estimate, one sigma: without and with that of a calibration in motion."""
 _BIAS_N = 0.5
 """Change of the bias since the calibration, one standard deviation."""
 _HELD = 0.05
@@ -70,9 +71,10 @@ class DelayEstimator:
         self._seconds: deque[tuple[Array, Array]] = deque(maxlen=window)
         self._pending: list[Paired] = []
         self._settling = False
-        self.delay_s = 0.0
-        """The estimate as soon as it is good enough; samples are paired with it."""
-        self.sigma_s = _PRIOR_S
+        motion = calibration.motion
+        self.delay_s = 0.0 if motion is None else min(max(motion.delay_s, -MOST_DELAY_S), MOST_DELAY_S)
+        """That of the calibration, then the estimate as soon as it is good enough; samples are paired with it."""
+        self.sigma_s = _PRIOR_S if motion is None else _SAME_LINKS_S
         """One standard deviation of the estimate."""
 
     def add(self, paired: Paired) -> None:

@@ -1,31 +1,31 @@
-"""Motion of the arm at each sample, and the wrench of it that the stream does not subtract."""
-
-from enum import Enum
+"""State of motion of the arm at each sample, and the wrench of a load that it moves."""
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
 
-from ftcalib.model import Parameters
+from ftcalib.model import Parameters, skew
 from ftdrivers.interfaces import Array
 
 READING_S = 0.02
 """A reading is the mean of the samples of this time: contact is judged by readings."""
+REST = 0
+SPEEDS_RAD_S = (0.15, 0.4, 0.7)
+"""Limits of the classes of speed: angular speed, plus that of the flange at 0.5 m."""
+ACCELERATION_RAD_S2 = 1.5
+"""Limit of the two classes of acceleration, likewise, beyond that of an even turn."""
+SLOW = 2
+"""So many classes of speed are divided by acceleration; faster ones ring and ripple alike."""
+STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW
+"""Rest, then the classes: the noise is learnt for each."""
 
 _STILL_RAD, _STILL_M = 2e-4, 2e-4
 """Largest motion at rest, from the mean of one reading to the next: beyond joint noise of 3e-5 rad."""
 _FELT_M = 4e-5
 """Motion of the centre of mass from which its wrench counts, which is felt before the motion is seen."""
-_HOLD_S = 0.3
-"""A stopped arm rings so long."""
-_DELAY_S = 0.01
-"""Usual error of the delay between pose and wrench."""
-
-
-class Motion(Enum):
-    """State of motion of the arm; the noise is learnt for each."""
-
-    REST = "rest"
-    MOVING = "moving"
+_HOLD_S, _RINGS_S = 0.5, 0.4
+"""Rest begins so long after the last motion, and a state ends so long after it, because links ring behind it."""
+_LEVER_M = 0.5
 
 
 def samples_in_reading(rate_Hz: float) -> int:
@@ -34,7 +34,7 @@ def samples_in_reading(rate_Hz: float) -> int:
 
 
 class MotionTracker:
-    """State of motion at each sample, by the mean poses of successive readings; rest begins when it has lasted 0.3 s.
+    """State of motion at each sample, by the mean poses of successive readings; rest begins when it has lasted 0.5 s.
 
     Parameters
     ----------
@@ -56,45 +56,66 @@ class MotionTracker:
         self._earlier: Array | None = None
         self._since = self._hold
         """Samples since the last motion."""
+        self._classes = np.zeros(round(_RINGS_S * rate_Hz), np.int8)
 
-    def follow(self, R_base_flange: Array, p_base_flange_m: Array) -> tuple[NDArray[np.bool_], Array]:
+    def follow(self, R_base_flange: Array, p_base_flange_m: Array) -> tuple[NDArray[np.int8], Array]:
         """Add samples with these poses; an unknown position does not move.
 
         Returns
         -------
-        moving : array, shape (n,)
-        wrenches : array, shape (2, n, 6)
-            Of inertia about, and of gravity by which it may be late, N and N·m, sensor axes; zero at rest.
+        states : array, shape (n,)
+            `REST` or a class of motion.
+        felt : array, shape (n, 6)
+            Wrench of inertia, N and N·m, sensor axes, that rest does not exclude; zero where nothing shows.
         """
         n, k = len(R_base_flange), self._size
-        wrenches = np.zeros((2, n, 6))
         if not n:
-            return np.zeros(0, np.bool_), wrenches
+            return np.zeros(0, np.int8), np.zeros((0, 6))
         p_base_com_m = np.nan_to_num(p_base_flange_m) + R_base_flange @ self._p_flange_com_m
         poses = np.concatenate([R_base_flange.reshape(n, 9), p_base_com_m], axis=1)
         if self._earlier is None:
-            self._earlier = np.repeat(poses[:1], 2 * k, axis=0)
+            self._earlier = np.repeat(poses[:1], 3 * k, axis=0)
         poses = np.concatenate([self._earlier, poses])
         self._earlier = poses[n:]
-        sums = np.cumsum(poses, axis=0)  # means, because joint noise in single poses looks like motion
-        moved = np.abs(sums[2 * k :] - 2 * sums[k:-k] + sums[: -2 * k]) / k
-        moves = (moved[:, :9] > _STILL_RAD).any(axis=1) | (moved[:, 9:] > _STILL_M).any(axis=1)
+        sums = np.cumsum(poses, axis=0) / k  # means, because joint noise in single poses looks like motion
+        moved = sums[2 * k :] - 2 * sums[k:-k] + sums[: -2 * k]
+        before, moved = moved[:n], moved[k:]
+        far = np.abs(moved)
+        moves = (far[:, :9] > _STILL_RAD).any(axis=1) | (far[:, 9:] > _STILL_M).any(axis=1)
         newest = np.maximum.accumulate(np.where(moves, np.arange(n), -1 - self._since))
         self._since = int(n - 1 - newest[-1])
-        moving = np.asarray(np.arange(n) - newest < self._hold)
-        felt = (np.linalg.norm(moved[:, 9:], axis=1) > _FELT_M) | moving
+        moving = np.arange(n) - newest < self._hold
+        speed = self._rate(moved) / self._step_s
+        changes = self._rate(moved - before) / self._step_s**2 > ACCELERATION_RAD_S2 + speed**2
+        fast = np.searchsorted(SPEEDS_RAD_S, speed)
+        number = 1 + fast + np.minimum(fast, SLOW) + (changes & (fast < SLOW))
+        present = np.where(moves, number, REST).astype(np.int8)
+        classes = np.concatenate([self._classes, present])
+        self._classes = classes[n:]
+        w = len(classes) - n + 1
+        rung = maximum_filter1d(classes, w, origin=(w - 1) // 2, mode="constant")[w - 1 :]  # with those before
+        states = np.where(moving, np.maximum(rung, 1), REST).astype(np.int8)
+        return states, self._felt(R_base_flange, far[:, 9:], (moved - before)[:, 9:])
+
+    @staticmethod
+    def _rate(moved: Array) -> Array:
+        """Angle (n,) by which orientations, and positions at `_LEVER_M`, have moved."""
+        return np.asarray(
+            np.sqrt(np.square(moved[:, :9]).sum(axis=1) / 2) + np.linalg.norm(moved[:, 9:], axis=1) / _LEVER_M
+        )
+
+    def _felt(self, R_base_flange: Array, far_m: Array, second_m: Array) -> Array:
+        felt = np.linalg.norm(far_m, axis=1) > _FELT_M
+        wrench = np.zeros((len(felt), 6))
         if felt.any():
-            R = poses[:, :9].reshape(-1, 3, 3)
-            second = (poses[2 * k :] - 2 * poses[k:-k] + poses[: -2 * k])[:, 9:]
-            inertial_N = -self._mass_kg / self._step_s**2 * second
-            late_N = (
-                _DELAY_S
-                / self._step_s
-                * ((R[2 * k :] - R[k:-k]).swapaxes(1, 2) @ self._parameters.gravity_force_base_N)
-            )
-            R_base_sensor = R[2 * k :] @ self._parameters.R_flange_sensor
-            wrenches[0, :, :3] = np.einsum("nij,ni->nj", R_base_sensor, inertial_N)
-            wrenches[1, :, :3] = late_N @ self._parameters.R_flange_sensor
-            wrenches[..., 3:] = np.cross(self._parameters.p_sensor_com_m, wrenches[..., :3])
-            wrenches[:, ~felt] = 0.0
-        return moving, wrenches
+            parameters = self._parameters
+            R_base_sensor = R_base_flange[felt] @ parameters.R_flange_sensor
+            inertial_N = -self._mass_kg / self._step_s**2 * second_m[felt]
+            wrench[felt, :3] = np.einsum("nij,ni->nj", R_base_sensor, inertial_N)
+            wrench[felt, 3:] = np.cross(parameters.p_sensor_com_m, wrench[felt, :3])
+        return wrench
+
+
+def accelerated(mass_kg: float, p_sensor_com_m: Array) -> Array:
+    """Wrench (6, 3) of a load by the three axes of its acceleration, N and N·m per m/s², sensor axes."""
+    return mass_kg * np.concatenate([np.eye(3), skew(p_sensor_com_m)])

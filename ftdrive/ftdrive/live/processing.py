@@ -6,19 +6,20 @@ from collections.abc import Callable, Iterable, Mapping
 from threading import RLock
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ftcalib.compensation import Compensator
-from ftcalib.extras.inertia import REACH_S, inertial_wrench, motion_of_poses
+from ftcalib.extras.inertia import inertial_wrench, motion_of_poses
 from ftcalib.extras.update import Calibrated
 from ftcalib.extras.weighing import Weight, holding
 from ftcalib.files import JSON
 from ftcalib.rounding import with_sigma
 from ftdrive.errors import ConfigError
-from ftdrive.live.contact import Contact, ContactTest, ContactTracker
+from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia
 from ftdrive.live.drift import DriftFilter
 from ftdrive.live.filters import LOWPASS_ORDER, NOTCH_Q, Filter, deadband
 from ftdrive.live.frames import FrameTransform
-from ftdrive.live.motion import READING_S, Motion, MotionTracker
+from ftdrive.live.motion import READING_S, REST, MotionTracker, accelerated
 from ftdrive.live.noise import NoiseEstimator
 from ftdrive.live.samples import (
     Block,
@@ -33,15 +34,16 @@ from ftdrive.live.samples import (
 )
 from ftdrive.live.tare import TARE_S, try_tare
 from ftdrivers.clock import Clock
-from ftdrivers.interfaces import Array
+from ftdrivers.interfaces import WRIST_SENSOR, Array
 
 SENSOR_FRAME = WrenchFrame()
-STANDARD = Stages()
 FALSE_ALARM_RATE = 1e-6
 _CHUNK_ROWS = 8192
 """More rows are processed in pieces that stay in the cache."""
 _KNOT_S = 0.002
 """Poses of this spacing give the acceleration."""
+_REACH_S = 0.015
+"""Half the time over which poses give the acceleration: longer ones lose the edges of a move, and are later."""
 _DRIFT_SIGMAS = 5.0
 
 
@@ -52,11 +54,10 @@ class Processor:
     ----------
     info : StreamInfo
     frame : WrenchFrame
-    stages : Stages
+    stages : Stages, optional
+        Without it, `standard_stages`.
     false_alarm_rate : float
         Share of independent readings of a free tool beyond the limit. See `ftdrive.live.contact`.
-    inertia_com_kg_m2 : array, shape (3, 3), optional
-        Inertia of the load about its centre of mass, in sensor axes; without it the load counts as a point.
 
     Raises
     ------
@@ -68,16 +69,17 @@ class Processor:
         self,
         info: StreamInfo,
         frame: WrenchFrame = SENSOR_FRAME,
-        stages: Stages = STANDARD,
+        stages: Stages | None = None,
         *,
         false_alarm_rate: float = FALSE_ALARM_RATE,
-        inertia_com_kg_m2: Array | None = None,
     ) -> None:
         self.info = info
         self._lock = RLock()  # frame, stages and tare may come from another thread
         calibration = info.calibration
         self._compensator: Compensator = calibration.compensator
-        self._inertia = inertia_com_kg_m2
+        self._inertia = None if calibration.motion is None else calibration.motion.inertia_kg_m2
+        self.delay_sigma_s = 0.0
+        """Of the wrench after the pose."""
         self._held: Weight | None = None
         self.reading = np.zeros(6)
         """Mean of the newest 20 ms minus the load, sensor axes, about its origin."""
@@ -88,17 +90,25 @@ class Processor:
         self._usual_error_N = float(likely_error[0])
         beyond = np.repeat((likely_error**2 - np.square(calibration.predicted_error())).clip(0.0) / 3, 3)
         self._motion = self._motion_tracker()
-        self._noise = NoiseEstimator(info.sensor_rate_Hz)
+        self._noise = NoiseEstimator(
+            info.sensor_rate_Hz, accelerated(calibration.mass_kg, calibration.parameters.p_sensor_com_m)
+        )
         self._noise_is_learnt = False
-        self._test = ContactTest(info.sensor_rate_Hz, false_alarm_rate, beyond)
+        in_wrist = info.sensor.model == WRIST_SENSOR
+        self._test = ContactTest(
+            info.sensor_rate_Hz, false_alarm_rate, beyond, calibration.R_flange_sensor[2] if in_wrist else None
+        )
         self._tracker = ContactTracker(info.sensor_rate_Hz)
         self._drift = DriftFilter()
         self._drift_warned = False
         self._recent: deque[Paired] = deque()
         self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
         knot_s = self._stride / info.sensor_rate_Hz
-        self._reach = max(2, round(max(REACH_S, 2 / info.arm_rate_Hz) / knot_s))
+        self._reach = max(2, round(max(_REACH_S, 2 / info.arm_rate_Hz) / knot_s))
         self._buffer: Paired | None = None
+        self._states = np.zeros(0, np.int8), np.zeros((0, 6))
+        """Of the rows of the buffer, as `MotionTracker.follow` returns them."""
+        self._state = REST
         self._done = 0
         """Rows of the buffer that are processed; they remain as neighbours for the acceleration."""
         self._newest_ns = 0
@@ -106,7 +116,8 @@ class Processor:
         self._events: list[StreamEvent] = []
         self._contacts: list[Contact] = []
         self._frame, self._transform = frame, FrameTransform(frame, info)
-        self._stages, self._filter = stages, self._filter_of(stages)
+        self._stages = stages or standard_stages(info)
+        self._filter = self._filter_of(self._stages)
 
     # ------------------------------------------------------------------------------------------------ what is settable
 
@@ -157,11 +168,11 @@ class Processor:
         """
         with self._lock:
             if not len(paired):
-                return self._processed(paired, None)
+                return self._processed(paired, (np.zeros(0, np.int8), np.zeros((0, 6))), None)
             if len(paired) <= 2 * _CHUNK_ROWS:
                 return self._process(paired, last)
             chunks = [paired.rows(slice(i, i + _CHUNK_ROWS)) for i in range(0, len(paired), _CHUNK_ROWS)]
-            if self._noise.of(Motion.REST) is None:
+            if self._noise.of(REST) is None:
                 self.learn_noise([paired])
             return Block.concatenate([self._process(chunk, last and chunk is chunks[-1]) for chunk in chunks])
 
@@ -173,16 +184,37 @@ class Processor:
             self._recent.popleft()
         self._newest_ns = int(paired.t_host_ns[-1])
         buffer = paired if self._buffer is None else Paired.concatenate([self._buffer, paired])
+        found = self._motion.follow(paired.R_base_flange, paired.p_base_flange_m)
+        self._states = np.concatenate([self._states[0], found[0]]), np.concatenate([self._states[1], found[1]])
+        return self._advance(buffer, last)
+
+    def finish(self) -> Block:
+        """Process the samples that wait for poses after them: there are none at the end of a recording."""
+        with self._lock:
+            if self._buffer is None or not len(self._buffer):
+                raise ValueError("no samples were processed")
+            return self._advance(self._buffer, last=True)
+
+    def _advance(self, buffer: Paired, last: bool) -> Block:
+        """Process the rows of the buffer that have neighbours on both sides; keep those that others need."""
+        states, felt = self._states
         end, inertial = len(buffer), None
         neighbours = self._reach * self._stride
-        if self._stages.inertia:
+        positions = bool(np.isfinite(buffer.p_base_flange_m[-1]).all())
+        if self._stages.inertia and positions:
             inertial, ready = self._inertial(buffer)
             end = end if last else max(ready, self._done)
-            inertial = inertial[self._done : end]
+            ahead = np.minimum(np.arange(self._done, end) + neighbours, len(states) - 1)  # the poses after them
+            state = states[ahead]
+            inertial = np.where((state == REST)[:, None], 0.0, inertial[self._done : end])
+        else:
+            state = states[self._done : end]
         rows = buffer.rows(slice(self._done, end))
+        motion = state, felt[self._done : end]
         keep = max(0, end - neighbours - self._stride) // self._stride * self._stride  # knots stay where they are
         self._buffer, self._done = buffer.rows(slice(keep, None)), end - keep
-        block = self._processed(rows, inertial)
+        self._states = states[keep:], felt[keep:]
+        block = self._processed(rows, motion, inertial)
         if last:
             self._report_contacts(self._tracker.end())
         return block
@@ -195,8 +227,11 @@ class Processor:
             for block in recording:
                 for i in range(0, len(block), _CHUNK_ROWS):
                     rows = block.rows(slice(i, i + _CHUNK_ROWS))
-                    moving, wrenches = motion.follow(rows.R_base_flange, rows.p_base_flange_m)
-                    self._noise.add(self._free(rows)[0] - wrenches[0], moving)
+                    states, _ = motion.follow(rows.R_base_flange, rows.p_base_flange_m)
+                    residual = self._free(rows)[0]
+                    if self._stages.inertia:
+                        residual -= np.where((states == REST)[:, None], 0.0, self._inertial(rows)[0])
+                    self._noise.add(residual, states)
 
     def hold(self, weight: Weight | None) -> None:
         """Count a part that was weighed as part of the tool from now on; None empties the gripper."""
@@ -213,9 +248,13 @@ class Processor:
         return empty if self._held is None else holding(empty, self._held, self.info.calibration.g_m_s2)
 
     def _motion_tracker(self) -> MotionTracker:
-        load, g_m_s2 = self._loaded(self.info.calibration).parameters, self.info.calibration.g_m_s2
-        mass_kg = float(np.linalg.norm(load.gravity_force_base_N)) / g_m_s2
-        return MotionTracker(self.info.sensor_rate_Hz, mass_kg, load, self.info.p_flange_sensor_m)
+        load = self._expected.parameters
+        return MotionTracker(self.info.sensor_rate_Hz, self._mass_kg, load, self.info.p_flange_sensor_m)
+
+    @property
+    def _mass_kg(self) -> float:
+        """Of the load, with a part that is held."""
+        return float(np.linalg.norm(self._expected.parameters.gravity_force_base_N)) / self.info.calibration.g_m_s2
 
     def _free(self, rows: Paired) -> tuple[Array, Array, Array]:
         """Return the residual of a free tool at rest, (n, 6), its weight (n, 6) and the bias (6,)."""
@@ -244,23 +283,39 @@ class Processor:
         wrench = np.stack([np.interp(t_s, motion.t_s, column) for column in at_knots.T], axis=1)
         return wrench, int(knots[-1 - self._reach]) + 1
 
-    def _processed(self, rows: Paired, inertial: Array | None) -> Block:
+    def _processed(self, rows: Paired, motion: tuple[NDArray[np.int8], Array], inertial: Array | None) -> Block:
         stages, n = self._stages, len(rows)
         residual, gravity, bias = self._free(rows)  # chi2 is that of a free tool, whatever is switched off
+        states, felt = motion
         if inertial is not None:
             residual -= inertial
-        moving, wrenches = self._motion.follow(rows.R_base_flange, rows.p_base_flange_m)
-        if inertial is not None:
-            wrenches[0] = 0.0
+            known, left = Inertia.EXACT, residual
+        else:
+            known = Inertia.COARSE if np.isfinite(rows.p_base_flange_m).all() else Inertia.UNKNOWN
+            inertial = np.where((states == REST)[:, None], 0.0, felt)
+            left = residual - inertial
         if not self._noise_is_learnt:
-            self._noise.add(residual - wrenches[0], moving)
+            self._noise.add(left, states)
         current = self._expected
-        self._test.expect((current.parameters, current.covariance, current.response))
-        readings, chi2, beyond = self._test.judge(residual, rows.R_base_flange, (moving, wrenches), self._noise)
+        self._test.expect(
+            (current.parameters, current.covariance, current.response),
+            self._mass_kg,
+            tensor_known=self._inertia is not None,
+        )
+        readings, chi2, beyond = self._test.judge(
+            left,
+            gravity + inertial,
+            rows.R_base_flange,
+            motion,
+            self._noise,
+            delay_sigma_s=self.delay_sigma_s,
+            inertia=known,
+        )
         if n:
-            self.reading = readings[-1]
+            self._state, self.reading = int(states[-1]), readings[-1]
         readings = self._transform(readings, rows.R_base_flange)
-        in_contact, contacts = self._tracker.follow(rows.t_host_ns, beyond, readings)
+        soon = (states == REST) & (known is Inertia.EXACT)
+        in_contact, contacts = self._tracker.follow(rows.t_host_ns, beyond, readings, soon)
         self._report_contacts(contacts)
         wrench = residual
         if not stages.gravity:
@@ -292,7 +347,7 @@ class Processor:
 
         NaN until it is known. `R_base_flange` (3, 3) is that of the sample.
         """
-        noise = self._noise.of(Motion.REST)
+        noise = self._noise.of(self._state)
         if noise is None:
             return np.full(6, np.nan)
         if mean_s > 0:
@@ -316,6 +371,7 @@ class Processor:
             self._filter = self._filter_of(self._stages)
             self._recent.clear()
             self._buffer, self._done = None, 0
+            self._states = np.zeros(0, np.int8), np.zeros((0, 6))
             if elsewhere:
                 self._newest_seq = None
 
@@ -425,7 +481,7 @@ class Processor:
     @property
     def rest_sigma(self) -> Array | None:
         """(6,) standard deviation of one sample at rest; None until it is known."""
-        noise = self._noise.of(Motion.REST)
+        noise = self._noise.of(REST)
         return None if noise is None else np.sqrt(np.diag(noise.sample))
 
     def undo_tare(self) -> StreamEvent:
@@ -446,7 +502,7 @@ class Processor:
         self._filter = self._filter_of(self._stages)
 
     def _follow_drift(self, rows: Paired, residual: Array) -> None:
-        noise = self._noise.of(Motion.REST)
+        noise = self._noise.of(REST)
         if noise is None or not self._drift.follow(
             rows.t_host_ns, residual, rows.R_base_flange, noise, np.diag(self._test.uncertainty)
         ):
@@ -465,7 +521,7 @@ class ProcessedStream(ABC):
     info: StreamInfo
     clock: Clock
     on_contact: Callable[[Contact], object] | None = None
-    """Called by the thread that reads, once when a contact has lasted 60 to 80 ms and once when it is over."""
+    """Called by the thread that reads, once when a contact has lasted 40 to 60 ms and once when it is over."""
     _processor: Processor
 
     def _process(self, paired: Paired, *, last: bool = False) -> Block:
@@ -547,6 +603,11 @@ class ProcessedStream(ABC):
         NaN until the noise is known. `R_base_flange` is (3, 3).
         """
         return self._processor.sigma(R_base_flange, duration_s)
+
+
+def standard_stages(info: StreamInfo) -> Stages:
+    """Return bias and gravity, with inertia where calibration and cell have what it needs."""
+    return Stages(inertia=info.calibration.motion is not None and bool(np.isfinite(info.p_flange_sensor_m).all()))
 
 
 def stages_in_words(stages: Stages) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
-from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME, STANDARD, ProcessedStream, Processor
+from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME, ProcessedStream, Processor
 from ftdrive.live.samples import (
     Block,
     LinkStatus,
@@ -55,7 +55,7 @@ class ReplayedStream(ProcessedStream):
         rows: Paired,
         *,
         frame: WrenchFrame = SENSOR_FRAME,
-        stages: Stages = STANDARD,
+        stages: Stages | None = None,
         speed: float = 1.0,
         clock: Clock = REAL,
         false_alarm_rate: float = FALSE_ALARM_RATE,

@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
 from ftcalib.files import JSON
+from ftcalib.motion.model import HEIGHT
 from ftdrive.runs.verification_record import VerificationRecord, marks_of
 from ftdrivers.interfaces import Array, DeviceInfo
 
 Axes = Literal["sensor", "flange", "base", "tcp"]
 Point = Literal["sensor", "flange", "tcp"]
 Ns = NDArray[np.int64]
+_KNOWN_HEIGHT_M = 3e-3
+"""One sigma."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +62,7 @@ class Stages:
     bias: bool = True
     gravity: bool = True
     inertia: bool = False
-    """Subtract the inertial wrench of the identified load."""
+    """Subtract the inertial wrench of the load; on by default where the calibration is one in motion."""
     notch_Hz: float | None = None
     lowpass_Hz: float | None = None
     deadband_N: float = 0.0
@@ -192,12 +195,12 @@ class Sample:
     raw: Array
     """(6,) as measured, sensor axes, about the sensor origin."""
     in_contact: bool
-    """Whether four of the last five readings exceed the limit; it ends when four do not.
+    """Whether three readings in a row exceed the limit; it ends when three do not.
 
-    A reading is the mean over 20 ms, so a contact begins after 60 to 80 ms. One reading of a free tool in a million
-    exceeds the limit (`false_alarm_rate`); the limit follows the noise, also behind a filter of the sensor. At rest, a
-    force that grows by less than the limit in 2 s counts as drift, up to 0.5 N and 15 mN·m. In motion, inertia that is
-    not subtracted counts as unknown, so a smaller contact is not found.
+    A reading is the mean over 20 ms, so a contact begins after 40 to 60 ms. One reading of a free tool in a million
+    exceeds the limit (`false_alarm_rate`). The limit follows the noise in the present state of motion, also behind a
+    filter of the sensor. At rest, a force that grows by less than the limit in 2 s counts as drift, up to 0.5 N and
+    15 mN·m. In motion, inertia that is not subtracted counts as unknown, so a smaller contact is not found.
     """
     frame: WrenchFrame
 
@@ -207,8 +210,14 @@ def mean_rate_Hz(t_ns: NDArray[np.int64]) -> float:
     return (len(t_ns) - 1) / max(float(t_ns[-1] - t_ns[0]) * 1e-9, 1e-9)
 
 
-def sensor_origin_m(height_mm: float | None) -> Array:
-    """Return `p_flange_sensor_m` (3,) of a sensor whose origin is so high above the flange face; NaN where unknown."""
+def sensor_origin_m(height_mm: float | None, calibration: CalibrationResult | None = None) -> Array:
+    """Return `p_flange_sensor_m` (3,) of a sensor whose origin is so high above the flange face; NaN where unknown.
+
+    A calibration in motion that knows the height well replaces one that is not configured.
+    """
+    motion = None if calibration is None else calibration.motion
+    if height_mm is None and motion is not None and float(motion.covariance[HEIGHT, HEIGHT]) < _KNOWN_HEIGHT_M**2:
+        height_mm = 1e3 * motion.height_m
     return np.full(3, np.nan) if height_mm is None else np.array([0.0, 0.0, height_mm / 1e3])
 
 

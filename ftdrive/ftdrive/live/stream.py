@@ -20,7 +20,7 @@ from ftdrive.checks.devices import belonging
 from ftdrive.errors import ConfigError
 from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.pairing import Pairing
-from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME, STANDARD, ProcessedStream, Processor
+from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME, ProcessedStream, Processor
 from ftdrive.live.samples import (
     Block,
     LinkStatus,
@@ -95,7 +95,7 @@ class CompensatedStream(ProcessedStream):
         name: str = "",
         force: bool = False,
         frame: WrenchFrame = SENSOR_FRAME,
-        stages: Stages = STANDARD,
+        stages: Stages | None = None,
         false_alarm_rate: float = FALSE_ALARM_RATE,
         devices: tuple[ForceTorqueSensor | None, RobotArm | None] = (None, None),
     ) -> None:
@@ -192,7 +192,7 @@ class CompensatedStream(ProcessedStream):
             utc_offset_ns=time.time_ns() - self.clock.now_ns(),  # the anchor of all times in files
             sensor_rate_Hz=sensor_rate_Hz,
             arm_rate_Hz=arm_rate_Hz,
-            p_flange_sensor_m=sensor_origin_m(self.cell.sensor.height_mm),
+            p_flange_sensor_m=sensor_origin_m(self.cell.sensor.height_mm, self._calibration),
             R_flange_tcp=np.eye(3) if status.tcp_offset is None else Rotation.from_rotvec(tcp[3:]).as_matrix(),
             p_flange_tcp_m=tcp[:3],
             versions=versions(),
@@ -283,6 +283,7 @@ class CompensatedStream(ProcessedStream):
         paired = self._pairing.take()
         if paired is None:
             return None
+        self._processor.delay_sigma_s = self._pairing.delay_sigma_s
         block = self._process(paired)
         return block if len(block) else None
 

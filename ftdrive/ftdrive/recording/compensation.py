@@ -134,6 +134,7 @@ def compensated(
                 block = processor.process(samples) if len(samples) else None
                 found.add(block, [one for one in events if one.kind in _KEPT], processor.take_events(), recorder)
                 show(f"Compensating: {share:.0%}")
+            found.add(processor.finish(), [], processor.take_events(), recorder)
         except (BadDataset, BadRecording, KeyboardInterrupt) as error:
             if not found.samples:
                 raise
@@ -177,6 +178,7 @@ class _Sums:
         self, block: Block | None, old: Sequence[StreamEvent], new: Sequence[StreamEvent], recorder: Recorder | None
     ) -> None:
         """Add the next block, and the events of the recording and of the result since the one before."""
+        block = block if block is not None and len(block) else None
         if block is not None:
             if not self.samples:
                 self._begin_ns, self._seq = int(block.t_host_ns[0]), int(block.seq[0]) - 1

@@ -18,7 +18,7 @@ from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format
 from ftdrive.errors import BadRecording
 from ftdrive.live.quaternions import matrices, quaternions
-from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame
+from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame, sensor_origin_m
 from ftdrive.runs.verification_record import VerificationRecord
 from ftdrivers.interfaces import DeviceInfo, Fact
 
@@ -227,6 +227,8 @@ class Source(Protocol):
 def with_calibration(header: Header, calibration: CalibrationResult, name: str) -> Header:
     """Return a header with another calibration."""
     info = replace(header.info, calibration=calibration, calibration_name=name, verification=None, calibration_state="")
+    if not np.isfinite(info.p_flange_sensor_m).all():
+        info = replace(info, p_flange_sensor_m=sensor_origin_m(None, calibration))
     return replace(header, info=info)
 
 
