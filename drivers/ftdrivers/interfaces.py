@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftdrivers.errors import DeviceFault
 from ftdrivers.follow import Follow
+from ftdrivers.sweep import Sweep
 
 Array = NDArray[np.float64]
 
@@ -439,6 +440,16 @@ class RobotArm(_Device):
         least 20 times a second while the arm moves. Whatever ends the wait early (an exception of the guard, a fault,
         the time-out, Ctrl-C) stops the arm first and is raised afterwards.
         """
+
+    def sweep(self, sweep: Sweep, *, guard: Guard) -> None:
+        """Follow a sweep from the posture where it begins, and return when the arm stands there again. Needs control.
+
+        `guard` and early ends as in `move_to`. The default raises `DeviceFault`.
+        """
+        guard()
+        raise DeviceFault(
+            f"the driver of this arm cannot follow a sweep of {sweep.duration_s:g} s", "calibrate without --sweep"
+        )
 
     @abstractmethod
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:

@@ -1,6 +1,7 @@
 """A calibration from a recording in motion."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,8 @@ _MISTAKES = frozenset(
 _COMPENSATED = 0.5
 """Of the inertial mass: less weight than this was subtracted."""
 _JUDGED_ROWS = 300
+_SECOND = 9
+"""Rows."""
 _OF_POSES = frozenset(("noise_unknown", "poses_unchecked", "pose_deviates", "residuals_alike", "few_poses"))
 """Findings about single poses, which rows in motion are not."""
 
@@ -118,6 +121,8 @@ def solve_motion(
     found += _findings(rows, used, best, motion, height_m, positions=positions)
     estimated = best.components.keys() & {"gain", "cross_talk"}
     places = np.r_[0:15, 23:34]
+    response = Response(best.load.response, best.covariance[np.ix_(places, places)]) if estimated else None
+    error = expected_error(best.load.static, best.covariance[:15, :15], response)
     return CalibrationResult(
         parameters=best.load.static,
         covariance=best.covariance[:15, :15],
@@ -131,10 +136,12 @@ def solve_motion(
         provenance=provenance or {},
         components=best.components,
         drift=None if best.drift_change is None else DriftResult(*best.drift_change),
-        response=Response(best.load.response, best.covariance[np.ix_(places, places)]) if estimated else None,
+        response=response,
         gain_sigma=best.components.get("gain", 0.0),
         second_basin_chi2=best.second_basin_chi2,
         quality={
+            "next_use_force_rms_N": error[0],
+            "next_use_torque_rms_Nm": error[1],
             "loo_force_rms_N": quality.loo_force_rms_N,
             "loo_torque_rms_Nm": quality.loo_torque_rms_Nm,
             "worst_pose": quality.worst_pose + 1,
@@ -218,9 +225,13 @@ def _static_wrench(rows: Rows, best: MotionFit, weight_N: float) -> Array:
 def _judged(
     rows: Rows, best: MotionFit, setup: Setup, known: Known | None, g_m_s2: float
 ) -> tuple[Quality, NDArray[np.intp]]:
-    """Judge some kept rows as if they were poses; also return their places."""
+    """Judge some kept rows as if they were poses; also return their places.
+
+    A pose is a mean, so each row has the mean residual of a second around it: what is quicker is vibration.
+    """
     places = np.flatnonzero(best.kept)
     places = places[:: max(1, len(places) // _JUDGED_ROWS)]
+    best = replace(best, residuals=_mean_of_a_second(best), sigma=best.sigma / np.sqrt(_SECOND))
     weight_N = float(np.linalg.norm(best.load.static.gravity_force_base_N))
     poses = IndependentFit(
         best.load.static,
@@ -233,6 +244,13 @@ def _judged(
         best.second_basin_chi2,
     )
     return judge(poses, t_s=rows.t_s[places], setup=setup, known=known, g_m_s2=g_m_s2), places
+
+
+def _mean_of_a_second(best: MotionFit) -> Array:
+    """Residuals (n, 6) averaged over the kept rows among the nearest."""
+    window, weight = np.ones(_SECOND), best.kept.astype(np.float64)
+    count = np.maximum(np.convolve(weight, window, "same"), 1.0)
+    return np.stack([np.convolve(column * weight, window, "same") / count for column in best.residuals.T], axis=1)
 
 
 def _findings(

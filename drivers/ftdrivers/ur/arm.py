@@ -30,6 +30,7 @@ from ftdrivers.interfaces import (
     Guard,
     RobotArm,
 )
+from ftdrivers.sweep import Sweep
 from ftdrivers.ur.control import CONTROL_SETTINGS, STOP_RAD_S2, Control, ControlSetting
 from ftdrivers.ur.controller_settings import checked_gravity, checked_payload, read_controller_settings
 from ftdrivers.ur.kinematics import MODELS, model_named
@@ -46,6 +47,8 @@ _ARRIVED_RAD: Final = 1e-3
 _STANDING_RAD_S: Final = 1e-6
 """Speed of the set-point, which is exactly zero at rest."""
 _STILL_RAD_S: Final = 0.002
+_SETTLES_S: Final = 5.0
+"""Within this time after the end of a sweep the arm stands."""
 
 
 class UrArm(RobotArm):
@@ -341,6 +344,47 @@ class UrArm(RobotArm):
         speed = self._speed_rad_s if speed_rad_s is None else float(speed_rad_s)
         acceleration = self._acceleration_rad_s2 if acceleration_rad_s2 is None else float(acceleration_rad_s2)
         _check_speed(speed, acceleration)
+
+        def begin(control: Control) -> bool:
+            return bool(control.call("move", q, speed, acceleration, look_out=self._look_out))
+
+        self._travel(begin, q, speed, f"the move to {_degrees(q)}", timeout_s=timeout_s, guard=guard)
+
+    def sweep(self, sweep: Sweep, *, guard: Guard) -> None:
+        """Follow a sweep from the posture where it begins; see `RobotArm`. Guard and errors as in `move_to`.
+
+        Our program evaluates it in every cycle of the controller. The path "ur-rtde" cannot: the arm would follow this
+        computer, and not stop with it.
+        """
+        centre = _joints(sweep.centre_rad)
+        speed = float(sweep.largest(1).max())
+        _check_speed(speed, float(sweep.largest(2).max()))
+        if not self._in_control().stops_itself:
+            raise DeviceFault(
+                "the control path ur-rtde follows no sweep, because its program on the controller cannot evaluate one",
+                "take the other path: --control script, or [robot] control",
+            )
+
+        def begin(control: Control) -> bool:
+            waves = sweep.waves.reshape(-1, 3).tolist()
+            sent = all(control.call("wave", k, *wave, look_out=self._look_out) for k, wave in enumerate(waves))
+            numbers = (centre, sweep.duration_s, sweep.ramp_s)
+            return sent and bool(control.call("sweep", *numbers, look_out=self._look_out))
+
+        timeout_s = sweep.duration_s + _SETTLES_S
+        self._travel(begin, centre, speed, "the sweep", timeout_s=timeout_s, guard=guard)
+
+    def _travel(
+        self,
+        begin: Callable[[Control], bool],
+        q: list[float],
+        speed_rad_s: float,
+        what: str,
+        *,
+        timeout_s: float,
+        guard: Guard,
+    ) -> None:
+        """Begin a motion that ends at `q`, and return when it has."""
         control = self._in_control()
         self._stop_requested.clear()
         self._goal = None
@@ -348,17 +392,13 @@ class UrArm(RobotArm):
             self._look_out()
         self._check_ours(control)  # another program is not stopped
         guard()
-        self._moves_at_rad_s = speed
+        self._moves_at_rad_s = speed_rad_s
         with self._stopping_on_error():
             with self._reporting_stop():
-                if not control.call("move", q, speed, acceleration, look_out=self._look_out):
-                    raise self._fault() or DeviceFault(
-                        f"the controller rejected the move to {_degrees(q)}", "read the pendant's log"
-                    )
+                if not begin(control):
+                    raise self._fault() or DeviceFault(f"the controller rejected {what}", "read the pendant's log")
             checked_s = self._clock.now_s()
-            for look in self._watch(
-                timeout_s, guard, f"the move to {_degrees(q)} has not ended", self._look_out_moving
-            ):
+            for look in self._watch(timeout_s, guard, f"{what} has not ended", self._look_out_moving):
                 with self._reporting_stop():
                     if self._has_ended(control):
                         self._check_arrival(look, q)

@@ -32,7 +32,7 @@ class Control(ABC):
     """
 
     stops_itself = False
-    """Whether the program stops the arm and ends when the link is lost."""
+    """Whether the program stops the arm and ends when the link is lost. Only such a program follows a sweep."""
 
     @property
     @abstractmethod

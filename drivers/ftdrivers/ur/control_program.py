@@ -36,9 +36,13 @@ COMMANDS: Final = MappingProxyType(
         "set_payload": 5,
         "set_gravity": 6,
         "quit": 7,
+        "wave": 8,
+        "sweep": 9,
     }
 )
-"""By the names of `control_child.Calls`."""
+"""By the names of `control_child.Calls`, which has no sweep."""
+MOVING: Final = ("move", "sweep")
+"""Commands that begin a motion."""
 _MOVING: Final = 2
 _NO_HEARTBEAT: Final = -2
 

@@ -20,7 +20,7 @@ from typing import Any, Final
 from ftdrivers.clock import Clock, Follower
 from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.ur.control import Control, LookOut, ProgramRefused
-from ftdrivers.ur.control_program import COMMANDS, INPUTS, NAME, NUMBERS, OUTPUTS, Report, program_text
+from ftdrivers.ur.control_program import COMMANDS, INPUTS, MOVING, NAME, NUMBERS, OUTPUTS, Report, program_text
 from ftdrivers.ur.primary import Code, Failed, Primary, RobotType, Stopped
 from ftdrivers.ur.rtde import Subscription
 from ftdrivers.ur.timing import Patience, UrTiming, held
@@ -119,7 +119,7 @@ class ScriptControl(Control):
             )
             with self._changed:
                 report = self._report
-                self._moving = self._moving or (name == "move" and bool(report.answer))
+                self._moving = self._moving or (name in MOVING and bool(report.answer))
             if report.sequence > sequence:
                 raise StreamBroken(f"another command replaced {name}", "open the arm again")
             if name == "tcp_offset":
@@ -317,7 +317,7 @@ class ScriptControl(Control):
         return self._command[0]
 
     def _set(self, command: int, numbers: Sequence[float]) -> None:
-        if COMMANDS["move"] == command:
+        if command in {COMMANDS[name] for name in MOVING}:
             self._unwatched = False
         padding = (0.0,) * (NUMBERS - len(numbers))
         self._command = (self._command[0] + 1, command, (*numbers, *padding))

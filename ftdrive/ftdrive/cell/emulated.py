@@ -18,6 +18,8 @@ from ftdrivers.errors import ConnectError
 
 TIME_SCALE = 20
 """The emulated arm moves this many times faster; nothing else differs from a real cell."""
+REAL_PACE = ("--time-scale", "1")
+"""Options of a cell whose arm is recorded in motion."""
 
 SENSORS = {
     "can": "ATI sensor on CAN",

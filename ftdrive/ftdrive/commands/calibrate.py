@@ -15,6 +15,7 @@ from ftdrive.commands.common import (
     FOLDER,
     YES,
     NewFile,
+    Number,
     declined_aborts,
     index_run,
     require_viz,
@@ -32,8 +33,9 @@ if TYPE_CHECKING:
 
 _OF_A_PLAN = ("--quick", "--minimal", "--output", "--png", "--view")
 _EXCLUDE_ONE_ANOTHER = (
-    ("--step", "--manual", "--listen"),
-    ("--quick", "--minimal", "--plan", "--resume"),
+    ("--step", "--manual", "--listen", "--sweep"),
+    ("--quick", "--minimal", "--plan", "--resume", "--sweep"),
+    ("--fast", "--sweep"),
     *((hand, option) for hand in ("--manual", "--listen") for option in _OF_A_PLAN),
     *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
 )
@@ -51,6 +53,10 @@ _EXCLUDE_ONE_ANOTHER = (
 @simulate()
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
+@click.option("--sweep", is_flag=True, help="Calibrate in one smooth motion of the wrist, with inertia and delay.")
+@click.option(
+    "--seconds", type=Number(10, 120), default=20.0, show_default=True, help="With --sweep: its duration at full speed."
+)
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
 @click.option(
     "--fast", is_flag=True, help="Full speed of the plan (60 °/s, 250 mm/s at most), after one complete slow run."
@@ -80,6 +86,7 @@ def calibrate(
     simulate: bool,
     quick: bool,
     minimal: bool,
+    sweep: bool,
     step: bool,
     manual: bool,
     listen: bool,
@@ -94,7 +101,7 @@ def calibrate(
     word. If there is room, only the three wrist joints move. Ctrl-C stops the arm; the poses are kept, and --resume
     continues.
     """
-    from ftdrive.cell.emulated import Station
+    from ftdrive.cell.emulated import REAL_PACE, Station
     from ftdrive.commands.emulated_run import start_mover
     from ftdrive.runs.run import Run
     from ftdrive.session.options import SessionOptions
@@ -106,13 +113,15 @@ def calibrate(
 
     _refuse_contradictions(click.get_current_context())
     require_viz(as_session["png"], view=as_session["view"])
-    mode: Mode = "step" if step else "manual" if manual else "listen" if listen else "auto"
+    chosen: dict[Mode, bool] = {"sweep": sweep, "step": step, "manual": manual, "listen": listen}
+    mode: Mode = next((name for name, given in chosen.items() if given), "auto")
     with ExitStack() as stack:
         description: dict[str, Any] = {}
         made_by = None if resume is None else Run(resume).header_to_resume().get("station")
         simulate = simulate or bool(made_by and not (config or robot or tool))  # a resumed run keeps its cell
         if simulate:
-            station = stack.enter_context(Station.of(made_by, sensor, control_path=control))
+            pace = REAL_PACE if sweep else ()
+            station = stack.enter_context(Station.of(made_by, sensor, pace, control_path=control))
             cell = station.cell
             description = described(station)
         else:

@@ -9,16 +9,19 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from ftdrive.cell.emulated import Station
     from ftdrive.runs.outcome import Outcome
+    from ftdrive.runs.run import Mode
     from ftdrive.session.options import SessionOptions
 
 
-def rehearse(station: "Station", runs: Path, name: str, *, poses: int = 24, kept: bool = True) -> "Outcome":
+def rehearse(
+    station: "Station", runs: Path, name: str, *, poses: int = 24, kept: bool = True, mode: "Mode" = "auto"
+) -> "Outcome":
     """Calibrate an emulated cell as `ftdrive.session.rehearsal.rehearse` does, and show it."""
     from ftdrive.session import rehearsal
     from ftdrive.terminal.screen import open_operator
 
     with open_operator() as operator:
-        return rehearsal.rehearse(station, runs, name, operator, poses=poses, kept=kept)
+        return rehearsal.rehearse(station, runs, name, operator, poses=poses, kept=kept, mode=mode)
 
 
 def start_mover(station: "Station", options: "SessionOptions") -> None:

@@ -10,7 +10,9 @@ _SPELLED = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–"
 
 
 def require_usable(plan: Plan) -> None:
-    """Raise `PlanRefused` for placeholders, moves that are not proven clear, and values that no arm can follow."""
+    """Raise `PlanRefused` for sweeps, placeholders, moves that are not proven clear, and values no arm can follow."""
+    if plan.sweep is not None:
+        raise PlanRefused("this plan is a sweep, which no other program can follow: export the plan of a tour")
     if not plan.measured:
         raise PlanRefused(
             "tool, planes and boxes of this plan are not marked as measured: "

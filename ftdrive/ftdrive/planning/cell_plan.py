@@ -14,6 +14,7 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene, lean_
 from ftdrive.planning.motion import Speeds, slower
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_box, plan_cone, plan_tour
+from ftdrive.planning.sweep_planner import plan_sweep
 from ftdrivers.ur.kinematics import MODELS, model_named
 
 FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
@@ -53,6 +54,19 @@ def plan_for(
         made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
     if not made.certified:
         raise PlanRefused("a move of the plan could not be proven clear")
+    return made.marked(measured=cell.workcell.measured, emulated=cell.is_emulated)
+
+
+def sweep_for(cell: CellConfig, certifier: Certifier, q_rad: ArrayLike, seconds: float) -> Plan:
+    """Plan a sweep for a cell, with its certifier, from joint angles `q_rad` (6,); raises as `plan_sweep`."""
+    made = plan_sweep(
+        certifier,
+        q_rad,
+        seconds,
+        speeds=speeds_of(cell),
+        stop_rad_s2=float(np.radians(cell.robot.stop_deceleration_deg_s2)),
+        guess=guess_of(certifier, cell.tool.mass_kg),
+    )
     return made.marked(measured=cell.workcell.measured, emulated=cell.is_emulated)
 
 

@@ -14,10 +14,13 @@ from ftcalib.poses.information import Guess, Prediction, predicted_sigma, specia
 from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
+from ftdrivers.sweep import Sweep
 from ftdrivers.ur.kinematics import Array
 
 PLAN_FORMAT = "ftdrive.plan/1"
 BALL_SAMPLES = 181
+PROOF_S = 0.1
+"""Between two points of a sweep whose straight move is proven clear."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +47,7 @@ class Plan:
     """A closed tour of poses; `to_dict` defines the file."""
 
     kind: str
-    """constant, wrist, posture, box, cone, reachable or verification."""
+    """constant, wrist, posture, box, cone, reachable, verification or sweep."""
     why: tuple[str, ...]
     """What was tried, and the loss of accuracy of this choice."""
     made_for: Mapping[str, str]
@@ -58,6 +61,10 @@ class Plan:
     predicted: Mapping[str, Any]
     description: Mapping[str, Any]
     """Model, tool, scene and speeds; `measured` and `emulated` see `marked`."""
+    sweep: Sweep | None = None
+    """The curve that the arm follows through the steps, which are points of it."""
+    off_curve_m: float = 0.0
+    """How much nearer to anything the arm can be on the curve than on the moves between the steps."""
 
     @property
     def certified(self) -> bool:
@@ -97,6 +104,25 @@ class Plan:
         return np.array([step.R_base_flange for step in self.steps])
 
     @property
+    def nodes_rad(self) -> Array:
+        """(n, 6) joint vectors at which the arm stands: the poses, or the centre of a sweep."""
+        if self.sweep is not None:
+            return np.array([self.sweep.centre_rad])
+        return np.array([step.q_rad for step in self.steps])
+
+    @property
+    def stops(self) -> range:
+        """Numbers of the stops, from 1: every pose and the return to the first; a sweep is one."""
+        return range(1, 2 if self.sweep else len(self.steps) + 2)
+
+    @property
+    def top_speed_rad_s(self) -> float:
+        """Largest speed of a joint."""
+        if self.sweep is not None:
+            return float(self.sweep.largest(1).max())
+        return max(step.speed_rad_s for step in self.steps)
+
+    @property
     def motion_time_s(self) -> float:
         """Sum of the moves at the plan's speeds, the last one back included."""
         return float(sum(step.duration_s for step in self.steps))
@@ -126,6 +152,8 @@ class Plan:
             "description": dict(self.description),
             "steps": [asdict(step) for step in self.steps],
         }
+        if self.sweep is not None:
+            document |= {"sweep": self.sweep.to_dict(), "off_curve_m": self.off_curve_m}
         document = json.loads(json.dumps(document))  # tuples become lists, as they come back from a file
         return document | {"sha256": digest(document)}
 
@@ -159,6 +187,8 @@ class Plan:
             tuple(document["ball_centre_m"]),
             document["predicted_sigma"],
             document["description"],
+            Sweep.from_dict(document["sweep"]) if "sweep" in document else None,
+            document.get("off_curve_m", 0.0),
         )
 
     def require(self, certifier: Certifier) -> None:
@@ -168,7 +198,9 @@ class Plan:
         if changed:
             raise PlanRefused(f"the plan was made for another {' and another '.join(changed)}: make a new one")
         q = np.array([step.q_rad for step in self.steps])
-        if not certifier.clear_around(q):
+        if self.sweep is not None:
+            q = self.sweep.at(np.arange(0.0, self.sweep.duration_s, PROOF_S))
+        if not certifier.keeping(self.off_curve_m).clear_around(q):
             raise PlanRefused("a move of the plan cannot be proven clear: make a new plan")
 
 
@@ -203,7 +235,7 @@ def make_plan(
     words = f"Predicted error of force compensation: {prediction.force_rms_N:.3f} N"
     if set(numbers) != set(range(1, 25)):
         words += f", {prediction.force_rms_N / all_24:.2f} times that of all 24 poses"
-    ball_centre_m, ball_m = _ball(certifier, q_rad, following)
+    ball_centre_m, ball_m = ball_of(certifier, q_rad, following)
     steps = tuple(
         Step(
             int(numbers[i]),
@@ -227,22 +259,27 @@ def make_plan(
         ball_m,
         tuple(ball_centre_m.tolist()),
         _as_json(prediction),
-        {
-            "model": arm.name,
-            "tool": [asdict(part) for part in arm.tool],
-            "scene": certifier.scene.describe(),
-            "margins": asdict(certifier.margins),
-            "speeds": asdict(speeds),
-            "guess": {
-                "mass_kg": guess.mass_kg,
-                "sigma_force_N": guess.sigma_force_N,
-                "sigma_torque_Nm": guess.sigma_torque_Nm,
-            },
-        },
+        description_of(certifier, speeds, guess),
     )
 
 
-def _ball(certifier: Certifier, start_rad: Array, end_rad: Array) -> tuple[Array, float]:
+def description_of(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[str, Any]:
+    """Return the description of a plan."""
+    return {
+        "model": certifier.arm.name,
+        "tool": [asdict(part) for part in certifier.arm.tool],
+        "scene": certifier.scene.describe(),
+        "margins": asdict(certifier.margins),
+        "speeds": asdict(speeds),
+        "guess": {
+            "mass_kg": guess.mass_kg,
+            "sigma_force_N": guess.sigma_force_N,
+            "sigma_torque_Nm": guess.sigma_torque_Nm,
+        },
+    }
+
+
+def ball_of(certifier: Certifier, start_rad: Array, end_rad: Array) -> tuple[Array, float]:
     """Centre (3,) and radius of a ball that contains wrist and tool during all moves."""
     share = np.linspace(0, 1, BALL_SAMPLES)[:, None, None]
     wrist_m = certifier.arm.frames(((1 - share) * start_rad + share * end_rad).reshape(-1, 6)).wrist_m

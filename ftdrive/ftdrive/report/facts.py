@@ -50,6 +50,7 @@ def facts_of(subject: Subject) -> dict[str, Any]:
     Units are those of the names: rad, m, N, N·m, s. `result` is the content of the calibration file.
     """
     result, dataset = subject.result, subject.dataset
+    R_base_flange = _swept(subject) if dataset is None else dataset.R_base_flange
     force_N, torque_Nm = result.likely_error().tolist()
     last = (subject.trust or {}).get("last_verification")
     failed = last is not None and not last["passed"] and result.verdict != "rejected"
@@ -78,7 +79,8 @@ def facts_of(subject: Subject) -> dict[str, Any]:
         "poses": _poses(subject),
         "drift": _drift(subject),
         "noise": _noise(subject),
-        "coverage": None if dataset is None else _coverage(subject, dataset.R_base_flange),
+        "coverage": None if R_base_flange is None else _coverage(subject, R_base_flange),
+        "motion": None if result.motion is None else _motion(subject),
         "tour": None if subject.run is None else _tour(subject.run, len(subject.records)),
         "comparison": None if subject.parent is None else compared(result, subject.parent),
         "compared_with": subject.parent_name,
@@ -190,6 +192,33 @@ def _coverage(subject: Subject, R_base_flange: Array) -> dict[str, Any]:
         "largest_gap_rad": gap_rad,
         "gap_towards": towards.tolist(),
         "gap_words": direction_in_words(towards, "flange"),
+    }
+
+
+def _swept(subject: Subject) -> Array | None:
+    """Orientations (n, 3, 3) along the planned sweep; None for another source."""
+    run = subject.run
+    if run is None or not run.in_motion or not run.plan_path.is_file():
+        return None
+    return Plan.load(run.plan_path).R_base_flange
+
+
+def _motion(subject: Subject) -> dict[str, Any] | None:
+    """Return what a recording in motion gives beside the static model, and the planned sweep."""
+    motion = subject.result.motion
+    if motion is None:
+        return None
+    run, sweep = subject.run, None
+    if run is not None and run.in_motion and run.plan_path.is_file():
+        sweep = Plan.load(run.plan_path).to_dict().get("sweep")
+    return {
+        "inertia_kg_m2": motion.inertia_kg_m2.tolist(),
+        "sigma": {name: np.asarray(value).tolist() for name, value in motion.sigma.items()},
+        "delay_s": motion.delay_s,
+        "height_m": motion.height_m,
+        "used_share": motion.used_share,
+        "contacts": [dict(one) for one in motion.contacts],
+        "sweep": sweep,
     }
 
 

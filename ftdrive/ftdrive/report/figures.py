@@ -14,9 +14,11 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftdrive.errors import ConfigError
+from ftdrive.planning.show.words import JOINTS
 from ftdrive.report.fit_sections import SUSPICIOUS_SIGMAS
 from ftdrive.report.origin_sections import LIMIT_SIGMAS
 from ftdrive.report.words import label_of, shown_poses
+from ftdrivers.sweep import WRISTS, Sweep
 
 Facts = Mapping[str, Any]
 
@@ -171,6 +173,16 @@ def _dots(axes: Any, directions: Any, **style: Any) -> None:
     axes.scatter(*_on_map(directions[::step]), linewidth=0.8, zorder=3, clip_on=False, **style)
 
 
+def _sweep(figure: Any, facts: Facts) -> None:
+    axes, sweep = figure.add_subplot(), Sweep.from_dict(facts["motion"]["sweep"])
+    t_s = np.linspace(0.0, sweep.duration_s, 400)
+    q_deg = np.degrees(sweep.at(t_s))
+    for joint, colour in zip(WRISTS, SERIES, strict=True):
+        axes.plot(t_s, q_deg[:, joint], color=colour, linewidth=1.5, label=JOINTS[joint])
+    axes.set(xlabel="time, s", ylabel="joint, °", xlim=(0, sweep.duration_s))
+    axes.legend(loc="upper right", fontsize=8, ncols=3)
+
+
 def _correlation(figure: Any, facts: Facts) -> None:
     axes = figure.add_subplot()
     matrix = np.abs(np.array(facts["correlation"]["matrix"]))
@@ -305,6 +317,7 @@ _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callabl
     "time_residuals": (3.8, (0.65, 0.1, 0.5, 0.35), _time_residuals),
     "noise": (3.6, (0.65, 0.1, 0.65, 0.1), _noise),
     "coverage": (2.7, (0.1, 0.1, 0.1, 0.1), _coverage),
+    "sweep": (2.6, (0.65, 0.1, 0.5, 0.1), _sweep),
     "comparison": (3.8, (1.15, 0.2, 0.5, 0.1), _comparison),
 }
 """Height and margins (left, right, bottom, top) in inches and how to draw it, by name."""

@@ -32,6 +32,9 @@ def tour(facts: Facts) -> Section:
         text.append(run["plan_error"] or "The poses were chosen by hand: there is no plan.")
         return Section("tour", title, text, (), tables)
     text += plan["why"]
+    if "sweep" in plan:
+        text.append(f"Proven clear along the whole curve, nearest {plan['min_clearance_mm']:.0f} mm.")
+        return Section("tour", title, text, (), tables)
     text.append(
         f"{plan['poses']} poses, {plan['motion_time_s']:.0f} s of motion, no move above {plan['max_move_deg']:.0f}°, "
         f"{'all' if plan['certified'] else 'NOT all'} proven clear, nearest {plan['min_clearance_mm']:.0f} mm."

@@ -5,6 +5,7 @@ from typing import Any
 
 from ftdrive.report.document import Section
 from ftdrive.report.fit_sections import coverage, cross_validation, drift, error, estimates, noise, residuals
+from ftdrive.report.motion_section import motion
 from ftdrive.report.origin_sections import comparison, provenance, tour
 
 
@@ -13,6 +14,7 @@ def sections_of(facts: Mapping[str, Any]) -> list[Section]:
     return [
         estimates(facts),
         error(facts),
+        *([motion(facts)] if facts["motion"] is not None else []),
         cross_validation(facts),
         residuals(facts),
         drift(facts),

@@ -14,7 +14,8 @@ from ftcalib.likelihood.session import Drift
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord
 from ftdrive.errors import ConfigError
-from ftdrive.runs.run import Run
+from ftdrive.runs.outcome import solve_in_motion
+from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import read_source
 
 
@@ -92,7 +93,7 @@ def is_calibration(source: Path) -> bool:
 
 def _of_result(source: Path, result: CalibrationResult) -> Subject:
     folder = source.absolute().parent
-    if (folder / "run.json").is_file():
+    if (folder / "run.json").is_file() and not in_motion(folder):
         data = read_source(folder, "R_base_flange")
         if data.dataset.sha256() == result.provenance.get("dataset_sha256"):
             run = Run(folder)
@@ -100,7 +101,19 @@ def _of_result(source: Path, result: CalibrationResult) -> Subject:
     return Subject(source, result, "")
 
 
+def _in_motion(source: Path, options: SolveOptions) -> Subject:
+    """Return the subject of a run in motion, which has no dataset."""
+    run = Run(source)
+    if options == SolveOptions() and run.calibration_path.is_file():
+        result = CalibrationResult.load(run.calibration_path)
+    else:
+        result = solve_in_motion(run, options.known)
+    return Subject(source, result, " ".join([run.solve_command, *options.words]), run=run)
+
+
 def _of_data(source: Path, options: SolveOptions) -> Subject:
+    if in_motion(source):
+        return _in_motion(source, options)
     data = read_source(source, options.orientation, options.known, options.up_in_base)
     solved_with = {"drift": options.drift, **data.circumstances}
     run = Run(source) if source.is_dir() else None

@@ -4,9 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ftcalib import CalibrationDataset, CalibrationResult, Setup, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, solve
 from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
 from ftdrive.planning.geometry.scene import down_of
+from ftdrive.runs.motion import solve_motion_file
 from ftdrive.runs.run import Run, made_now
 
 
@@ -15,24 +16,41 @@ class Outcome:
     """A solved run."""
 
     run: Run
-    dataset: CalibrationDataset
+    dataset: CalibrationDataset | None
+    """None of a run in motion."""
     result: CalibrationResult
     drift: DriftCheck | None
 
 
 def solve_and_save(run: Run) -> Outcome:
     """Solve a run from its files, so that the files suffice to repeat it. Raises `OSError` if they cannot be saved."""
-    outcome = solve_records(run, run.records())
+    outcome = Outcome(run, None, solve_in_motion(run), None) if run.in_motion else solve_records(run, run.records())
     try:
-        outcome.dataset.save(run.new_path("dataset"))
+        if outcome.dataset is not None:
+            outcome.dataset.save(run.new_path("dataset"))
         if outcome.result.verdict != "rejected":
             outcome.result.save(run.new_path("calibration"))
     except OSError as error:
+        kept = "all poses are" if outcome.dataset is not None else "the recording is"
         raise OSError(
-            f"{error.strerror or error}: the result is not saved, but all poses are. Make room in {run.folder}, then "
+            f"{error.strerror or error}: the result is not saved, but {kept}. Make room in {run.folder}, then "
             f"{run.solve_command} --output FILE"
         ) from error
     return outcome
+
+
+def solve_in_motion(run: Run, known: Known | None = None, *, point_mass: bool = False) -> CalibrationResult:
+    """Solve the recording of a run in motion."""
+    circumstances, origin = circumstances_of(run)
+    setup: Setup = circumstances["setup"]
+    return solve_motion_file(
+        run.motion_path,
+        height_m=setup.sensor_height_m,
+        known=known,
+        point_mass=point_mass,
+        provenance={**made_now(), **origin},
+        **circumstances,
+    )
 
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:

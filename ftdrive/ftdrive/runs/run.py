@@ -3,6 +3,7 @@
 run.json          ftdrive.run/1: when, with what, command line, versions, configuration, devices
 plan.json         ftdrive.plan/1: the plan the arm followed; not where a person moved it
 events.ndjson     what happened, one object a line, as `ftdrive.session.events` has it
+motion.npz        ftdrive.motion/1: every sample of sensor and arm while the tool moved; motion-2.npz likewise
 poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on; 01-2.npz took its place
 dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after poses were added or taken again
 calibration.json  ftdrive.calibration/1: the result; calibration-2.json likewise. Of a verification: the accepted update
@@ -69,7 +70,7 @@ CRC: Final = "crc32"
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 """Of a recording, named as in `FtSamples`."""
 
-Mode = Literal["auto", "step", "manual", "listen"]
+Mode = Literal["auto", "step", "manual", "listen", "sweep"]
 """How a session moves from pose to pose."""
 
 
@@ -172,6 +173,16 @@ class Run:
         return _newest(self.folder / "dataset.json")
 
     @property
+    def motion_path(self) -> Path:
+        """Where the newest recording in motion is kept."""
+        return _newest(self.folder / "motion.npz")
+
+    @property
+    def in_motion(self) -> bool:
+        """Whether it holds a recording in motion instead of poses."""
+        return self.motion_path.is_file()
+
+    @property
     def plan_path(self) -> Path:
         """Where the plan is kept."""
         return self.folder / "plan.json"
@@ -191,9 +202,9 @@ class Run:
         """Command that solves the poses taken."""
         return f"ftdrive solve {shlex.quote(str(self.folder))}"
 
-    def new_path(self, name: str) -> Path:
+    def new_path(self, name: str, ending: str = ".json") -> Path:
         """Give the next free path for a file that may be written again: name.json, name-2.json and so on."""
-        return _next(self.folder / f"{name}.json")
+        return _next(self.folder / f"{name}{ending}")
 
     def append_event(self, event: Mapping[str, Any], *, sync: bool = False) -> None:
         """Add a line to events.ndjson, or nothing; with `sync` return when it is on disk. Any thread."""
@@ -300,6 +311,11 @@ class Run:
         """Return the stops taken, without reading them."""
         names = {path.stem.partition("-")[0] for path in (self.folder / "poses").glob("*.npz")}
         return sorted(int(name) for name in names if name.isdecimal())
+
+
+def in_motion(place: Path) -> bool:
+    """Whether a place is a run folder with a recording in motion instead of poses."""
+    return place.is_dir() and Run(place).in_motion
 
 
 def event_of(line: str) -> dict[str, Any] | None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, read_csv
 from ftcalib.data.dataset import Orientation
+from ftcalib.errors import BadDataset
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.routine import PoseRecord
 from ftdrive.runs.outcome import dataset_of
@@ -47,6 +48,8 @@ def read_source(
     """
     if source.is_dir():
         run = Run(source)
+        if run.in_motion:
+            raise BadDataset(f"{source} is a recording in motion and has no poses: solve it with {run.solve_command}")
         records = run.records()
         dataset, circumstances, provenance = dataset_of(run, records)
     else:

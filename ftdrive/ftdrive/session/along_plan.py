@@ -32,6 +32,8 @@ from ftdrive.session.pose_book import PoseBook
 from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
 from ftdrive.session.recovery import GuardedCell
 from ftdrive.session.safety_questions import SafetyQuestions
+from ftdrive.session.sweep import SweepTour
+from ftdrive.session.sweeping import sweep_pace
 from ftdrive.session.task import Task
 from ftdrive.session.tour import SLOW, Pace, Tour
 from ftdrive.session.watchdog import Watcher
@@ -71,7 +73,7 @@ class AlongPlan:
         plan = plan or self._plan(certifier)
         kept = self._kept()
         taken = {record.stop for record in kept}
-        todo = [stop for stop in range(1, len(plan.steps) + 2) if stop not in taken]
+        todo = [stop for stop in plan.stops if stop not in taken]
         judge = self.task.judge(by_hand=False)
         for record in kept:
             cell.journal.show(judge.add(record))
@@ -103,6 +105,8 @@ class AlongPlan:
 
     def _plan(self, certifier: Certifier) -> Plan:
         q = np.round(self.cell.arm.state().q_rad / _GRID_RAD) * _GRID_RAD
+        if self.options.mode == "sweep":
+            return self.task.plan(certifier, q, self.options.poses)
         with suppress(ConfigError):  # the planner reports it, with what to do
             q[3:5] = constant_tour(q)[0, 3:5]  # joint 6 keeps its turn: it shows how the cable is wound
         return self.task.plan(certifier, q, self.options.poses)
@@ -114,14 +118,14 @@ class AlongPlan:
 
     def _look(self, certifier: Certifier, plan: Plan, todo: Sequence[int]) -> Before:
         """Plan the approach to the first pose that is left, listen to the resting sensor, and show every motion."""
-        cell, options, steps = self.cell, self.options, plan.steps
-        goal = steps[(todo[0] - 1) % len(steps) if todo else 0].q_rad
+        cell, options, nodes_rad = self.cell, self.options, plan.nodes_rad
+        goal = nodes_rad[(todo[0] - 1) % len(nodes_rad) if todo else 0]
         before = Before(
             cell=cell,
             config=self.task.cell,
             certifier=certifier,
             plan=plan,
-            approach=plan_approach(certifier, cell.arm.state().q_rad, np.array(goal), SLOW),
+            approach=plan_approach(certifier, cell.arm.state().q_rad, goal, SLOW),
             runs=options.runs,
             known=not options.real or has_completed(self._serial, plan.sha256),
             quiet=cell.listen(LISTEN_S),
@@ -133,6 +137,8 @@ class AlongPlan:
     def _pace(self, before: Before, todo: Sequence[int], *, taken: int) -> Pace:
         """Choose speeds and averaging time; show the accuracy to expect with this sensor's noise, and the duration."""
         cell, plan = self.cell, before.plan
+        if plan.sweep is not None:
+            return sweep_pace(before, slow=self.options.real and not before.known)
         sampling, sigma = _chosen_sampling(before, todo)
         cell.note(self.task.forecast(Averages(plan, before.certifier, sampling.average_s, sigma)))
         slow = self._is_slow(before)
@@ -141,12 +147,11 @@ class AlongPlan:
             cell.note(f"{'every' if why else 'the first'} run of a plan is slow{why}", warning=True)
         speeds = speeds_of(self.task.cell)
         driven = at_most(plan, before.certifier, slower(speeds, SLOW) if slow else speeds)
-        fastest_rad_s = max(step.speed_rad_s for step in driven.steps)
         total_s = moves_s(driven, todo, before.approach)
         total_s += len(todo) * (sampling.average_s + 0.6)
         cell.note(
-            f"{len(todo)} stops left, at most {np.degrees(fastest_rad_s):.0f}°/s: about {total_s / 60:.1f} min; "
-            f"{taken} poses taken before"
+            f"{len(todo)} stops left, at most {np.degrees(driven.top_speed_rad_s):.0f}°/s: "
+            f"about {total_s / 60:.1f} min; {taken} poses taken before"
         )
         window = int(len(before.quiet) * min(1.0, sampling.average_s / LISTEN_S))
         return Pace(
@@ -173,6 +178,8 @@ class AlongPlan:
             guards.ModelGuard(cell.limits, before.certifier),
             guards.SettingsGuard(),
             guards.StallGuard(cell.limits),
+            guards.SliderGuard(),
+            *((judge,) if isinstance(judge, guards.Guard) else ()),  # it learns what the other guards let pass
         )
 
         def on_trip(trip: guards.Tripped) -> None:
@@ -188,7 +195,7 @@ class AlongPlan:
             run = self.resumed or self._keep_plan(before.plan)
             book = PoseBook(cell, run, judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)
-            tour = Tour(guarded, pace, book, options)
+            tour = (SweepTour if pace.plan.sweep else Tour)(guarded, pace, book, options)
             with book.reporting_early_end():
                 tour.run(todo)
         if todo and not before.known:
@@ -226,7 +233,7 @@ class AlongPlan:
 
     def _judge_completed(self, plan: Plan, run: Run, undriven: Sequence[int]) -> None:
         """Record that the plan was driven to its end, slowly, or show why it does not count."""
-        if undriven or len(run.stops()) <= len(plan.steps):
+        if undriven or (plan.sweep is None and len(run.stops()) <= len(plan.steps)):
             why = "a plan counts as completed when one session takes every pose and drives every move of it; "
             why += f"moves replaced: from {_poses(undriven)} on" if undriven else "poses are missing"
         elif self._serial == NOT_REPORTED:

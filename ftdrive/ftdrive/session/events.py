@@ -24,6 +24,7 @@ class State(StrEnum):
     MOVE = "move"
     SETTLE = "settle"
     SAMPLE = "sample"
+    SWEEP = "sweep"
     CLOSE = "close"
     REPORT = "report"
     STOP = "stop"
@@ -54,7 +55,7 @@ class RunOpened(Event):
 
     folder: str
     resume: str
-    """The command that continues it."""
+    """The command that continues it; empty for a sweep, which starts again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -124,6 +125,20 @@ class PoseTaken(Event):
     average_s: float
     attempts: int
     steady: bool
+    temperature_C: float | None = None
+    """Of the sensor, where it reports it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MotionRecorded(Event):
+    """A recording in motion is on disk."""
+
+    file: str
+    duration_s: float
+    samples: int
+    """Of the sensor."""
+    states: int
+    """Of the arm."""
     temperature_C: float | None = None
     """Of the sensor, where it reports it."""
 

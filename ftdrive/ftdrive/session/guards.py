@@ -22,6 +22,9 @@ from ftdrivers.errors import DeviceError, DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ArmState, ArmStatus
 
 G_M_S2: Final = 9.81
+_SLIDER: Final = 0.02
+_PROGRESS_RAD: Final = 1e-3
+"""On a curve, an arm that has moved so far makes progress."""
 
 
 class Tripped(Exception):
@@ -93,11 +96,29 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExpectedMotion:
-    """The expected motion: a straight move in joint space, or standing."""
+    """The expected motion: a straight move in joint space, along a curve, or standing."""
 
     start_rad: Array
     goal_rad: Array
     moving: bool
+    curve_rad: Array | None = None
+    """(n, 6) dense points of a curve from start to goal."""
+
+    @property
+    def turns_rad(self) -> Array:
+        """How far each joint turns (6,)."""
+        if self.curve_rad is None:
+            return np.abs(self.goal_rad - self.start_rad)
+        return np.asarray(np.ptp(self.curve_rad, axis=0))
+
+    def nearest_rad(self, q_rad: Array) -> Array:
+        """Return the point (6,) of the motion that is nearest to a posture (6,)."""
+        if self.curve_rad is not None:
+            return np.asarray(self.curve_rad[np.square(self.curve_rad - q_rad).sum(axis=1).argmin()])
+        turn = self.goal_rad - self.start_rad
+        length2 = float(turn @ turn)
+        share = 0.0 if length2 == 0 else float(np.clip((q_rad - self.start_rad) @ turn / length2, 0, 1))
+        return np.asarray(self.start_rad + share * turn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,18 +168,15 @@ class SupervisorGuard(Guard):
 
 @dataclass
 class PathGuard(Guard):
-    """Rows 2 and 21: moving joints stay on the straight line to the goal, the others rest."""
+    """Rows 2 and 21: moving joints stay on the straight line or curve to the goal, the others rest."""
 
     limits: Limits
 
     def look(self, seen: Seen) -> None:
-        """Compare with the nearest point of the line."""
+        """Compare with the nearest point of the motion."""
         motion, q = seen.motion, seen.state.q_rad
-        turn = motion.goal_rad - motion.start_rad
-        length2 = float(turn @ turn)
-        share = 0.0 if length2 == 0 else float(np.clip((q - motion.start_rad) @ turn / length2, 0, 1))
-        off = np.abs(q - motion.start_rad - share * turn)
-        resting = (np.abs(turn) < 1e-3) & ((np.arange(6) < 3) | (not motion.moving))
+        off = np.abs(q - motion.nearest_rad(q))
+        resting = (motion.turns_rad < 1e-3) & ((np.arange(6) < 3) | (not motion.moving))
         allowed = np.where(resting, self.limits.frozen_rad, self.limits.tracking_rad)
         if not (off > allowed).any():
             return
@@ -182,12 +200,19 @@ class StallGuard(Guard):
     limits: Limits
     _nearest_rad: float = field(default=np.inf, init=False)
     _still_s: float = field(default=0.0, init=False)
+    _on_curve: Array | None = field(default=None, init=False)
     _goal_rad: Array | None = field(default=None, init=False)
 
     def look(self, seen: Seen) -> None:
-        """Count the time without progress."""
+        """Count the time without progress: towards the goal, or on a curve in any direction."""
         goal = seen.motion.goal_rad
-        left = float(np.abs(goal - seen.state.q_rad).max())
+        if seen.motion.curve_rad is not None:
+            if self._on_curve is None or np.abs(seen.state.q_rad - self._on_curve).max() > _PROGRESS_RAD:
+                self._on_curve, self._still_s = seen.state.q_rad, 0.0
+            left, self._nearest_rad, self._goal_rad = np.inf, -np.inf, goal
+        else:
+            self._on_curve = None
+            left = float(np.abs(goal - seen.state.q_rad).max())
         if goal is not self._goal_rad or not seen.motion.moving or left < self._nearest_rad - 1e-4:
             self._goal_rad, self._nearest_rad, self._still_s = goal, left, 0.0
             return
@@ -200,6 +225,28 @@ class StallGuard(Guard):
                     f"{100 * seen.status.speed_slider:.0f} %, scaling {100 * seen.status.speed_scaling:.0f} %): set "
                     "the slider at the pendant, or find what holds the arm"
                 ),
+            )
+
+
+@dataclass
+class SliderGuard(Guard):
+    """Row 22 in a sweep, on which the speed slider does not act: the operator who moves it wants another speed."""
+
+    _before: float | None = field(default=None, init=False)
+
+    def begin(self, seen: Seen) -> None:
+        """Remember the slider."""
+        self._before = seen.status.speed_slider
+
+    def look(self, seen: Seen) -> None:
+        """Compare while the arm sweeps."""
+        if self._before is None or seen.motion.curve_rad is None:
+            return
+        if abs(seen.status.speed_slider - self._before) > _SLIDER:
+            raise fault(
+                Hazard.STALL,
+                f"the speed slider was moved from {100 * self._before:.0f} to {100 * seen.status.speed_slider:.0f} %, "
+                "which a sweep does not follow: start again, it takes the new speed",
             )
 
 

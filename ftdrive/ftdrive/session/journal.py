@@ -35,7 +35,7 @@ class Journal:
             for event in self._early:
                 run.append_event(event.to_dict())
             self._early.clear()
-        self.show(RunOpened(folder=str(run.folder), resume=run.resume_command), sync=True)
+        self.show(RunOpened(folder=str(run.folder), resume=_to_continue(run)), sync=True)
 
     def show(self, event: Event, *, sync: bool = False) -> None:
         """Show and record an event. Raises `SupervisorGone` at the first one that cannot be seen any more."""
@@ -102,3 +102,8 @@ class Journal:
     def pressed(self) -> Key | None:
         """Return the next key pressed."""
         return self._operator.pressed()
+
+
+def _to_continue(run: Run) -> str:
+    """Return the command that continues a run; a sweep starts again."""
+    return "" if run.header().get("mode") == "sweep" else run.resume_command

@@ -38,6 +38,8 @@ class SessionOptions:
     questions: bool = True
     yes: bool = False
     """Answer the safety questions automatically, never the first motion."""
+    seconds: float = 20.0
+    """Of a sweep, at the planned speed."""
     description: Mapping[str, Any] = field(default_factory=dict)
     """Goes into run.json."""
 
@@ -50,6 +52,8 @@ class SessionOptions:
 def with_recorded_mode(options: SessionOptions) -> SessionOptions:
     """Return options with the mode of the resumed run; raises `ConfigError` for options that exclude each other."""
     begun = options.mode if options.resume is None else Run(options.resume).header().get("mode", "auto")
+    if options.resume is not None and begun == "sweep":
+        raise ConfigError(f"{options.resume} is a sweep, which is not continued: start again with --sweep")
     if options.mode != "auto" and (begun in _BY_HAND) != options.by_hand:
         way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
         raise ConfigError(f"{options.resume} was started {way} and only continues so: leave out --{options.mode}")

@@ -31,6 +31,10 @@ class PoseBook:
             yield
         except BaseException:
             run = self.run
+            if run.header().get("mode") == "sweep":
+                words = f"the sweep was not completed: {run.folder} has its events, and no recording"
+                self.cell.journal.show(Noted(words=words), sync=True)
+                raise
             words = f"{len(run.stops())} poses saved in {run.folder}; continue with {run.resume_command}"
             words += f", or solve them with {run.solve_command}" if run.stops() and run.command == "calibrate" else ""
             self.cell.journal.show(Noted(words=words), sync=True)

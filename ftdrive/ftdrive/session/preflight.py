@@ -119,7 +119,8 @@ def check_plan(before: Before) -> Check:
     except PlanRefused as error:
         return Check("plan", "failed", str(error))
     clear = 1e3 * min(step.clearance_m for step in before.plan.steps)
-    found = f"{len(before.plan.steps)} moves proven clear, nearest {clear:.0f} mm; joint moves only"
+    motion = "sweep" if before.plan.sweep else f"{len(before.plan.steps)} moves"
+    found = f"{motion} proven clear, nearest {clear:.0f} mm; joint motion only"
     return Check("plan", "ok", found)
 
 

@@ -8,6 +8,7 @@ from ftcalib import CalibrationResult
 from ftdrive.cell.emulated import Station
 from ftdrive.errors import Declined, NotAccepted
 from ftdrive.runs.outcome import Outcome
+from ftdrive.runs.run import Mode
 from ftdrive.session.events import Event
 from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.session.options import SessionOptions
@@ -66,10 +67,19 @@ def described(station: Station) -> dict[str, Any]:
 
 
 def rehearse(
-    station: Station, runs: Path, name: str, operator: Operator, *, poses: int = 24, kept: bool = True
+    station: Station,
+    runs: Path,
+    name: str,
+    operator: Operator,
+    *,
+    poses: int = 24,
+    kept: bool = True,
+    mode: Mode = "auto",
 ) -> Outcome:
     """Calibrate an emulated cell; `kept` says whether the folder `runs` outlives the calibration."""
-    options = SessionOptions(runs, name, poses=poses, real=False, questions=False, description=described(station))
+    options = SessionOptions(
+        runs, name, poses=poses, mode=mode, real=False, questions=False, description=described(station)
+    )
     outcome = calibrate(station.cell, operator if kept else _Unkept(operator, runs), options)
     if outcome is None:
         raise RuntimeError("a rehearsal is never a dry run")

@@ -22,13 +22,17 @@ from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Operator
 from ftdrive.session.options import SessionOptions, plan_on_disk, with_recorded_mode
 from ftdrive.session.pose_book import PoseBook
+from ftdrive.session.sweeping import Sweeping, on_script_path
 from ftdrive.session.task import Calibrating, Task
 from ftdrivers.interfaces import DeviceInfo
 
 
 def calibrate(cell: CellConfig, operator: Operator, options: SessionOptions) -> Outcome | None:
     """Guide the operator through a calibration; None after a dry run. Raises as `take_poses`."""
-    run = take_poses(Calibrating(cell, options.real), operator, options)
+    task = Calibrating(cell, options.real)
+    if options.mode == "sweep":
+        task = Sweeping(on_script_path(cell), options.real, options.seconds)
+    run = take_poses(task, operator, options)
     return None if run is None else solve_and_save(run)
 
 
@@ -84,7 +88,7 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
             run = AlongPlan(cell, task, options, resumed, new_run).take(plan)
     if run is None:
         return None
-    if not run.stops():
+    if not (run.stops() or run.in_motion):
         raise Declined(f"ended before the first pose: {run.folder} has no pose to solve")
     journal.show(StateChanged(state=State.REPORT))
     return run

@@ -5,7 +5,7 @@ planned from where the arm stands, shown and confirmed.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
@@ -92,8 +92,8 @@ class Tour:
             book,
             options,
         )
-        self._nodes = np.array([step.q_rad for step in pace.plan.steps])
-        self._now = Progress(len(pace.plan.steps))
+        self._nodes = pace.plan.nodes_rad
+        self._now = Progress(len(self._nodes))
 
     def run(self, todo: Sequence[int]) -> None:
         """Take the poses of these stops, counted from 1; the return to the first pose is the last.
@@ -116,6 +116,10 @@ class Tour:
                 self._hold(error)
         self._guarded.show_new()
         self._show_state(State.CLOSE)
+
+    @property
+    def _begin_words(self) -> str:
+        return f"The arm stands at the first pose. The tour has {self._now.stops} stops. Begin?"
 
     @property
     def undriven(self) -> list[int]:
@@ -324,7 +328,7 @@ class Tour:
             self._move(q, goal, min(float(speed), most_rad_s), SLOW.joint_rad_s2)
             q = goal
         if stop == 1 and not back:
-            self._confirm(f"The arm stands at the first pose. The tour has {self._now.stops} stops. Begin?")
+            self._confirm(self._begin_words)
 
     def _passed(self, way: Array, goal: int) -> list[str]:
         """Return the skipped poses that an approach (k, 6) to another pose comes close to."""
@@ -353,17 +357,7 @@ class Tour:
 
     def _move(self, start: Array, goal: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Make one certified move, only from where it was certified to begin."""
-        if not self._now.confirmed:
-            self._confirm("The arm begins the tour.")
-        self._guarded.require_answers()
-        off_rad = np.abs(self._arm.state().q_rad - start)
-        if off_rad.max() > _AT_RAD:
-            self._now.lose_place()
-            raise fault(
-                Hazard.OTHER_CLIENT,
-                f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° from where its move begins: "
-                "something else has moved the arm; stop that, then resume",
-            )
+        self._require_at(start)
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
         self._now.standing = False
@@ -374,6 +368,20 @@ class Tour:
                 guard=self._between_looks,
                 speed_rad_s=speed_rad_s,
                 acceleration_rad_s2=acceleration_rad_s2,
+            )
+
+    def _require_at(self, start: Array) -> None:
+        """Raise unless the first motion is confirmed, every question is answered, and the arm stands at `start`."""
+        if not self._now.confirmed:
+            self._confirm("The arm begins the tour.")
+        self._guarded.require_answers()
+        off_rad = np.abs(self._arm.state().q_rad - start)
+        if off_rad.max() > _AT_RAD:
+            self._now.lose_place()
+            raise fault(
+                Hazard.OTHER_CLIENT,
+                f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° from where its move begins: "
+                "something else has moved the arm; stop that, then resume",
             )
 
     def _between_looks(self) -> None:
@@ -392,7 +400,7 @@ class Tour:
             raise trip.error
         if trip is not None and self._reopened_sensor(trip):
             return
-        stop, back = self._now.todo[0], self._now.came_from
+        back = self._now.came_from
         self._now.standing = False
         words = str(error if trip is None else trip)
         reported, report_error = self._watcher.tripped(wait_s=0.0), self._watcher.report_error
@@ -405,13 +413,7 @@ class Tour:
         self._show_state(State.HOLD, words=words)
         by_operator = isinstance(error, OperatorStop)
         end = Declined(words) if by_operator else error if trip is None else trip.error
-        ways = {"resume": f"go on with pose {stop}{'' if by_operator else ' after fixing the cause'}"}
-        ways["skip"] = f"leave pose {stop} out"
-        if back is not None:
-            ways["back"] = f"return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f}°/s"
-        ways["quit"] = "stop; continue later with --resume"
-        choices = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
-        question = Question(f"{len(self._book.run.stops())} poses are saved. {choices}", tuple(ways))
+        question = self._how_to_go_on(back, "" if by_operator else " after fixing the cause")
         while True:
             answer = self._choose(question, end)
             try:
@@ -424,6 +426,15 @@ class Tour:
             if answer == "back" and back is not None:
                 self._now.back = (back, words)
             return
+
+    def _how_to_go_on(self, back: int | None, fixed: str) -> Question:
+        """Return the question in a hold; `back` is the index of the pose to which the arm can return."""
+        stop = self._now.todo[0]
+        ways = {"resume": f"go on with pose {stop}{fixed}", "skip": f"leave pose {stop} out"}
+        if back is not None:
+            ways["back"] = f"return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f}°/s"
+        ways["quit"] = "stop; continue later with --resume"
+        return question_of(f"{len(self._book.run.stops())} poses are saved.", ways)
 
     def _choose(self, question: Question, end: Exception) -> str:
         """Ask how to go on; raise `end`, the first cause, if the operator quits or does not answer."""
@@ -452,5 +463,11 @@ class Tour:
         return True
 
     def _show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
-        number = None if stop is None else self._plan.steps[self._now.index(stop)].number
+        number = None if stop is None or self._plan.sweep else self._plan.steps[self._now.index(stop)].number
         self._journal.show(StateChanged(state=state, stop=stop, stops=self._now.stops, number=number, words=words))
+
+
+def question_of(first: str, ways: Mapping[str, str]) -> Question:
+    """Return a question whose answers are keys of `ways`, with their effects."""
+    choices = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
+    return Question(f"{first} {choices}", tuple(ways))

@@ -67,12 +67,17 @@ class Watcher:
         self._begun = False
 
     @contextmanager
-    def watching(self, start_rad: Array, goal_rad: Array, *, moving: bool) -> Iterator[None]:
-        """Watch while the block runs, after a first look. A trip is raised before it, after it, and by `check`."""
+    def watching(
+        self, start_rad: Array, goal_rad: Array, *, moving: bool, curve_rad: Array | None = None
+    ) -> Iterator[None]:
+        """Watch while the block runs, after a first look. A trip is raised before it, after it, and by `check`.
+
+        With `curve_rad` (n, 6) the arm moves along this curve, else straight.
+        """
         self.check()
         self._last = None
         self._looked_s = self.clock.now_s()
-        motion = self._motion = ExpectedMotion(np.asarray(start_rad), np.asarray(goal_rad), moving)
+        motion = self._motion = ExpectedMotion(np.asarray(start_rad), np.asarray(goal_rad), moving, curve_rad)
         self._wake.set()
         try:
             while self._seen is not motion:

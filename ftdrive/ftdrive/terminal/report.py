@@ -99,13 +99,13 @@ def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
         if key in _DERIVED and not messages.verbose:
             continue
         estimates, sigmas = (values_of(source[key], key) * scale for source in (data, data["sigma"]))
-        truths = None if truth is None else values_of(truth[key], key) * scale
+        truths = values_of(truth[key], key) * scale if truth is not None and key in truth else None
         fixed = sigmas <= fixed_below * scale
         for i, axis in enumerate(axes_of(len(estimates))):
             sigma = 0.0 if fixed[i] else float(sigmas[i])
             spread = "fixed" if fixed[i] else to_place_of(sigma, sigma)
-            known = [] if truths is None else [to_place_of(truths[i], sigma)]
-            error = [Text(f"{errors[key][i]:+.1f}", _error_style(errors[key][i]))] if known else []
+            known = [] if truth is None else ["" if truths is None else to_place_of(truths[i], sigma)]
+            error = [] if truths is None else [Text(f"{errors[key][i]:+.1f}", _error_style(errors[key][i]))]
             name = f"{label} {axis}".strip() + f", {unit}"
             table.add_row(name, *known, to_place_of(estimates[i], sigma), spread, *error)
     return table
@@ -240,14 +240,16 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
     """
     data = result.to_dict()
     errors = {}
-    for _, _, _, key in QUANTITIES:
+    for _, _, _, key in quantities_of(data):
+        if key not in truth:
+            continue
         if key == "R_flange_sensor":
             error = Rotation.from_matrix(result.R_flange_sensor @ np.transpose(truth[key])).as_rotvec()
         else:
-            error = np.atleast_1d(np.subtract(data[key], truth[key]))
+            error = values_of(data[key], key) - values_of(truth[key], key)
             if key.endswith("_rad"):
                 error = np.remainder(error + np.pi, 2 * np.pi) - np.pi  # a ceiling is at both +180 and -180 degrees
-        errors[key] = error / np.atleast_1d(data["sigma"][key])
+        errors[key] = error / values_of(data["sigma"][key], key)
     return errors
 
 

@@ -14,6 +14,7 @@ from ftdrive.session.events import (
     Estimated,
     Event,
     GuardTripped,
+    MotionRecorded,
     Noted,
     Planned,
     PoseTaken,
@@ -49,6 +50,7 @@ class SessionText:
     def __init__(self, *, verbose: bool = False, poses: bool = True) -> None:
         self._verbose, self._poses = verbose, verbose or poses
         self._sections = list[str]()
+        self._sweeps = False
         self._passed = list[str]()
 
     def lines(self, event: Event) -> list[TextLine]:
@@ -70,11 +72,12 @@ class SessionText:
     def _heading_before(self, event: Event) -> list[TextLine]:
         match event:
             case Planned():
+                self._sweeps = event.plan.sweep is not None
                 return self._heading("Plan")
             case Checked():
                 return self._heading("Checks")
-            case RunOpened() | PoseTaken() | StateChanged(state=State.APPROACH | State.MOVE):
-                return self._heading("Tour")
+            case RunOpened() | PoseTaken() | StateChanged(state=State.APPROACH | State.MOVE | State.SWEEP):
+                return self._heading("Motion" if self._sweeps else "Tour")
             case _:
                 return []
 
@@ -113,15 +116,18 @@ class SessionText:
 
 
 def plan_in_brief(plan: Plan) -> tuple[str, str]:
-    """Describe a plan in two lines: its moves and clearance, and the room to keep free."""
+    """Describe a plan in two lines: its motion and clearance, and the room to keep free."""
     nearest = min(plan.steps, key=lambda step: step.clearance_m)
     count = len(plan.steps)
     clear = f"{1e3 * nearest.clearance_m:.0f} mm"
     proven = f"proven clear by {clear}" if plan.certified else f"NOT ALL PROVEN CLEAR (nearest: {clear})"
     moving = "only the wrist moves" if plan.arm_rests else "the whole arm moves"
     room = "" if plan.arm_rests else ", and the room of the whole arm"
+    motion = f"{count} poses, {count} moves"
+    if plan.sweep is not None:
+        motion = f"sweep of {plan.sweep.duration_s:.0f} s,"
     return (
-        f"{count} poses, {count} moves {proven}; {moving}",
+        f"{motion} {proven}; {moving}",
         f"keep free: ball of {plan.ball_m:.2f} m around {point_in_words(plan)}{room}",
     )
 
@@ -135,10 +141,12 @@ def head_and_words(event: Event) -> tuple[str, str]:
     """Return the mark an event begins with, under which its lines are not continued, and its words."""
     match event:
         case RunOpened():
-            return "", f"kept in {event.folder}; to continue after a stop: {event.resume}"
+            return "", f"kept in {event.folder}" + (
+                f"; to continue after a stop: {event.resume}" if event.resume else ""
+            )
         case StateChanged(state=State.HOLD):  # repeats the words of STOP
             return "", f"{event.state.upper()}: {event.words}"
-        case StateChanged(state=State.PREFLIGHT | State.APPROACH | State.CLOSE):
+        case StateChanged(state=State.PREFLIGHT | State.APPROACH | State.SWEEP | State.CLOSE):
             return "", f"{event.state}{': ' if event.words else ''}{event.words}"
         case Checked():
             return "✔ " if event.passed else "✘ ", f"{event.name}: {event.words}"
@@ -146,8 +154,8 @@ def head_and_words(event: Event) -> tuple[str, str]:
             return "", "\n".join(filter(None, (plan_in_words(event.plan), event.stop_words, event.way_words)))
         case Noted():
             return "! " if event.warning else "", event.words
-        case PoseTaken():
-            return "", pose_in_words(event)
+        case PoseTaken() | MotionRecorded():
+            return "", pose_in_words(event) if isinstance(event, PoseTaken) else motion_in_words(event)
         case Estimated():
             return "  ", estimate_in_words(event)
         case Compared():
@@ -159,6 +167,12 @@ def head_and_words(event: Event) -> tuple[str, str]:
             return "", f"{event.question}{colon} {event.answer}{' (--yes)' if event.by == '--yes' else ''}"
         case _:
             return "", ""
+
+
+def motion_in_words(event: MotionRecorded) -> str:
+    """Describe what was recorded in motion."""
+    words = f"recorded {event.samples} samples of the sensor, {event.states} of the arm"
+    return f"{words}; the sweep took {event.duration_s:.1f} s"
 
 
 def pose_in_words(event: PoseTaken) -> str:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from ftdrivers.errors import DeviceFault, DeviceTimeout
-from ftdrivers.interfaces import ArmStates, ControllerSettings
+from ftdrivers.interfaces import ArmStates, ControllerSettings, RobotArm
+from ftdrivers.sweep import Sweep
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import FakeArm
 
@@ -29,5 +30,8 @@ def test_an_arm_whose_driver_sets_nothing_says_what_it_was_to_set() -> None:
     assert arm.controller_settings() == ControllerSettings(1.5, (0.0, 0.0, 0.05))  # of its status
     with pytest.raises(DeviceFault, match=r"payload of 1.2 kg at \[0.0, 0.0, 0.08\] m"):
         arm.set_payload(1.2, (0.0, 0.0, 0.08))
+    sweep = Sweep(arm.q.tolist(), [[0.1, 0.1]] * 3, [[1.0, 2.0]] * 3, [[0.0, 0.0]] * 3, 10.0, 2.0)
+    with pytest.raises(DeviceFault, match="calibrate without --sweep"):
+        RobotArm.sweep(arm, sweep, guard=lambda: None)
     with pytest.raises(DeviceFault, match=r"gravity of \[0.0, 0.0, 9.82\]"):
         arm.set_gravity((0.0, 0.0, 9.82))

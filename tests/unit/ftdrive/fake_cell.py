@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -35,11 +35,22 @@ from ftdrive.session.journal import Journal
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.options import SessionOptions
+from ftdrive.session.sweeping import Sweeping
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceFault
 from ftdrivers.follow import Follow
-from ftdrivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
+from ftdrivers.interfaces import (
+    ArmState,
+    ArmStatus,
+    DeviceInfo,
+    ForceTorqueSensor,
+    FtSamples,
+    Guard,
+    Health,
+    RobotArm,
+)
+from ftdrivers.sweep import Sweep
 from tests.fake_clock import FakeClock
 
 Array = NDArray[np.float64]
@@ -74,6 +85,9 @@ class FakeArm(RobotArm):
         self.remote: bool | None = True
         self.asked_limits = 0
         self.at_move: dict[int, Callable[[], None]] = {}
+        self.sweeps: list[Sweep] = []
+        self.at_sweep_s: dict[int, tuple[float, Callable[[], None]]] = {}
+        """By the number of the sweep: when something happens in it, and what."""
         self.at_look: Callable[[], None] = lambda: None
         """Called whenever the status is read."""
         self.forbidden: Array | None = None
@@ -157,6 +171,23 @@ class FakeArm(RobotArm):
                     self.clock.sleep(0.002)
             self.clock.sleep(0.02)
 
+    def sweep(self, sweep: Sweep, *, guard: Guard) -> None:
+        assert self.control
+        assert np.allclose(self.q, sweep.centre_rad, atol=1e-3)
+        self.sweeps.append(sweep)
+        self.halted.clear()
+        begun_s, fault_at_s = self.clock.now_s(), self.at_sweep_s.pop(len(self.sweeps), None)
+        while (t_s := self.clock.now_s() - begun_s) < sweep.duration_s:
+            guard()
+            if self.halted.is_set():
+                raise DeviceFault("the arm was commanded to stop before it had arrived.")
+            if fault_at_s is not None and t_s > fault_at_s[0]:
+                fault_at_s[1]()
+                fault_at_s = None
+            self.q = sweep.at(t_s)[0]
+            self.clock.sleep(0.02)
+        self.q = np.array(sweep.centre_rad)
+
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
         assert timeout_s > 0
         guard()
@@ -226,7 +257,7 @@ class FakeSensor(ForceTorqueSensor):
         )
 
     def follow(self) -> AbstractContextManager[Follow[FtSamples]]:
-        raise NotImplementedError
+        return nullcontext(Follow(lambda _: self.collect(0.0)))
 
     def latest(self, *, timeout_s: float) -> FtSamples:
         assert timeout_s == 0
@@ -395,6 +426,10 @@ class Lab:
 
     def calibrate(self, **options: Any) -> Outcome | None:
         return session.calibrate(self.cell, self.operator, SessionOptions(self.folder / "runs", poses=6, **options))
+
+    def sweep(self, **options: Any) -> Run | None:
+        chosen = SessionOptions(self.folder / "runs", mode="sweep", **options)
+        return session.take_poses(Sweeping(self.cell, chosen.real, 10.0), self.operator, chosen)
 
     def run(self) -> Run:
         (folder,) = (self.folder / "runs").iterdir()

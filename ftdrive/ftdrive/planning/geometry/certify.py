@@ -72,6 +72,14 @@ class Certifier:
         ]
         self._names += [f"{arm.names[i]} - {things[k]}" for i, k in self._of_scene]
 
+    def reach_m(self, off_rad: Array) -> float:
+        """Return how much nearer any two bodies can come if each joint is off by up to `off_rad` (6,)."""
+        return float((self._lever_m @ np.abs(off_rad)).max())
+
+    def keeping(self, more_m: float) -> "Certifier":
+        """Return a certifier that keeps so much more distance: to what is that near a move, the margins remain."""
+        return Certifier(self.arm, self.scene, Margins(self.margins.self_m + more_m, self.margins.scene_m + more_m))
+
     def free(self, q_rad: ArrayLike) -> NDArray[np.bool_]:
         """Return (n,) whether the margins are kept at joint vectors (n, 6)."""
         q = np.asarray(q_rad, dtype=np.float64).reshape(-1, 6)

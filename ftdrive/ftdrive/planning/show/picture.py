@@ -16,12 +16,16 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import Frames
 from ftdrive.planning.geometry.scene import Plane, Scene
 from ftdrive.planning.plan import Plan
+from ftdrive.planning.show.words import JOINTS
+from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
 VIEWS = ((1, 2, "along base x"), (0, 2, "along base y"), (0, 1, "from above"))
 """Axis to the right, axis up, title."""
 _ALONG = 0.1
 """A plane is drawn where it is seen from its edge: of its unit normal, the share along the view is below this."""
+_OF_SWEEP = 5
+"""One in so many steps of a sweep is drawn."""
 _FAR_M = 20.0
 _NEAR_M, _EDGE_M = 1.0, 0.06
 """How far from arm and ball surroundings are shown, and some room at the edge."""
@@ -54,13 +58,18 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
     except ImportError:
         raise ConfigError("a picture needs matplotlib: install ftdrive with its extra viz, `ftdrive[viz]`") from None
     arm, scene = certifier.arm, certifier.scene
-    poses = arm.frames([step.q_rad for step in plan.steps])
+    shown = plan.steps if plan.sweep is None else plan.steps[::_OF_SWEEP]
+    poses = arm.frames([step.q_rad for step in shown])
     before = np.reshape(np.asarray(way_rad, dtype=np.float64), (-1, 6))[:-1]
     there = _skeletons(arm.frames(before)) if len(before) else np.zeros((0, 7, 3))
     limits = _limits(plan, poses, there.reshape(-1, 3), scene)
-    figure = Figure(figsize=(12, 4.9), layout="constrained")
+    rows = 1 if plan.sweep is None else 2
+    figure = Figure(figsize=(12, 4.9 + 2.6 * (rows - 1)), layout="constrained")
+    grid = figure.add_gridspec(rows, 3, height_ratios=[4.9, 2.6][:rows])
+    if plan.sweep is not None:
+        _joints(figure.add_subplot(grid[1, :]), plan.sweep)
     for column, (across, up, title) in enumerate(VIEWS):
-        axes = figure.add_subplot(1, 3, column + 1)
+        axes = figure.add_subplot(grid[0, column])
         view = [across, up]
         for one in _skeletons(poses):
             axes.plot(*one[:, view].T, "-o", color="tab:gray", markersize=3, linewidth=1)
@@ -83,12 +92,24 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
     write_new(path, picture.getvalue())
 
 
+def _joints(axes: Any, sweep: Sweep) -> None:
+    """Draw the wrist joints against time."""
+    t_s = np.linspace(0.0, sweep.duration_s, 400)
+    q_deg = np.degrees(sweep.at(t_s))
+    for joint in WRISTS:
+        axes.plot(t_s, q_deg[:, joint], label=JOINTS[joint])
+    axes.set(xlabel="time at the planned speed [s]", ylabel="joint [deg]", xlim=(0, sweep.duration_s))
+    axes.legend(loc="upper right", ncols=3)
+    axes.grid(visible=True)
+
+
 def title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
     """Say what is seen, and what is not."""
     ball = f"ball of {plan.ball_m:.2f} m"
     moves = f"all that moves stays in this {ball}" if plan.arm_rests else f"wrist and tool stay in this {ball}"
     name = f"EMULATED {certifier.arm.name}" if plan.emulated else certifier.arm.name
-    lines = [f"{name}: {len(plan.steps)} poses; blue, dotted: {moves}"]
+    motion = f"{len(plan.steps)} poses" if plan.sweep is None else f"sweep of {plan.sweep.duration_s:.0f} s"
+    lines = [f"{name}: {motion}; blue, dotted: {moves}"]
     if not plan.arm_rests:
         lines[0] += ", the WHOLE ARM moves"
     lines.append("grey: arm, orange: tool, at every pose; black: base; red: planes and boxes")

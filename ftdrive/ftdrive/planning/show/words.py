@@ -6,6 +6,7 @@ from numpy.typing import ArrayLike
 from ftdrive.cell.config import RobotConfig
 from ftdrive.planning.approach import STILL_RAD, arm_moves
 from ftdrive.planning.plan import Plan
+from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
 JOINTS = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
@@ -18,6 +19,8 @@ def plan_in_words(plan: Plan) -> str:
     """
     still = ", ".join(f"{angle:.0f}" for angle in np.degrees(plan.steps[0].q_rad[:3]))
     rest = [f"Base, shoulder and elbow stay at {still} degrees."] if plan.arm_rests else []
+    if plan.sweep is not None:
+        return "\n".join([*plan.why, *rest, *_sweep_table(plan.sweep), "", *_sweep_summary(plan)])
     return "\n".join([*plan.why, *rest, *_table(plan), "", *_summary(plan)])
 
 
@@ -25,7 +28,7 @@ def stop_in_words(plan: Plan, robot: RobotConfig) -> str:
     """Return time and angle from the begin of braking to rest, at the plan's highest speed; empty for other drivers."""
     if robot.driver != "ur":
         return ""
-    speed_deg_s, stop_deg_s2 = np.degrees(max(step.speed_rad_s for step in plan.steps)), robot.stop_deceleration_deg_s2
+    speed_deg_s, stop_deg_s2 = np.degrees(plan.top_speed_rad_s), robot.stop_deceleration_deg_s2
     return (
         f"A stop from {speed_deg_s:.0f} °/s brakes with {stop_deg_s2:.0f} °/s²: at rest after "
         f"{speed_deg_s / stop_deg_s2:.2f} s and {speed_deg_s**2 / (2 * stop_deg_s2):.1f}°."
@@ -78,6 +81,26 @@ def _table(plan: Plan) -> list[str]:
         move = f"{turn:5.0f}{speed:5.0f}{step.duration_s:5.1f}{1e3 * step.clearance_m:9.0f}"
         lines.append(f"{i:4}  {step.number:02d}{angles(q)}{move}")
     return [*lines, f"{'from':8}{angles(q_deg.min(axis=0))}", f"{'to':8}{angles(q_deg.max(axis=0))}"]
+
+
+def _sweep_table(sweep: Sweep) -> list[str]:
+    t = np.arange(0.0, sweep.duration_s, 0.05)
+    q_deg, speed, acceleration = np.degrees(sweep.at(t)), np.degrees(sweep.largest(1)), np.degrees(sweep.largest(2))
+    lines = [f"Joints in degrees, within {sweep.duration_s:.0f} s:", f"{'':10}begin  from    to  °/s  °/s²"]
+    for j in WRISTS:
+        low, high = q_deg[:, j].min(), q_deg[:, j].max()
+        lines.append(f"  {JOINTS[j]:8}{q_deg[0, j]:5.0f}{low:6.0f}{high:6.0f}{speed[j]:5.0f}{acceleration[j]:6.0f}")
+    return lines
+
+
+def _sweep_summary(plan: Plan) -> list[str]:
+    nearest = min(plan.steps, key=lambda step: step.clearance_m)
+    proven = "proven clear along its whole length" if plan.certified else "NOT PROVEN CLEAR"
+    return [
+        f"A smooth curve from rest to rest, {proven}, {1e3 * plan.off_curve_m:.0f} mm off the curve included.",
+        f"Nearest: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
+        room_in_words(plan),
+    ]
 
 
 def _summary(plan: Plan) -> list[str]:

@@ -60,6 +60,9 @@ class Controller:
         self.q_rad = [0.1, -1.2, 1.5, -0.7, -1.4, 0.3]
         self.qd_rad_s = [0.0] * 6
         self.goal_rad: list[float] | None = None
+        self.sweeps_until_s = 0.0
+        self.swept: tuple[float, ...] = ()
+        """Numbers of the last sweep."""
         self.speed_rad_s = 0.0
         self.tcp_offset = [0.1, -0.02, 0.25, 0.3, -1.2, 0.7]
         self.robot_mode, self.safety_mode, self.safety_bits, self.program = 7, 1, 1, 1
@@ -189,6 +192,8 @@ class Controller:
     def _move(self) -> None:
         if self.goal_rad is None or self.program != 2 or self.safety_bits != 1:
             return
+        if self.clock.now_s() < self.sweeps_until_s:
+            return
         left_rad = self.goal_rad[5] - self.q_rad[5]
         step_rad = self.speed_rad_s * self.period_s
         if abs(left_rad) <= step_rad:
@@ -216,6 +221,13 @@ class Controller:
         self.did.append("move")
         self._operation += 1
         self.goal_rad, self.speed_rad_s = q, speed
+        return True
+
+    def sweep(self, duration_s: float) -> bool:
+        """Joint 6 moves away and back: what matters here is when it ends."""
+        self.did.append("sweep")
+        self.goal_rad, self.speed_rad_s = list(self.q_rad), 0.1
+        self.sweeps_until_s = self.clock.now_s() + duration_s
         return True
 
     def getAsyncOperationProgressEx(self) -> "Controller":

@@ -21,6 +21,7 @@ from ftdrivers.ur.timing import UrTiming
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, HOST, Controller
 
 COMMANDS = {1: "move", 2: "stop", 3: "limits", 4: "tcp_offset", 5: "set_payload", 6: "set_gravity", 7: "quit"}
+COMMANDS |= {8: "wave", 9: "sweep"}
 
 
 class Registers:
@@ -33,6 +34,7 @@ class Registers:
         self.outputs = [0.0] * 10
         """Token, state, sequence number, answer; the TCP."""
         self.running = False
+        self.waves = [(0.0, 0.0, 0.0)] * 6
         self._hangs = False
 
     def start(self, token: int) -> None:
@@ -86,6 +88,13 @@ class Registers:
             if self._moving:
                 far.stopJ(4.0)
                 self._moving = not far.stopping_works
+        elif name == "wave":
+            self.waves[round(numbers[0])] = (numbers[1], numbers[2], numbers[3])
+        elif name == "sweep":
+            if self._moving or not np.allclose(numbers[:6], far.q_rad, atol=1e-3):
+                return False
+            far.swept = tuple(numbers[:8])
+            self._moving = far.sweep(numbers[6])
         elif name == "limits":
             return abs(numbers[5]) < 2.0
         elif name == "tcp_offset":

@@ -1,12 +1,14 @@
 """The control path through a program of ours: its text, the heartbeat, what ends it; on a fake clock."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.sweep import Sweep
 from ftdrivers.ur import control_program
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import ControlSetting
@@ -53,7 +55,7 @@ def test_program_and_driver_agree_on_registers_and_commands() -> None:
     assert numbers == set(range(10))
     for command in (f"input_int_register_{k}" for k in range(32, 36)):
         assert command in control_program.INPUTS
-    named = {int(number): name for name, number in re.findall(r"global ft_(\w+) = ([1-7])\n", text)}
+    named = {int(number): name for name, number in re.findall(r"global ft_(\w+) = ([1-9])\n", text)}
     assert len(named) == len(control_program.COMMANDS) == len(COMMANDS)
     for name, number in control_program.COMMANDS.items():
         stem = {"within_safety_limits": "limits", "quit": "end"}.get(name, name.removeprefix("set_").split("_")[0])
@@ -259,3 +261,55 @@ def test_settings_and_questions_pass_through_the_registers(arm: UrArm, controlle
     assert arm.within_safety_limits(controller.q_rad)
     assert not arm.within_safety_limits([*controller.q_rad[:5], 3.0])
     assert control_of(arm).call("tcp_offset") == pytest.approx(controller.tcp_offset)
+
+
+# ---------------------------------------------------------------------- a sweep
+
+
+def sweep_of(arm: UrArm) -> Sweep:
+    return Sweep(arm.state().q_rad.tolist(), [[0.2, 0.02]] * 3, [[0.6, 4.0]] * 3, [[0.0, 1.0]] * 3, 3.0, 1.0)
+
+
+def test_a_sweep_is_sent_wave_by_wave(arm: UrArm, script: Script, controller: Controller) -> None:
+    sweep = sweep_of(arm)
+    arm.sweep(sweep, guard=no_guard)
+    assert np.allclose(script.registers.waves, sweep.waves.reshape(-1, 3))
+    assert controller.swept == (*sweep.centre_rad, sweep.duration_s, sweep.ramp_s)
+
+
+def test_a_guard_stops_a_sweep(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
+    begun_s = clock.now_s()
+
+    def guard() -> None:
+        if clock.now_s() - begun_s > 1.0:
+            raise RuntimeError("something is wrong")
+
+    with pytest.raises(RuntimeError, match="something is wrong"):
+        arm.sweep(sweep_of(arm), guard=guard)
+    assert controller.goal_rad is None
+    assert controller.did[-1] == "stop softly"
+
+
+def test_a_sweep_from_elsewhere_is_rejected(arm: UrArm, controller: Controller) -> None:
+    sweep = replace(sweep_of(arm), centre_rad=away(controller))
+    with pytest.raises(DeviceFault, match="rejected the sweep"):
+        arm.sweep(sweep, guard=no_guard)
+
+
+@pytest.mark.parametrize("how", ["suspended", "cut"])
+def test_a_sweep_without_heartbeat_stops(
+    arm: UrArm, script: Script, controller: Controller, clock: FakeClock, how: str
+) -> None:
+    control, sweep = control_of(arm), sweep_of(arm)
+    for k, wave in enumerate(sweep.waves.reshape(-1, 3).tolist()):
+        control.call("wave", k, *wave)
+    control.call("sweep", list(sweep.centre_rad), sweep.duration_s, sweep.ramp_s)
+    clock.advance(0.3)
+    assert controller.goal_rad is not None
+    if how == "cut":
+        script.link.cut = True
+    else:
+        control.suspended = True
+    clock.advance(STOPS_ITSELF_S)
+    assert controller.goal_rad is None
+    assert script.registers.outputs[1] == -2

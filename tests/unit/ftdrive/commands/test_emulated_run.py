@@ -62,7 +62,7 @@ def test_the_demo_names_its_next_commands_as_they_can_be_typed(
     monkeypatch.setattr(Run, "records", lambda _: [])
     outcome = SimpleNamespace(run=run, result=SimpleNamespace(verdict="good"), drift=None)
     monkeypatch.setattr(demo, "Station", lambda *_, **__: nullcontext(STATION))
-    monkeypatch.setattr(demo, "rehearse", lambda *_: outcome)
+    monkeypatch.setattr(demo, "rehearse", lambda *_, **__: outcome)
     monkeypatch.setattr(demo, "print_result", lambda *_, **__: None)
     with capsys.disabled():
         shown = CliRunner().invoke(demo.demo, catch_exceptions=False).stderr

@@ -190,6 +190,7 @@ def test_calibrate_solve_and_library_say_the_same(as_json: bool, lab: Lab, capsy
     lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting="3"))
     outcome = lab.calibrate()
     assert outcome is not None
+    assert outcome.dataset is not None
     records = outcome.run.records()
     lean = np.radians(3)
     setup = Setup(

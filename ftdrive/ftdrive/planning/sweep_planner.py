@@ -1,0 +1,278 @@
+"""Plans a sweep: the most informative curves of the wrist within the limits, the first of them that is proven clear.
+
+Candidates have random frequencies, shares and phases, and as much amplitude as the limits of speed, acceleration and
+tips leave. Their information about the load comes from the same model as the estimate. Planning is deterministic.
+
+The proof is that of a tour through points of the curve, with more distance. Between two points the curve leaves the
+straight move by at most ``acceleration step²/8``. A controller that follows with a lag T leaves the curve by about
+``acceleration T²/2``, as a first-order lag does. A stop that brakes for a time S follows the tangent, at most
+``acceleration S²/8`` off the curve.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftcalib.assessment.verdict import expected_error
+from ftcalib.motion.estimate import DELAY_S, GYRATION_M, HEIGHT_M
+from ftcalib.motion.model import DELAY, HEIGHT, INERTIA, Load, jacobian
+from ftcalib.motion.samples import Motion
+from ftcalib.poses.information import Guess
+from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.planning.geometry.arm_model import ArmModel
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.kinematics import checked_joints
+from ftdrive.planning.motion import Speeds, tips
+from ftdrive.planning.plan import PROOF_S, Plan, Step, ball_of, description_of, fingerprints
+from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.planning.search.nodes import WRIST_6_RAD
+from ftdrive.planning.search.postures import with_room
+from ftdrivers.sweep import WRISTS, Sweep
+from ftdrivers.ur.kinematics import Array
+
+SECONDS = (10.0, 120.0)
+RAMP_S = 3.0
+STEP_S = 0.2
+"""Between two steps of the plan."""
+SMOOTHED_S = 0.1
+"""The `lookahead_time` of the controller."""
+RANDOM, CHANGED = 24, 40
+"""Curves that are tried."""
+PROVEN = 6
+"""So many of them, the best ones, are tried at one posture, in each of the sizes."""
+SIZES = (1.0, 0.8, 0.6)
+POSTURES = 6
+SLOW_HZ, QUICK_HZ = (0.06, 0.16), (0.3, 0.9)
+"""Of the two sines of each joint: the slow one turns far, the quick one shows the inertia."""
+MOST_RAD = 1.5
+_MODEL_STEP_S = 0.01
+_COARSE = 5
+"""Of the points of the proof, one in so many is looked at first."""
+_ROW_S = 0.12
+_INERTIA_WORTH = 0.5
+"""Of the logarithm of its sigma, beside that of the compensation error."""
+
+
+def plan_sweep(
+    certifier: Certifier,
+    q_rad: ArrayLike,
+    seconds: float,
+    *,
+    speeds: Speeds,
+    stop_rad_s2: float,
+    guess: Guess,
+) -> Plan:
+    """Plan a sweep around the present posture, or around one that has more room.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        Present joint angles.
+    seconds : float
+        Duration at the planned speed.
+    speeds : Speeds
+        Limits.
+    stop_rad_s2 : float
+        Deceleration of a stop.
+    guess : Guess
+        Of the tool and the noise.
+
+    Raises
+    ------
+    ConfigError
+        `seconds` is out of range.
+    PlanRefused
+        No sweep was proven clear.
+    """
+    if not SECONDS[0] <= seconds <= SECONDS[1]:
+        raise ConfigError(f"a sweep of {seconds:g} s does not exist: give {SECONDS[0]:g} to {SECONDS[1]:g} s")
+    q_now = checked_joints(q_rad)
+    tried = 0
+    for centre in _centres(certifier, q_now):
+        if not certifier.free(centre)[0]:
+            continue
+        tried += 1
+        best = _candidates(certifier.arm, centre, seconds, speeds, guess)[:PROVEN]
+        for sweep in (one.smaller(size) for size in SIZES for _, one in best):
+            off_m = certifier.reach_m(_off_curve(sweep, stop_rad_s2))
+            keeping, path = certifier.keeping(off_m), sweep.at(_times(sweep, PROOF_S))
+            if keeping.free(path[::_COARSE]).all() and keeping.clear_around(path):
+                return _plan(certifier, sweep, off_m, q_now, speeds, guess)
+        if tried == POSTURES:
+            break
+    raise PlanRefused(
+        "no sweep of the wrist is proven clear: describe the tool more closely, clear the surroundings, or jog the arm "
+        "to a posture with more room"
+    )
+
+
+def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
+    """Postures to sweep around: the present one, others of the wrist, others of the arm."""
+    yield q_now
+    for turn in (np.pi / 2, -np.pi / 2):
+        yield np.concatenate([q_now[:4], [turn], q_now[5:]])
+    near = constant_tour(q_now)
+    yield from near[np.argsort(np.abs(near - q_now).max(axis=1), kind="stable")[:6]]
+    for tour in with_room(certifier, q_now):
+        yield tour[int(np.abs(tour - q_now).max(axis=1).argmin())]
+
+
+def _candidates(
+    arm: ArmModel, centre: Array, seconds: float, speeds: Speeds, guess: Guess
+) -> list[tuple[float, Sweep]]:
+    """Curves with their scores, the best first: random ones, then changes of the best one."""
+    rng, found = np.random.default_rng(0), list[tuple[float, Sweep]]()
+    best, least = _drawn(rng), np.inf
+    for k in range(RANDOM + CHANGED):
+        tried = _drawn(rng)
+        if k >= RANDOM:
+            share = rng.choice([0.1, 0.3])
+            tried = (1 - share) * best + share * tried
+        sweep = _within(arm, _curve(tried, centre, seconds), speeds)
+        if sweep is None:
+            continue
+        found.append((_score(arm, sweep, guess), sweep))
+        if found[-1][0] < least:
+            least, best = found[-1][0], tried
+    return sorted(found, key=lambda one: one[0])
+
+
+def _drawn(rng: np.random.Generator) -> Array:
+    """Return numbers (3, 6) from 0 to 1: of each wrist, its size, the share of its quick sine, frequencies, phases."""
+    return rng.uniform(size=(len(WRISTS), 6))
+
+
+def _curve(drawn: Array, centre: Array, seconds: float) -> Sweep:
+    hertz = np.stack([low + (high - low) * drawn[:, k] for k, (low, high) in enumerate((SLOW_HZ, QUICK_HZ))], axis=1)
+    quick = 0.1 + 0.8 * drawn[:, 2]  # of the acceleration
+    strength = np.stack([1 - quick, quick], axis=1) / (2 * np.pi * hertz) ** 2
+    size = (0.2 + 0.8 * drawn[:, 3]) * MOST_RAD
+    amplitude = size[:, None] * strength / strength.sum(axis=1, keepdims=True)
+    return Sweep(centre.tolist(), amplitude, 2 * np.pi * hertz, 2 * np.pi * drawn[:, 4:], seconds, RAMP_S)
+
+
+def _within(arm: ArmModel, sweep: Sweep, speeds: Speeds) -> Sweep | None:
+    """Reduce amplitudes until every limit is kept."""
+    limits = MOST_RAD, speeds.joint_rad_s, speeds.joint_rad_s2
+    most = np.stack([sweep.largest(k) for k in range(3)])[:, list(WRISTS)]
+    most[0] = np.abs(sweep.at(_times(sweep, 0.05)) - sweep.centre_rad)[:, list(WRISTS)].max(axis=0)
+    sweep = sweep.smaller(np.minimum(1.0, 0.99 * (np.array(limits)[:, None] / most).min(axis=0)))
+    for share in ((1, 1, 0), (1, 1, 0), (1, 1, 1), (1, 1, 1), (1, 1, 1)):
+        if speeds.tip_m_s is None:
+            break
+        excess = _tip_speed_m_s(arm, sweep) / speeds.tip_m_s
+        if excess <= 1:
+            break
+        sweep = sweep.smaller(np.where(share, 0.98 / excess, 1.0))
+    else:
+        return None
+    low, high = (np.array(sweep.centre_rad) + side * MOST_RAD for side in (-1, 1))
+    return sweep if max(-low.min(), high.max()) <= 2 * np.pi else None
+
+
+def _tip_speed_m_s(arm: ArmModel, sweep: Sweep) -> float:
+    step_s = 0.05
+    path = tips(arm, sweep.at(_times(sweep, step_s)))
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=2).max()) / step_s
+
+
+def _times(sweep: Sweep, step_s: float) -> Array:
+    return np.arange(0.0, sweep.duration_s, step_s)
+
+
+def _off_curve(sweep: Sweep, stop_rad_s2: float) -> Array:
+    """Bound (6,) of how far a joint is from the moves between the points."""
+    stop_s = float(sweep.largest(1).max()) / stop_rad_s2
+    return np.asarray(sweep.largest(2) * (PROOF_S**2 / 8 + SMOOTHED_S**2 / 2 + stop_s**2 / 8))
+
+
+def _score(arm: ArmModel, sweep: Sweep, guess: Guess) -> float:
+    force_N, torque_Nm, inertia = predicted(arm, sweep, guess)
+    return float(np.log(force_N) + np.log(torque_Nm) + _INERTIA_WORTH * np.log(inertia))
+
+
+def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, float]:
+    """Return the predicted compensation error, N and N·m, and the largest sigma of a moment of inertia, kg·m².
+
+    The noise of 0.12 s of motion counts as that of a pose in the guess.
+    """
+    load = Load(guess.parameters, guess.g_m_s2, inertia=np.r_[np.full(3, 1e-3), np.zeros(3)])
+    motion, rate = _motion(arm, sweep)
+    J = (jacobian(load, motion, rate) / guess.wrench_sigma[:, None])[:, :, :23].reshape(-1, 23)
+    prior = np.zeros(23)
+    prior[INERTIA], prior[HEIGHT], prior[DELAY] = guess.mass_kg * GYRATION_M**2, HEIGHT_M, DELAY_S
+    weight = np.divide(1.0, prior**2, out=np.zeros(23), where=prior > 0)
+    weight[:15] = 1e-6 / guess.scale**2  # what the motion does not show stays finite
+    covariance = np.linalg.inv(J.T @ J + np.diag(weight))
+    force_N, torque_Nm = expected_error(guess.parameters, covariance[:15, :15])
+    return force_N, torque_Nm, float(np.sqrt(np.diag(covariance)[INERTIA].max()))
+
+
+def _motion(arm: ArmModel, sweep: Sweep) -> tuple[Motion, Motion]:
+    """Motion of the flange in rows of 0.12 s, and its rate of change, by differences."""
+    t, h = _times(sweep, _ROW_S), _MODEL_STEP_S
+    places = [arm.frames(sweep.at(t + k * h)) for k in range(-2, 3)]
+    columns = []
+    for k in (1, 2, 3):
+        R = places[k].R_base_flange
+        before, after = places[k - 1], places[k + 1]
+        Rdd = (before.R_base_flange - 2 * R + after.R_base_flange) / h**2
+        a = (before.flange_m - 2 * places[k].flange_m + after.flange_m) / h**2
+        columns.append(Motion(R, np.einsum("nji,nj->ni", R, a), np.swapaxes(R, 1, 2) @ Rdd).columns())
+    return Motion.of_columns(columns[1]), Motion.of_columns((columns[2] - columns[0]) / (2 * h))
+
+
+def _plan(certifier: Certifier, sweep: Sweep, off_curve_m: float, q_now: Array, speeds: Speeds, guess: Guess) -> Plan:
+    arm, q = certifier.arm, sweep.at(_times(sweep, STEP_S))
+    following = np.roll(q, -1, axis=0)
+    certificate = certifier.keeping(off_curve_m).certify(q, following)
+    R, turn = arm.frames(q).R_base_flange, np.abs(following - q).max(axis=1)
+    steps = tuple(
+        Step(
+            i + 1,
+            tuple(q[i].tolist()),
+            tuple(tuple(row) for row in R[i].tolist()),
+            float(turn[i]),
+            float(turn[i]) / STEP_S,
+            STEP_S,
+            bool(certificate.clear[i]),
+            float(certificate.clearance_m[i]) - off_curve_m,
+            certificate.limited_by[i],
+        )
+        for i in range(len(q))
+    )
+    force_N, torque_Nm, inertia = predicted(arm, sweep, guess)
+    centre_m, ball_m = ball_of(certifier, q, following)
+    why = ["A sweep of the wrist: the most informative of the curves within the limits that is proven clear."]
+    if not np.allclose(q_now, sweep.centre_rad):
+        first = np.degrees(sweep.centre_rad).round().astype(int).tolist()
+        why.append(f"It has room around joints {first} degrees; the approach to them is not part of the plan.")
+    why.append(f"Predicted error of force compensation: {force_N:.3f} N.")
+    return Plan(
+        "sweep",
+        tuple(why),
+        fingerprints(certifier),
+        steps,
+        float(sweep.largest(2).max()),
+        ball_m,
+        tuple(centre_m.tolist()),
+        {"force_rms_N": force_N, "torque_rms_Nm": torque_Nm, "inertia_kg_m2": inertia},
+        description_of(certifier, speeds, guess),
+        sweep,
+        off_curve_m,
+    )
+
+
+def at_speed(plan: Plan, share: float) -> Plan:
+    """Return a sweep's plan with the same path at a share of the speed."""
+    if plan.sweep is None or share == 1.0:
+        return plan
+    return replace(plan, sweep=plan.sweep.slower(share), acceleration_rad_s2=plan.acceleration_rad_s2 * share**2)
+
+
+def winds_little(sweep: Sweep, q_rad: Array) -> bool:
+    """Return whether wrist 3 stays in its window around a present angle."""
+    turns = sweep.at(_times(sweep, STEP_S))[:, 5] - q_rad[5]
+    return bool(np.abs(turns).max() <= WRIST_6_RAD)

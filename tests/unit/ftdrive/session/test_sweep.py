@@ -1,0 +1,186 @@
+"""A sweep on the fake cell: what is asked, its speed, the hazards of the tour, and what is kept."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ftcalib.model import Array
+from ftdrive.cell.config import CellConfig
+from ftdrive.errors import ConfigError, Declined, NotAccepted, SupervisorGone
+from ftdrive.planning import sweep_planner
+from ftdrive.planning.cell_plan import certifier_for, sweep_for
+from ftdrive.planning.plan import Plan
+from ftdrive.runs.motion import MotionRecording
+from ftdrive.session import sweeping
+from ftdrive.session.events import Event, GuardTripped, MotionRecorded, State, StateChanged
+from ftdrive.session.free_tool import FreeTool
+from ftdrive.session.guards import ExpectedMotion, Seen
+from ftdrive.session.operator import Key
+from ftdrive.session.options import SessionOptions, with_recorded_mode
+from ftdrive.session.sweeping import on_script_path
+from ftdrivers.clock import REAL
+from ftdrivers.interfaces import ArmState
+from tests.unit.ftdrive.fake_cell import STATUS, Lab
+from tests.unit.ftdrive.session.test_stops import FAULTS
+
+LATE_S = 4.5
+"""Then the tool is known."""
+
+
+@cache
+def planned(q_rad: tuple[float, ...], cell: CellConfig, seconds: float) -> Plan:
+    return sweep_for(cell, certifier_for(cell, "UR5e"), np.array(q_rad), seconds)
+
+
+@pytest.fixture(autouse=True)
+def _short_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep_planner, "RANDOM", 2)
+    monkeypatch.setattr(sweep_planner, "CHANGED", 0)
+
+    def planned_once(cell: CellConfig, _: object, q_rad: Array, seconds: float) -> Plan:
+        return planned(tuple(q_rad.tolist()), replace(cell, clock=REAL), seconds)
+
+    monkeypatch.setattr(sweeping, "sweep_for", planned_once)
+
+
+@pytest.mark.slow
+def test_the_first_run_is_slow_and_the_second_is_not(lab: Lab) -> None:
+    for _ in range(2):
+        assert lab.sweep() is not None
+    first, second = lab.arm.sweeps
+    assert first.duration_s == pytest.approx(2 * second.duration_s)
+    assert second.duration_s == 10.0
+    words = [question for question in lab.operator.asked if question.answers == ("MOVE",)]
+    assert [question.assumed for question in words] == [None, "MOVE"]
+    assert [question.text[:6] for question in lab.operator.asked].count("Is the") == 6
+
+
+def test_everything_is_kept_in_one_file(lab: Lab) -> None:
+    run = lab.sweep(real=False)
+    assert run is not None
+    assert run.in_motion
+    assert run.stops() == []
+    (event,) = lab.operator.of(MotionRecorded)
+    recording = MotionRecording.load(run.motion_path)
+    assert (event.samples, event.states) == (len(recording.samples), len(recording.states))
+    assert recording.nominal_rate_Hz != recording.nominal_rate_Hz
+    assert State.SWEEP in lab.operator.states()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_in_a_sweep_stops_the_arm_and_resume_starts_again(fault: str, lab: Lab) -> None:
+    hazard, inject, repair, _ = FAULTS[fault]
+    lab.arm.at_sweep_s[1] = LATE_S, lambda: inject(lab)
+
+    def on_event(event: Event) -> None:
+        if isinstance(event, StateChanged) and event.state is State.HOLD:
+            assert lab.arm.halted.is_set()
+            assert not lab.run().in_motion
+            repair(lab)
+
+    lab.operator.on_event = on_event
+    lab.operator.answers["resume:"] = ["resume"]
+    run = lab.sweep(real=False)
+    assert run is not None
+    assert run.in_motion
+    assert [event.hazard for event in lab.operator.of(GuardTripped)] == [hazard]
+    assert len(lab.arm.sweeps) == 2
+    assert lab.holds() == [("resume", "quit")]
+
+
+def test_a_push_that_the_weight_of_a_heavy_tool_would_hide_is_seen_once_the_tool_is_known(lab: Lab) -> None:
+    lab.arm.at_sweep_s[1] = LATE_S, lambda: setattr(lab.sensor, "push", np.array([0, 22.0, 0, 0, 0, 0]))
+    with pytest.raises(Exception, match="from the weight of the free tool"):
+        lab.sweep(real=False)
+    assert lab.operator.of(GuardTripped)[0].hazard == 14
+    assert not lab.run().in_motion
+
+
+def test_a_joint_off_the_curve_stops_the_arm(lab: Lab) -> None:
+    lab.arm.at_sweep_s[1] = 5.0, lambda: setattr(lab.arm, "push_rad", np.radians([0, 0, 0, 0, 3.0, 0]))
+    with pytest.raises(Exception, match="from where it should be"):
+        lab.sweep(real=False)
+    assert lab.operator.of(GuardTripped)[0].hazard == 2
+
+
+def test_a_slider_that_moves_stops_the_arm(lab: Lab) -> None:
+    lab.arm.at_sweep_s[1] = 2.0, lambda: lab.arm.set_status(speed_slider=0.7)
+    with pytest.raises(Exception, match="speed slider was moved from 100 to 70 %"):
+        lab.sweep(real=False)
+    assert lab.operator.of(GuardTripped)[0].hazard == 22
+
+
+@pytest.mark.slow
+def test_a_sweep_starts_at_the_speed_of_the_slider(lab: Lab) -> None:
+    lab.arm.set_status(speed_slider=0.8)
+    lab.sweep(real=False)
+    assert lab.arm.sweeps[0].duration_s == pytest.approx(10.0 / 0.8)
+    lab.arm.set_status(speed_slider=0.4)
+    with pytest.raises(NotAccepted, match="40 %"):
+        lab.sweep(real=False)
+
+
+def test_a_supervisor_that_leaves_stops_the_arm(lab: Lab) -> None:
+    lab.arm.at_sweep_s[1] = 4.0, lambda: setattr(lab.operator, "gone", "the terminal was closed")
+    with pytest.raises(SupervisorGone):
+        lab.sweep(real=False)
+    assert lab.arm.halted.is_set()
+    assert lab.holds() == []
+
+
+def test_q_ends_a_sweep(lab: Lab) -> None:
+    lab.arm.at_sweep_s[1] = 4.0, lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined, match="stopped by the operator"):
+        lab.sweep(real=False)
+    assert lab.arm.halted.is_set()
+    assert "was not completed" in lab.said()
+
+
+def test_a_sweep_is_not_continued(lab: Lab) -> None:
+    run = lab.sweep(real=False)
+    assert run is not None
+    with pytest.raises(ConfigError, match="start again with --sweep"):
+        with_recorded_mode(SessionOptions(lab.folder, resume=run.folder))
+
+
+def test_the_other_control_path_is_refused_at_once(lab: Lab) -> None:
+    cell = replace(lab.cell, robot=replace(lab.cell.robot, control="ur-rtde"))
+    with pytest.raises(ConfigError, match="--control script"):
+        on_script_path(cell)
+    assert on_script_path(lab.cell).robot.control == "script"
+
+
+def seen(t_s: float, R: Array, wrench: Array, sample: int, curve: Array | None) -> Seen:
+    motion = ExpectedMotion(np.zeros(6), np.zeros(6), True, curve)
+    state = ArmState(0, 0.0, np.zeros(6), np.zeros(6), R, np.zeros(3))
+    return Seen(t_s, 0.01, motion, state, STATUS, wrench, sample, 0.0)
+
+
+def test_the_weight_is_learned_from_three_seconds_on(orientation: Callable[[float], Array]) -> None:
+    tool, rng = FreeTool(np.array([0, 0, -1.0]), 5.0), np.random.default_rng(0)
+    curve = np.zeros((2, 6))
+
+    def wrench(R: Array) -> Array:
+        force = R.T @ [0, 0, -12.0]
+        return np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
+
+    tool.begin(seen(0.0, np.eye(3), np.zeros(6), 0, curve))
+    for k in range(1500):
+        t_s = 0.01 * k
+        R = orientation(t_s)
+        found = tool.predict(R)
+        assert found is None or t_s > 2.9
+        if t_s > 8.0:
+            assert found is not None
+            assert np.abs(found - wrench(R))[:3].max() < 0.5
+        tool.look(seen(t_s, R, wrench(R) + rng.normal(0, [0.5] * 3 + [0.03] * 3), k + 1, curve))
+
+
+@pytest.fixture
+def orientation() -> Callable[[float], Array]:
+    return lambda t_s: Rotation.from_euler("xyz", [np.sin(0.5 * t_s), np.sin(0.7 * t_s), 0.4 * t_s]).as_matrix()
