@@ -29,7 +29,7 @@ SCHEME: Final = "ros2:"
 _FIRST_S: Final = 2.0
 """From the publisher to the first pose."""
 _STALE_S: Final = 0.3
-_SPEED_S: Final = 0.1
+_SPEED_NS: Final = 100_000_000
 """The speed is that of so long, because encoders have steps and stamps scatter."""
 _LEVER_M: Final = 1.0
 """A translation counts as a turn with this lever."""
@@ -63,7 +63,7 @@ class Ros2Arm(ReadOnlyArm):
         clock: Clock = REAL,
     ) -> None:
         self._host, self._model, self._clock = host, model, clock
-        self._reader = _reader_of(host)  # also finds wrong options
+        self._reader = pose_reader_of(host)  # also finds wrong options
         self._ros: Node | None = None
         self._publishers: dict[str, str] = {}
         self._changed = threading.Condition()
@@ -80,7 +80,7 @@ class Ros2Arm(ReadOnlyArm):
             if self._failure is None and self._age_s() < _STALE_S:
                 return
             self.close()
-        self._reader, self._failure, self._newest, self._dropped = _reader_of(self._host), None, None, 0
+        self._reader, self._failure, self._newest, self._dropped = pose_reader_of(self._host), None, None, 0
         self._recent.clear()
         self._ros = Node("ftdrive_arm")
         self._ros.spin()
@@ -139,11 +139,12 @@ class Ros2Arm(ReadOnlyArm):
         with self._changed:
             for pose in poses:
                 newest = self._newest
-                if newest is not None and pose.t_s <= newest.t_device_s:
+                t_s = 1e-9 * pose.t_ns
+                if newest is not None and t_s <= newest.t_device_s:
                     self._dropped += 1
-                    if pose.t_s < newest.t_device_s - _BACK_S:
+                    if t_s < newest.t_device_s - _BACK_S:
                         self._failure = ProtocolError(
-                            f"the stamps of {topic} went back by {newest.t_device_s - pose.t_s:.1f} s",
+                            f"the stamps of {topic} went back by {newest.t_device_s - t_s:.1f} s",
                             "check that one node publishes it, with one clock",
                         )
                     continue
@@ -154,10 +155,12 @@ class Ros2Arm(ReadOnlyArm):
 
     def _state_of(self, pose: StampedPose, t_host_ns: int) -> ArmState:
         self._recent.append(pose)
-        while len(self._recent) > 2 and self._recent[1].t_s <= pose.t_s - _SPEED_S:
+        while len(self._recent) > 2 and self._recent[1].t_ns <= pose.t_ns - _SPEED_NS:
             self._recent.popleft()
         speed = np.full(6, _speed(self._recent[0], pose))
-        return ArmState(t_host_ns, pose.t_s, np.full(6, np.nan), speed, pose.R_base_flange, pose.p_base_flange_m)
+        return ArmState(
+            t_host_ns, 1e-9 * pose.t_ns, np.full(6, np.nan), speed, pose.R_base_flange, pose.p_base_flange_m
+        )
 
     def state(self) -> ArmState:
         """Return a state that arrives after this call. Raises `DeviceTimeout`."""
@@ -224,7 +227,7 @@ class Ros2Arm(ReadOnlyArm):
 
 def _speed(before: StampedPose, after: StampedPose) -> float:
     """Return the speed of the flange between two poses, rad/s; 0 for one pose alone."""
-    dt_s = after.t_s - before.t_s
+    dt_s = 1e-9 * (after.t_ns - before.t_ns)
     if dt_s <= 0:
         return 0.0
     change = before.R_base_flange.T @ after.R_base_flange
@@ -239,7 +242,7 @@ def _no_states() -> ArmStates:
     return ArmStates(np.zeros(0, np.int64), np.zeros(0), nothing, nothing, np.zeros((0, 3, 3)), np.zeros((0, 3)))
 
 
-def _reader_of(host: str) -> PoseReader:
+def pose_reader_of(host: str) -> PoseReader:
     """Return what turns the messages of an address into poses. Raises `BadUrl`."""
     parts = split_url(host)
     options = Options(host, parts.query)

@@ -69,16 +69,20 @@ class Chain:
         if not self.names:
             raise BadUrl(f"{path}: no joint moves between {base or link} and {flange}: give other links")
 
-    def pose(self, positions: Mapping[str, float]) -> tuple[Array, Array]:
-        """Return orientation (3, 3) and origin (3,) of the flange in the base at these joint positions, rad or m."""
-        R, p = np.eye(3), np.zeros(3)
+    def poses(self, positions: Mapping[str, Array]) -> tuple[Array, Array]:
+        """Return orientations (n, 3, 3) and origins (n, 3) of the flange in the base.
+
+        `positions` has the joint positions (n,) by name, rad or m.
+        """
+        n = len(positions[self.names[0]])
+        R, p = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
         for joint in self._joints:
             p = p + R @ joint.p
             R = R @ joint.R
             if joint.kind == "prismatic":
-                p = p + R @ (positions[joint.name] * joint.axis)
+                p = p + np.einsum("nij,nj->ni", R, np.outer(positions[joint.name], joint.axis))
             elif joint.kind in _MOVES:
-                R = R @ Rotation.from_rotvec(positions[joint.name] * joint.axis).as_matrix()
+                R = R @ Rotation.from_rotvec(np.outer(positions[joint.name], joint.axis)).as_matrix()
         return R, p
 
 

@@ -9,17 +9,18 @@ from scipy.spatial.transform import Rotation
 from ftdrivers.errors import ProtocolError
 from ftdrivers.interfaces import Array
 from ftdrivers.ros2.kinematics import Chain
-from ftdrivers.ros2.subscription import is_finite, stamp_s
+from ftdrivers.ros2.subscription import is_finite, stamp_ns
 
-_UNIT_TOLERANCE: Final = 1e-3
-_SPREAD_S: Final = 0.1
+UNIT_TOLERANCE: Final = 1e-3
+"""Of the length of a quaternion."""
+_SPREAD_NS: Final = 100_000_000
 """The parts of a chain of tf may differ by so much in time."""
 
 
 class StampedPose(NamedTuple):
     """The flange in the base at one time."""
 
-    t_s: float
+    t_ns: int
     R_base_flange: Array
     p_base_flange_m: Array
 
@@ -43,7 +44,7 @@ def pose_of(position: Any, quaternion: Any, what: str) -> tuple[Array, Array]:
     q = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     if not is_finite(*p, *q):
         raise ProtocolError(f"{what} is not finite", "check its driver")
-    if abs(float(np.linalg.norm(q)) - 1) > _UNIT_TOLERANCE:
+    if abs(float(np.linalg.norm(q)) - 1) > UNIT_TOLERANCE:
         raise ProtocolError(f"{what} has a quaternion of length {np.linalg.norm(q):.3g}", "normalize it in its driver")
     return Rotation.from_quat(q).as_matrix(), np.array(p)
 
@@ -57,7 +58,7 @@ class Poses:
     def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
         """Give the pose of a message."""
         pose = pose_of(message.pose.position, message.pose.orientation, f"a pose of {topic}")
-        yield StampedPose(stamp_s(message.header, topic), *pose)
+        yield StampedPose(stamp_ns(message.header, topic), *pose)
 
     def missing(self) -> str:
         """Return that no message came."""
@@ -69,11 +70,11 @@ class Joints:
 
     def __init__(self, topic: str, chain: Chain) -> None:
         self.topics = {topic: "sensor_msgs/msg/JointState"}
-        self._chain = chain
+        self.chain = chain
         self._seen: set[str] = set()
 
-    def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
-        """Give the pose of a message that has all joints."""
+    def positions(self, topic: str, message: Any) -> dict[str, float] | None:
+        """Return the joints of the chain; None for a message of others. Raises `ProtocolError`."""
         if len(message.position) != len(message.name):
             raise ProtocolError(
                 f"a message of {topic} has {len(message.name)} names and {len(message.position)} positions",
@@ -81,15 +82,21 @@ class Joints:
             )
         self._seen |= set(message.name)
         found = dict(zip(message.name, map(float, message.position), strict=True))
-        if not all(name in found for name in self._chain.names):
-            return
-        if not is_finite(*(found[name] for name in self._chain.names)):
+        if not all(name in found for name in self.chain.names):
+            return None
+        if not is_finite(*(found[name] for name in self.chain.names)):
             raise ProtocolError(f"a joint of {topic} is not finite", "check its driver")
-        yield StampedPose(stamp_s(message.header, topic), *self._chain.pose(found))
+        return {name: found[name] for name in self.chain.names}
+
+    def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
+        """Give the pose of a message that has all joints."""
+        if (found := self.positions(topic, message)) is not None:
+            R, p = self.chain.poses({name: np.array([value]) for name, value in found.items()})
+            yield StampedPose(stamp_ns(message.header, topic), R[0], p[0])
 
     def missing(self) -> str:
         """Return which joints no message had."""
-        lacking = [name for name in self._chain.names if name not in self._seen]
+        lacking = [name for name in self.chain.names if name not in self._seen]
         has = ", ".join(sorted(self._seen)) or "none"
         return f"no message of {next(iter(self.topics))} has all joints; missing {', '.join(lacking)}, found {has}"
 
@@ -100,9 +107,9 @@ class Transforms:
     def __init__(self, base: str, flange: str) -> None:
         self._base, self._flange = base, flange
         self.topics = {"/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage"}
-        self._parts: dict[str, tuple[str, float | None, Array, Array]] = {}
+        self._parts: dict[str, tuple[str, int | None, Array, Array]] = {}
         """By child: parent, time or None if it is static, orientation, origin."""
-        self._last_s = 0.0
+        self._last_ns = 0
 
     def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
         """Give the pose if the oldest part of the chain is newer than before."""
@@ -110,32 +117,33 @@ class Transforms:
             child = part.child_frame_id.lstrip("/")
             parent = part.header.frame_id.lstrip("/")
             pose = pose_of(part.transform.translation, part.transform.rotation, f"the transform {parent} to {child}")
-            t_s = None if topic == "/tf_static" else stamp_s(part.header, f"{topic} ({parent} to {child})")
-            self._parts[child] = parent, t_s, *pose
+            t_ns = None if topic == "/tf_static" else stamp_ns(part.header, f"{topic} ({parent} to {child})")
+            self._parts[child] = parent, t_ns, *pose
         chain = self._chain()
         if chain is None:
             return
-        times = [t_s for _, t_s, _, _ in chain if t_s is not None]
-        t_s = min(times, default=0.0)
-        if not times or t_s <= self._last_s:
+        times = [t_ns for _, t_ns, _, _ in chain if t_ns is not None]
+        oldest_ns = min(times, default=0)
+        if not times or oldest_ns <= self._last_ns:
             return
-        if max(times) - t_s > _SPREAD_S:
-            if self._last_s:
+        if max(times) - oldest_ns > _SPREAD_NS:
+            if self._last_ns:
+                apart_s = 1e-9 * (max(times) - oldest_ns)
                 raise ProtocolError(
-                    f"the transforms between {self._base} and {self._flange} are {max(times) - t_s:.2f} s apart",
+                    f"the transforms between {self._base} and {self._flange} are {apart_s:.2f} s apart",
                     "check that one driver publishes all of them, with one clock",
                 )
             return
-        self._last_s = t_s
+        self._last_ns = oldest_ns
         R, p = np.eye(3), np.zeros(3)
         for _, _, R_part, p_part in chain:
             p = p + R @ p_part
             R = R @ R_part
-        yield StampedPose(t_s, R, p)
+        yield StampedPose(oldest_ns, R, p)
 
-    def _chain(self) -> list[tuple[str, float | None, Array, Array]] | None:
+    def _chain(self) -> list[tuple[str, int | None, Array, Array]] | None:
         """Return the parts from base to flange; None while one is missing."""
-        chain: list[tuple[str, float | None, Array, Array]] = []
+        chain: list[tuple[str, int | None, Array, Array]] = []
         frame = self._flange
         while frame != self._base:
             if frame not in self._parts or len(chain) > len(self._parts):

@@ -16,7 +16,7 @@ from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError, ProtocolError
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Diagnosis, Fact, FtSamples
 from ftdrivers.ros2.middleware import Node
-from ftdrivers.ros2.subscription import Received, clock_diagnosis, stamp_s, subscribe
+from ftdrivers.ros2.subscription import Received, clock_diagnosis, stamp_ns, subscribe
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class Ros2Sensor(StreamingSensor):
                 [getattr(part, axis) for part in (one.wrench.force, one.wrench.torque) for axis in "xyz"]
                 for one in messages
             ],
-            t_device_s=[stamp_s(message.header, self._topic) for message in messages],
+            t_device_s=[1e-9 * stamp_ns(message.header, self._topic) for message in messages],
         )
 
     def _check_frame(self, frames: set[str]) -> None:

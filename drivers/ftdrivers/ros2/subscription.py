@@ -128,15 +128,15 @@ def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool
     return names[0]
 
 
-def stamp_s(header: Any, topic: str) -> float:
-    """Return the time of a header in seconds. Raises `ProtocolError` for one that was not set."""
-    seconds = header.stamp.sec + 1e-9 * header.stamp.nanosec
-    if seconds <= 0:
+def stamp_ns(header: Any, topic: str) -> int:
+    """Return the time of a header in nanoseconds. Raises `ProtocolError` for one that was not set."""
+    t_ns = int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+    if t_ns <= 0:
         raise ProtocolError(
-            f"the messages of {topic} have the stamp {seconds:g}, so they cannot be paired",
+            f"the messages of {topic} have the stamp {t_ns * 1e-9:g}, so they cannot be paired",
             "set header.stamp to the time of measurement in its driver",
         )
-    return float(seconds)
+    return t_ns
 
 
 def is_finite(*values: float) -> bool:

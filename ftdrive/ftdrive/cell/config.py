@@ -36,7 +36,11 @@ USUAL_KG = 1.0
 class RobotConfig:
     """The arm."""
 
-    host: str = entry("name or IPv4 address of the controller", option="--robot", reject=rules.reject_host)
+    host: str = entry(
+        "name or IPv4 address of the controller, or topics of ROS 2 such as ros2:/pose",
+        option="--robot",
+        reject=rules.reject_host,
+    )
     model: str | None = entry(
         'such as "ur5e"; compared with the controller where it reports one',
         None,

@@ -53,7 +53,7 @@ def CELL(command: F) -> F:
     """Add the options --config, --robot and --sensor, which `read_cell` takes."""
     sensor_help = "Address, such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0."
     command = click.option("--sensor", metavar="URL", help=sensor_help)(command)
-    return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller.")(command))
+    return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller, or ros2:/TOPIC.")(command))
 
 
 EDITED = "that was edited by hand; every output then says so"
@@ -75,6 +75,13 @@ def CALIBRATION_OR_TOOL(command: F) -> F:
         "--force", is_flag=True, help=f"Apply a calibration of another arm, sensor or mount, or one {EDITED}."
     )
     return CALIBRATION(tool(force(command)))
+
+
+def BAG_TOPICS(command: F) -> F:
+    """Add the options --wrench-topic and --pose-topic, which `recording.bag.as_csv_pair` takes."""
+    poses = "Of a bag of ROS 2: topic of PoseStamped, tf?base=B&flange=F, or /joint_states?urdf=FILE&flange=F."
+    command = click.option("--pose-topic", metavar="TOPIC", help=poses)(command)
+    return click.option("--wrench-topic", metavar="TOPIC", help="Of a bag of ROS 2: topic of WrenchStamped.")(command)
 
 
 class Number(click.FloatRange):

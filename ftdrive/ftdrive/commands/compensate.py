@@ -1,12 +1,13 @@
 """`ftdrive compensate`: a recording compensated at once, without a device."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import FILE, FORCE, FRAME, JSON, NewFile, numbers, read_frame, write_json
+from ftdrive.commands.common import BAG_TOPICS, FILE, FORCE, FRAME, JSON, NewFile, numbers, read_frame, write_json
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ BIAS = click.option(
 @CALIBRATION
 @click.option("--wrench", metavar="FILE", type=FILE, help="Instead of RECORDING: CSV with t,fx,fy,fz,tx,ty,tz.")
 @click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: CSV with t and the orientation.")
+@BAG_TOPICS
 @click.option("--delay", metavar="S|auto", help="With --wrench: delay of the wrench, s.  [default: auto]")
 @FORCE
 @BIAS
@@ -43,6 +45,8 @@ def compensate(
     calibration: Path | None,
     wrench: Path | None,
     orientation_file: Path | None,
+    wrench_topic: str | None,
+    pose_topic: str | None,
     delay: str | None,
     force: bool,
     bias: str,
@@ -55,8 +59,10 @@ def compensate(
 
     RECORDING is a file of `ftdrive record`; without --calibration its own is used. Recordings of other programs come as
     two CSV files on one clock, each at its own rate: the wrench in N and N·m, and the orientation of the flange in base
-    as r11..r33, qx,qy,qz,qw or rx,ry,rz in rad.
+    as r11..r33, qx,qy,qz,qw or rx,ry,rz in rad; or as a rosbag2 folder or an MCAP file of ROS 2.
     """
+    from ftdrive.errors import ConfigError
+    from ftdrive.recording.bag import as_csv_pair, is_bag, read_bag
     from ftdrive.recording.compensation import compensated
     from ftdrive.recording.files import format_of
     from ftdrive.runs.source import read_calibration
@@ -66,7 +72,13 @@ def compensate(
         format_of(output)
     frame = read_frame(axes, about)
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
-    with working("Reading") as show:
+    with working("Reading") as show, ExitStack() as stack:
+        if path is not None and is_bag(path):
+            bag = read_bag(path, wrench_topic, pose_topic)
+            wrench, orientation_file = stack.enter_context(as_csv_pair(bag, path.name))
+            path = None
+        elif wrench_topic or pose_topic:
+            raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS 2: leave them out")
         source, found = _open(path, calibration, loaded, wrench, orientation_file, delay, everything=output is not None)
         numbers, failure = compensated(source, frame, output, estimate_bias=bias == "estimate", show=show)
     result = {**numbers, "delay_s": found or numbers["delay_s"], "file": None if output is None else str(output)}

@@ -20,6 +20,7 @@ from ftcalib.model import UP_IN_BASE
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord, drift_check
 from ftdrive.commands.common import (
+    BAG_TOPICS,
     EMULATED_SENSOR,
     FILE,
     JSON,
@@ -34,6 +35,7 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
+from ftdrive.recording.bag import bag_means, is_bag, read_bag
 from ftdrive.recording.in_motion import is_recording, solve_recording
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.outcome import solve_in_motion
@@ -87,6 +89,7 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
 @click.option(
     "--orientation-file", metavar="FILE", type=FILE, help="With --wrench: CSV with t, the orientation and x,y,z in m."
 )
+@BAG_TOPICS
 @click.option("--point-mass", is_flag=True, help="In motion: the load is known to have no inertia of its own.")
 @click.option("--output", "-o", type=NewFile(), help="Save the calibration as a new file.")
 @click.option("--force", is_flag=True, help="Save a rejected result too; it stays marked as rejected.")
@@ -104,6 +107,8 @@ def solve(
     up: str | None,
     wrench: Path | None,
     orientation_file: Path | None,
+    wrench_topic: str | None,
+    pose_topic: str | None,
     point_mass: bool,
     output: Path | None,
     force: bool,
@@ -117,7 +122,8 @@ def solve(
     t in seconds and sigma_fx..sigma_tz, the standard error of each pose's mean. With --json, one object a line.
 
     A DATASET may also be a recording of `ftdrive record`: the load is then estimated from its motion, with inertia and
-    delay. Recordings of other programs come as --wrench and --orientation-file on one clock, each at its own rate.
+    delay. Recordings of other programs come as --wrench and --orientation-file on one clock, each at its own rate, or
+    as a rosbag2 folder or an MCAP file of ROS 2.
     """
     check_simulate(simulate, real={"DATASET": sources, "--wrench": wrench}, emulated={"--sensor": sensor})
     if (wrench is None) != (orientation_file is None) or (wrench is not None and sources):
@@ -133,7 +139,7 @@ def solve(
         "known": known_values(mass_kg, level_deg, mounting_deg),
         "up_in_base": upward(up),
     }
-    motion = {"pair": pair, "point_mass": point_mass}
+    motion = {"pair": pair, "point_mass": point_mass, "topics": (wrench_topic, pose_topic)}
     with rehearsed_run(sensor) if simulate else nullcontext() as run:
         _solve_each(sources if run is None else [run], method, drift, read, motion, output, force, as_json)
     if output is not None and sources and sources[0].is_dir():
@@ -154,7 +160,8 @@ def _solve_each(
     for source in sources:
         try:
             with unpacked(source) as place:
-                if method == "all" and motion["pair"] is None and not (is_recording(place) or in_motion(place)):
+                is_motion = is_recording(place) or is_bag(place) or in_motion(place)
+                if method == "all" and motion["pair"] is None and not is_motion:
                     data = read_source(place, **read)
                     _show_all(source, data.dataset, {"drift": drift, **data.circumstances}, as_json)
                     continue
@@ -184,14 +191,20 @@ def _result_of(
     place: Path, method: str, drift: Drift, read: dict[str, Any], motion: dict[str, Any]
 ) -> tuple[CalibrationResult, Sequence[PoseRecord]]:
     """Solve a recording in motion, or poses; also return the records of a run."""
-    if motion["pair"] is not None or is_recording(place) or in_motion(place):
+    topics = motion["topics"]
+    from_bag = motion["pair"] is None and is_bag(place)
+    if any(topics) and not from_bag:
+        raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS 2: leave them out")
+    if motion["pair"] is not None or from_bag or is_recording(place) or in_motion(place):
         if method != "ml":
             raise ConfigError(f"--method {method} is for poses at rest: leave it out for a recording")
         if in_motion(place):
             with working("Solving"):
                 return solve_in_motion(Run(place), read["known"], point_mass=motion["point_mass"]), ()
+        options = {"point_mass": motion["point_mass"], "known": read["known"], "up_in_base": read["up_in_base"]}
         with working("Solving"):
-            return solve_recording(place, **motion, known=read["known"], up_in_base=read["up_in_base"]), ()
+            means = bag_means(read_bag(place, *topics)) if from_bag else None
+            return solve_recording(place, motion["pair"], means, **options), ()
     data = read_source(place, **read)
     options = {"drift": drift, **data.circumstances, "provenance": data.provenance}
     with working("Solving"):

@@ -38,6 +38,7 @@ def is_recording(path: Path) -> bool:
 def solve_recording(
     path: Path,
     pair: tuple[Path, Path] | None = None,
+    means: tuple[Means, Means] | None = None,
     *,
     known: Known | None,
     point_mass: bool,
@@ -51,6 +52,8 @@ def solve_recording(
         A recording of `ftdrive record`.
     pair : tuple of Path, optional
         Instead of it: CSV files of the wrench and of the poses, on one clock.
+    means : tuple of Means, optional
+        Instead of both: wrench and poses of a bag, whose name is that of `path`.
     known : Known, optional
         A known direction of gravity means a base that is level with respect to `up_in_base`.
     point_mass : bool
@@ -66,7 +69,10 @@ def solve_recording(
         The motion does not determine the parameters.
     """
     provenance, height_m, g_m_s2 = made_now(), None, STANDARD_GRAVITY_M_S2
-    if pair is None:
+    if means is not None:
+        wrench, poses = means
+        provenance |= {"recording": path.name}
+    elif pair is None:
         wrench, poses, header = read_in_motion(path)
         devices = {"arm": asdict(header.info.arm), "sensor": asdict(header.info.sensor)}
         provenance |= {"recording": path.name, "devices": devices}
