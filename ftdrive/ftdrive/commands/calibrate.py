@@ -37,6 +37,7 @@ _EXCLUDE_ONE_ANOTHER = (
     ("--step", "--manual", "--listen", "--sweep", "--passive"),
     ("--quick", "--minimal", "--plan", "--resume", "--sweep", "--passive"),
     ("--fast", "--sweep", "--passive"),
+    ("--from", "--resume", "--sweep", "--passive"),
     *((hand, option) for hand in ("--manual", "--listen", "--passive") for option in _OF_A_PLAN),
     *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
 )
@@ -54,6 +55,13 @@ _EXCLUDE_ONE_ANOTHER = (
 @simulate()
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
+@click.option(
+    "--from",
+    "earlier",
+    metavar="RESULT",
+    type=click.Path(exists=True, path_type=Path),
+    help="A new tool: take mounting, base and gain from this result of the same sensor; 6 poses unless --quick.",
+)
 @click.option("--sweep", is_flag=True, help="Calibrate in one smooth motion of the wrist, with inertia and delay.")
 @click.option(
     "--passive", is_flag=True, help="No motion commands: read beside any program or freedrive until it is good."
@@ -92,6 +100,7 @@ def calibrate(
     simulate: bool,
     quick: bool,
     minimal: bool,
+    earlier: Path | None,
     sweep: bool,
     passive: bool,
     seconds: float | None,
@@ -111,7 +120,6 @@ def calibrate(
     """
     from ftdrive.cell.emulated import REAL_PACE, Station
     from ftdrive.commands.emulated_run import start_mover
-    from ftdrive.errors import ConfigError
     from ftdrive.runs.run import Run
     from ftdrive.session.options import SessionOptions
     from ftdrive.session.rehearsal import described
@@ -121,8 +129,6 @@ def calibrate(
     from ftdrive.terminal.screen import open_operator
 
     _refuse_contradictions(click.get_current_context())
-    if seconds is not None and (seconds > _LONGEST_SWEEP_S if sweep else not passive):
-        raise ConfigError(f"--seconds {seconds:g} goes with --passive, or up to {_LONGEST_SWEEP_S} with --sweep")
     require_viz(as_session["png"], view=as_session["view"])
     chosen: dict[Mode, bool] = {"sweep": sweep, "passive": passive, "step": step, "manual": manual, "listen": listen}
     mode: Mode = next((name for name, given in chosen.items() if given), "auto")
@@ -139,7 +145,11 @@ def calibrate(
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool, control)
             description = {"said": asdict(said)}
             cell = said.cell() if resume is None else _cell_to_resume(resume, said)
-        poses = 6 if minimal else 12 if quick else 24
+        if earlier is not None:
+            from ftdrive.runs.source import read_calibration
+
+            description["earlier"] = read_calibration(earlier).to_dict()
+        poses = 12 if quick else 6 if minimal or earlier is not None else 24
         options = SessionOptions(
             runs,
             poses=poses,
@@ -173,11 +183,15 @@ def calibrate(
 def _refuse_contradictions(context: click.Context) -> None:
     from ftdrive.errors import ConfigError
 
-    given = [f"--{name.replace('_', '-')}" for name, value in context.params.items() if value]
+    params = {"from" if name == "earlier" else name: value for name, value in context.params.items()}
+    given = [f"--{name.replace('_', '-')}" for name, value in params.items() if value]
     for group in _EXCLUDE_ONE_ANOTHER:
         both = [option for option in group if option in given]
         if len(both) > 1:
             raise ConfigError(f"{both[0]} and {both[1]} exclude one another: leave one of them out")
+    seconds, sweep, passive = (context.params[name] for name in ("seconds", "sweep", "passive"))
+    if seconds is not None and (seconds > _LONGEST_SWEEP_S if sweep else not passive):
+        raise ConfigError(f"--seconds {seconds:g} goes with --passive, or up to {_LONGEST_SWEEP_S} with --sweep")
 
 
 @dataclass(frozen=True, slots=True)
