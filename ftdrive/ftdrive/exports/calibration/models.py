@@ -2,11 +2,15 @@
 
 import xml.etree.ElementTree as ET
 
+import numpy as np
+
 from ftcalib import CalibrationResult
 from ftdrive.exports.calibration.settings import Settings
 from ftdrive.exports.calibration.shared import (
     R_frame_sensor,
     gravity_in_frame_m_s2,
+    inertia_kg_m2,
+    inertia_note,
     quaternion_xyzw,
     rpy_rad,
     world_note,
@@ -30,8 +34,12 @@ def urdf(calibration: CalibrationResult, settings: Settings) -> Exported:
     inertial = ET.SubElement(ET.SubElement(robot, "link", name=settings.tool_frame), "inertial")
     ET.SubElement(inertial, "origin", xyz=_words(calibration.p_sensor_com_m.tolist()), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=repr(calibration.mass_kg))
-    inertial.append(ET.Comment(" not identified: zeros stand for a point mass; put values of the CAD model here "))
-    ET.SubElement(inertial, "inertia", {f"i{axes}": "0.0" for axes in ("xx", "xy", "xz", "yy", "yz", "zz")})
+    J = inertia_kg_m2(calibration)
+    if J is None:
+        inertial.append(ET.Comment(" not identified: zeros stand for a point mass; put values of the CAD model here "))
+    moments = np.zeros((3, 3)) if J is None else J
+    elements = {f"i{'xyz'[i]}{'xyz'[j]}": repr(float(moments[i, j])) for i in range(3) for j in range(i, 3)}
+    ET.SubElement(inertial, "inertia", elements)
     _fix(
         robot,
         settings.flange_frame,
@@ -42,7 +50,7 @@ def urdf(calibration: CalibrationResult, settings: Settings) -> Exported:
     _fix(robot, settings.sensor_frame, settings.tool_frame, [0.0] * 3, [0.0] * 3)
     ET.indent(robot)
     notes = (
-        "The inertia was not identified: zeros stand for a point mass. Simulators may need the values of a CAD model.",
+        inertia_note(calibration),
         f"Leave out the link {settings.flange_frame} if your robot has it.",
         "The mass of the sensor itself is not in it, nor its bias.",
         world_note(settings),
@@ -78,8 +86,14 @@ def mujoco(calibration: CalibrationResult, settings: Settings) -> Exported:
     )
     body = ET.SubElement(ET.SubElement(root, "worldbody"), "body", name=settings.tool_frame)
     body.attrib |= {"pos": _words(settings.p_frame_sensor_m("mujoco").tolist()), "quat": _words([w, x, y, z])}
-    body.append(ET.Comment(" inertia not identified: zeros stand for a point mass; put values of the CAD model here "))
-    ET.SubElement(body, "inertial", pos=_words(com_m), mass=repr(calibration.mass_kg), diaginertia="0 0 0")
+    J = inertia_kg_m2(calibration)
+    inertial = ET.SubElement(body, "inertial", pos=_words(com_m), mass=repr(calibration.mass_kg))
+    if J is None:
+        note = " inertia not identified: zeros stand for a point mass; put values of the CAD model here "
+        body.insert(0, ET.Comment(note))
+        inertial.set("diaginertia", "0 0 0")
+    else:
+        inertial.set("fullinertia", _words(J[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].tolist()))
     ET.SubElement(body, "site", name=settings.sensor_frame)
     sensors = ET.SubElement(root, "sensor")
     for kind in ("force", "torque"):
@@ -89,7 +103,7 @@ def mujoco(calibration: CalibrationResult, settings: Settings) -> Exported:
         f"Attach the body {settings.tool_frame} to {settings.flange_frame}. A simulated sensor has no bias.",
         "Plain MuJoCo sensors have the opposite sign: negate sensordata, as the hardware interface of "
         "mujoco_ros2_control does, to get the wrench on the sensor.",
-        "The inertia was not identified: zeros stand for a point mass. The mass of the sensor itself is not in it.",
+        f"{inertia_note(calibration)} The mass of the sensor itself is not in it.",
         "The plugin FtsGravCompPlugin needs a mujoco_ros2_control newer than 0.1.2 (pull request 308, September 2026).",
         world_note(settings),
     )

@@ -4,7 +4,13 @@ import numpy as np
 
 from ftcalib import CalibrationResult
 from ftdrive.exports.calibration.settings import Settings
-from ftdrive.exports.calibration.shared import R_frame_sensor, gravity_m_s2, rpy_rad
+from ftdrive.exports.calibration.shared import (
+    R_frame_sensor,
+    gravity_m_s2,
+    inertia_note,
+    payload_inertia_kg_m2,
+    rpy_rad,
+)
 from ftdrive.exports.calibration.text import Exported, numbers, yaml_text
 
 MC_RTC_G_M_S2 = 9.80665
@@ -103,11 +109,13 @@ def ur_payload(calibration: CalibrationResult, settings: Settings) -> Exported:
     """
     mass_kg, com_m = settings.payload("ur-payload", calibration)
     cog = ", ".join(_fixed(x) for x in com_m)
-    text = f"set_target_payload({_fixed(mass_kg)}, [{cog}], [0, 0, 0, 0, 0, 0])\n"
+    J = payload_inertia_kg_m2(calibration, mass_kg, np.asarray(com_m), settings.p_flange_sensor_m("ur-payload"))
+    inertia = "0, 0, 0, 0, 0, 0" if J is None else ", ".join(map(_fixed, J[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]))
+    text = f"set_target_payload({_fixed(mass_kg)}, [{cog}], [{inertia}])\n"
     notes = (
         *settings.assumed,
         "The controller zeroes its own force sensor when this runs: keep the tool free and the arm still.",
-        "The inertia was not identified: zeros stand for a point mass. Needs PolyScope 5.10; set_payload before that.",
+        f"{inertia_note(calibration)} Needs PolyScope 5.10; set_payload before that.",
         "The payload has no bias. How the controller uses it is not public: compare get_tcp_force() without contact in "
         "two poses.",
         "set_gravity takes the acceleration away from the earth, in base axes. The mounting in PolyScope sets it too.",

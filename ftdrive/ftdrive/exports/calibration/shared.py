@@ -53,3 +53,48 @@ def frame_note(calibration: CalibrationResult, settings: Settings) -> str:
         f"({rpy}) rad: the formats urdf and static-transform write it. {settings.base_frame} must have the axes of "
         f"{settings.base_axes}."
     )
+
+
+def inertia_kg_m2(calibration: CalibrationResult) -> Array | None:
+    """Return the inertia (3, 3) about the centre of mass, sensor axes; None if motion did not identify one of a body.
+
+    A body has positive moments, none larger than the sum of the others.
+    """
+    if calibration.motion is None:
+        return None
+    J = calibration.motion.inertia_kg_m2
+    low, middle, high = np.linalg.eigvalsh(J)
+    return J if low > 0 and high <= low + middle else None
+
+
+def payload_inertia_kg_m2(
+    calibration: CalibrationResult, mass_kg: float, p_flange_com_m: Array, p_flange_sensor_m: Array
+) -> Array | None:
+    """Return the inertia (3, 3) of all that the flange carries, about its centre of mass, flange axes; None as above.
+
+    The sensor itself counts as a point at its centre of mass.
+    """
+    J = inertia_kg_m2(calibration)
+    if J is None:
+        return None
+    Q, tool_kg = calibration.R_flange_sensor, calibration.mass_kg
+    tool_m = p_flange_sensor_m + Q @ calibration.p_sensor_com_m - p_flange_com_m
+    total, sensor_kg = Q @ J @ Q.T + tool_kg * _steiner(tool_m), mass_kg - tool_kg
+    if sensor_kg > 0:
+        total += sensor_kg * _steiner(-tool_kg / sensor_kg * tool_m)
+    return np.asarray(total)
+
+
+def _steiner(p_m: Array) -> Array:
+    """Inertia per mass (3, 3) of a point about the origin."""
+    return np.asarray(p_m @ p_m * np.eye(3) - np.outer(p_m, p_m))
+
+
+def inertia_note(calibration: CalibrationResult) -> str:
+    """Say whether the inertia was identified."""
+    motion = calibration.motion
+    if motion is None or inertia_kg_m2(calibration) is None:
+        why = "" if motion is None else " well enough"
+        return f"The inertia was not identified{why}: zeros stand for a point mass. Take the values of a CAD model."
+    sigma = 1e3 * float(np.sqrt(np.diag(motion.covariance)[15:21].max()))
+    return f"The inertia was identified from motion, with a sigma of {sigma:.2g} g·m2 at most."

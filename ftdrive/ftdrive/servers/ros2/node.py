@@ -32,7 +32,7 @@ _DISCOVERY_S: Final = 1.0
 _RETRY_S: Final = 2.0
 """After a device did not open."""
 _RETRY_CONFIG_S: Final = 10.0
-"""After the calibration did not fit: somebody has to calibrate, or to choose another tool."""
+"""After the calibration did not fit: a person has to calibrate, or to choose another tool."""
 _HISTORY_S: Final = 10.0
 """Of a reliable topic: Fast DDS asks for what was lost every 3 s."""
 _TOOL_S: Final = 5.0

@@ -47,7 +47,7 @@ def test_it_is_found_and_the_sigmas_hold(seeds: int) -> None:
     z, shares = [], []
     for seed in range(seeds):
         result = solved(seed, 0.002)
-        shares.append(result.components["hysteresis"])  # of six axes, so one session tells it to about 40 %
+        shares.append(result.components["hysteresis"])  # of six axes, so one session gives it to about 40 %
         error = result.parameters.difference(TRUTH)
         z.append(error / np.sqrt(np.diag(result.covariance)))
     ratio = np.sqrt([np.mean(part**2) for part in np.split(np.array(z), 5, axis=1)])

@@ -11,6 +11,8 @@ import yaml
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
+from ftcalib import CalibrationResult
+from ftcalib.result import MotionResult
 from ftdrive import __version__
 from ftdrive.exports.calibration.formats import FORMATS
 from ftdrive.exports.calibration.registry import TARGETS, Export, export
@@ -128,3 +130,42 @@ def test_notes_have_all_digits() -> None:
     raised = replace(MEASURED, height_mm=100 / 3)
     notes = export(odd, "mc-rtc", raised, max_force_error_N=1e3).notes
     assert numbers_after("with the sensor at ", notes)[2] == raised.p_frame_sensor_m("mc-rtc")[2]
+
+
+def in_motion() -> CalibrationResult:
+    moments = np.diag([2.0, 2.4, 1.4]) * 1e-3
+    moments[0, 1] = moments[1, 0] = 1e-4
+    return replace(calibration(), motion=MotionResult(moments, 0.003, 0.02, np.eye(23) * 1e-8, 1.0))
+
+
+def test_an_inertia_from_motion_is_written() -> None:
+    found = {name: export(in_motion(), name, MEASURED, max_force_error_N=1e3) for name in ("urdf", "mujoco")}
+    assert 'ixx="0.002"' in found["urdf"].text
+    assert 'ixy="0.0001"' in found["urdf"].text
+    assert 'fullinertia="0.002 0.0024 0.0014 0.0001 0.0 0.0"' in found["mujoco"].text
+    assert all("identified from motion" in "".join(one.notes) for one in found.values())
+
+
+def test_the_payload_has_the_inertia_of_tool_and_sensor_about_their_centre() -> None:
+    statement = export(in_motion(), "ur-payload", MEASURED, max_force_error_N=1e3).text.rsplit("\n", 2)[1]
+    xx, yy, zz, xy, xz, yz = map(float, statement.split("[")[2].split("]")[0].split(", "))
+    found = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    calibrated = in_motion()
+    assert calibrated.motion is not None
+    Q = calibrated.R_flange_sensor
+    tool_kg, com = calibrated.mass_kg, np.array(PAYLOAD_COM)
+    points = [(tool_kg, np.array([0.02, 0.01, 0.083])), (0.5, np.array([0.0, 0.0, 0.015]))]
+    expected = Q @ calibrated.motion.inertia_kg_m2 @ Q.T
+    for mass_kg, at_m in points:
+        off = at_m - com
+        expected += mass_kg * (off @ off * np.eye(3) - np.outer(off, off))
+    assert np.allclose(found, expected, atol=1e-9)
+
+
+def test_an_inertia_that_no_body_has_is_not_written() -> None:
+    result = in_motion()
+    assert result.motion is not None
+    wrong = replace(result, motion=replace(result.motion, inertia_kg_m2=np.diag([5.0, 1.0, 1.0]) * 1e-3))
+    written = export(wrong, "urdf", MEASURED, max_force_error_N=1e3)
+    assert 'ixx="0.0"' in written.text
+    assert "not identified well enough" in "".join(written.notes)

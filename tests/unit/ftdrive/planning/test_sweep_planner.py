@@ -1,0 +1,106 @@
+"""A sweep: its limits, its proof beside brute force, its file."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.planning import sweep_planner
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Scene
+from ftdrive.planning.motion import Speeds, tips
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of
+from ftdrive.planning.show.words import plan_in_words
+from ftdrive.planning.sweep_planner import at_speed, plan_sweep
+
+SPEEDS = Speeds()
+STOP_RAD_S2 = float(np.radians(300))
+
+
+def certifier_of(*boxes: Box, tool_m: float = 0.2) -> Certifier:
+    return Certifier(ArmModel("UR5e", [Cylinder(0.0, tool_m, 0.1)]), Scene((BASE_PLANE,), boxes))
+
+
+def planned(certifier: Certifier, seconds: float = 10.0) -> Plan:
+    guess = guess_of(certifier, 1.2)
+    return plan_sweep(certifier, USUAL_POSTURE_RAD, seconds, speeds=SPEEDS, stop_rad_s2=STOP_RAD_S2, guess=guess)
+
+
+@pytest.fixture(autouse=True)
+def _short_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweep_planner, "RANDOM", 3)
+    monkeypatch.setattr(sweep_planner, "CHANGED", 2)
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep_planner, "RANDOM", 3)
+        patch.setattr(sweep_planner, "CHANGED", 2)
+        return planned(certifier_of())
+
+
+def test_every_limit_is_kept(plan: Plan) -> None:
+    assert plan.sweep is not None
+    t = np.arange(0.0, plan.sweep.duration_s, 0.002)
+    assert np.abs(plan.sweep.at(t, 1)).max() <= SPEEDS.joint_rad_s
+    assert np.abs(plan.sweep.at(t, 2)).max() <= SPEEDS.joint_rad_s2
+    path_m = tips(certifier_of().arm, plan.sweep.at(t))
+    assert SPEEDS.tip_m_s is not None
+    assert np.linalg.norm(np.diff(path_m, axis=0), axis=2).max() / 0.002 <= 1.01 * SPEEDS.tip_m_s
+    assert np.abs(plan.sweep.at(t) - plan.sweep.centre_rad).max() <= 1.02 * sweep_planner.MOST_RAD
+    assert plan.arm_rests
+    assert np.allclose(plan.nodes_rad, [USUAL_POSTURE_RAD])
+
+
+def test_the_margins_hold_on_the_curve_and_beside_it(plan: Plan) -> None:
+    assert plan.sweep is not None
+    rng, certifier = np.random.default_rng(0), certifier_of()
+    q = plan.sweep.at(np.arange(0.0, plan.sweep.duration_s, 0.05))
+    off = np.zeros_like(q)
+    off[:, 3:] = rng.uniform(-1, 1, (len(q), 3)) * plan.sweep.largest(2)[3:] * sweep_planner.SMOOTHED_S**2 / 2
+    assert certifier.free(q + off).all()
+    assert plan.certified
+    plan.require(certifier)
+
+
+def test_the_file_keeps_the_curve(plan: Plan, tmp_path: Path) -> None:
+    assert plan.sweep is not None
+    plan.save(tmp_path / "sweep.json")
+    again = Plan.load(tmp_path / "sweep.json")
+    assert again.sweep is not None
+    assert again.sha256 == plan.sha256
+    assert np.allclose(again.sweep.waves, plan.sweep.waves)
+    assert again.stops == range(1, 2)
+
+
+def test_half_the_speed_is_the_same_path(plan: Plan) -> None:
+    assert plan.sweep is not None
+    half = at_speed(plan, 0.5)
+    assert half.sweep is not None
+    assert half.sweep.duration_s == 2 * plan.sweep.duration_s
+    assert half.top_speed_rad_s == pytest.approx(plan.top_speed_rad_s / 2, rel=0.05)
+
+
+def test_a_plan_for_another_scene_is_refused(plan: Plan) -> None:
+    with pytest.raises(PlanRefused, match="scene"):
+        plan.require(certifier_of(Box((-0.2, -0.4, 0.9), (0.2, 0.0, 1.2))))
+
+
+def test_planning_is_deterministic(plan: Plan) -> None:
+    assert planned(certifier_of()).sha256 == plan.sha256
+
+
+def test_the_words_name_joints_and_proof(plan: Plan) -> None:
+    words = plan_in_words(plan)
+    assert "proven clear along its whole length" in words
+    assert "wrist 3" in words
+    assert max(len(line) for line in words.splitlines() if line.startswith("  ")) <= 72
+
+
+def test_impossible_durations_and_cells_are_refused() -> None:
+    with pytest.raises(ConfigError, match="10 to 120 s"):
+        planned(certifier_of(), seconds=5.0)
