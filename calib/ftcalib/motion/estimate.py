@@ -291,6 +291,7 @@ def fit(rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = Fa
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
         kept = _without_contact(distance)
         state = states(rows.speed_rad_s, kept)
+    state = np.minimum(state, len(noise.scale) - 1)  # the last contacts may have freed a faster class
     chi2, others = problem.sums(load, drift, noise, kept, state)[2], []
     for other, _ in roughs[1:]:
         if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
