@@ -63,16 +63,16 @@ def main() -> int:
             new_tool(earlier, poses(replace(OTHER, R_flange_sensor=turn @ TRUTH.R_flange_sensor), FOUR, seed))
         except NotObservable as error:
             named += "mounted otherwise" in str(error)
-    error = {name: float(np.sqrt(np.mean(values))) for name, values in rms.items()}
+    size = {name: float(np.sqrt(np.mean(values))) for name, values in rms.items()}
     click.echo(
         f"{options.runs} runs: mean squared error / variance {np.mean(z2):.2f}, worst component {worst:.1f} sigma, "
         f"refused {refused}; sensor turned by 1 degree: named {named}"
     )
     for name in ("four", "six"):
-        random, tour = error[name] / error["random"], error[name] / error["tour"]
+        random, tour = size[name] / size["random"], size[name] / size["tour"]
         click.echo(f"force error of {name} poses / 12 alone: {random:.2f} (random poses), {tour:.2f} (of the tour)")
     good = 0.8 <= np.mean(z2) <= 1.25 and named == options.runs and refused <= 1
-    good &= error["four"] <= 1.3 * error["random"]
+    good &= size["four"] <= 1.3 * size["random"]
     return 0 if good else 1
 
 
