@@ -274,10 +274,11 @@ def fit(rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = Fa
     problem = _Problem(rows, known, g_m_s2, point_mass=point_mass)
     roughs = sorted((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])
     load, _ = roughs[0]
-    kept, state = _first_kept(problem, load)
+    kept = _first_kept(problem, load)
     drift, sizes = np.zeros((len(problem.knots), 6)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
     solved = _Step.none()
     for stage in range(_STAGES):
+        state = states(rows.speed_rad_s, kept)
         r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
         absorbed = problem.absorbed(load, rows[kept], solved)
         noise = Noise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept]))
@@ -290,7 +291,6 @@ def fit(rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = Fa
         r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
         kept = _without_contact(distance)
-        state = states(rows.speed_rad_s, kept)
     chi2, others = problem.sums(load, drift, noise, kept, state)[2], []
     for other, _ in roughs[1:]:
         if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
@@ -324,7 +324,7 @@ def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
     return min((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])[0].delay_s
 
 
-def _first_kept(problem: _Problem, load: Load) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+def _first_kept(problem: _Problem, load: Load) -> NDArray[np.bool_]:
     """Rows without contact, by the quiet rows of each state; at rest there is no more noise than in motion."""
     rows = problem.rows
     r = rows.wrench - problem.predicted(load, rows)
@@ -333,8 +333,7 @@ def _first_kept(problem: _Problem, load: Load) -> tuple[NDArray[np.bool_], NDArr
     quiet = np.array([np.quantile(size[state == k], QUIET, axis=(0, 2)) for k in np.unique(state)])
     scale = np.minimum.accumulate(quiet[::-1], axis=0)[::-1] / ndtri((1 + QUIET) / 2) + 1e-12
     distance = np.sum((r / np.repeat(scale, 3, axis=1)[state]) ** 2, axis=1)
-    kept = _without_contact(distance / 2)
-    return kept, states(rows.speed_rad_s, kept)
+    return _without_contact(distance / 2)
 
 
 def _without_contact(distance: Array) -> NDArray[np.bool_]:
