@@ -320,7 +320,9 @@ def read_mcap(path: Path, columns: Collection[str]) -> Generator[Piece, None, st
                 content.close_chunk()
             yield content.piece(1.0)
         except (MemoryError, OverflowError, TypeError, ValueError, ZstdError, struct.error) as error:
-            raise BadRecording(f"a record cannot be read ({error or type(error).__name__}): the file is damaged") from error
+            raise BadRecording(
+                f"a record cannot be read ({error or type(error).__name__}): the file is damaged"
+            ) from error
     return "its last record is incomplete"
 
 
