@@ -324,13 +324,16 @@ class CalibrationResult:
     def sigma(self) -> Mapping[str, Array | float]:
         """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes.
 
-        They are those of `tool_covariance`. Weight and mass have at least 0.2 %, unless they were known.
+        They are those of `tool_covariance`. Weight, mass and the gravity force along the weight have at least 0.2 %,
+        unless they were known.
         """
         std = np.sqrt(np.maximum(np.diag(self.tool_covariance), 0.0))
         cov = self.covariance[3:6, 3:6]
         weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, cov)
         if weight > 1e-9 * self.weight_N:  # not exactly known
             weight = float(np.hypot(weight, self.scale_sigma * self.weight_N))
+            hidden = self.scale_sigma**2 - (COMMON_GAIN * self.gain_sigma) ** 2  # beyond `tool_covariance`
+            std[3:6] = np.sqrt(std[3:6] ** 2 + hidden * self.gravity_force_base_N**2)
         return {
             "R_flange_sensor": std[0:3],
             "gravity_force_base_N": std[3:6],

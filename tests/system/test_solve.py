@@ -125,3 +125,31 @@ def test_bad_csv_gets_one_clear_sentence(solve: Solve, case: str, tmp_path: Path
     assert outcome.stderr.count("\n") == 1
     assert word in outcome.stderr
     assert [item.name for item in tmp_path.iterdir()] == ["poses.csv"]
+
+
+def noisy(lines: list[str]) -> list[str]:
+    """Add the standard errors that the rows have."""
+    return [f"{HEADER},{','.join(f'sigma_{c}' for c in ('fx', 'fy', 'fz', 'tx', 'ty', 'tz'))}"] + [
+        f"{line},{','.join(['0.001'] * 6)}" for line in lines
+    ]
+
+
+def test_a_new_tool_takes_four_poses_and_two_runs_are_one(solve: Solve, tmp_path: Path) -> None:
+    every = rows(24)
+    for name, some in (("all", every[:16]), ("four", every[16:20]), ("more", every[16:])):
+        (tmp_path / f"{name}.csv").write_text("\n".join(noisy(some)))
+    assert solve("all.csv", "-o", "all.json").returncode == 0
+    outcome = solve("four.csv", "--from", "all.json", "--json")
+    assert outcome.returncode == 0, outcome.stderr
+    result = json.loads(outcome.stdout)
+    assert result["mass_kg"] == pytest.approx(1.2, abs=4 * result["sigma"]["mass_kg"])
+    assert result["provenance"]["parent"]["id"] == json.loads((tmp_path / "all.json").read_text())["id"]
+    both = json.loads(solve("all.csv", "more.csv", "--together", "--json").stdout)
+    assert "together" in [one["code"] for one in both["findings"]]
+    for arguments, words in (
+        (("all.csv", "--together"), "two runs or more"),
+        (("four.csv", "--from", "all.json", "--method", "srom"), "--method ml"),
+    ):
+        refused = solve(*arguments)
+        assert refused.returncode == 2
+        assert words in refused.stderr

@@ -86,8 +86,17 @@ def standardized(residuals: Array, covariance: Array) -> Array:
     unit = np.empty_like(residuals)
     for first in range(0, len(residuals), CHUNK):
         part = slice(first, first + CHUNK)
-        unit[part] = np.linalg.solve(np.linalg.cholesky(covariance[part]), residuals[part, :, None])[..., 0]
+        unit[part] = np.linalg.solve(_root(covariance[part]), residuals[part, :, None])[..., 0]
     return unit
+
+
+def _root(covariance: Array) -> Array:
+    """Give roots A with A A' = covariance (n, 6, 6), which rounding may have made indefinite."""
+    try:
+        return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        value, vector = np.linalg.eigh(covariance)
+        return np.asarray(vector * np.sqrt(np.maximum(value, 1e-12 * value[:, -1:]))[:, None])
 
 
 USUAL_INTERVAL_S = 10.0

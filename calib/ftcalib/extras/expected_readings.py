@@ -1,18 +1,21 @@
 """How far readings of an unchanged cell may be from their prediction, under each explanation of the fit's residuals.
 
-What is estimated by a fit of few poses is uncertain, and so is what acts on its readings. Two explanations are kept:
+What is estimated by a fit of few poses is uncertain, and so is what acts on its readings. Three explanations are kept:
 
 * The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
 * The measured noise, by a factor that only the residuals of the fit show, and inexact orientations, which a fit of few
   poses does not separate from other noise, or not from none. Known is only the usual accuracy of arms.
+* The measured noise, by such a factor, and hysteresis: each channel is off by a share of the last change of its load.
+  A fit without it takes a part of it for weight, because the load changes most towards the poses that load a channel
+  most.
 
-Under the second, with the ratio of both variances given, the squared distance of new readings from their prediction
+Under the last two, with the ratio of both variances given, the squared distance of new readings from their prediction
 over the mean square of the fit's residuals has exactly an F distribution (predictive test of Chow, Econometrica 28,
 1960). Its probability is averaged over the ratios, each weighted by its restricted likelihood in the fit (posterior
 predictive probability), so an error that the fit cannot find widens the limit as much as the data allow.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,11 +30,14 @@ from ftcalib.extras.update import Update
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.gain_and_cross_talk import Response, response_columns
 from ftcalib.likelihood.hysteresis import hysteresis_columns
+from ftcalib.likelihood.session_noise import pose_times, summed_products
 from ftcalib.model import BIASES, Array, Parameters, jacobian
 from ftcalib.result import CalibrationResult
 
 USUAL_ERRORS_RAD = np.deg2rad(np.geomspace(0.005, 0.5, 20))
 """Errors of an arm's orientations over which the average is taken. Before the fit, each is as likely as any other."""
+USUAL_SHARES = np.geomspace(1e-4, 5e-3, 9)
+"""Of the last change of load, over which the average is taken. Before the fit, each is as likely as any other."""
 MANY_POSES = 1000
 LEAST_FACTOR = 0.1
 """Of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck."""
@@ -145,55 +151,89 @@ def expected_with_inexact_orientations(
     fitted : CalibrationDataset
         Poses of the fit, with measured noise.
     R_base_flange : array, shape (n, 3, 3)
-        New poses.
+        New poses, in the order of measuring.
     wrench_cov : array, shape (n, 6, 6)
         Of the new readings.
     """
+    share = calibration.components.get("hysteresis", 0.0)
+    usual = [(error_rad, share) for error_rad in USUAL_ERRORS_RAD]
+    return _expected(calibration, fitted, R_base_flange, wrench_cov, usual)
+
+
+def expected_with_hysteresis(
+    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
+) -> list[Expected]:
+    """Explain the fit by scaled measured noise and hysteresis; all else as `expected_with_inexact_orientations`."""
+    return _expected(calibration, fitted, R_base_flange, wrench_cov, [(0.0, share) for share in USUAL_SHARES])
+
+
+def _expected(
+    calibration: CalibrationResult,
+    fitted: CalibrationDataset,
+    R_base_flange: Array,
+    wrench_cov: Array,
+    usual: Sequence[tuple[float, float]],
+) -> list[Expected]:
+    """Explain the fit with each error of the orientations (rad) and share of the last change of load."""
     p, response = calibration.parameters, calibration.response
     kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
     dof = 6 * int(kept.sum()) - 15
     if fitted.wrench_cov is None or calibration.method != "ml" or calibration.dof != dof or len(kept) > MANY_POSES:
         return []
-    R, D = fitted.R_base_flange[kept], pooled_covariance(fitted.wrench_cov, fitted.n_samples)[kept]
-    e = np.asarray(Compensator(p, response=response).batch(fitted.wrench[kept], R), dtype=np.float64)
-    turn, turn_new = _turns(p, R), _turns(p, R_base_flange)
-    # Found coefficients of gain and cross-talk count as measured: zero, with the variance that the fit found.
-    size = np.full(15, np.inf)
+    order = np.argsort(pose_times(fitted.t_s), kind="stable")
+    lag, order = hysteresis_columns(p, fitted.R_base_flange[order])[kept[order]], order[kept[order]]
+    R, D = fitted.R_base_flange[order], pooled_covariance(fitted.wrench_cov, fitted.n_samples)[order]
+    e = np.asarray(Compensator(p, response=response).batch(fitted.wrench[order], R), dtype=np.float64)
+    J = np.concatenate([_columns(p, response, R), lag], axis=2)
+    known = J.shape[2] - lag.shape[2]  # parameters, and found coefficients: measured as zero, with the variance found
+    sizes, offset = np.full(15, np.inf), np.zeros(J.shape[2])
     if response is not None:
-        size = np.append(
-            size, np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
-        )
-    seen = np.flatnonzero(size)
-    J, before = _columns(p, response, R)[..., seen], size[seen] ** -2
-    offset = (np.zeros(15) if response is None else np.append(np.zeros(15), response.coefficients))[seen]
-    known_by = len(seen)
-    if share := calibration.components.get("hysteresis"):
-        lag = hysteresis_columns(p, fitted.R_base_flange)[kept]
-        J, before = np.concatenate([J, lag], axis=2), np.append(before, np.full(lag.shape[2], share**-2))
-        offset = np.append(offset, np.zeros(lag.shape[2]))
-        lag_new = hysteresis_columns(p, R_base_flange).reshape(6 * len(R_base_flange), -1)
-    found, likelihood = [], []
-    for variance in USUAL_ERRORS_RAD**2:
-        V = D + variance * turn
-        W = np.linalg.inv(V)
-        WJ = W @ J
-        H = np.einsum("nij,nik->jk", J, WJ) + np.diag(before)
-        g = np.einsum("nij,ni->j", WJ, e) - before * offset
-        scale = np.outer(column_scale(H), column_scale(H))
-        C = np.zeros((len(size), len(size)))
-        inverse = np.linalg.inv(H / scale) / scale
-        C[np.ix_(seen, seen)] = inverse[:known_by, :known_by]
-        rest = float(np.einsum("ni,nij,nj->", e, W, e) + before @ offset**2 - g @ inverse @ g)
-        logdet = float(np.linalg.slogdet(V)[1].sum() + np.linalg.slogdet(H)[1])
-        likelihood.append(-0.5 * (logdet + dof * np.log(rest)))
-        joint = None if response is None else replace(response, covariance=C)
-        noise = np.asarray(block_diag(*(wrench_cov + variance * turn_new)))
-        if share:
-            noise = noise + share**2 * lag_new @ lag_new.T
-        known = Update(p, C[:15, :15], 0.0, 0, response=joint)
-        found.append(Expected(known, noise, dof, max(rest / dof, LEAST_FACTOR)))
+        found = [calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")]
+        sizes, offset[15:known] = np.append(sizes, np.repeat(found, [5, 6])), response.coefficients
+    turn, turn_new = _turns(p, R), _turns(p, R_base_flange)
+    lag_new = hysteresis_columns(p, R_base_flange).reshape(6 * len(R_base_flange), -1)
+
+    explanations, likelihood = [], []
+    for error_rad, share in usual:
+        sigma = np.append(sizes, np.full(lag.shape[2], share))
+        x, C, chi2, logdet = _posterior(J, D + error_rad**2 * turn, sigma, e, offset)
+        likelihood.append(-0.5 * (logdet + dof * np.log(chi2)))
+        factor = max(chi2 / dof, LEAST_FACTOR)
+        C += np.outer(x, x) / factor  # the calibration as stored is off by what this explanation moves its estimates
+        joint = None if response is None else replace(response, covariance=C[:known, :known])
+        noise = np.asarray(block_diag(*(wrench_cov + error_rad**2 * turn_new)))
+        shares = C[known : known + 6, known : known + 6]  # the swing to the first new pose is unknown too
+        noise += lag_new @ block_diag(shares, np.diag(np.diag(shares))) @ lag_new.T
+        explanations.append(Expected(Update(p, C[:15, :15], 0.0, 0, response=joint), noise, dof, factor))
     weights = np.exp(np.array(likelihood) - max(likelihood))
-    return [replace(one, weight=weight) for one, weight in zip(found, weights / weights.sum(), strict=True)]
+    return [replace(one, weight=weight) for one, weight in zip(explanations, weights / weights.sum(), strict=True)]
+
+
+def _posterior(J: Array, V: Array, sigma: Array, e: Array, offset: Array) -> tuple[Array, Array, float, float]:
+    """Estimate what acts on residuals e (n, 6) through columns J (n, 6, k), under noise V (n, 6, 6).
+
+    Before, each has the mean `-offset` (k,) and the standard deviation `sigma` (k,): infinite if unknown, 0 if absent.
+
+    Returns
+    -------
+    x : array, shape (k,)
+    covariance : array, shape (k, k)
+    chi2 : float
+    logdet : float
+        Logarithm of the determinants that belong to the restricted likelihood.
+    """
+    seen = np.flatnonzero(sigma)
+    before, W = sigma[seen] ** -2, np.linalg.inv(V)
+    WJ = W @ J[..., seen]
+    H = summed_products(J[..., seen], WJ) + np.diag(before)
+    g = np.einsum("nij,ni->j", WJ, e) - before * offset[seen]
+    scale = np.outer(column_scale(H), column_scale(H))
+    x, C = np.zeros(len(sigma)), np.zeros((len(sigma), len(sigma)))
+    C[np.ix_(seen, seen)] = np.linalg.inv(H / scale) / scale
+    x[seen] = C[np.ix_(seen, seen)] @ g
+    chi2 = float(np.einsum("ni,nij,nj->", e, W, e) + before @ offset[seen] ** 2 - g @ x[seen])
+    logdet = np.linalg.slogdet(V)[1].sum() + np.linalg.slogdet(H)[1] - np.log(before[before > 0]).sum()
+    return x, C, chi2, float(logdet)
 
 
 def _columns(p: Parameters, response: Response | None, R_base_flange: Array) -> Array:

@@ -17,8 +17,12 @@ import numpy as np
 from ftcalib.data.dataset import CalibrationDataset, finite
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.extras.bias_change import BiasChange, bias_change
-from ftcalib.extras.expected_hysteresis import expected_with_hysteresis
-from ftcalib.extras.expected_readings import Expected, expected_as_found, expected_with_inexact_orientations
+from ftcalib.extras.expected_readings import (
+    Expected,
+    expected_as_found,
+    expected_with_hysteresis,
+    expected_with_inexact_orientations,
+)
 from ftcalib.extras.update import BLOCKS, Update, reestimate
 from ftcalib.files import JSON
 from ftcalib.model import BIASES, Array, Parameters, gravity_wrench, read_only, skew

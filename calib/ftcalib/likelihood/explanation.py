@@ -31,7 +31,16 @@ from ftcalib.likelihood.outliers import (
 )
 from ftcalib.likelihood.session import LEVER_M, Session, inverses, white
 from ftcalib.likelihood.session_noise import Noise
-from ftcalib.likelihood.variance_components import Component, Linearised, Point, maximise, noise_of, squared_length
+from ftcalib.likelihood.variance_components import (
+    Component,
+    Linearised,
+    Point,
+    expected_variances,
+    maximise,
+    noise_of,
+    point,
+    squared_length,
+)
 from ftcalib.model import Array, Parameters, predict
 
 MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or `drift` asks for it
@@ -80,6 +89,8 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
     if _is_quiet(session, minima[0]):
         return plain, minima, minima[0].chi2
     chosen = min(_explanations(session, minima, weights), key=lambda e: e.criterion)
+    if not session.measured:
+        chosen = _with_expected_noise(session, chosen)
     static = minima if chosen.kept.all() else session.descent.minima(weights * chosen.kept[:, None, None])
     for _ in range(len(static)):
         found = with_all_minima(session, chosen, static)
@@ -88,8 +99,15 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
         other = _explained(session, found[0].parameters, chosen.kept)
         if other.criterion > chosen.criterion:
             break
-        chosen = other
+        chosen = other if session.measured else _with_expected_noise(session, other)
     return chosen, found, static[0].chi2
+
+
+def _with_expected_noise(session: Session, e: Explanation) -> Explanation:
+    """Take the white noise that is expected instead of the likeliest."""
+    problem = session.linearised(e.parameters, e.kept)
+    theta = expected_variances(problem, point(problem, e.components, e.theta))
+    return replace(e, theta=theta, noise=None)
 
 
 def _is_quiet(session: Session, best: Minimum) -> bool:

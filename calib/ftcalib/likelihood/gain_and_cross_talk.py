@@ -82,8 +82,8 @@ class Response:
         """One standard deviation (3, 3) of each entry of both matrices, by their names."""
         C = self.covariance[15:, 15:]
         return {
-            "force_gain": np.sqrt(np.einsum("kij,kl,lij->ij", GAIN, C[:5, :5], GAIN)),
-            "cross_talk_m": np.sqrt(np.einsum("kij,kl,lij->ij", CROSS_TALK_M, C[5:, 5:], CROSS_TALK_M)),
+            name: np.sqrt(np.maximum(np.einsum("kij,kl,lij->ij", basis, C[own, own], basis), 0.0))
+            for name, basis, own in (("force_gain", GAIN, slice(5)), ("cross_talk_m", CROSS_TALK_M, slice(5, None)))
         }
 
     @property

@@ -378,6 +378,24 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array,
     return best
 
 
+def expected_variances(problem: Linearised, at: Point) -> Array:
+    """Give the variances (k,) with the white noise that is expected instead of the likeliest, which may be none.
+
+    A drift that varies as fast as the poses leaves little for the noise, whose likelihood is then flat down to zero.
+    Its standard deviation is uniformly distributed before (Gelman 2006), and its square has a normal likelihood.
+    """
+    slope, information = score(problem, at, at.components, at.theta)
+    scale = column_scale(information)
+    correlation = information / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
+    spread = at.theta / scale * np.sqrt(np.diag(np.linalg.inv(correlation)))
+    mode = at.theta / spread + spread * slope / at.theta
+    variance = (np.linspace(0.0, 1.0, 200)[:, None] * np.sqrt(np.maximum(mode, 0.0) + 6.0)) ** 2
+    density = np.exp(variance * np.minimum(mode, 0.0) - (variance - np.maximum(mode, 0.0)) ** 2 / 2)
+    mean = spread * (variance * density).sum(axis=0) / density.sum(axis=0)
+    white = np.array([c.kind == "white" for c in at.components])
+    return np.where(white & (mean > at.theta), mean, at.theta)
+
+
 def estimates(problem: Linearised, at: Point) -> tuple[Array, Array]:
     """Estimate parameters, and gain and cross-talk of the sensor, under given variances.
 

@@ -35,6 +35,7 @@ SENSORS = {
 EMULATED = "emulated://"
 MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
     "manual": ({"do": "hand-guide"}, "its arm is guided by hand from orientation to orientation"),
+    "passive": ({"do": "production"}, "a production program picks, places and touches"),
     "listen": ({"do": "pendant-program"}, "a program is started on its pendant, which turns the wrist"),
 }
 """How the emulated arm moves in modes in which the session does not move it: the request to the cell, and words."""

@@ -31,12 +31,14 @@ if TYPE_CHECKING:
     from ftdrive.runs.outcome import Outcome
     from ftdrive.runs.run import Mode
 
+_LONGEST_SWEEP_S = 120
 _OF_A_PLAN = ("--quick", "--minimal", "--output", "--png", "--view")
 _EXCLUDE_ONE_ANOTHER = (
-    ("--step", "--manual", "--listen", "--sweep"),
-    ("--quick", "--minimal", "--plan", "--resume", "--sweep"),
-    ("--fast", "--sweep"),
-    *((hand, option) for hand in ("--manual", "--listen") for option in _OF_A_PLAN),
+    ("--step", "--manual", "--listen", "--sweep", "--passive"),
+    ("--quick", "--minimal", "--plan", "--resume", "--sweep", "--passive"),
+    ("--fast", "--sweep", "--passive"),
+    ("--from", "--resume", "--sweep", "--passive"),
+    *((hand, option) for hand in ("--manual", "--listen", "--passive") for option in _OF_A_PLAN),
     *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
 )
 
@@ -53,9 +55,21 @@ _EXCLUDE_ONE_ANOTHER = (
 @simulate()
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
+@click.option(
+    "--from",
+    "earlier",
+    metavar="RESULT",
+    type=click.Path(exists=True, path_type=Path),
+    help="A new tool: take mounting, base and gain from this result of the same sensor; 6 poses unless --quick.",
+)
 @click.option("--sweep", is_flag=True, help="Calibrate in one smooth motion of the wrist, with inertia and delay.")
 @click.option(
-    "--seconds", type=Number(10, 120), default=20.0, show_default=True, help="With --sweep: its duration at full speed."
+    "--passive", is_flag=True, help="No motion commands: read beside any program or freedrive until it is good."
+)
+@click.option(
+    "--seconds",
+    type=Number(10, 3600),
+    help="Duration of --sweep at full speed (20, at most 120), or the longest of --passive (600).",
 )
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
 @click.option(
@@ -86,7 +100,10 @@ def calibrate(
     simulate: bool,
     quick: bool,
     minimal: bool,
+    earlier: Path | None,
     sweep: bool,
+    passive: bool,
+    seconds: float | None,
     step: bool,
     manual: bool,
     listen: bool,
@@ -113,14 +130,14 @@ def calibrate(
 
     _refuse_contradictions(click.get_current_context())
     require_viz(as_session["png"], view=as_session["view"])
-    chosen: dict[Mode, bool] = {"sweep": sweep, "step": step, "manual": manual, "listen": listen}
+    chosen: dict[Mode, bool] = {"sweep": sweep, "passive": passive, "step": step, "manual": manual, "listen": listen}
     mode: Mode = next((name for name, given in chosen.items() if given), "auto")
     with ExitStack() as stack:
         description: dict[str, Any] = {}
         made_by = None if resume is None else Run(resume).header_to_resume().get("station")
         simulate = simulate or bool(made_by and not (config or robot or tool))  # a resumed run keeps its cell
         if simulate:
-            pace = REAL_PACE if sweep else ()
+            pace = REAL_PACE if sweep or passive else ()
             station = stack.enter_context(Station.of(made_by, sensor, pace, control_path=control))
             cell = station.cell
             description = described(station)
@@ -128,9 +145,20 @@ def calibrate(
             said = Said(str(config.absolute()) if config else None, robot, sensor, tool, control)
             description = {"said": asdict(said)}
             cell = said.cell() if resume is None else _cell_to_resume(resume, said)
-        poses = 6 if minimal else 12 if quick else 24
+        if earlier is not None:
+            from ftdrive.runs.source import read_calibration
+
+            description["earlier"] = read_calibration(earlier).to_dict()
+        poses = 12 if quick else 6 if minimal or earlier is not None else 24
         options = SessionOptions(
-            runs, poses=poses, mode=mode, resume=resume, real=not simulate, description=description, **as_session
+            runs,
+            poses=poses,
+            mode=mode,
+            seconds=seconds or (600.0 if passive else 20.0),
+            resume=resume,
+            real=not simulate,
+            description=description,
+            **as_session,
         )
         if simulate:
             start_mover(station, options)
@@ -155,11 +183,15 @@ def calibrate(
 def _refuse_contradictions(context: click.Context) -> None:
     from ftdrive.errors import ConfigError
 
-    given = [f"--{name.replace('_', '-')}" for name, value in context.params.items() if value]
+    params = {"from" if name == "earlier" else name: value for name, value in context.params.items()}
+    given = [f"--{name.replace('_', '-')}" for name, value in params.items() if value]
     for group in _EXCLUDE_ONE_ANOTHER:
         both = [option for option in group if option in given]
         if len(both) > 1:
             raise ConfigError(f"{both[0]} and {both[1]} exclude one another: leave one of them out")
+    seconds, sweep, passive = (context.params[name] for name in ("seconds", "sweep", "passive"))
+    if seconds is not None and (seconds > _LONGEST_SWEEP_S if sweep else not passive):
+        raise ConfigError(f"--seconds {seconds:g} goes with --passive, or up to {_LONGEST_SWEEP_S} with --sweep")
 
 
 @dataclass(frozen=True, slots=True)

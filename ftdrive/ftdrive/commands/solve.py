@@ -15,6 +15,7 @@ from ftcalib import solve as solve_dataset
 from ftcalib.compare import compare
 from ftcalib.data.dataset import Orientation
 from ftcalib.errors import AcceptanceError, DataError
+from ftcalib.extras.new_tool import new_tool, together
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import UP_IN_BASE
 from ftcalib.result import Method
@@ -38,10 +39,11 @@ from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.recording.bag import bag_means, is_bag, read_bag
 from ftdrive.recording.in_motion import is_recording, solve_recording
 from ftdrive.runs.bundle import unpacked
+from ftdrive.runs.new_tool import require_same_cell
 from ftdrive.runs.outcome import solve_in_motion
 from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.run import Run, in_motion
-from ftdrive.runs.source import read_source
+from ftdrive.runs.source import read_calibration, read_source
 from ftdrive.terminal.console import beside, working
 from ftdrive.terminal.report import print_comparison, print_result
 from ftdrive.terminal.text import echo
@@ -89,6 +91,14 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
 @click.option(
     "--orientation-file", metavar="FILE", type=FILE, help="With --wrench: CSV with t, the orientation and x,y,z in m."
 )
+@click.option(
+    "--from",
+    "earlier",
+    metavar="RESULT",
+    type=click.Path(exists=True, path_type=Path),
+    help="A new tool: take mounting, base and gain from this result of the same sensor; 4 poses are enough.",
+)
+@click.option("--together", "joined", is_flag=True, help="Join runs of one tool, each with a bias of its own.")
 @BAG_TOPICS
 @click.option("--point-mass", is_flag=True, help="In motion: the load is known to have no inertia of its own.")
 @click.option("--output", "-o", type=NewFile(), help="Save the calibration as a new file.")
@@ -107,6 +117,8 @@ def solve(
     up: str | None,
     wrench: Path | None,
     orientation_file: Path | None,
+    earlier: Path | None,
+    joined: bool,
     wrench_topic: str | None,
     pose_topic: str | None,
     point_mass: bool,
@@ -132,14 +144,23 @@ def solve(
     sources = sources if pair is None else pair[:1]
     if not (sources or simulate):
         raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
-    if output is not None and (len(sources) > 1 or method == "all"):
+    if (earlier is not None or joined) and (method != "ml" or pair is not None or (earlier is not None and joined)):
+        raise ConfigError("--from and --together are for poses at rest and --method ml, one of the two at a time")
+    if joined and len(sources) < 2:
+        raise ConfigError("--together joins two runs or more: name them, the oldest first")
+    if output is not None and ((len(sources) > 1 and not joined) or method == "all"):
         raise ConfigError("--output takes one result: give one dataset and one method")
-    read = {
+    read: dict[str, Any] = {
         "orientation": orientation,
         "known": known_values(mass_kg, level_deg, mounting_deg),
         "up_in_base": upward(up),
     }
     motion = {"pair": pair, "point_mass": point_mass, "topics": (wrench_topic, pose_topic)}
+    if joined:
+        _solve_together(sources, drift, read, output, force, as_json)
+        return
+    if earlier is not None:
+        read["earlier"] = read_calibration(earlier)
     with rehearsed_run(sensor) if simulate else nullcontext() as run:
         _solve_each(sources if run is None else [run], method, drift, read, motion, output, force, as_json)
     if output is not None and sources and sources[0].is_dir():
@@ -160,9 +181,10 @@ def _solve_each(
     for source in sources:
         try:
             with unpacked(source) as place:
+                options = {key: value for key, value in read.items() if key != "earlier"}
                 is_motion = is_recording(place) or is_bag(place) or in_motion(place)
                 if method == "all" and motion["pair"] is None and not is_motion:
-                    data = read_source(place, **read)
+                    data = read_source(place, **options)
                     _show_all(source, data.dataset, {"drift": drift, **data.circumstances}, as_json)
                     continue
                 result, records = _result_of(place, method, drift, read, motion)
@@ -198,6 +220,8 @@ def _result_of(
     if motion["pair"] is not None or from_bag or is_recording(place) or in_motion(place):
         if method != "ml":
             raise ConfigError(f"--method {method} is for poses at rest: leave it out for a recording")
+        if "earlier" in read:
+            raise ConfigError("--from is for poses at rest: leave it out for a recording in motion")
         if in_motion(place):
             with working("Solving"):
                 return solve_in_motion(Run(place), read["known"], point_mass=motion["point_mass"]), ()
@@ -205,10 +229,44 @@ def _result_of(
         with working("Solving"):
             means = bag_means(read_bag(place, *topics)) if from_bag else None
             return solve_recording(place, motion["pair"], means, **options), ()
-    data = read_source(place, **read)
+    data = read_source(place, **{key: value for key, value in read.items() if key not in ("earlier", "alone")})
+    earlier = None if read.get("alone") else read.get("earlier") or data.earlier
+    if earlier is not None:
+        require_same_cell(earlier, data.provenance)
+        return new_tool(earlier, data.dataset, data.provenance), data.records
     options = {"drift": drift, **data.circumstances, "provenance": data.provenance}
     with working("Solving"):
         return _solve(data.dataset, method, options), data.records
+
+
+_AT_REST = {"pair": None, "point_mass": False, "topics": (None, None)}
+
+
+def _solve_together(
+    sources: Sequence[Path],
+    drift: Drift,
+    read: dict[str, Any],
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    results = []
+    read = {**read, "alone": True}  # a result from another one would count that twice
+    for source in sources:
+        with unpacked(source) as place:
+            if is_recording(place) or in_motion(place) or is_bag(place):
+                raise ConfigError(f"--together joins poses at rest, and {source} is in motion")
+            results.append(_result_of(place, "ml", drift, read, _AT_REST)[0])
+    result = together(results)
+    if as_json:
+        write_json({"sources": [str(source) for source in sources], **result.to_dict()})
+    else:
+        print_result(result)
+    if not force:
+        stop_unless_accepted(result, to_be_saved=output is not None)
+    if output is not None:
+        result.save(output)
+        beside(as_json).print(f" Saved {output}")
 
 
 def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) -> CalibrationResult:

@@ -23,6 +23,8 @@ from ftdrivers.interfaces import Array
 
 WEIGH_S: Final = TARE_S
 """A weighing averages so long."""
+_FEW: Final = 10.0
+"""The variance of a mean comes from its own samples. With n of them it is raised by this over n."""
 _NEW_POSE_RAD: Final = 0.17
 """Poses farther apart than this show more of the centre of mass."""
 _WHOLE: Final = 0.1
@@ -158,7 +160,8 @@ def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, PoseMean]:
         raise CannotWeigh("moving")
     if not is_stationary(rows.raw) or restless_channels(rows.raw, rest_sigma).any():
         raise CannotWeigh("unsteady")
-    return rows.R_base_flange[-1], mean_and_covariance(rows.raw)
+    dwell = mean_and_covariance(rows.raw)
+    return rows.R_base_flange[-1], PoseMean(dwell.mean, dwell.covariance * (1 + _FEW / len(rows)))
 
 
 def _unexplained(info: StreamInfo) -> Array:

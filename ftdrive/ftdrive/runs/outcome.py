@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, solve
+from ftcalib.extras.new_tool import new_tool
 from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.motion import solve_motion_file
+from ftdrive.runs.new_tool import require_same_cell
 from ftdrive.runs.run import Run, made_now
 
 
@@ -56,8 +58,19 @@ def solve_in_motion(run: Run, known: Known | None = None, *, point_mass: bool = 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
     dataset, circumstances, provenance = dataset_of(run, records)
-    result = solve(dataset, **circumstances, provenance=provenance)
+    earlier = earlier_of(run)
+    if earlier is None:
+        result = solve(dataset, **circumstances, provenance=provenance)
+    else:
+        require_same_cell(earlier, provenance)
+        result = new_tool(earlier, dataset, provenance)
     return Outcome(run, dataset, result, drift_check(records))
+
+
+def earlier_of(run: Run) -> CalibrationResult | None:
+    """Return the result from which a run of a new tool takes mounting, base and gain; None for any other run."""
+    document = run.header().get("earlier")
+    return None if document is None else CalibrationResult.from_dict(document)
 
 
 def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:

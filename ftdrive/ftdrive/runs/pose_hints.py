@@ -75,6 +75,8 @@ def moved(records: Sequence[PoseRecord]) -> list[Finding]:
 
 
 def _out_of_line(result: CalibrationResult) -> list[int]:
+    if "residual_sigma" not in result.quality:  # a new tool, or an update
+        return []
     spread = np.asarray(result.quality["residual_sigma"], dtype=np.float64)
     return out_of_line(spread, np.ones(len(spread), bool) if result.weights is None else result.weights > 0.5)
 

@@ -70,7 +70,7 @@ CRC: Final = "crc32"
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 """Of a recording, named as in `FtSamples`."""
 
-Mode = Literal["auto", "step", "manual", "listen", "sweep"]
+Mode = Literal["auto", "step", "manual", "listen", "sweep", "passive"]
 """How a session moves from pose to pose."""
 
 

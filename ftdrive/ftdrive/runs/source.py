@@ -10,7 +10,7 @@ from ftcalib.data.dataset import Orientation
 from ftcalib.errors import BadDataset
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.routine import PoseRecord
-from ftdrive.runs.outcome import dataset_of
+from ftdrive.runs.outcome import dataset_of, earlier_of
 from ftdrive.runs.run import Run, versions
 
 
@@ -24,6 +24,8 @@ class Source:
     provenance: dict[str, Any]
     records: Sequence[PoseRecord] = ()
     """Only of a run."""
+    earlier: CalibrationResult | None = None
+    """Of a run of a new tool: the result that gives mounting, base and gain."""
 
 
 def read_source(
@@ -46,11 +48,12 @@ def read_source(
     ------
     BadDataset, OSError
     """
+    earlier = None
     if source.is_dir():
         run = Run(source)
         if run.in_motion:
             raise BadDataset(f"{source} is a recording in motion and has no poses: solve it with {run.solve_command}")
-        records = run.records()
+        records, earlier = run.records(), earlier_of(run)
         dataset, circumstances, provenance = dataset_of(run, records)
     else:
         records = []
@@ -62,7 +65,7 @@ def read_source(
         provenance["up_in_base"] = list(up_in_base)
     if known is not None and known.gravity_direction_base is not None:
         known = replace(known, gravity_direction_base=-circumstances["setup"].up)
-    return Source(dataset, {**circumstances, "known": known}, provenance, records)
+    return Source(dataset, {**circumstances, "known": known}, provenance, records, earlier)
 
 
 def read_dataset(path: str | Path, orientation: Orientation = "R_base_flange") -> CalibrationDataset:

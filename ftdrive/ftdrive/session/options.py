@@ -9,7 +9,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Mode, Run
 
-_BY_HAND: Final = ("manual", "listen")
+_BY_HAND: Final = ("manual", "listen", "passive")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class SessionOptions:
     yes: bool = False
     """Answer the safety questions automatically, never the first motion."""
     seconds: float = 20.0
-    """Of a sweep, at the planned speed."""
+    """Of a sweep, at the planned speed; of a passive calibration at most."""
     description: Mapping[str, Any] = field(default_factory=dict)
     """Goes into run.json."""
 

@@ -9,7 +9,7 @@ from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.errors import ConfigError, Declined
 from ftdrive.planning.geometry.scene import down_of
-from ftdrive.runs.outcome import Outcome, solve_and_save
+from ftdrive.runs.outcome import Outcome, circumstances_of, solve_and_save
 from ftdrive.runs.run import Run
 from ftdrive.session import preflight
 from ftdrive.session.along_plan import AlongPlan
@@ -21,6 +21,7 @@ from ftdrive.session.journal import Journal
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Operator
 from ftdrive.session.options import SessionOptions, plan_on_disk, with_recorded_mode
+from ftdrive.session.passive import record_passively
 from ftdrive.session.pose_book import PoseBook
 from ftdrive.session.sweeping import Sweeping, on_script_path
 from ftdrive.session.task import Calibrating, Task
@@ -82,8 +83,12 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
             description = description_of(task, options, connected)
             return locked.enter_context(Run.create(options.runs, options.name, description, config.clock))
 
-        if options.by_hand:
-            run: Run | None = _by_hand(cell, task, resumed, new_run, listen=options.mode == "listen")
+        if options.mode == "passive":
+            run: Run | None = (kept := new_run())
+            circumstances, _ = circumstances_of(kept)
+            record_passively(cell, kept, options.seconds, circumstances["setup"], circumstances["g_m_s2"])
+        elif options.by_hand:
+            run = _by_hand(cell, task, resumed, new_run, listen=options.mode == "listen")
         else:
             run = AlongPlan(cell, task, options, resumed, new_run).take(plan)
     if run is None:

@@ -172,7 +172,7 @@ def head_and_words(event: Event) -> tuple[str, str]:
 def motion_in_words(event: MotionRecorded) -> str:
     """Describe what was recorded in motion."""
     words = f"recorded {event.samples} samples of the sensor, {event.states} of the arm"
-    return f"{words}; the sweep took {event.duration_s:.1f} s"
+    return f"{words}; {event.duration_s:.1f} s"
 
 
 def pose_in_words(event: PoseTaken) -> str:

@@ -18,6 +18,7 @@ from ftcalib import (
     read_csv,
     solve,
 )
+from ftcalib.assessment.faults import least_rms, rough_fit
 from ftcalib.known import Known
 from ftcalib.model import Array, predict
 
@@ -297,3 +298,13 @@ def test_nothing_is_named_in_sound_sessions() -> None:
         result = solved(R, wrench)
         assert result.verdict == "good"
         assert {one.code for one in result.findings} <= {"noise_unknown", "pose_deviates", "residuals_alike"}
+
+
+def test_no_rotation_leaves_less_than_the_bound() -> None:
+    for seed in range(5):
+        _, R, wrench = session(seed, 24)
+        for orientations in (R, np.swapaxes(R, 1, 2)):
+            left = wrench - predict(rough_fit(orientations, wrench), orientations)
+            rms = np.sqrt(np.mean(np.sum(left[:, :3] ** 2, axis=1)))
+            assert least_rms(orientations, wrench[:, :3]) <= rms
+    assert least_rms(orientations, wrench[:, :3]) > 0.1 * rms  # inverted orientations can be left out by it

@@ -494,3 +494,15 @@ def test_among_many_poses_larger_noise_rejects_none_and_bumped_poses_are_rejecte
     rejected = np.flatnonzero(found.weights == 0)
     assert rejected[:bumped].tolist() == list(range(bumped))
     assert len(rejected) <= bumped + bool(bumped)  # among so many, one that is not bumped
+
+
+def test_a_bias_is_uncertain_where_a_drift_leaves_no_noise() -> None:
+    z = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        p, R = truth(rng), haar(rng, 12)
+        warming = (1 - np.exp(-np.arange(12) / 4))[:, None] * np.repeat([2.0, 0.05], 3)
+        found = fit(R, predict(p, R) + warming - warming.mean(axis=0) + noise(rng, 12))
+        z.append(p.difference(found.parameters)[6:9] / np.sqrt(np.diag(found.covariance)[6:9]))
+        assert found.components["white_force_N"] > 0.1 * SIGMA[0]
+    assert np.sqrt(np.mean(np.square(z))) < 1.5

@@ -1,6 +1,7 @@
 """Predicted uncertainty of sets of poses, and their choice, against closed forms, other code and published figures."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,7 +77,11 @@ def test_prediction_is_what_the_solver_states_for_such_data() -> None:
     result = solve(CalibrationDataset(R, predict(guess.parameters, R), cov, np.full(9, 100), np.arange(9.0)))
     prediction = predicted_sigma(R, guess)
     assert prediction.sigma.keys() == result.sigma.keys()
-    common_gain = {"weight_N": 0.002 * guess.weight_N, "mass_kg": 0.002 * guess.mass_kg}  # which no pose shows
+    common_gain: dict[str, Any] = {  # which no pose shows
+        "weight_N": 0.002 * guess.weight_N,
+        "mass_kg": 0.002 * guess.mass_kg,
+        "gravity_force_base_N": 0.002 * guess.parameters.gravity_force_base_N,
+    }
     for name, sigma in result.sigma.items():
         assert_allclose(np.hypot(prediction.sigma[name], common_gain.get(name, 0)), sigma, rtol=1e-6, err_msg=name)
     assert_allclose((prediction.force_rms_N, prediction.torque_rms_Nm), result.predicted_error(), rtol=1e-6)

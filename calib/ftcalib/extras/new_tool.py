@@ -1,0 +1,239 @@
+"""A new tool from few poses, and several runs as one fit: mounting, base and gain belong to the cell, not to the tool.
+
+`new_tool` takes mounting, direction of gravity, gain and cross-talk of an earlier result with their covariance as a
+prior. Weight, centre of mass and bias have none. The misfit of poses and prior tests whether they still hold.
+
+`together` joins runs of one tool whose bias has moved between them: each is solved by itself, and what they share is
+the mean weighted by information.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtrc as chi2_sf
+
+from ftcalib.data.dataset import CalibrationDataset
+from ftcalib.data.pooling import pooled_covariance
+from ftcalib.errors import NotObservable
+from ftcalib.extras.update import Update, updated
+from ftcalib.findings import Finding
+from ftcalib.likelihood.gain_and_cross_talk import Response, response_columns
+from ftcalib.model import BIASES, Array, Parameters, angle_between, jacobian, predict, skew
+from ftcalib.result import CalibrationResult
+
+FALSE_ALARMS = 1e-4
+"""Share of good runs that the test of what was kept rejects."""
+_PRIOR_SIZE = 5
+_MOST_STEPS = 30
+_SETTLED = 1e-12
+"""Squared step in standard deviations."""
+_SINGULAR = 1e12
+_SIGNIFICANT = 5.0
+_SHARED = np.array([0, 1, 2, 3, 4, 5, 9, 10, 11])
+"""Rows of the error coordinates that runs of one tool share."""
+
+
+def new_tool(
+    earlier: CalibrationResult, dataset: CalibrationDataset, provenance: Mapping[str, Any] | None = None
+) -> CalibrationResult:
+    """Estimate weight, centre of mass and bias of a tool; take the rest from an earlier result with its covariance.
+
+    Parameters
+    ----------
+    earlier : CalibrationResult
+        Accepted, of the same sensor, mounting and base.
+    dataset : CalibrationDataset
+        3 poses or more whose noise was measured; 4 for a test worth its name.
+    provenance : mapping, optional
+        Of the dataset.
+
+    Returns
+    -------
+    CalibrationResult
+        Its `provenance` names the earlier result as `parent`.
+
+    Raises
+    ------
+    NotObservable
+        The poses do not determine the tool, or what was kept holds no more: the message names mounting or base.
+    """
+    if dataset.wrench_cov is None:
+        raise NotObservable(
+            "the noise of the poses was not measured, so nothing tests the earlier result: leave --from out."
+        )
+    cov = pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier))
+    weights: Array = np.linalg.inv(cov).astype(np.float64)
+    poses = dataset.R_base_flange, dataset.wrench, weights
+    found = _fitted(earlier, *poses, range(_PRIOR_SIZE))
+    if found.dof and chi2_sf(found.dof, found.chi2) < FALSE_ALARMS:
+        raise NotObservable(_changed(earlier, found, poses))
+    result = updated(earlier, found, {**(provenance or {}), "dataset_sha256": dataset.sha256()})
+    return replace(result, quality={}, weights=None, components=_kept_noise(earlier))
+
+
+def _fitted(
+    earlier: CalibrationResult, R_base_flange: Array, wrench: Array, weights: Array, kept: Sequence[int]
+) -> Update:
+    """Fit all parameters; `kept` are the rows of the prior that count, 0 to 2 mounting, 3 and 4 base."""
+    n, old, gain = len(wrench), earlier.parameters, earlier.response
+    C = np.array(earlier.covariance if gain is None else gain.covariance)
+    across = np.linalg.svd(skew(old.gravity_force_base_N))[0][:, :2]  # two directions across gravity
+    rows = [*kept, *range(_PRIOR_SIZE, _PRIOR_SIZE + len(C) - 15)]
+    before = _prior_rows(old, across, len(C))[rows]
+    V = before @ C @ before.T
+    P = np.linalg.inv(V + 1e-12 * np.diag(np.diag(V)) + 1e-24 * np.eye(len(V)))
+    new, coefficients = _start(old, R_base_flange, wrench), np.zeros(len(C) - 15) if gain is None else gain.coefficients
+    for _ in range(_MOST_STEPS):
+        left = wrench - predict(new, R_base_flange)
+        J = jacobian(new, R_base_flange)
+        if gain is not None:
+            T = response_columns(new, R_base_flange)
+            left, J = left - T @ coefficients, np.concatenate([J, T], axis=2)
+        A = _prior_rows(new, across, len(C))[rows]
+        apart = np.concatenate([new.difference(old)[:3], across.T @ (_unit(old) - _unit(new))])
+        if gain is not None:
+            apart = np.concatenate([apart, gain.coefficients - coefficients])
+        r = apart[rows]
+        WJ = weights @ J
+        H = np.einsum("nij,nik->jk", J, WJ) + A.T @ P @ A
+        scale = np.sqrt(np.diag(H))
+        if not (scale > 0).all() or np.linalg.cond(H / np.outer(scale, scale)) > _SINGULAR:
+            raise NotObservable(f"{n} poses do not determine the tool: add poses with other tilts of the tool.")
+        step = np.linalg.solve(H, np.einsum("nij,ni->j", WJ, left) + A.T @ P @ r)
+        new, coefficients = new.moved(step[:15]), coefficients + step[15:]
+        if float(step @ H @ step) < _SETTLED:
+            break
+    else:
+        raise NotObservable(f"the fit has not settled in {_MOST_STEPS} steps: check the poses, or solve alone.")
+    covariance = np.linalg.inv(H)
+    weight_N = float(np.linalg.norm(new.gravity_force_base_N))
+    sigma_N = float(np.sqrt(_unit(new) @ covariance[3:6, 3:6] @ _unit(new)))
+    if weight_N < _SIGNIFICANT * sigma_N:
+        raise NotObservable(f"the weight of the tool is {weight_N:.2g} N, sigma {sigma_N:.2g} N: check the sensor.")
+    chi2 = float(np.einsum("ni,nij,nj->", left, weights, left) + r @ P @ r)
+    dof = 6 * n + len(rows) - len(C)
+    response = None if gain is None else Response(coefficients, covariance)
+    return Update(new, covariance[:15, :15], chi2, dof, "tool", left, response)
+
+
+def _prior_rows(p: Parameters, across: Array, size: int) -> Array:
+    """Derivative (5 + gain, size) of mounting, direction of gravity and gain by the error coordinates."""
+    F, u = float(np.linalg.norm(p.gravity_force_base_N)), _unit(p)
+    rows = np.zeros((_PRIOR_SIZE + size - 15, size))
+    rows[:3, :3] = np.eye(3)
+    rows[3:5, 3:6] = across.T @ (np.eye(3) - np.outer(u, u)) / F
+    rows[5:, 15:] = np.eye(size - 15)
+    return rows
+
+
+def _unit(p: Parameters) -> Array:
+    return np.asarray(p.gravity_force_base_N / np.linalg.norm(p.gravity_force_base_N))
+
+
+def _start(old: Parameters, R_base_flange: Array, wrench: Array) -> Parameters:
+    """Take weight, centre of mass and bias by linear least squares with the earlier mounting and base."""
+    u = _unit(old) @ (R_base_flange @ old.R_flange_sensor)
+    A = np.zeros((len(u), 6, 10))
+    A[:, :3, 0], A[:, :3, 1:4] = u, np.eye(3)
+    A[:, 3:, 4:7], A[:, 3:, 7:] = -skew(u), np.eye(3)
+    x: Array = np.linalg.lstsq(A.reshape(-1, 10), wrench.ravel(), rcond=None)[0].astype(np.float64)
+    weight_N = max(float(x[0]), 1e-3)
+    return Parameters(old.R_flange_sensor, weight_N * _unit(old), x[1:4], x[4:7] / weight_N, x[7:])
+
+
+def _kept_noise(earlier: CalibrationResult) -> dict[str, float]:
+    """Return the components that belong to the cell: errors of the arm and of the sensor, not of one session."""
+    return {name: value for name, value in earlier.components.items() if name in ("rotation_rad", "hysteresis")}
+
+
+def _beyond(earlier: CalibrationResult) -> Array:
+    """Variance (6,) of a pose beyond its noise, where noise alone did not explain the residuals of the earlier fit."""
+    if earlier.noise_explains:
+        return np.zeros(6)
+    excess = np.square(earlier.likely_error()) - np.square(earlier.predicted_error())
+    return np.repeat(np.maximum(excess, 0.0) / 3, 3)
+
+
+def _changed(earlier: CalibrationResult, kept: Update, poses: tuple[Array, Array, Array]) -> str:
+    """Name what does not hold any more: what explains the poses without its prior."""
+    explained = list[tuple[float, str]]()
+    for what, rows in (("the sensor is mounted otherwise", (3, 4)), ("the base leans otherwise", (0, 1, 2))):
+        try:
+            found = _fitted(earlier, *poses, rows)
+        except NotObservable:
+            continue
+        if not found.dof or chi2_sf(found.dof, found.chi2) >= FALSE_ALARMS:
+            old, new = earlier.parameters, found.parameters
+            turned = float(angle_between(old.R_flange_sensor, new.R_flange_sensor))
+            if 0 in rows:
+                turned = float(np.arctan2(np.linalg.norm(np.cross(_unit(old), _unit(new))), _unit(old) @ _unit(new)))
+            explained.append((found.chi2, f"{what}, by {np.degrees(turned):.2g}°"))
+    misfit = f"chi2 {kept.chi2:.0f} for {kept.dof} degrees of freedom"
+    if not explained:
+        return f"the poses do not fit mounting and base of {earlier.id} ({misfit}): check for contact, or solve alone."
+    explained.sort()
+    cause = " or ".join(text for chi2, text in explained if chi2 < explained[0][0] + 10)
+    return f"{cause} since {earlier.id} ({misfit}): calibrate this tool alone, from 12 poses or more."
+
+
+def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any] | None = None) -> CalibrationResult:
+    """Join results of one tool on one cell; the bias is that of the last run.
+
+    Parameters
+    ----------
+    results : sequence of CalibrationResult
+        Of runs that were solved by themselves, the oldest first.
+    provenance : mapping, optional
+
+    Returns
+    -------
+    CalibrationResult
+        Verdict, findings and residuals are those of the last run.
+
+    Raises
+    ------
+    NotObservable
+        The runs contradict each other in more than the bias, or a run shows gain and cross-talk.
+    """
+    if any(one.response is not None for one in results):
+        raise NotObservable("a run shows gain or cross-talk of the sensor, and these are not joined: use --from.")
+    if any((np.diag(one.covariance)[_SHARED] <= 0).any() for one in results):
+        raise NotObservable("a run takes a value as exactly known: solve its runs without known values.")
+    last = results[-1]
+    difference = np.array([last.parameters.difference(one.parameters)[_SHARED] for one in results])
+    information = np.array([np.linalg.inv(one.covariance[np.ix_(_SHARED, _SHARED)]) for one in results])
+    C = np.linalg.inv(information.sum(axis=0))
+    x = C @ np.einsum("kij,kj->i", information, difference)
+    rest = difference - x
+    chi2, dof = float(np.einsum("ki,kij,kj->", rest, information, rest)), 9 * (len(results) - 1)
+    if dof and chi2_sf(dof, chi2) < FALSE_ALARMS:
+        raise NotObservable(
+            f"the runs contradict each other in more than the bias (chi2 {chi2:.0f} for {dof} degrees of freedom): "
+            "`ftdrive diff` shows in what; tool, sensor or base has changed."
+        )
+    shared, own = np.ix_(_SHARED, _SHARED), np.arange(15)[BIASES]
+    G = last.covariance[np.ix_(own, _SHARED)] @ np.linalg.inv(last.covariance[shared])
+    step = np.zeros(15)
+    step[_SHARED], step[own] = x, G @ x
+    covariance = np.zeros((15, 15))
+    covariance[shared] = C
+    covariance[np.ix_(own, _SHARED)] = G @ C
+    covariance[np.ix_(_SHARED, own)] = (G @ C).T
+    alone = last.covariance[np.ix_(own, own)] - G @ last.covariance[np.ix_(_SHARED, own)]
+    covariance[np.ix_(own, own)] = alone + G @ C @ G.T
+    note = Finding.of("together", n_runs=len(results))
+    return replace(
+        last,
+        parameters=last.parameters.moved(step),
+        covariance=(covariance + covariance.T) / 2,
+        findings=(*last.findings, note),
+        provenance={
+            **last.provenance,
+            **(provenance or {}),
+            "together": [one.id for one in results],
+            "between_chi2": chi2,
+            "between_dof": dof,
+        },
+    )

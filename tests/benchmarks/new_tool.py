@@ -1,0 +1,74 @@
+"""A new tool from four poses and an earlier result, against 12 poses alone.
+
+    uv run python -m tests.benchmarks.new_tool [--runs 200]
+
+The earlier result has 24 poses of another tool. Shown: squared error over the stated variance (1 expected), the error
+of compensation over all orientations against that of 12 poses alone, and what is found when the sensor has turned by
+1 degree since. Exit code: 1 if a target is missed.
+"""
+
+import argparse
+import sys
+from dataclasses import replace
+
+import click
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib import solve
+from ftcalib.errors import NotObservable
+from ftcalib.extras.new_tool import new_tool
+from ftcalib.model import predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
+from tests.unit.calib.extras.test_new_tool import FOUR, OTHER, poses
+from tests.unit.ftdrive.live.simulated import TRUTH, calibrated
+
+TOUR = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+EVERYWHERE = Rotation.random(500, rng=np.random.default_rng(0)).as_matrix()
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=200)
+    options = parser.parse_args()
+    z2, worst, rms = list[float](), 0.0, {name: list[float]() for name in ("four", "random", "tour")}
+    named = refused = 0
+    for seed in range(options.runs):
+        rng = np.random.default_rng([seed, 3])
+        earlier = calibrated(24, seed % 40)
+        try:
+            four = new_tool(earlier, poses(OTHER, FOUR, seed))
+        except NotObservable:
+            refused += 1
+            continue
+        drawn = Rotation.random(12, rng=rng).as_matrix()
+        alone = {
+            "random": solve(poses(OTHER, drawn, seed)),
+            "tour": solve(poses(OTHER, rng.permutation(TOUR)[:12], seed)),
+        }
+        e = four.parameters.difference(OTHER)
+        z2.append(float(e @ np.linalg.solve(four.covariance, e)) / 15)
+        worst = max(worst, float(np.max(np.abs(e) / np.sqrt(np.diag(four.covariance)))))
+        for name, result in {"four": four, **alone}.items():
+            off = predict(result.parameters, EVERYWHERE) - predict(OTHER, EVERYWHERE)
+            rms[name].append(float(np.mean(np.sum(off[:, :3] ** 2, axis=1))))
+        axis = rng.normal(size=3)
+        turn = Rotation.from_rotvec(axis / np.linalg.norm(axis), degrees=True).as_matrix()
+        try:
+            new_tool(earlier, poses(replace(OTHER, R_flange_sensor=turn @ TRUTH.R_flange_sensor), FOUR, seed))
+        except NotObservable as error:
+            named += "mounted otherwise" in str(error)
+    ratios = {name: float(np.sqrt(np.mean(rms["four"]) / np.mean(rms[name]))) for name in ("random", "tour")}
+    click.echo(
+        f"{options.runs} runs: mean squared error / variance {np.mean(z2):.2f}, worst component {worst:.1f} sigma, "
+        f"refused {refused}; force error of 4 poses / 12 alone "
+        f"{ratios['random']:.2f} (random poses), {ratios['tour']:.2f} (of the tour); "
+        f"sensor turned by 1 degree: named {named}"
+    )
+    good = 0.8 <= np.mean(z2) <= 1.25 and ratios["random"] <= 1.3 and named == options.runs and refused <= 1
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

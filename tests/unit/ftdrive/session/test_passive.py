@@ -1,0 +1,90 @@
+"""A passive calibration: it ends by itself, by a key, or after its time, and its run solves again."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ftcalib import Setup
+from ftdrive.errors import Declined
+from ftdrive.runs.motion import MotionRecording
+from ftdrive.runs.run import Run
+from ftdrive.session.operator import Key
+from ftdrive.session.passive import record_passively
+from ftdrivers.interfaces import ArmStates, FtSamples
+from tests.fake_clock import FakeClock
+from tests.moving_load import Truth, programme, record
+
+SECONDS = 60.0
+STEP_S = 2.0
+
+
+class FakeCell:
+    """Sensor, arm and journal of a free tool that a program moves."""
+
+    def __init__(self, *, stop_s: float = np.inf) -> None:
+        self.clock, self.shown, self._stop_s = FakeClock(), list[Any](), stop_s
+        recorded = record(Truth(vibrates_at_rest=False), programme(1, SECONDS)[0], SECONDS, 1)
+        nothing = np.zeros((len(recorded.t_pose_s), 6))
+        start_ns = self._start_ns = self.clock.now_ns()
+        self._samples = FtSamples.of(
+            start_ns + (1e9 * recorded.t_s).astype(np.int64), np.arange(len(recorded.t_s)), recorded.wrench
+        )
+        t_ns = start_ns + (1e9 * recorded.t_pose_s).astype(np.int64)
+        self._states = ArmStates(
+            t_ns, recorded.t_pose_s, nothing, nothing, recorded.R_base_flange, recorded.p_base_flange_m
+        )
+        health = SimpleNamespace(nominal_rate_Hz=500.0)
+        self.sensor = SimpleNamespace(
+            follow=lambda: self._follow(self._samples, STEP_S), health=lambda: health, temperature_C=lambda: None
+        )
+        self.arm = SimpleNamespace(follow=lambda: self._follow(self._states, 0.0))
+        self.journal = SimpleNamespace(pressed=self._pressed, show=lambda event, **_: self.shown.append(event))
+
+    @contextmanager
+    def _follow(self, rows: Any, step_s: float) -> Iterator[Any]:
+        before = [self._start_ns]
+
+        def read(_: float) -> Any:
+            self.clock.sleep(step_s)
+            now_ns = self.clock.now_ns()
+            since, until = np.searchsorted(rows.t_host_ns, [before[0], now_ns])
+            before[0] = now_ns
+            return type(rows)(*(getattr(rows, name)[since:until] for name in rows.__slots__))
+
+        yield SimpleNamespace(read=read)
+
+    def _pressed(self) -> Key | None:
+        return Key.STOP if (self.clock.now_ns() - self._start_ns) * 1e-9 >= self._stop_s else None
+
+    def note(self, words: str) -> None:
+        self.shown.append(words)
+
+
+def passively(cell: Any, folder: Path, seconds: float) -> Run:
+    run = Run.create(folder, "passive", {"mode": "passive"})
+    record_passively(cell, run, seconds, Setup(), 9.80665)
+    return run
+
+
+def test_it_ends_by_itself_when_the_result_is_good(tmp_path: Path) -> None:
+    cell = FakeCell()
+    run = passively(cell, tmp_path, SECONDS)
+    duration_s = cell.shown[-1].duration_s
+    assert 10 < duration_s < SECONDS - 2 * STEP_S
+    recording = MotionRecording.load(run.motion_path)
+    assert len(recording.samples) == pytest.approx(500 * duration_s, rel=0.05)
+
+
+def test_q_and_the_time_end_it_and_too_little_is_not_kept(tmp_path: Path) -> None:
+    by_key, by_time = FakeCell(stop_s=6.0), FakeCell()
+    assert passively(by_key, tmp_path, SECONDS).motion_path.is_file()
+    assert by_key.shown[-1].duration_s == pytest.approx(6.0, abs=STEP_S)
+    passively(by_time, tmp_path, 8.0)
+    assert by_time.shown[-1].duration_s == pytest.approx(8.0, abs=STEP_S)
+    with pytest.raises(Declined, match="record 10 s"):
+        passively(FakeCell(stop_s=2.0), tmp_path, SECONDS)
