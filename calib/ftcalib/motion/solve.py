@@ -52,7 +52,7 @@ _OF_POSES = frozenset(("noise_unknown", "poses_unchecked", "pose_deviates", "res
 """Findings about single poses, which rows in motion are not."""
 
 
-def solve_motion(
+def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     wrench: Means,
     poses: Means,
     *,
