@@ -58,7 +58,7 @@ def main() -> int:
     parser.add_argument("--average", type=float, default=2.0, help="s at each pose of the tour")
     options = parser.parse_args()
     show = sys.stdout.write
-    show("seed  tour N     mN·m   sweep N    mN·m   verdict  inertia sigma, g·m²  delay ms        s\n")
+    show("seed  tour N     mN·m   sweep N    mN·m   verdict  inertia sigma, g·m²  delay ms        s  findings\n")
     rows = []
     with TemporaryDirectory() as folder:
         for seed in range(options.seeds):
@@ -69,9 +69,10 @@ def main() -> int:
             assert motion is not None
             inertia = 1e3 * float(np.sqrt(np.diag(motion.covariance)[15:18].max()))
             rows.append([*errors, seconds])
+            codes = " ".join(one.code for one in sweep.result.findings if one.severity != "note")
             show(
                 f"{seed:4}{errors[0]:8.4f}{1e3 * errors[1]:9.3f}{errors[2]:10.4f}{1e3 * errors[3]:8.3f}"
-                f"{sweep.result.verdict:>10}{inertia:14.3f}{1e3 * motion.delay_s:17.2f}{seconds:11.1f}\n"
+                f"{sweep.result.verdict:>10}{inertia:14.3f}{1e3 * motion.delay_s:17.2f}{seconds:11.1f}  {codes}\n"
             )
             sys.stdout.flush()
     force_N, torque_Nm, swept_N, swept_Nm = np.sqrt(np.mean(np.square(np.array(rows)[:, :4]), axis=0))

@@ -1,7 +1,7 @@
 """The load that explains rows in motion: Gauss-Newton from each mounting that forces allow, contact left out."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -22,6 +22,8 @@ GYRATION_M, HEIGHT_M, DELAY_S = 0.15, 0.3, 0.3
 """What is expected of a tool before any data, one sigma: radius of gyration, sensor height, delay beyond the rows."""
 CONTACT = float(chi2_isf(6, 1e-7))
 """Squared distance of a row in contact."""
+TOUCH_N, TOUCH_NM = 2.0, 0.2
+"""Of a row in contact, in a motion that a guard has watched."""
 QUIET = 0.4
 """Share of the rows of a state that is free of contact."""
 MOST_CONTACT = 0.8
@@ -42,6 +44,8 @@ _CHUNK = 1000
 _MANY = 1000
 """Rows beside which what the fit absorbs is small."""
 _SAME_RAD = 0.2
+_AROUND, _PRIOR_ROWS = 9, 1.0
+"""Rows that show the noise of the one in their middle, and how many of its state count with them."""
 _STAGES, _CHOICES = 6, (1, 2, 4)
 """Solutions, each with the noise and the contacts of the one before, and those before which components are chosen."""
 _SIZES: Mapping[str, Array] = {
@@ -259,7 +263,9 @@ class _Step:
         return np.asarray(self.basis @ cho_solve(self.factor, self.basis.T))
 
 
-def fit(rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = False) -> MotionFit:
+def fit(
+    rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = False, guarded: bool = False
+) -> MotionFit:
     """Fit all unknowns to rows.
 
     Parameters
@@ -270,17 +276,26 @@ def fit(rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = Fa
     g_m_s2 : float
     point_mass : bool
         Whether the inertia about the centre of mass is known to be 0.
+    guarded : bool
+        Whether a contact guard has watched the motion. Then bursts of noise, as of gears at the reversal of a joint,
+        are no contact: only rows above `TOUCH_N` or `TOUCH_NM` are, and each row has the noise of its surroundings.
     """
     problem = _Problem(rows, known, g_m_s2, point_mass=point_mass)
     roughs = sorted((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])
     load, _ = roughs[0]
-    kept, state = _first_kept(problem, load)
+    r = rows.wrench - problem.predicted(load, rows)
+    kept = _untouched(r) if guarded else _first_kept(problem, load)
     drift, sizes = np.zeros((len(problem.knots), 6)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
     solved = _Step.none()
     for stage in range(_STAGES):
+        state = states(rows.speed_rad_s, kept)
         r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
         absorbed = problem.absorbed(load, rows[kept], solved)
         noise = Noise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept]))
+        if guarded:
+            local = _local(r / noise.scale[state], kept)[:, None]
+            noise = Noise.of((r / local)[kept], absorbed / local[kept][:, :, None], state[kept], runs(rows.t_s[kept]))
+            noise, state = replace(noise, scale=noise.scale[state] * local), np.arange(len(rows))
         sums = problem.sums(load, drift, noise, kept, state)
         if stage in _CHOICES:
             sizes = _chosen(problem, sizes, sums, load, drift)
@@ -289,9 +304,7 @@ def fit(rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = Fa
         drift = drift + (problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
         r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
-        kept = _without_contact(distance)
-        state = states(rows.speed_rad_s, kept)
-    state = np.minimum(state, len(noise.scale) - 1)  # the last contacts may have freed a faster class
+        kept = _untouched(r) if guarded else _without_contact(distance)
     chi2, others = problem.sums(load, drift, noise, kept, state)[2], []
     for other, _ in roughs[1:]:
         if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
@@ -325,7 +338,7 @@ def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
     return min((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])[0].delay_s
 
 
-def _first_kept(problem: _Problem, load: Load) -> tuple[NDArray[np.bool_], NDArray[np.intp]]:
+def _first_kept(problem: _Problem, load: Load) -> NDArray[np.bool_]:
     """Rows without contact, by the quiet rows of each state; at rest there is no more noise than in motion."""
     rows = problem.rows
     r = rows.wrench - problem.predicted(load, rows)
@@ -334,8 +347,20 @@ def _first_kept(problem: _Problem, load: Load) -> tuple[NDArray[np.bool_], NDArr
     quiet = np.array([np.quantile(size[state == k], QUIET, axis=(0, 2)) for k in np.unique(state)])
     scale = np.minimum.accumulate(quiet[::-1], axis=0)[::-1] / ndtri((1 + QUIET) / 2) + 1e-12
     distance = np.sum((r / np.repeat(scale, 3, axis=1)[state]) ** 2, axis=1)
-    kept = _without_contact(distance / 2)
-    return kept, states(rows.speed_rad_s, kept)
+    return _without_contact(distance / 2)
+
+
+def _untouched(residuals: Array) -> NDArray[np.bool_]:
+    """Rows without contact in a motion that a guard has watched."""
+    force_N, torque_Nm = (np.linalg.norm(residuals[:, k : k + 3], axis=1) for k in (0, 3))
+    return _without_contact(np.where((force_N > TOUCH_N) | (torque_Nm > TOUCH_NM), np.inf, 0.0))
+
+
+def _local(unit: Array, kept: NDArray[np.bool_]) -> Array:
+    """Noise (n,) of each row in that of its state, from the residuals around it."""
+    square, window = np.where(kept, np.mean(unit**2, axis=1), 0.0), np.ones(_AROUND)
+    rows = np.convolve(kept.astype(np.float64), window, "same")
+    return np.asarray(np.sqrt((_PRIOR_ROWS + np.convolve(square, window, "same")) / (_PRIOR_ROWS + rows)))
 
 
 def _without_contact(distance: Array) -> NDArray[np.bool_]:

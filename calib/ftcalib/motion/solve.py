@@ -52,12 +52,13 @@ _OF_POSES = frozenset(("noise_unknown", "poses_unchecked", "pose_deviates", "res
 """Findings about single poses, which rows in motion are not."""
 
 
-def solve_motion(
+def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     wrench: Means,
     poses: Means,
     *,
     known: Known | None = None,
     point_mass: bool = False,
+    guarded: bool = False,
     height_m: float | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
     setup: Setup = NOTHING,
@@ -76,6 +77,8 @@ def solve_motion(
         Known mounting, direction of gravity and mass.
     point_mass : bool
         Whether the inertia of the load about its centre of mass is known to be 0.
+    guarded : bool
+        As for `ftcalib.motion.estimate.fit`.
     height_m : float, optional
         Of the sensor origin above the flange face, as configured, to be checked.
     g_m_s2 : float
@@ -99,7 +102,7 @@ def solve_motion(
     for _ in range(3):
         rows = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)))
         used = _used(rows, positions)
-        best = fit(used, known, g_m_s2, point_mass=point_mass or not positions)
+        best = fit(used, known, g_m_s2, point_mass=point_mass or not positions, guarded=guarded)
         delay_s = rows.delay_s + best.load.delay_s
         if abs(best.load.delay_s) < LINEAR_S:
             break

@@ -159,8 +159,9 @@ class Transforms:
             if frame not in frames:
                 return f"tf has no frame {frame!r}; it has {', '.join(sorted(frames)) or 'none'}"
         frame = self._flange
-        while frame in self._parts and frame != self._base:
-            frame = self._parts[frame][0]
+        for _ in self._parts:  # a wrong tree may be a circle
+            if frame in self._parts and frame != self._base:
+                frame = self._parts[frame][0]
         if frame != self._base:
             return f"tf does not connect {self._base} with {self._flange}: nothing is above {frame}"
         return f"no transform between {self._base} and {self._flange} moves, so none has a time"

@@ -14,6 +14,8 @@ DISCOVERY_S: Final = 3.0
 _SAME_CLOCK_MS: Final = 2.0
 _LONGEST_WAY_MS: Final = 30.0
 """A stamp that is older by the clock of this computer was given by another clock."""
+_OTHERS_S: Final = 0.5
+"""Until a second publisher is known too."""
 _UNNAMED: Final = "NAME_UNKNOWN"
 _UNNUMBERED: Final = (1 << 64) - 1
 
@@ -106,6 +108,8 @@ def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool
     for _ in clock.looks(DISCOVERY_S):
         found = ros.node.get_publishers_info_by_topic(topic)
         if found and not any(_UNNAMED in one.node_name for one in found):  # names arrive later
+            clock.sleep(_OTHERS_S)
+            found = ros.node.get_publishers_info_by_topic(topic)
             break
         clock.sleep(0.05)
     kinds = sorted({one.topic_type for one in found})

@@ -107,5 +107,11 @@ def solve_motion_file(
     wrench, poses = MotionRecording.load(path).means()
     source = {"recording": path.name, "recording_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     return solve_motion(
-        wrench, poses, known=known, height_m=height_m, provenance={**provenance, **source}, **circumstances
+        wrench,
+        poses,
+        known=known,
+        guarded=True,
+        height_m=height_m,
+        provenance={**provenance, **source},
+        **circumstances,
     )

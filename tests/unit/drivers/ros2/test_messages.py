@@ -1,0 +1,200 @@
+"""Messages and addresses that cannot be used: one sentence each. No ROS is needed: the messages are plain objects."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ftcalib.errors import FtdriveError
+from ftdrivers.errors import BadUrl, DeviceError, ProtocolError
+from ftdrivers.registry import sensor_from_url
+from ftdrivers.ros2.arm import Ros2Arm, pose_reader_of
+from ftdrivers.ros2.kinematics import Chain
+from ftdrivers.ros2.poses import Joints, Poses, Transforms
+from ftdrivers.ros2.sensor import Ros2Sensor
+from ftdrivers.ros2.subscription import Received
+from tests.ros2.seven_joints import JOINTS, URDF, flange, posture
+
+NAN = float("nan")
+
+
+def header(t_s: float, frame: str = "base") -> Any:
+    sec, nanosec = divmod(round(t_s * 1e9), 10**9)
+    return SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec), frame_id=frame)
+
+
+def vector(*values: float) -> Any:
+    return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
+
+
+def pose(t_s: float = 5.0, p: Any = (0, 0, 1), q: Any = (0, 0, 0, 1)) -> Any:
+    return SimpleNamespace(header=header(t_s), pose=SimpleNamespace(position=vector(*p), orientation=vector(*q)))
+
+
+def joints(t_s: float, names: list[str], position: Any) -> Any:
+    return SimpleNamespace(header=header(t_s), name=names, position=position)
+
+
+def tf(*parts: tuple[float, str, str], q: Any = (0, 0, 0, 1)) -> Any:
+    moved = SimpleNamespace(translation=vector(0, 0, 1), rotation=vector(*q))
+    made = [
+        SimpleNamespace(header=header(t, parent), child_frame_id=child, transform=moved) for t, parent, child in parts
+    ]
+    return SimpleNamespace(transforms=made)
+
+
+def wrench(t_s: float = 5.0, frame: str = "ft", fx: float = 1.0) -> Any:
+    parts = SimpleNamespace(force=vector(fx, 2, 3), torque=vector(4, 5, 6))
+    return SimpleNamespace(header=header(t_s, frame), wrench=parts)
+
+
+@pytest.fixture
+def urdf(tmp_path: Path) -> Path:
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF)
+    return path
+
+
+def read_sensor(*messages: Any) -> Any:
+    sensor = Ros2Sensor("/ft")
+    for number, message in enumerate(messages):
+        sensor._queue.put(Received(message, 7, number))
+    return sensor._read_block()
+
+
+def test_a_chain_agrees_with_kinematics_written_apart(urdf: Path) -> None:
+    chain = Chain(urdf, "link0", "flange")
+    q = np.array([posture(number) for number in range(5)])
+    R, p = chain.poses(dict(zip(JOINTS, q.T, strict=True)))
+    expected_R, expected_p = flange(q)
+    assert np.allclose(R, expected_R, atol=1e-12)
+    assert np.allclose(p, expected_p, atol=1e-12)
+
+
+def test_other_joints_on_the_topic_are_left_out(urdf: Path) -> None:
+    reader = Joints("/joints", Chain(urdf, "", "flange"))
+    assert list(reader.read("/joints", joints(5.0, ["finger"], [0.1]))) == []
+    assert "missing joint1, joint2" in reader.missing()
+    (found,) = reader.read("/joints", joints(5.25, [*JOINTS, "finger"], [*posture(1), 0.1]))
+    assert found.t_ns == 5_250_000_000
+
+
+def test_a_pose_of_tf_has_the_time_of_its_oldest_part() -> None:
+    reader = Transforms("base", "flange")
+    turned = Rotation.from_euler("z", 90, degrees=True).as_quat()
+    assert list(reader.read("/tf_static", tf((0.0, "wrist", "flange"), q=turned))) == []
+    assert list(reader.read("/tf", tf((5.0, "base", "arm")))) == []
+    (found,) = reader.read("/tf", tf((5.01, "arm", "wrist")))
+    assert found.t_ns == 5_000_000_000
+    assert np.allclose(found.p_base_flange_m, [0, 0, 3])
+    assert np.allclose(found.R_base_flange, Rotation.from_quat(turned).as_matrix())
+    assert list(reader.read("/tf", tf((5.02, "arm", "wrist")))) == []  # the oldest part is that of before
+
+
+def test_a_sensor_numbers_and_stamps_its_samples() -> None:
+    samples = read_sensor(wrench(5.0), wrench(5.002))
+    assert samples.t_device_s == pytest.approx([5.0, 5.002], abs=1e-9)
+    assert samples.seq.tolist() == [0, 1]
+    assert samples.wrench[0].tolist() == [1, 2, 3, 4, 5, 6]
+
+
+def _read_tf(*messages: tuple[str, Any]) -> None:
+    reader = Transforms("base", "flange")
+    for topic, message in messages:
+        list(reader.read(topic, message))
+    raise ProtocolError(reader.missing())
+
+
+BAD_MESSAGES: list[tuple[str, Callable[[], object]]] = [
+    ("stamp 0", lambda: read_sensor(wrench(0.0))),
+    ("stamp 0", lambda: list(Poses("/p").read("/p", pose(0.0)))),
+    ("stamp -1", lambda: list(Poses("/p").read("/p", pose(-1.0)))),
+    ("frame changed from 'ft' to 'other'", lambda: read_sensor(wrench(), wrench(frame="other"))),
+    ("pose of /p is not finite", lambda: list(Poses("/p").read("/p", pose(p=(NAN, 0, 0))))),
+    ("pose of /p is not finite", lambda: list(Poses("/p").read("/p", pose(q=(0, 0, 0, float("inf")))))),
+    ("quaternion of length 0.5", lambda: list(Poses("/p").read("/p", pose(q=(0, 0, 0, 0.5))))),
+    ("quaternion of length 0", lambda: list(Poses("/p").read("/p", pose(q=(0, 0, 0, 0))))),
+    ("tf has no frame 'flange'", lambda: _read_tf(("/tf", tf((5.0, "base", "arm"))))),
+    ("nothing is above arm", lambda: _read_tf(("/tf", tf((5.0, "arm", "flange"), (5.0, "base", "other"))))),
+    ("moves, so none has a time", lambda: _read_tf(("/tf_static", tf((0.0, "base", "flange"))))),
+    ("stamp 0", lambda: _read_tf(("/tf", tf((0.0, "base", "flange"))))),
+    (
+        "are 0.50 s apart",
+        lambda: _read_tf(
+            ("/tf", tf((5.0, "base", "arm"), (5.0, "arm", "flange"))),
+            ("/tf", tf((5.5, "arm", "flange"), (5.001, "base", "arm"))),
+        ),
+    ),
+    (
+        "does not connect base with flange",
+        lambda: _read_tf(("/tf", tf((5.0, "a", "flange"), (5.0, "flange", "a"), (5.0, "base", "b")))),
+    ),
+]
+
+
+@pytest.mark.parametrize(("words", "read"), BAD_MESSAGES)
+def test_a_message_that_cannot_be_used_is_one_sentence(words: str, read: Callable[[], object]) -> None:
+    with pytest.raises(DeviceError) as error:
+        read()
+    assert re.search(words, str(error.value))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "names", "position"),
+    [
+        ("7 names and 3 positions", JOINTS, [0.0, 0.0, 0.0]),
+        ("a joint of /j is not finite", JOINTS, [0.0] * 6 + [NAN]),
+    ],
+)
+def test_joints_that_cannot_be_used_are_one_sentence(
+    words: str, names: list[str], position: list[float], urdf: Path
+) -> None:
+    with pytest.raises(ProtocolError, match=words):
+        list(Joints("/j", Chain(urdf, "", "flange")).read("/j", joints(5.0, names, position)))
+
+
+@pytest.mark.parametrize(
+    ("words", "host"),
+    [
+        ("names no topic", "ros2:"),
+        ("names no topic", "ros2:/"),
+        ("tf needs base and flange", "ros2:tf"),
+        ("tf needs base and flange", "ros2:tf?base=base"),
+        ("unknown option parent", "ros2:tf?base=base&flange=f&parent=x"),
+        ("option is given twice", "ros2:tf?base=base&base=other&flange=f"),
+        ("base and flange go with tf or urdf", "ros2:/pose?flange=f"),
+        ("option 'flange' is missing", "ros2:/joints?urdf={urdf}"),
+        ("has no link 'flang': did you mean flange", "ros2:/joints?urdf={urdf}&flange=flang"),
+        ("link0 is not below link7", "ros2:/joints?urdf={urdf}&flange=link0&base=link7"),
+        ("no joint moves between link7 and flange", "ros2:/joints?urdf={urdf}&flange=flange&base=link7"),
+        ("is not a URDF", "ros2:/joints?urdf=none.urdf&flange=flange"),
+        ("is not a URDF", "ros2:/joints?urdf={broken}&flange=flange"),
+        ("a joint cannot be read", "ros2:/joints?urdf={planar}&flange=flange"),
+    ],
+)
+def test_an_address_that_cannot_be_used_is_one_sentence(words: str, host: str, urdf: Path) -> None:
+    broken, planar = urdf.with_name("broken.urdf"), urdf.with_name("planar.urdf")
+    broken.write_text(URDF[:-20])
+    planar.write_text(URDF.replace('type="fixed"', 'type="planar"'))
+    with pytest.raises(BadUrl, match=words):
+        Ros2Arm(host.format(urdf=urdf, broken=broken, planar=planar))
+
+
+@pytest.mark.parametrize("url", ["ros2:", "ros2:/", "ros2:/ft?reliable=2", "ros2:/ft?rate=5", "ros2:/ft#x"])
+def test_an_address_of_a_sensor_that_cannot_be_used_is_one_sentence(url: str) -> None:
+    with pytest.raises(FtdriveError, match=r"names no device|reliable|unknown option rate"):
+        sensor_from_url(url)
+
+
+def test_addresses_of_topics() -> None:
+    sensor = sensor_from_url("ros2:/robot/ft?reliable=1&recover=1&range=300,30", sign=-1)
+    assert isinstance(sensor, Ros2Sensor)
+    assert (sensor.name, sensor.recover) == ("ROS 2 topic /robot/ft", True)
+    assert list(pose_reader_of("ros2:/arm/pose").topics) == ["/arm/pose"]
+    assert list(pose_reader_of("ros2:tf?base=b&flange=f").topics) == ["/tf", "/tf_static"]
