@@ -134,12 +134,7 @@ def test_a_full_disk_is_no_crash() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    [
-        name
-        for name in names(cli)
-        if name
-        not in ("demo", "live", "push", "record", "serve-load", "stream", "weigh", *GUIDED, *REHEARSED, *OFFLINE)
-    ],
+    [name for name in names(cli) if name not in ("live", "push", "record", *ELSEWHERE, *GUIDED, *REHEARSED, *OFFLINE)],
 )
 def test_every_command_works_with_simulate_and_json(
     command: str, ftdrive: CommandLine, capfd: pytest.CaptureFixture[str]
