@@ -1,6 +1,6 @@
 """Recordings of other programs in ROS 2: rosbag2 folders, and MCAP files without our header. Needs the extra `ros2`.
 
-`compensate` reads them as two CSV files, as it does recordings of any other program: decision 242. `solve`
+`compensate` reads them as two CSV files, as it does recordings of any other program: decision 181. `solve`
 takes the same numbers without files, so that both agree with the CSV files of the same data.
 """
 
