@@ -16,7 +16,7 @@ from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError, ProtocolError
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Diagnosis, Fact, FtSamples
 from ftdrivers.ros2.middleware import Node
-from ftdrivers.ros2.subscription import Received, clock_diagnosis, stamp_ns, subscribe
+from ftdrivers.ros2.subscription import Received, clock_diagnosis, require_one_publisher, stamp_ns, subscribe
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor
 
 if TYPE_CHECKING:
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 _TYPE = "geometry_msgs/msg/WrenchStamped"
 _WAIT_S = 0.05
+_LOOK_S = 1.0
+"""Between two looks whether another node publishes too."""
 
 
 class Ros2Sensor(StreamingSensor):
@@ -48,6 +50,7 @@ class Ros2Sensor(StreamingSensor):
         self._ros: Node | None = None
         self._queue: SimpleQueue[Received] = SimpleQueue()
         self._frame_id: str | None = None
+        self._looked_s = 0.0
 
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
@@ -76,6 +79,9 @@ class Ros2Sensor(StreamingSensor):
     def _read_block(self) -> FtSamples:
         if self._ros is not None:
             self._ros.check()
+            if (now_s := self._clock.now_s()) - self._looked_s > _LOOK_S:
+                self._looked_s = now_s
+                require_one_publisher(self._ros, self._topic)
         try:
             received = [self._queue.get(timeout=_WAIT_S)]
         except Empty:

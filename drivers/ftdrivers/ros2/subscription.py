@@ -1,7 +1,7 @@
 """One topic of another program: who publishes it, and each message with its stamp, number and time of receipt."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from ftdrivers.clock import Clock
@@ -51,7 +51,9 @@ def subscribe(
     Raises
     ------
     ConnectError
-        Nobody publishes the topic, two nodes do, its type is another one, or it offers best effort alone.
+        Nobody publishes the topic, its type is another one, or it offers best effort alone.
+    ProtocolError
+        Two nodes publish it.
     """
     package, _, name = kind.partition("/msg/")
     message_type = getattr(ros2_module(f"{package}.msg"), name)
@@ -112,11 +114,7 @@ def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool
             found = ros.node.get_publishers_info_by_topic(topic)
             break
         clock.sleep(0.05)
-    kinds = sorted({one.topic_type for one in found})
-    names = sorted(
-        "a program without a node" if _UNNAMED in one.node_name else f"{one.node_namespace.rstrip('/')}/{one.node_name}"
-        for one in found
-    )
+    kinds, names = sorted({one.topic_type for one in found}), _names(found)
     if not found:
         same = [name for name, types in ros.node.get_topic_names_and_types() if kind in types and name != topic]
         others = f"topics of this type: {', '.join(same)}" if same else "no topic has this type"
@@ -124,12 +122,25 @@ def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool
         raise ConnectError(f"no node publishes {topic} ({kind}); {others}", domain)
     if kinds != [kind]:
         raise ConnectError(f"{topic} has the type {', '.join(kinds)}, needed is {kind}", "give another topic")
-    if len(found) > 1:
-        raise ConnectError(f"{len(found)} nodes publish {topic}: {', '.join(names)}", "stop all but one of them")
+    require_one_publisher(ros, topic)
     best_effort = ros2_module("rclpy.qos").ReliabilityPolicy.BEST_EFFORT
     if reliable and found[0].qos_profile.reliability == best_effort:
         raise ConnectError(f"{topic} is offered with best effort alone", "leave the option reliable out")
     return names[0]
+
+
+def require_one_publisher(ros: Node, topic: str) -> None:
+    """Raise `ProtocolError` if more than one node publishes a topic; some are discovered after seconds."""
+    names = _names(ros.node.get_publishers_info_by_topic(topic))
+    if len(names) > 1:
+        raise ProtocolError(f"{len(names)} nodes publish {topic}: {', '.join(names)}", "stop all but one of them")
+
+
+def _names(publishers: Sequence[Any]) -> list[str]:
+    return sorted(
+        "a program without a node" if _UNNAMED in one.node_name else f"{one.node_namespace.rstrip('/')}/{one.node_name}"
+        for one in publishers
+    )
 
 
 def stamp_ns(header: Any, topic: str) -> int:
