@@ -33,8 +33,9 @@ def test_the_classifiers_begin_with_the_oldest_python() -> None:
 
 
 def compiled(python: str, system: str) -> str:
-    """Resolve the default install, all extras and the tests from wheels alone; return the pinned requirements."""
+    """Resolve the default install, all extras and the tests from wheels; return the pinned requirements."""
     command = ["pip", "compile", "pyproject.toml", "--all-extras", "--group", "dev", "--only-binary", ":all:"]
+    command += ["--no-binary", "empy"]  # pure Python without a wheel, which rclpy requires
     command += ["--python", sys.executable, "--python-version", python, "--python-platform", system, "--no-header"]
     return run_uv(*command, cwd=ROOT)
 
