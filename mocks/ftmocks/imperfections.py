@@ -12,7 +12,8 @@ Chosen here, where the sources are silent:
 
 * The gear ratio is 101. The shares of k = 2, 4, 6 in the power are 60, 30 and 10 %.
 * The ripple is an acceleration of the tool along the axes of the sensor, whatever the tool's mass. It has its full size
-  however many joints turn, in shares of their speed, and fades below .3 rad/s with the square of the speed.
+  however many joints turn, in shares of their speed. That of a joint fades below .3 rad/s of this joint with the square
+  of its speed, as the acceleration of an error in the position of a gear does.
 * Each joint rings behind its encoder, as a mass on a spring that follows the joint. The seed draws the frequency.
 * The noise of joint angles is white, also at rest; joint speeds have none.
 * The sensor's delay is that of its filter, 3 ms. The wires of the emulated cell add their own delay and jitter.
@@ -124,7 +125,7 @@ class Ripple:
     def at(self, q_rad: Array, qd_rad_s: Array) -> Array:
         """Return accelerations of the tool, (n, 3) in m/s², sensor axes, for joints (n, 6) and their speeds."""
         speed = np.linalg.norm(qd_rad_s, axis=1, keepdims=True)
-        shares = qd_rad_s * (-np.expm1(-((speed / FULL_SPEED_RAD_S) ** 2)) / np.maximum(speed, 1e-12))
+        shares = qd_rad_s / np.maximum(speed, 1e-12) * -np.expm1(-((qd_rad_s / FULL_SPEED_RAD_S) ** 2))
         turns = np.exp(1j * q_rad[:, :, None] * self._orders) * shares[:, :, None]
         return np.asarray((turns.reshape(len(q_rad), -1) @ self._waves).real)
 
