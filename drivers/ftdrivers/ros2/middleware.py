@@ -1,6 +1,6 @@
 """The way to rclpy: that of a sourced ROS 2, else the wheels of the extra `ros2`. Nothing else of ROS is used.
 
-docs/decisions/0240-ros-2-through-rclpy-alone.md gives the reason.
+docs/decisions/0179-ros-2-through-rclpy-alone.md gives the reason.
 """
 
 import importlib
