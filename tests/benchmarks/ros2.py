@@ -105,7 +105,12 @@ def play_plain(out: Path) -> None:
 
 def watch(ended: threading.Event) -> None:
     """Set an event when stdin is closed."""
-    threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
+
+    def wait() -> None:
+        sys.stdin.read()
+        ended.set()
+
+    threading.Thread(target=wait, daemon=True).start()
 
 
 def measured(folder: Path, role: str, sensor: str, seconds: float) -> tuple[Any, dict[str, Any]]:

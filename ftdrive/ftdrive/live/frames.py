@@ -51,7 +51,7 @@ class FrameTransform:
         """Return the matrix (6, 6) of the transform at one orientation (3, 3)."""
         if not self._turns:
             return self._matrix
-        return (R_base_flange @ self._matrix.reshape(2, 3, 6)).reshape(6, 6)
+        return np.asarray((R_base_flange @ self._matrix.reshape(2, 3, 6)).reshape(6, 6))
 
 
 def frames_in_flange(frame: WrenchFrame, info: StreamInfo, R_base_flange: Array) -> dict[str, tuple[Array, Array]]:

@@ -22,9 +22,7 @@ from ftdrivers.interfaces import ArmStates, FtSamples
 FORMAT: Final = "ftdrive.motion/1"
 _WRENCH: Final = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 _POSES: Final = ("t_host_ns", "t_device_s", "q_rad", "qd_rad_s", "R_base_flange", "p_base_flange_m")
-_OUTLIER_SIGMAS, _PASSES = 3.0, 3
-_SOONEST: Final = 0.01
-"""Share of the samples that are received the soonest: their time of receipt is that of the measurement."""
+_PASSES: Final = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,15 +87,21 @@ class MotionRecording:
 
 
 def measured_s(count: Any, t_host_ns: Any, start_ns: int) -> Array:
-    """Return the times of measurement (n,): the straight line below the times of receipt over the device's count."""
+    """Return the times of measurement (n,): the straight line below the times of receipt over the device's count.
+
+    Of all lines with no sample below it, the one that is the nearest to all on average: however many samples a computer
+    that starves receives late, it goes through those that came the soonest.
+    """
     x, y = np.asarray(count, dtype=np.float64) - float(count[0]), (t_host_ns - start_ns) * 1e-9
-    kept = np.ones(len(x), bool)
-    for _ in range(_PASSES):  # a computer that starves receives some samples late
-        slope, offset = np.polyfit(x[kept], y[kept], 1)
-        off = y - slope * x - offset
-        kept = np.abs(off) <= _OUTLIER_SIGMAS * 1.4826 * float(np.median(np.abs(off))) + 1e-6
-    soonest = np.quantile(off, _SOONEST)
-    return np.asarray(np.maximum.accumulate(slope * x + offset + soonest))
+    middle = int(np.clip(np.searchsorted(x, x.mean(), "right"), 1, len(x) - 1))
+    slope = (y[-1] - y[0]) / (x[-1] - x[0])
+    for _ in range(_PASSES):  # Newton's method: equal distances of the soonest sample in both parts
+        above = y - slope * x
+        i, j = int(np.argmin(above[:middle])), middle + int(np.argmin(above[middle:]))
+        before, slope = slope, (y[j] - y[i]) / (x[j] - x[i])
+        if slope == before:
+            break
+    return np.asarray(np.maximum.accumulate(slope * x + np.min(y - slope * x)))
 
 
 def solve_motion_file(

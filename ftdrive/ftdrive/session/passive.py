@@ -13,7 +13,7 @@ from ftdrive.runs.run import Run
 from ftdrive.session.events import MotionRecorded
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key
-from ftdrivers.errors import DeviceTimeout
+from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 FIRST_S: Final = 10.0
@@ -21,7 +21,7 @@ FIRST_S: Final = 10.0
 LONGER: Final = 1.25
 LEAST_S: Final = 5.0
 _READ_S: Final = 0.2
-_SILENT_S: Final = 2.0
+_SILENT_S: Final = 10.0
 """A shorter silence of a device is a gap in the recording, not its end."""
 GOOD: Final = 2
 """So many good fits in a row end it."""
@@ -49,7 +49,7 @@ def record_passively(cell: OpenCell, run: Run, seconds: float, setup: Setup, g_m
                 samples.append(wrench.read(_READ_S))
                 states.append(poses.read(0.0))
                 heard_s = cell.clock.now_s()
-            except DeviceTimeout:
+            except (DeviceTimeout, StreamBroken, ConnectError):  # a sensor with `recover` reconnects
                 if cell.clock.now_s() - heard_s > _SILENT_S:
                     raise
                 cell.clock.sleep(_READ_S)
