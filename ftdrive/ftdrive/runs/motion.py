@@ -89,7 +89,7 @@ class MotionRecording:
 
 
 def measured_s(count: Any, t_host_ns: Any, start_ns: int) -> Array:
-    """Return the times of measurement (n,): the straight line over the device's count that is closest below all receipts.
+    """Return the times of measurement (n,): the line over the device's count that is closest below all receipts.
 
     A computer that starves receives samples late, for seconds on end, but none early. Source: Moon, Skelly, Towsley,
     "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999.
@@ -102,7 +102,7 @@ def measured_s(count: Any, t_host_ns: Any, start_ns: int) -> Array:
     )
     at, above = x[soonest] / max(x[-1], 1.0), 1e3 * (late_s[soonest] - late_s.min())
     line = linprog([-0.5, -1.0], np.column_stack([at, np.ones(len(at))]), above, bounds=(None, None))
-    turn_s, offset_s = 1e-3 * line.x
+    turn_s, offset_s = 1e-3 * np.asarray(line.x, dtype=np.float64)
     return np.asarray(rough * x + late_s.min() + offset_s + turn_s * x / max(x[-1], 1.0))
 
 
