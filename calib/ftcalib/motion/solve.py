@@ -271,7 +271,7 @@ def _findings(
         values = {"height_mm": 1e3 * best.load.height_m, "sigma_mm": 1e3 * sigma[HEIGHT]}
         found.append(Finding.of("height_differs", **values, configured_mm=1e3 * height_m))
     if motion.contacts:
-        share = 1 - float(best.kept.mean())
+        share = sum(one["duration_s"] for one in motion.contacts) / max(len(used) * used.row_s, 1e-9)
         largest_N = max(one["force_N"] for one in motion.contacts)
         values = {"count": len(motion.contacts), "share_percent": 100 * share, "force_N": largest_N}
         found.append(Finding.of("mostly_contact" if share > MOSTLY else "contacts_left_out", **values))

@@ -116,7 +116,6 @@ def solve_motion_file(
         wrench,
         poses,
         known=known,
-        guarded=True,
         height_m=height_m,
         provenance={**provenance, **source},
         **circumstances,
