@@ -31,7 +31,7 @@ _CALLS = {
     "diff": ("diff", "a.json", "a.json"),
     "convert": ("convert", _RECORDING, "{new}.csv"),
     "compensate": ("compensate", _RECORDING),
-    "export": ("export", "calibration", "a.json", "--for", "numbers"),
+    "export": ("export", "calibration", "a.json", "--format", "json"),
 }
 """The smallest call that needs no device, in a folder with 17 poses, a calibration of them and a store with it."""
 _LIMITS = {"solve": 1.5, "report": 2.0 / 0.45, "history": 0.35 / 0.45, "devices": 0.35 / 0.45}
