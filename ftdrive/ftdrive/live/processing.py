@@ -33,6 +33,8 @@ from ftdrive.live.samples import (
     WrenchFrame,
 )
 from ftdrive.live.tare import TARE_S, try_tare
+from ftdrive.live.tracking import Tracked, Tracker
+from ftdrive.live.windows import Windows
 from ftdrivers.clock import Clock
 from ftdrivers.interfaces import WRIST_SENSOR, Array
 
@@ -94,6 +96,10 @@ class Processor:
             info.sensor_rate_Hz, accelerated(calibration.mass_kg, calibration.parameters.p_sensor_com_m)
         )
         self._noise_is_learnt = False
+        self.track = False
+        self.tracked: Tracked | None = None
+        self._windows = Windows(info)
+        self._load_tracker = Tracker(calibration.mass_kg, calibration.parameters.p_sensor_com_m)
         in_wrist = info.sensor.model == WRIST_SENSOR
         self._test = ContactTest(
             info.sensor_rate_Hz, false_alarm_rate, beyond, calibration.R_flange_sensor[2] if in_wrist else None
@@ -313,6 +319,9 @@ class Processor:
         )
         if n:
             self._state, self.reading = int(states[-1]), readings[-1]
+        if self.track:
+            for window in self._windows.add(rows, states, self._noise):
+                self.tracked = self._load_tracker.update(window)
         readings = self._transform(readings, rows.R_base_flange)
         soon = (states == REST) & (known is Inertia.EXACT)
         in_contact, contacts = self._tracker.follow(rows.t_host_ns, beyond, readings, soon)
