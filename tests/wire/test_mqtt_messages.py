@@ -9,6 +9,7 @@ from contextlib import closing, contextmanager
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
+from socket import socket
 from threading import Event
 from typing import Any
 
@@ -191,4 +192,6 @@ def test_a_certificate_must_be_one_that_the_computer_trusts(tmp_path: Path, monk
             found.update(reading(cell("A")))
             wait_until(lambda: found._answers)
             assert not said
+        open_sockets = [one for one in vars(found._client).values() if isinstance(one, socket) and one.fileno() >= 0]
+        assert not open_sockets
     gc.collect()

@@ -51,7 +51,7 @@ def subscribe(
     Raises
     ------
     ConnectError
-        Nobody publishes the topic, its type is another one, or it offers best effort alone.
+        No node publishes the topic, its type is another one, or it offers best effort alone.
     ProtocolError
         Two nodes publish it.
     """

@@ -3,9 +3,10 @@
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from os import fsdecode
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast, get_args
 
 import click
 
@@ -66,15 +67,6 @@ CALIBRATION = click.option(
     type=click.Path(exists=True, path_type=Path),
     help="A calibration.json or its run folder. With --simulate the default is a new one.",
 )
-
-
-def CALIBRATION_OR_TOOL(command: F) -> F:
-    """Add the options --calibration, --tool and --force, which `open_source` takes."""
-    tool = click.option("--tool", metavar="NAME", help="Newest accepted calibration of this tool on this cell.")
-    force = click.option(
-        "--force", is_flag=True, help=f"Apply a calibration of another arm, sensor or mount, or one {EDITED}."
-    )
-    return CALIBRATION(tool(force(command)))
 
 
 def BAG_TOPICS(command: F) -> F:
@@ -170,6 +162,42 @@ def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated:
         raise ConfigError(f"{given[0]} {'does not go with' if simulate else 'goes only with'} --simulate: {fix}")
 
 
+class Source(NamedTuple):
+    """The cell and the calibration of a compensated stream, as the options of `SOURCE` name them."""
+
+    path: Path | None
+    tool: str | None
+    force: bool
+    config: Path | None
+    robot: str | None
+    sensor: str | None
+    simulate: bool
+
+    def check(self) -> None:
+        """Raise `ConfigError` for options that exclude one another."""
+        from ftdrive.errors import ConfigError
+
+        check_simulate(self.simulate, real={"--tool": self.tool, "--config": self.config, "--robot": self.robot})
+        if self.path is not None and self.tool is not None:
+            raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
+
+
+def SOURCE(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that name cell and calibration, and pass them to the command as one `Source`."""
+
+    @wraps(command)
+    def with_source(**options: Any) -> None:
+        source = Source(*(options.pop(name) for name in Source._fields))
+        source.check()
+        command(source=source, **options)
+
+    force = f"Apply a calibration of another arm, sensor or mount, or one {EDITED}."
+    tool = "Newest accepted calibration of this tool on this cell."
+    found = simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")(with_source)
+    found = click.option("--force", is_flag=True, help=force)(CELL(found))
+    return CALIBRATION(click.option("--tool", metavar="NAME", help=tool)(found))
+
+
 def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
     """Read the numbers in the value of an option; raises `ConfigError` unless their count is one of `counts`."""
     from math import isfinite
@@ -191,19 +219,16 @@ def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[
     return [numbers(option, text, ":", counts) for text in texts] or None
 
 
-def FRAME(command: F) -> F:
-    """Add the options --axes and --about, which `read_frame` takes."""
-    about = click.option(
-        "--about",
-        default="sensor",
-        show_default=True,
-        metavar="POINT",
-        help="Reference point of the torque: sensor, flange, tcp, or x,y,z in m from the flange along its axes.",
-    )
-    axes = click.Choice(["sensor", "flange", "base", "tcp"])
-    return click.option("--axes", type=axes, default="sensor", show_default=True, help="Axes of the wrench.")(
-        about(command)
-    )
+def frame_options(axes: "Axes", about: str) -> Callable[[F], F]:
+    """Make the options --axes and --about, which `read_frame` takes, with their defaults."""
+    point = "Reference point of the torque: sensor, flange, tcp, or x,y,z in m from the flange along its axes."
+    about_option = click.option("--about", default=about, show_default=True, metavar="POINT", help=point)
+    choice = click.Choice(["sensor", "flange", "base", "tcp"])
+    axes_option = click.option("--axes", type=choice, default=axes, show_default=True, help="Axes of the wrench.")
+    return lambda command: axes_option(about_option(command))
+
+
+FRAME = frame_options("sensor", "sensor")
 
 
 def read_frame(axes: "Axes", about: str) -> "WrenchFrame":

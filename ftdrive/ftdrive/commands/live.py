@@ -16,14 +16,13 @@ from rich.live import Live
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_weighed_payload
 from ftdrive.commands.common import (
-    CALIBRATION_OR_TOOL,
-    CELL,
     FRAME,
     JSON,
+    SOURCE,
     Number,
+    Source,
     check_simulate,
     read_frame,
-    simulate,
     write_json,
 )
 from ftdrive.commands.live_source import RECOVER_S, open_source
@@ -50,9 +49,7 @@ _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
 
 
 @click.command()
-@CALIBRATION_OR_TOOL
-@CELL
-@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@SOURCE
 @click.option(
     "--replay",
     metavar="RUN|RECORDING",
@@ -65,13 +62,7 @@ _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
 @click.option("--plain", is_flag=True, help="Show a table instead of the full screen; lines in a file.")
 @JSON
 def live(
-    path: Path | None,
-    tool: str | None,
-    force: bool,
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
-    simulate: bool,
+    source: Source,
     replay: Path | None,
     speed: float | None,
     axes: Axes,
@@ -86,10 +77,10 @@ def live(
     chosen point. The arm is only read, never moved. With --json, one object per line. With --simulate, the key f pushes
     the tool.
     """
-    check_simulate(simulate, real={"--config": config, "--robot": robot, "--replay": replay})
+    check_simulate(source.simulate, real={"--replay": replay})
     if speed is not None and replay is None:
         raise ConfigError("--speed goes only with --replay: add it, or leave --speed out")
-    if replay is not None and tool:
+    if replay is not None and source.tool:
         raise ConfigError("--tool does not go with --replay: leave one of the two out")
     frame = read_frame(axes, about)
     with ExitStack() as stack:
@@ -98,13 +89,11 @@ def live(
         recorder: Callable[[Path], Recorder] | None = None
         push: Callable[[], object] | None = None
         if replay is not None:
-            stream = _replayed(replay, path, frame, speed=1.0 if speed is None else speed, force=force)
+            stream = _replayed(replay, source.path, frame, speed=1.0 if speed is None else speed, force=source.force)
         else:
-            stream = open_source(
-                path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
-            )
+            stream = open_source(source, frame, stack)
             checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, stream.cell.sensor.mass_kg)]
-            if simulate:
+            if source.simulate:
                 push = partial(stream.station.control, do="push", wrench=_PUSH, seconds=1.0)
             recorder = partial(_recorder, stream.info, stream.cell.to_dict())
         if once or as_json or not sys.stdout.isatty():

@@ -1,11 +1,10 @@
-"""The compensated stream of the cell that the options name, for `live`, `record` and `stream`."""
+"""The compensated stream of the cell that the options name, for the commands that have `SOURCE`."""
 
 from contextlib import ExitStack
-from pathlib import Path
 
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.common import check_simulate, read_cell
+from ftdrive.commands.common import Source, read_cell
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import WrenchFrame
 from ftdrive.live.stream import CompensatedStream
@@ -18,36 +17,13 @@ RECOVER_S = 10.0
 """So long a stream with an interruption may take to deliver again; then the command ends."""
 
 
-def open_source(
-    path: Path | None,
-    tool: str | None,
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
-    *,
-    force: bool,
-    simulate: bool,
-    frame: WrenchFrame,
-    stack: ExitStack,
-) -> CompensatedStream:
+def open_source(source: Source, frame: WrenchFrame, stack: ExitStack) -> CompensatedStream:
     """Open the stream of a real or an emulated cell; `stack` closes it.
 
-    The state of the calibration and warnings are printed.
-
-    Parameters
-    ----------
-    path : Path, optional
-        A calibration.json or its run folder. Only an emulated cell needs none: it is calibrated first.
-    tool : str, optional
-        Instead of `path`, on a real cell: the newest accepted calibration of this tool.
-    config, robot, sensor
-        As `read_cell` takes them.
-    force : bool
-        Apply a calibration of another arm, sensor or mount, or one that was edited by hand.
+    The state of the calibration and warnings are printed. Only an emulated cell needs no calibration: it is calibrated
+    first.
     """
-    check_simulate(simulate, real={"--tool": tool})
-    if path is not None and tool is not None:
-        raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
+    path, tool, force, config, robot, sensor, simulate = source
     calibration = None if path is None else read_calibration(path, accept_edited=force)
     cell: CellConfig | Station
     if simulate:

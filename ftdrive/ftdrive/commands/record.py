@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ftdrive.commands.common import (
-    CALIBRATION_OR_TOOL,
-    CELL,
     FRAME,
     JSON,
+    SOURCE,
     NewFile,
-    check_simulate,
+    Source,
     read_frame,
-    simulate,
     write_json,
 )
 from ftdrive.errors import RecordingHasGaps
@@ -60,22 +58,14 @@ class Duration(click.ParamType):  # type: ignore[type-arg]  # a generic type in 
     help="Duration, such as 60s, 10min or 1h; without a limit, until Ctrl-C.",
 )
 @click.option("--count", type=click.IntRange(1), help="Number of samples.")
-@CALIBRATION_OR_TOOL
-@CELL
-@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@SOURCE
 @FRAME
 @JSON
 def record(
     paths: Sequence[Path],
     duration_s: float | None,
     count: int | None,
-    path: Path | None,
-    tool: str | None,
-    force: bool,
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
-    simulate: bool,
+    source: Source,
     axes: "Axes",
     about: str,
     as_json: bool,
@@ -90,13 +80,10 @@ def record(
     from ftdrive.recording.files import require_new_recordings
     from ftdrive.terminal.console import messages, working
 
-    check_simulate(simulate, real={"--config": config, "--robot": robot})
     require_new_recordings(paths)
     frame = read_frame(axes, about)
     with ExitStack() as stack:
-        stream = open_source(
-            path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
-        )
+        stream = open_source(source, frame, stack)
         recorder = Recorder(paths, stream.info, stream.cell.to_dict())
         messages.print(f" Recording, {frame}. Ctrl-C ends.")
         try:

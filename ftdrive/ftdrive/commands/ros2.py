@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 from contextlib import closing
-from pathlib import Path
 from typing import Any, cast
 
 import click
 
-from ftdrive.commands.common import CALIBRATION_OR_TOOL, CELL, FRAME, check_simulate, read_cell, read_frame, simulate
+from ftdrive.commands.common import FRAME, SOURCE, Source, read_cell, read_frame
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Axes
 from ftdrive.live.stream import CompensatedStream
@@ -31,9 +30,7 @@ class _RosCommand(click.Command):
 
 
 @click.command(cls=_RosCommand)
-@CALIBRATION_OR_TOOL
-@CELL
-@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@SOURCE
 @FRAME
 @click.option(
     _ROS_ARGS,
@@ -42,13 +39,7 @@ class _RosCommand(click.Command):
     help="Arguments of ROS until the end of the line: -r __ns:=/cell_1, -p rate:=100.0, --params-file FILE.",
 )
 def ros2(
-    path: Path | None,
-    tool: str | None,
-    force: bool,
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
-    simulate: bool,
+    source: Source,
     axes: Axes,
     about: str,
     ros_args: Sequence[str],
@@ -62,9 +53,7 @@ def ros2(
     ros2_module("rclpy")  # before any work
     from ftdrive.servers.ros2.node import Ros2Node
 
-    check_simulate(simulate, real={"--tool": tool, "--config": config, "--robot": robot})
-    if path is not None and tool is not None:
-        raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
+    path, tool, force, config, robot, sensor, simulate = source
     frame = read_frame(axes, about)
     calibration = None if path is None else read_calibration(path, accept_edited=force)
     cell = None if simulate else read_cell(config, robot, sensor)
@@ -77,10 +66,10 @@ def ros2(
                 raise ConfigError("no calibration: give --calibration PATH or --tool NAME, or --simulate")
 
             def open_stream() -> CompensatedStream:
-                source = station_of(calibration, sensor) if cell is None and calibration is not None else cell
+                place = station_of(calibration, sensor) if cell is None and calibration is not None else cell
                 name = "temporary calibration" if path is None else str(path)
                 chosen = node.parameters.tool or calibration
-                return CompensatedStream(cast(Any, source), cast(Any, chosen), name=name, force=force)
+                return CompensatedStream(cast(Any, place), cast(Any, chosen), name=name, force=force)
 
             messages.print(
                 f"Node {node.name} publishes {node.name}/wrench in {node.parameters.frame}, at most "

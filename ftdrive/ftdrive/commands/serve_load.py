@@ -2,12 +2,11 @@
 
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 
 import click
 
 from ftdrive.cell.devices import program_registers
-from ftdrive.commands.common import CALIBRATION_OR_TOOL, CELL, read_frame, simulate
+from ftdrive.commands.common import SOURCE, Source, frame_options, read_frame
 from ftdrive.commands.live_source import open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Axes
@@ -17,32 +16,11 @@ from ftdrivers.ur.program_registers import FIRST, LAST
 
 
 @click.command()
-@CALIBRATION_OR_TOOL
-@CELL
-@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
-@click.option(
-    "--axes",
-    type=click.Choice(["sensor", "flange", "base", "tcp"]),
-    default="base",
-    show_default=True,
-    help="Axes of the wrench.",
-)
-@click.option(
-    "--about",
-    default="tcp",
-    show_default=True,
-    metavar="POINT",
-    help="Reference point of the torque: sensor, flange, tcp, or x,y,z in m from the flange along its axes.",
-)
+@SOURCE
+@frame_options("base", "tcp")
 @click.option("--first", type=int, default=FIRST, show_default=True, help="First register of each kind.")
 def serve_load(
-    path: Path | None,
-    tool: str | None,
-    force: bool,
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
-    simulate: bool,
+    source: Source,
     axes: Axes,
     about: str,
     first: int,
@@ -60,9 +38,7 @@ def serve_load(
         )
     frame = read_frame(axes, about)
     with ExitStack() as stack:
-        stream = open_source(
-            path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
-        )
+        stream = open_source(source, frame, stack)
         if stream.cell.sensor.height_mm is None:
             raise ConfigError("the centre of mass of a part needs [sensor] height_mm: set it, see `ftdrive init`")
         connect = partial(program_registers, stream.cell, first, len(INTEGERS), len(DOUBLES))

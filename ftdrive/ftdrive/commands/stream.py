@@ -3,18 +3,15 @@
 import socket
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from ftdrive.commands.common import (
-    CALIBRATION_OR_TOOL,
-    CELL,
     FRAME,
-    check_simulate,
+    SOURCE,
+    Source,
     read_frame,
-    simulate,
 )
 from ftdrive.commands.live_source import RECOVER_S, open_source
 from ftdrive.live.processing import ProcessedStream
@@ -30,9 +27,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@CALIBRATION_OR_TOOL
-@CELL
-@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@SOURCE
 @FRAME
 @click.option(
     "--host",
@@ -47,13 +42,7 @@ if TYPE_CHECKING:
 @click.option("--allow-control", is_flag=True, help="Pages may tare and change frame and stages; programs always may.")
 @click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
 def stream(
-    path: Path | None,
-    tool: str | None,
-    force: bool,
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
-    simulate: bool,
+    source: Source,
     axes: Axes,
     about: str,
     host: str,
@@ -70,21 +59,18 @@ def stream(
     """
     from ftdrive.servers.foxglove import FoxgloveServer
 
-    check_simulate(simulate, real={"--config": config, "--robot": robot})
     frame = read_frame(axes, about)
     udp_address = None if udp is None else host_and_port("--udp", udp, "127.0.0.1:9870")
     with ExitStack() as stack:
-        source = open_source(
-            path, tool, config, robot, sensor, force=force, simulate=simulate, frame=frame, stack=stack
-        )
+        opened = open_source(source, frame, stack)
         server = stack.enter_context(
-            closing(FoxgloveServer(source, host, port, origins=origins, allow_control=allow_control))
+            closing(FoxgloveServer(opened, host, port, origins=origins, allow_control=allow_control))
         )
         sinks: list[FoxgloveServer | UdpSender] = [server]
         if udp_address is not None:
-            sinks.append(stack.enter_context(closing(UdpSender(source.info, *udp_address))))
-        _introduce(source, server, host, udp_address)
-        serve(source, sinks)
+            sinks.append(stack.enter_context(closing(UdpSender(opened.info, *udp_address))))
+        _introduce(opened, server, host, udp_address)
+        serve(opened, sinks)
 
 
 def serve(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:

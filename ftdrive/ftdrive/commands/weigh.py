@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ftdrive.commands.common import CALIBRATION_OR_TOOL, CELL, JSON, NewFile, Number, simulate, write_json
+from ftdrive.commands.common import JSON, SOURCE, NewFile, Number, Source, write_json
 from ftdrive.commands.live_source import open_source
 from ftdrive.live.processing import SENSOR_FRAME
 from ftdrive.live.samples import StreamInfo
@@ -19,9 +19,7 @@ from ftdrive.terminal.weighing import PATIENCE_S, Shown, Weighing, line_of
 
 
 @click.command()
-@CALIBRATION_OR_TOOL
-@CELL
-@simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")
+@SOURCE
 @click.option(
     "--zero", is_flag=True, help="First tare the empty gripper: then drift since the calibration is no error."
 )
@@ -31,13 +29,7 @@ from ftdrive.terminal.weighing import PATIENCE_S, Shown, Weighing, line_of
 @click.option("-o", "--output", type=NewFile(), help="Record samples and weighings: .mcap, .csv or .parquet.")
 @JSON
 def weigh(
-    path: Path | None,
-    tool: str | None,
-    force: bool,
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
-    simulate: bool,
+    source: Source,
     zero: bool,
     poses: int,
     part_kg: float | None,
@@ -52,9 +44,7 @@ def weigh(
     only read, never moved. Ctrl-C ends.
     """
     with ExitStack() as stack:
-        stream = open_source(
-            path, tool, config, robot, sensor, force=force, simulate=simulate, frame=SENSOR_FRAME, stack=stack
-        )
+        stream = open_source(source, SENSOR_FRAME, stack)
         recorder = None
         if output is not None:
             recorder = Recorder([output], stream.info, stream.cell.to_dict())

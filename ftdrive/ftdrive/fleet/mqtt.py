@@ -145,11 +145,13 @@ class Messages:
             if self._answers:
                 self._retain(self._server_topic, self._offline)
         self._client.disconnect()
-        stopping = Thread(target=self._client.loop_stop, daemon=True)  # it may be in an attempt to connect
+        stopping = Thread(target=self._stop, daemon=True)  # it may be in an attempt to connect
         stopping.start()
         stopping.join(_GOODBYE_S)
-        for event in ("on_connect", "on_connect_fail", "on_disconnect", "on_message"):
-            setattr(self._client, event, None)  # else a cycle keeps the client, and with it its sockets
+
+    def _stop(self) -> None:
+        self._client.loop_stop()
+        self._client.reinitialise()  # closes its sockets, which would else wait for the garbage collector
 
     # ------------------------------------------------------------------------------------------------ thread of paho
 
@@ -173,7 +175,8 @@ class Messages:
                 self._retain(topic, payload)
 
     def _on_connect_fail(self, _client: Client, _data: Any) -> None:
-        self._lost(_words(sys.exception()))  # paho calls this where it handles the error
+        if self._is_open:
+            self._lost(_words(sys.exception()))  # paho calls this where it handles the error
 
     def _on_disconnect(self, _client: Client, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if self._is_open and self._rejection is None:

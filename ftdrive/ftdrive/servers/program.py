@@ -34,7 +34,7 @@ PATIENCE_S: Final = 1.0
 _TRY_NS: Final = 20_000_000
 _WAITS: Final = ("samples", "moving", "unsteady")
 _ALIKE_RAD: Final = 0.1
-"""A load in contact is told from a push by the direction of its force: so near to gravity."""
+"""A load differs from a push by the direction of its force, which is so near to gravity."""
 _COUNT_LIMIT: Final = 2**30
 
 

@@ -211,15 +211,16 @@ def test_a_result_that_solve_saves_in_its_run_is_indexed(
     assert len(Store().results()) == 2
 
 
-@pytest.mark.parametrize("command", [["live"], ["stream"], ["record", "-o", "a.csv"]])
+@pytest.mark.parametrize("command", [["live"], ["stream"], ["record", "-o", "a.csv"], ["weigh"], ["serve-load"]])
 @pytest.mark.parametrize(
     ("more", "words"),
     [
         (["--tool", "gripper", "--calibration", "."], "--calibration and --tool exclude one another"),
         (["--tool", "gripper", "--simulate"], "--tool does not go with --simulate"),
+        (["--robot", "10.0.0.2", "--simulate"], "--robot does not go with --simulate"),
     ],
 )
-def test_a_tool_excludes_what_names_another_calibration(
+def test_options_that_name_another_cell_or_calibration_are_refused(
     run: Callable[..., Ran], command: list[str], more: list[str], words: str
 ) -> None:
     code, _, err = run(*command, *more)

@@ -111,4 +111,4 @@ def test_parts_are_counted_or_not() -> None:
         count_of(weight, 0.4)
     assert refusal.value.code == "count"
     with pytest.raises(CannotWeigh):
-        count_of(weight, 0.001)  # sigma does not tell so small parts apart
+        count_of(weight, 0.001)  # sigma is larger than such a part
