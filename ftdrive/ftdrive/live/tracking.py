@@ -1,13 +1,13 @@
 """Bias and held part, followed while a program runs: a step of the load is not drift, and a contact is neither."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from scipy.special import chdtri
 
 from ftcalib.model import Array, skew
 from ftdrive.live.motion import REST, STATES
+from ftdrive.live.samples import LoadEvent, Tracked
 
 _GATE = float(chdtri(6, 1e-4))
 """Squared innovation of a window that bias and part do not explain."""
@@ -15,8 +15,8 @@ _TAILS = 4.0
 """Degrees of freedom of Student's distribution, by which a far window counts less: vibration has tails."""
 _SAME = float(chdtri(4, 1e-3))
 """Squared distance of one part from another, of which mass and moment are estimated."""
-_RUN = 4
-"""So many windows in a row agree on a part."""
+_RUN, _LONGEST_RUN = 4, 24
+"""So many windows in a row agree on a part; an earlier one counts no more."""
 _TURN_RAD, _TRAVEL_M = 0.25, 0.15
 """A new part is known once gravity has turned so far in the sensor, or the arm has gone so far: a contact stays."""
 _GUARD = 2
@@ -27,7 +27,7 @@ _BIAS = np.repeat([1.0, 0.03], 3)
 """Error of the bias at the beginning, one sigma, N and N·m."""
 _FORGET_S = 3600.0
 """The likelihood of a walk counts so long."""
-_NOTHING_KG = 0.02
+NOTHING_KG = 0.02
 """A lighter part is none."""
 _ANY_PART = np.array([5.0, 0.5, 0.5, 0.5])
 """One sigma of mass and mass times centre of a part that is not known yet, kg and kg m."""
@@ -39,41 +39,6 @@ _PLACED_M = 0.03
 """A part whose centre of mass is known so well turns about it."""
 _FIRST_WINDOWS, _MOST_WINDOWS = 10, 200
 """The first noise of a state counts as so many windows; the noise follows within so many."""
-
-
-@dataclass(frozen=True, slots=True)
-class LoadEvent:
-    """A grasp or a release, or a contact that is over."""
-
-    kind: Literal["load", "contact"]
-    t_s: float
-    """When it began."""
-    size: float
-    """Change of the mass, kg, or the largest force, N."""
-    sigma: float = 0.0
-    """Of the change of the mass, kg."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Tracked:
-    """What is followed."""
-
-    t_s: float
-    bias: Array
-    """(6,) change of the bias since the calibration, N and N·m, sensor axes."""
-    sigma: Array
-    """(6,) one standard deviation; it grows while the bias cannot be seen."""
-    part_kg: float
-    """Mass that is held beside the tool."""
-    part_sigma_kg: float
-    part_known: bool
-    """Whether the part is that of the last look; else a contact or a new part is not decided yet."""
-    last_seen_s: float
-    """Since the bias was seen."""
-    walk_N: float
-    """Random walk of the force bias in an hour, one sigma, as learnt."""
-    events: tuple[LoadEvent, ...] = ()
-    """Since the last update."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -160,7 +125,16 @@ class Tracker:
         seen_s = window.t_s - self._seen_s
         part_sigma_kg = float(np.sqrt(part_P[0, 0]))
         return Tracked(
-            window.t_s, x[:6], sigma, float(part[0]), part_sigma_kg, known, seen_s, walk_N, tuple(events)
+            window.t_s,
+            x[:6],
+            sigma,
+            float(part[0]),
+            part_sigma_kg,
+            known,
+            seen_s,
+            walk_N,
+            (part.copy(), part_P.copy()),
+            tuple(events),
         )
 
     def _follow(self, window: Window) -> None:
@@ -196,8 +170,8 @@ class Tracker:
         self._seen_s = window.t_s
 
     def _decide(self, window: Window) -> list[LoadEvent]:
-        """Try to end an interruption: which part do the last windows agree on?"""
-        self._run.append(window)
+        """End an interruption, if the last windows agree on a part."""
+        self._run = [*self._run, window][-_LONGEST_RUN:]
         while self._agreed(self._run) is None:
             del self._run[0]
         before = np.concatenate([self._mixed(self._x, self._P)[0][:6], self._before[0]])
@@ -212,7 +186,7 @@ class Tracker:
             off = mean[6:] - part
             if off @ np.linalg.solve(covariance[6:, 6:] + part_P, off) < _SAME:
                 return self._end(*_corrected(x, P, part, part_P, np.eye(10)[6:]))
-        if mean[6] < _NOTHING_KG or not self._moved(self._run):
+        if mean[6] < NOTHING_KG or not self._moved(self._run):
             return []
         return self._end(x, P)
 
@@ -230,15 +204,14 @@ class Tracker:
 
     def _end(self, x: Array, P: Array) -> list[LoadEvent]:
         """End an interruption with the part that the windows agree on."""
-        begin_s, self._open_s = self._open_s, None
-        assert begin_s is not None
+        begin_s, self._open_s = self._open_s or 0.0, None
         self._x, self._P = x, P
         self._seen_s = self._run[-_GUARD].t_s
         self._queue, self._run = self._run[-_GUARD:], []
         mean, covariance = self._mixed(x, P)
         change_kg = float(mean[6] - self._before[0][0])
         sigma_kg = float(np.sqrt(covariance[6, 6] + self._before[1][0, 0]))
-        if abs(change_kg) > max(_NOTHING_KG, 4 * sigma_kg):
+        if abs(change_kg) > max(NOTHING_KG, 4 * sigma_kg):
             return [LoadEvent("load", begin_s, change_kg, sigma_kg)]
         return [LoadEvent("contact", begin_s, self._peak_N)]
 
@@ -320,5 +293,5 @@ def _observed(window: Window, p_sensor_m: Array | None) -> Array:
 
 def _place(x: Array, P: Array) -> Array | None:
     """Return the centre of mass of a part (3,), if it is known well enough to be a centre of turning."""
-    placed = x[6] > _NOTHING_KG and float(np.trace(P[7:, 7:])) < (_PLACED_M * x[6]) ** 2
+    placed = x[6] > NOTHING_KG and float(np.trace(P[7:, 7:])) < (_PLACED_M * x[6]) ** 2
     return x[7:] / x[6] if placed else None
