@@ -195,6 +195,9 @@ def matrices_of(rotations: Rotations) -> NDArray[Any]:
 
 def skew(v: Array) -> Array:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3): skew(a) @ b = a x b."""
+    if v.ndim == 1:  # most calls, and four times faster
+        x, y, z = v.tolist()
+        return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     matrix = np.zeros((*v.shape[:-1], 3, 3))
     matrix[..., 0, 1], matrix[..., 0, 2], matrix[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
     return matrix - np.swapaxes(matrix, -1, -2)

@@ -17,6 +17,7 @@ SLOW = {"live_contact", "monte_carlo", "plan_without_robot"}
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in SLOW])
 def test_an_example_prints_what_its_page_shows(name: str, tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONIOENCODING": "utf-8"}

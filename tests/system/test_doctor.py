@@ -168,6 +168,7 @@ def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdr
     assert all(port.keys() == keys for port in (*own["serial"], *emulated["serial"]))
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_configured_otherwise_gets_the_cure_its_driver_names(
     station: Station, cell: Path, ftdrive: CommandLine
 ) -> None:

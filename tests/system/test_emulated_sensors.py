@@ -59,6 +59,7 @@ def test_a_driver_reads_the_truth_of_the_cell_and_refuses_what_is_none(name: str
                     sensor.collect(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["can", "ur-ft"])
 def test_a_station_that_is_stopped_for_a_while_loses_no_sample(name: str) -> None:
     """Its clock stands still as well: the arm's, which is 20 times faster, and that of its sensor."""

@@ -132,6 +132,7 @@ def test_a_full_disk_is_no_crash() -> None:
     assert outcome.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [name for name in names(cli) if name not in ("live", "push", "record", *ELSEWHERE, *GUIDED, *REHEARSED, *OFFLINE)],
@@ -239,6 +240,7 @@ def test_a_file_gets_the_answer_and_a_reader_that_ends_ends_the_command(
             assert outcome.stderr == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "url"),
     [

@@ -44,6 +44,7 @@ def run(*arguments: str, typed: str = "") -> Result:
     return CliRunner().invoke(cli, ["init", *arguments], input=typed)
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_questions(station: Station) -> None:
     addresses = ["--robot", station.cell.robot.host, "--sensor", serial_port(station)]
     more = [
@@ -79,6 +80,7 @@ def test_an_arm_without_a_measured_shape_is_reported(monkeypatch: pytest.MonkeyP
     assert "calibrate --manual" in outcome.output
 
 
+@pytest.mark.slow
 def test_a_bus_is_asked_what_is_there(station: Station) -> None:
     can = station.endpoints["sensors"]["can"]
     bus = f"slcan://{can['channel']}?bitrate={can['bitrate']}"
@@ -192,6 +194,7 @@ def test_the_operator_may_keep_addresses_that_do_not_answer() -> None:
     assert Path("ftdrive.toml").read_text().count("did not answer") == 2
 
 
+@pytest.mark.slow
 def test_an_emulated_cell_is_that_of_the_file_and_no_real_command_takes_it() -> None:
     more = ["--tool-name", "gripper", "--tool-mass", "1.3", "--mounting", "30", "--box", "500:500:0:900:900:90"]
     assert run("--simulate", "--sensor", "emulated://robotiq", "--yes", *TOOL, *more).exit_code == 0

@@ -17,6 +17,8 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
 from tests.wire.conftest import Station
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 SCRIPT_PORT = 30003
 DWELL_S = 1.0
 

@@ -9,6 +9,8 @@ from ftdrivers.interfaces import ArmStates, FtSamples
 from ftdrivers.registry import sensor_from_url
 from tests.wire.conftest import Station
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 SECONDS = 2.0
 
 

@@ -22,6 +22,8 @@ from tests.mosquitto import Mosquitto
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
 from tests.wire.waiting import wait_until
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 A, B = "ftdrive/cells/A/state", "ftdrive/cells/B/state"
 
 

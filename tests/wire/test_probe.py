@@ -16,6 +16,8 @@ from ftmocks.sensors.bota import BotaBox
 from ftmocks.sensors.robotiq import RobotiqBox
 from ftmocks.sensors.robotous import RobotousSerialBox
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 
 def measure(n: int) -> Any:
     return np.random.default_rng(n).normal(size=(n, 6)) + 3

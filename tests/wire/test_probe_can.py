@@ -15,6 +15,8 @@ from ftdrivers.registry import sensor_from_url
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.robotous import RobotousCanNode
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,8 @@ from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import StationProcess
 from tests.wire.waiting import LIMIT_S
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 OPTIONS = ("--seed", "2", "--sensor", "bota")
 
 

@@ -36,6 +36,8 @@ from ftmocks.sensors.robotiq import RobotiqBox
 from ftmocks.sensors.robotous import RobotousSerialBox
 from ftmocks.wires.faults import Faults
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
 NOISE = np.array([0.03] * 3 + [0.001] * 3)
 STEPS = np.array([0.02] * 3 + [0.001] * 3)

@@ -17,6 +17,8 @@ from ftdrivers.registry import sensor_from_url
 from ftdrivers.streaming.sensor import StreamingSensor
 from ftmocks.sensors.bota import BotaBox
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 WRENCH = np.array([3.0, -2.0, 12.0, 0.3, -0.2, 0.1])
 
 

@@ -29,6 +29,8 @@ from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station, on_ur
 from tests.wire.moves import away, no_guard
 from tests.wire.waiting import wait_until
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 TCP = (0.1, -0.02, 0.25, 0.3, -1.2, 0.7)
 
 NewArm = Callable[..., UrArm]

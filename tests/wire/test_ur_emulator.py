@@ -25,6 +25,8 @@ from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import ROOT, StationProcess
 from tests.wire.waiting import LIMIT_S, wait_until
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 OPTIONS = ("--time-scale", "20", "--plane", "0,0,1,0.2", "--payload", "0.7")
 
 

@@ -16,6 +16,8 @@ from tests.wire.primary_socket import PrimarySocket
 from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import ROOT, StationProcess
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 SLEEPING = "def f():\n  sleep(1000)\nend\n"
 HEARTBEAT = """
 def guarded():

@@ -6,8 +6,10 @@ import numpy as np
 
 from ftcalib.likelihood.variance_components import (
     FORCE,
+    HYSTERESIS,
     NEGLIGIBLE,
     RESPONSE,
+    ROTATION,
     TORQUE,
     Component,
     Linearised,
@@ -22,6 +24,7 @@ from ftcalib.model import Array
 
 SURE = 20.0  # a gain or loss that no other component can regain
 WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
+USUAL_HYSTERESIS = 0.001
 SMALL_RESPONSE, USUAL_RESPONSE = 0.005, 0.02  # gain and cross-talk of real sensors
 
 
@@ -172,3 +175,43 @@ def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Componen
             share = np.array(c.share)
             start[i] = max(0.1 * start[i], float(square @ share) / share.sum() - start[i])
     return gains, start
+
+
+def rivals(problem: Linearised, best: Point, candidates: Sequence[Component]) -> list[tuple[Point, float]]:
+    """Give other explanations that the data do not exclude, with their shares of the probability; `best` has the rest.
+
+    They are: all candidates that were not found, as large as slope and curvature at zero promise; gain and cross-talk
+    as large as the larger of both; hysteresis in place of inexact orientations.
+    """
+    waiting = [c for c in candidates if c not in best.components]
+    found = dict(zip(best.components, best.theta, strict=True))
+    others = [(_with_all(problem, best, waiting), 0.0)]
+    if any(c in found for c in RESPONSE):
+        alike = max(found.get(c, 0.0) for c in RESPONSE)
+        both = {c: min(alike, problem.largest(c)) for c in RESPONSE}
+        others.append((point(problem, tuple(found | both), np.array(list((found | both).values())), best), 0.0))
+    if ROTATION in found and HYSTERESIS in waiting:
+        components = [HYSTERESIS if c == ROTATION else c for c in best.components]
+        start = np.where([c == HYSTERESIS for c in components], USUAL_HYSTERESIS**2, best.theta)
+        others.append((maximise(problem, components, start), ROTATION.needed - HYSTERESIS.needed))
+    odds = [float(np.exp(min(one.loglik - best.loglik + bonus, 0.0))) for one, bonus in others]
+    return [(one, odd / (1 + sum(odds))) for (one, _), odd in zip(others, odds, strict=True)]
+
+
+def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) -> Point:
+    """Add the candidates whose variance is positive where the likelihood, as a parabola from zero, is largest."""
+    start = NEGLIGIBLE * units(problem, best, waiting)
+    components, theta = [*best.components, *waiting], np.concatenate([best.theta, start])
+    at = point(problem, components, theta) if best.own.walks else best
+    slope, information = score(problem, at, components, theta)
+    acting = np.arange(len(components))
+    while True:
+        promised = np.linalg.lstsq(information[np.ix_(acting, acting)], slope[acting])[0]
+        sure = acting < len(best.components)
+        if (sure | (promised > 1)).all():
+            break
+        acting = acting[sure | (promised > 1)]
+    variances = (promised * theta[acting])[~sure]
+    chosen = [components[i] for i in acting[~sure]]
+    variances = np.minimum(variances, [problem.largest(c) for c in chosen])
+    return point(problem, [*best.components, *chosen], np.append(best.theta, variances))

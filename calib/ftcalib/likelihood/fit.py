@@ -10,6 +10,7 @@ from scipy.linalg import block_diag
 
 from ftcalib.errors import NotObservable
 from ftcalib.known import Constraints, Known
+from ftcalib.likelihood.component_selection import rivals
 from ftcalib.likelihood.descent import MAX_STEPS, Minimum, column_scale
 from ftcalib.likelihood.explanation import Explanation, explain, noise_under
 from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response
@@ -20,6 +21,7 @@ from ftcalib.likelihood.variance_components import (
     POSES_THAT_SHOW_THE_NOISE,
     RESPONSE,
     Component,
+    doubt,
     estimates_of_unknown_variances,
     left_out,
     point,
@@ -197,6 +199,8 @@ def fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2:
         problem = session.linearised(best.parameters, e.kept)
         at = point(problem, e.components, e.theta)
         x, C = estimates_of_unknown_variances(problem, at)
+        if session.n < POSES_THAT_SHOW_THE_NOISE:
+            C = C + doubt(problem, at, rivals(problem, at, session.candidates()))
         if HYSTERESIS in found:
             lag, square = np.empty((session.n, 6)), np.empty((session.n, 6, 6))
             lag[session.order] = at.effect(HYSTERESIS)

@@ -435,6 +435,16 @@ def estimates_of_unknown_variances(problem: Linearised, at: Point) -> tuple[Arra
     return x, C + 2 * np.transpose(moves) @ uncertainty @ np.array(moves) + wider
 
 
+def doubt(problem: Linearised, at: Point, others: Sequence[tuple[Point, float]]) -> Array:
+    """Covariance (m + 11, m + 11) that `estimates` gain because other variances are right with a share each."""
+    x, C = estimates(problem, at)
+    total = np.zeros_like(C)
+    for one, share in others:
+        other, cov = estimates(problem, one)
+        total += share * (cov - C + np.outer(other - x, other - x))
+    return total
+
+
 def units(problem: Linearised, best: Point, components: Sequence[Component]) -> Array:
     """Variances (k,) at which each component is about as large as the white noise."""
     kept, n = problem.kept, int(problem.kept.sum())

@@ -44,7 +44,7 @@ _CHUNK = 1000
 _MANY = 1000
 """Rows beside which what the fit absorbs is small."""
 _SAME_RAD = 0.2
-_AROUND, _PRIOR_ROWS = 9, 1.0
+_AROUND, _PRIOR_ROWS = 3, 1.0
 """Rows that show the noise of the one in their middle, and how many of its state count with them."""
 _STAGES, _CHOICES = 6, (1, 2, 4)
 """Solutions, each with the noise and the contacts of the one before, and those before which components are chosen."""
@@ -163,7 +163,7 @@ class _Problem:
     ) -> tuple[Array, Array, float]:
         """Information, gradient and chi2 of load and drift, over kept rows as the noise weighs them."""
         rows, order = self.rows[kept], noise.filters.shape[0] - 1
-        state, place, knots = state[kept], runs(rows.t_s), len(self.knots)
+        state, place, knots = state[kept], runs(rows.t_s, rows.row_s), len(self.knots)
         size = SIZE + 6 * knots
         H, b, chi2 = np.zeros((size, size)), np.zeros(size), 0.0
         for start in range(0, len(rows), _CHUNK):
@@ -291,10 +291,11 @@ def fit(
         state = states(rows.speed_rad_s, kept)
         r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
         absorbed = problem.absorbed(load, rows[kept], solved)
-        noise = Noise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept]))
+        noise = Noise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept], rows.row_s))
         if guarded:
             local = _local(r / noise.scale[state], kept)[:, None]
-            noise = Noise.of((r / local)[kept], absorbed / local[kept][:, :, None], state[kept], runs(rows.t_s[kept]))
+            place = runs(rows.t_s[kept], rows.row_s)
+            noise = Noise.of((r / local)[kept], absorbed / local[kept][:, :, None], state[kept], place, bursts=True)
             noise, state = replace(noise, scale=noise.scale[state] * local), np.arange(len(rows))
         sums = problem.sums(load, drift, noise, kept, state)
         if stage in _CHOICES:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.model import Array
-from ftcalib.motion.samples import ROW_S
 
 REST_RAD_S = 0.02
 CLASSES = 3
@@ -15,7 +14,7 @@ CLASSES = 3
 FEWEST = 40
 """Rows that show the noise of a state; fewer count with the next faster one."""
 ORDER = 6
-"""Of the autoregression: 0.6 s."""
+"""Of the autoregression, in rows."""
 _ROWS_PER_ORDER = 25
 _MOST = 0.98
 """Of a partial correlation."""
@@ -34,9 +33,9 @@ def states(speed_rad_s: Array, kept: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.asarray(state if (state[kept] == state.max()).sum() >= FEWEST else np.zeros_like(state))
 
 
-def runs(t_s: Array) -> NDArray[np.intp]:
+def runs(t_s: Array, row_s: float) -> NDArray[np.intp]:
     """Return the place (n,) of each row in its run of rows without a gap, from 0."""
-    breaks = np.flatnonzero(np.diff(t_s, prepend=-np.inf) > 1.5 * ROW_S)
+    breaks = np.flatnonzero(np.diff(t_s, prepend=-np.inf) > 1.5 * row_s)
     return np.asarray(np.arange(len(t_s)) - np.repeat(breaks, np.diff(np.append(breaks, len(t_s)))))
 
 
@@ -52,7 +51,15 @@ class Noise:
     """(6, 6) inverse root of the correlation between channels of what they leave."""
 
     @classmethod
-    def of(cls, residuals: Array, absorbed: Array, state: NDArray[np.intp], place: NDArray[np.intp]) -> Self:
+    def of(
+        cls,
+        residuals: Array,
+        absorbed: Array,
+        state: NDArray[np.intp],
+        place: NDArray[np.intp],
+        *,
+        bursts: bool = False,
+    ) -> Self:
         """Estimate from kept rows.
 
         Parameters
@@ -62,6 +69,9 @@ class Noise:
             A root of the covariance of what the fit predicts: so much noise it has taken from the residuals.
         state, place : array, shape (n,)
             As `states` and `runs` return them.
+        bursts : bool
+            Whether noise that seems weaker at the frequencies of the motion than above them counts as white: gears
+            shake the tool quickly where a joint reverses, but unequal weights let that reach low frequencies.
         """
         X = np.concatenate([residuals[:, :, None], absorbed], axis=2)
         common = np.sqrt(np.mean(np.sum(X**2, axis=2), axis=0)) + 1e-12
@@ -70,7 +80,7 @@ class Noise:
         by_state = np.stack([np.bincount(state, group) for group in square.T], axis=1) / counts
         scale = np.sqrt(np.repeat(by_state, 3, axis=1)) * common
         unit = X / scale[state][:, :, None]
-        groups = [_filters(unit[:, part], place) for part in (slice(0, 3), slice(3, 6))]
+        groups = [_filters(unit[:, part], place, bursts=bursts) for part in (slice(0, 3), slice(3, 6))]
         noise = cls(scale, np.repeat(_of_equal_order(groups), 3, axis=1), np.eye(6))
         left = noise.whitened(X, state, place)
         correlation = np.einsum("nik,njk->ij", left, left) / len(left)
@@ -90,7 +100,7 @@ class Noise:
         return np.asarray(self.root @ result)
 
 
-def _filters(unit: Array, place: NDArray[np.intp]) -> Array:
+def _filters(unit: Array, place: NDArray[np.intp], *, bursts: bool) -> Array:
     """Predictors (order + 1, order + 1) of a group of channels by Levinson's recursion, of the order of least AIC."""
     most, size = min(ORDER, len(unit) // _ROWS_PER_ORDER), 3 * len(unit)
     lags = np.empty(most + 1)
@@ -106,6 +116,8 @@ def _filters(unit: Array, place: NDArray[np.intp]) -> Array:
         filters[k, : k + 1] = np.append(1.0, -a) / np.sqrt(error)
         criteria.append(size * np.log(error) + 2 * k)
     best = int(np.argmin(criteria)) + 1
+    if bursts and filters[best - 1, :best].sum() > 1:
+        best = 1
     return filters[:best, :best]
 
 

@@ -20,31 +20,50 @@ from ftcalib.errors import BadDataset
 from ftcalib.model import Array, skew
 
 MEAN_S = 0.01
-ROW_S = 0.12
-BAND_HZ = 4.7
-"""Of the rows, at half amplitude: below the ripple of gears and the vibration of an arm, above its motion. White noise
-of the sensor is white in the rows."""
 GAP_S = 0.06
 """Rows whose filter spans a longer gap, or one of three periods of a slower stream, are left out."""
 
-_STEP = round(ROW_S / MEAN_S)
-_LAGS_S = MEAN_S * np.arange(-40, 41)
-_KERNEL = np.sinc(2 * BAND_HZ * _LAGS_S) * np.kaiser(81, 6.0)
-_KERNEL /= _KERNEL.sum()
-_RATE_KERNEL = np.convolve(_KERNEL, [-0.5 / MEAN_S, 0.0, 0.5 / MEAN_S])
-"""Filters and differentiates."""
-_WIDE_KERNEL = np.pad(_KERNEL, 1)
-_FIT = np.linalg.pinv(np.vander(_LAGS_S[35:46], 5, increasing=True))[:3].T * [1.0, 1.0, 2.0]
+_FIT = np.linalg.pinv(np.vander(MEAN_S * np.arange(-5, 6), 5, increasing=True))[:3].T * [1.0, 1.0, 2.0]
 """(11, 3) value and two derivatives of a quartic through 110 ms: flat over the band."""
-_REACH = len(_WIDE_KERNEL) // 2 + len(_FIT) // 2
+_LEAST_WEIGHT = 1e-3
+"""Of the samples of a mean."""
 _CHUNK = 600
 """Rows that are filtered at once."""
 _LEVER_M = 0.5
 """Translation counts as a rotation about a point this far away."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Band:
+    """A zero-phase filter of means over 10 ms, and the rows that it leaves. White noise is white in them."""
+
+    row_s: float
+    """From row to row, a multiple of `MEAN_S`."""
+
+    @property
+    def step(self) -> int:
+        """Means from row to row."""
+        return round(self.row_s / MEAN_S)
+
+    @property
+    def kernel(self) -> Array:
+        """(2 k + 1,) of unit sum; half the amplitude is left at .56 of the rate of the rows."""
+        half = round(3.36 * self.step)
+        kernel = np.sinc(1.12 / self.step * np.arange(-half, half + 1)) * np.kaiser(2 * half + 1, 6.0)
+        return np.asarray(kernel / kernel.sum())
+
+
+WIDE = Band(0.12)
+"""To 4.7 Hz: below the ripple of gears and the vibration of an arm, above its motion. A contact is short in it."""
+NARROW = Band(0.28)
+"""To 2 Hz: gears of joints that turn slowly shake the tool at 2 to 5 Hz."""
+
+
 class Means:
-    """Means of one stream over 10 ms, added piece by piece."""
+    """Means of one stream around every 10 ms, added piece by piece.
+
+    Weights fall linearly to 0 in 10 ms: what is quicker than 50 Hz is cut alike wherever the samples lie.
+    """
 
     def __init__(self) -> None:
         self._parts: list[tuple[NDArray[np.int64], Array]] = []
@@ -72,19 +91,32 @@ class Means:
         if not (np.isfinite(t_s).all() and np.isfinite(values).all()):
             raise BadDataset("a time or a value is not a finite number: remove these samples")
         self._last_s, self.samples = float(t_s[-1]), self.samples + len(t_s)
-        cell = np.floor(t_s / MEAN_S).astype(np.int64)
-        first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
-        sums = np.add.reduceat(np.column_stack([np.ones(len(t_s)), t_s, values]), first)
-        self._parts.append((cell[first], sums))
+        before = np.floor(t_s / MEAN_S)
+        share = (t_s / MEAN_S - before)[:, None]
+        first = np.flatnonzero(np.diff(before, prepend=-np.inf))
+        rows = np.column_stack([np.ones(len(t_s)), t_s, values])
+        after_sums = np.add.reduceat(rows * share, first)
+        sums = np.concatenate([np.add.reduceat(rows, first) - after_sums, after_sums])
+        cell = before[first].astype(np.int64)
+        self._parts.append(_summed(np.concatenate([cell, cell + 1]), sums))
 
     def result(self) -> tuple[Array, Array]:
-        """Return the mean time (m,) and the means (m, k) of each 10 ms that have samples."""
+        """Return the mean time (m,) and the means (m, k) around each 10 ms that have samples."""
         if not self._parts:
             raise BadDataset("there are no samples")
-        cell = np.concatenate([cells for cells, _ in self._parts])
-        first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))  # a cell of two pieces
-        sums = np.add.reduceat(np.concatenate([sums for _, sums in self._parts]), first)
-        return sums[:, 1] / sums[:, 0], sums[:, 2:] / sums[:, :1]
+        _, sums = _summed(*(np.concatenate(each) for each in zip(*self._parts, strict=True)))
+        sums = sums[sums[:, 0] > _LEAST_WEIGHT]
+        t_s = sums[:, 1] / sums[:, 0]
+        own = np.diff(t_s, prepend=-np.inf) > MEAN_S / 10  # a sample of a slow stream is alone in two means
+        return t_s[own], sums[own, 2:] / sums[own, :1]
+
+
+def _summed(cell: NDArray[np.int64], sums: Array) -> tuple[NDArray[np.int64], Array]:
+    """Add the sums of equal cells; return both in the order of the cells."""
+    order = np.argsort(cell, kind="stable")
+    cell = cell[order]
+    first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
+    return cell[first], np.add.reduceat(sums[order], first)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +155,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rows:
-    """Wrench and motion on one clock, filtered alike, 8 rows a second where both are complete."""
+    """Wrench and motion on one clock, filtered alike, where both are complete."""
 
     t_s: Array
     wrench: Array
@@ -135,6 +167,8 @@ class Rows:
     """(n,) angular speed, plus that of the flange origin at 0.5 m: the state of motion."""
     delay_s: float
     """Assumed delay of the wrench after the poses."""
+    row_s: float
+    """From row to row."""
 
     def __len__(self) -> int:
         return len(self.t_s)
@@ -142,10 +176,10 @@ class Rows:
     def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Self:
         """Return some rows."""
         parts = self.t_s[rows], self.wrench[rows], self.motion[rows], self.rate[rows], self.speed_rad_s[rows]
-        return type(self)(*parts, self.delay_s)
+        return type(self)(*parts, self.delay_s, self.row_s)
 
 
-def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: float = 0.0) -> Rows:
+def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: float = 0.0, band: Band = WIDE) -> Rows:
     """Put wrench and poses on one clock.
 
     Parameters
@@ -157,6 +191,8 @@ def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: fl
         counts as 0.
     delay_s : float
         Of the wrench after the pose at which it arose.
+    band : Band
+        Of the rows.
 
     Raises
     ------
@@ -164,8 +200,9 @@ def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: fl
         The two have less than a second in common.
     """
     t_w, t_p = wrench[0], poses[0] + delay_s
-    first, last = max(t_w[0], t_p[0]), min(t_w[-1], t_p[-1])
-    count = int((last - first) / MEAN_S) - 2 * _REACH
+    first, last = MEAN_S * np.ceil(max(t_w[0], t_p[0]) / MEAN_S), min(t_w[-1], t_p[-1])  # where the means are
+    reach = len(band.kernel) // 2 + 1 + len(_FIT) // 2
+    count = int((last - first) / MEAN_S) - 2 * reach
     if count < 1 / MEAN_S:
         raise BadDataset(
             f"wrench and poses have {max(last - first, 0):.1f} s in common: give files of one recording, on one clock"
@@ -175,16 +212,20 @@ def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: fl
     quaternion[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
     poses = t_p, np.hstack([quaternion, poses[1][:, 9:]])
     parts = [
-        _chunk((t_w, wrench[1]), poses, first + MEAN_S * np.arange(start * _STEP, end * _STEP + 2 * _REACH))
-        for start in range(0, count // _STEP, _CHUNK)
-        for end in [min(start + _CHUNK, count // _STEP)]
+        _chunk(
+            (t_w, wrench[1]), poses, first + MEAN_S * np.arange(start * band.step, end * band.step + 2 * reach), band
+        )
+        for start in range(0, count // band.step, _CHUNK)
+        for end in [min(start + _CHUNK, count // band.step)]
     ]
     t, y, columns, rates, speed = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return Rows(t, y, Motion.of_columns(columns), Motion.of_columns(rates), speed, delay_s)
+    return Rows(t, y, Motion.of_columns(columns), Motion.of_columns(rates), speed, delay_s, band.row_s)
 
 
-def _chunk(wrench: tuple[Array, Array], poses: tuple[Array, Array], grid: Array) -> tuple[Array, ...]:
+def _chunk(wrench: tuple[Array, Array], poses: tuple[Array, Array], grid: Array, band: Band) -> tuple[Array, ...]:
     """Return time, wrench, columns of the motion, their rates and the speed, where no gap is near."""
+    rate_kernel = np.convolve(band.kernel, [-0.5 / MEAN_S, 0.0, 0.5 / MEAN_S])  # filters and differentiates
+    kernel, step = np.pad(band.kernel, 1), band.step
     (y, whole_w), (pose, whole_p) = _at(grid, *wrench), _at(grid, *poses)
     fits = np.einsum("nkw,wd->dnk", sliding_window_view(pose, len(_FIT), axis=0), _FIT)
     length = np.linalg.norm(fits[0, :, :4], axis=1, keepdims=True)
@@ -195,17 +236,18 @@ def _chunk(wrench: tuple[Array, Array], poses: tuple[Array, Array], grid: Array)
     W = skew(omega)
     Omega = skew(alpha) + W @ W
     a = np.einsum("nji,nj->ni", R, acceleration)
-    motion = Motion(R + MEAN_S**2 / 24 * R @ Omega, a, Omega)  # R as its mean over 10 ms, like the wrench
+    motion = Motion(R + MEAN_S**2 / 12 * R @ Omega, a, Omega)  # R as its mean, like the wrench
     speed = np.linalg.norm(omega, axis=1) + np.linalg.norm(velocity, axis=1) / _LEVER_M
     inner = slice(len(_FIT) // 2, len(grid) - len(_FIT) // 2)
-    windows = sliding_window_view(motion.columns(), len(_WIDE_KERNEL), axis=0)[::_STEP]
-    whole = np.all(sliding_window_view((whole_w & whole_p)[inner], len(_WIDE_KERNEL))[::_STEP], axis=1)
+    windows = sliding_window_view(motion.columns(), len(kernel), axis=0)[::step]
+    whole = np.all(sliding_window_view((whole_w & whole_p)[inner], len(kernel))[::step], axis=1)
+    first = len(kernel) // 2 + len(_FIT) // 2
     return (
-        grid[_REACH:-_REACH:_STEP][: len(whole)][whole],
-        (sliding_window_view(y[inner], len(_WIDE_KERNEL), axis=0)[::_STEP] @ _WIDE_KERNEL)[whole],
-        (windows @ _WIDE_KERNEL)[whole],
-        (windows @ _RATE_KERNEL)[whole],
-        sliding_window_view(speed, len(_WIDE_KERNEL))[::_STEP].mean(axis=1)[whole],
+        grid[first::step][: len(whole)][whole],
+        (sliding_window_view(y[inner], len(kernel), axis=0)[::step] @ kernel)[whole],
+        (windows @ kernel)[whole],
+        (windows @ rate_kernel)[whole],
+        sliding_window_view(speed, len(kernel))[::step].mean(axis=1)[whole],
     )
 
 

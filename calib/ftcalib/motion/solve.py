@@ -17,7 +17,7 @@ from ftcalib.likelihood.gain_and_cross_talk import Response
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, rough_delay
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
-from ftcalib.motion.samples import ROW_S, Means, Rows, rows_of
+from ftcalib.motion.samples import NARROW, WIDE, Means, Rows, rows_of
 from ftcalib.result import CalibrationResult, DriftResult, MotionResult
 from ftcalib.setup import NOTHING, Setup
 
@@ -46,8 +46,6 @@ _MISTAKES = frozenset(
 _COMPENSATED = 0.5
 """Of the inertial mass: less weight than this was subtracted."""
 _JUDGED_ROWS = 300
-_SECOND = 9
-"""Rows."""
 _OF_POSES = frozenset(("noise_unknown", "poses_unchecked", "pose_deviates", "residuals_alike", "few_poses"))
 """Findings about single poses, which rows in motion are not."""
 
@@ -96,11 +94,11 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     """
     data = wrench.result(), poses.result()
     positions = data[1][1].shape[1] == 12
-    delay_s = _coarse_delay(rows_of(*data))
-    rows = rows_of(*data, delay_s)
+    delay_s, band = _coarse_delay(rows_of(*data)), NARROW if guarded else WIDE
+    rows = rows_of(*data, delay_s, band)
     delay_s += rough_delay(_used(rows, positions), known, g_m_s2)
     for _ in range(3):
-        rows = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)))
+        rows = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), band)
         used = _used(rows, positions)
         best = fit(used, known, g_m_s2, point_mass=point_mass or not positions, guarded=guarded)
         delay_s = rows.delay_s + best.load.delay_s
@@ -114,7 +112,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         delay_s,
         best.load.height_m,
         best.covariance[:23, :23],
-        min(best.kept.sum() * ROW_S / duration_s, 1.0),
+        min(best.kept.sum() * rows.row_s / duration_s, 1.0),
         contacts,
     )
     quality, judged = _judged(used, best, setup, known, g_m_s2)
@@ -158,14 +156,14 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
 
 def _coarse_delay(rows: Rows) -> float:
     """Delay, in whole rows, at which a linear function of the motion explains the wrench best."""
-    if len(rows) * ROW_S < LEAST_S:
-        raise BadDataset(f"{len(rows) * ROW_S:.1f} s of motion without a gap are too short: record 20 s or more")
-    index = np.round((rows.t_s - rows.t_s[0]) / ROW_S).astype(np.int64)
+    if len(rows) * rows.row_s < LEAST_S:
+        raise BadDataset(f"{len(rows) * rows.row_s:.1f} s of motion without a gap are too short: record 20 s or more")
+    index = np.round((rows.t_s - rows.t_s[0]) / rows.row_s).astype(np.int64)
     place = np.full(index[-1] + 1, -1)
     place[index] = np.arange(len(rows))
     features = np.column_stack([np.ones(len(rows)), rows.motion.columns()])
     y = rows.wrench / np.maximum(rows.wrench.std(axis=0), 1e-12)
-    farthest = min(round(FARTHEST_S / ROW_S), len(place) // 4)
+    farthest = min(round(FARTHEST_S / rows.row_s), len(place) // 4)
     left = {}
     for shift in range(-farthest, farthest + 1):
         at = np.arange(max(shift, 0), min(len(place) + shift, len(place)))
@@ -175,7 +173,7 @@ def _coarse_delay(rows: Rows) -> float:
             residual = target - X @ np.linalg.lstsq(X, target, rcond=1e-9)[0]
             left[shift] = float(np.median(np.abs(residual)))
     best = min(left, key=lambda shift: left[shift], default=0)
-    return rows.delay_s + best * ROW_S if left and left[best] < 0.8 * left[0] else rows.delay_s
+    return rows.delay_s + best * rows.row_s if left and left[best] < 0.8 * left[0] else rows.delay_s
 
 
 def _used(rows: Rows, positions: bool) -> Rows:
@@ -183,10 +181,10 @@ def _used(rows: Rows, positions: bool) -> Rows:
     if positions:
         return rows
     slow = rows[rows.speed_rad_s < SLOW_RAD_S]
-    if len(slow) * ROW_S < LEAST_S:
+    if len(slow) * rows.row_s < LEAST_S:
         raise BadDataset(
-            f"without positions only slow parts count, and these are {len(slow) * ROW_S:.1f} s long: give the position "
-            "of the flange (x, y, z), or record a slower motion"
+            f"without positions only slow parts count, and these are {len(slow) * rows.row_s:.1f} s long: give the "
+            "position of the flange (x, y, z), or record a slower motion"
         )
     return slow
 
@@ -234,7 +232,8 @@ def _judged(
     """
     places = np.flatnonzero(best.kept)
     places = places[:: max(1, len(places) // _JUDGED_ROWS)]
-    best = replace(best, residuals=_mean_of_a_second(best), sigma=best.sigma / np.sqrt(_SECOND))
+    second = round(1 / rows.row_s / 2) * 2 + 1
+    best = replace(best, residuals=_means(best, second), sigma=best.sigma / np.sqrt(second))
     weight_N = float(np.linalg.norm(best.load.static.gravity_force_base_N))
     poses = IndependentFit(
         best.load.static,
@@ -249,9 +248,9 @@ def _judged(
     return judge(poses, t_s=rows.t_s[places], setup=setup, known=known, g_m_s2=g_m_s2), places
 
 
-def _mean_of_a_second(best: MotionFit) -> Array:
-    """Residuals (n, 6) averaged over the kept rows among the nearest."""
-    window, weight = np.ones(_SECOND), best.kept.astype(np.float64)
+def _means(best: MotionFit, rows: int) -> Array:
+    """Residuals (n, 6) averaged over the kept ones of so many rows."""
+    window, weight = np.ones(rows), best.kept.astype(np.float64)
     count = np.maximum(np.convolve(weight, window, "same"), 1.0)
     return np.stack([np.convolve(column * weight, window, "same") / count for column in best.residuals.T], axis=1)
 
@@ -272,7 +271,7 @@ def _findings(
         values = {"height_mm": 1e3 * best.load.height_m, "sigma_mm": 1e3 * sigma[HEIGHT]}
         found.append(Finding.of("height_differs", **values, configured_mm=1e3 * height_m))
     if motion.contacts:
-        share = 1 - float(best.kept.mean())
+        share = sum(one["duration_s"] for one in motion.contacts) / max(len(used) * used.row_s, 1e-9)
         largest_N = max(one["force_N"] for one in motion.contacts)
         values = {"count": len(motion.contacts), "share_percent": 100 * share, "force_N": largest_N}
         found.append(Finding.of("mostly_contact" if share > MOSTLY else "contacts_left_out", **values))
@@ -330,7 +329,7 @@ def _contacts(rows: Rows, best: MotionFit, first_s: float) -> tuple[Mapping[str,
     for rows_of_one in segments:
         force, torque = (np.linalg.norm(best.residuals[rows_of_one, k : k + 3], axis=1) for k in (0, 3))
         within = rows_of_one[(force > force.max() / 2) | (torque > torque.max() / 2)]
-        start_s, end_s = rows.t_s[within[0]] - ROW_S / 2, rows.t_s[within[-1]] + ROW_S / 2
+        start_s, end_s = rows.t_s[within[0]] - rows.row_s / 2, rows.t_s[within[-1]] + rows.row_s / 2
         found.append(
             {
                 "t_s": float(start_s - first_s),

@@ -38,11 +38,13 @@ STEP_S = 0.2
 """Between two steps of the plan."""
 SMOOTHED_S = 0.1
 """The `lookahead_time` of the controller."""
-RANDOM, CHANGED = 24, 40
+RANDOM, CHANGED = 40, 200
 """Curves that are tried."""
+STEPS = (0.03, 0.1, 0.3)
+"""Of a change."""
 PROVEN = 6
 """So many of them, the best ones, are tried at one posture, in each of the sizes."""
-SIZES = (1.0, 0.8, 0.6)
+SIZES = (1.0, 0.9, 0.8, 0.6)
 POSTURES = 6
 SLOW_HZ, QUICK_HZ = (0.06, 0.16), (0.3, 0.9)
 """Of the two sines of each joint: the slow one turns far, the quick one shows the inertia."""
@@ -50,6 +52,8 @@ MOST_RAD = 1.5
 _MODEL_STEP_S = 0.01
 _COARSE = 5
 """Of the points of the proof, one in so many is looked at first."""
+_TOUCHING = 10.0
+"""Score of a curve that touches something, beyond its own: it is the last to be made smaller."""
 _ROW_S = 0.12
 _INERTIA_WORTH = 0.5
 """Of the logarithm of its sigma, beside that of the compensation error."""
@@ -94,11 +98,11 @@ def plan_sweep(
         if not certifier.free(centre)[0]:
             continue
         tried += 1
-        best = _candidates(certifier.arm, centre, seconds, speeds, guess)[:PROVEN]
+        best = _candidates(certifier, centre, seconds, speeds=speeds, stop_rad_s2=stop_rad_s2, guess=guess)[:PROVEN]
         for sweep in (one.smaller(size) for size in SIZES for _, one in best):
             off_m = certifier.reach_m(_off_curve(sweep, stop_rad_s2))
-            keeping, path = certifier.keeping(off_m), sweep.at(_times(sweep, PROOF_S))
-            if keeping.free(path[::_COARSE]).all() and keeping.clear_around(path):
+            path = sweep.at(_times(sweep, PROOF_S))
+            if _seems_free(certifier, sweep, stop_rad_s2) and certifier.keeping(off_m).clear_around(path):
                 return _plan(certifier, sweep, off_m, q_now, speeds, guess)
         if tried == POSTURES:
             break
@@ -120,23 +124,33 @@ def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
 
 
 def _candidates(
-    arm: ArmModel, centre: Array, seconds: float, speeds: Speeds, guess: Guess
+    certifier: Certifier, centre: Array, seconds: float, *, speeds: Speeds, stop_rad_s2: float, guess: Guess
 ) -> list[tuple[float, Sweep]]:
-    """Curves with their scores, the best first: random ones, then changes of the best one."""
+    """Curves with their scores, the best first: random ones, then changes of the best one that seems clear."""
+    arm = certifier.arm
     rng, found = np.random.default_rng(0), list[tuple[float, Sweep]]()
     best, least = _drawn(rng), np.inf
     for k in range(RANDOM + CHANGED):
         tried = _drawn(rng)
         if k >= RANDOM:
-            share = rng.choice([0.1, 0.3])
+            share = rng.choice(STEPS)
             tried = (1 - share) * best + share * tried
         sweep = _within(arm, _curve(tried, centre, seconds), speeds)
         if sweep is None:
             continue
-        found.append((_score(arm, sweep, guess), sweep))
-        if found[-1][0] < least:
-            least, best = found[-1][0], tried
+        score = _score(arm, sweep, guess)
+        seems_free = score < least and _seems_free(certifier, sweep, stop_rad_s2)
+        if k < RANDOM or seems_free:
+            found.append((score if seems_free else score + _TOUCHING, sweep))
+        if seems_free:
+            least, best = score, tried
     return sorted(found, key=lambda one: one[0])
+
+
+def _seems_free(certifier: Certifier, sweep: Sweep, stop_rad_s2: float) -> bool:
+    """Look at few points of the curve."""
+    keeping = certifier.keeping(certifier.reach_m(_off_curve(sweep, stop_rad_s2)))
+    return bool(keeping.free(sweep.at(_times(sweep, _COARSE * PROOF_S))).all())
 
 
 def _drawn(rng: np.random.Generator) -> Array:

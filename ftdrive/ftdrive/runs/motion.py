@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from scipy.optimize import linprog
 
 from ftcalib import CalibrationResult, Known
 from ftcalib.errors import BadDataset
@@ -22,9 +23,8 @@ from ftdrivers.interfaces import ArmStates, FtSamples
 FORMAT: Final = "ftdrive.motion/1"
 _WRENCH: Final = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 _POSES: Final = ("t_host_ns", "t_device_s", "q_rad", "qd_rad_s", "R_base_flange", "p_base_flange_m")
-_OUTLIER_SIGMAS, _PASSES = 3.0, 3
-_SOONEST: Final = 0.01
-"""Share of the samples that are received the soonest: their time of receipt is that of the measurement."""
+_BLOCKS: Final = 200
+"""Of samples, from each of which the one counts that is received the soonest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,15 +89,21 @@ class MotionRecording:
 
 
 def measured_s(count: Any, t_host_ns: Any, start_ns: int) -> Array:
-    """Return the times of measurement (n,): the straight line below the times of receipt over the device's count."""
+    """Return the times of measurement (n,): the line over the device's count that is closest below all receipts.
+
+    A computer that starves receives samples late, for seconds on end, but none early. Source: Moon, Skelly, Towsley,
+    "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999.
+    """
     x, y = np.asarray(count, dtype=np.float64) - float(count[0]), (t_host_ns - start_ns) * 1e-9
-    kept = np.ones(len(x), bool)
-    for _ in range(_PASSES):  # a computer that starves receives some samples late
-        slope, offset = np.polyfit(x[kept], y[kept], 1)
-        off = y - slope * x - offset
-        kept = np.abs(off) <= _OUTLIER_SIGMAS * 1.4826 * float(np.median(np.abs(off))) + 1e-6
-    soonest = np.quantile(off, _SOONEST)
-    return np.asarray(np.maximum.accumulate(slope * x + offset + soonest))
+    rough = (y[-1] - y[0]) / max(x[-1], 1.0)
+    late_s = y - rough * x
+    soonest = np.array(
+        [block[np.argmin(late_s[block])] for block in np.array_split(np.arange(len(x)), _BLOCKS) if len(block)]
+    )
+    at, above = x[soonest] / max(x[-1], 1.0), 1e3 * (late_s[soonest] - late_s.min())
+    line = linprog([-0.5, -1.0], np.column_stack([at, np.ones(len(at))]), above, bounds=(None, None))
+    turn_s, offset_s = 1e-3 * np.asarray(line.x, dtype=np.float64)
+    return np.asarray(rough * x + late_s.min() + offset_s + turn_s * x / max(x[-1], 1.0))
 
 
 def solve_motion_file(
@@ -110,7 +116,6 @@ def solve_motion_file(
         wrench,
         poses,
         known=known,
-        guarded=True,
         height_m=height_m,
         provenance={**provenance, **source},
         **circumstances,

@@ -50,6 +50,7 @@ def solve_in_motion(run: Run, known: Known | None = None, *, point_mass: bool = 
         height_m=setup.sensor_height_m,
         known=known,
         point_mass=point_mass,
+        guarded=run.header().get("mode") == "sweep",
         provenance={**made_now(), **origin},
         **circumstances,
     )

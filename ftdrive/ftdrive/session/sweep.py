@@ -10,7 +10,7 @@ from ftdrive.session.operator import Question
 from ftdrive.session.tour import Tour, question_of
 from ftdrivers.sweep import Sweep
 
-REST_S: Final = 1.0
+REST_S: Final = 2.0
 """Recorded before the sweep and after it."""
 CURVE_S: Final = 0.01
 """Between two points of the curve that the guards compare with."""

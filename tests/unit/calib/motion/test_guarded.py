@@ -16,5 +16,5 @@ def test_bursts_of_noise_are_no_contact_and_a_touch_is() -> None:
     assert found.motion is not None
     assert "mostly_contact" not in [one.code for one in found.findings]
     assert [round(one["t_s"]) for one in found.motion.contacts] == [6]
-    assert found.motion.used_share > 0.8
+    assert found.motion.used_share > 0.7  # the filter of .9 s and the touch
     assert abs(found.mass_kg - Truth().mass_kg) < 0.01

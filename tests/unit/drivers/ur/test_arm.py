@@ -111,6 +111,7 @@ def test_a_new_arm_opens_no_connection_and_closes() -> None:
         arm.identify()
 
 
+@pytest.mark.slow
 def test_importing_the_driver_does_not_load_ur_rtde() -> None:
     code = "import sys, ftdrivers.ur.arm; sys.exit(any('rtde_' in n or n == 'dashboard_client' for n in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

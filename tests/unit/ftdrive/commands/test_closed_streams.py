@@ -6,6 +6,7 @@ import sys
 import pytest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
 def test_a_closed_stream_is_no_traceback_and_no_file_gets_its_number(closed: str) -> None:
     """`devices` asks whether stdout is a terminal; `convert` of nothing prints on stderr."""

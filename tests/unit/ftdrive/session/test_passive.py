@@ -1,6 +1,6 @@
 """A passive calibration: it ends by itself, by a key, or after its time, and its run solves again."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +11,7 @@ import pytest
 
 from ftcalib import Setup
 from ftdrive.errors import Declined
+from ftdrive.runs import outcome
 from ftdrive.runs.motion import MotionRecording
 from ftdrive.runs.run import Run
 from ftdrive.session.operator import Key
@@ -26,9 +27,9 @@ STEP_S = 2.0
 class FakeCell:
     """Sensor, arm and journal of a free tool that a program moves."""
 
-    def __init__(self, *, stop_s: float = np.inf) -> None:
+    def __init__(self, *, stop_s: float = np.inf, contacts: Mapping[tuple[float, float], Any] | None = None) -> None:
         self.clock, self.shown, self._stop_s = FakeClock(), list[Any](), stop_s
-        recorded = record(Truth(vibrates_at_rest=False), programme(1, SECONDS)[0], SECONDS, 1)
+        recorded = record(Truth(vibrates_at_rest=False), programme(1, SECONDS)[0], SECONDS, 1, contacts=contacts)
         nothing = np.zeros((len(recorded.t_pose_s), 6))
         start_ns = self._start_ns = self.clock.now_ns()
         self._samples = FtSamples.of(
@@ -88,3 +89,16 @@ def test_q_and_the_time_end_it_and_too_little_is_not_kept(tmp_path: Path) -> Non
     assert by_time.shown[-1].duration_s == pytest.approx(8.0, abs=STEP_S)
     with pytest.raises(Declined, match="record 10 s"):
         passively(FakeCell(stop_s=2.0), tmp_path, SECONDS)
+
+
+def test_a_touch_below_that_of_a_guard_is_left_out_of_the_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    touches = {(start, start + 2.0): np.array([1.0, 0.0, -0.8, 0.0, 0.05, 0.0]) for start in np.arange(4.0, 25.0, 7.0)}
+    run = passively(FakeCell(contacts=touches), tmp_path, 25.0)
+    monkeypatch.setattr(outcome, "circumstances_of", lambda _: ({"setup": Setup()}, {}))
+    found = outcome.solve_in_motion(run)
+    assert found.verdict == "good"
+    assert found.motion is not None
+    assert found.motion.contacts
+    assert float(np.linalg.norm(found.gravity_force_base_N - Truth().mass_kg * Truth().gravity_m_s2)) < 0.02

@@ -31,6 +31,7 @@ def require_whole(url: str, n: int) -> None:
     assert dump(url) == before
 
 
+@pytest.mark.slow
 def test_two_connections_at_once_lose_nothing(store_url: str, tmp_path: Path) -> None:
     with ThreadPoolExecutor(2) as pool:
         list(pool.map(write, 2 * [store_url], new_runs(tmp_path, 2, 4)))

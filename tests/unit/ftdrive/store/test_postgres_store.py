@@ -15,6 +15,8 @@ from ftdrive.store.store import Store
 from tests.postgres import Server
 from tests.unit.ftdrive.store.contents import dump
 
+pytestmark = pytest.mark.slow  # every test needs a process of its own
+
 
 @pytest.mark.parametrize("outage", ["server killed", "connection cut"])
 def test_an_outage_in_mid_write_loses_no_run(

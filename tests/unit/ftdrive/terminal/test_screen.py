@@ -488,6 +488,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "environment", "kind"),
     [
