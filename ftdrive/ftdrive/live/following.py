@@ -83,8 +83,8 @@ def in_words(tracked: Tracked) -> str:
     force_N = float(np.linalg.norm(tracked.bias[:3]))
     sigma_N = float(np.linalg.norm(tracked.sigma[:3]) / np.sqrt(3))
     seen = f", seen {tracked.last_seen_s:.0f} s ago" if tracked.last_seen_s >= 1 else ""
-    part = with_sigma(tracked.part_kg, tracked.part_sigma_kg) if tracked.part_known else "unknown,"
-    return f"bias {with_sigma(force_N, sigma_N)} N{seen}, part {part} kg".replace("unknown, kg", "not known yet")
+    part = f"{with_sigma(tracked.part_kg, tracked.part_sigma_kg)} kg" if tracked.part_known else "not known yet"
+    return f"bias {with_sigma(force_N, sigma_N)} N{seen}, part {part}"
 
 
 def applied(calibration: CalibrationResult, tracked: Tracked) -> Update | None:
