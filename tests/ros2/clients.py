@@ -15,7 +15,9 @@ from typing import Any
 CYCLONE = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
 <AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>
 <MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>
-<Peers><Peer address="localhost"/></Peers></Discovery></Domain></CycloneDDS>"""
+<Peers><Peer address="localhost"/></Peers></Discovery>
+<Internal><PrimaryReorderMaxSamples>100000</PrimaryReorderMaxSamples>
+<SecondaryReorderMaxSamples>100000</SecondaryReorderMaxSamples></Internal></Domain></CycloneDDS>"""
 
 
 def say(message: Any) -> None:
@@ -34,7 +36,7 @@ def by_rclpy(topic: str, wanted: int, *, reliable: bool) -> None:
     node = rclpy.create_node("second_process")
     received: list[Any] = []
     node.create_subscription(
-        WrenchStamped, topic, received.append, QoSProfile(depth=1000) if reliable else qos_profile_sensor_data
+        WrenchStamped, topic, received.append, QoSProfile(depth=100_000) if reliable else qos_profile_sensor_data
     )
     _print_all(received, wanted, lambda: rclpy.spin_once(node, timeout_sec=0.1))
 
@@ -82,7 +84,7 @@ def by_cyclonedds(topic: str, wanted: int, *, reliable: bool) -> None:
 
     participant = DomainParticipant(int(os.environ["ROS_DOMAIN_ID"]))
     reliability = Policy.Reliability.Reliable(10**9) if reliable else Policy.Reliability.BestEffort
-    qos = Qos(reliability, Policy.History.KeepLast(1000))
+    qos = Qos(reliability, Policy.History.KeepLast(100_000))
     reader = DataReader(participant, Topic(participant, f"rt{topic}", WrenchStamped), qos=qos)
     received: list[Any] = []
 

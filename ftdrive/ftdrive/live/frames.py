@@ -49,7 +49,9 @@ class FrameTransform:
 
     def matrix(self, R_base_flange: Array) -> Array:
         """Return the matrix (6, 6) of the transform at one orientation (3, 3)."""
-        return np.kron(np.eye(2), R_base_flange) @ self._matrix if self._turns else self._matrix
+        if not self._turns:
+            return self._matrix
+        return np.asarray((R_base_flange @ self._matrix.reshape(2, 3, 6)).reshape(6, 6))
 
 
 def frames_in_flange(frame: WrenchFrame, info: StreamInfo, R_base_flange: Array) -> dict[str, tuple[Array, Array]]:

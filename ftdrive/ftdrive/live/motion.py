@@ -26,6 +26,7 @@ _FELT_M = 4e-5
 _HOLD_S, _RINGS_S = 0.5, 0.4
 """Rest begins so long after the last motion, and a state ends so long after it, because links ring behind it."""
 _LEVER_M = 0.5
+_SPEEDS = np.array(SPEEDS_RAD_S)
 
 
 def samples_in_reading(rate_Hz: float) -> int:
@@ -87,7 +88,7 @@ class MotionTracker:
         moving = np.arange(n) - newest < self._hold
         speed = self._rate(moved) / self._step_s
         changes = self._rate(moved - before) / self._step_s**2 > ACCELERATION_RAD_S2 + speed**2
-        fast = np.searchsorted(SPEEDS_RAD_S, speed)
+        fast = _SPEEDS.searchsorted(speed)
         number = 1 + fast + np.minimum(fast, SLOW) + (changes & (fast < SLOW))
         present = np.where(moves, number, REST).astype(np.int8)
         classes = np.concatenate([self._classes, present])

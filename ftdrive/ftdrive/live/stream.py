@@ -1,5 +1,6 @@
 """The compensated stream: arm, sensor and calibration in, samples out. It knows no screen and no file."""
 
+import math
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -132,7 +133,7 @@ class CompensatedStream(ProcessedStream):
             nominal_Hz = self._sensor.health().nominal_rate_Hz
             sensor_rate_Hz = nominal_Hz if np.isfinite(nominal_Hz) else mean_rate_Hz(samples.t_host_ns)
             arm_rate_Hz = mean_rate_Hz(states.t_host_ns)
-            self._block_rows = int(_BLOCK_S * sensor_rate_Hz)
+            self._block_rows = math.ceil(_BLOCK_S * sensor_rate_Hz)
             self._arm_step_s = float(np.median(np.diff(states.t_device_s)))
             status = self._arm.status()
             self.payload_kg = status.payload_kg

@@ -41,6 +41,8 @@ class Averaged:
 
     def add(self, block: Block) -> Means:
         """Return the means that are complete with this block."""
+        if self.count == 1:
+            return Means(block.t_host_ns, block.raw, block.wrench, block.in_contact)
         waiting, self._waiting = self._waiting, None
         if waiting is not None and self._continues(waiting, block):
             block = Block.concatenate([waiting, block])

@@ -13,6 +13,7 @@ from ftdrive.runs.run import Run
 from ftdrive.session.events import MotionRecorded
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key
+from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 FIRST_S: Final = 10.0
@@ -20,6 +21,8 @@ FIRST_S: Final = 10.0
 LONGER: Final = 1.25
 LEAST_S: Final = 5.0
 _READ_S: Final = 0.2
+_SILENT_S: Final = 10.0
+"""A shorter silence of a device is a gap in the recording, not its end."""
 GOOD: Final = 2
 """So many good fits in a row end it."""
 
@@ -39,10 +42,17 @@ def record_passively(cell: OpenCell, run: Run, seconds: float, setup: Setup, g_m
     cell.note(f"Recording for {seconds:.0f} s at most; nothing is commanded. Keep the tool free for part of the time.")
     samples, states = list[FtSamples](), list[ArmStates]()
     begin_s, next_s, good = cell.clock.now_s(), FIRST_S, 0
+    heard_s = begin_s
     with cell.sensor.follow() as wrench, cell.arm.follow() as poses:
         for _ in cell.clock.looks(seconds):
-            samples.append(wrench.read(_READ_S))
-            states.append(poses.read(0.0))
+            try:
+                samples.append(wrench.read(_READ_S))
+                states.append(poses.read(0.0))
+                heard_s = cell.clock.now_s()
+            except (DeviceTimeout, StreamBroken, ConnectError):  # a sensor with `recover` reconnects
+                if cell.clock.now_s() - heard_s > _SILENT_S:
+                    raise
+                cell.clock.sleep(_READ_S)
             elapsed_s = cell.clock.now_s() - begin_s
             if cell.journal.pressed() is Key.STOP:
                 break

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftcalib.errors import FtdriveError
+from ftcalib import CalibrationDataset, solve
+from ftcalib.errors import AcceptanceError, DataError, FtdriveError
+from ftdrive.checks.devices import check_compensated
 from ftdrivers.errors import BadUrl, DeviceError, ProtocolError
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.ros2.arm import Ros2Arm, pose_reader_of
@@ -198,3 +201,19 @@ def test_addresses_of_topics() -> None:
     assert (sensor.name, sensor.recover) == ("ROS 2 topic /robot/ft", True)
     assert list(pose_reader_of("ros2:/arm/pose").topics) == ["/arm/pose"]
     assert list(pose_reader_of("ros2:tf?base=b&flange=f").topics) == ["/tf", "/tf_static"]
+
+
+@pytest.mark.parametrize("bias_N", [0.0, 7.0])
+def test_a_compensated_wrench_at_rest_is_named_and_never_good(bias_N: float) -> None:
+    cell: Any = SimpleNamespace(tool=SimpleNamespace(mass_kg=1.3), site=SimpleNamespace(g_m_s2=9.80665))
+    rng = np.random.default_rng(1)
+    R = Rotation.random(12, rng=rng).as_matrix()
+    wrench = np.repeat([bias_N, 0.0], 3) + rng.normal(size=(12, 6)) * np.repeat([0.05, 0.002], 3)
+    check = check_compensated(wrench, cell)
+    assert (check.state == "warning") == (bias_N == 0.0)  # a bias hides it at rest, but not from poses
+    covariance = np.tile(np.diag(np.repeat([0.05, 0.002], 3) ** 2), (12, 1, 1))
+    data = CalibrationDataset(R, wrench, covariance, np.zeros(12, np.int64), np.full(12, np.nan))
+    with suppress(AcceptanceError, DataError):
+        result = solve(data)
+        assert result.verdict == "rejected"
+        assert any("compensated" in reason for reason in result.reasons)
