@@ -22,7 +22,7 @@ _EXAMPLES = Path(__file__).parents[2] / "examples"
 _POSES, _RECORDING = str(_EXAMPLES / "poses.csv"), str(_EXAMPLES / "recording.csv")
 _CALLS = {
     "config": ("config", "show"),
-    "plan": ("plan", "--model", "ur5e", "--poses", "6"),
+    "plan": ("plan", "--model", "ur5e", "--minimal", "--tool", "0:60:90"),
     "devices": ("devices",),
     "solve": ("solve", "17.csv"),
     "report": ("report", "17.csv", "--output", "{new}.html"),
