@@ -12,7 +12,7 @@ from ftdrive.cell.emulated import EMULATED, Station, emulated_cell
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact
 from ftdrive.live.processing import SENSOR_FRAME
-from ftdrive.live.samples import Stages, WrenchFrame
+from ftdrive.live.samples import Stages, Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.planning.cell_plan import certifier_for, plan_for
 from ftdrive.planning.plan import Plan
@@ -99,6 +99,7 @@ def open_stream(
     stages: Stages | None = None,
     on_contact: Callable[[Contact], object] | None = None,
     force: bool = False,
+    track: Tracking = "off",
 ) -> CompensatedStream:
     """Return the stream of compensated samples of a cell, for use with `with`. The arm is only read.
 
@@ -126,6 +127,8 @@ def open_stream(
     force : bool
         Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`, or one that
         was edited by hand, with a mark in `StreamInfo.marks`.
+    track : "off", "show" or "apply"
+        Follow bias and held part while the arm works: `stream.status().tracked`. Only `apply` corrects the wrench.
 
     Raises
     ------
@@ -159,7 +162,9 @@ def open_stream(
     else:
         chosen = _only_one(given, tool)
         cell = _cell(config, sensor, arm)
-    stream = CompensatedStream(cell, chosen, name=name, frame=frame, stages=stages, force=force, devices=(sensor, arm))
+    devices = sensor, arm
+    stream = CompensatedStream(cell, chosen, name=name, frame=frame, stages=stages, force=force, devices=devices)
+    stream.track = track
     stream.on_contact = on_contact
     return stream
 

@@ -19,7 +19,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.exports.calibration.registry import export
 from ftdrive.exports.calibration.settings import Settings
 from ftdrive.live.processing import Processor
-from ftdrive.live.samples import Stages, WrenchFrame
+from ftdrive.live.samples import EventKind, Stages, StreamEvent, WrenchFrame
 from ftdrivers.errors import NoRos2
 from ftdrivers.ros2.middleware import Node, ros2_module
 from tests.ros2.fake_cell import Stream
@@ -205,6 +205,9 @@ def test_a_wrong_calibration_is_reported_until_the_stream_opens(
 def test_a_tare_in_contact_is_refused_with_a_reason(stack: ExitStack) -> None:
     served, listener = Served(stack), Listener(stack)
     until(lambda: listener.wrench_s)
+    kinds: tuple[EventKind, ...] = ("tool", "gap")
+    for kind in kinds:
+        served.node.event(StreamEvent(7, kind, "logged as information, then as a warning"))
     assert listener.call("tare").success
     assert served.stream.tares == 1
     served.stream.contact = True

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ftcalib.assessment.cross_validation import IndependentFit
@@ -322,20 +323,21 @@ def _range_deg(rows: Rows) -> float:
 
 
 def _contacts(rows: Rows, best: MotionFit, first_s: float) -> tuple[Mapping[str, float], ...]:
-    """Segments that do not fit, without the rows at both sides that the filter or the margin adds."""
-    touched = np.flatnonzero(~best.kept)
-    segments = np.split(touched, np.flatnonzero(np.diff(touched) > 1) + 1) if len(touched) else []
+    """Rows that do not fit, without those beside them that the filter or the margin adds, as contacts."""
+    force, torque = (np.where(best.kept, 0.0, np.linalg.norm(best.residuals[:, k : k + 3], axis=1)) for k in (0, 3))
+    half = round(0.5 / rows.row_s)
+    largest = (sliding_window_view(np.pad(each, half), 2 * half + 1).max(axis=1) for each in (force, torque))
+    strong = [each > most / 2 for each, most in zip((force, torque), largest, strict=True)]
+    touched = np.flatnonzero((strong[0] | strong[1]) & ~best.kept)
     found = []
-    for rows_of_one in segments:
-        force, torque = (np.linalg.norm(best.residuals[rows_of_one, k : k + 3], axis=1) for k in (0, 3))
-        within = rows_of_one[(force > force.max() / 2) | (torque > torque.max() / 2)]
+    for within in np.split(touched, np.flatnonzero(np.diff(touched) > 1) + 1) if len(touched) else []:
         start_s, end_s = rows.t_s[within[0]] - rows.row_s / 2, rows.t_s[within[-1]] + rows.row_s / 2
         found.append(
             {
                 "t_s": float(start_s - first_s),
                 "duration_s": float(end_s - start_s),
-                "force_N": float(force.max()),
-                "torque_Nm": float(torque.max()),
+                "force_N": float(force[within].max()),
+                "torque_Nm": float(torque[within].max()),
             }
         )
     return tuple(found)

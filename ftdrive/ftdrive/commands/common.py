@@ -198,6 +198,15 @@ def SOURCE(command: Callable[..., None]) -> Callable[..., None]:
     return CALIBRATION(click.option("--tool", metavar="NAME", help=tool)(found))
 
 
+TRACK = click.option(
+    "--track",
+    type=click.Choice(["off", "show", "apply"]),
+    default="off",
+    show_default=True,
+    help="Follow bias and held part while the arm works; only apply corrects the wrench.",
+)
+
+
 def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
     """Read the numbers in the value of an option; raises `ConfigError` unless their count is one of `counts`."""
     from math import isfinite

@@ -19,6 +19,7 @@ from ftdrive.commands.common import (
     FRAME,
     JSON,
     SOURCE,
+    TRACK,
     Number,
     Source,
     check_simulate,
@@ -27,8 +28,9 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.live_source import RECOVER_S, open_source
 from ftdrive.errors import ConfigError
+from ftdrive.live.following import to_dict
 from ftdrive.live.replay import ReplayedStream, replay_run
-from ftdrive.live.samples import Axes, StreamInfo, WrenchFrame
+from ftdrive.live.samples import Axes, StreamInfo, Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.recording import Recorder, read_recording
 from ftdrive.recording.recording import with_calibration
@@ -50,6 +52,7 @@ _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
 
 @click.command()
 @SOURCE
+@TRACK
 @click.option(
     "--replay",
     metavar="RUN|RECORDING",
@@ -63,6 +66,7 @@ _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
 @JSON
 def live(
     source: Source,
+    track: Tracking,
     replay: Path | None,
     speed: float | None,
     axes: Axes,
@@ -90,8 +94,9 @@ def live(
         push: Callable[[], object] | None = None
         if replay is not None:
             stream = _replayed(replay, source.path, frame, speed=1.0 if speed is None else speed, force=source.force)
+            stream.track = track
         else:
-            stream = open_source(source, frame, stack)
+            stream = open_source(source, frame, stack, track)
             checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, stream.cell.sensor.mass_kg)]
             if source.simulate:
                 push = partial(stream.station.control, do="push", wrench=_PUSH, seconds=1.0)
@@ -206,6 +211,7 @@ def _reading(view: View) -> dict[str, Any]:
         "calibration_id": calibration.id,
         "verdict": calibration.verdict,
         "marks": list(view.info.marks),
+        "tracked": None if status.tracked is None else to_dict(status.tracked),
         "verification": None if verification is None else verification.to_dict(),
     }
 

@@ -6,7 +6,7 @@ from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import Station
 from ftdrive.commands.common import Source, read_cell
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import WrenchFrame
+from ftdrive.live.samples import Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.source import read_calibration
 from ftdrive.session.rehearsal import short_calibration, station_of
@@ -17,7 +17,7 @@ RECOVER_S = 10.0
 """So long a stream with an interruption may take to deliver again; then the command ends."""
 
 
-def open_source(source: Source, frame: WrenchFrame, stack: ExitStack) -> CompensatedStream:
+def open_source(source: Source, frame: WrenchFrame, stack: ExitStack, track: Tracking = "off") -> CompensatedStream:
     """Open the stream of a real or an emulated cell; `stack` closes it.
 
     The state of the calibration and warnings are printed. Only an emulated cell needs no calibration: it is calibrated
@@ -37,7 +37,9 @@ def open_source(source: Source, frame: WrenchFrame, stack: ExitStack) -> Compens
         cell = read_cell(config, robot, sensor)
     chosen = calibration if calibration is not None else str(tool)
     name = "temporary calibration" if path is None else str(path)
-    stream = stack.enter_context(CompensatedStream(cell, chosen, name=name, frame=frame, force=force))
+    opened = CompensatedStream(cell, chosen, name=name, frame=frame, force=force)
+    opened.track = track
+    stream = stack.enter_context(opened)
     if tool is not None:
         messages.print(f" {tool}: {stream.info.calibration_name}")
     messages.print(f" {stream.info.calibration_state}")

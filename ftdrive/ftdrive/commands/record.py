@@ -12,6 +12,7 @@ from ftdrive.commands.common import (
     FRAME,
     JSON,
     SOURCE,
+    TRACK,
     NewFile,
     Source,
     read_frame,
@@ -20,7 +21,7 @@ from ftdrive.commands.common import (
 from ftdrive.errors import RecordingHasGaps
 
 if TYPE_CHECKING:
-    from ftdrive.live.samples import Axes, WrenchFrame
+    from ftdrive.live.samples import Axes, Tracking, WrenchFrame
     from ftdrive.live.stream import CompensatedStream
     from ftdrive.recording import Recorder
 
@@ -59,6 +60,7 @@ class Duration(click.ParamType):  # type: ignore[type-arg]  # a generic type in 
 )
 @click.option("--count", type=click.IntRange(1), help="Number of samples.")
 @SOURCE
+@TRACK
 @FRAME
 @JSON
 def record(
@@ -66,6 +68,7 @@ def record(
     duration_s: float | None,
     count: int | None,
     source: Source,
+    track: "Tracking",
     axes: "Axes",
     about: str,
     as_json: bool,
@@ -83,7 +86,7 @@ def record(
     require_new_recordings(paths)
     frame = read_frame(axes, about)
     with ExitStack() as stack:
-        stream = open_source(source, frame, stack)
+        stream = open_source(source, frame, stack, track)
         recorder = Recorder(paths, stream.info, stream.cell.to_dict())
         messages.print(f" Recording, {frame}. Ctrl-C ends.")
         try:

@@ -10,12 +10,13 @@ import click
 from ftdrive.commands.common import (
     FRAME,
     SOURCE,
+    TRACK,
     Source,
     read_frame,
 )
 from ftdrive.commands.live_source import RECOVER_S, open_source
 from ftdrive.live.processing import ProcessedStream
-from ftdrive.live.samples import Axes
+from ftdrive.live.samples import Axes, Tracking
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.servers.address import host_and_port, is_loopback, with_port
 from ftdrive.servers.udp import UdpSender
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @SOURCE
+@TRACK
 @FRAME
 @click.option(
     "--host",
@@ -43,6 +45,7 @@ if TYPE_CHECKING:
 @click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
 def stream(
     source: Source,
+    track: Tracking,
     axes: Axes,
     about: str,
     host: str,
@@ -62,7 +65,7 @@ def stream(
     frame = read_frame(axes, about)
     udp_address = None if udp is None else host_and_port("--udp", udp, "127.0.0.1:9870")
     with ExitStack() as stack:
-        opened = open_source(source, frame, stack)
+        opened = open_source(source, frame, stack, track)
         server = stack.enter_context(
             closing(FoxgloveServer(opened, host, port, origins=origins, allow_control=allow_control))
         )

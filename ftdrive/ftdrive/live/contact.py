@@ -26,7 +26,7 @@ _DRIFT = np.repeat([TARE_DRIFT_N, TARE_DRIFT_NM], 3)
 """The offset follows no farther than this beyond three sigmas of the prediction."""
 _UNKNOWN_M_S2, _COARSE_M_S2, _UNKNOWN_RAD_S2 = 1.0, 0.3, 2.5
 """Acceleration of an arm in motion, one sigma, without positions; its error without the poses that follow; rotation."""
-_GYRATION_M = 0.08
+GYRATION_M = 0.08
 """Radius of gyration of a tool, where its inertia is not known."""
 _INEXACT_S = 0.005
 """Error of the time of a predicted wrench, beside that of the delay: accelerations are means over as long."""
@@ -110,7 +110,7 @@ class ContactTest:
         if self._calibration is None or calibration[0] is not self._calibration[0]:
             self._R = None
             B = accelerated(mass_kg, calibration[0].p_sensor_com_m)
-            turned = np.diag(np.repeat([0.0, (mass_kg * _GYRATION_M**2 * _UNKNOWN_RAD_S2) ** 2], 3))
+            turned = np.diag(np.repeat([0.0, (mass_kg * GYRATION_M**2 * _UNKNOWN_RAD_S2) ** 2], 3))
             self._unknown = {
                 Inertia.UNKNOWN: _UNKNOWN_M_S2**2 * B @ B.T + turned,
                 Inertia.COARSE: _COARSE_M_S2**2 * B @ B.T + turned,

@@ -76,6 +76,14 @@ def frames_in_flange(frame: WrenchFrame, info: StreamInfo, R_base_flange: Array)
     return found
 
 
+def near(info: StreamInfo) -> Array:
+    """Return where the gripper holds parts, (3,) sensor frame: the TCP, or the tool's centre of mass without one."""
+    p_flange_m = info.p_flange_tcp_m - info.p_flange_sensor_m
+    if np.isfinite(p_flange_m).all() and info.p_flange_tcp_m.any():
+        return np.asarray(info.calibration.R_flange_sensor.T @ p_flange_m)
+    return info.calibration.p_sensor_com_m
+
+
 def _sensor_from(frame: WrenchFrame, info: StreamInfo) -> Array:
     """Position of the sensor origin from the frame's point, in flange axes."""
     if frame.about == "sensor":

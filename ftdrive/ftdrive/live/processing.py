@@ -18,6 +18,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia
 from ftdrive.live.drift import DriftFilter
 from ftdrive.live.filters import LOWPASS_ORDER, NOTCH_Q, Filter, deadband
+from ftdrive.live.following import Following, applied, part_of
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.motion import READING_S, REST, MotionTracker, accelerated
 from ftdrive.live.noise import NoiseEstimator
@@ -30,6 +31,7 @@ from ftdrive.live.samples import (
     StreamEvent,
     StreamInfo,
     StreamStatus,
+    Tracking,
     WrenchFrame,
 )
 from ftdrive.live.tare import TARE_S, try_tare
@@ -94,6 +96,8 @@ class Processor:
             info.sensor_rate_Hz, accelerated(calibration.mass_kg, calibration.parameters.p_sensor_com_m)
         )
         self._noise_is_learnt = False
+        self.track: Tracking = "off"
+        self._following = Following(info)
         in_wrist = info.sensor.model == WRIST_SENSOR
         self._test = ContactTest(
             info.sensor_rate_Hz, false_alarm_rate, beyond, calibration.R_flange_sensor[2] if in_wrist else None
@@ -313,6 +317,8 @@ class Processor:
         )
         if n:
             self._state, self.reading = int(states[-1]), readings[-1]
+        if self.track != "off":
+            self._follow_load(rows, states)
         readings = self._transform(readings, rows.R_base_flange)
         soon = (states == REST) & (known is Inertia.EXACT)
         in_contact, contacts = self._tracker.follow(rows.t_host_ns, beyond, readings, soon)
@@ -369,6 +375,7 @@ class Processor:
             self._test.restart()
             self._motion = self._motion_tracker()
             self._filter = self._filter_of(self._stages)
+            self._following.restart()
             self._recent.clear()
             self._buffer, self._done = None, 0
             self._states = np.zeros(0, np.int8), np.zeros((0, 6))
@@ -395,6 +402,7 @@ class Processor:
             drift_sigma_N_h=drift_sigma_N_h,
             contact_limit=self._test.limit,
             false_alarm_rate=self._test.false_alarm_rate,
+            tracked=None if self.track == "off" else self._following.tracked,
         )
 
     # ---------------------------------------------------------------------------------------------------------- events
@@ -501,6 +509,22 @@ class Processor:
         self._test.restart()
         self._filter = self._filter_of(self._stages)
 
+    def _follow_load(self, rows: Paired, states: NDArray[np.int8]) -> None:
+        """Follow bias and part; apply them if that is wanted."""
+        for tracked, events in self._following.add(rows, states, self._noise):
+            for event in events:
+                if event.kind != "contact" or (tracked.part_known and self._held is None and tracked.part_kg > 0):
+                    self._events.append(event)
+            if self.track != "apply":
+                continue
+            if any(event.kind == "load-step" for event in events):
+                self.hold(part_of(tracked))
+            if (update := applied(self.info.calibration, tracked)) is not None:
+                before = np.zeros(6) if self.tare_wrench is None else self.tare_wrench
+                self._tares = [self._tares[0], (update, self._newest_ns)]
+                self._expected = self._loaded(update)
+                self._drift.shift((np.zeros(6) if self.tare_wrench is None else self.tare_wrench) - before)
+
     def _follow_drift(self, rows: Paired, residual: Array) -> None:
         noise = self._noise.of(REST)
         if noise is None or not self._drift.follow(
@@ -523,6 +547,7 @@ class ProcessedStream(ABC):
     on_contact: Callable[[Contact], object] | None = None
     """Called by the thread that reads, once when a contact has lasted 40 to 60 ms and once when it is over."""
     _processor: Processor
+    _track: Tracking = "off"
 
     def _process(self, paired: Paired, *, last: bool = False) -> Block:
         block = self._processor.process(paired, last=last)
@@ -542,6 +567,17 @@ class ProcessedStream(ABC):
     @frame.setter
     def frame(self, frame: WrenchFrame) -> None:
         self._processor.frame = frame
+
+    @property
+    def track(self) -> Tracking:
+        """Whether bias and held part are followed, and applied. May be set at any time; see `StreamStatus.tracked`."""
+        return self._track
+
+    @track.setter
+    def track(self, track: Tracking) -> None:
+        self._track = track
+        if (processor := getattr(self, "_processor", None)) is not None:  # else it is set when the stream is opened
+            processor.track = track
 
     @property
     def stages(self) -> Stages:

@@ -221,6 +221,57 @@ def sensor_origin_m(height_mm: float | None, calibration: CalibrationResult | No
     return np.full(3, np.nan) if height_mm is None else np.array([0.0, 0.0, height_mm / 1e3])
 
 
+Tracking = Literal["off", "show", "apply"]
+"""Whether bias and held part are followed beside the calibration, and whether they are applied."""
+
+
+@dataclass(frozen=True, slots=True)
+class LoadEvent:
+    """A grasp or a release, or a contact that is over."""
+
+    kind: Literal["load", "contact"]
+    t_s: float
+    """When it began."""
+    size: float
+    """Change of the mass, kg, or the largest force, N."""
+    sigma: float = 0.0
+    """Of the change of the mass, kg."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracked:
+    """Bias and held part, as followed while the arm works.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> with ftdrive.open_stream(simulate=True, track="show") as stream:
+    ...     while (tracked := stream.status().tracked) is None:
+    ...         block = stream.read()
+    >>> tracked.bias.shape, tracked.part_kg
+    ((6,), 0.0)
+    """
+
+    t_s: float
+    bias: Array
+    """(6,) change of the bias since the calibration, N and N·m, sensor axes."""
+    sigma: Array
+    """(6,) one standard deviation; it grows while the bias cannot be seen."""
+    part_kg: float
+    """Mass that is held beside the tool."""
+    part_sigma_kg: float
+    part_known: bool
+    """Whether the load is decided; else a contact or a new part is not yet, and the part is that before."""
+    last_seen_s: float
+    """Since the bias was seen; infinite before the first time."""
+    walk_N: float
+    """Random walk of the force bias in an hour, one sigma, as learnt."""
+    moment: tuple[Array, Array]
+    """Mass and mass times centre of mass of the part (4,), kg and kg m, sensor axes, and their covariance."""
+    events: tuple[LoadEvent, ...] = ()
+    """Since the last update."""
+
+
 EventKind = Literal[
     "contact",
     "tare",
@@ -235,6 +286,8 @@ EventKind = Literal[
     "recovered",
     "tool",
     "load",
+    "load-step",
+    "tracked",
     "mark",
 ]
 
@@ -317,3 +370,5 @@ class StreamStatus:
     contact_limit: float
     """Of `chi2`."""
     false_alarm_rate: float
+    tracked: Tracked | None = None
+    """Bias and held part beside the calibration; None unless the stream follows them."""

@@ -141,6 +141,7 @@ class CompensatedStream(ProcessedStream):
             self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, status)
             frame, stages, false_alarm_rate = self._begin
             self._processor = Processor(self.info, frame, stages, false_alarm_rate=false_alarm_rate)
+            self.track = self._track
             delay_ms = self.cell.sensor.delay_ms
             delay = (
                 DelayEstimator(self._calibration, self.info.p_flange_sensor_m) if delay_ms is None else delay_ms / 1e3
@@ -242,6 +243,7 @@ class CompensatedStream(ProcessedStream):
             ),
         )
         self._processor = Processor(self.info, old.frame, old.stages, false_alarm_rate=self._begin[2])
+        self.track = old.track
         for event in old.take_events():
             self._processor.note(event.kind, event.text, event.values, event.t_host_ns)
         self._pairing.use(DelayEstimator(self._calibration, self.info.p_flange_sensor_m))

@@ -13,6 +13,7 @@ from ftcalib.extras import weighing
 from ftcalib.extras.weighing import Fault, Weight, drift_since
 from ftcalib.files import JSON
 from ftcalib.model import angle_between
+from ftdrive.live.frames import near
 from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Paired, StreamEvent, StreamInfo
@@ -171,14 +172,6 @@ def _unexplained(info: StreamInfo) -> Array:
         return np.zeros(6)
     excess = np.square(calibration.likely_error()) - np.square(calibration.predicted_error())
     return np.repeat(np.maximum(excess, 0.0) / 3, 3)
-
-
-def near(info: StreamInfo) -> Array:
-    """Return where the gripper holds parts, (3,) sensor frame: the TCP, or the tool's centre of mass without one."""
-    p_flange_m = info.p_flange_tcp_m - info.p_flange_sensor_m
-    if np.isfinite(p_flange_m).all() and info.p_flange_tcp_m.any():
-        return np.asarray(info.calibration.R_flange_sensor.T @ p_flange_m)
-    return info.calibration.p_sensor_com_m
 
 
 def weigh(stream: CompensatedStream | ReplayedStream, *, poses: int = 1, timeout_s: float = 10.0) -> Weight:

@@ -33,7 +33,7 @@ from ftdrive.recording.recording import ROW, Header, Piece, Rows, changed
 if TYPE_CHECKING:
     from mcap.records import McapRecord
 
-SAMPLE, EVENTS, LOAD = "/ft_sample", "/events", "/ftdrive/load"
+SAMPLE, EVENTS, LOAD, TRACKED = "/ft_sample", "/events", "/ftdrive/load", "/ftdrive/tracked"
 _SCHEMAS: Final[Mapping[str, ros2.Schema]] = {
     **ros2.SCHEMAS,
     SAMPLE: ros2.Schema(
@@ -48,6 +48,11 @@ _SCHEMAS: Final[Mapping[str, ros2.Schema]] = {
     LOAD: ros2.Schema(
         "ftdrive_msgs/msg/Load",
         "float64 mass_kg\nfloat64 mass_sigma_kg\nfloat64[3] p_sensor_com_m\nfloat64[3] p_sensor_com_sigma_m",
+    ),
+    TRACKED: ros2.Schema(
+        "ftdrive_msgs/msg/Tracked",
+        "float64[6] bias\nfloat64[6] sigma\nfloat64 part_kg\nfloat64 part_sigma_kg\nfloat64 last_seen_s\n"
+        "bool part_known",
     ),
 }
 _CHANNELS: Final = {topic: number for number, topic in enumerate(_SCHEMAS, 1)}
@@ -172,12 +177,15 @@ class McapFile(GrowingFile):
             tables[_CHANNELS[EVENTS]] = _table(times, places[:-1])
             content += [log.data for log in logs]
             size += sum(log.size for log in logs)
-            loads = [event for event in events if event.kind == "load"]
-            if loads:
-                times = np.array([event.t_host_ns for event in loads]) + offset_ns
-                packed = _records(_CHANNELS[LOAD], times, np.array([_load(event) for event in loads]))
-                tables[_CHANNELS[LOAD]] = _table(times, size + packed.shape[1] * np.arange(len(loads)))
+            for topic, kind, pack in ((LOAD, "load", _load), (TRACKED, "tracked", _tracked)):
+                chosen = [event for event in events if event.kind == kind]
+                if not chosen:
+                    continue
+                times = np.array([event.t_host_ns for event in chosen]) + offset_ns
+                packed = _records(_CHANNELS[topic], times, np.array([pack(event) for event in chosen]))
+                tables[_CHANNELS[topic]] = _table(times, size + packed.shape[1] * np.arange(len(chosen)))
                 content.append(packed.data)
+                size += packed.size
         return b"".join(content), tables
 
     def _transforms(self, rows: Rows, t_ns: NDArray[np.int64]) -> NDArray[np.void]:
@@ -265,6 +273,15 @@ def _load(event: StreamEvent) -> np.void:
     numbers = [values["mass_kg"], values["mass_sigma_kg"]]
     numbers += [*(values["p_sensor_com_m"] or nowhere), *(values["p_sensor_com_sigma_m"] or nowhere)]
     return np.void(ros2.ENCODING + struct.pack("<8d", *numbers))
+
+
+def _tracked(event: StreamEvent) -> np.void:
+    """Pack bias and part as followed; an age that is not known is infinite."""
+    values = event.values
+    age_s = values["last_seen_s"]
+    numbers = [*values["bias"], *values["sigma"], values["part_kg"], values["part_sigma_kg"]]
+    numbers.append(np.inf if age_s is None else age_s)
+    return np.void(ros2.ENCODING + struct.pack("<15d?", *numbers, values["part_known"]))
 
 
 def _event(body: bytes, t_host_ns: int) -> StreamEvent:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.optimize import linprog
 
 from ftcalib import CalibrationResult, Known
 from ftcalib.errors import BadDataset
@@ -94,6 +93,8 @@ def measured_s(count: Any, t_host_ns: Any, start_ns: int) -> Array:
     A computer that starves receives samples late, for seconds on end, but none early. Source: Moon, Skelly, Towsley,
     "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999.
     """
+    from scipy.optimize import linprog
+
     x, y = np.asarray(count, dtype=np.float64) - float(count[0]), (t_host_ns - start_ns) * 1e-9
     rough = (y[-1] - y[0]) / max(x[-1], 1.0)
     late_s = y - rough * x

@@ -209,7 +209,10 @@ class Ros2Node:
 
     def event(self, event: StreamEvent) -> None:
         """Log an event."""
-        (self._log.warning if event.kind in _WARNINGS else self._log.info)(event.text)
+        if event.kind in _WARNINGS:  # rclpy raises ValueError if one call has two severities
+            self._log.warning(event.text)
+        else:
+            self._log.info(event.text)
 
     def _publish_contact(self, in_contact: bool) -> None:
         now_s = time.monotonic()

@@ -165,6 +165,8 @@ class Feed:
         self._read()
         for event in self.stream.take_events():
             self._record(methodcaller("event", event))
+            if event.kind == "tracked":
+                continue  # the screen has a place for it
             text = f'mark "{event.text}"' if event.kind == "mark" else event.text
             self.notes.append(Note(event.t_host_ns, text, _STYLES.get(event.kind, ""), event.kind in _MARKS))
 

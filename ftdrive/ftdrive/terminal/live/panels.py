@@ -13,6 +13,7 @@ from ftcalib.sphere import axes_along
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import AXES, check_rate
 from ftdrive.errors import ConfigError
+from ftdrive.live.following import in_words
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
 from ftdrive.runs.verification_record import age_in_words
@@ -126,12 +127,14 @@ def state(view: View, width: int) -> Line:
     line.add(calibration.id[:6]).add(" ")
     line.add(calibration.verdict.upper(), GOOD if calibration.verdict == "good" else WARNING)
     line.add(_age(view)).add(", ").add(*_verified(view))
-    line.add("  tare ")
-    if status.tare is None or status.tare_t_host_ns is None:
-        line.add("none", FAINT)
-    else:
+    if status.tare is not None and status.tare_t_host_ns is not None:
         force_N = float(np.linalg.norm(status.tare[:3]))
-        line.add(f"{_time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
+        line.add(f"  tare {_time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
+    elif status.tracked is None:
+        line.add("  tare ").add("none", FAINT)
+    if status.tracked is not None:
+        line.add(f"  {in_words(status.tracked)}")
+        return line.fit(width)
     line.add(f"  drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
     return line.fit(width)
 

@@ -99,7 +99,7 @@ def test_rosbags_reads_the_messages(paths: Sequence[Path]) -> None:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
         assert counts == dict.fromkeys(
             ["/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states", "/ft_sample"], 2600
-        ) | {"/events": 4, "/ftdrive/load": 0, "/tf": counts["/tf"]}
+        ) | {"/events": 4, "/ftdrive/load": 0, "/ftdrive/tracked": 0, "/tf": counts["/tf"]}
         seen: dict[str, list[Any]] = {topic: [] for topic in counts}
         for connection, t_ns, data in reader.messages():
             message: Any = reader.deserialize(data, connection.msgtype)
