@@ -35,6 +35,7 @@ from ftdrive.live.samples import (
     WrenchFrame,
 )
 from ftdrive.live.tare import TARE_S, try_tare
+from ftdrive.live.tracking import NOTHING_KG
 from ftdrivers.clock import Clock
 from ftdrivers.interfaces import WRIST_SENSOR, Array
 
@@ -513,7 +514,8 @@ class Processor:
         """Follow bias and part; apply them if that is wanted."""
         for tracked, events in self._following.add(rows, states, self._noise):
             for event in events:
-                if event.kind != "contact" or (tracked.part_known and self._held is None and tracked.part_kg > 0):
+                # Without a part the contact test reports contacts; one that is not applied hides them from that test.
+                if event.kind != "contact" or (self._held is None and tracked.part_kg > NOTHING_KG):
                     self._events.append(event)
             if self.track != "apply":
                 continue

@@ -29,3 +29,15 @@ def test_only_apply_corrects_the_wrench(track: Tracking, left: np.ndarray) -> No
     assert tracked.part_kg == pytest.approx(0.0, abs=4 * tracked.part_sigma_kg)
     assert 6 <= len(events) <= 8
     assert events[-1].values["last_seen_s"] < 1.0
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_contact_without_a_part_is_reported_once(seed: int) -> None:
+    processor = Processor(info(calibrated()))
+    processor.track = "show"
+    motion = dwells(1, 6000, seed=seed)
+    rows = paired(motion)
+    rows.raw[3000:3600] += [0, 0, -5.0, 0, 0, 0]
+    for i in range(0, len(rows), 50):
+        processor.process(rows.rows(slice(i, i + 50)))
+    assert len([event for event in processor.take_events() if event.kind == "contact"]) == 1
