@@ -3,6 +3,7 @@
 import os
 from itertools import count
 from pathlib import Path
+from zlib import crc32
 
 import pytest
 
@@ -24,7 +25,9 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> None:
     """A domain of its own, among those whose ports are below the ephemeral ones of Linux."""
     for module in _MODULES:
         pytest.importorskip(module, reason="the group ros2 is not installed")
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + (7 * os.getpid() + next(_numbers)) % 100))
+    run = crc32(os.environ.get("PYTEST_XDIST_TESTRUNUID", str(os.getpid())).encode())
+    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + (run + 50 * worker + next(_numbers)) % 100))  # two workers never share
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("PYTHONUNBUFFERED", "1")
     monkeypatch.delenv("RMW_IMPLEMENTATION", raising=False)
