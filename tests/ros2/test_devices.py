@@ -74,6 +74,7 @@ def off_in_sigmas(result: CalibrationResult) -> dict[str, float]:
     return {name: float(np.max(value)) for name, value in off.items()}
 
 
+@pytest.mark.slow
 def test_a_passive_calibration_by_topics_gives_the_load_and_the_offset_of_the_clocks(
     stack: ExitStack, tmp_path: Path
 ) -> None:
