@@ -64,14 +64,16 @@ class Server:
                 time.sleep(0.01)
 
     def kill(self) -> None:
-        """End all its processes at once with SIGKILL."""
+        """End all its processes at once with SIGKILL; return when none of them holds the memory that they share."""
         main = self._process.pid
-        children = Path(f"/proc/{main}/task/{main}/children").read_text().split()
-        self._process.kill()
-        for pid in children:
+        self._process.send_signal(signal.SIGSTOP)  # it starts no other
+        children = [int(pid) for pid in Path(f"/proc/{main}/task/{main}/children").read_text().split()]
+        for pid in (main, *children):
             with suppress(ProcessLookupError):  # it has ended meanwhile
-                os.kill(int(pid), signal.SIGKILL)
+                os.kill(pid, signal.SIGKILL)
         self._process.wait()
+        while any(_is_alive(pid) for pid in children):
+            time.sleep(0.01)
 
     def stop(self) -> None:
         """End it, and all connections."""
@@ -95,6 +97,13 @@ class Server:
     def url(self, database: str, user: str = "lab") -> str:
         """Return the address of a database; `user` may have a password, as "guest:secret"."""
         return f"postgresql+psycopg://{user}@/{database}?host={self._folder}"
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 def find_programs() -> Path | None:
