@@ -4,7 +4,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from importlib.util import find_spec
@@ -20,8 +20,7 @@ from ftdrive.live.samples import Block
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.motion import MotionRecording, measured_s
 from ftdrivers.clock import REAL
-from ftdrivers.errors import ConnectError, DeviceError, NoRos2
-from ftdrivers.interfaces import ForceTorqueSensor
+from ftdrivers.errors import ConnectError, DeviceError, DeviceTimeout, NoRos2, StreamBroken
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.ros2.arm import Ros2Arm
 from tests.ros2.seven_joints import TRUTH, URDF
@@ -229,19 +228,28 @@ def read_for_some_time(arm: Ros2Arm) -> None:
             follow.read(0.05)
 
 
-def test_two_publishers_of_one_topic_are_refused(stack: ExitStack) -> None:
+def test_two_publishers_of_one_wrench_are_refused(stack: ExitStack) -> None:
     for _ in range(2):
         source(stack)
     sensor = sensor_from_url("ros2:/ft/wrench")
-    with (
-        closing(sensor),
-        pytest.raises(DeviceError, match=r"2 nodes publish /ft/wrench: /other_make, (/other|a program)"),
-    ):
-        collect_until_it_fails(sensor)
+    stack.enter_context(closing(sensor))
+    with pytest.raises(DeviceError, match=r"2 nodes publish /ft/wrench: /other_make, (/other|a program)"):
+        read_until_refused(sensor.open, lambda: sensor.collect(0.1))
 
 
-def collect_until_it_fails(sensor: ForceTorqueSensor) -> None:
-    """Read on, because the second publisher may be discovered late."""
-    sensor.open()
+def test_two_publishers_of_one_pose_are_refused(stack: ExitStack) -> None:
+    for _ in range(2):
+        source(stack)
+    arm = Ros2Arm("ros2:/arm/pose")
+    stack.enter_context(closing(arm))
+    with pytest.raises(DeviceError, match=r"2 nodes publish /arm/pose: /other_make, (/other|a program)"):
+        read_until_refused(arm.open, arm.state)
+
+
+def read_until_refused(open_again: Callable[[], object], read: Callable[[], object]) -> None:
+    """Do as the errors advise, because the second publisher may be discovered late, and its messages before it."""
     while True:
-        sensor.collect(0.1)
+        with suppress(StreamBroken, DeviceTimeout):
+            open_again()
+            while True:
+                read()

@@ -23,7 +23,7 @@ from ftdrivers.registry import Options, split_url
 from ftdrivers.ros2.kinematics import Chain
 from ftdrivers.ros2.middleware import Node
 from ftdrivers.ros2.poses import Joints, PoseReader, Poses, StampedPose, Transforms
-from ftdrivers.ros2.subscription import Received, clock_diagnosis, subscribe, subscribe_to_tf
+from ftdrivers.ros2.subscription import OnePublisher, Received, clock_diagnosis, subscribe, subscribe_to_tf
 
 SCHEME: Final = "ros2:"
 _FIRST_S: Final = 2.0
@@ -66,6 +66,7 @@ class Ros2Arm(ReadOnlyArm):
         self._reader = pose_reader_of(host)  # also finds wrong options
         self._ros: Node | None = None
         self._publishers: dict[str, str] = {}
+        self._single: list[OnePublisher] = []
         self._changed = threading.Condition()
         self._followers: list[Unread[ArmState]] = []
         self._recent: deque[StampedPose] = deque()
@@ -92,6 +93,7 @@ class Ros2Arm(ReadOnlyArm):
             raise
 
     def _subscribe(self, ros: Node) -> None:
+        self._single = []
         for topic, kind in self._reader.topics.items():
             on_message = partial(self._receive, topic)
             if isinstance(self._reader, Transforms):
@@ -99,6 +101,7 @@ class Ros2Arm(ReadOnlyArm):
                 self._publishers[topic] = "tf"
             else:
                 self._publishers[topic] = subscribe(ros, topic, kind, on_message, self._clock)
+                self._single.append(OnePublisher(ros, topic, self._clock))
 
     def _await_first(self) -> None:
         with self._changed:
@@ -207,6 +210,8 @@ class Ros2Arm(ReadOnlyArm):
         if self._ros is None:
             raise ConnectError(f"{self._host}: not open", "open it first")
         self._ros.check()
+        for publisher in self._single:
+            publisher.check()
         if self._failure is not None:
             raise ProtocolError(self._failure.found, self._failure.fix) from self._failure
 

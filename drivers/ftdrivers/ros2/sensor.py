@@ -16,7 +16,7 @@ from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError, ProtocolError
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Diagnosis, Fact, FtSamples
 from ftdrivers.ros2.middleware import Node
-from ftdrivers.ros2.subscription import Received, clock_diagnosis, require_one_publisher, stamp_ns, subscribe
+from ftdrivers.ros2.subscription import OnePublisher, Received, clock_diagnosis, stamp_ns, subscribe
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor
 
 if TYPE_CHECKING:
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 _TYPE = "geometry_msgs/msg/WrenchStamped"
 _WAIT_S = 0.05
-_LOOK_S = 1.0
-"""Between two looks whether another node publishes too."""
 
 
 class Ros2Sensor(StreamingSensor):
@@ -50,7 +48,7 @@ class Ros2Sensor(StreamingSensor):
         self._ros: Node | None = None
         self._queue: SimpleQueue[Received] = SimpleQueue()
         self._frame_id: str | None = None
-        self._looked_s = 0.0
+        self._publisher: OnePublisher | None = None
 
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
@@ -63,6 +61,7 @@ class Ros2Sensor(StreamingSensor):
         self._ros = Node("ftdrive_sensor")
         self._ros.spin()
         publisher = subscribe(self._ros, self._topic, _TYPE, self._queue.put, self._clock, reliable=self._reliable)
+        self._publisher = OnePublisher(self._ros, self._topic, self._clock)
         frame_id = self._first_frame()
         facts = {"publisher": Fact(publisher, "device"), "frame_id": Fact(frame_id, "device")}
         return DeviceInfo(f"{self.name}, frame {frame_id}", NOT_REPORTED, NOT_REPORTED, facts)
@@ -79,9 +78,6 @@ class Ros2Sensor(StreamingSensor):
     def _read_block(self) -> FtSamples:
         if self._ros is not None:
             self._ros.check()
-            if (now_s := self._clock.now_s()) - self._looked_s > _LOOK_S:
-                self._looked_s = now_s
-                require_one_publisher(self._ros, self._topic)
         try:
             received = [self._queue.get(timeout=_WAIT_S)]
         except Empty:
@@ -93,6 +89,10 @@ class Ros2Sensor(StreamingSensor):
         numbers = np.array([one.number for one in received])
         newest = int(self._newest.seq[-1]) if len(self._newest) else int(numbers[0]) - 1
         self._lost += max(0, int(numbers[-1]) - newest - len(numbers))
+        t_device_s = [1e-9 * stamp_ns(message.header, self._topic) for message in messages]
+        if self._publisher is not None:
+            steps_s = np.diff([*self._newest.t_device_s[-1:], *t_device_s])
+            self._publisher.check(in_order=bool((steps_s >= 0).all()))
         return FtSamples.of(
             [one.t_host_ns for one in received],
             numbers,
@@ -100,7 +100,7 @@ class Ros2Sensor(StreamingSensor):
                 [getattr(part, axis) for part in (one.wrench.force, one.wrench.torque) for axis in "xyz"]
                 for one in messages
             ],
-            t_device_s=[1e-9 * stamp_ns(message.header, self._topic) for message in messages],
+            t_device_s=t_device_s,
         )
 
     def _check_frame(self, frames: set[str]) -> None:

@@ -16,6 +16,8 @@ _LONGEST_WAY_MS: Final = 30.0
 """A stamp that is older by the clock of this computer was given by another clock."""
 _OTHERS_S: Final = 0.5
 """Until a second publisher is known too."""
+_LOOK_S: Final = 1.0
+"""Between two looks whether another node publishes too."""
 _UNNAMED: Final = "NAME_UNKNOWN"
 _UNNUMBERED: Final = (1 << 64) - 1
 
@@ -122,18 +124,30 @@ def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool
         raise ConnectError(f"no node publishes {topic} ({kind}); {others}", domain)
     if kinds != [kind]:
         raise ConnectError(f"{topic} has the type {', '.join(kinds)}, needed is {kind}", "give another topic")
-    require_one_publisher(ros, topic)
+    OnePublisher(ros, topic, clock).check()
     best_effort = ros2_module("rclpy.qos").ReliabilityPolicy.BEST_EFFORT
     if reliable and found[0].qos_profile.reliability == best_effort:
         raise ConnectError(f"{topic} is offered with best effort alone", "leave the option reliable out")
     return names[0]
 
 
-def require_one_publisher(ros: Node, topic: str) -> None:
-    """Raise `ProtocolError` if more than one node publishes a topic; some are discovered after seconds."""
-    names = _names(ros.node.get_publishers_info_by_topic(topic))
-    if len(names) > 1:
-        raise ProtocolError(f"{len(names)} nodes publish {topic}: {', '.join(names)}", "stop all but one of them")
+class OnePublisher:
+    """Looks again and again whether another node publishes a topic too; some are discovered after seconds."""
+
+    def __init__(self, ros: Node, topic: str, clock: Clock) -> None:
+        self._ros, self._topic, self._clock = ros, topic, clock
+        self._looked_s = -math.inf
+
+    def check(self, *, in_order: bool = True) -> None:
+        """Raise `ProtocolError` if there is another; stamps that are not in order are a reason to look at once."""
+        if in_order and self._clock.now_s() - self._looked_s < _LOOK_S:
+            return
+        self._looked_s = self._clock.now_s()
+        names = _names(self._ros.node.get_publishers_info_by_topic(self._topic))
+        if len(names) > 1:
+            raise ProtocolError(
+                f"{len(names)} nodes publish {self._topic}: {', '.join(names)}", "stop all but one of them"
+            )
 
 
 def _names(publishers: Sequence[Any]) -> list[str]:
