@@ -369,6 +369,9 @@ CODES: Final[Mapping[str, Code]] = {
     "cross_talk": Code(_NOTE, "the sensor reads up to {torque_mNm:.2g} of torque for 1 N of force, corrected for this "
         "load"),
     "response_small": Code(_NOTE, "the sensor has a small error of gain or cross-talk, corrected for this load"),
+    "cable_spring": Code(_NOTE, "a torque of {torque_Nm:.2g} turns with the orientation, as of a cable that acts as a "
+        "spring; it may have moved the centre of mass by {shift_mm:.2g}, which sigma allows for",
+        "give the cable more slack"),
     "residuals_alike": Code(_NOTE, "successive poses have similar residuals (correlation {correlation:.2f}), most "
         "likely from drift", "let the sensor warm up and mix the order of the poses"),
     "pose_deviates": Code(_NOTE, "{pose:poses} deviates from the others by {sigmas:.1f} sigma",

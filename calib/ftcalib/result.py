@@ -161,6 +161,9 @@ class CalibrationResult:
     """Gain and cross-talk of the sensor; None: none were found, or the method does not estimate them."""
     gain_sigma: float = 0.0
     """Standard deviation of the entries of the gain, if one was found."""
+    cable_shift: Array | None = None
+    """(15,) by which a cable that acts as a spring may have moved the estimates, in the coordinates of `covariance`;
+    None: the readings show none."""
     second_basin_chi2: float | None = None
     """Increase of chi2 at the second best solution, under the noise model; None: there is no other."""
     quality: Mapping[str, JSON] = field(default_factory=dict)
@@ -185,7 +188,7 @@ class CalibrationResult:
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be {shape} finite numbers, got shape {value.shape}")
             object.__setattr__(self, name, value)
-        for name, length in (("measured_sigma", 6), ("weights", n)):
+        for name, length in (("measured_sigma", 6), ("weights", n), ("cable_shift", 15)):
             if getattr(self, name) is not None:
                 value = read_only(getattr(self, name))
                 if value.shape != (length,) or not np.isfinite(value).all():
@@ -310,12 +313,14 @@ class CalibrationResult:
     def tool_covariance(self) -> Array:
         """(15, 15) of mounting, weight and centre of mass of the tool itself, in the coordinates of `covariance`.
 
-        It includes what the gain and cross-talk that were found can hide in them. `covariance` does not, because
-        compensation needs only the sum of both.
+        It includes what the gain and cross-talk that were found, and a cable, can hide in them. `covariance` does not,
+        because compensation needs only the sum.
         """
-        if self.response is None:
-            return self.covariance
-        hidden = hidden_covariance(self.parameters, self.gain_sigma, self.response.cross_talk_sigma_m)
+        hidden = np.zeros((15, 15))
+        if self.response is not None:
+            hidden += hidden_covariance(self.parameters, self.gain_sigma, self.response.cross_talk_sigma_m)
+        if self.cable_shift is not None:
+            hidden += np.outer(self.cable_shift, self.cable_shift)
         known = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)) < 1e-12
         hidden[known], hidden[:, known] = 0.0, 0.0
         return np.asarray(self.covariance + hidden)
@@ -463,6 +468,7 @@ class CalibrationResult:
             else {"change": self.drift.change.tolist(), "sigma": self.drift.sigma.tolist()},
             "response": None if self.response is None else self.response.to_dict(),
             "gain_sigma": self.gain_sigma,
+            "cable_shift": None if self.cable_shift is None else self.cable_shift.tolist(),
             "weights": None if self.weights is None else self.weights.tolist(),
             "rejected_poses": list(self.rejected_poses),
             "second_basin_chi2": self.second_basin_chi2,
@@ -492,10 +498,11 @@ class CalibrationResult:
         """
         check_format(document, FORMAT, BadCalibration)
         try:
-            plain = [field.name for field in fields(cls) if field.name not in {"parameters", "motion"}]
+            plain = [field.name for field in fields(cls) if field.name not in {"parameters", "cable_shift", "motion"}]
             result = cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
                 **{name: document[name] for name in plain},
+                cable_shift=document.get("cable_shift"),  # files of version 0.1.0 and earlier have none
                 motion=MotionResult.from_dict(document),
             )
             derived = (("id", result._id(document.get("response"))), ("verdict", result.verdict))

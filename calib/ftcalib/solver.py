@@ -169,6 +169,7 @@ def solve(
         drift=None if drifted is None else DriftResult(drifted.change, drifted.sigma),
         response=assessed.response,
         gain_sigma=assessed.gain_sigma,
+        cable_shift=None if quality.cable is None else quality.cable.shift,
         second_basin_chi2=best.second_basin_chi2,
         quality={
             "loo_force_rms_N": quality.loo_force_rms_N,

@@ -10,6 +10,7 @@ from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtr as normal_cdf
 
 from ftcalib.assessment import described_cell, units
+from ftcalib.assessment.cable import Cable, cable_of
 from ftcalib.assessment.contradictions import contradictions
 from ftcalib.assessment.cross_validation import AssessedFit, DriftAhead, drift_ahead, standardized
 from ftcalib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, other_poses
@@ -69,6 +70,8 @@ class Quality:
     """Correlation of the residuals of successive used poses; near 0 without drift."""
     correlations: tuple[tuple[str, str, float], ...]
     """Pairs of parameters that are correlated by more than 0.9, strongest first."""
+    cable: Cable | None
+    """None: the readings show none."""
 
     @property
     def verdict(self) -> Verdict:
@@ -116,6 +119,7 @@ def judge(
     changed = [] if mistakes else _change(unconstrained or fit, at, measured_sigma, t_s)
     if suspect and not (mistakes or changed):
         mistakes = _other_poses(fit, at.used, t_s)
+    cable = cable_of(fit) if isinstance(fit, Fit) and not (at.fits_measured_noise or mistakes or changed) else None
     contradicted: list[Finding] = []
     if known is not None and unconstrained is not None:
         at_its_best = unconstrained.parameters, unconstrained.covariance
@@ -134,6 +138,7 @@ def judge(
         *_poses(fit, at, "note" if few_rejected else "limit"),
         *_drift(fit.drift, at.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
         *_response(fit.response),
+        *_cable(cable),
     ]
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
     if not mistakes and at.largest_share < SENSELESS_SHARE:
@@ -158,6 +163,7 @@ def judge(
         residual_sigma=at.residual_sigma,
         lag1=at.lag1,
         correlations=strong_correlations(fit.covariance),
+        cable=cable,
     )
 
 
@@ -411,6 +417,14 @@ def _response(response: Response | None) -> list[Finding]:
     if (np.abs(cross_talk) > 3 * sigma["cross_talk_m"]).any():
         found.append(Finding.of("cross_talk", torque_mNm=1e3 * np.abs(cross_talk).max()))
     return found or [Finding.of("response_small")]
+
+
+def _cable(cable: Cable | None) -> list[Finding]:
+    """Name the torque of a cable, and what it may have done to the centre of mass."""
+    if cable is None:
+        return []
+    shift_mm = 1e3 * float(np.linalg.norm(cable.shift[9:12]))
+    return [Finding.of("cable_spring", torque_Nm=cable.torque_Nm, shift_mm=shift_mm)]
 
 
 def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:

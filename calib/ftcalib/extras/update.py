@@ -188,6 +188,7 @@ def updated(
         components=calibration.components,
         response=update.response,
         gain_sigma=calibration.gain_sigma,
+        cable_shift=calibration.cable_shift,
         second_basin_chi2=calibration.second_basin_chi2,
     )
 
