@@ -19,22 +19,22 @@ from typing import Any
 
 import numpy as np
 
+from ftdrive.cell.config import SamplingConfig
 from ftdrive.cell.emulated import REAL_PACE, Station
 from ftdrive.runs.outcome import Outcome
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.rehearsal import NoOperator, described
 from ftdrive.session.session import calibrate
-from ftdrive.terminal.report import compensation_error
+from ftdrive.terminal.report import compensation_error, errors_in_sigma
 
 RATIO, SESSION_S = 1.5, 30.0
 
 
-def calibrated(sensor: str, seed: int, folder: Path, mode: Any, average_s: float) -> tuple[Outcome, Mapping[str, Any]]:
+def calibrated(sensor: str, seed: int, folder: Path, mode: Any) -> tuple[Outcome, Mapping[str, Any]]:
     """Calibrate one cell; also return its truth."""
     options = ["--seed", str(seed), *(REAL_PACE if mode == "sweep" else ())]
     with Station(sensor, options, control_path="script") as station:
-        cell = station.cell
-        cell = replace(cell, sampling=replace(cell.sampling, average_s=average_s))
+        cell = replace(station.cell, sampling=SamplingConfig())
         chosen = SessionOptions(folder, mode=mode, real=False, questions=False, description=described(station))
         outcome = calibrate(cell, NoOperator(), chosen)
         assert outcome is not None
@@ -55,20 +55,20 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--sensor", default="netft")
-    parser.add_argument("--average", type=float, default=2.0, help="s at each pose of the tour")
     options = parser.parse_args()
     show = sys.stdout.write
     show("seed  tour N     mN·m   sweep N    mN·m   verdict  inertia sigma, g·m²  delay ms        s  findings\n")
-    rows = []
+    rows, ratios_of = [], list[Mapping[str, Any]]()
     with TemporaryDirectory() as folder:
         for seed in range(options.seeds):
-            tour, truth = calibrated(options.sensor, seed, Path(folder), "auto", options.average)
-            sweep, _ = calibrated(options.sensor, seed, Path(folder), "sweep", options.average)
+            tour, truth = calibrated(options.sensor, seed, Path(folder), "auto")
+            sweep, _ = calibrated(options.sensor, seed, Path(folder), "sweep")
             errors = [value for one in (tour, sweep) for value in compensation_error(one.result, truth).values()]
             motion, seconds = sweep.result.motion, motion_to_verdict_s(sweep)
             assert motion is not None
             inertia = 1e3 * float(np.sqrt(np.diag(motion.covariance)[15:18].max()))
             rows.append([*errors, seconds])
+            ratios_of.append(errors_in_sigma(sweep.result, truth))
             codes = " ".join(one.code for one in sweep.result.findings if one.severity != "note")
             show(
                 f"{seed:4}{errors[0]:8.4f}{1e3 * errors[1]:9.3f}{errors[2]:10.4f}{1e3 * errors[3]:8.3f}"
@@ -81,6 +81,10 @@ def main() -> int:
     show(f"rms: tour {force_N:.4f} N, {1e3 * torque_Nm:.3f} mN·m; sweep {swept_N:.4f} N, {1e3 * swept_Nm:.3f} mN·m\n")
     show(f"ratio: force {ratios[0]:.2f}, torque {ratios[1]:.2f} (target {RATIO})\n")
     show(f"first motion to verdict: {longest_s:.1f} s at most (target {SESSION_S:.0f} s)\n")
+    for name in ratios_of[0]:
+        values = np.array([one[name] for one in ratios_of])
+        inside = np.mean(np.abs(values) < 2)
+        show(f"error / sigma of {name:24}{np.sqrt(np.mean(values**2)):6.2f}, {100 * inside:.0f} % within 2\n")
     return sum(value > limit for value, limit in ((*zip(ratios, (RATIO, RATIO), strict=True), (longest_s, SESSION_S))))
 
 

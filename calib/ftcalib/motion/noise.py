@@ -80,8 +80,8 @@ class Noise:
         by_state = np.stack([np.bincount(state, group) for group in square.T], axis=1) / counts
         scale = np.sqrt(np.repeat(by_state, 3, axis=1)) * common
         unit = X / scale[state][:, :, None]
-        groups = [_filters(unit[:, part], place, bursts=bursts) for part in (slice(0, 3), slice(3, 6))]
-        noise = cls(scale, np.repeat(_of_equal_order(groups), 3, axis=1), np.eye(6))
+        channels = [_filters(channel, place, bursts=bursts) for channel in np.moveaxis(unit, 1, 0)]
+        noise = cls(scale, _of_equal_order(channels), np.eye(6))
         left = noise.whitened(X, state, place)
         correlation = np.einsum("nik,njk->ij", left, left) / len(left)
         return cls(scale, noise.filters, np.linalg.inv(np.linalg.cholesky(correlation + 1e-9 * np.eye(6))))
@@ -101,8 +101,8 @@ class Noise:
 
 
 def _filters(unit: Array, place: NDArray[np.intp], *, bursts: bool) -> Array:
-    """Predictors (order + 1, order + 1) of a group of channels by Levinson's recursion, of the order of least AIC."""
-    most, size = min(ORDER, len(unit) // _ROWS_PER_ORDER), 3 * len(unit)
+    """Predictors (order + 1, order + 1) of a channel by Levinson's recursion, of the order of least BIC."""
+    most, size = min(ORDER, len(unit) // _ROWS_PER_ORDER), len(unit)
     lags = np.empty(most + 1)
     for lag in range(most + 1):
         paired = place >= lag
@@ -114,17 +114,17 @@ def _filters(unit: Array, place: NDArray[np.intp], *, bursts: bool) -> Array:
         partial = float(np.clip((r[k] - a @ r[k - 1 : 0 : -1]) / error, -_MOST, _MOST))
         a, error = np.append(a - partial * a[::-1], partial), error * (1 - partial**2)
         filters[k, : k + 1] = np.append(1.0, -a) / np.sqrt(error)
-        criteria.append(size * np.log(error) + 2 * k)
+        criteria.append(size * np.log(error) + np.log(size) * k)
     best = int(np.argmin(criteria)) + 1
     if bursts and filters[best - 1, :best].sum() > 1:
         best = 1
     return filters[:best, :best]
 
 
-def _of_equal_order(groups: list[Array]) -> Array:
-    """Stack filters (order + 1, groups, order + 1): beyond its order a group keeps its last one."""
-    size = max(len(one) for one in groups)
-    padded = [np.pad(one, ((0, size - len(one)), (0, size - len(one))), mode="constant") for one in groups]
-    for one, wide in zip(groups, padded, strict=True):
+def _of_equal_order(channels: list[Array]) -> Array:
+    """Stack filters (order + 1, channels, order + 1): beyond its order a channel keeps its last one."""
+    size = max(len(one) for one in channels)
+    padded = [np.pad(one, ((0, size - len(one)), (0, size - len(one))), mode="constant") for one in channels]
+    for one, wide in zip(channels, padded, strict=True):
         wide[len(one) :, : len(one)] = one[-1]
     return np.stack(padded, axis=1)

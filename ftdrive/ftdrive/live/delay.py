@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from itertools import pairwise
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ftcalib import CalibrationResult
 from ftcalib.extras.inertia import inertial_wrench, motion_of_poses
@@ -14,12 +15,14 @@ from ftdrivers.interfaces import Array
 
 MOST_DELAY_S = 0.1
 
-PERIOD_S = 0.008
-"""Samples are averaged over this time."""
+PERIOD_S = 0.024
+"""Samples are averaged over this time: over a shorter one, noise of the poses passes for acceleration."""
 _BATCH_S = 1.0
 _REACH = 2
 """Neighbours on each side from which the acceleration comes."""
-_USABLE_S = 1e-3
+_SAME = np.convolve([2, 3, 2], [1, 10, 1]) / 84
+"""What means of an acceleration keep of it when it comes from means of the poses: a parabola through five of them."""
+_USABLE_S = 3e-3
 """The estimate is applied from this sigma on."""
 _SLOWEST_RAD_S = 0.02
 """Slower, a tool does not show the delay."""
@@ -146,17 +149,18 @@ class DelayEstimator:
             p_flange_sensor_m=self._p_flange_sensor_m,
             reach=_REACH,
         )
-        W, inner = skew(motion.angular_velocity_rad_s), slice(_REACH, len(t_s) - _REACH)
+        W = skew(motion.angular_velocity_rad_s)
         if np.sqrt((motion.angular_velocity_rad_s**2).sum(axis=1).mean()) < _SLOWEST_RAD_S:
             return None
         mass_kg = self._calibration.mass_kg
-        prediction = R[inner].reshape(-1, 9) @ compensator.matrix[:3].T + compensator.offset[:3]
+        still = R.reshape(-1, 9) @ compensator.matrix[:3].T + compensator.offset[:3]
+        force, prediction = (sliding_window_view(one, len(_SAME), axis=0) @ _SAME for one in (force, still))
         prediction = prediction + inertial_wrench(mass_kg, parameters.p_sensor_com_m, motion)[:, :3]
         H = np.empty((len(motion.t_s), 3, 13))
         H[..., 0] = -np.gradient(prediction, motion.t_s, axis=0)
         H[..., 1:10] = jacobian(parameters, motion.R_base_flange)[:, :3, :9]
         H[..., 10:] = -mass_kg * (skew(motion.angular_acceleration_rad_s2) + W @ W)
-        return H.reshape(-1, 13) @ self._scale, (force[inner] - prediction).ravel()
+        return H.reshape(-1, 13) @ self._scale, (force - prediction).ravel()
 
     def _apply(self) -> None:
         """Solve for the delay that is left, and apply it if it is known well enough."""

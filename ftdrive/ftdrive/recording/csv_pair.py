@@ -15,16 +15,16 @@ from ftcalib import CalibrationResult
 from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns, rotations_of
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
-from ftdrive.live.delay import PERIOD_S, DelayEstimator
+from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.pairing import estimate_delay, paired_blocks
 from ftdrive.live.samples import Paired, Stages, StreamInfo, WrenchFrame
-from ftdrive.recording.compensation import free_samples
 from ftdrive.recording.recording import PIECE_ROWS, Header, Measured
 from ftdrive.runs.run import versions
 from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtSamples
 
 _WHOLE = 10**6
 """Seconds: the delay is estimated from all of a recording."""
+_MEAN_S = 0.008
 _READ_BYTES, _LONGEST_LINE = 1 << 21, 1 << 14
 _NEAR = 100
 """Samples before and after a step that show whether it is a gap."""
@@ -96,14 +96,10 @@ class CsvPair:
             yield Measured(waiting[0], (), 1.0)
 
     def _estimated_delay(self) -> tuple[float, float]:
-        """Return the delay and its sigma, from means over `PERIOD_S` without contact, which would look like a delay."""
+        """Return the delay and its sigma, from means over `_MEAN_S`."""
         info = self.header.info
-        size = max(1, round(PERIOD_S * info.sensor_rate_Hz))
+        size = max(1, round(_MEAN_S * info.sensor_rate_Hz))
         means = [FtSamples.concatenate(list(_means(self._wrench, size)))]
-        paired = Paired.concatenate(list(paired_blocks(means, self._states, 0.0)))
-        left = info.calibration.compensate(paired.raw, paired.R_base_flange)
-        free = paired.seq[free_samples(left, info.sensor_rate_Hz / size)]
-        means = [means[0].rows(np.isin(means[0].seq, free))]
         estimator = DelayEstimator(info.calibration, info.p_flange_sensor_m, window=_WHOLE)
         estimate_delay(means, self._states, estimator)
         return estimator.delay_s, estimator.sigma_s

@@ -11,7 +11,8 @@ from ftcalib.model import angle_between
 from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.pairing import RATE_TOLERANCE, Pairing, PoseTrack, Timeline, estimate_delay, paired_blocks
 from ftdrivers.interfaces import ArmStates, FtSamples
-from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, T0_NS, Motion, calibrated
+from tests.moving_load import Truth, record, sweep
+from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, T0_NS, Motion, calibrated, calibrated_from
 
 
 def received(seconds: float, rate_Hz: float, batch: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -152,6 +153,18 @@ def test_the_delay_between_the_links_is_found_from_motion(delay_s: float, touch:
     estimate_delay([samples], [states], estimator)
     assert estimator.delay_s == pytest.approx(delay_s, abs=max(6 * estimator.sigma_s, 5e-5))
     assert estimator.sigma_s < 2e-4
+
+
+def test_vibration_and_noisy_poses_are_not_taken_for_a_delay() -> None:
+    truth = Truth()
+    one = record(truth, sweep(20.0), 20.0, 3)
+    samples = FtSamples.of(T0_NS + np.rint(1e9 * one.t_s).astype(np.int64), np.arange(len(one.t_s)), one.wrench)
+    calibration = calibrated_from(truth.to_dict() | {"noise_force_N": 0.05, "noise_torque_Nm": 0.002})
+    t_ns, unknown = T0_NS + np.rint(1e9 * one.t_pose_s).astype(np.int64), np.full((len(one.t_pose_s), 6), np.nan)
+    states = ArmStates(t_ns, one.t_pose_s, unknown, unknown, one.R_base_flange, one.p_base_flange_m)
+    estimator = DelayEstimator(calibration, np.array([0, 0, truth.height_m]), window=60)
+    estimate_delay([samples], [states], estimator)
+    assert abs(estimator.delay_s - truth.delay_s) < 3 * estimator.sigma_s < 3e-3
 
 
 def test_an_unknown_height_of_the_sensor_is_not_taken_for_a_delay() -> None:
