@@ -1,6 +1,6 @@
 """How far readings of an unchanged cell may be from their prediction, under each explanation of the fit's residuals.
 
-What is estimated by a fit of few poses is uncertain, and so is what acts on its readings. Three explanations are kept:
+What is estimated by a fit of few poses is uncertain, and so is what acts on its readings. Four explanations are kept:
 
 * The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
 * The measured noise, by a factor that only the residuals of the fit show, and inexact orientations, which a fit of few
@@ -8,8 +8,10 @@ What is estimated by a fit of few poses is uncertain, and so is what acts on its
 * The measured noise, by such a factor, and hysteresis: each channel is off by a share of the last change of its load.
   A fit without it takes a part of it for weight, because the load changes most towards the poses that load a channel
   most.
+* The measured noise, by such a factor, and a bias that walks, where a fit of 24 poses or fewer found a drift, which it
+  may have missed in the other three channels, or noise beyond the measured.
 
-Under the last two, with the ratio of both variances given, the squared distance of new readings from their prediction
+Under the last three, with the ratio of both variances given, the squared distance of new readings from their prediction
 over the mean square of the fit's residuals has exactly an F distribution (predictive test of Chow, Econometrica 28,
 1960). Its probability is averaged over the ratios, each weighted by its restricted likelihood in the fit (posterior
 predictive probability), so an error that the fit cannot find widens the limit as much as the data allow.
@@ -17,6 +19,7 @@ predictive probability), so an error that the fit cannot find widens the limit a
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -38,9 +41,16 @@ USUAL_ERRORS_RAD = np.deg2rad(np.geomspace(0.005, 0.5, 20))
 """Errors of an arm's orientations over which the average is taken. Before the fit, each is as likely as any other."""
 USUAL_SHARES = np.geomspace(1e-4, 5e-3, 9)
 """Of the last change of load, over which the average is taken. Before the fit, each is as likely as any other."""
+USUAL_WALKS = np.geomspace(0.3, 30, 5)
+"""Steps of the bias from pose to pose, in sigma of the measured noise, over which the average is taken: of the forces,
+and of the torques. Before the fit, each pair is as likely as any other."""
 MANY_POSES = 1000
+FEW_POSES = 24
+"""From more, the fit finds a walk in all channels that have one."""
 LEAST_FACTOR = 0.1
 """Of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck."""
+
+NO_WALK = (0.0, 0.0)
 
 _AXES = {name: [k] for k, name in enumerate(("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm"))}
 _CHANNELS = _AXES | {"force_N": [0, 1, 2], "torque_Nm": [3, 4, 5]}
@@ -156,7 +166,7 @@ def expected_with_inexact_orientations(
         Of the new readings.
     """
     share = calibration.components.get("hysteresis", 0.0)
-    usual = [(error_rad, share) for error_rad in USUAL_ERRORS_RAD]
+    usual = [(error_rad, share, NO_WALK) for error_rad in USUAL_ERRORS_RAD]
     return _expected(calibration, fitted, R_base_flange, wrench_cov, usual)
 
 
@@ -164,7 +174,23 @@ def expected_with_hysteresis(
     calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
 ) -> list[Expected]:
     """Explain the fit by scaled measured noise and hysteresis; all else as `expected_with_inexact_orientations`."""
-    return _expected(calibration, fitted, R_base_flange, wrench_cov, [(0.0, share) for share in USUAL_SHARES])
+    usual = [(0.0, share, NO_WALK) for share in USUAL_SHARES]
+    return _expected(calibration, fitted, R_base_flange, wrench_cov, usual)
+
+
+def expected_with_walk(
+    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
+) -> list[Expected]:
+    """Explain the fit by scaled measured noise and a bias that walks on; all else as the other two.
+
+    Empty too if the fit found neither drift nor noise beyond the measured, or has more than 24 poses.
+    """
+    looks_so = any(name.startswith(("walk", "slope", "white")) for name in calibration.components)
+    if not looks_so or len(fitted) > FEW_POSES:
+        return []
+    share = calibration.components.get("hysteresis", 0.0)
+    usual = [(0.0, share, walk) for walk in product(USUAL_WALKS, repeat=2)]
+    return _expected(calibration, fitted, R_base_flange, wrench_cov, usual)
 
 
 def _expected(
@@ -172,9 +198,9 @@ def _expected(
     fitted: CalibrationDataset,
     R_base_flange: Array,
     wrench_cov: Array,
-    usual: Sequence[tuple[float, float]],
+    usual: Sequence[tuple[float, float, tuple[float, float]]],
 ) -> list[Expected]:
-    """Explain the fit with each error of the orientations (rad) and share of the last change of load."""
+    """Explain the fit with each error of the orientations (rad), share of the last change of load, and walk."""
     p, response = calibration.parameters, calibration.response
     kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
     dof = 6 * int(kept.sum()) - 15
@@ -184,18 +210,22 @@ def _expected(
     lag, order = hysteresis_columns(p, fitted.R_base_flange[order])[kept[order]], order[kept[order]]
     R, D = fitted.R_base_flange[order], pooled_covariance(fitted.wrench_cov, fitted.n_samples)[order]
     e = np.asarray(Compensator(p, response=response).batch(fitted.wrench[order], R), dtype=np.float64)
-    J = np.concatenate([_columns(p, response, R), lag], axis=2)
-    known = J.shape[2] - lag.shape[2]  # parameters, and found coefficients: measured as zero, with the variance found
+    walk = _walk_columns(D) if usual[0][2] != NO_WALK else np.zeros((len(D), 6, 0))
+    J = np.concatenate([_columns(p, response, R), lag, walk], axis=2)
+    known = J.shape[2] - lag.shape[2] - walk.shape[2]
     sizes, offset = np.full(15, np.inf), np.zeros(J.shape[2])
-    if response is not None:
+    if response is not None:  # found coefficients: measured as zero, with the variance found
         found = [calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")]
         sizes, offset[15:known] = np.append(sizes, np.repeat(found, [5, 6])), response.coefficients
     turn, turn_new = _turns(p, R), _turns(p, R_base_flange)
+    later = np.arange(1.0, len(R_base_flange) + 1)
+    walk_new = np.kron(np.minimum.outer(later, later), np.diag(np.einsum("ncc->c", D) / len(D)))
     lag_new = hysteresis_columns(p, R_base_flange).reshape(6 * len(R_base_flange), -1)
 
     explanations, likelihood = [], []
-    for error_rad, share in usual:
-        sigma = np.append(sizes, np.full(lag.shape[2], share))
+    for error_rad, share, steps in usual:
+        each = np.repeat(steps, 3)
+        sigma = np.concatenate([sizes, np.full(lag.shape[2], share), np.tile(each, walk.shape[2] // 6)])
         x, C, chi2, logdet = _posterior(J, D + error_rad**2 * turn, sigma, e, offset)
         likelihood.append(-0.5 * (logdet + dof * np.log(chi2)))
         factor = max(chi2 / dof, LEAST_FACTOR)
@@ -204,6 +234,7 @@ def _expected(
         noise = np.asarray(block_diag(*(wrench_cov + error_rad**2 * turn_new)))
         shares = C[known : known + 6, known : known + 6]  # the swing to the first new pose is unknown too
         noise += lag_new @ block_diag(shares, np.diag(np.diag(shares))) @ lag_new.T
+        noise += walk_new * np.tile(each, len(later)) ** 2
         explanations.append(Expected(Update(p, C[:15, :15], 0.0, 0, response=joint), noise, dof, factor))
     weights = np.exp(np.array(likelihood) - max(likelihood))
     return [replace(one, weight=weight) for one, weight in zip(explanations, weights / weights.sum(), strict=True)]
@@ -234,6 +265,17 @@ def _posterior(J: Array, V: Array, sigma: Array, e: Array, offset: Array) -> tup
     chi2 = float(np.einsum("ni,nij,nj->", e, W, e) + before @ offset[seen] ** 2 - g @ x[seen])
     logdet = np.linalg.slogdet(V)[1].sum() + np.linalg.slogdet(H)[1] - np.log(before[before > 0]).sum()
     return x, C, chi2, float(logdet)
+
+
+def _walk_columns(D: Array) -> Array:
+    """Give the derivative (n, 6, 6n - 6) of readings by the steps of the bias between them, in sigma of their noise.
+
+    The bias is that of the last pose, which the next readings have, so earlier ones lack the steps after them.
+    """
+    n = len(D)
+    before = np.triu(np.ones((n, n)), 1)[:, 1:]
+    sigma = np.sqrt(np.einsum("ncc->c", D) / n)
+    return np.asarray(-before[:, None, :, None] * np.diag(sigma)[:, None]).reshape(n, 6, 6 * (n - 1))
 
 
 def _columns(p: Parameters, response: Response | None, R_base_flange: Array) -> Array:

@@ -22,6 +22,7 @@ from ftcalib.extras.expected_readings import (
     expected_as_found,
     expected_with_hysteresis,
     expected_with_inexact_orientations,
+    expected_with_walk,
 )
 from ftcalib.extras.update import BLOCKS, Update, reestimate
 from ftcalib.files import JSON
@@ -107,7 +108,8 @@ def verify(
     """Test whether new poses agree with a calibration; on an alarm, name the change and propose the smallest update.
 
     An alarm is a p-value below `false_alarms` under each explanation of what acted on the fit: the components that it
-    found, inexact orientations, hysteresis. The change is named under the one that makes the new readings likeliest.
+    found, inexact orientations, hysteresis, a walk. The change is named under the one that makes the new readings
+    likeliest.
 
     Each change is a model that estimates some parameters again and keeps the others with their uncertainty. It explains
     the readings unless its remaining misfit exceeds that of 999 in 1000 good fits. Of these changes, the one with the
@@ -144,7 +146,7 @@ def verify(
         raise BadDataset(f"{len(fitted)} poses are not those of the calibration, which has {calibration.n_poses}.")
     explanations = [[expected_as_found(calibration, R_base_flange, wrench_cov)]]
     if fitted is not None:
-        for expected in (expected_with_inexact_orientations, expected_with_hysteresis):
+        for expected in (expected_with_inexact_orientations, expected_with_hysteresis, expected_with_walk):
             if others := expected(calibration, fitted, R_base_flange, wrench_cov):
                 explanations.append(others)
     p_values = [

@@ -246,6 +246,20 @@ def test_an_error_that_a_fit_of_six_poses_cannot_find_is_no_false_alarm() -> Non
         assert verify(calibration, R, wrench, noise_of(6), fitted=fitted).passed
 
 
+def test_a_walk_that_a_fit_of_six_poses_finds_in_part_is_no_false_alarm() -> None:
+    for seed in (19, 56, 61):  # taken in part for a slope or noise, or all for noise
+        rng = np.random.default_rng(seed)
+        R = np.concatenate([special(SUBSET_6), Rotation.random(6, rng=rng).as_matrix()])
+        walk = np.cumsum(np.repeat([0.02, 6e-4], 3) * rng.normal(size=(12, 6)), axis=0)
+        wrench = readings(TRUTH, R, seed) + walk
+        fitted = CalibrationDataset(R[:6], wrench[:6], noise_of(6), np.full(6, 200), np.arange(6.0))
+        calibration, new = solve(fitted), (R[6:], wrench[6:])
+        assert not verify(calibration, *new, noise_of(6)).passed
+        assert verify(calibration, *new, noise_of(6), fitted=fitted).passed
+        jumped = new[1] + np.array([0.6, 0, -0.8, 0, 0, 0])
+        assert not verify(calibration, new[0], jumped, noise_of(6), fitted=fitted).passed
+
+
 def test_a_change_is_found_all_the_same() -> None:
     fitted, R, wrench = inexact(6, 1)
     found = verify(solve(fitted), R, wrench + np.array([0.3, 0.0, 0.4, 0, 0, 0]), noise_of(6), fitted=fitted)
