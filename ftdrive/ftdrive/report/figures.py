@@ -261,7 +261,8 @@ def _time_residuals(figure: Any, facts: Facts) -> None:
     unit = "min" if long else "s"
     if not timed:
         axes.xaxis.get_major_locator().set_params(integer=True)
-    axes.set_xlabel(f"time since the first pose, {unit}" if timed else "pose, in the order of the rows")
+    words = "part of the motion, in the order of time" if facts["motion"] else "pose, in the order of the rows"
+    axes.set_xlabel(f"time since the first pose, {unit}" if timed else words)
 
 
 def _noise(figure: Any, facts: Facts) -> None:

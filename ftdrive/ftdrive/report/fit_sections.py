@@ -23,10 +23,11 @@ _AXES = "xyz"
 def estimates(facts: Facts) -> Section:
     """Show the estimates with sigma, their correlations, and gain and cross-talk if found."""
     result, strong = facts["result"], facts["correlation"]["strong"]
+    rows = "poses" if facts["motion"] is None else "parts of the motion"
     pairs = "; ".join(f"{label_of(one)} and {label_of(other)} {value:+.2f}" for one, other, value in strong[:5])
     text = [
-        f"Method {result['method']}, {result['n_poses']} poses, gravity {result['g_m_s2']:g} m/s². Wrenches are on the "
-        "sensor, in its axes, about its origin. Centre of mass and biases are in sensor axes.",
+        f"Method {result['method']}, {result['n_poses']} {rows}, gravity {result['g_m_s2']:g} m/s². Wrenches are on "
+        "the sensor, in its axes, about its origin. Centre of mass and biases are in sensor axes.",
         f"Strongest correlations: {pairs}." if pairs else "No two parameters are correlated by more than 0.7.",
     ]
     figure = Figure(
@@ -154,8 +155,8 @@ def cross_validation(facts: Facts) -> Section:
 
 
 def residuals(facts: Facts) -> Section:
-    """Show the residuals of each pose, and in time."""
-    result, poses = facts["result"], facts["poses"]
+    """Show the residuals of each pose, and in time; of a motion, of its parts."""
+    result, poses, in_motion = facts["result"], facts["poses"], facts["motion"] is not None
     sums = result["residual"]
     text = [
         f"Residuals: force {rounded(sums['force_rms_N'])} N rms, {rounded(sums['force_max_N'])} N at most; torque "
@@ -167,7 +168,7 @@ def residuals(facts: Facts) -> Section:
     if result["rejected_poses"]:
         names = ", ".join(poses[row - 1]["name"] for row in result["rejected_poses"])
         text.append(f"Rejected, because they do not fit the others: pose {names}.")
-    known = [pose for pose in poses if pose["sigmas"] is not None]
+    known = [] if in_motion else [pose for pose in poses if pose["sigmas"] is not None]
     figures = []
     if known:
         worst = max(known, key=lambda pose: float(pose["sigmas"]))
@@ -180,12 +181,13 @@ def residuals(facts: Facts) -> Section:
                 f"line at {SUSPICIOUS_SIGMAS:g}. Repeat a pose above it. Hatched: rejected.",
             )
         )
-    timed = all(pose["t_s"] is not None for pose in poses)
+    timed = in_motion or all(pose["t_s"] is not None for pose in poses)
+    order = "time" if timed else "the order of the poses"
     figures.append(
         Figure(
             "time_residuals",
-            f"Force and torque residuals along x, y and z against {'time' if timed else 'the order of the poses'}.",
-            f"Measured minus predicted wrench, drift included, in the order of {'time' if timed else 'the rows'}. "
+            f"Force and torque residuals along x, y and z against {order}.",
+            f"Measured minus predicted wrench, drift included, against {order}. "
             "Good: a scatter about zero. A slope or slow wave is drift; one point far away is contact or a cable.",
         )
     )
@@ -202,9 +204,8 @@ def residuals(facts: Facts) -> Section:
     ]
     columns = ("pose", "t, s", *(f"F{a}, N" for a in _AXES), *(f"T{a}, mN·m" for a in _AXES), "sigma", "used")
     few = "" if len(rows) == len(poses) else f" ({len(rows)} of {len(poses)} poses, the worst among them)"
-    return Section(
-        "residuals", "Residuals", text, figures, [Table(f"Table of the residuals{few}", columns, rows, folded=True)]
-    )
+    tables = [] if in_motion else [Table(f"Table of the residuals{few}", columns, rows, folded=True)]
+    return Section("residuals", "Residuals", text, figures, tables)
 
 
 def drift(facts: Facts) -> Section:

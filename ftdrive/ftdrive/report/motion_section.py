@@ -19,8 +19,8 @@ def motion(facts: Facts) -> Section:
     moments, of_moments = (np.array(values) for values in (found["inertia_kg_m2"], sigma["inertia_kg_m2"]))
     principal = np.linalg.eigvalsh(moments)
     text = [
-        f"{100 * found['used_share']:.0f} % of the recording was used; the rest was contact, gaps, or too fast where "
-        "the position is unknown.",
+        f"{100 * found['used_share']:.0f} % of the recording was used. Not used: contact, gaps, both ends, which the "
+        "filter needs, and what is too fast where the position is unknown.",
         f"The wrench follows the pose by {with_sigma(1e3 * found['delay_s'], 1e3 * sigma['delay_s'])} ms.",
         f"The origin of the sensor is {with_sigma(1e3 * found['height_m'], 1e3 * sigma['height_m'])} mm above the "
         "flange face, as the acceleration shows it.",

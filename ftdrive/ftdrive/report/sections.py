@@ -10,15 +10,18 @@ from ftdrive.report.origin_sections import comparison, provenance, tour
 
 
 def sections_of(facts: Mapping[str, Any]) -> list[Section]:
-    """Write the sections in the order in which a reader needs them; one without data says why it is empty."""
+    """Write the sections in the order in which a reader needs them; one without data says why it is empty.
+
+    A calibration in motion has no poses, and so none of the sections about single ones.
+    """
+    in_motion = facts["motion"] is not None
     return [
         estimates(facts),
         error(facts),
-        *([motion(facts)] if facts["motion"] is not None else []),
-        cross_validation(facts),
+        *([motion(facts)] if in_motion else [cross_validation(facts)]),
         residuals(facts),
-        drift(facts),
-        noise(facts),
+        *([] if in_motion and facts["drift"]["in_fit"] is None else [drift(facts)]),
+        *([] if in_motion else [noise(facts)]),
         coverage(facts),
         tour(facts),
         comparison(facts),

@@ -428,7 +428,8 @@ class Screen:
             self._live.transient = kind is None  # after an error the frame stays: it has the command to resume
             self._live.stop()
         if kind is None and self._view.folder:
-            self._print([TextLine(" ✔ ", f"{len(self._view.taken)} averages kept in {self._view.folder}", "green")])
+            kept = f"{len(self._view.taken)} averages" if self._view.taken else "everything"  # a sweep has no averages
+            self._print([TextLine(" ✔ ", f"{kept} kept in {self._view.folder}", "green")])
 
     def show(self, event: Event) -> None:
         """Show an event."""

@@ -99,7 +99,7 @@ def _joints(axes: Any, sweep: Sweep) -> None:
     for joint in WRISTS:
         axes.plot(t_s, q_deg[:, joint], label=JOINTS[joint])
     axes.set(xlabel="time at the planned speed [s]", ylabel="joint [deg]", xlim=(0, sweep.duration_s))
-    axes.legend(loc="upper right", ncols=3)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False)
     axes.grid(visible=True)
 
 
