@@ -81,12 +81,13 @@ def cable_of(fit: Fit) -> Cable | None:
 
     best = best_of(nearest_rotation(R.sum(axis=0))[None])
     sure = probability(best[0], STIFFNESS) < FALSE[0]
-    if not sure:
+    measured = bool(np.isfinite(fit.measured_chi2))
+    noisy = measured and any(name.startswith("white_t") for name in fit.components)
+    if not sure and (noisy or not measured):
         best = max(best, best_of(R[:: max(1, n // STARTS)]), key=lambda found: found[0])
         for angle_rad in STEPS_RAD:
             near = best[1] @ Rotation.from_rotvec(angle_rad * _AROUND).as_matrix()
             best = max(best, best_of(near), key=lambda found: found[0])
-        noisy = np.isfinite(fit.measured_chi2) and any(name.startswith("white_t") for name in fit.components)
         sure = probability(best[0], STIFFNESS + SLACK) < (FALSE_IN_NOISE if noisy else FALSE[1])
     if not sure:
         return None
