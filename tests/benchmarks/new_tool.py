@@ -72,7 +72,7 @@ def main() -> int:
         random, tour = size[name] / size["random"], size[name] / size["tour"]
         click.echo(f"force error of {name} poses / 12 alone: {random:.2f} (random poses), {tour:.2f} (of the tour)")
     good = 0.8 <= np.mean(z2) <= 1.25 and named == options.runs and refused <= 1
-    good &= size["four"] <= 1.3 * size["random"]
+    good &= size["six"] <= 1.3 * size["random"]
     return 0 if good else 1
 
 
