@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, fields
+from functools import cache
 from typing import Final, Literal, Self
 
 import numpy as np
@@ -59,7 +60,7 @@ class DeviceInfo:
     `control`, by what it is moved and why."""
 
 
-class _Columns:
+class Columns:
     """n consecutive samples, one array for each quantity, one row for each sample."""
 
     __slots__ = ()
@@ -81,12 +82,13 @@ class _Columns:
         return type(self)(*(getattr(self, name)[which] for name in self._names()))
 
     @classmethod
-    def _names(cls) -> list[str]:
-        return [column.name for column in fields(cls)]  # type: ignore[arg-type]  # every subclass is a dataclass
+    @cache  # `fields` takes longer than the rest
+    def _names(cls) -> tuple[str, ...]:
+        return tuple(column.name for column in fields(cls))  # type: ignore[arg-type]  # every subclass is a dataclass
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FtSamples(_Columns):
+class FtSamples(Columns):
     """n consecutive samples of one sensor, one row each, as measured: no bias, tare or filter applied.
 
     The wrench is exerted on the sensor by what hangs on it or pushes on it, in the sensor frame, about its origin.
@@ -193,7 +195,7 @@ class ArmState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ArmStates(_Columns):
+class ArmStates(Columns):
     """n consecutive samples of the arm, one row each. The flange is the mechanical flange, whatever TCP is active."""
 
     t_host_ns: NDArray[np.int64]

@@ -1,7 +1,7 @@
 """Subscribers in a process of their own: rclpy, and Cyclone DDS as a second implementation that knows no ROS.
 
-`python -m tests.ros2.clients rclpy|cyclonedds TOPIC COUNT [reliable]` prints "ready", then one JSON line a
-WrenchStamped with its time of receipt, and ends after COUNT messages.
+`python -m tests.ros2.clients rclpy|cyclonedds TOPIC COUNT [reliable]` prints "ready" and, after COUNT messages,
+one JSON line a WrenchStamped with its time of receipt.
 """
 
 import json
@@ -20,25 +20,27 @@ CYCLONE = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface address=
 <SecondaryReorderMaxSamples>100000</SecondaryReorderMaxSamples></Internal></Domain></CycloneDDS>"""
 
 
-def say(message: Any) -> None:
+def say(arrived_ns: int, message: Any) -> None:
     stamp, wrench = message.header.stamp, message.wrench
     numbers = [getattr(part, axis) for part in (wrench.force, wrench.torque) for axis in "xyz"]
     t_ns = stamp.sec * 10**9 + stamp.nanosec
-    sys.stdout.write(json.dumps([t_ns, message.header.frame_id, numbers, time.time_ns()]) + "\n")
+    sys.stdout.write(json.dumps([t_ns, message.header.frame_id, numbers, arrived_ns]) + "\n")
 
 
 def by_rclpy(topic: str, wanted: int, *, reliable: bool) -> None:
     import rclpy
     from geometry_msgs.msg import WrenchStamped
+    from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import QoSProfile, qos_profile_sensor_data
 
     rclpy.init()
     node = rclpy.create_node("second_process")
-    received: list[Any] = []
-    node.create_subscription(
-        WrenchStamped, topic, received.append, QoSProfile(depth=100_000) if reliable else qos_profile_sensor_data
-    )
-    _print_all(received, wanted, lambda: rclpy.spin_once(node, timeout_sec=0.1))
+    received: list[tuple[int, Any]] = []
+    quality = QoSProfile(depth=100_000) if reliable else qos_profile_sensor_data
+    node.create_subscription(WrenchStamped, topic, lambda one: received.append((time.time_ns(), one)), quality)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    _print_all(received, wanted, lambda: executor.spin_once(timeout_sec=0.1))
 
 
 def by_cyclonedds(topic: str, wanted: int, *, reliable: bool) -> None:
@@ -86,24 +88,22 @@ def by_cyclonedds(topic: str, wanted: int, *, reliable: bool) -> None:
     reliability = Policy.Reliability.Reliable(10**9) if reliable else Policy.Reliability.BestEffort
     qos = Qos(reliability, Policy.History.KeepLast(100_000))
     reader = DataReader(participant, Topic(participant, f"rt{topic}", WrenchStamped), qos=qos)
-    received: list[Any] = []
+    received: list[tuple[int, Any]] = []
 
     def look() -> None:
-        received.extend(message for message in reader.take(1000) if hasattr(message, "wrench"))
+        received.extend((time.time_ns(), one) for one in reader.take(1000) if hasattr(one, "wrench"))
         time.sleep(0.001)
 
     _print_all(received, wanted, look)
 
 
-def _print_all(received: list[Any], wanted: int, look: Callable[[], None]) -> None:
+def _print_all(received: list[tuple[int, Any]], wanted: int, look: Callable[[], None]) -> None:
     sys.stdout.write("ready\n")
     sys.stdout.flush()
-    printed = 0
-    while printed < wanted:
+    while len(received) < wanted:
         look()
-        for message in received[printed:wanted]:
-            say(message)
-        printed = min(len(received), wanted)
+    for arrived_ns, message in received[:wanted]:  # at the end: a pipe must not delay what is received
+        say(arrived_ns, message)
 
 
 if __name__ == "__main__":

@@ -84,7 +84,7 @@ class DeviceClock:
         step_s = lead_s - self._lead_s
         # a slow clock falls behind steadily, and its samples are not late
         self._lead_s = max(lead_s, self._lead_s - _CLOCK_DRIFT * (heard_s - heard_before_s))
-        back_s = -float(np.diff(t_device_s, prepend=before_s).min())
+        back_s = float((np.concatenate([[before_s], t_device_s[:-1]]) - t_device_s).max())
         if back_s > 0:
             raise StreamBroken(
                 f"{self._name}: the device's clock jumped back by {back_s:.3f} s to {newest_s:.3f} s: it has restarted",

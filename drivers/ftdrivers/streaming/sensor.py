@@ -479,7 +479,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._arrivals.append((t_ns, len(block)))
             while self._arrivals[0][0] < t_ns - 1_000_000_000:
                 self._arrivals.popleft()
-            self._newest, self._newest_ns = block.rows(slice(-1, None)), t_ns
+            self._newest, self._newest_ns = block if len(block) == 1 else block.rows(slice(-1, None)), t_ns
             if self._failure is not None:
                 # an interruption ends when the device measures, not when it answers
                 self._failure = self._interruption = None

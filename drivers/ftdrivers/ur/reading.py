@@ -56,6 +56,8 @@ _TIMESTAMP: Final = struct.Struct(">xd")
 """The first output, after the number of the recipe."""
 _MODEL_POSITION_M: Final = 0.005
 _MODEL_ANGLE_RAD: Final = radians(0.5)
+_CHECK_S: Final = 0.1
+"""Between two comparisons of followed poses with the model: one takes as long as reading ten samples."""
 
 
 class Reader:
@@ -87,6 +89,8 @@ class Reader:
         self._t_device_s = math.nan
         self._lateness, self._late_s = Lateness(), 0.0
         self._followers: list[Unread[Received]] = []
+        self._check_s = -math.inf
+        """When a followed pose is compared with the model again."""
         self._failure: DeviceError | None = None
         self.silent = False
         """Whether no sample has arrived since `DeviceTimeout` was raised."""
@@ -193,7 +197,9 @@ class Reader:
             self._check_measures(Sample.of(t_host_ns[-1], outputs))
         if not measured.all():
             states = states.rows(measured)
-        self._check_model(states.q_rad[-1], Pose(states.R_base_flange[-1], states.p_base_flange_m[-1]))
+        if (now_s := self._clock.now_s()) >= self._check_s:
+            self._check_model(states.q_rad[-1], Pose(states.R_base_flange[-1], states.p_base_flange_m[-1]))
+            self._check_s = now_s + _CHECK_S
         return states
 
     def _check_measures(self, sample: Sample) -> None:

@@ -104,7 +104,8 @@ class UrWristSensor(StreamingSensor):
         if not (np.isfinite(t_device_s).all() and np.isfinite(raw).all()):
             raise ProtocolError(f"{self.name}: the wrench at {t_device_s[-1]} s is not finite: {raw[-1].tolist()}")
         seq = np.rint(t_device_s * _RATE_Hz).astype(np.int64)
-        steps = np.diff(seq, prepend=seq[0] - 1 if self._seq is None else self._seq)
+        before = seq[0] - 1 if self._seq is None else self._seq
+        steps = seq - np.concatenate([[before], seq[:-1]])  # `np.diff` takes four times as long
         if (steps <= 0).any():
             raise StreamBroken(
                 f"{self.name}: the controller's clock went back to {t_device_s[steps <= 0][0]:.3f} s", "open it again"

@@ -186,10 +186,11 @@ class ContactTest:
 
     def _parts(self, R_base_flange: Array, states: NDArray[np.int8]) -> Iterator[slice]:
         """Yield parts of one orientation, one state of motion and one offset."""
-        turned = np.sqrt(np.square(np.diff(R_base_flange, axis=0, prepend=R_base_flange[:1])).sum(axis=(1, 2)) / 2)
-        cell = np.floor(np.cumsum(turned) / _TURN_RAD)
+        turned = np.sqrt(np.square(R_base_flange[1:] - R_base_flange[:-1]).sum(axis=(1, 2)) / 2)
+        cell = np.concatenate([[0.0], np.floor(np.cumsum(turned) / _TURN_RAD)])
         step = (self._count + np.arange(len(states))) // (_STEP * self._size)
-        edges = np.flatnonzero((np.diff(cell) != 0) | (np.diff(step) != 0) | (np.diff(states) != 0)) + 1
+        is_edge = [column[1:] != column[:-1] for column in (cell, step, states)]
+        edges = np.flatnonzero(np.logical_or.reduce(is_edge)) + 1
         for start, stop in pairwise([0, *edges.tolist(), len(states)] if len(states) else []):
             yield slice(start, stop)
 
@@ -332,7 +333,8 @@ class ContactTracker:
         changes = list[Contact]()
         if n and self.open is not None and not in_contact[0]:
             changes += self._over()
-        for start, stop in np.flatnonzero(np.diff(in_contact, prepend=False, append=False)).reshape(-1, 2):
+        edges = np.flatnonzero(np.diff(in_contact, prepend=False, append=False)).tolist() if in_contact.any() else []
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
             lag = self._short_lag if soon[start] else self._lag
             first = start + before - (0 if self.open is not None else (_IN_A_ROW - 1) * lag)  # it has begun before
             at = first + np.flatnonzero(beyond[first : before + stop])

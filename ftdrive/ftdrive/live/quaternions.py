@@ -4,6 +4,8 @@ import numpy as np
 
 from ftdrivers.interfaces import Array
 
+_I, _J, _K = np.arange(4), np.array([2, 0, 1]), np.array([1, 2, 0])
+
 
 def quaternions(R: Array) -> Array:
     """Return unit quaternions x y z w (n, 4) of rotations (n, 3, 3), by the largest component (Shepperd 1978)."""
@@ -12,9 +14,8 @@ def quaternions(R: Array) -> Array:
     largest = squares.argmax(axis=1)
     outer = np.empty((len(R), 4, 4))  # 4 q q^T
     outer[:, :3, :3] = R + np.swapaxes(R, 1, 2)
-    for i, (j, k) in enumerate(((2, 1), (0, 2), (1, 0))):
-        outer[:, i, 3] = outer[:, 3, i] = R[:, j, k] - R[:, k, j]
-    outer[:, range(4), range(4)] = squares
+    outer[:, :3, 3] = outer[:, 3, :3] = R[:, _J, _K] - R[:, _K, _J]
+    outer[:, _I, _I] = squares
     row = outer[np.arange(len(R)), largest]
     return np.asarray(row / np.sqrt(np.square(row).sum(axis=1, keepdims=True)))
 

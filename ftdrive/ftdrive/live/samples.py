@@ -11,7 +11,7 @@ from ftcalib import CalibrationResult
 from ftcalib.files import JSON
 from ftcalib.motion.model import HEIGHT
 from ftdrive.runs.verification_record import VerificationRecord, marks_of
-from ftdrivers.interfaces import Array, DeviceInfo
+from ftdrivers.interfaces import Array, Columns, DeviceInfo
 
 Axes = Literal["sensor", "flange", "base", "tcp"]
 Point = Literal["sensor", "flange", "tcp"]
@@ -70,7 +70,7 @@ class Stages:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Paired:
+class Paired(Columns):
     """n consecutive samples of the sensor, each with the pose at its time; the fields are those of `Block`."""
 
     t_host_ns: Ns
@@ -89,21 +89,6 @@ class Paired:
     """(n, 3, 3)"""
     p_base_flange_m: Array
     """(n, 3) NaN where unknown."""
-
-    def __len__(self) -> int:
-        """Count the samples."""
-        return len(self.t_host_ns)
-
-    def rows(self, which: slice | NDArray[np.bool_]) -> Self:
-        """Select samples."""
-        return type(self)(*(getattr(self, column.name)[which] for column in fields(self)))
-
-    @classmethod
-    def concatenate(cls, blocks: Sequence[Self]) -> Self:
-        """Join blocks in the order given."""
-        if len(blocks) == 1:
-            return blocks[0]
-        return cls(*(np.concatenate([getattr(block, column.name) for block in blocks]) for column in fields(cls)))
 
 
 _ALIKE = ("sigma", "frame", "stages")

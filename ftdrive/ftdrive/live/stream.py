@@ -44,8 +44,6 @@ from ftdrivers.interfaces import ArmStates, ArmStatus, DeviceInfo, ForceTorqueSe
 STALE_S = 0.3
 """Without a new sample of either device for so long, `CompensatedStream.read` raises."""
 
-_BLOCK_S = 0.003
-"""A block has the samples of so long, because it costs about the same with one sample as with many."""
 _RETRY_S = 0.2
 """Between two attempts to reconnect."""
 _RATE_S = 0.5
@@ -106,6 +104,9 @@ class CompensatedStream(ProcessedStream):
         self._name = name
         self._force = force
         self._begin = frame, stages, false_alarm_rate
+        self.block_s = 0.003
+        """A block has the samples of so long, because it costs about the same with one sample as with many. May be set
+        at any time: longer blocks arrive later and take less of the processor."""
         self._stack = ExitStack()
         self._follows: ExitStack | None = None
         self._failure: tuple[str, DeviceError] | None = None
@@ -133,7 +134,6 @@ class CompensatedStream(ProcessedStream):
             nominal_Hz = self._sensor.health().nominal_rate_Hz
             sensor_rate_Hz = nominal_Hz if np.isfinite(nominal_Hz) else mean_rate_Hz(samples.t_host_ns)
             arm_rate_Hz = mean_rate_Hz(states.t_host_ns)
-            self._block_rows = math.ceil(_BLOCK_S * sensor_rate_Hz)
             self._arm_step_s = float(np.median(np.diff(states.t_device_s)))
             status = self._arm.status()
             self.payload_kg = status.payload_kg
@@ -294,7 +294,8 @@ class CompensatedStream(ProcessedStream):
         """Wait for the first samples, then for those of one block; the last of them have just arrived."""
         blocks = [self._sensor_follow.read(wait_s)]
         rows = len(blocks[0])
-        while 0 < rows < self._block_rows and len(more := self._sensor_follow.read(_BLOCK_S)):
+        wanted = self.block_s * self.info.sensor_rate_Hz
+        while 0 < rows < wanted and len(more := self._sensor_follow.read(self.block_s)):
             blocks.append(more)
             rows += len(more)
         return FtSamples.concatenate(blocks)
@@ -384,7 +385,7 @@ class CompensatedStream(ProcessedStream):
         self._arrivals.append((t_ns, len(states)))
         while self._arrivals[0][0] < t_ns - _RATE_WINDOW_NS:
             self._arrivals.popleft()
-        if self._arm_newest is not None and np.isfinite(states.t_device_s).all():
-            steps = np.diff(states.t_device_s, prepend=self._arm_newest[1]) / self._arm_step_s
-            self._arm_lost += int(np.maximum(np.rint(steps) - 1, 0).sum())
-        self._arm_newest = t_ns, float(states.t_device_s[-1])
+        newest_s = float(states.t_device_s[-1])
+        if self._arm_newest is not None and math.isfinite(duration_s := newest_s - self._arm_newest[1]):
+            self._arm_lost += max(round(duration_s / self._arm_step_s) - len(states), 0)
+        self._arm_newest = t_ns, newest_s

@@ -26,6 +26,8 @@ from ftdrivers.ros2.middleware import Node, ros2_module
 NAME: Final = "ftdrive"
 REPORT_S: Final = 0.4
 """Between two reports; a fault is reported at once."""
+_BLOCK_S: Final = 0.006
+"""Samples of so long are processed at once: a message is that late at most, and half as many blocks are processed."""
 _CONTACT_S: Final = 0.1
 _DISCOVERY_S: Final = 1.0
 """Until the nodes of this computer and its network are known."""
@@ -161,6 +163,7 @@ class Ros2Node:
         self._averaged = Averaged(stream.info.sensor_rate_Hz, self.fixed.rate)
         self._transforms.use(stream.info)
         stream.frame, stream.stages = self.parameters.frame, self.parameters.stages
+        stream.block_s = _BLOCK_S
         self.parameters.apply = self._apply
         if self._failure:
             self._failure = ""
@@ -199,8 +202,9 @@ class Ros2Node:
                 (self._raw, means.raw, self.fixed.sensor_frame),
                 (self._compensated, means.wrench, frame_id),
             ):
-                for message in ros2.pack_wrenches(t_ns, wrench, frame).tolist():
-                    publisher.publish(message)
+                if publisher.get_subscription_count():
+                    for message in ros2.pack_wrenches(t_ns, wrench, frame).tolist():
+                        publisher.publish(message)
             self.sent += len(t_ns)
             self._publish_contact(bool(means.in_contact[-1]))
             self._transforms.publish(block, info, int(t_ns[-1]))
