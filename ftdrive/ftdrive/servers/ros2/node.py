@@ -26,7 +26,7 @@ from ftdrivers.ros2.middleware import Node, ros2_module
 NAME: Final = "ftdrive"
 REPORT_S: Final = 0.4
 """Between two reports; a fault is reported at once."""
-_BLOCK_S: Final = 0.006
+_BLOCK_S: Final = 0.008
 """Samples of so long are processed at once: a message is that late at most, and half as many blocks are processed."""
 _CONTACT_S: Final = 0.1
 _DISCOVERY_S: Final = 1.0
