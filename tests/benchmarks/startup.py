@@ -15,11 +15,12 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from ftdrive.recording import Recorder
 from ftdrive.terminal.command_names import COMMANDS
+from tests.unit.ftdrive.recorded import block, info
 
 _PEER = ("-c", "import numpy, scipy.optimize, scipy.spatial.transform, click")
-_EXAMPLES = Path(__file__).parents[2] / "examples"
-_POSES, _RECORDING = str(_EXAMPLES / "poses.csv"), str(_EXAMPLES / "recording.csv")
+_POSES = str(Path(__file__).parents[2] / "examples" / "poses.csv")
 _CALLS = {
     "config": ("config", "show"),
     "plan": ("plan", "--model", "ur5e", "--minimal", "--tool", "0:60:90"),
@@ -29,11 +30,11 @@ _CALLS = {
     "history": ("history",),
     "fleet": ("fleet", "status"),
     "diff": ("diff", "a.json", "a.json"),
-    "convert": ("convert", _RECORDING, "{new}.csv"),
-    "compensate": ("compensate", _RECORDING),
+    "convert": ("convert", "recording.csv", "{new}.csv"),
+    "compensate": ("compensate", "recording.csv", "--bias", "estimate"),
     "export": ("export", "calibration", "a.json", "--format", "json"),
 }
-"""The smallest call that needs no device, in a folder with 17 poses, a calibration of them and a store with it."""
+"""The smallest call that needs no device; the folder has 17 poses, their calibration, a store and a short recording."""
 _LIMITS = {"solve": 1.5, "report": 2.0 / 0.45, "history": 0.35 / 0.45, "devices": 0.35 / 0.45}
 """Ratios: the times of the last three were set on a machine that takes 0.45 s for the import."""
 
@@ -66,6 +67,9 @@ def main() -> int:
         folder = Path(made)
         lines = Path(_POSES).read_text("utf-8").splitlines(keepends=True)
         (folder / "17.csv").write_text("".join(lines[:18]), "utf-8")
+        recorder = Recorder([folder / "recording.csv"], info(), {})
+        recorder.write(block(2500))
+        recorder.close()
         run = folder / "runs" / "a"
         run.mkdir(parents=True)
         seconds(("-m", "ftdrive", "solve", _POSES, "--output", str(run / "calibration.json")), folder)
