@@ -28,7 +28,11 @@ os.environ.pop("UV_RUN_RECURSION_DEPTH", None)  # or every command in a message 
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Keep the byte code of the processes that tests start, which would each compile numpy and scipy again."""
+    """Choose how many examples a property has, and keep the byte code of the processes that tests start.
+
+    Each of those processes would otherwise compile numpy and scipy again.
+    """
+    settings.load_profile("fast" if "not slow" in config.option.markexpr and "CI" not in os.environ else "full")
     cache = getattr(config, "cache", None)  # none with `-p no:cacheprovider`
     if os.environ.pop("PYTHONDONTWRITEBYTECODE", None) and cache is not None:
         os.environ["PYTHONPYCACHEPREFIX"] = str(cache.mkdir("bytecode"))
@@ -40,8 +44,8 @@ def pytest_collection_finish() -> None:
     gc.freeze()
 
 
-settings.register_profile("ftdrive", deadline=None, derandomize=True, max_examples=60)
-settings.load_profile("ftdrive")
+settings.register_profile("fast", deadline=None, derandomize=True, max_examples=20)
+settings.register_profile("full", deadline=None, derandomize=True, max_examples=60)
 
 
 @pytest.fixture(scope="session")
