@@ -18,6 +18,7 @@ INSIDE = {"Tripped", "OperatorStop", "Turned", "Interrupted", "Moved"}
 """The session catches these itself."""
 
 
+@pytest.mark.slow
 def test_only_the_root_derives_from_an_exception_of_python() -> None:
     trees = [
         ast.parse(path.read_text(encoding="utf-8"))

@@ -36,6 +36,7 @@ def test_the_page_of_finding_codes_is_up_to_date() -> None:
     assert codes_page.PAGE.read_text(encoding="utf-8") == codes_page.page(), f"uv run python {codes_page.__file__}"
 
 
+@pytest.mark.slow
 def test_no_code_tests_or_edits_a_sentence() -> None:
     """A program that has to know what was found takes it as data, such as `ftcalib.Finding` or a class of errors."""
     folders = ("ftdrive/ftdrive", "calib/ftcalib", "drivers/ftdrivers", "mocks/ftmocks")

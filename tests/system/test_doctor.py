@@ -119,6 +119,7 @@ def test_an_old_controller_needs_its_model(ftdrive: CommandLine) -> None:
     assert [check for check in named.values() if check["state"] == "failed"] == []
 
 
+@pytest.mark.slow
 def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine) -> None:
     # Not the path of an unplugged pseudo-terminal: the next one opened on this machine would take its name.
     cell.write_text(cell.read_text().replace(station.cell.sensor.url, "ati-serial:///dev/unplugged"))
@@ -130,6 +131,7 @@ def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine)
     assert "sensor.identity, permissions.port" in outcome.stderr
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_not_there(station: Station, cell: Path, ftdrive: CommandLine) -> None:
     cell.write_text(cell.read_text().replace(station.cell.robot.host, "no-such-arm.invalid"))
     outcome = ftdrive.run("doctor", "--config", cell, "--json")

@@ -446,6 +446,7 @@ def test_a_linear_drift_goes_on_for_the_next_minute(timed: bool) -> None:
     np.testing.assert_allclose(result.likely_error(), (1 + steps * 2 / 23) * np.array([0.5, 0.01]), rtol=0.1)
 
 
+@pytest.mark.slow
 def test_the_likely_error_is_that_of_the_next_use_where_the_bias_walks() -> None:
     walk, rng, ratios = np.repeat([0.1, 0.003], 3), np.random.default_rng(27), []
     times = 10.0 * np.arange(24, dtype=np.float64)

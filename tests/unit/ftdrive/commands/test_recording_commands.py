@@ -276,7 +276,7 @@ def test_compensate_prints_a_table(recorded: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("command", ["compensate", "convert"])
-@pytest.mark.parametrize("ending", [".mcap", ".csv", ".parquet"])
+@pytest.mark.parametrize("ending", [".mcap", pytest.param(".csv", marks=pytest.mark.slow), ".parquet"])
 def test_damage_and_control_c_keep_what_was_before(
     command: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -91,6 +91,7 @@ def test_q_and_the_time_end_it_and_too_little_is_not_kept(tmp_path: Path) -> Non
         passively(FakeCell(stop_s=2.0), tmp_path, SECONDS)
 
 
+@pytest.mark.slow
 def test_a_touch_below_that_of_a_guard_is_left_out_of_the_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

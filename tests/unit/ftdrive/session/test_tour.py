@@ -116,6 +116,7 @@ def test_a_plan_for_any_speed_is_driven_at_no_more_than_is_allowed(lab: Lab) -> 
     assert max(acceleration for *_, acceleration in lab.arm.moves[1:]) <= np.radians(30) + 1e-9
 
 
+@pytest.mark.slow
 def test_how_long_to_average_is_chosen_from_the_noise_of_the_sensor(lab: Lab) -> None:
     lab.cell = replace(lab.cell, sampling=Sampling())
     lab.calibrate()
