@@ -37,7 +37,7 @@ _EXCLUDE_ONE_ANOTHER = (
     ("--step", "--manual", "--listen", "--sweep", "--passive"),
     ("--quick", "--minimal", "--plan", "--resume", "--sweep", "--passive"),
     ("--fast", "--sweep", "--passive"),
-    ("--from", "--resume", "--sweep", "--passive"),
+    ("--from", "--resume", "--passive"),
     *((hand, option) for hand in ("--manual", "--listen", "--passive") for option in _OF_A_PLAN),
     *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
 )

@@ -122,7 +122,7 @@ def _first_found(attempts: Iterable[Attempt], refusal: str, certifier: Certifier
 def plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
     """Plan a tour of the four most informative reachable poses, for a new tool on a calibrated cell.
 
-    They determine everything, as few poses can, so they determine weight, centre of mass and bias of the tool: its error
+    They determine everything, so they determine weight, centre of mass and bias of the tool too: its error
     is 3 % above that of a tetrahedron of gravity directions.
 
     Parameters
