@@ -1,6 +1,7 @@
 """A new tool from a short recording in motion: mounting, base and gain are those of an earlier result."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ def test_an_earlier_result_adds_what_it_knows() -> None:
 def test_gain_and_cross_talk_are_kept() -> None:
     rng = np.random.default_rng(1)
     gain, cross_talk_m = (np.tensordot(0.02 * rng.normal(size=len(basis)), basis, 1) for basis in (GAIN, CROSS_TALK_M))
-    response = {"gain": gain, "cross_talk_m": cross_talk_m}
+    response: dict[str, Any] = {"gain": gain, "cross_talk_m": cross_talk_m}
     found = swept(replace(NEW, **response), earlier_of(replace(OLD, **response))).response
     assert found is not None
     assert np.abs((found.force_gain - gain) / found.sigma["force_gain"]).max() < 4
@@ -68,6 +69,6 @@ def test_gain_and_cross_talk_are_kept() -> None:
     ],
     ids=["mounting", "base"],
 )
-def test_what_holds_no_more_is_named(changed: dict[str, np.ndarray], named: str) -> None:
+def test_what_holds_no_more_is_named(changed: dict[str, Any], named: str) -> None:
     with pytest.raises(NotObservable, match=named):
-        swept(replace(NEW, **changed), earlier_of(OLD))  # type: ignore[arg-type]
+        swept(replace(NEW, **changed), earlier_of(OLD))
