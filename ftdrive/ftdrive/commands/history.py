@@ -93,7 +93,7 @@ def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime)
         one.verdict,
         f"{one.mass_kg:.4f}",
         verified,
-        " ".join(f"{value:.2f}" for value in one.parameters.force_bias_N),
+        " ".join(f"{value:.2f}" for value in one.numbers["force_bias_N"]),
         one.run,
         "" if one.temperature_C is None else f"{one.temperature_C:.0f}",
         f"{one.parent[:6]} ({one.update})" if one.parent else "",

@@ -4,17 +4,16 @@ import hashlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
+from math import isfinite
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_object
-from ftcalib.model import Array, Parameters
 from ftdrive.runs.verification_record import EMULATED, FORMAT, marks_of
 
-_NUMBERS = tuple(field.name for field in fields(Parameters))
+if TYPE_CHECKING:  # a list of results needs no numpy
+    from ftcalib.model import Array, Parameters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,13 +62,19 @@ class StoredResult:
         return tool_in_words(self.tool, emulated=self.emulated)
 
     @property
-    def parameters(self) -> Parameters:
+    def parameters(self) -> "Parameters":
         """Estimates; with `covariance` they make a `ftcalib.extras.difference.Estimated`."""
-        return Parameters(**{name: np.array(self.numbers[name]) for name in _NUMBERS})
+        import numpy as np
+
+        from ftcalib.model import Parameters
+
+        return Parameters(**{one.name: np.array(self.numbers[one.name]) for one in fields(Parameters)})
 
     @property
-    def covariance(self) -> Array:
+    def covariance(self) -> "Array":
         """(15, 15) of the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
+        import numpy as np
+
         return np.array(self.numbers["covariance"], dtype=np.float64)
 
     @property
@@ -137,8 +142,10 @@ def tool_in_words(tool: str | None, *, emulated: bool) -> str:
     return EMULATED if tool in (None, "emulated") else f"{tool} {EMULATED}"
 
 
-def mass_sigma_kg(parameters: Parameters, covariance: Array, g_m_s2: float) -> float:
+def mass_sigma_kg(parameters: "Parameters", covariance: "Array", g_m_s2: float) -> float:
     """Return one standard deviation of the mass from the covariance (15, 15) alone."""
+    import numpy as np
+
     force = parameters.gravity_force_base_N
     down = force / (np.linalg.norm(force) or 1.0)
     return float(np.sqrt(np.maximum(down @ covariance[3:6, 3:6] @ down, 0.0))) / g_m_s2
@@ -213,7 +220,7 @@ def _result(path: Path) -> StoredResult:
         mass_kg=result.mass_kg,
         g_m_s2=result.g_m_s2,
         numbers={
-            **{name: getattr(result.parameters, name).tolist() for name in _NUMBERS},
+            **{one.name: getattr(result.parameters, one.name).tolist() for one in fields(result.parameters)},
             "covariance": result.covariance.tolist(),
         },
         dataset_sha256=_text(provenance.get("dataset_sha256")),
@@ -269,7 +276,7 @@ def _text(value: Any) -> str | None:
 
 
 def _number(value: Any) -> float | None:
-    usable = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+    usable = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
     return float(value) if usable else None
 
 
