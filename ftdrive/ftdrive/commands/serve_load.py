@@ -7,7 +7,7 @@ import click
 
 from ftdrive.cell.devices import program_registers
 from ftdrive.commands.common import SOURCE, Source, frame_options, read_frame
-from ftdrive.commands.live_source import open_source
+from ftdrive.commands.live_source import open_log, open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Axes
 from ftdrive.servers.program import DOUBLES, INTEGERS, ProgramService
@@ -42,7 +42,7 @@ def serve_load(
         if stream.cell.sensor.height_mm is None:
             raise ConfigError("the centre of mass of a part needs [sensor] height_mm: set it, see `ftdrive init`")
         connect = partial(program_registers, stream.cell, first, len(INTEGERS), len(DOUBLES))
-        service = ProgramService(stream, connect, messages.print)
+        service = ProgramService(stream, connect, messages.print, open_log(source, stream, stack))
         messages.print(
             f"Serving weight and wrench ({stream.frame}) in the registers from {first}; {stream.info.calibration_name}."
         )

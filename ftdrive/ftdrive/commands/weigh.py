@@ -8,10 +8,10 @@ from typing import Any
 import click
 
 from ftdrive.commands.common import JSON, SOURCE, NewFile, Number, Source, write_json
-from ftdrive.commands.live_source import open_source
+from ftdrive.commands.live_source import open_log, open_source
 from ftdrive.live.processing import SENSOR_FRAME
 from ftdrive.live.samples import StreamInfo
-from ftdrive.live.weighing import CannotWeigh, load_values
+from ftdrive.live.weighing import load_values
 from ftdrive.recording import Recorder
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.text import echo
@@ -49,7 +49,8 @@ def weigh(
         if output is not None:
             recorder = Recorder([output], stream.info, stream.cell.to_dict())
             stack.callback(recorder.close)
-        weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg)
+        log = open_log(source, stream, stack)
+        weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg, log=log)
         if zero:
             messages.print(" Zero: the gripper must be empty.")
             weighing.zero()
@@ -74,7 +75,7 @@ def _print(weighing: Weighing, *, once: bool, waits: bool, poses: int, as_json: 
     begin_s = clock.now_s()
     for shown, is_new in weighing.states(raises=once):
         if once and not waits and clock.now_s() - begin_s > PATIENCE_S:
-            raise CannotWeigh(shown.refusal or "samples", shown.weight)
+            raise weighing.given_up(shown)
         weight = shown.weight
         if not is_new or (once and (shown.refusal is not None or weight is None or weight.poses < poses)):
             continue

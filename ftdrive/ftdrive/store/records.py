@@ -1,6 +1,7 @@
 """What the store keeps: of a run folder, read from its files, and of a cell, as it was configured."""
 
 import hashlib
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from datetime import UTC, datetime
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_object
 from ftdrive.runs.verification_record import EMULATED, FORMAT, marks_of
+from ftdrive.runs.weighings import FILES, FOLDER, WeighingsFile, is_weighings
 
 if TYPE_CHECKING:  # a list of results needs no numpy
     from ftcalib.model import Array, Parameters
@@ -132,7 +134,65 @@ class StoredCell:
     tool: str | None
 
 
-Record = StoredResult | StoredVerification
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredWeighings:
+    """The weighings of one day (UTC) with one calibration on one arm."""
+
+    id: str
+    """Name of the file without its ending."""
+    path: str
+    day: str
+    """As ISO 8601."""
+    tool: str | None
+    arm_serial: str | None
+    sensor_serial: str | None
+    robot_host: str | None
+    calibration_id: str | None
+    emulated: bool
+    size: int
+    """Bytes that were read; a file that has more is read again."""
+    weighings: int
+    """Of a part: an empty gripper does not count."""
+    refusals: dict[str, int]
+    """By the codes of `ftdrive.runs.weighings.REFUSALS`."""
+    last_utc: str | None
+    """Of the last part."""
+    mass_kg: float | None
+    mass_sigma_kg: float | None
+
+    @property
+    def tool_in_words(self) -> str:
+        """Name of the tool, and whether the cell was emulated."""
+        return tool_in_words(self.tool, emulated=self.emulated)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weighed:
+    """The last weighing of a tool, and the counts of its day."""
+
+    tool: str | None
+    arm_serial: str | None
+    robot_host: str | None
+    emulated: bool
+    day: str
+    weighings: int
+    """Of a part on this day."""
+    refusals: dict[str, int]
+    """By the codes of `ftdrive.runs.weighings.REFUSALS`, on this day."""
+    last_utc: str | None
+    """Of the last part; None if every weighing of this day was refused or found nothing."""
+    mass_kg: float | None
+    mass_sigma_kg: float | None
+
+
+Record = StoredResult | StoredVerification | StoredWeighings
+
+
+def user_folder() -> Path:
+    """Return the folder of the user's store and weighings; it need not exist."""
+    home = os.environ.get("XDG_DATA_HOME", "")
+    folder = Path(home) if Path(home).is_absolute() else Path("~/.local/share").expanduser()
+    return folder / "ftdrive"
 
 
 def tool_in_words(tool: str | None, *, emulated: bool) -> str:
@@ -152,14 +212,17 @@ def mass_sigma_kg(parameters: "Parameters", covariance: "Array", g_m_s2: float) 
 
 
 def record_paths(folders: Iterable[Path]) -> list[Path]:
-    """Return the files that become records, of runs or of the runs in folders, each once and by name."""
+    """Return the files that become records, of runs or of the runs in folders, each once and by name.
+
+    A folder of weighings counts as a run.
+    """
     runs = set[Path]()
     for folder in (one.resolve() for one in folders):
         if _is_run(folder):
             runs.add(folder)
         elif folder.is_dir():
             runs.update(filter(_is_run, folder.iterdir()))
-    names = ("calibration*.json", "verification*.json")
+    names = ("calibration*.json", "verification*.json", FILES)
     return [path for run in sorted(runs) for name in names for path in sorted(run.glob(name))]
 
 
@@ -176,13 +239,13 @@ def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
 
 def _is_run(folder: Path) -> bool:
     try:
-        return (folder / "run.json").is_file()
+        return (folder / "run.json").is_file() or (folder.name == FOLDER and folder.is_dir())
     except OSError:  # a folder of another user
         return False
 
 
 def read_record(path: Path) -> Record:
-    """Read one file of a run folder; fields that this version does not know are ignored.
+    """Read one file of a run folder or of weighings; fields that this version does not know are ignored.
 
     Raises
     ------
@@ -190,7 +253,33 @@ def read_record(path: Path) -> Record:
         The file is damaged or of another format.
     OSError
     """
+    if is_weighings(path):
+        file = WeighingsFile(path)
+        file.read()
+        return weighings_of(file)
     return _verification(path) if path.name.startswith("verification") else _result(path)
+
+
+def weighings_of(file: WeighingsFile) -> StoredWeighings:
+    """Return what was read of a file of weighings."""
+    header, last = file.header, file.last
+    return StoredWeighings(
+        id=file.path.stem,
+        path=str(file.path),
+        day=_text(header.get("day")) or "",
+        tool=_text(header.get("tool")),
+        arm_serial=_text(header.get("arm_serial")),
+        sensor_serial=_text(header.get("sensor_serial")),
+        robot_host=_text(header.get("robot_host")),
+        calibration_id=_text(header.get("calibration_id")),
+        emulated=header.get("emulated") is True,
+        size=file.size,
+        weighings=file.weighings,
+        refusals=dict(file.refusals),
+        last_utc=_utc(last.get("t_utc")),
+        mass_kg=_number(last.get("mass_kg")),
+        mass_sigma_kg=_number(last.get("mass_sigma_kg")),
+    )
 
 
 def _result(path: Path) -> StoredResult:

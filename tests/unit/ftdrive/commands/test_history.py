@@ -17,6 +17,7 @@ from ftdrive.runs.run import Run
 from ftdrive.session import session
 from ftdrive.store.database import default_file
 from ftdrive.store.store import Store
+from ftdrive.store.tables import SCHEMA
 from tests.unit.ftdrive.live.simulated import calibrated
 from tests.unit.ftdrive.store.run_folders import new_run, result, verified
 
@@ -105,12 +106,12 @@ def test_a_store_that_cannot_be_used_is_one_sentence(
 ) -> None:
     Store().index(runs)
     with sqlite3.connect(default_file()) as connection:
-        connection.execute("UPDATE ftdrive_schema SET version = 4")
+        connection.execute(f"UPDATE ftdrive_schema SET version = {SCHEMA + 1}")
     connection.close()
     for arguments in (["history"], ["history", "--index", runs], ["diff", "abcd", "abcd"]):
         code, out, err = run(*arguments)
         assert (code, out) == (6, "")
-        assert "has version 4, this ftdrive uses version 3: install a newer ftdrive" in err
+        assert f"has version {SCHEMA + 1}, this ftdrive uses version {SCHEMA}: install a newer ftdrive" in err
     monkeypatch.setenv("FTDRIVE_STORE_URL", "mysql://host/db")
     code, _, err = run("history")
     assert (code, "begins with mysql" in err) == (2, True)

@@ -12,7 +12,7 @@ from ftcalib.model import Array
 from ftdrive.fleet.observed import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification, Weighed
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.live.simulated import calibrated
 
@@ -104,14 +104,15 @@ class FakeStore:
     kept_cells: Sequence[StoredCell] = ()
     kept_results: Sequence[StoredResult] = ()
     kept_checks: Sequence[StoredVerification] = field(default_factory=list)
+    kept_weighed: Sequence[Weighed] = ()
 
     def cells(self) -> list[StoredCell]:
         return sorted(self.kept_cells, key=lambda one: one.name)
 
     def fleet(
         self, newest: int, since: datetime
-    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification]]:
-        return self.cells(), self._newest_accepted(newest), self._checks(since)
+    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[Weighed]]:
+        return self.cells(), self._newest_accepted(newest), self._checks(since), [*self.kept_weighed]
 
     def _newest_accepted(self, most: int) -> list[StoredResult]:
         found = sorted(self.kept_results, key=lambda one: (one.created_utc or "", one.id), reverse=True)
