@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
-    from ftdrive.store.records import StoredResult, StoredVerification, StoredWeighings
+    from ftdrive.store.records import StoredResult, StoredVerification, StoredWeighings, Weighed
 
 
 @click.command()
@@ -44,7 +44,7 @@ def history(
     from ftdrive.terminal.console import answer, hanging, messages
 
     left_out: tuple[str, ...] = ()
-    days: Sequence[StoredWeighings] = ()
+    weighed: Sequence[Weighed] = ()
     name = None
     if folders:
         if option := (
@@ -64,11 +64,11 @@ def history(
         if weighings:
             _show_weighings(store.weighings(_MOST_DAYS, tool), name, left_out, as_json)
             return
-        results, checks, days = store.results(tool), store.verifications(), store.weighings(_MOST_DAYS, tool)
+        results, checks = store.results(tool), store.verifications()
+        weighed = store.weighed((datetime.now(UTC) - _RECENT).date().isoformat(), tool)
     for words in left_out:
         messages.print(hanging(" left out: ", words))
     now = datetime.now(UTC)
-    weighed = {(one.tool, one.arm_serial, one.emulated): one for one in days if one.last_utc}
     found, advice = drifts(results), list(warnings(results, checks, now))
     last = {check.calibration_id: check for check in checks}
     if as_json:
@@ -81,7 +81,7 @@ def history(
                 "results": rows,
                 "trends": trends,
                 "warnings": advice,
-                "last_weighings": [asdict(one) for one in weighed.values()],
+                "last_weighings": [asdict(one) for one in weighed],
             }
         )
         return
@@ -93,14 +93,16 @@ def history(
     _print_table([_row(one, last.get(one.id), now) for one in results])
     for drift in found:
         echo(f"trend: {drift}")
-    for one in weighed.values():
+    for one in weighed:
         echo(f"last weighing: {_weighing_in_words(one)}")
     for words in advice:
         answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
 _MOST_DAYS = 20
-"""Of weighings that are listed, and in which the last one is looked for."""
+"""Of weighings that are listed."""
+_RECENT = timedelta(days=90)
+"""An earlier weighing is not the last one of a list."""
 
 
 def _show_weighings(days: "Sequence[StoredWeighings]", name: str, left_out: Sequence[str], as_json: bool) -> None:
@@ -117,7 +119,7 @@ def _show_weighings(days: "Sequence[StoredWeighings]", name: str, left_out: Sequ
         print_table(_DAY_TITLES, [_day_row(one) for one in days], folding={"arm", "tool", "refused"})
 
 
-_DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "kg", "file")
+_DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "mass", "file")
 
 
 def _day_row(one: "StoredWeighings") -> tuple[str, ...]:
@@ -133,16 +135,17 @@ def _day_row(one: "StoredWeighings") -> tuple[str, ...]:
     )
 
 
-def _weighing_in_words(one: "StoredWeighings") -> str:
+def _weighing_in_words(one: "Weighed") -> str:
     refused = sum(one.refusals.values())
     counts = f"{one.weighings} part{'' if one.weighings == 1 else 's'}, {refused} refused on this day"
-    return f"{one.tool_in_words}, {str(one.last_utc)[:16]}: {_mass_in_words(one)} kg; {counts}"
+    time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
+    return f"{one.tool_in_words}, {time}: {_mass_in_words(one)}; {counts}"
 
 
-def _mass_in_words(one: "StoredWeighings") -> str:
-    if one.mass_kg is None:
+def _mass_in_words(one: "StoredWeighings | Weighed") -> str:
+    if one.mass_kg is None or one.mass_sigma_kg is None:
         return "-"
-    return f"{one.mass_kg:.4f}" if one.mass_sigma_kg is None else with_sigma(one.mass_kg, one.mass_sigma_kg)
+    return f"{with_sigma(one.mass_kg, one.mass_sigma_kg)} kg"
 
 
 _TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias, N", "run", "°C", "parent")

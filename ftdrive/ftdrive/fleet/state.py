@@ -84,7 +84,7 @@ class CellState:
         return {**plain, "is_due": self.is_due(now)}
 
 
-FindingKind = Literal["payload", "temperature", "base", "overdue"]
+FindingKind = Literal["payload", "temperature", "base", "overdue", "weighing"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -184,6 +184,11 @@ class Weighed:
     mass_kg: float | None
     mass_sigma_kg: float | None
 
+    @property
+    def tool_in_words(self) -> str:
+        """Name of the tool, and whether the cell was emulated."""
+        return tool_in_words(self.tool, emulated=self.emulated)
+
 
 Record = StoredResult | StoredVerification | StoredWeighings
 

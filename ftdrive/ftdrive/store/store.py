@@ -175,8 +175,9 @@ class Store:
         return self._read(query, tables.to_weighings)[::-1]
 
     def weighed(self, since_day: str, tool: str | None = None) -> list[Weighed]:
-        """Return the last weighing of each tool on each arm, if it was on `since_day` (ISO 8601, UTC) or later."""
-        return self._read(_weighed(since_day, tool), tables.to_weighed)
+        """Return the last weighing of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
+        found = self._read(_weighed(since_day, tool), tables.to_weighed)
+        return sorted(found, key=lambda one: (one.day, one.last_utc or ""))
 
     def cells(self) -> list[StoredCell]:
         """Return all cells by name."""

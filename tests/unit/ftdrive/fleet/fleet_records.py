@@ -12,6 +12,7 @@ from ftcalib.model import Array
 from ftdrive.fleet.observed import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
+from ftdrive.runs.weighings import REFUSALS
 from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification, Weighed
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.live.simulated import calibrated
@@ -84,6 +85,24 @@ def daily(of: StoredResult, days: int, seed: int = 0, added: Array | None = None
     return [check(of, days - 1 - i, bias_change=(SIGMA * row).tolist(), **more) for i, row in enumerate(values)]
 
 
+def weighed(name: str, days_ago: float, **more: Any) -> Weighed:
+    """The last weighing of the cell `name`."""
+    at = time(days_ago)
+    values: dict[str, Any] = {
+        "tool": "gripper",
+        "arm_serial": f"arm-{name}",
+        "robot_host": f"host-{name}",
+        "emulated": False,
+        "day": at[:10],
+        "weighings": 7,
+        "refusals": dict.fromkeys(REFUSALS, 0) | {"cable": 2},
+        "last_utc": at,
+        "mass_kg": 0.25,
+        "mass_sigma_kg": 1e-3,
+    }
+    return Weighed(**(values | more))
+
+
 def time(days_ago: float) -> str:
     return (NOW - timedelta(days=days_ago)).isoformat(timespec="microseconds")
 
@@ -135,12 +154,22 @@ class FakeStore:
         return max(found, key=lambda one: one.created_utc or "", default=None)
 
 
-def store(cells: Sequence[StoredCell], results: Sequence[StoredResult], checks: Sequence[Any] = ()) -> Store:
-    return cast("Store", FakeStore(cells, results, checks))
+def store(
+    cells: Sequence[StoredCell],
+    results: Sequence[StoredResult],
+    checks: Sequence[Any] = (),
+    weighings: Sequence[Weighed] = (),
+) -> Store:
+    return cast("Store", FakeStore(cells, results, checks, weighings))
 
 
-def fleet(cells: Sequence[StoredCell], results: Sequence[StoredResult], checks: Sequence[Any] = ()) -> Fleet:
-    return fleet_state(store(cells, results, checks), NOW)
+def fleet(
+    cells: Sequence[StoredCell],
+    results: Sequence[StoredResult],
+    checks: Sequence[Any] = (),
+    weighings: Sequence[Weighed] = (),
+) -> Fleet:
+    return fleet_state(store(cells, results, checks, weighings), NOW)
 
 
 def observed(cells: Sequence[StoredCell], results: Sequence[StoredResult], checks: Sequence[Any] = ()) -> Observed:
