@@ -13,7 +13,7 @@ from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
-    from ftdrive.store.records import StoredResult, StoredVerification, StoredWeighings, Weighed
+    from ftdrive.store.records import StoredResult, StoredVerification, StoredWeighings
 
 
 @click.command()
@@ -44,7 +44,7 @@ def history(
     from ftdrive.terminal.console import answer, hanging, messages
 
     left_out: tuple[str, ...] = ()
-    weighed: Sequence[Weighed] = ()
+    weighed: Sequence[StoredWeighings] = ()
     name = None
     if folders:
         if option := (
@@ -65,7 +65,7 @@ def history(
             _show_weighings(store.weighings(_MOST_DAYS, tool), name, left_out, as_json)
             return
         results, checks = store.results(tool), store.verifications()
-        weighed = store.weighed((datetime.now(UTC) - _RECENT).date().isoformat(), tool)
+        weighed = store.last_weighings((datetime.now(UTC) - _RECENT).date().isoformat(), tool)
     for words in left_out:
         messages.print(hanging(" left out: ", words))
     now = datetime.now(UTC)
@@ -135,14 +135,14 @@ def _day_row(one: "StoredWeighings") -> tuple[str, ...]:
     )
 
 
-def _weighing_in_words(one: "Weighed") -> str:
+def _weighing_in_words(one: "StoredWeighings") -> str:
     refused = sum(one.refusals.values())
     counts = f"{one.weighings} part{'' if one.weighings == 1 else 's'}, {refused} refused on this day"
     time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
     return f"{one.tool_in_words}, {time}: {_mass_in_words(one)}; {counts}"
 
 
-def _mass_in_words(one: "StoredWeighings | Weighed") -> str:
+def _mass_in_words(one: "StoredWeighings") -> str:
     if one.mass_kg is None or one.mass_sigma_kg is None:
         return "-"
     return f"{with_sigma(one.mass_kg, one.mass_sigma_kg)} kg"

@@ -9,7 +9,7 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftdrive.fleet.cells import Owners
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification, Weighed
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification, StoredWeighings
 from ftdrive.store.store import Store
 
 WINDOW: Final = timedelta(days=90)
@@ -50,7 +50,7 @@ class Observed:
     """Verifications by calibration, the oldest first; none without a time, or older than `WINDOW`."""
     changes: Mapping[str, BiasChanges]
     """By calibration, where its verifications have them."""
-    weighed: Mapping[tuple[str | None, str | None, bool], Weighed]
+    weighings: Mapping[tuple[str | None, str | None, bool], StoredWeighings]
     """The last weighing by cell and tool, and whether the cell was emulated."""
     now: datetime
 
@@ -68,8 +68,8 @@ class Observed:
             checks.setdefault(check.calibration_id, []).append(check)
         known = [one for found in results.values() for one in found if one.id in checks]
         changes = {one.id: found for one in known if (found := _changes(one, checks[one.id])) is not None}
-        weighed = {(owners.cell_of(one), one.tool, one.emulated): one for one in sorted(weighings, key=_last)}
-        return cls(tuple(cells), results, checks, changes, weighed, now)
+        last = {(owners.cell_of(one), one.tool, one.emulated): one for one in weighings}
+        return cls(tuple(cells), results, checks, changes, last, now)
 
     def newest(self, cell: StoredCell) -> Iterator[StoredResult]:
         """Yield the newest result of each tool in use, in the order of their names.
@@ -111,7 +111,3 @@ def _changes(result: StoredResult, checks: Sequence[BriefVerification]) -> BiasC
 def when(one: StoredResult | StoredVerification | BriefVerification) -> datetime:
     """Return the time of a record that has one."""
     return datetime.fromisoformat(str(one.created_utc))
-
-
-def _last(one: Weighed) -> tuple[str, str]:
-    return one.day, one.last_utc or ""

@@ -3,7 +3,7 @@
 import hashlib
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from math import isfinite
 from pathlib import Path
@@ -136,7 +136,7 @@ class StoredCell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredWeighings:
-    """The weighings of one day (UTC) with one calibration on one arm."""
+    """The weighings of one day (UTC) with one calibration on one arm: a file, or the sum of several."""
 
     id: str
     """Name of the file without its ending."""
@@ -166,30 +166,6 @@ class StoredWeighings:
         return tool_in_words(self.tool, emulated=self.emulated)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Weighed:
-    """The last weighing of a tool, and the counts of its day."""
-
-    tool: str | None
-    arm_serial: str | None
-    robot_host: str | None
-    emulated: bool
-    day: str
-    weighings: int
-    """Of a part on this day."""
-    refusals: dict[str, int]
-    """By the codes of `ftdrive.runs.weighings.REFUSALS`, on this day."""
-    last_utc: str | None
-    """Of the last part; None if every weighing of this day was refused or found nothing."""
-    mass_kg: float | None
-    mass_sigma_kg: float | None
-
-    @property
-    def tool_in_words(self) -> str:
-        """Name of the tool, and whether the cell was emulated."""
-        return tool_in_words(self.tool, emulated=self.emulated)
-
-
 Record = StoredResult | StoredVerification | StoredWeighings
 
 
@@ -198,6 +174,24 @@ def user_folder() -> Path:
     home = os.environ.get("XDG_DATA_HOME", "")
     folder = Path(home) if Path(home).is_absolute() else Path("~/.local/share").expanduser()
     return folder / "ftdrive"
+
+
+def summed(days: Iterable[StoredWeighings]) -> list[StoredWeighings]:
+    """Sum up the files of each tool and arm, and keep the last weighing; the oldest first.
+
+    A tool has several files on a day if it was calibrated meanwhile.
+    """
+    found = dict[tuple[object, ...], StoredWeighings]()
+    for one in sorted(days, key=lambda one: (one.day, one.last_utc or "", one.id)):
+        key = (one.tool, one.arm_serial, one.robot_host, one.emulated)
+        before = found.pop(key, None)
+        found[key] = one if before is None or before.day != one.day else _with_counts(one, before)
+    return [*found.values()]
+
+
+def _with_counts(one: StoredWeighings, before: StoredWeighings) -> StoredWeighings:
+    refusals = {code: number + before.refusals[code] for code, number in one.refusals.items()}
+    return replace(one, weighings=one.weighings + before.weighings, refusals=refusals)
 
 
 def tool_in_words(tool: str | None, *, emulated: bool) -> str:

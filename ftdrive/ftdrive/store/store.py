@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
 
-from ftdrive.runs.weighings import REFUSALS, is_weighings
+from ftdrive.runs.weighings import is_weighings
 from ftdrive.store import tables
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import (
@@ -19,9 +19,9 @@ from ftdrive.store.records import (
     StoredResult,
     StoredVerification,
     StoredWeighings,
-    Weighed,
     read_records,
     record_paths,
+    summed,
 )
 
 WAIT_S = 5.0
@@ -174,10 +174,9 @@ class Store:
             query = query.where(table.c.tool == tool)
         return self._read(query, tables.to_weighings)[::-1]
 
-    def weighed(self, since_day: str, tool: str | None = None) -> list[Weighed]:
-        """Return the last weighing of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
-        found = self._read(_weighed(since_day, tool), tables.to_weighed)
-        return sorted(found, key=lambda one: (one.day, one.last_utc or ""))
+    def last_weighings(self, since_day: str, tool: str | None = None) -> list[StoredWeighings]:
+        """Return the last day with weighings of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
+        return summed(self._read(_last_weighings(since_day, tool), tables.to_weighings))
 
     def cells(self) -> list[StoredCell]:
         """Return all cells by name."""
@@ -185,10 +184,10 @@ class Store:
 
     def fleet(
         self, newest: int, since: datetime
-    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[Weighed]]:
+    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[StoredWeighings]]:
         """Return what a fleet needs, in one look at the database: cells, results and checks, the oldest first.
 
-        Also the last weighing of each tool on each arm.
+        Also `last_weighings`.
 
         Parameters
         ----------
@@ -203,9 +202,9 @@ class Store:
             cells = _rows(connection, select(tables.cells), tables.to_cell)
             results = _rows(connection, _newest_accepted(newest), tables.to_result)
             found = _rows(connection, checks, tables.to_check)
-            weighed = _rows(connection, _weighed(start[:10]), tables.to_weighed)
+            weighings = _rows(connection, _last_weighings(start[:10]), tables.to_weighings)
         cells.sort(key=lambda cell: cell.name)
-        return cells, results, sorted(found, key=lambda check: check.created_utc), weighed
+        return cells, results, sorted(found, key=lambda check: check.created_utc), summed(weighings)
 
     def _read(self, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
         with self._current.reading() as connection:
@@ -250,17 +249,13 @@ def _newest_accepted(most: int) -> Select[Any]:
     return _oldest_first(table).where(table.c.id.in_(select(found.c.id).where(found.c.rank <= most)))
 
 
-def _weighed(since_day: str, tool: str | None = None) -> Select[Any]:
-    """Select the last day of each tool on each arm, with the sums over its files of that day."""
+def _last_weighings(since_day: str, tool: str | None = None) -> Select[Any]:
+    """Select the files of the last day of each tool on each arm."""
     table = tables.weighings
     key = (table.c.tool, table.c.arm_serial, table.c.robot_host, table.c.emulated)
-    counts = [table.c.weighings, *(table.c[f"refused_{code}"] for code in REFUSALS)]
-    newest = (table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id)
-    rank = func.row_number().over(partition_by=key, order_by=newest).label("rank")
-    sums = [func.sum(one).over(partition_by=(*key, table.c.day)).label(one.name) for one in counts]
-    ranked = select(*key, table.c.day, *sums, table.c.last_utc, table.c.mass_kg, table.c.mass_sigma_kg, rank)
-    ranked = ranked.where(table.c.day >= since_day)
+    rank = func.rank().over(partition_by=key, order_by=table.c.day.desc()).label("rank")
+    ranked = select(table.c.id, rank).where(table.c.day >= since_day)
     if tool is not None:
         ranked = ranked.where(table.c.tool == tool)
     found = ranked.subquery()
-    return select(*(column for column in found.c if column.name != "rank")).where(found.c.rank == 1)
+    return select(table).where(table.c.id.in_(select(found.c.id).where(found.c.rank == 1)))

@@ -18,7 +18,6 @@ from ftdrive.store.records import (
     StoredResult,
     StoredVerification,
     StoredWeighings,
-    Weighed,
 )
 
 SCHEMA: Final = 4
@@ -130,18 +129,9 @@ def to_verification(row: Row[Any]) -> StoredVerification:
 
 def to_weighings(row: Row[Any]) -> StoredWeighings:
     """Return a row of `weighings` as a record."""
-    return StoredWeighings(**_with_refusals(row))
-
-
-def to_weighed(row: Row[Any]) -> Weighed:
-    """Return a row of `ftdrive.store.store.Store.weighed` as a record."""
-    return Weighed(**_with_refusals(row))
-
-
-def _with_refusals(row: Row[Any]) -> dict[str, Any]:
     values = row._asdict()
-    refusals = {code: int(values.pop(f"refused_{code}")) for code in REFUSALS}
-    return values | {"refusals": refusals}
+    refusals = {code: values.pop(f"refused_{code}") for code in REFUSALS}
+    return StoredWeighings(**values, refusals=refusals)
 
 
 def to_check(row: Sequence[Any]) -> BriefVerification:

@@ -13,7 +13,14 @@ from ftdrive.fleet.observed import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
 from ftdrive.runs.weighings import REFUSALS
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification, Weighed
+from ftdrive.store.records import (
+    BriefVerification,
+    StoredCell,
+    StoredResult,
+    StoredVerification,
+    StoredWeighings,
+    summed,
+)
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.live.simulated import calibrated
 
@@ -85,14 +92,19 @@ def daily(of: StoredResult, days: int, seed: int = 0, added: Array | None = None
     return [check(of, days - 1 - i, bias_change=(SIGMA * row).tolist(), **more) for i, row in enumerate(values)]
 
 
-def weighed(name: str, days_ago: float, **more: Any) -> Weighed:
+def weighed(name: str, days_ago: float, **more: Any) -> StoredWeighings:
     """The last weighing of the cell `name`."""
     at = time(days_ago)
     values: dict[str, Any] = {
+        "id": f"weighings-{name}-{days_ago:g}",
+        "path": f"/weighings/{name}-{days_ago:g}.ndjson",
         "tool": "gripper",
         "arm_serial": f"arm-{name}",
+        "sensor_serial": f"ft-{name}",
         "robot_host": f"host-{name}",
+        "calibration_id": f"{name}-1",
         "emulated": False,
+        "size": 1000,
         "day": at[:10],
         "weighings": 7,
         "refusals": dict.fromkeys(REFUSALS, 0) | {"cable": 2},
@@ -100,7 +112,7 @@ def weighed(name: str, days_ago: float, **more: Any) -> Weighed:
         "mass_kg": 0.25,
         "mass_sigma_kg": 1e-3,
     }
-    return Weighed(**(values | more))
+    return StoredWeighings(**(values | more))
 
 
 def time(days_ago: float) -> str:
@@ -123,15 +135,15 @@ class FakeStore:
     kept_cells: Sequence[StoredCell] = ()
     kept_results: Sequence[StoredResult] = ()
     kept_checks: Sequence[StoredVerification] = field(default_factory=list)
-    kept_weighed: Sequence[Weighed] = ()
+    kept_weighings: Sequence[StoredWeighings] = ()
 
     def cells(self) -> list[StoredCell]:
         return sorted(self.kept_cells, key=lambda one: one.name)
 
     def fleet(
         self, newest: int, since: datetime
-    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[Weighed]]:
-        return self.cells(), self._newest_accepted(newest), self._checks(since), [*self.kept_weighed]
+    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[StoredWeighings]]:
+        return self.cells(), self._newest_accepted(newest), self._checks(since), summed(self.kept_weighings)
 
     def _newest_accepted(self, most: int) -> list[StoredResult]:
         found = sorted(self.kept_results, key=lambda one: (one.created_utc or "", one.id), reverse=True)
@@ -158,7 +170,7 @@ def store(
     cells: Sequence[StoredCell],
     results: Sequence[StoredResult],
     checks: Sequence[Any] = (),
-    weighings: Sequence[Weighed] = (),
+    weighings: Sequence[StoredWeighings] = (),
 ) -> Store:
     return cast("Store", FakeStore(cells, results, checks, weighings))
 
@@ -167,7 +179,7 @@ def fleet(
     cells: Sequence[StoredCell],
     results: Sequence[StoredResult],
     checks: Sequence[Any] = (),
-    weighings: Sequence[Weighed] = (),
+    weighings: Sequence[StoredWeighings] = (),
 ) -> Fleet:
     return fleet_state(store(cells, results, checks, weighings), NOW)
 

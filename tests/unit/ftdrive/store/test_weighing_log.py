@@ -57,13 +57,13 @@ def test_the_last_weighing_and_the_counts_of_its_day_come_back(logs: Logs) -> No
     logs.write(0.31, times=iter([NOON + timedelta(hours=1)]), calibration_id="b7431b000000")
     logs.write(9.9, emulated=True)
     store = Store(logs.url)
-    gripper, emulated = sorted(store.weighed("2026-11-01", "gripper"), key=lambda one: one.emulated)
+    gripper, emulated = sorted(store.last_weighings("2026-11-01", "gripper"), key=lambda one: one.emulated)
     assert (gripper.day, gripper.weighings, gripper.mass_kg, gripper.mass_sigma_kg) == ("2026-11-26", 3, 0.31, 1e-3)
     assert gripper.last_utc == "2026-11-26T13:00:00.000000+00:00"
     assert {code: n for code, n in gripper.refusals.items() if n} == {"cable": 2, "lifted": 1}
     assert (emulated.mass_kg, emulated.weighings) == (9.9, 1)
-    assert {one.tool for one in store.weighed("2026-11-01")} == {"gripper", "drill"}
-    assert store.weighed("2026-11-27") == []
+    assert {one.tool for one in store.last_weighings("2026-11-01")} == {"gripper", "drill"}
+    assert store.last_weighings("2026-11-27") == []
     days = store.weighings(3, "gripper")
     assert [(one.day, one.mass_kg) for one in days][-1] == ("2026-11-26", 0.31)
     assert len(days) == 3
