@@ -2,17 +2,16 @@
 
 from contextlib import ExitStack
 from functools import partial
+from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.cell.devices import program_registers
 from ftdrive.commands.common import SOURCE, Source, frame_options, read_frame
-from ftdrive.commands.live_source import open_log, open_source
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Axes
-from ftdrive.servers.program import DOUBLES, INTEGERS, ProgramService
-from ftdrive.terminal.console import messages
 from ftdrivers.ur.program_registers import FIRST, LAST
+
+if TYPE_CHECKING:
+    from ftdrive.live.samples import Axes
 
 
 @click.command()
@@ -21,7 +20,7 @@ from ftdrivers.ur.program_registers import FIRST, LAST
 @click.option("--first", type=int, default=FIRST, show_default=True, help="First register of each kind.")
 def serve_load(
     source: Source,
-    axes: Axes,
+    axes: "Axes",
     about: str,
     first: int,
 ) -> None:
@@ -30,6 +29,11 @@ def serve_load(
     Any program may run. It requests in two output registers and reads input registers, with the functions of `ftdrive
     export urscript`. Nothing else is sent, and the arm is never moved. Ctrl-C ends.
     """
+    from ftdrive.cell.devices import program_registers
+    from ftdrive.commands.live_source import open_log, open_source
+    from ftdrive.servers.program import DOUBLES, INTEGERS, ProgramService
+    from ftdrive.terminal.console import messages
+
     last = LAST + 1 - max(len(INTEGERS), len(DOUBLES))
     if not FIRST <= first <= last:
         raise ConfigError(

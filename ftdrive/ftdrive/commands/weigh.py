@@ -3,19 +3,16 @@
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ftdrive.commands.common import JSON, SOURCE, NewFile, Number, Source, write_json
-from ftdrive.commands.live_source import open_log, open_source
-from ftdrive.live.processing import SENSOR_FRAME
-from ftdrive.live.samples import StreamInfo
-from ftdrive.live.weighing import load_values
-from ftdrive.recording import Recorder
-from ftdrive.terminal.console import messages
 from ftdrive.terminal.text import echo
-from ftdrive.terminal.weighing import PATIENCE_S, Shown, Weighing, line_of
+
+if TYPE_CHECKING:
+    from ftdrive.live.samples import StreamInfo
+    from ftdrive.terminal.weighing import Shown, Weighing
 
 
 @click.command()
@@ -43,6 +40,12 @@ def weigh(
     and the smallest mass that differs from zero. Contact, cables and moving parts are named and not weighed. The arm is
     only read, never moved. Ctrl-C ends.
     """
+    from ftdrive.commands.live_source import open_log, open_source
+    from ftdrive.live.processing import SENSOR_FRAME
+    from ftdrive.recording import Recorder
+    from ftdrive.terminal.console import messages
+    from ftdrive.terminal.weighing import Weighing
+
     with ExitStack() as stack:
         stream = open_source(source, SENSOR_FRAME, stack)
         recorder = None
@@ -62,15 +65,19 @@ def weigh(
             run_weigh(weighing)
 
 
-def answer_of(shown: Shown, info: StreamInfo) -> dict[str, Any]:
+def answer_of(shown: "Shown", info: "StreamInfo") -> dict[str, Any]:
     """Return a state as JSON."""
+    from ftdrive.live.weighing import load_values
+
     values: dict[str, Any] = {"schema_version": 1, "calibration_id": info.calibration.id, "marks": list(info.marks)}
     values |= {} if shown.weight is None else load_values(shown.weight, info)
     return values | {"count": shown.count, "refused": shown.refusal}
 
 
-def _print(weighing: Weighing, *, once: bool, waits: bool, poses: int, as_json: bool) -> None:
+def _print(weighing: "Weighing", *, once: bool, waits: bool, poses: int, as_json: bool) -> None:
     """Print each new weight or fault as a line; with `once` end with the first weight."""
+    from ftdrive.terminal.weighing import PATIENCE_S, line_of
+
     clock = weighing.stream.clock
     begin_s = clock.now_s()
     for shown, is_new in weighing.states(raises=once):
