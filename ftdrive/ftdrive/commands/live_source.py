@@ -1,5 +1,6 @@
 """The compensated stream of the cell that the options name, for the commands that have `SOURCE`."""
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from socket import gethostname
 
@@ -51,8 +52,13 @@ def open_source(source: Source, frame: WrenchFrame, stack: ExitStack, track: Tra
     return stream
 
 
-def open_log(source: Source, stream: CompensatedStream, stack: ExitStack) -> WeighingLog | None:
-    """Keep the weighings of a stream until `stack` ends; None with a temporary calibration of an emulated cell."""
+def open_log(
+    source: Source, stream: CompensatedStream, stack: ExitStack, say: Callable[[str], object]
+) -> WeighingLog | None:
+    """Keep the weighings of a stream until `stack` ends; None with a temporary calibration of an emulated cell.
+
+    `say` takes a sentence for the operator, from any thread.
+    """
     if source.simulate and source.path is None:
         return None
     info, cell = stream.info, stream.cell
@@ -65,6 +71,6 @@ def open_log(source: Source, stream: CompensatedStream, stack: ExitStack) -> Wei
         "emulated": EMULATED in info.marks,
         "computer": gethostname(),
     }
-    log = WeighingLog(origin, store_url() if source.simulate else cell.store.url, messages.print)
+    log = WeighingLog(origin, store_url() if source.simulate else cell.store.url, say)
     stack.callback(log.close)
     return log

@@ -46,7 +46,7 @@ def serve_load(
         if stream.cell.sensor.height_mm is None:
             raise ConfigError("the centre of mass of a part needs [sensor] height_mm: set it, see `ftdrive init`")
         connect = partial(program_registers, stream.cell, first, len(INTEGERS), len(DOUBLES))
-        service = ProgramService(stream, connect, messages.print, open_log(source, stream, stack))
+        service = ProgramService(stream, connect, messages.print, open_log(source, stream, stack, messages.print))
         messages.print(
             f"Serving weight and wrench ({stream.frame}) in the registers from {first}; {stream.info.calibration_name}."
         )

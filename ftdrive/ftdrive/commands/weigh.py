@@ -1,6 +1,7 @@
 """`ftdrive weigh`: what the gripper holds beyond its calibrated tool."""
 
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,17 +53,27 @@ def weigh(
         if output is not None:
             recorder = Recorder([output], stream.info, stream.cell.to_dict())
             stack.callback(recorder.close)
-        log = open_log(source, stream, stack)
+        on_screen = not (once or as_json) and sys.stdout.isatty()
+        later: list[str] = []  # a screen would hide it
+        stack.callback(_print_all, later)
+        log = open_log(source, stream, stack, later.append if on_screen else messages.print)
         weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg, log=log)
         if zero:
             messages.print(" Zero: the gripper must be empty.")
             weighing.zero()
-        if once or as_json or not sys.stdout.isatty():
-            _print(weighing, once=once, waits=zero, poses=poses, as_json=as_json)
-        else:
+        if on_screen:
             from ftdrive.terminal.weigh_screen import run_weigh
 
             run_weigh(weighing)
+        else:
+            _print(weighing, once=once, waits=zero, poses=poses, as_json=as_json)
+
+
+def _print_all(texts: Sequence[str]) -> None:
+    from ftdrive.terminal.console import messages
+
+    for words in texts:
+        messages.print(words)
 
 
 def answer_of(shown: "Shown", info: "StreamInfo") -> dict[str, Any]:

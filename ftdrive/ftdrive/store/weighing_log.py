@@ -20,6 +20,7 @@ _GOODBYE_S: Final = 6.0
 """So long the end of a program waits for the last write: a store is waited for 5 s."""
 _MOST_WAITING: Final = 1000
 """Lines that wait for a disk; then the oldest are lost."""
+_NOT_INDEXED: Final = "Weighings are kept but not in the history yet"
 _Line = tuple[str, Mapping[str, JSON]]
 """Day and content."""
 
@@ -62,6 +63,8 @@ class WeighingLog:
         self._file: WeighingsFile | None = None
         self._is_new = False
         """Whether the file has lines that the store lacks."""
+        self._lacks_older = True
+        """Whether the store may lack other files of the folder."""
         self._store: Any = None
         self._said = set[str]()
         self._thread = Thread(target=self._run, daemon=True, name="weighings")
@@ -87,7 +90,7 @@ class WeighingLog:
     # -------------------------------------------------------------------------------------------------- its own thread
 
     def _run(self) -> None:
-        self._attempt("The history lacks older weighings", self._catch_up)
+        self._attempt(_NOT_INDEXED, self._open)
         due_s, ends = monotonic(), False
         while not ends:
             new = self._next(max(0.0, due_s - monotonic()) if self._is_new else None)
@@ -109,13 +112,11 @@ class WeighingLog:
             found.append(self._lines.get())
         return found
 
-    def _catch_up(self) -> None:
-        """Add what an outage kept from the store; the database is imported here, before there is anything to write."""
+    def _open(self) -> None:
+        """Import the database, before there is anything to write."""
         from ftdrive.store.store import Store
 
         self._store = Store(self._url)
-        if self._folder.is_dir():
-            self._store.index(self._folder)
 
     def _append(self) -> None:
         while self._waiting:
@@ -129,11 +130,14 @@ class WeighingLog:
             self._is_new = True
 
     def _index(self) -> None:
-        self._attempt("Weighings are kept but not in the history yet", self._put_weighings)
+        self._attempt(_NOT_INDEXED, self._put_weighings)
 
     def _put_weighings(self) -> None:
         if self._store is None:
-            self._catch_up()
+            self._open()
+        if self._lacks_older:
+            self._store.index(self._folder)  # what an outage kept from the store
+            self._lacks_older = False
         if self._file is not None:
             self._file.read()
             self._store.put_weighings(weighings_of(self._file))

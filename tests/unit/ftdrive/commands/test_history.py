@@ -290,8 +290,8 @@ def test_weighings_are_kept_with_a_calibration_of_a_file(
     stream: Any = SimpleNamespace(info=replace(info(calibration), emulated=emulated), cell=config)
     source = Source(None, None, False, None, None, None, emulated)
     with ExitStack() as stack:
-        assert (open_log(source, stream, stack) is None) == emulated
-        log = open_log(source._replace(path=tmp_path), stream, stack)
+        assert (open_log(source, stream, stack, print) is None) == emulated
+        log = open_log(source._replace(path=tmp_path), stream, stack, print)
         assert log is not None
         log.refused("cable")
     (day,) = Store().weighings(9)

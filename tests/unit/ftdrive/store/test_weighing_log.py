@@ -110,8 +110,8 @@ def test_a_store_that_cannot_be_written_is_reported_once_and_caught_up(tmp_path:
     assert len(down.said) == 1
     assert down.said[0].startswith(" Weighings are kept but not in the history yet, because the store")
     up = Logs(down.folder, f"sqlite:///{tmp_path}/store.sqlite")
-    up.write()
-    assert Store(up.url).weighings(9)[0].weighings == 5
+    up.write("cable", times=iter([NOON + timedelta(days=1)]))
+    assert [one.weighings for one in Store(up.url).weighings(9)] == [5, 0]
     assert up.said == []
 
 
