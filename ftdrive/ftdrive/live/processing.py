@@ -31,6 +31,7 @@ from ftdrive.live.samples import (
     StreamEvent,
     StreamInfo,
     StreamStatus,
+    Tracked,
     Tracking,
     WrenchFrame,
 )
@@ -403,8 +404,13 @@ class Processor:
             drift_sigma_N_h=drift_sigma_N_h,
             contact_limit=self._test.limit,
             false_alarm_rate=self._test.false_alarm_rate,
-            tracked=None if self.track == "off" else self._following.tracked,
+            tracked=self.tracked,
         )
+
+    @property
+    def tracked(self) -> Tracked | None:
+        """Bias and part as followed; None unless they are, and before the first window."""
+        return None if self.track == "off" else self._following.tracked
 
     # ---------------------------------------------------------------------------------------------------------- events
 
@@ -580,6 +586,11 @@ class ProcessedStream(ABC):
         self._track = track
         if (processor := getattr(self, "_processor", None)) is not None:  # else it is set when the stream is opened
             processor.track = track
+
+    @property
+    def tracked(self) -> Tracked | None:
+        """Bias and held part as followed; None unless `track` is set, and before the first look."""
+        return self._processor.tracked
 
     @property
     def stages(self) -> Stages:
