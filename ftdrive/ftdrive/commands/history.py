@@ -33,10 +33,11 @@ def history(
     url: str | None,
     as_json: bool,
 ) -> None:
-    """List results with their date and last verification, the trends of bias and payload, and the last weighings.
+    """List results with their date and last verification, how bias and payload change, and the last weighings.
 
     They come from the store, where `calibrate` and `verify` add theirs, or from the run folders in RUNS. A trend is
     significant if the uncertainty of the results explains it in less than one case of 100, and so does their scatter.
+    Where a sensor reports its temperature, its bias is fitted against that too.
     """
     from ftdrive.errors import ConfigError
     from ftdrive.store.history import drifts, warnings
@@ -70,20 +71,18 @@ def history(
         messages.print(hanging(" left out: ", words))
     now = datetime.now(UTC)
     found, advice = drifts(results), list(warnings(results, checks, now))
+    warmth = []
+    if any(one.temperature_C is not None for one in results):
+        from ftdrive.store.temperature import temperatures
+
+        warmth = temperatures(results, checks)
     last = {check.calibration_id: check for check in checks}
     if as_json:
         rows = [_as_json(one, last.get(one.id), now) for one in results]
         trends = [one.to_dict() for one in found]
-        write_json(
-            {
-                "schema_version": 1,
-                "store": name,
-                "results": rows,
-                "trends": trends,
-                "warnings": advice,
-                "last_weighings": [asdict(one) for one in weighed],
-            }
-        )
+        about = {"trends": trends, "temperature": [one.to_dict() for one in warmth], "warnings": advice}
+        about["last_weighings"] = [asdict(one) for one in weighed]
+        write_json({"schema_version": 1, "store": name, "results": rows, **about})
         return
     if not results:
         messages.print(
@@ -91,10 +90,11 @@ def history(
         )
         return
     _print_table([_row(one, last.get(one.id), now) for one in results])
-    for drift in found:
-        echo(f"trend: {drift}")
-    for one in weighed:
-        echo(f"last weighing: {_weighing_in_words(one)}")
+    trend_lines = (f"trend: {drift}" for drift in found)
+    warmth_lines = (line for one in warmth for line in one.lines())
+    weighing_lines = (f"last weighing: {_weighing_in_words(one)}" for one in weighed)
+    for line in (*trend_lines, *warmth_lines, *weighing_lines):
+        echo(line)
     for words in advice:
         answer.print(hanging(" ! ", words, answer), style="yellow")
 
