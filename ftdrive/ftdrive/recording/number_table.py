@@ -14,6 +14,11 @@ from ftcalib.errors import BadDataset
 from ftdrivers.interfaces import Array
 
 _READ_BYTES, _LONGEST_LINE = 1 << 21, 1 << 14
+_SEPARATORS = np.frombuffer(b",\n", np.uint8)
+_BEFORE: Final = {
+    sign: np.frombuffer(text, np.uint8) for sign, text in ((b"-", b",\ne"), (b"+", b"e"), (b"e", b"0123456789."))
+}
+"""What may precede a sign."""
 
 
 class Wanted(NamedTuple):
@@ -116,13 +121,18 @@ def parsed(text: bytes, columns: int, use: Sequence[int]) -> Array:
 
 
 def _is_plain(text: bytes, columns: int) -> bool:
-    """Whether each line has so many decimals as `-1.5` or `2e-05`; they may still lack their digits."""
+    """Whether each line has so many decimals as `-1.5` or `2e-05`; some may lack their digits."""
     between = text.translate(None, b"0123456789-+")
     one_line = b"," * (columns - 1) + b"\n"
-    return (
-        between.translate(None, b".e") == one_line * text.count(b"\n")
-        and not any(pair in between for pair in (b"..", b"ee", b"e."))
-        and text.count(b"-") == sum(map(text.count, (b",-", b"\n-", b"e-"))) + text.startswith(b"-")
-        and text.count(b"+") == text.count(b"e+")
-        and not any(end in text for sign in (b"e", b"-", b"+") for end in (sign + b",", sign + b"\n"))
-    )
+    if between.translate(None, b".e") != one_line * text.count(b"\n"):
+        return False
+    if any(pair in between for pair in ((b"..", b"ee", b"e.") if b"e" in between else (b"..",))):
+        return False
+    byte = np.frombuffer(b"\n" + text, np.uint8)
+    for sign, before in _BEFORE.items():
+        if sign not in text:
+            continue
+        places = np.flatnonzero(byte == ord(sign))
+        if not np.isin(byte[places - 1], before).all() or np.isin(byte[places + 1], _SEPARATORS).any():
+            return False
+    return True
