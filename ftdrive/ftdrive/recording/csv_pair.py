@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import chain
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from ftdrive.recording.recording import PIECE_ROWS, Header, Measured
 from ftdrive.runs.run import versions
 from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtSamples
 
+T = TypeVar("T")
 _WHOLE = 10**6
 """Seconds: the delay is estimated from all of a recording."""
 _MEAN_S = 0.008
@@ -84,21 +86,27 @@ class CsvPair:
                 yield from (block.rows(slice(i, i + PIECE_ROWS)) for i in range(0, len(block), PIECE_ROWS))
 
         waiting: list[Paired] = []
-        for paired in paired_blocks(samples(), self._states, self.delay_s):
-            rows = Paired.concatenate([*waiting, paired])
-            if len(rows) >= PIECE_ROWS:  # as of other recordings, because the contact test goes in steps
-                yield Measured(rows.rows(slice(PIECE_ROWS)), (), share[0])
-            waiting = [rows.rows(slice(PIECE_ROWS if len(rows) >= PIECE_ROWS else 0, None))]
+        failure: BadDataset | None = None
+        try:
+            for paired in paired_blocks(samples(), self._states, self.delay_s):
+                rows = Paired.concatenate([*waiting, paired])
+                if len(rows) >= PIECE_ROWS:  # as of other recordings, because the contact test goes in steps
+                    yield Measured(rows.rows(slice(PIECE_ROWS)), (), share[0])
+                waiting = [rows.rows(slice(PIECE_ROWS if len(rows) >= PIECE_ROWS else 0, None))]
+        except BadDataset as error:
+            failure = error
         if any(map(len, waiting)):
-            yield Measured(waiting[0], (), 1.0)
+            yield Measured(waiting[0], (), share[0])
+        if failure is not None:
+            raise failure
 
     def _estimated_delay(self) -> tuple[float, float]:
         """Return the delay and its sigma, from means over `_MEAN_S`."""
         info = self.header.info
         size = max(1, round(_MEAN_S * info.sensor_rate_Hz))
-        means = [FtSamples.concatenate(list(_means(self._wrench, size)))]
+        means = [FtSamples.concatenate(list(_before_a_fault(_means(self._wrench, size))))]
         estimator = DelayEstimator(info.calibration, info.p_flange_sensor_m, window=_WHOLE)
-        estimate_delay(means, self._states, estimator)
+        estimate_delay(means, _Again(lambda: _before_a_fault(iter(self._states))), estimator)
         return estimator.delay_s, estimator.sigma_s
 
 
@@ -110,6 +118,18 @@ class _Again:
 
     def __iter__(self) -> Iterator[ArmStates]:
         return self._states()
+
+
+def _before_a_fault(parts: Iterator[T]) -> Iterator[T]:
+    """Yield the parts before a fault, if there are any; the pass that follows reports it."""
+    count = 0
+    try:
+        for part in parts:
+            yield part
+            count += 1
+    except BadDataset:
+        if not count:
+            raise
 
 
 def _means(path: Path, size: int) -> Iterator[FtSamples]:

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -57,8 +58,10 @@ def read_table(path: Path, wanted: Wanted) -> Iterator[Part]:
     with path.open("rb") as file:
         names, found = _columns(path, file.readline(), wanted)
         use = [names.index(name) for name in ("t", *found)]
+        count = 0
         while text := file.read(_READ_BYTES) + file.readline():
-            table = _parsed(path, text, len(names), use)
+            table = _parsed(path, text, len(names), use, count)
+            count += table.shape[1]
             yield Part(table[0], np.ascontiguousarray(table[1:].T), found, file.tell())
 
 
@@ -94,11 +97,14 @@ def _columns(path: Path, head: bytes, wanted: Wanted) -> tuple[list[str], Sequen
     return names, found
 
 
-def _parsed(path: Path, text: bytes, columns: int, use: Sequence[int]) -> Array:
+def _parsed(path: Path, text: bytes, columns: int, use: Sequence[int], before: int = 0) -> Array:
+    """Parse lines behind so many rows of a file."""
     try:
         return parsed(text, columns, use)
     except ValueError as error:
-        raise BadDataset(f"{path.name}: {error}: correct this line") from error
+        first = before + ("convert" in str(error))  # loadtxt counts rows from 0 in this message, from 1 in others
+        words = re.sub(r"(?<=row )\d+", lambda row: str(first + int(row[0])), str(error))
+        raise BadDataset(f"{path.name}: {words}: correct this line") from error
 
 
 def parsed(text: bytes, columns: int, use: Sequence[int]) -> Array:

@@ -66,9 +66,13 @@ def test_a_long_table_is_read_in_parts_up_to_its_fault(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.concatenate([part.numbers for part in parts]), rows[:, 1:])
     assert parts[-1].place == path.stat().st_size
     assert mean_rate_Hz(path, WRENCH) == pytest.approx(1000)
-    with path.open("a") as file:
-        file.write("60000,60,1,2,3,4,5,6.7.8\n")
-    valid = list[Part]()
-    with pytest.raises(BadDataset, match=r"w\.csv: .*'6\.7\.8'.*correct this line"):
-        valid.extend(read_table(path, WRENCH))
-    assert 0 < len(valid) < len(parts)
+    content = path.read_text()
+    for line, words in (
+        ("1,60,1,2,3,4,5,6.7.8", r"'6\.7\.8'.* row 60001, column 8"),
+        ("1,60", "column index 2 at row 60001"),
+    ):
+        path.write_text(f"{content}{line}\n")
+        valid = list[Part]()
+        with pytest.raises(BadDataset, match=rf"w\.csv: .*{words}.*correct this line"):
+            valid.extend(read_table(path, WRENCH))
+        assert 0 < len(valid) < len(parts)
