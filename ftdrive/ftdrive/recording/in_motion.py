@@ -15,21 +15,12 @@ from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
 from ftdrive.recording.compensation import NEEDED
-from ftdrive.recording.files import ENDINGS, RecordingReader
+from ftdrive.recording.files import RecordingReader
 from ftdrive.recording.number_table import ORIENTATION, WRENCH, Wanted, read_table
-from ftdrive.recording.recording import FORMAT, Header
+from ftdrive.recording.recording import Header
 from ftdrive.runs.run import made_now
 
 _POSITION = ("x", "y", "z")
-
-
-def is_recording(path: Path) -> bool:
-    """Whether a file is a recording of `ftdrive record`, by its ending; a CSV by its first line."""
-    ending = Path(path.name.removesuffix(".partial")).suffix
-    if ending == ".csv" and path.is_file():
-        with path.open("rb") as file:
-            return file.readline(100).startswith(f"# {FORMAT.partition('/')[0]}/".encode())
-    return ending in ENDINGS and ending != ".csv"
 
 
 def solve_recording(

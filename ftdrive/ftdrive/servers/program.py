@@ -8,7 +8,7 @@ program must look at the counter and never at a number alone.
 import threading
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
@@ -18,6 +18,9 @@ from ftdrive.live.stream import CompensatedStream
 from ftdrive.live.weighing import WEIGH_S, CannotWeigh, Scale, load_values
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import Array
+
+if TYPE_CHECKING:
+    from ftdrive.store.weighing_log import WeighingLog
 
 INTEGERS: Final = ("state", "code", "condition", "number", "live", "tracking")
 DOUBLES: Final = (
@@ -107,12 +110,18 @@ class ProgramService:
         Opens the registers, as many as `INTEGERS` and `doubles_of(stream.track)`; called again after they were lost.
     say : callable
         Takes a sentence for the operator, from any thread.
+    log : WeighingLog, optional
+        Keeps the answers.
     """
 
     def __init__(
-        self, stream: CompensatedStream, connect: Callable[[], Registers], say: Callable[[str], object]
+        self,
+        stream: CompensatedStream,
+        connect: Callable[[], Registers],
+        say: Callable[[str], object],
+        log: "WeighingLog | None" = None,
     ) -> None:
-        self._stream, self._connect, self._say = stream, connect, say
+        self._stream, self._connect, self._say, self._log = stream, connect, say, log
         self._registers: Registers | None = connect()
         self._scale = Scale(stream)
         self._lock = threading.Lock()
@@ -160,6 +169,7 @@ class ProgramService:
                 self._say("Samples arrive again.")
             silent = False
             self.take(block)
+            self._stream.take_events()  # nothing records them, and they would pile up as long as the service runs
 
     def stop(self) -> None:
         """Write that the service has ended, and close."""
@@ -264,6 +274,8 @@ class ProgramService:
             except CannotWeigh as refusal:
                 if refusal.code not in _WAITS or (t_ns - since_ns) * 1e-9 > PATIENCE_S:
                     self._answer(refusal.code)
+                    if self._log is not None:
+                        self._log.refused(refusal.code)
             else:
                 self._answer("")
 
@@ -281,7 +293,10 @@ class ProgramService:
         self._weight = np.array([*mass, *(_placed(weight, info) if known else np.zeros(6))])
         self._stream.hold(weight if known else None)
         text = f"weighed for the program: {weight.mass_kg:.4f} kg"
-        self._stream.note("load", text, load_values(weight, info))
+        values = load_values(weight, info)
+        self._stream.note("load", text, values)
+        if self._log is not None:
+            self._log.weighed(values)
 
     def _zero(self, since_ns: int) -> None:
         self._scale.zero(since_ns)

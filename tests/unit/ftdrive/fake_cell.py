@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftcalib.routine import Sampling
+from ftcalib.sampling import Sampling
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
 from ftdrive.planning.cell_plan import certifier_for, plan_for

@@ -7,7 +7,7 @@ import pytest
 
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import WrenchFrame
-from ftdrive.servers.program import INTEGERS, ProgramService, doubles_of
+from ftdrive.servers.program import CODES, INTEGERS, ProgramService, doubles_of
 from ftdrivers.errors import StreamBroken
 from tests.unit.ftdrive.live.simulated import calibrated, info
 from tests.unit.ftdrive.live.test_weighing import NOTHING, POSE, part, rests
@@ -32,6 +32,17 @@ class FakeRegisters:
         pass
 
 
+class FakeLog:
+    def __init__(self) -> None:
+        self.kept: list[float | str] = []
+
+    def weighed(self, values: dict[str, Any]) -> None:
+        self.kept.append(round(values["mass_kg"], 2))
+
+    def refused(self, code: str) -> None:
+        self.kept.append(code)
+
+
 class Cell:
     """A service on a recording."""
 
@@ -41,7 +52,10 @@ class Cell:
         )
         self.registers = FakeRegisters()
         self.said: list[str] = []
-        self.service = ProgramService(cast("Any", self.stream), lambda: self.registers, self.said.append)
+        self.log = FakeLog()
+        self.service = ProgramService(
+            cast("Any", self.stream), lambda: self.registers, self.said.append, cast("Any", self.log)
+        )
 
     def run(self, seconds: float) -> dict[str, float]:
         n = 0
@@ -130,3 +144,20 @@ def test_a_lost_controller_is_reported_once() -> None:
     cell.run(0.1)
     assert len(cell.said) == 1
     assert "cable is cut" in cell.said[0]
+
+
+def test_answers_of_weighings_are_kept_and_others_are_not() -> None:
+    push = np.array([0, 8.0, 0, 0, 0, 0])
+    cell = Cell((POSE, NOTHING), (POSE, part(POSE, 0.8)), (POSE, part(POSE, 0.8)), (POSE, push), seconds=1.5)
+    cell.run(0.2)
+    assert cell.ask(6, ZERO)["state"] == 1
+    assert cell.ask(7, STATUS, 0.02)["state"] == 1
+    assert cell.ask(8, 99, 0.02)["state"] == 3
+    cell.run(0.6)
+    assert cell.ask(9, WEIGH)["state"] == 1
+    cell.run(2.2)
+    assert cell.ask(10, WEIGH)["state"] == 3
+    assert cell.log.kept == [
+        0.8,
+        next(name for name, code in CODES.items() if code == cell.registers.written[-1]["code"]),
+    ]

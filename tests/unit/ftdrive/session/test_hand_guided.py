@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from ftcalib import solve
 from ftcalib.errors import TooFewSamples
 from ftcalib.model import Array
-from ftcalib.routine import PoseRecord, Sampling, dataset_from, drift_check
+from ftcalib.routine import PoseRecord, dataset_from, drift_check
+from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
 from ftdrive.session.events import Compared, Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.guards import Limits

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftcalib.routine import Sampling
+from ftcalib.sampling import Sampling
 from ftdrive.cell.config import WorkcellConfig
 from ftdrive.errors import Declined, NotAccepted
 from ftdrive.planning.cell_plan import certifier_for
