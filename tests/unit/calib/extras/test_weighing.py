@@ -50,6 +50,7 @@ class Gripper:
         )
 
 
+@pytest.mark.slow
 def test_sigmas_hold_after_a_zero_in_the_same_pose() -> None:
     errors, com = [], []
     for seed in range(100):
