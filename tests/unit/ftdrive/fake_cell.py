@@ -439,7 +439,7 @@ class Lab:
         return Run(folder)
 
     def stops(self) -> list[int]:
-        return [record.stop for record in self.run().records()]
+        return self.run().stops()
 
     def said(self) -> str:
         return "\n".join(event.words for event in self.operator.of(Noted))
