@@ -65,6 +65,7 @@ def test_turning_joints_make_a_ripple_as_large_as_that_of_a_real_arm(joint: int)
     assert not ripple[ENDED].any()
 
 
+@pytest.mark.slow
 def test_the_ripple_has_the_lines_of_the_motor_and_little_below_3_Hz() -> None:
     ripple = vibration(4, ripple=1.0)[EVEN, 0]
     power = np.abs(np.fft.rfft(ripple * np.hanning(len(ripple)))) ** 2
