@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 def history(
     folders: Sequence[Path], tool: str | None, index: Sequence[Path], rebuild: bool, url: str | None, as_json: bool
 ) -> None:
-    """List results with their date and last verification, and the trends of bias and payload.
+    """List results with their date and last verification, and how bias and payload change.
 
     They come from the store, where `calibrate` and `verify` add theirs, or from the run folders in RUNS. A trend is
     significant if the uncertainty of the results explains it in less than one case of 100, and so does their scatter.
+    Where a sensor reports its temperature, its bias is fitted against that too.
     """
     from ftdrive.errors import ConfigError
     from ftdrive.store.history import drifts, warnings
@@ -54,11 +55,17 @@ def history(
         messages.print(hanging(" left out: ", words))
     now = datetime.now(UTC)
     found, advice = drifts(results), list(warnings(results, checks, now))
+    warmth = []
+    if any(one.temperature_C is not None for one in results):
+        from ftdrive.store.temperature import temperatures
+
+        warmth = temperatures(results, checks)
     last = {check.calibration_id: check for check in checks}
     if as_json:
         rows = [_as_json(one, last.get(one.id), now) for one in results]
         trends = [one.to_dict() for one in found]
-        write_json({"schema_version": 1, "store": name, "results": rows, "trends": trends, "warnings": advice})
+        about = {"trends": trends, "temperature": [one.to_dict() for one in warmth], "warnings": advice}
+        write_json({"schema_version": 1, "store": name, "results": rows, **about})
         return
     if not results:
         messages.print(
@@ -68,6 +75,8 @@ def history(
     _print_table([_row(one, last.get(one.id), now) for one in results])
     for drift in found:
         echo(f"trend: {drift}")
+    for words in (line for one in warmth for line in one.lines()):
+        echo(words)
     for words in advice:
         answer.print(hanging(" ! ", words, answer), style="yellow")
 

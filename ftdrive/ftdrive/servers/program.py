@@ -13,19 +13,25 @@ from typing import Final, Protocol
 import numpy as np
 
 from ftcalib.extras.weighing import Weight
-from ftdrive.live.samples import Block, StreamInfo
+from ftdrive.live.samples import Block, StreamInfo, Tracking
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.live.weighing import WEIGH_S, CannotWeigh, Scale, load_values
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import Array
 
-INTEGERS: Final = ("state", "code", "condition", "number", "live")
+INTEGERS: Final = ("state", "code", "condition", "number", "live", "tracking")
 DOUBLES: Final = (
     *("fx", "fy", "fz", "tx", "ty", "tz"),
     *("mass", "mass_sigma", "least_mass"),
     *("com_x", "com_y", "com_z", "com_sigma_x", "com_sigma_y", "com_sigma_z"),
 )
 """What the input registers hold from the first one on, of each kind."""
+TRACKED: Final = ("bias_fx", "bias_fy", "bias_fz", "bias_tx", "bias_ty", "bias_tz", "bias_age")
+"""Further doubles where bias and part are followed."""
+TRACKINGS: Final[tuple[Tracking, ...]] = ("off", "show", "apply")
+"""What `tracking` counts: where it is 0, the registers of `TRACKED` are not those of the service."""
+NEVER_S: Final = -1.0
+"""Age of the last look at the bias, before the first one."""
 
 STALE_S: Final = 0.05
 """Without a sample for so long the wrench counts as stale."""
@@ -85,15 +91,20 @@ class Registers(Protocol):
         """Close the connection."""
 
 
+def doubles_of(track: Tracking) -> tuple[str, ...]:
+    """Return what the double registers hold."""
+    return DOUBLES if track == "off" else DOUBLES + TRACKED
+
+
 class ProgramService:
     """Answers one program.
 
     Parameters
     ----------
     stream : CompensatedStream
-        Open, in the frame that the program gets; read here.
+        Open, in the frame that the program gets; read here. With `stream.track` the program gets the tracked bias too.
     connect : callable
-        Opens the registers; called again after they were lost.
+        Opens the registers, as many as `INTEGERS` and `doubles_of(stream.track)`; called again after they were lost.
     say : callable
         Takes a sentence for the operator, from any thread.
     """
@@ -200,13 +211,22 @@ class ProgramService:
         busy = self._busy is not None
         number = self._busy[0] if self._busy is not None else self._answered or 0
         state = State.BUSY if busy and self._state is not State.STOPPED else self._state
-        integers = [int(state), 0 if busy else self._code, int(self._condition), number, self._live]
+        tracking = TRACKINGS.index(self._stream.track)
+        integers = [int(state), 0 if busy else self._code, int(self._condition), number, self._live, tracking]
+        tracked = self._tracked() if tracking else []
         try:
-            self._registers.write(integers, [*self._wrench.tolist(), *self._weight.tolist()])
+            self._registers.write(integers, [*self._wrench.tolist(), *self._weight.tolist(), *tracked])
         except DeviceError as error:
             self._say(f"{error}. Trying again.")
             self._registers.close()
             self._registers = None
+
+    def _tracked(self) -> list[float]:
+        """Return the tracked change of the bias since the calibration, and the age of the last look at it."""
+        tracked = self._stream.tracked
+        if tracked is None or not np.isfinite(tracked.last_seen_s):
+            return [0.0] * 6 + [NEVER_S]
+        return [*tracked.bias.tolist(), tracked.last_seen_s + max(self._newest_ns * 1e-9 - tracked.t_s, 0.0)]
 
     def _judge(self, block: Block) -> Condition:
         """Return what touches the tool; a load that is not known pulls along gravity."""

@@ -7,7 +7,7 @@ import pytest
 
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import WrenchFrame
-from ftdrive.servers.program import DOUBLES, INTEGERS, ProgramService
+from ftdrive.servers.program import INTEGERS, ProgramService, doubles_of
 from ftdrivers.errors import StreamBroken
 from tests.unit.ftdrive.live.simulated import calibrated, info
 from tests.unit.ftdrive.live.test_weighing import NOTHING, POSE, part, rests
@@ -21,11 +21,12 @@ class FakeRegisters:
         """Of a program before."""
         self.written: list[dict[str, float]] = []
         self.broken = False
+        self.names = INTEGERS + doubles_of("off")
 
     def write(self, integers: list[int], doubles: list[float]) -> None:
         if self.broken:
             raise StreamBroken("the cable is cut")
-        self.written.append(dict(zip((*INTEGERS, *DOUBLES), [*integers, *doubles], strict=True)))
+        self.written.append(dict(zip(self.names, [*integers, *doubles], strict=True)))
 
     def close(self) -> None:
         pass
@@ -104,6 +105,22 @@ def test_a_zero_with_a_part_is_refused() -> None:
     cell = Cell((POSE, part(POSE, 2.0)))
     cell.run(0.1)
     assert cell.ask(6, ZERO, 0.8)["code"] == 8
+
+
+def test_the_tracked_bias_ages_while_a_contact_hides_it() -> None:
+    drifted = np.array([0.4, -0.3, 0.2, 0, 0, 0])
+    cell = Cell((POSE, drifted), (POSE, drifted + np.array([5.0, 8.0, 0, 0, 0, 0])), seconds=2.0)
+    assert cell.run(0.1)["tracking"] == 0
+    cell.stream.track = "show"
+    cell.registers.names = INTEGERS + doubles_of("show")
+    new = cell.run(0.1)
+    assert (new["tracking"], new["bias_age"], new["bias_fx"]) == (1, -1, 0), "not seen yet"
+    seen = cell.run(1.7)
+    assert 0 <= seen["bias_age"] < 1
+    assert [seen["bias_fx"], seen["bias_fy"], seen["bias_fz"]] == pytest.approx(drifted[:3], abs=0.1)
+    hidden = cell.run(1.5)
+    assert hidden["bias_age"] > 1
+    assert hidden["bias_fy"] == pytest.approx(-0.3, abs=0.1)
 
 
 def test_a_lost_controller_is_reported_once() -> None:
