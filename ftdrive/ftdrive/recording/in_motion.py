@@ -18,6 +18,7 @@ from ftdrive.recording.compensation import NEEDED
 from ftdrive.recording.files import RecordingReader
 from ftdrive.recording.number_table import ORIENTATION, WRENCH, Wanted, read_table
 from ftdrive.recording.recording import Header
+from ftdrive.runs.new_tool import require_same_cell
 from ftdrive.runs.run import made_now
 
 _POSITION = ("x", "y", "z")
@@ -31,6 +32,7 @@ def solve_recording(
     known: Known | None,
     point_mass: bool,
     up_in_base: Sequence[float] | None,
+    earlier: CalibrationResult | None = None,
 ) -> CalibrationResult:
     """Calibrate from a recording in motion.
 
@@ -48,13 +50,15 @@ def solve_recording(
         Whether the load is known to have no inertia about its centre of mass.
     up_in_base : sequence of float, optional
         (3,) declared up direction.
+    earlier : CalibrationResult, optional
+        Of the same cell with another tool, as for `solve_motion`.
 
     Raises
     ------
     BadDataset, BadRecording, ConfigError, OSError
-        A file cannot be used.
+        A file cannot be used, or the earlier result is rejected or of another sensor or arm.
     NotObservable
-        The motion does not determine the parameters.
+        The motion does not determine the parameters, or contradicts the earlier result.
     """
     provenance, height_m, g_m_s2 = made_now(), None, STANDARD_GRAVITY_M_S2
     if means is not None:
@@ -69,6 +73,8 @@ def solve_recording(
     else:
         wrench, poses = read_wrench_file(pair[0]), read_pose_file(pair[1])
         provenance |= {"wrench": pair[0].name, "orientation": pair[1].name}
+    if earlier is not None:
+        require_same_cell(earlier, provenance)
     setup = Setup(up_in_base=up_in_base)
     if known is not None and known.gravity_direction_base is not None:
         known = replace(known, gravity_direction_base=-setup.up)
@@ -76,6 +82,7 @@ def solve_recording(
         wrench,
         poses,
         known=known,
+        earlier=earlier,
         point_mass=point_mass,
         height_m=height_m if height_m is not None and isfinite(height_m) else None,
         g_m_s2=g_m_s2,
