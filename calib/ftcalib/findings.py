@@ -382,6 +382,7 @@ CODES: Final[Mapping[str, Code]] = {
         "compared with the declared mounting", "level the base, or set its mounting in the controller"),
     "noise_unknown": Code(_NOTE, "the noise was estimated from the residuals, so chi2 does not test the fit",
         "state the noise of each pose to test it"),
+    "earlier_cell": Code(_NOTE, "mounting, base and gain of {parent} count as known, within their sigmas"),
     "together": Code(_NOTE, "{n_runs} runs as one fit, each with a bias of its own; the bias is that of the last"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),
     # Hints about single poses, beside the result

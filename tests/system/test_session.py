@@ -11,6 +11,7 @@ import pytest
 from ftcalib import CalibrationResult
 from ftdrive.cell.emulated import Station
 from ftdrive.planning.plan import Plan
+from ftdrive.runs.run import Run
 from ftdrive.terminal.report import errors_in_sigma
 from tests.system.command_line import CommandLine, assert_found, end_of, listen_for, say, wait_until
 
@@ -88,6 +89,21 @@ def test_a_dry_run_shows_everything_and_moves_nothing(station: Station, config: 
     assert moves_of(station) == 0
     assert programs_of(station) == []
     assert not (ftdrive.folder / "runs").exists()
+
+
+@pytest.mark.slow
+def test_a_new_tool_takes_four_long_poses(station: Station, config: Path, ftdrive: CommandLine) -> None:
+    typed = QUESTIONS + FIRST_MOTION
+    first = ftdrive.json("calibrate", "--config", config, "--minimal", typed=typed)
+    before = moves_of(station)
+    tool = ftdrive.json("calibrate", "--config", config, "--from", ftdrive.folder / first["run"], typed=typed)
+    assert moves_of(station) - before == 5
+    assert tool["provenance"]["parent"]["id"] == first["id"]
+    assert tool["mass_kg"] == pytest.approx(first["mass_kg"], abs=0.01)
+    runs = [Run(ftdrive.folder / one["run"]) for one in (first, tool)]
+    usual, longer = ({one["average_s"] for one in run.events() if "average_s" in one} for run in runs)
+    assert longer == {2 * average_s for average_s in usual}
+    assert Plan.load(runs[1].plan_path).kind == "tool"
 
 
 @pytest.mark.slow

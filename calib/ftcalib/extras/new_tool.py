@@ -17,15 +17,13 @@ from scipy.special import chdtrc as chi2_sf
 from ftcalib.data.dataset import CalibrationDataset
 from ftcalib.data.pooling import pooled_covariance
 from ftcalib.errors import NotObservable
+from ftcalib.extras.cell_prior import FALSE_ALARMS, WHOLE, CellPrior, down
 from ftcalib.extras.update import Update, updated
 from ftcalib.findings import Finding
 from ftcalib.likelihood.gain_and_cross_talk import Response, response_columns
-from ftcalib.model import BIASES, Array, Parameters, angle_between, jacobian, predict, skew
+from ftcalib.model import BIASES, Array, Parameters, jacobian, predict, skew
 from ftcalib.result import CalibrationResult
 
-FALSE_ALARMS = 1e-4
-"""Share of good runs that the test of what was kept rejects."""
-_PRIOR_SIZE = 5
 _MOST_STEPS = 30
 _SETTLED = 1e-12
 """Squared step in standard deviations."""
@@ -66,42 +64,37 @@ def new_tool(
     cov = pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier))
     weights: Array = np.linalg.inv(cov).astype(np.float64)
     poses = dataset.R_base_flange, dataset.wrench, weights
-    found = _fitted(earlier, *poses, range(_PRIOR_SIZE))
-    if found.dof and chi2_sf(found.dof, found.chi2) < FALSE_ALARMS:
-        raise NotObservable(_changed(earlier, found, poses))
+    prior = CellPrior(earlier)
+    found = _fitted(prior, *poses, WHOLE)
+
+    def refit(kept: Sequence[int]) -> tuple[float, int, Parameters]:
+        again = _fitted(prior, *poses, kept)
+        return again.chi2, again.dof, again.parameters
+
+    alone = "calibrate this tool alone, from 12 poses or more"
+    if changed := prior.contradiction(found.chi2, found.dof, refit, "the poses", alone):
+        raise NotObservable(changed)
     result = updated(earlier, found, {**(provenance or {}), "dataset_sha256": dataset.sha256()})
     return replace(result, quality={}, weights=None, components=_kept_noise(earlier))
 
 
-def _fitted(
-    earlier: CalibrationResult, R_base_flange: Array, wrench: Array, weights: Array, kept: Sequence[int]
-) -> Update:
-    """Fit all parameters; `kept` are the rows of the prior that count, 0 to 2 mounting, 3 and 4 base."""
-    n, old, gain = len(wrench), earlier.parameters, earlier.response
-    C = np.array(earlier.covariance if gain is None else gain.covariance)
-    across = np.linalg.svd(skew(old.gravity_force_base_N))[0][:, :2]  # two directions across gravity
-    rows = [*kept, *range(_PRIOR_SIZE, _PRIOR_SIZE + len(C) - 15)]
-    before = _prior_rows(old, across, len(C))[rows]
-    V = before @ C @ before.T
-    P = np.linalg.inv(V + 1e-12 * np.diag(np.diag(V)) + 1e-24 * np.eye(len(V)))
-    new, coefficients = _start(old, R_base_flange, wrench), np.zeros(len(C) - 15) if gain is None else gain.coefficients
+def _fitted(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Array, kept: Sequence[int]) -> Update:
+    """Fit all parameters; `kept` as of `CellPrior.rows`."""
+    n, coefficients = len(wrench), prior.coefficients
+    new = _start(prior.earlier.parameters, R_base_flange, wrench)
     for _ in range(_MOST_STEPS):
         left = wrench - predict(new, R_base_flange)
         J = jacobian(new, R_base_flange)
-        if gain is not None:
+        if prior.has_response:
             T = response_columns(new, R_base_flange)
             left, J = left - T @ coefficients, np.concatenate([J, T], axis=2)
-        A = _prior_rows(new, across, len(C))[rows]
-        apart = np.concatenate([new.difference(old)[:3], across.T @ (_unit(old) - _unit(new))])
-        if gain is not None:
-            apart = np.concatenate([apart, gain.coefficients - coefficients])
-        r = apart[rows]
+        A, r = prior.rows(new, coefficients, kept)
         WJ = weights @ J
-        H = np.einsum("nij,nik->jk", J, WJ) + A.T @ P @ A
+        H = np.einsum("nij,nik->jk", J, WJ) + A.T @ A
         scale = np.sqrt(np.diag(H))
         if not (scale > 0).all() or np.linalg.cond(H / np.outer(scale, scale)) > _SINGULAR:
             raise NotObservable(f"{n} poses do not determine the tool: add poses with other tilts of the tool.")
-        step = np.linalg.solve(H, np.einsum("nij,ni->j", WJ, left) + A.T @ P @ r)
+        step = np.linalg.solve(H, np.einsum("nij,ni->j", WJ, left) + A.T @ r)
         new, coefficients = new.moved(step[:15]), coefficients + step[15:]
         if float(step @ H @ step) < _SETTLED:
             break
@@ -109,38 +102,24 @@ def _fitted(
         raise NotObservable(f"the fit has not settled in {_MOST_STEPS} steps: check the poses, or solve alone.")
     covariance = np.linalg.inv(H)
     weight_N = float(np.linalg.norm(new.gravity_force_base_N))
-    sigma_N = float(np.sqrt(_unit(new) @ covariance[3:6, 3:6] @ _unit(new)))
+    sigma_N = float(np.sqrt(down(new) @ covariance[3:6, 3:6] @ down(new)))
     if weight_N < _SIGNIFICANT * sigma_N:
         raise NotObservable(f"the weight of the tool is {weight_N:.2g} N, sigma {sigma_N:.2g} N: check the sensor.")
-    chi2 = float(np.einsum("ni,nij,nj->", left, weights, left) + r @ P @ r)
-    dof = 6 * n + len(rows) - len(C)
-    response = None if gain is None else Response(coefficients, covariance)
+    chi2 = float(np.einsum("ni,nij,nj->", left, weights, left) + r @ r)
+    dof = 6 * n + len(r) - len(H)
+    response = Response(coefficients, covariance) if prior.has_response else None
     return Update(new, covariance[:15, :15], chi2, dof, "tool", left, response)
-
-
-def _prior_rows(p: Parameters, across: Array, size: int) -> Array:
-    """Derivative (5 + gain, size) of mounting, direction of gravity and gain by the error coordinates."""
-    F, u = float(np.linalg.norm(p.gravity_force_base_N)), _unit(p)
-    rows = np.zeros((_PRIOR_SIZE + size - 15, size))
-    rows[:3, :3] = np.eye(3)
-    rows[3:5, 3:6] = across.T @ (np.eye(3) - np.outer(u, u)) / F
-    rows[5:, 15:] = np.eye(size - 15)
-    return rows
-
-
-def _unit(p: Parameters) -> Array:
-    return np.asarray(p.gravity_force_base_N / np.linalg.norm(p.gravity_force_base_N))
 
 
 def _start(old: Parameters, R_base_flange: Array, wrench: Array) -> Parameters:
     """Take weight, centre of mass and bias by linear least squares with the earlier mounting and base."""
-    u = _unit(old) @ (R_base_flange @ old.R_flange_sensor)
+    u = down(old) @ (R_base_flange @ old.R_flange_sensor)
     A = np.zeros((len(u), 6, 10))
     A[:, :3, 0], A[:, :3, 1:4] = u, np.eye(3)
     A[:, 3:, 4:7], A[:, 3:, 7:] = -skew(u), np.eye(3)
     x: Array = np.linalg.lstsq(A.reshape(-1, 10), wrench.ravel(), rcond=None)[0].astype(np.float64)
     weight_N = max(float(x[0]), 1e-3)
-    return Parameters(old.R_flange_sensor, weight_N * _unit(old), x[1:4], x[4:7] / weight_N, x[7:])
+    return Parameters(old.R_flange_sensor, weight_N * down(old), x[1:4], x[4:7] / weight_N, x[7:])
 
 
 def _kept_noise(earlier: CalibrationResult) -> dict[str, float]:
@@ -154,28 +133,6 @@ def _beyond(earlier: CalibrationResult) -> Array:
         return np.zeros(6)
     excess = np.square(earlier.likely_error()) - np.square(earlier.predicted_error())
     return np.repeat(np.maximum(excess, 0.0) / 3, 3)
-
-
-def _changed(earlier: CalibrationResult, kept: Update, poses: tuple[Array, Array, Array]) -> str:
-    """Name what does not hold any more: what explains the poses without its prior."""
-    explained = list[tuple[float, str]]()
-    for what, rows in (("the sensor is mounted otherwise", (3, 4)), ("the base leans otherwise", (0, 1, 2))):
-        try:
-            found = _fitted(earlier, *poses, rows)
-        except NotObservable:
-            continue
-        if not found.dof or chi2_sf(found.dof, found.chi2) >= FALSE_ALARMS:
-            old, new = earlier.parameters, found.parameters
-            turned = float(angle_between(old.R_flange_sensor, new.R_flange_sensor))
-            if 0 in rows:
-                turned = float(np.arctan2(np.linalg.norm(np.cross(_unit(old), _unit(new))), _unit(old) @ _unit(new)))
-            explained.append((found.chi2, f"{what}, by {np.degrees(turned):.2g}°"))
-    misfit = f"chi2 {kept.chi2:.0f} for {kept.dof} degrees of freedom"
-    if not explained:
-        return f"the poses do not fit mounting and base of {earlier.id} ({misfit}): check for contact, or solve alone."
-    explained.sort()
-    cause = " or ".join(text for chi2, text in explained if chi2 < explained[0][0] + 10)
-    return f"{cause} since {earlier.id} ({misfit}): calibrate this tool alone, from 12 poses or more."
 
 
 def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any] | None = None) -> CalibrationResult:

@@ -76,6 +76,8 @@ class Weight:
     poses: int
     scale_sigma: float = 0.0
     """Relative error of the scale of the sensor, one standard deviation, if set: common to all weights, tool too."""
+    in_motion: bool = False
+    """Whether it was weighed while the arm carried it; then `poses` is 0."""
     moment: tuple[Array, Array] = field(default=(np.zeros(4), np.zeros((4, 4))), repr=False)
     """Mass and mass times centre of mass (4,), and their covariance."""
 

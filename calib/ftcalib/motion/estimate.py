@@ -1,6 +1,6 @@
 """The load that explains rows in motion: Gauss-Newton from each mounting that forces allow, contact left out."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
 
@@ -10,6 +10,7 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtri
 
+from ftcalib.extras.cell_prior import WHOLE, CellPrior
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
 from ftcalib.model import Array, Parameters, angle_between, nearest_rotation
@@ -40,12 +41,16 @@ WORTH = 4.0
 ROUGH: Mapping[str, float] = {"gain": 0.02, "cross_talk": 0.02}
 """Sizes of components at first."""
 _ROUGH_ROWS = 600
+_RESPONDING = np.r_[0:15, GAINS.start : SIZE]
+"""Places of the coordinates of a result at rest, gain and cross-talk last."""
 _CHUNK = 1000
 _MANY = 1000
 """Rows beside which what the fit absorbs is small."""
 _SAME_RAD = 0.2
 _AROUND, _PRIOR_ROWS = 3, 1.0
 """Rows that show the noise of the one in their middle, and how many of its state count with them."""
+_PRIOR_STEPS, _SETTLED = 20, 1e-4
+"""Of the fit with a prior, and the change of its cost that ends it."""
 _STAGES, _CHOICES = 6, (1, 2, 4)
 """Solutions, each with the noise and the contacts of the one before, and those before which components are chosen."""
 _SIZES: Mapping[str, Array] = {
@@ -80,6 +85,8 @@ class MotionFit:
     second_basin_chi2: float | None = None
     chi2: float = 0.0
     """Of the kept rows, made independent: about 6 a row."""
+    contradiction: str = ""
+    """Of rows and prior."""
 
     @property
     def prior_share(self) -> Array:
@@ -217,8 +224,15 @@ class _Problem:
         P[:SIZE, :SIZE] += np.diag(precision)
         return P, on, log_det
 
-    def solved(self, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: Load, drift: Array) -> "_Step":
-        """Solve the sums for load and drift with these sizes of the components."""
+    def solved(
+        self,
+        sizes: Mapping[str, float],
+        sums: tuple[Array, Array, float],
+        load: Load,
+        drift: Array,
+        prior: tuple[Array, Array] | None = None,
+    ) -> "_Step":
+        """Solve the sums for load and drift with these sizes of the components, and rows of a prior."""
         H, b, chi2 = sums
         P, on, log_det = self.components(sizes, load)
         value = np.concatenate([load.vector, self.centred.T @ drift.ravel()])
@@ -229,20 +243,28 @@ class _Problem:
         H, b = H + P, b - P @ value
         H[:15, :15] += rows.T @ rows
         b[:15] += rows.T @ residuals
+        if prior is not None:
+            rows, residuals = prior
+            places = _RESPONDING[: rows.shape[1]]
+            H[np.ix_(places, places)] += rows.T @ rows
+            b[places] += rows.T @ residuals
         Z = block_diag(self.free(load), np.eye(len(P) - SIZE))
         Z = Z[:, on[np.argmax(np.abs(Z), axis=0)]]
         H = Z.T @ H @ Z
         scale = np.sqrt(np.diag(H))
         factor = cho_factor(H / np.outer(scale, scale) + RIDGE * np.eye(len(H)))
         step = Z @ (cho_solve(factor, Z.T @ b / scale) / scale)
-        criterion = chi2 + float(value @ P @ value - b @ step) + log_det
+        cost = chi2 + float(value @ P @ value + residuals @ residuals - b @ step)
+        criterion = cost + log_det
         criterion += 2 * float(np.log(np.diag(factor[0]) * scale).sum())
-        return _Step(step + removed, criterion, Z / scale, factor)
+        return _Step(step + removed, cost, criterion, Z / scale, factor)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
     step: Array
+    cost: float
+    """Chi2 of rows and priors after the step."""
     criterion: float
     basis: Array
     factor: tuple[Array, bool]
@@ -251,7 +273,7 @@ class _Step:
     def none(cls) -> Self:
         """Before the first one."""
         nothing = np.zeros((0, 0))
-        return cls(np.zeros(0), 0.0, nothing, (nothing, False))
+        return cls(np.zeros(0), 0.0, 0.0, nothing, (nothing, False))
 
     @property
     def root(self) -> tuple[Array, Array]:
@@ -264,7 +286,13 @@ class _Step:
 
 
 def fit(
-    rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool = False, guarded: bool = False
+    rows: Rows,
+    known: Known | None,
+    g_m_s2: float,
+    *,
+    prior: CellPrior | None = None,
+    point_mass: bool = False,
+    guarded: bool = False,
 ) -> MotionFit:
     """Fit all unknowns to rows.
 
@@ -274,6 +302,8 @@ def fit(
     known : Known, optional
         As for `ftcalib.solve`.
     g_m_s2 : float
+    prior : CellPrior, optional
+        It joins the last stage: noise and contact are those of the rows alone, so a wrong prior leaves no row out.
     point_mass : bool
         Whether the inertia about the centre of mass is known to be 0.
     guarded : bool
@@ -306,8 +336,17 @@ def fit(
         r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
         kept = _untouched(r) if guarded else _without_contact(distance)
+    contradiction = ""
+    if prior is not None:
+        if prior.has_response:
+            sizes |= {"gain": np.inf, "cross_talk": np.inf}
+        joined = _Joined(problem, prior, sizes, (load, drift), (noise, kept, state))
+        load, drift, solved = joined.fitted(WHOLE)
+        contradiction = joined.contradiction(solved.cost)
+        r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
+        distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
     chi2, others = problem.sums(load, drift, noise, kept, state)[2], []
-    for other, _ in roughs[1:]:
+    for other, _ in roughs[1:] if prior is None else ():
         if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
             there = problem.sums(other, drift, noise, kept, state)
             others.append(there[2] - float(there[1] @ problem.solved(sizes, there, other, drift).step) - chi2)
@@ -327,10 +366,50 @@ def fit(
         distance,
         problem.hats(rows.t_s) @ drift,
         change,
-        {name: size for name, size in sizes.items() if size},
+        {name: size for name, size in sizes.items() if 0 < size < np.inf},
         max(min(others), 0.0) if others else None,
         chi2,
+        contradiction,
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Joined:
+    """Rows, with noise and contact as they show alone, and a prior."""
+
+    problem: _Problem
+    prior: CellPrior
+    sizes: Mapping[str, float]
+    start: tuple[Load, Array]
+    """The fit of the rows alone, and its drift."""
+    weighed: tuple[Noise, NDArray[np.bool_], NDArray[np.intp]]
+
+    def fitted(self, kept: Sequence[int]) -> tuple[Load, Array, _Step]:
+        """Fit; `kept` as of `CellPrior.rows`."""
+        (load, drift), before = self.start, np.inf
+        for _ in range(_PRIOR_STEPS):
+            sums = self.problem.sums(load, drift, *self.weighed)
+            known = self.prior.rows(load.static, load.response[: 11 * self.prior.has_response], kept)
+            solved = self.problem.solved(self.sizes, sums, load, drift, known)
+            load = load.moved(solved.step[:SIZE])
+            drift = drift + (self.problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
+            if abs(before - solved.cost) < _SETTLED:
+                break
+            before = solved.cost
+        return load, drift, solved
+
+    def contradiction(self, cost: float) -> str:
+        """Name what the rows contradict in the prior, with which the fit has this cost; empty if they do not."""
+        alone = self.fitted(())[2].cost
+
+        def refit(kept: Sequence[int]) -> tuple[float, int, Parameters]:
+            load, _, solved = self.fitted(kept)
+            return solved.cost - alone, self.prior.count(kept), load.static
+
+        words = "calibrate this tool alone, without --from"
+        return self.prior.contradiction(
+            cost - alone, self.prior.count(WHOLE), refit, "the rows of the recording", words
+        )
 
 
 def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:

@@ -12,6 +12,7 @@ from ftcalib.assessment.cross_validation import IndependentFit
 from ftcalib.assessment.observability import assess
 from ftcalib.assessment.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, expected_error, judge
 from ftcalib.errors import BadDataset, NotObservable
+from ftcalib.extras.cell_prior import CellPrior
 from ftcalib.findings import Finding, Severity, ordered, verdict_of
 from ftcalib.known import Known
 from ftcalib.likelihood.gain_and_cross_talk import Response
@@ -56,6 +57,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     poses: Means,
     *,
     known: Known | None = None,
+    earlier: CalibrationResult | None = None,
     point_mass: bool = False,
     guarded: bool = False,
     height_m: float | None = None,
@@ -74,6 +76,9 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         on one clock, s, each at its own rate.
     known : Known, optional
         Known mounting, direction of gravity and mass.
+    earlier : CalibrationResult, optional
+        Accepted, of the same sensor, mounting and base with any tool: its mounting, direction of gravity, gain and
+        cross-talk are a prior, with their covariance. The result's `provenance` names it as `parent`.
     point_mass : bool
         Whether the inertia of the load about its centre of mass is known to be 0.
     guarded : bool
@@ -91,8 +96,10 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     BadDataset
         Too short, or without a common time.
     NotObservable
-        The motion does not determine the parameters; the message names what is missing.
+        The motion does not determine the parameters, or the earlier result holds no more; the message names what is
+        missing or has changed.
     """
+    prior = None if earlier is None else CellPrior(earlier)
     data = wrench.result(), poses.result()
     positions = data[1][1].shape[1] == 12
     delay_s, band = _coarse_delay(rows_of(*data)), NARROW if guarded else WIDE
@@ -101,10 +108,12 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     for _ in range(3):
         rows = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), band)
         used = _used(rows, positions)
-        best = fit(used, known, g_m_s2, point_mass=point_mass or not positions, guarded=guarded)
+        best = fit(used, known, g_m_s2, prior=prior, point_mass=point_mass or not positions, guarded=guarded)
         delay_s = rows.delay_s + best.load.delay_s
         if abs(best.load.delay_s) < LINEAR_S:
             break
+    if best.contradiction:
+        raise NotObservable(best.contradiction)
     _require_determined(used, best, known)
     duration_s = float(np.ptp(data[0][0]))
     contacts = _contacts(used, best, data[0][0][0]) if positions else ()
@@ -121,9 +130,10 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     mistakes = _mistakes(used, best, found)
     found += mistakes + _narrow(used, best, explained=verdict_of(mistakes + found) == "rejected")
     found += _findings(rows, used, best, motion, height_m, positions=positions)
-    estimated = best.components.keys() & {"gain", "cross_talk"}
+    found += [] if earlier is None else [Finding.of("earlier_cell", parent=earlier.id)]
+    responding = best.components.keys() & {"gain", "cross_talk"} or (prior is not None and prior.has_response)
     places = np.r_[0:15, 23:34]
-    response = Response(best.load.response, best.covariance[np.ix_(places, places)]) if estimated else None
+    response = Response(best.load.response, best.covariance[np.ix_(places, places)]) if responding else None
     error = expected_error(best.load.static, best.covariance[:15, :15], response)
     return CalibrationResult(
         parameters=best.load.static,
@@ -135,11 +145,11 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         g_m_s2=g_m_s2,
         method="motion",
         findings=ordered(found),
-        provenance=provenance or {},
+        provenance={**(provenance or {}), **({} if earlier is None else {"parent": {"id": earlier.id}})},
         components=best.components,
         drift=None if best.drift_change is None else DriftResult(*best.drift_change),
         response=response,
-        gain_sigma=best.components.get("gain", 0.0),
+        gain_sigma=best.components.get("gain", 0.0 if earlier is None else earlier.gain_sigma),
         second_basin_chi2=best.second_basin_chi2,
         quality={
             "next_use_force_rms_N": error[0],

@@ -37,7 +37,7 @@ _EXCLUDE_ONE_ANOTHER = (
     ("--step", "--manual", "--listen", "--sweep", "--passive"),
     ("--quick", "--minimal", "--plan", "--resume", "--sweep", "--passive"),
     ("--fast", "--sweep", "--passive"),
-    ("--from", "--resume", "--sweep", "--passive"),
+    ("--from", "--resume", "--passive"),
     *((hand, option) for hand in ("--manual", "--listen", "--passive") for option in _OF_A_PLAN),
     *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
 )
@@ -60,7 +60,7 @@ _EXCLUDE_ONE_ANOTHER = (
     "earlier",
     metavar="RESULT",
     type=click.Path(exists=True, path_type=Path),
-    help="A new tool: take mounting, base and gain from this result of the same sensor; 6 poses unless --quick.",
+    help="A new tool: take mounting, base and gain from this result of the same sensor; 4 longer poses, or --sweep.",
 )
 @click.option("--sweep", is_flag=True, help="Calibrate in one smooth motion of the wrist, with inertia and delay.")
 @click.option(
@@ -149,7 +149,7 @@ def calibrate(
             from ftdrive.runs.source import read_calibration
 
             description["earlier"] = read_calibration(earlier).to_dict()
-        poses = 12 if quick else 6 if minimal or earlier is not None else 24
+        poses = 12 if quick else 6 if minimal else 4 if earlier is not None else 24
         options = SessionOptions(
             runs,
             poses=poses,

@@ -96,7 +96,7 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
     "earlier",
     metavar="RESULT",
     type=click.Path(exists=True, path_type=Path),
-    help="A new tool: take mounting, base and gain from this result of the same sensor; 4 poses are enough.",
+    help="A new tool: take mounting, base and gain from this result of the same sensor. 4 poses or 10 s of motion do.",
 )
 @click.option("--together", "joined", is_flag=True, help="Join runs of one tool, each with a bias of its own.")
 @BAG_TOPICS
@@ -144,8 +144,10 @@ def solve(
     sources = sources if pair is None else pair[:1]
     if not (sources or simulate):
         raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
-    if (earlier is not None or joined) and (method != "ml" or pair is not None or (earlier is not None and joined)):
-        raise ConfigError("--from and --together are for poses at rest and --method ml, one of the two at a time")
+    if (earlier is not None or joined) and (method != "ml" or (earlier is not None and joined)):
+        raise ConfigError("--from and --together are for --method ml, one of the two at a time")
+    if joined and pair is not None:
+        raise ConfigError("--together joins poses at rest: leave out --wrench and --orientation-file")
     if joined and len(sources) < 2:
         raise ConfigError("--together joins two runs or more: name them, the oldest first")
     if output is not None and ((len(sources) > 1 and not joined) or method == "all"):
@@ -220,14 +222,13 @@ def _result_of(
     if motion["pair"] is not None or from_bag or is_recording(place) or in_motion(place):
         if method != "ml":
             raise ConfigError(f"--method {method} is for poses at rest: leave it out for a recording")
-        if "earlier" in read:
-            raise ConfigError("--from is for poses at rest: leave it out for a recording in motion")
+        options = {"earlier": read.get("earlier"), "known": read["known"], "point_mass": motion["point_mass"]}
         if in_motion(place):
             with working("Solving"):
-                return solve_in_motion(Run(place), read["known"], point_mass=motion["point_mass"]), ()
+                return solve_in_motion(Run(place), **options), ()
         from ftdrive.recording.in_motion import solve_recording  # with the filters of a stream
 
-        options = {"point_mass": motion["point_mass"], "known": read["known"], "up_in_base": read["up_in_base"]}
+        options["up_in_base"] = read["up_in_base"]
         with working("Solving"):
             means = bag_means(read_bag(place, *topics)) if from_bag else None
             return solve_recording(place, motion["pair"], means, **options), ()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ftdrive.commands.common import JSON, SOURCE, NewFile, Number, Source, write_json
+from ftdrive.errors import ConfigError
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     "--zero", is_flag=True, help="First tare the empty gripper: then drift since the calibration is no error."
 )
 @click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Rests of one load to join.")
+@click.option("--moving", is_flag=True, help="Weigh what the arm carries, in motion too; begin with an empty gripper.")
 @click.option("--count", "part_kg", type=Number(0, min_open=True), metavar="KG", help="Mass of one part: count parts.")
 @click.option("--once", is_flag=True, help="Print one weight, then end; with --zero wait for a part.")
 @click.option("-o", "--output", type=NewFile(), help="Record samples and weighings: .mcap, .csv or .parquet.")
@@ -30,6 +32,7 @@ def weigh(
     source: Source,
     zero: bool,
     poses: int,
+    moving: bool,
     part_kg: float | None,
     once: bool,
     output: Path | None,
@@ -38,8 +41,9 @@ def weigh(
     """Weigh what the gripper holds beyond its calibrated tool, in half a second at rest.
 
     One pose gives the mass, and the centre of mass but for its place along gravity. The answer has one sigma of each,
-    and the smallest mass that differs from zero. Contact, cables and moving parts are named and not weighed. The arm is
-    only read, never moved. Ctrl-C ends.
+    and the smallest mass that differs from zero. Contact, cables and moving parts are named and not weighed. With
+    --moving, the load is weighed while the arm carries it, and has its whole centre of mass. The arm is only read,
+    never moved. Ctrl-C ends.
     """
     from ftdrive.commands.live_source import open_log, open_source
     from ftdrive.live.processing import SENSOR_FRAME
@@ -47,8 +51,10 @@ def weigh(
     from ftdrive.terminal.console import messages
     from ftdrive.terminal.weighing import Weighing
 
+    if moving and (zero or poses > 1):
+        raise ConfigError("--moving follows the bias and has the whole centre of mass: leave out --zero and --poses")
     with ExitStack() as stack:
-        stream = open_source(source, SENSOR_FRAME, stack)
+        stream = open_source(source, SENSOR_FRAME, stack, "show" if moving else "off")
         recorder = None
         if output is not None:
             recorder = Recorder([output], stream.info, stream.cell.to_dict())
@@ -57,7 +63,7 @@ def weigh(
         later: list[str] = []  # a screen would hide it
         stack.callback(_print_all, later)
         log = open_log(source, stream, stack, later.append if on_screen else messages.print)
-        weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg, log=log)
+        weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg, moving=moving, log=log)
         if zero:
             messages.print(" Zero: the gripper must be empty.")
             weighing.zero()
@@ -66,7 +72,7 @@ def weigh(
 
             run_weigh(weighing)
         else:
-            _print(weighing, once=once, waits=zero, poses=poses, as_json=as_json)
+            _print(weighing, once=once, waits=zero or moving, poses=0 if moving else poses, as_json=as_json)
 
 
 def _print_all(texts: Sequence[str]) -> None:

@@ -112,11 +112,14 @@ def _with_bias(covariance: Array, sigma: Array) -> Array:
 
 def part_of(tracked: Tracked) -> Weight | None:
     """Return the part as if it had been weighed; None for an empty gripper."""
+    return None if tracked.part_kg < NOTHING_KG else weight_of(tracked)
+
+
+def weight_of(tracked: Tracked) -> Weight:
+    """Return what is held, nothing included, as if it had been weighed."""
     (x, covariance), mass_kg = tracked.moment, tracked.part_kg
-    if mass_kg < NOTHING_KG:
-        return None
-    com_m = x[1:] / mass_kg
-    T = np.column_stack([-com_m, np.eye(3)]) / mass_kg
+    com_m = x[1:] / (mass_kg or 1.0)
+    T = np.column_stack([-com_m, np.eye(3)]) / max(abs(mass_kg), 1e-9)
     return Weight(
         mass_kg=mass_kg,
         mass_sigma_kg=tracked.part_sigma_kg,
@@ -128,5 +131,6 @@ def part_of(tracked: Tracked) -> Weight | None:
         chi2=0.0,
         dof=0,
         poses=0,
+        in_motion=True,
         moment=(x, covariance),
     )

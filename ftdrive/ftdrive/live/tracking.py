@@ -37,7 +37,7 @@ _GYRATION_M = 0.08
 """Radius of gyration of a part, and what its place that is not known yet adds."""
 _PLACED_M = 0.03
 """A part whose centre of mass is known so well turns about it."""
-_FIRST_WINDOWS, _MOST_WINDOWS = 10, 200
+_FIRST_WINDOWS, _MOST_WINDOWS = 3, 200
 """The first noise of a state counts as so many windows; the noise follows within so many."""
 
 

@@ -1,4 +1,4 @@
-"""Weigh what the gripper holds, from half a second of a stream at rest."""
+"""Weigh what the gripper holds, from half a second of a stream at rest, or while the arm carries it."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -13,6 +13,8 @@ from ftcalib.extras import weighing
 from ftcalib.extras.weighing import Fault, Weight, drift_since
 from ftcalib.files import JSON
 from ftcalib.model import angle_between
+from ftdrive.errors import ConfigError
+from ftdrive.live.following import weight_of
 from ftdrive.live.frames import near
 from ftdrive.live.processing import ProcessedStream
 from ftdrive.live.replay import ReplayedStream
@@ -26,6 +28,8 @@ WEIGH_S: Final = TARE_S
 """A weighing averages so long."""
 _FEW: Final = 10.0
 """The variance of a mean comes from its own samples. With n of them it is raised by this over n."""
+_LATE_S: Final = 1.0
+"""In motion the last window may be so old."""
 _NEW_POSE_RAD: Final = 0.17
 """Poses farther apart than this show more of the centre of mass."""
 _WHOLE: Final = 0.1
@@ -40,6 +44,7 @@ WORDS: Final[Mapping[str, str]] = {
     "changed": "the poses do not agree on one weight: the part slipped, a cable pulls, or the load has changed",
     "lifted": "less than the empty tool: contact from below, or the gripper was not empty at the zero",
     "not-empty": "the reading is too far from that of the empty tool for a zero: empty the gripper, or calibrate again",
+    "undecided": "a contact, or a load that is not decided yet: let the arm carry it freely for about 2 s",
     "count": "no whole number of parts: check the mass of one part, and the gripper",
 }
 """Why nothing was weighed, and what to do, by `CannotWeigh.code`."""
@@ -174,7 +179,39 @@ def _unexplained(info: StreamInfo) -> Array:
     return np.repeat(np.maximum(excess, 0.0) / 3, 3)
 
 
-def weigh(stream: CompensatedStream | ReplayedStream, *, poses: int = 1, timeout_s: float = 10.0) -> Weight:
+def weigh_in_motion(stream: ProcessedStream, since_ns: int = 0) -> Weight:
+    """Weigh what the arm carries, by the load that the stream follows.
+
+    Parameters
+    ----------
+    stream : CompensatedStream or ReplayedStream
+        Its `track` is not "off".
+    since_ns : int
+        Earlier samples do not count, clock of the cell.
+
+    Raises
+    ------
+    CannotWeigh
+        A contact, a load that is not decided yet, or no samples.
+    ConfigError
+        The stream does not follow the load.
+    """
+    if stream.track == "off":
+        raise ConfigError('the stream does not follow the load: open it with track="show" to weigh in motion')
+    rows, tracked = stream.recent(), stream.tracked
+    if rows is None or tracked is None or not np.isfinite(tracked.last_seen_s):
+        raise CannotWeigh("samples")  # the first windows are no answer: an empty gripper is assumed
+    t_ns = round(1e9 * tracked.t_s)
+    if t_ns < max(since_ns, int(rows.t_host_ns[-1]) - round(1e9 * _LATE_S)):
+        raise CannotWeigh("samples")
+    if not tracked.part_known:
+        raise CannotWeigh("undecided")
+    return replace(weight_of(tracked), scale_sigma=stream.info.calibration.scale_sigma)
+
+
+def weigh(
+    stream: CompensatedStream | ReplayedStream, *, poses: int = 1, moving: bool = False, timeout_s: float = 10.0
+) -> Weight:
     """Wait until arm and reading rest, and weigh what the gripper holds beyond its calibrated tool.
 
     Call `stream.tare()` at the empty gripper just before it grasps: that cancels the drift of the bias.
@@ -186,6 +223,9 @@ def weigh(stream: CompensatedStream | ReplayedStream, *, poses: int = 1, timeout
     poses : int
         One gives the mass, and the centre of mass but for its place along gravity. From two on, another program turns
         the arm meanwhile, and each rest that is 10° from the others counts.
+    moving : bool
+        Do not wait for rest: take what the arm carries as the stream follows it, once it is decided. The stream was
+        opened with `track`, while the gripper was empty. `poses` does not count then.
     timeout_s : float
         For each pose.
 
@@ -198,6 +238,8 @@ def weigh(stream: CompensatedStream | ReplayedStream, *, poses: int = 1, timeout
     ------
     CannotWeigh
         Nothing could be weighed in this time; its `code` is the reason of the last attempt.
+    ConfigError
+        With `moving`, the stream does not follow the load.
     DeviceError
         The stream has failed.
 
@@ -219,6 +261,8 @@ def weigh(stream: CompensatedStream | ReplayedStream, *, poses: int = 1, timeout
             rows = stream.read()
             since_ns = since_ns or int(rows.t_host_ns[-1])
             try:
+                if moving:
+                    return weigh_in_motion(stream, since_ns)
                 found = scale.weigh(since_ns, more=True)
             except CannotWeigh as error:
                 refusal = error
@@ -251,6 +295,7 @@ def load_values(weight: Weight, info: StreamInfo) -> dict[str, JSON]:
         "p_flange_com_sigma_m": np.sqrt(np.diag(C_flange)).tolist() if placed else None,
         "line_sensor": weight.line.tolist() if known and weight.line is not None else None,
         "poses": weight.poses,
+        "in_motion": weight.in_motion,
         "fault": weight.fault,
     }
 

@@ -29,6 +29,8 @@ from ftdrivers.ur.kinematics import Array
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 """All models have room for the constant tour here with usual tools; the wrist is at its first pose."""
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
+TOOL_POSES = 4
+"""Of a new tool on a calibrated cell."""
 BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6
 
@@ -115,6 +117,33 @@ def _first_found(attempts: Iterable[Attempt], refusal: str, certifier: Certifier
         if found is not None:
             return make_plan(kind, why, certifier, *found, speeds, guess)
     raise PlanRefused(refusal)
+
+
+def plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
+    """Plan a tour of the four most informative reachable poses, for a new tool on a calibrated cell.
+
+    They determine everything, so they determine weight, centre of mass and bias of the tool too: its error
+    is 3 % above that of a tetrahedron of gravity directions.
+
+    Parameters
+    ----------
+    q_rad, guess
+        As of `plan_tour`.
+
+    Raises
+    ------
+    PlanRefused
+        Too few poses are reachable by moves that are proven clear.
+    """
+    found = chosen_tour(certifier, checked_joints(q_rad), TOOL_POSES, np.pi, speeds, guess)
+    if found is None:
+        raise PlanRefused(
+            f"no tour of {TOOL_POSES} poses is reachable, proven clear and informative enough for a new tool: jog the "
+            "arm to another posture, or clear the surroundings"
+        )
+    why = [f"{TOOL_POSES} poses for a new tool; mounting and base are known.", *_chosen_words(found)]
+    plan = make_plan("tool", why, certifier, found.numbers, found.q_rad, speeds, guess)
+    return replace(plan, why=tuple(why))  # without the accuracy of these poses alone
 
 
 def plan_cone(

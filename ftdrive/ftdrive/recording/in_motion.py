@@ -1,9 +1,7 @@
 """A calibration in motion from files, read piece by piece: a recording, or two CSV files of another program."""
 
-import csv
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
-from itertools import islice
 from math import isfinite
 from pathlib import Path
 
@@ -11,18 +9,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Known, Setup
-from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns, rotations_of
-from ftcalib.data.dwell_mean import CHANNELS
+from ftcalib.data.dataset import rotations_of
 from ftcalib.errors import BadDataset
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
 from ftdrive.recording.compensation import NEEDED
 from ftdrive.recording.files import RecordingReader
+from ftdrive.recording.number_table import ORIENTATION, WRENCH, Wanted, read_table
 from ftdrive.recording.recording import Header
+from ftdrive.runs.new_tool import require_same_cell
 from ftdrive.runs.run import made_now
 
-_PIECE = 1 << 16
 _POSITION = ("x", "y", "z")
 
 
@@ -34,6 +32,7 @@ def solve_recording(
     known: Known | None,
     point_mass: bool,
     up_in_base: Sequence[float] | None,
+    earlier: CalibrationResult | None = None,
 ) -> CalibrationResult:
     """Calibrate from a recording in motion.
 
@@ -51,13 +50,15 @@ def solve_recording(
         Whether the load is known to have no inertia about its centre of mass.
     up_in_base : sequence of float, optional
         (3,) declared up direction.
+    earlier : CalibrationResult, optional
+        Of the same cell with another tool, as for `solve_motion`.
 
     Raises
     ------
     BadDataset, BadRecording, ConfigError, OSError
-        A file cannot be used.
+        A file cannot be used, or the earlier result is rejected or of another sensor or arm.
     NotObservable
-        The motion does not determine the parameters.
+        The motion does not determine the parameters, or contradicts the earlier result.
     """
     provenance, height_m, g_m_s2 = made_now(), None, STANDARD_GRAVITY_M_S2
     if means is not None:
@@ -72,6 +73,8 @@ def solve_recording(
     else:
         wrench, poses = read_wrench_file(pair[0]), read_pose_file(pair[1])
         provenance |= {"wrench": pair[0].name, "orientation": pair[1].name}
+    if earlier is not None:
+        require_same_cell(earlier, provenance)
     setup = Setup(up_in_base=up_in_base)
     if known is not None and known.gravity_direction_base is not None:
         known = replace(known, gravity_direction_base=-setup.up)
@@ -79,6 +82,7 @@ def solve_recording(
         wrench,
         poses,
         known=known,
+        earlier=earlier,
         point_mass=point_mass,
         height_m=height_m if height_m is not None and isfinite(height_m) else None,
         g_m_s2=g_m_s2,
@@ -105,8 +109,8 @@ def read_in_motion(path: Path) -> tuple[Means, Means, Header]:
 def read_wrench_file(path: Path) -> Means:
     """Read columns t in s, fx, fy, fz in N, tx, ty, tz in N·m. Raises `BadDataset` or `OSError`."""
     means = Means()
-    for t_s, numbers, _ in _pieces(path, lambda _: CHANNELS, ", ".join(CHANNELS)):
-        _add(means, path, t_s, numbers)
+    for part in read_table(path, WRENCH):
+        _add(means, path, part.t_s, part.numbers)
     return means
 
 
@@ -116,17 +120,17 @@ def read_pose_file(path: Path) -> Means:
     The orientation is r11..r33, qx, qy, qz, qw, or rx, ry, rz in rad. Raises `BadDataset` or `OSError`.
     """
 
-    def wanted(names: Sequence[str]) -> Sequence[str]:
-        return [*orientation_columns(names), *(_POSITION if set(_POSITION) <= set(names) else ())]
+    def pose(names: Sequence[str]) -> Sequence[str]:
+        return [*ORIENTATION.choose(names), *(_POSITION if set(_POSITION) <= set(names) else ())]
 
     means = Means()
-    for t_s, numbers, names in _pieces(path, wanted, ORIENTATION_FORMS):
-        of_orientation = tuple(name for name in names if name not in _POSITION)
+    for part in read_table(path, Wanted(pose, ORIENTATION.words)):
+        of_orientation = tuple(name for name in part.names if name not in _POSITION)
         try:
-            R = rotations_of(of_orientation, numbers[:, : len(of_orientation)]).reshape(-1, 9)
+            R = rotations_of(of_orientation, part.numbers[:, : len(of_orientation)]).reshape(-1, 9)
         except BadDataset as error:
             raise BadDataset(f"{path.name}: {error}") from error
-        _add(means, path, t_s, np.hstack([R, numbers[:, len(of_orientation) :]]))
+        _add(means, path, part.t_s, np.hstack([R, part.numbers[:, len(of_orientation) :]]))
     return means
 
 
@@ -135,21 +139,3 @@ def _add(means: Means, path: Path, t_s: Array, values: Array) -> None:
         means.add(t_s, values)
     except BadDataset as error:
         raise BadDataset(f"{path.name}: {error}") from error
-
-
-def _pieces(
-    path: Path, columns_of: Callable[[Sequence[str]], Sequence[str]], wanted: str
-) -> Iterator[tuple[Array, Array, Sequence[str]]]:
-    """Give times (n,), the columns that are chosen by the names of all (n, k), and their names."""
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
-        names = [name.strip() for name in next(csv.reader(file), [])]
-        found = columns_of(names)
-        if not {"t", *found} <= set(names):
-            raise BadDataset(f"{path.name}: the first row must name t and {wanted}; it names {', '.join(names)}")
-        order = [names.index(name) for name in ("t", *found)]
-        while lines := list(islice(file, _PIECE)):
-            try:
-                table = np.loadtxt(lines, delimiter=",", usecols=order, ndmin=2)
-            except ValueError as error:
-                raise BadDataset(f"{path.name}: {error}: correct this line") from error
-            yield table[:, 0], table[:, 1:], found

@@ -19,12 +19,12 @@ def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any])
         serials = [_of(one, "devices", device, "serial") for one in (before, now)]
         if all(serials) and serials[0] != serials[1]:
             raise ConfigError(
-                f"--from: result {earlier.id} is of {device} {serials[0]}, these poses of {serials[1]}: take one of "
+                f"--from: result {earlier.id} is of {device} {serials[0]}, the new data of {serials[1]}: take one of "
                 f"the same {device}"
             )
     mounts = [_of(one, "setup", "mount") for one in (before, now)]
     if all(mounts) and mounts[0] != mounts[1]:
-        raise ConfigError(f"--from: result {earlier.id} is of mount {mounts[0]}, these poses of {mounts[1]}")
+        raise ConfigError(f"--from: result {earlier.id} is of mount {mounts[0]}, the new data of {mounts[1]}")
 
 
 def _of(document: Any, *keys: str) -> Any:

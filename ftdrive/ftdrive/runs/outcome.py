@@ -41,14 +41,20 @@ def solve_and_save(run: Run) -> Outcome:
     return outcome
 
 
-def solve_in_motion(run: Run, known: Known | None = None, *, point_mass: bool = False) -> CalibrationResult:
-    """Solve the recording of a run in motion."""
+def solve_in_motion(
+    run: Run, known: Known | None = None, *, earlier: CalibrationResult | None = None, point_mass: bool = False
+) -> CalibrationResult:
+    """Solve the recording of a run in motion; with the earlier result of a new tool that is given, or its own."""
     circumstances, origin = circumstances_of(run)
+    earlier = earlier or earlier_of(run)
+    if earlier is not None:
+        require_same_cell(earlier, origin)
     setup: Setup = circumstances["setup"]
     return solve_motion_file(
         run.motion_path,
         height_m=setup.sensor_height_m,
         known=known,
+        earlier=earlier,
         point_mass=point_mass,
         guarded=run.header().get("mode") == "sweep",
         provenance={**made_now(), **origin},

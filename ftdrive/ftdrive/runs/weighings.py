@@ -21,7 +21,7 @@ FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
 FILES: Final = "weighings-*.ndjson"
 REFUSALS: Final = (
-    *("samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "count"),
+    *("samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "undecided", "count"),
     "other",  # of a newer version
 )
 """Why nothing was weighed: the codes of `ftdrive.live.weighing.WORDS`."""

@@ -44,6 +44,8 @@ _GRID_RAD: Final = float(np.radians(0.1))
 """Joints 1 to 3 are rounded to this grid before planning, so that the same posture gives the same plan and hash."""
 _TARGET_N, _TARGET_NM = 0.057, 0.0035
 """Target sigma of one average: it gives 0.02 N of bias from 24 poses."""
+_TOOL_AVERAGES: Final = 2.0
+"""Length of an average of a new tool in that of other tours: its four poses then show as much as eight."""
 _HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
 _HEAVIEST_OF_ALL_KG: Final = 30.0
 _NO_SERIAL: Final = (
@@ -273,8 +275,16 @@ def show_plan(before: Before, options: SessionOptions) -> None:
 def _chosen_sampling(before: Before, todo: Sequence[int]) -> tuple[Sampling, Array]:
     """Return how each pose is averaged, and (6,) one sigma of such an average.
 
-    The duration is configured, or chosen from a record of the sensor's noise.
+    The duration is configured, or chosen from a record of the sensor's noise. The few poses of a new tool take longer.
     """
+    sampling, sigma = _usual_sampling(before, todo)
+    if before.plan.kind != "tool":
+        return sampling, sigma
+    before.cell.note(f"a new tool: {_TOOL_AVERAGES:g} times that average at each of its {len(before.plan.steps)} poses")
+    return replace(sampling, average_s=_TOOL_AVERAGES * sampling.average_s), sigma / np.sqrt(_TOOL_AVERAGES)
+
+
+def _usual_sampling(before: Before, todo: Sequence[int]) -> tuple[Sampling, Array]:
     cell, sampling = before.cell, before.config.sampling
     if not (sampling.noise_record_s and todo):
         variance = np.diag(mean_and_covariance(before.quiet.wrench).covariance)

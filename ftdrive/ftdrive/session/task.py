@@ -69,6 +69,8 @@ class Calibrating:
         return RunningFit(g_m_s2=self.cell.site.g_m_s2, down_base=down_base, advise=by_hand)
 
     def forecast(self, averages: Averages) -> str:
-        """Describe the sigmas of the result."""
+        """Describe the sigmas of the result; those of a new tool depend on the earlier result too."""
+        if averages.plan.kind == "tool":
+            return str(averages)
         mass_kg = self.cell.tool.mass_kg
         return prediction(averages, mass_kg, assumed=self.real and not mass_kg)

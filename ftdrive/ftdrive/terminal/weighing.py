@@ -8,7 +8,7 @@ from ftcalib.extras.weighing import Weight
 from ftcalib.rounding import with_sigma
 from ftdrive.errors import NotAccepted
 from ftdrive.live.stream import CompensatedStream
-from ftdrive.live.weighing import FAULTS, WEIGH_S, WORDS, CannotWeigh, Scale, count_of, load_values
+from ftdrive.live.weighing import FAULTS, WEIGH_S, WORDS, CannotWeigh, Scale, count_of, load_values, weigh_in_motion
 from ftdrive.recording import Recorder
 from ftdrivers.errors import DeviceError
 
@@ -43,6 +43,8 @@ class Weighing:
     recorder : Recorder, optional
     joins : bool
         Join the poses of one load.
+    moving : bool
+        Weigh what the arm carries, in motion too.
     part_kg : float, optional
         Mass of one part.
     log : WeighingLog, optional
@@ -56,11 +58,12 @@ class Weighing:
         *,
         joins: bool,
         part_kg: float | None,
+        moving: bool = False,
         log: "WeighingLog | None" = None,
     ) -> None:
         self.stream, self.part_kg = stream, part_kg
         self._log = log
-        self.joins = joins
+        self.joins, self._moving = joins, moving
         self._recorder = recorder
         self._scale = Scale(stream)
         self._last: Weight | None = None
@@ -122,7 +125,7 @@ class Weighing:
 
     def _weighed(self) -> Shown:
         try:
-            weight = self._scale.weigh(more=self.joins)
+            weight = weigh_in_motion(self.stream) if self._moving else self._scale.weigh(more=self.joins)
             return Shown(weight, None, None if self.part_kg is None else count_of(weight, self.part_kg))
         except CannotWeigh as refusal:
             if refusal.code not in ("unsteady", "samples"):  # then it may be the same load as before

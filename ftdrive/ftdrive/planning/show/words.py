@@ -112,7 +112,7 @@ def _summary(plan: Plan) -> list[str]:
         f"{sum(step.duration_s for step in plan.steps):.0f} s of motion at the plan's speeds.",
         f"Nearest: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
         room_in_words(plan),
-        *([] if plan.kind == "verification" else [_accuracy(plan)]),
+        *([] if plan.kind in ("verification", "tool") else [_accuracy(plan)]),
     ]
 
 

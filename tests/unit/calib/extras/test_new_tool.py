@@ -24,8 +24,8 @@ FOUR = np.array([Rotation.align_vectors([[0, 0, -1.0]], [down])[0].as_matrix() f
 """Gravity points evenly in all directions of the flange."""
 
 
-def poses(truth: Parameters, R: Array, seed: int) -> CalibrationDataset:
-    sigma = NOISE / 20
+def poses(truth: Parameters, R: Array, seed: int, longer: float = 1.0) -> CalibrationDataset:
+    sigma = NOISE / 20 / np.sqrt(longer)
     wrench = predict(truth, R) + sigma * np.random.default_rng(seed).normal(size=(len(R), 6))
     covariance = np.tile(np.diag(sigma**2), (len(R), 1, 1))
     return CalibrationDataset(R, wrench, covariance, np.zeros(len(R), np.int64), np.full(len(R), np.nan))

@@ -41,12 +41,12 @@ def calibrated(poses: int = 24, seed: int = 1, samples: int = 400) -> Calibratio
     return solve(CalibrationDataset(R, wrench, covariance, np.zeros(poses, np.int64), np.full(poses, np.nan)))
 
 
-def calibrated_from(truth: Mapping[str, Any]) -> CalibrationResult:
+def calibrated_from(truth: Mapping[str, Any], seed: int = 1) -> CalibrationResult:
     """A calibration of an emulated cell with 24 poses, without the minutes of a tour."""
     names = ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
     parameters = Parameters(**{name: np.array(truth[name]) for name in names})
     sigma = np.repeat([truth["noise_force_N"], truth["noise_torque_Nm"]], 3) / 20
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(seed)
     R = Rotation.random(24, rng=rng).as_matrix()
     wrench = predict(parameters, R) + sigma * rng.normal(size=(24, 6))
     covariance = np.tile(np.diag(sigma**2), (24, 1, 1))

@@ -83,7 +83,7 @@ class Link:
         for left_s in self.clock.looks(timeout_s):
             if self._due() > self.sent and not self.silent:
                 break
-            self.clock.advance(min(left_s, 0.005))
+            self.clock.advance(min(left_s, 0.02))
         if self.silent and timeout_s:
             self.clock.advance(0.3)
         if self.silent:

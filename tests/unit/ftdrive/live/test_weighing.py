@@ -6,9 +6,10 @@ from scipy.spatial.transform import Rotation
 
 import ftdrive
 from ftcalib.model import Array
+from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Paired
-from ftdrive.live.weighing import WORDS, CannotWeigh, Scale, count_of, load_values
+from ftdrive.live.weighing import WORDS, CannotWeigh, Scale, count_of, load_values, weigh_in_motion
 from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, TRUTH, G, calibrated, info, paired
 
 POSE = Rotation.from_euler("xz", [170, 25], degrees=True).as_matrix()
@@ -21,6 +22,14 @@ def part(R: Array, mass_kg: float) -> Array:
     down = TRUTH.gravity_force_base_N / np.linalg.norm(TRUTH.gravity_force_base_N)
     force_N = mass_kg * G * down @ (R @ TRUTH.R_flange_sensor)
     return np.concatenate([force_N, np.cross(COM_M, force_N)])
+
+
+def inertia(R: Array, mass_kg: float, p_sensor_m: Array) -> Array:
+    """Wrench (n, 6) of a point mass that turns with the flange, whose origin rests."""
+    at_m = R @ (P_FLANGE_SENSOR_M + TRUTH.R_flange_sensor @ p_sensor_m)
+    acceleration = np.gradient(np.gradient(at_m, 1e-3, axis=0), 1e-3, axis=0)
+    force_N = -mass_kg * np.einsum("nij,ni->nj", R @ TRUTH.R_flange_sensor, acceleration)
+    return np.hstack([force_N, np.cross(p_sensor_m, force_N)])
 
 
 def rests(*each: tuple[Array, Array], seconds: float = 1.0) -> Paired:
@@ -97,6 +106,53 @@ def test_a_zero_needs_an_empty_gripper_at_rest() -> None:
             Scale(source).zero()
         assert refusal.value.code == code
         assert source.reference()[1] == float("inf")
+
+
+def carried(mass_kg: float, *, push: Array = NOTHING, empty_s: float = 6.0) -> ReplayedStream:
+    """An arm that turns without rest; after `empty_s` it has a part, and from 4 s later on a push."""
+    t_s = np.arange(0, empty_s + 8.0, 1e-3)
+    R = (Rotation.from_rotvec(np.outer(t_s, [0.3, 0.2, 0.1])) * Rotation.from_matrix(POSE)).as_matrix()
+    weight = np.array([part(one, mass_kg) for one in R]) + inertia(R, mass_kg, COM_M)
+    tool_kg = float(np.linalg.norm(TRUTH.gravity_force_base_N)) / G
+    wrench = inertia(R, tool_kg, TRUTH.p_sensor_com_m) + weight * (t_s > empty_s)[:, None]
+    wrench[t_s > empty_s + 4] += push
+    source = stream(paired(R, push=wrench))
+    source.track = "show"
+    return source
+
+
+def test_a_part_is_weighed_while_the_arm_carries_it() -> None:
+    source = carried(0.8)
+    read(source, 5.0)
+    empty = ftdrive.weigh(source, moving=True)
+    assert not empty.is_something
+    read(source, 4.0)
+    weight = ftdrive.weigh(source, moving=True)
+    assert weight.is_something
+    assert weight.mass_kg == pytest.approx(0.8, abs=4 * weight.mass_sigma_kg)
+    np.testing.assert_allclose(weight.p_sensor_com_m, COM_M, atol=4 * weight.com_sigma_m.max())
+    values = load_values(weight, source.info)
+    assert (values["in_motion"], values["poses"], values["line_sensor"]) == (True, 0, None)
+    assert values.keys() == load_values(empty, source.info).keys()
+
+
+def test_a_push_in_motion_is_refused_until_it_is_over() -> None:
+    source = carried(0.8, push=np.array([3.0, 4.0, 0, 0, 0, 0.2]))
+    read(source, 10.6)
+    for _ in range(3):
+        with pytest.raises(CannotWeigh) as refusal:
+            weigh_in_motion(source)
+        assert refusal.value.code == "undecided"
+        read(source, 0.4)
+
+
+def test_weighing_in_motion_needs_a_stream_that_follows() -> None:
+    source = carried(0.0)
+    with pytest.raises(CannotWeigh, match="too few samples"):
+        weigh_in_motion(source)
+    source.track = "off"
+    with pytest.raises(ConfigError, match="track"):
+        weigh_in_motion(source)
 
 
 def test_parts_are_counted_or_not() -> None:

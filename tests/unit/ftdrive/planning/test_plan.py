@@ -15,7 +15,7 @@ from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.scene import Box, Plane, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import NUMBERS, USUAL_POSTURE_RAD, guess_of, plan_tour
+from ftdrive.planning.planner import NUMBERS, TOOL_POSES, USUAL_POSTURE_RAD, guess_of, plan_tool, plan_tour
 from ftdrive.planning.search.tours import shortest_tour
 from ftdrivers.ur.kinematics import Array
 
@@ -42,7 +42,9 @@ def planned(certifier: Certifier, q: Array = USUAL_POSTURE_RAD, poses: int = 24,
     return plan_tour(certifier, q, poses, speeds=speeds or Speeds(), guess=guess_of(certifier))
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    "model", [model if model in {"UR3e", "UR10e"} else pytest.param(model, marks=pytest.mark.slow) for model in MODELS]
+)
 def test_figures_of_the_constant_tour(model: str) -> None:
     plan = planned(certifier_of(model), speeds=NO_TIP_LIMIT)
     document = plan.to_dict()
@@ -79,6 +81,20 @@ def test_fewer_poses_have_one_solution_and_say_what_they_cost(poses: int) -> Non
     assert any("times that of all 24" in sentence for sentence in plan.why)
     assert not any("times that of all 24" in sentence for sentence in planned(certifier_of()).why)
     assert document["motion_time_s"] < planned(certifier_of()).to_dict()["motion_time_s"]
+
+
+def test_poses_of_a_new_tool_spread_gravity_like_a_tetrahedron() -> None:
+    certifier = certifier_of()
+    plan = plan_tool(certifier, USUAL_POSTURE_RAD, speeds=Speeds(), guess=guess_of(certifier))
+    assert (plan.kind, len(plan.steps), plan.certified) == ("tool", TOOL_POSES, True)
+    u = -np.array([step.R_base_flange for step in plan.steps])[:, 2]
+    X = np.column_stack([u.ravel(), np.tile(np.eye(3), (len(u), 1))])  # force of a weight of 1, and its bias
+    variance = np.trace(np.linalg.inv(X.T @ X))
+    assert variance < 1.1 * (1 / 4 + 3 / 4)
+    assert not any("times that of all 24" in sentence for sentence in plan.why)
+    ceiling = certifier_of(scene=Scene(planes=(*Scene().planes, Plane((0.0, 0.0, -1.0), -0.3))))
+    with pytest.raises(PlanRefused, match="new tool"):
+        plan_tool(ceiling, USUAL_POSTURE_RAD, speeds=Speeds(), guess=guess_of(certifier))
 
 
 @pytest.mark.parametrize("pan_deg", [-120.0, 33.0])

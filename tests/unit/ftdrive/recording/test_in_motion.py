@@ -17,6 +17,7 @@ from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.recording.files import write_recording
 from ftdrive.recording.recording import ROW, Header, Recording
 from tests.moving_load import Recorded, Truth, record, sweep
+from tests.unit.ftdrive.live.simulated import calibrated_from
 from tests.unit.ftdrive.recorded import info
 
 SECONDS = 10.0
@@ -66,6 +67,11 @@ def test_files_of_another_program_are_solved(tmp_path: Path, swept: Recorded) ->
     assert document["verdict"] == "good"
     assert document["mass_kg"] == pytest.approx(TRUTH.mass_kg, abs=1e-3)
     assert document["sigma"]["inertia_kg_m2"][0][0] > 0
+    earlier = calibrated_from({**TRUTH.to_dict(), "noise_force_N": 0.05, "noise_torque_Nm": 0.002})
+    earlier.save(tmp_path / "earlier.json")
+    joined = run("--wrench", wrench, "--orientation-file", poses, "--from", tmp_path / "earlier.json")
+    assert joined["provenance"]["parent"] == {"id": earlier.id}
+    assert joined["covariance"][0][0] < document["covariance"][0][0]
 
 
 @pytest.mark.parametrize(
