@@ -42,7 +42,6 @@ def history(
     from ftdrive.errors import ConfigError
     from ftdrive.store.history import drifts, warnings
     from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
-    from ftdrive.terminal.console import answer, hanging, messages
 
     left_out: tuple[str, ...] = ()
     weighed: Sequence[StoredWeighings] = ()
@@ -67,8 +66,7 @@ def history(
             return
         results, checks = store.results(tool), store.verifications()
         weighed = store.last_weighings((datetime.now(UTC) - _RECENT).date().isoformat(), tool)
-    for words in left_out:
-        messages.print(hanging(" left out: ", words))
+    _print_left_out(left_out)
     now = datetime.now(UTC)
     found, advice = drifts(results), list(warnings(results, checks, now))
     warmth = []
@@ -85,9 +83,7 @@ def history(
         write_json({"schema_version": 1, "store": name, "results": rows, **about})
         return
     if not results:
-        messages.print(
-            "No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder."
-        )
+        _say("No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder.")
         return
     _print_table([_row(one, last.get(one.id), now) for one in results])
     trend_lines = (f"trend: {drift}" for drift in found)
@@ -95,8 +91,25 @@ def history(
     weighing_lines = (f"last weighing: {_weighing_in_words(one)}" for one in weighed)
     for line in (*trend_lines, *warmth_lines, *weighing_lines):
         echo(line)
-    for words in advice:
-        answer.print(hanging(" ! ", words, answer), style="yellow")
+    if advice:
+        from ftdrive.terminal.console import answer, hanging
+
+        for words in advice:
+            answer.print(hanging(" ! ", words, answer), style="yellow")
+
+
+def _print_left_out(left_out: Sequence[str]) -> None:
+    if left_out:
+        from ftdrive.terminal.console import hanging, messages
+
+        for words in left_out:
+            messages.print(hanging(" left out: ", words))
+
+
+def _say(words: str) -> None:
+    from ftdrive.terminal.console import messages
+
+    messages.print(words)
 
 
 _MOST_DAYS = 20
@@ -106,15 +119,13 @@ _RECENT = timedelta(days=90)
 
 
 def _show_weighings(days: "Sequence[StoredWeighings]", name: str, left_out: Sequence[str], as_json: bool) -> None:
-    from ftdrive.terminal.console import hanging, messages
     from ftdrive.terminal.table import print_table
 
-    for words in left_out:
-        messages.print(hanging(" left out: ", words))
+    _print_left_out(left_out)
     if as_json:
         write_json({"schema_version": 1, "store": name, "weighings": [asdict(one) for one in days]})
     elif not days:
-        messages.print("No weighings. `ftdrive weigh` and `ftdrive serve-load` add them.")
+        _say("No weighings. `ftdrive weigh` and `ftdrive serve-load` add them.")
     else:
         print_table(_DAY_TITLES, [_day_row(one) for one in days], folding={"arm", "tool", "refused"})
 

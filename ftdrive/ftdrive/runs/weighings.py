@@ -24,7 +24,8 @@ REFUSALS: Final = (
     *("samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "undecided", "count"),
     "other",  # of a newer version
 )
-"""Why nothing was weighed: the codes of `ftdrive.live.weighing.WORDS`."""
+"""Why nothing was weighed: the codes of `ftdrive.live.weighing.WORDS`. Each is a column of the store: a change raises
+`ftdrive.store.tables.SCHEMA`."""
 _TAIL: Final = 1 << 16
 """Bytes that contain the end of the line before, if a power failure cut the last one off."""
 
