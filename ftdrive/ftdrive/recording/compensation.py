@@ -1,7 +1,7 @@
 """A recording of any length compensated in blocks, without a device."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -133,10 +133,11 @@ def compensated(
             recorder = Recorder([output], info, header.configuration)
             stack.callback(recorder.discard)
         try:
-            read = ahead if overlap else iter
-            for block, old, new, share in read(_processed(read(source.blocks()), processor)):
-                found.add(block, old, new, recorder)
-                show(f"Compensating: {share:.0%}")
+            blocks = _processed(ahead(source.blocks()) if overlap else source.blocks(), processor)
+            with closing(ahead(blocks) if overlap else blocks) as coming:  # so that no thread processes further
+                for block, old, new, share in coming:
+                    found.add(block, old, new, recorder)
+                    show(f"Compensating: {share:.0%}")
         except (BadDataset, BadRecording, KeyboardInterrupt) as error:
             if not found.samples:
                 raise
@@ -158,7 +159,7 @@ def compensated(
 
 def _processed(
     measured: Iterator[Measured], processor: Processor
-) -> Iterator[tuple[Block | None, Sequence[StreamEvent], Sequence[StreamEvent], float]]:
+) -> Generator[tuple[Block | None, Sequence[StreamEvent], Sequence[StreamEvent], float], None, None]:
     """Yield each block with the events of its recording that still hold, those of the processing, and its share."""
     for samples, events, share in measured:
         block = processor.process(samples) if len(samples) else None
@@ -261,7 +262,7 @@ def estimated_bias(
     readings, orientations = [np.empty((0, 6))], [np.empty((0, 3, 3))]
     waiting: list[Paired] = []
     with suppress(BadRecording):  # the pass that follows ends there too
-        for samples, _, share in (ahead if overlap else iter)(source.blocks()):
+        for samples, _, share in ahead(source.blocks()) if overlap else source.blocks():
             show(f"Estimating the bias: {share:.0%}")
             paired = Paired.concatenate([*waiting, samples])
             whole = len(paired) // size * size

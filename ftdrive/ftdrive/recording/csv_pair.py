@@ -104,7 +104,7 @@ class CsvPair:
         """Return the delay and its sigma, from means over `_MEAN_S`."""
         info = self.header.info
         size = max(1, round(_MEAN_S * info.sensor_rate_Hz))
-        means = [FtSamples.concatenate(list(_before_a_fault(_means(self._wrench, size))))]
+        means = list(_before_a_fault(_means(self._wrench, size)))
         estimator = DelayEstimator(info.calibration, info.p_flange_sensor_m, window=_WHOLE)
         estimate_delay(means, _Again(lambda: _before_a_fault(iter(self._states))), estimator)
         return estimator.delay_s, estimator.sigma_s

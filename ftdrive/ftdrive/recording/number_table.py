@@ -2,7 +2,6 @@
 
 import csv
 import io
-import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -102,9 +101,8 @@ def _parsed(path: Path, text: bytes, columns: int, use: Sequence[int], before: i
     try:
         return parsed(text, columns, use)
     except ValueError as error:
-        first = before + ("convert" in str(error))  # loadtxt counts rows from 0 in this message, from 1 in others
-        words = re.sub(r"(?<=row )\d+", lambda row: str(first + int(row[0])), str(error))
-        raise BadDataset(f"{path.name}: {words}: correct this line") from error
+        place = f"{path.name}, after row {before}" if before else path.name  # loadtxt counts from there
+        raise BadDataset(f"{place}: {error}: correct this line") from error
 
 
 def parsed(text: bytes, columns: int, use: Sequence[int]) -> Array:

@@ -4,7 +4,7 @@ The pose is stored as a quaternion, so that all formats hold the same bits.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import accumulate, pairwise
@@ -298,7 +298,7 @@ def divided(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
         )
 
 
-def ahead(items: Iterator[T]) -> Iterator[T]:
+def ahead(items: Iterator[T]) -> Generator[T, None, None]:
     """Give items of which a thread always makes the next one; errors come in their place."""
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, items, None)

@@ -158,7 +158,7 @@ def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
     assert found.delay_s == pytest.approx(0.012, abs=2e-3)
     numbers, failure = compensated(found, WrenchFrame(), tmp_path / "new.csv")
     assert isinstance(failure, BadDataset)
-    assert f"{damaged}: " in numbers["cut"]
+    assert f"{damaged}, after row" in numbers["cut"]
     assert 4000 < numbers["samples"] == len(read_recording(tmp_path / "new.csv").rows) <= 5100
 
 

@@ -68,11 +68,11 @@ def test_a_long_table_is_read_in_parts_up_to_its_fault(tmp_path: Path) -> None:
     assert mean_rate_Hz(path, WRENCH) == pytest.approx(1000)
     content = path.read_text()
     for line, words in (
-        ("1,60,1,2,3,4,5,6.7.8", r"'6\.7\.8'.* row 60001, column 8"),
-        ("1,60", "column index 2 at row 60001"),
+        ("1,60,1,2,3,4,5,6.7.8", r"'6\.7\.8'.* row \d+, column 8"),
+        ("1,60", "column index 2"),
     ):
         path.write_text(f"{content}{line}\n")
         valid = list[Part]()
-        with pytest.raises(BadDataset, match=rf"w\.csv: .*{words}.*correct this line"):
+        with pytest.raises(BadDataset, match=rf"w\.csv, after row \d+: .*{words}.*correct this line"):
             valid.extend(read_table(path, WRENCH))
         assert 0 < len(valid) < len(parts)
