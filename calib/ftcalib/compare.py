@@ -65,6 +65,7 @@ def compare(
     known: Known | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
     setup: Setup = NOTHING,
+    default: CalibrationResult | None = None,
 ) -> list[Compared]:
     """Run all methods; a method that cannot use these data gives a reason instead.
 
@@ -73,6 +74,8 @@ def compare(
     dataset : CalibrationDataset
     drift, known, g_m_s2, setup
         As for `solve`. The published methods that need gravity take it from `known`, or assume a level base.
+    default : CalibrationResult, optional
+        What the default method has found with all of these, if that is known already.
 
     Raises
     ------
@@ -86,7 +89,8 @@ def compare(
     >>> compared[0].method, round(compared[0].mass_kg, 3)
     ('ml', 1.235)
     """
-    default = solve(dataset, "ml", drift=drift, known=known, g_m_s2=g_m_s2, setup=setup)
+    if default is None:
+        default = solve(dataset, "ml", drift=drift, known=known, g_m_s2=g_m_s2, setup=setup)
     compared = []
     for method in get_args(Method):
         try:

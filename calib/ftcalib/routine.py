@@ -15,6 +15,7 @@ from ftcalib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_quiet, is_statio
 from ftcalib.errors import NotObservable, TooFewSamples
 from ftcalib.model import Array
 from ftcalib.ports import Arm, ArmReading, Sensor, WrenchSamples
+from ftcalib.sampling import Sampling
 
 Stage = Literal["settle", "sample"]
 
@@ -33,18 +34,6 @@ class TourPose:
     """Of the orientation: 1 to 24 as in Yu et al., Fig. 3; above 100 for all others."""
     q_rad: Array
     """(6,) joint angles."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sampling:
-    """Time limits and repetitions at each pose."""
-
-    average_s: float = 2.0
-    still_timeout_s: float = 10.0
-    attempts: int = 2
-    """Dwells at a pose, at most: a dwell with motion or drift is repeated, and the last one is kept as noisy."""
-    noise_record_s: float = 12.0
-    """Length of the record before a tour from which the averaging time is chosen; 0 uses `average_s`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -91,7 +91,7 @@ def write_folders(parent: Path, cells: int, days: int) -> None:
     header = json.dumps({"format": RUN_FORMAT, "created_utc": NOW.isoformat(), "config": {"robot": {"host": "a"}}})
     for n in range(cells):
         for one in records(n, days, rng):
-            if isinstance(one, StoredResult):
+            if not isinstance(one, StoredVerification):
                 continue
             (folder := parent / f"cell-{n:03d}" / one.run).mkdir(parents=True)
             (folder / "run.json").write_text(header)

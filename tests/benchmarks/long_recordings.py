@@ -3,9 +3,15 @@
     uv run python -m tests.benchmarks.long_recordings [--samples 1000000] [--folder FOLDER] [--fleet 40]
 
 A recording at 7 kHz is generated as MCAP and as a pair of CSV files, with an arm that moves and rests, noise, contacts
-and a wrench that is 4 ms late. Each command runs in a process of its own; the figure of its memory is the largest that
-the system saw. The copies: DuckDB writes the rows of a Parquet file again, the package `mcap` the messages of an MCAP
-file, one by one, of a tenth of a million samples at most. An hour is 25200000 samples and needs 50 GB in FOLDER.
+and a wrench that is 4 ms late. Each command runs in a process of its own. A row has its wall time, the rate, the CPU
+time of all its threads, and the largest memory that the system saw. Wall times and ratios hold on two free cores, since
+commands read, process and write at once; the CPU time holds also beside other work.
+
+The copies: DuckDB writes the rows of a Parquet file again, the package `mcap` the messages of an MCAP file, one by one,
+of a tenth of a million samples at most. The ratio is our wall time for each sample to that of the copy.
+
+An hour is 25200000 samples and needs 25 GB in FOLDER. With `--fleet 40`, so many files of the same samples together are
+compensated by one process and by two; with fewer than 100000 samples a file, the start of the processes shows.
 """
 
 import argparse

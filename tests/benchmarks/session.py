@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ftcalib.routine import Sampling
+from ftcalib.sampling import Sampling
 from ftdrive.cell.emulated import Station
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.session import calibrate

@@ -10,7 +10,7 @@ from ftdrive.cell.devices import program_registers
 from ftdrive.cell.emulated_clock import EmulatedClock
 from ftdrive.live.samples import WrenchFrame
 from ftdrive.live.stream import CompensatedStream
-from ftdrive.servers.program import DOUBLES, INTEGERS, ProgramService
+from ftdrive.servers.program import INTEGERS, ProgramService, doubles_of
 from tests.unit.ftdrive.live.simulated import calibrated_from
 
 
@@ -28,7 +28,7 @@ def opened(hello: dict[str, Any]) -> CompensatedStream:
 
 def service_on(stream: CompensatedStream, first: int = 24) -> ProgramService:
     """Return the service of an open stream."""
-    connect = partial(program_registers, stream.cell, first, len(INTEGERS), len(DOUBLES))
+    connect = partial(program_registers, stream.cell, first, len(INTEGERS), len(doubles_of(stream.track)))
     return ProgramService(stream, connect, sys.stderr.write)
 
 
@@ -41,6 +41,7 @@ def started(service: ProgramService, _block: object) -> None:
 
 if __name__ == "__main__":
     with opened(json.loads(sys.argv[1])) as stream:
+        stream.track = "show"
         service = service_on(stream)
         service.on_block = partial(started, service)
         service.run()

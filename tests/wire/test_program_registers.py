@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ftdrive.exports.program_functions import functions
@@ -38,6 +39,7 @@ def cycle():
   set_target_payload(payload[0], [payload[1], payload[2], payload[3]])
   sleep(0.3)
   textmsg("carried ", ftd_wrench())
+  textmsg("bias ", ftd_bias())
   textmsg("unknown ", ftd_request(7))
   textmsg("watch ", 0)
   while ftd_alive():
@@ -125,6 +127,8 @@ def test_a_cycle_and_then_a_failure(station: Station, failure: str) -> None:
         carried = values(said(station, "carried", since))
         assert carried[0] == 0, "the wrench is without the part"
         assert max(map(abs, carried[1:4])) < 0.3
+        bias = np.abs(values(said(station, "bias", since)))
+        assert (bias <= [0, 60, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1]).all(), "seen, and as calibrated"
         assert station.ask("state")["payload_kg"] == pytest.approx(1.0 + mass_kg)
         assert values(said(station, "unknown", since)) == [9]
         said(station, "watch", since)

@@ -3,7 +3,7 @@
 import gc
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -38,9 +38,9 @@ class Emulator(Protocol):
 Start = Callable[..., Emulator]
 
 
-@pytest.fixture(params=SCHEMES)
-def scheme(request: pytest.FixtureRequest) -> str:
-    return str(request.param)
+def one_fast(schemes: Iterable[str]) -> list[Any]:
+    """Sensors for a test of what all drivers share, `streaming/`, of which one waits for its limit in a fast run."""
+    return [pytest.param(scheme, marks=[] if scheme == "robotous-serial" else pytest.mark.slow) for scheme in schemes]
 
 
 def test_wrench_counts_and_samples(shared: Emulator) -> None:
@@ -89,6 +89,7 @@ def test_already_streaming_when_opened(start: Start, scheme: str) -> None:
         np.testing.assert_allclose(sensor.collect(0.3).wrench.mean(axis=0), WRENCH, atol=0.1)
 
 
+@pytest.mark.parametrize("scheme", one_fast(SCHEMES))
 def test_unplugged_is_broken_at_once_and_for_good(start: Start, scheme: str) -> None:
     emulator = start(scheme)
     sensor = emulator.sensor()
@@ -110,6 +111,7 @@ def test_unplugged_is_broken_at_once_and_for_good(start: Start, scheme: str) -> 
         sensor.open()
 
 
+@pytest.mark.parametrize("scheme", one_fast(SCHEMES))
 def test_silence_is_an_error(start: Start, scheme: str) -> None:
     emulator = start(scheme)
     with emulator.sensor() as sensor:
@@ -118,7 +120,9 @@ def test_silence_is_an_error(start: Start, scheme: str) -> None:
             sensor.collect(60.0)
 
 
-@pytest.mark.parametrize("scheme", [scheme for scheme in SCHEMES if scheme != "bota"])  # it is given 3 s to boot
+@pytest.mark.parametrize(
+    "scheme", one_fast(scheme for scheme in SCHEMES if scheme != "bota")
+)  # it is given 3 s to boot
 def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
     emulator = start(scheme)
     emulator.faults(stall=True)
@@ -164,7 +168,9 @@ def test_robotiq_saturation_is_a_fault(start: Start) -> None:
         start("robotiq-ft300", saturated_axis=2).sensor().open()
 
 
-@pytest.mark.parametrize(("status", "says"), [(2, "overrange"), (4, "invalid"), (8, "not in N")])
+@pytest.mark.parametrize(
+    ("status", "says"), [(2, "overrange"), pytest.param(4, "invalid", marks=pytest.mark.slow), (8, "not in N")]
+)
 def test_bota_unusable_samples_are_a_fault(start: Start, status: int, says: str) -> None:
     with pytest.raises(DeviceFault, match=says):
         start("bota", status=status).sensor().open()
@@ -201,6 +207,7 @@ def test_netft_latched_monitor_is_a_warning(start: Start, caplog: pytest.LogCapt
     assert caplog.text.count("monitor condition latched") == 1
 
 
+@pytest.mark.slow
 def test_netft_without_rdt_says_so(start: Start) -> None:
     with pytest.raises(ConnectError, match="enable RDT"):
         start("ati-netft", rdt_enabled=False).sensor().open()

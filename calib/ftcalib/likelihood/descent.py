@@ -110,7 +110,7 @@ class Descent:
             Z = self.constraints.free(p) if self.constraints.any else None
             Hz, gz = (H, g) if Z is None else (Z.T @ H @ Z, Z.T @ g)
             scale = column_scale(Hz)
-            step = np.asarray(_solved(Hz / np.outer(scale, scale), gz / scale, damping) / scale)
+            step = np.asarray(_solved(Hz / (scale[:, None] * scale), gz / scale, damping) / scale)
             moved = float(np.sqrt(max(float(step @ Hz @ step), 0.0)))  # in standard deviations of the noise
             trial = p.moved(step if Z is None else Z @ step)
             if Z is not None:
@@ -131,7 +131,7 @@ class Descent:
 
 def _solved(H: Array, g: Array, damping: float) -> Array:
     """Solve `(H + damping) x = g`; where the matrix lacks rank, the shortest such step."""
-    _, x, failed = dposv(H + damping * np.eye(len(H)), g)
+    _, x, failed = dposv(H + damping * np.eye(len(H)) if damping else H, g)
     if failed:
         eigenvalues, V = np.linalg.eigh(H)
         x = V @ (V.T @ g / np.maximum(eigenvalues + damping, 1e-14 * eigenvalues[-1]))
@@ -140,7 +140,7 @@ def _solved(H: Array, g: Array, damping: float) -> Array:
 
 def column_scale(information: Array) -> Array:
     """Root of the diagonal, 1 where it vanishes: dividing by it makes eigenvalues independent of units."""
-    diagonal = np.sqrt(np.diag(information))
+    diagonal = np.sqrt(information.diagonal())
     return np.asarray(np.where(diagonal > 0, diagonal, 1.0))
 
 

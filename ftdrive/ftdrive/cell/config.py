@@ -17,7 +17,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from ftcalib.routine import Sampling
+from ftcalib.sampling import Sampling
 from ftdrive.cell import rules
 from ftdrive.cell.rules import Rows, Rule, entry, rule_of
 from ftdrive.errors import ConfigError

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any, Self
 
-from ftcalib.routine import Sampling
+from ftcalib.sampling import Sampling
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, checked, settings
 from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL, Clock

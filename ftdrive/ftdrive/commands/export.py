@@ -213,8 +213,8 @@ def calibration(
 def urscript(first: int, example: bool, output: Path | None, simulate: bool, as_json: bool) -> None:  # noqa: ARG001
     """Write the functions with which a UR program uses `ftdrive serve-load`.
 
-    ftd_zero, ftd_weigh, ftd_wrench, ftd_alive, ftd_status and ftd_payload. Each waits with a time limit and returns a
-    state, never an old number.
+    ftd_zero, ftd_weigh, ftd_wrench, ftd_bias, ftd_alive, ftd_status and ftd_payload. Each waits with a time limit and
+    returns a state, never an old number.
     """
     from ftcalib.files import write_new
     from ftdrive.exports.program_functions import functions

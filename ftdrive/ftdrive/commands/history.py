@@ -1,17 +1,19 @@
 """`ftdrive history`: results and verifications of the store, with trends and warnings."""
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
+from dataclasses import asdict
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from ftcalib.rounding import with_sigma
 from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
-    from ftdrive.store.records import StoredResult, StoredVerification
+    from ftdrive.store.records import StoredResult, StoredVerification, StoredWeighings
 
 
 @click.command()
@@ -19,25 +21,35 @@ if TYPE_CHECKING:
 @click.option("--tool", metavar="NAME", help="Only results of this tool.")
 @click.option("--index", metavar="FOLDER", multiple=True, type=FOLDER, help="First add the runs in FOLDER. Repeatable.")
 @click.option("--rebuild", is_flag=True, help="First read all runs again, and forget those that were deleted.")
+@click.option("--weighings", is_flag=True, help="List the last days with weighings instead.")
 @STORE
 @JSON
 def history(
-    folders: Sequence[Path], tool: str | None, index: Sequence[Path], rebuild: bool, url: str | None, as_json: bool
+    folders: Sequence[Path],
+    tool: str | None,
+    index: Sequence[Path],
+    rebuild: bool,
+    weighings: bool,
+    url: str | None,
+    as_json: bool,
 ) -> None:
-    """List results with their date and last verification, and the trends of bias and payload.
+    """List results with their date and last verification, how bias and payload change, and the last weighings.
 
     They come from the store, where `calibrate` and `verify` add theirs, or from the run folders in RUNS. A trend is
     significant if the uncertainty of the results explains it in less than one case of 100, and so does their scatter.
+    Where a sensor reports its temperature, its bias is fitted against that too.
     """
     from ftdrive.errors import ConfigError
     from ftdrive.store.history import drifts, warnings
     from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
-    from ftdrive.terminal.console import answer, hanging, messages
 
     left_out: tuple[str, ...] = ()
+    weighed: Sequence[StoredWeighings] = ()
     name = None
     if folders:
-        if option := "--index" if index else "--rebuild" if rebuild else "--store" if url else "":
+        if option := (
+            "--index" if index else "--rebuild" if rebuild else "--weighings" if weighings else "--store" if url else ""
+        ):
             raise ConfigError(f"RUNS and {option} exclude one another: leave one out")
         records, left_out = read_records(record_paths(folders))
         results = [one for one in records if isinstance(one, StoredResult) and tool in {None, one.tool}]
@@ -49,27 +61,102 @@ def history(
         name = store.name
         if index or rebuild:
             left_out = (store.rebuild(*index) if rebuild else store.index(*index)).unreadable
+        if weighings:
+            _show_weighings(store.weighings(_MOST_DAYS, tool), name, left_out, as_json)
+            return
         results, checks = store.results(tool), store.verifications()
-    for words in left_out:
-        messages.print(hanging(" left out: ", words))
+        weighed = store.last_weighings((datetime.now(UTC) - _RECENT).date().isoformat(), tool)
+    _print_left_out(left_out)
     now = datetime.now(UTC)
     found, advice = drifts(results), list(warnings(results, checks, now))
+    warmth = []
+    if any(one.temperature_C is not None for one in results):
+        from ftdrive.store.temperature import temperatures
+
+        warmth = temperatures(results, checks)
     last = {check.calibration_id: check for check in checks}
     if as_json:
         rows = [_as_json(one, last.get(one.id), now) for one in results]
         trends = [one.to_dict() for one in found]
-        write_json({"schema_version": 1, "store": name, "results": rows, "trends": trends, "warnings": advice})
+        about = {"trends": trends, "temperature": [one.to_dict() for one in warmth], "warnings": advice}
+        about["last_weighings"] = [asdict(one) for one in weighed]
+        write_json({"schema_version": 1, "store": name, "results": rows, **about})
         return
     if not results:
-        messages.print(
-            "No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder."
-        )
+        _say("No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder.")
         return
     _print_table([_row(one, last.get(one.id), now) for one in results])
-    for drift in found:
-        echo(f"trend: {drift}")
-    for words in advice:
-        answer.print(hanging(" ! ", words, answer), style="yellow")
+    trend_lines = (f"trend: {drift}" for drift in found)
+    warmth_lines = (line for one in warmth for line in one.lines())
+    weighing_lines = (f"last weighing: {_weighing_in_words(one)}" for one in weighed)
+    for line in (*trend_lines, *warmth_lines, *weighing_lines):
+        echo(line)
+    if advice:
+        from ftdrive.terminal.console import answer, hanging
+
+        for words in advice:
+            answer.print(hanging(" ! ", words, answer), style="yellow")
+
+
+def _print_left_out(left_out: Sequence[str]) -> None:
+    if left_out:
+        from ftdrive.terminal.console import hanging, messages
+
+        for words in left_out:
+            messages.print(hanging(" left out: ", words))
+
+
+def _say(words: str) -> None:
+    from ftdrive.terminal.console import messages
+
+    messages.print(words)
+
+
+_MOST_DAYS = 20
+"""Of weighings that are listed."""
+_RECENT = timedelta(days=90)
+"""An earlier weighing is not the last one of a list."""
+
+
+def _show_weighings(days: "Sequence[StoredWeighings]", name: str, left_out: Sequence[str], as_json: bool) -> None:
+    from ftdrive.terminal.table import print_table
+
+    _print_left_out(left_out)
+    if as_json:
+        write_json({"schema_version": 1, "store": name, "weighings": [asdict(one) for one in days]})
+    elif not days:
+        _say("No weighings. `ftdrive weigh` and `ftdrive serve-load` add them.")
+    else:
+        print_table(_DAY_TITLES, [_day_row(one) for one in days], folding={"arm", "tool", "refused"})
+
+
+_DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "mass", "file")
+
+
+def _day_row(one: "StoredWeighings") -> tuple[str, ...]:
+    return (
+        one.day,
+        one.arm_serial or one.robot_host or "-",
+        one.tool_in_words,
+        f"{one.weighings}",
+        ", ".join(f"{number} {code}" for code, number in one.refusals.items() if number) or "-",
+        "-" if one.last_utc is None else one.last_utc[11:19],
+        _mass_in_words(one),
+        Path(one.path).name,
+    )
+
+
+def _weighing_in_words(one: "StoredWeighings") -> str:
+    refused = sum(one.refusals.values())
+    counts = f"{one.weighings} part{'' if one.weighings == 1 else 's'}, {refused} refused on this day"
+    time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
+    return f"{one.tool_in_words}, {time}: {_mass_in_words(one)}; {counts}"
+
+
+def _mass_in_words(one: "StoredWeighings") -> str:
+    if one.mass_kg is None or one.mass_sigma_kg is None:
+        return "-"
+    return f"{with_sigma(one.mass_kg, one.mass_sigma_kg)} kg"
 
 
 _TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias, N", "run", "°C", "parent")
@@ -93,7 +180,7 @@ def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime)
         one.verdict,
         f"{one.mass_kg:.4f}",
         verified,
-        " ".join(f"{value:.2f}" for value in one.parameters.force_bias_N),
+        " ".join(f"{value:.2f}" for value in one.numbers["force_bias_N"]),
         one.run,
         "" if one.temperature_C is None else f"{one.temperature_C:.0f}",
         f"{one.parent[:6]} ({one.update})" if one.parent else "",
@@ -113,8 +200,6 @@ def _print_table(rows: Sequence[Sequence[str]]) -> None:
 
 
 def _as_json(one: "StoredResult", check: "StoredVerification | None", now: datetime) -> dict[str, Any]:
-    from dataclasses import asdict
-
     import numpy as np
 
     from ftcalib.model import BIASES

@@ -1,15 +1,19 @@
 """The compensated stream of the cell that the options name, for the commands that have `SOURCE`."""
 
+from collections.abc import Callable
 from contextlib import ExitStack
+from socket import gethostname
 
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.common import Source, read_cell
+from ftdrive.commands.common import Source, read_cell, store_url
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.source import read_calibration
+from ftdrive.runs.verification_record import EMULATED
 from ftdrive.session.rehearsal import short_calibration, station_of
+from ftdrive.store.weighing_log import WeighingLog
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.screen import open_operator
 
@@ -46,3 +50,27 @@ def open_source(source: Source, frame: WrenchFrame, stack: ExitStack, track: Tra
     for words in stream.warnings:
         messages.print(f" {words}")
     return stream
+
+
+def open_log(
+    source: Source, stream: CompensatedStream, stack: ExitStack, say: Callable[[str], object]
+) -> WeighingLog | None:
+    """Keep the weighings of a stream until `stack` ends; None with a temporary calibration of an emulated cell.
+
+    `say` takes a sentence for the operator, from any thread.
+    """
+    if source.simulate and source.path is None:
+        return None
+    info, cell = stream.info, stream.cell
+    origin = {
+        "tool": (info.calibration.provenance.get("setup") or {}).get("tool") or info.tool,
+        "calibration_id": info.calibration.id,
+        "arm_serial": info.arm.serial,
+        "sensor_serial": info.sensor.serial,
+        "robot_host": cell.robot.host,
+        "emulated": EMULATED in info.marks,
+        "computer": gethostname(),
+    }
+    log = WeighingLog(origin, store_url() if source.simulate else cell.store.url, say)
+    stack.callback(log.close)
+    return log

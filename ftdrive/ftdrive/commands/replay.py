@@ -6,7 +6,8 @@ from pathlib import Path
 import click
 
 from ftcalib import CalibrationResult
-from ftcalib.routine import PoseRecord, Sampling, take_pose
+from ftcalib.routine import PoseRecord, take_pose
+from ftcalib.sampling import Sampling
 from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,

@@ -1,5 +1,6 @@
 """`ftdrive report`: one file that says whether a calibration is good, and why."""
 
+import gc
 import shlex
 from collections.abc import Iterator
 from dataclasses import replace
@@ -110,6 +111,7 @@ def report(
         require_extra("report", "a report in HTML (not --format md)", "jinja2", "matplotlib")
     given = known_values(mass_kg, level_deg, mounting_deg), upward(up)
     options = SolveOptions(method, orientation, drift, *given, _typed(click.get_current_context()))
+    gc.freeze()  # or the imports are searched for garbage again and again, as in `fleet status`
     with unpacked(source) if source is not None else rehearsed_run(sensor) as found:
         with working("Solving"):
             subject = read_subject(found, options, parent)

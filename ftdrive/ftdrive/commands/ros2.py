@@ -2,19 +2,15 @@
 
 from collections.abc import Sequence
 from contextlib import closing
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
 from ftdrive.commands.common import FRAME, SOURCE, Source, read_cell, read_frame
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Axes
-from ftdrive.live.stream import CompensatedStream
-from ftdrive.runs.source import read_calibration
-from ftdrive.session.rehearsal import short_calibration, station_of
-from ftdrive.terminal.console import messages
-from ftdrive.terminal.screen import open_operator
-from ftdrivers.ros2.middleware import ros2_module
+
+if TYPE_CHECKING:
+    from ftdrive.live.samples import Axes
 
 _ROS_ARGS = "--ros-args"
 
@@ -40,7 +36,7 @@ class _RosCommand(click.Command):
 )
 def ros2(
     source: Source,
-    axes: Axes,
+    axes: "Axes",
     about: str,
     ros_args: Sequence[str],
 ) -> None:
@@ -50,8 +46,15 @@ def ros2(
     `ros2 param describe` explains each parameter. While a device is silent or the calibration does not fit, no wrench
     is published and /diagnostics has the reason. The arm is only read, never moved. Ctrl-C ends.
     """
+    from ftdrivers.ros2.middleware import ros2_module
+
     ros2_module("rclpy")  # before any work
+    from ftdrive.live.stream import CompensatedStream
+    from ftdrive.runs.source import read_calibration
     from ftdrive.servers.ros2.node import Ros2Node
+    from ftdrive.session.rehearsal import short_calibration, station_of
+    from ftdrive.terminal.console import messages
+    from ftdrive.terminal.screen import open_operator
 
     path, tool, force, config, robot, sensor, simulate = source
     frame = read_frame(axes, about)

@@ -2,35 +2,43 @@
 
 from contextlib import ExitStack
 from functools import partial
+from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.cell.devices import program_registers
-from ftdrive.commands.common import SOURCE, Source, frame_options, read_frame
-from ftdrive.commands.live_source import open_source
+from ftdrive.commands.common import SOURCE, TRACK, Source, frame_options, read_frame
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Axes
-from ftdrive.servers.program import DOUBLES, INTEGERS, ProgramService
-from ftdrive.terminal.console import messages
 from ftdrivers.ur.program_registers import FIRST, LAST
+
+if TYPE_CHECKING:
+    from ftdrive.live.samples import Axes, Tracking
 
 
 @click.command()
 @SOURCE
 @frame_options("base", "tcp")
+@TRACK
 @click.option("--first", type=int, default=FIRST, show_default=True, help="First register of each kind.")
 def serve_load(
     source: Source,
-    axes: Axes,
+    axes: "Axes",
     about: str,
+    track: "Tracking",
     first: int,
 ) -> None:
     """Answer the program on the controller: weigh a part, zero, and the contact wrench all the time.
 
     Any program may run. It requests in two output registers and reads input registers, with the functions of `ftdrive
-    export urscript`. Nothing else is sent, and the arm is never moved. Ctrl-C ends.
+    export urscript`. Nothing else is sent, and the arm is never moved. With --track the program also gets the bias as
+    followed. Ctrl-C ends.
     """
-    last = LAST + 1 - max(len(INTEGERS), len(DOUBLES))
+    from ftdrive.cell.devices import program_registers
+    from ftdrive.commands.live_source import open_log, open_source
+    from ftdrive.servers.program import INTEGERS, ProgramService, doubles_of
+    from ftdrive.terminal.console import messages
+
+    doubles = len(doubles_of(track))
+    last = LAST + 1 - max(len(INTEGERS), doubles)
     if not FIRST <= first <= last:
         raise ConfigError(
             f"--first is {first}: give {FIRST} to {last}, because fieldbuses and PLCs own the registers below {FIRST}, "
@@ -38,11 +46,11 @@ def serve_load(
         )
     frame = read_frame(axes, about)
     with ExitStack() as stack:
-        stream = open_source(source, frame, stack)
+        stream = open_source(source, frame, stack, track)
         if stream.cell.sensor.height_mm is None:
             raise ConfigError("the centre of mass of a part needs [sensor] height_mm: set it, see `ftdrive init`")
-        connect = partial(program_registers, stream.cell, first, len(INTEGERS), len(DOUBLES))
-        service = ProgramService(stream, connect, messages.print)
+        connect = partial(program_registers, stream.cell, first, len(INTEGERS), doubles)
+        service = ProgramService(stream, connect, messages.print, open_log(source, stream, stack, messages.print))
         messages.print(
             f"Serving weight and wrench ({stream.frame}) in the registers from {first}; {stream.info.calibration_name}."
         )

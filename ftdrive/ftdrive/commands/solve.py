@@ -37,7 +37,7 @@ from ftdrive.commands.common import (
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.recording.bag import bag_means, is_bag, read_bag
-from ftdrive.recording.in_motion import is_recording, solve_recording
+from ftdrive.recording.files import is_recording
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.new_tool import require_same_cell
 from ftdrive.runs.outcome import solve_in_motion
@@ -226,6 +226,8 @@ def _result_of(
         if in_motion(place):
             with working("Solving"):
                 return solve_in_motion(Run(place), **options), ()
+        from ftdrive.recording.in_motion import solve_recording  # with the filters of a stream
+
         options["up_in_base"] = read["up_in_base"]
         with working("Solving"):
             means = bag_means(read_bag(place, *topics)) if from_bag else None

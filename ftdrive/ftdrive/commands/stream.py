@@ -14,17 +14,14 @@ from ftdrive.commands.common import (
     Source,
     read_frame,
 )
-from ftdrive.commands.live_source import RECOVER_S, open_source
-from ftdrive.live.processing import ProcessedStream
-from ftdrive.live.samples import Axes, Tracking
-from ftdrive.live.stream import CompensatedStream
 from ftdrive.servers.address import host_and_port, is_loopback, with_port
-from ftdrive.servers.udp import UdpSender
-from ftdrive.terminal.console import messages, print_address
-from ftdrivers.errors import DeviceError
 
 if TYPE_CHECKING:
+    from ftdrive.live.processing import ProcessedStream
+    from ftdrive.live.samples import Axes, Tracking
+    from ftdrive.live.stream import CompensatedStream
     from ftdrive.servers.foxglove import FoxgloveServer
+    from ftdrive.servers.udp import UdpSender
 
 
 @click.command()
@@ -45,8 +42,8 @@ if TYPE_CHECKING:
 @click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
 def stream(
     source: Source,
-    track: Tracking,
-    axes: Axes,
+    track: "Tracking",
+    axes: "Axes",
     about: str,
     host: str,
     port: int,
@@ -60,7 +57,9 @@ def stream(
     sensor, poses, joint angles, frames, arrows and events. Programs can tare and change frame and stages. A page in a
     browser is served if it is of Foxglove or Lichtblick. The arm is only read, never moved. Ctrl-C ends.
     """
+    from ftdrive.commands.live_source import open_source
     from ftdrive.servers.foxglove import FoxgloveServer
+    from ftdrive.servers.udp import UdpSender
 
     frame = read_frame(axes, about)
     udp_address = None if udp is None else host_and_port("--udp", udp, "127.0.0.1:9870")
@@ -76,8 +75,12 @@ def stream(
         serve(opened, sinks)
 
 
-def serve(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
+def serve(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
     """Send blocks and events until Ctrl-C is pressed, or a device is silent for `RECOVER_S`."""
+    from ftdrive.commands.live_source import RECOVER_S
+    from ftdrive.terminal.console import messages
+    from ftdrivers.errors import DeviceError
+
     silent_since_s: float | None = None
     try:
         while True:
@@ -101,14 +104,16 @@ def serve(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender
         _send_events(source, sinks)
 
 
-def _send_events(source: CompensatedStream, sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
+def _send_events(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
     for event in source.take_events():
         for sink in sinks:
             sink.event(event)
 
 
-def _introduce(source: ProcessedStream, server: "FoxgloveServer", host: str, udp: tuple[str, int] | None) -> None:
+def _introduce(source: "ProcessedStream", server: "FoxgloveServer", host: str, udp: tuple[str, int] | None) -> None:
     """Print what is served, and how to open it."""
+    from ftdrive.terminal.console import messages, print_address
+
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     url = f"ws://{with_port(name, server.port)}"
     messages.print(f"Serving the wrench in {source.frame}; {source.info.calibration_name}.")

@@ -1,22 +1,20 @@
 """`ftdrive weigh`: what the gripper holds beyond its calibrated tool."""
 
 import sys
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ftdrive.commands.common import JSON, SOURCE, NewFile, Number, Source, write_json
-from ftdrive.commands.live_source import open_source
 from ftdrive.errors import ConfigError
-from ftdrive.live.processing import SENSOR_FRAME
-from ftdrive.live.samples import StreamInfo
-from ftdrive.live.weighing import CannotWeigh, load_values
-from ftdrive.recording import Recorder
-from ftdrive.terminal.console import messages
 from ftdrive.terminal.text import echo
-from ftdrive.terminal.weighing import PATIENCE_S, Shown, Weighing, line_of
+
+if TYPE_CHECKING:
+    from ftdrive.live.samples import StreamInfo
+    from ftdrive.terminal.weighing import Shown, Weighing
 
 
 @click.command()
@@ -47,6 +45,12 @@ def weigh(
     --moving, the load is weighed while the arm carries it, and has its whole centre of mass. The arm is only read,
     never moved. Ctrl-C ends.
     """
+    from ftdrive.commands.live_source import open_log, open_source
+    from ftdrive.live.processing import SENSOR_FRAME
+    from ftdrive.recording import Recorder
+    from ftdrive.terminal.console import messages
+    from ftdrive.terminal.weighing import Weighing
+
     if moving and (zero or poses > 1):
         raise ConfigError("--moving follows the bias and has the whole centre of mass: leave out --zero and --poses")
     with ExitStack() as stack:
@@ -55,32 +59,47 @@ def weigh(
         if output is not None:
             recorder = Recorder([output], stream.info, stream.cell.to_dict())
             stack.callback(recorder.close)
-        weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg, moving=moving)
+        on_screen = not (once or as_json) and sys.stdout.isatty()
+        later: list[str] = []  # a screen would hide it
+        stack.callback(_print_all, later)
+        log = open_log(source, stream, stack, later.append if on_screen else messages.print)
+        weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg, moving=moving, log=log)
         if zero:
             messages.print(" Zero: the gripper must be empty.")
             weighing.zero()
-        if once or as_json or not sys.stdout.isatty():
-            _print(weighing, once=once, waits=zero or moving, poses=0 if moving else poses, as_json=as_json)
-        else:
+        if on_screen:
             from ftdrive.terminal.weigh_screen import run_weigh
 
             run_weigh(weighing)
+        else:
+            _print(weighing, once=once, waits=zero or moving, poses=0 if moving else poses, as_json=as_json)
 
 
-def answer_of(shown: Shown, info: StreamInfo) -> dict[str, Any]:
+def _print_all(texts: Sequence[str]) -> None:
+    from ftdrive.terminal.console import messages
+
+    for words in texts:
+        messages.print(words)
+
+
+def answer_of(shown: "Shown", info: "StreamInfo") -> dict[str, Any]:
     """Return a state as JSON."""
+    from ftdrive.live.weighing import load_values
+
     values: dict[str, Any] = {"schema_version": 1, "calibration_id": info.calibration.id, "marks": list(info.marks)}
     values |= {} if shown.weight is None else load_values(shown.weight, info)
     return values | {"count": shown.count, "refused": shown.refusal}
 
 
-def _print(weighing: Weighing, *, once: bool, waits: bool, poses: int, as_json: bool) -> None:
+def _print(weighing: "Weighing", *, once: bool, waits: bool, poses: int, as_json: bool) -> None:
     """Print each new weight or fault as a line; with `once` end with the first weight."""
+    from ftdrive.terminal.weighing import PATIENCE_S, line_of
+
     clock = weighing.stream.clock
     begin_s = clock.now_s()
     for shown, is_new in weighing.states(raises=once):
         if once and not waits and clock.now_s() - begin_s > PATIENCE_S:
-            raise CannotWeigh(shown.refusal or "samples", shown.weight)
+            raise weighing.given_up(shown)
         weight = shown.weight
         if not is_new or (once and (shown.refusal is not None or weight is None or weight.poses < poses)):
             continue

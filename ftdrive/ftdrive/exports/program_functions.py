@@ -7,13 +7,14 @@ Checked on hardware: no.
 
 from typing import Final
 
-from ftdrive.servers.program import CODES, DOUBLES, INTEGERS, Command, Condition, State
+from ftdrive.servers.program import CODES, DOUBLES, INTEGERS, TRACKED, Command, Condition, State
+from ftdrivers.ur.program_registers import LAST
 
 STALE_S: Final = 0.06
 """Without a new live counter for so long the service is gone; the states below 0 have no other meaning."""
 LIMIT_S: Final = 2.0
 """So long a request may take."""
-GONE, LATE = -1, -2
+GONE, LATE, UNSEEN = -1, -2, -3
 
 
 def functions(first: int, *, example: bool = False) -> str:
@@ -27,7 +28,7 @@ def functions(first: int, *, example: bool = False) -> str:
         Append a program that weighs a part and sets the payload.
     """
     integers = {name: f"read_input_integer_register({first + i})" for i, name in enumerate(INTEGERS)}
-    doubles = {name: f"read_input_float_register({first + i})" for i, name in enumerate(DOUBLES)}
+    doubles = {name: f"read_input_float_register({first + i})" for i, name in enumerate(DOUBLES + TRACKED)}
     values = {
         **integers,
         "FIRST": str(first),
@@ -42,10 +43,14 @@ def functions(first: int, *, example: bool = False) -> str:
         "CODES": ", ".join(f"{number} {name or 'ready'}" for name, number in CODES.items()),
         "WRENCH": ", ".join(doubles[name] for name in DOUBLES[:6]),
         "WEIGHT": ", ".join(doubles[name] for name in DOUBLES[6:]),
+        "BIAS": ", ".join(doubles[name] for name in TRACKED[:6]),
+        "AGE": doubles["bias_age"],
+        "UNSEEN": str(UNSEEN),
         "ZEROS": ", ".join(["0.0"] * len(DOUBLES[6:])),
         **{command.name: str(int(command)) for command in Command},
     }
-    text = _TEXT + (_EXAMPLE if example else "")
+    tracks = first + len(DOUBLES + TRACKED) <= LAST + 1
+    text = _TEXT + (_BIAS if tracks else "") + (_EXAMPLE if example else "")
     for name, value in values.items():
         text = text.replace(f"<{name}>", value)
     return text
@@ -146,6 +151,22 @@ def ftd_payload(weight, tool_kg, tool_cog):
   local y = (tool_kg * tool_cog[1] + weight[1] * weight[5]) / mass
   local z = (tool_kg * tool_cog[2] + weight[1] * weight[6]) / mass
   return [mass, x, y, z]
+end
+"""
+
+_BIAS = """\
+
+# [state, age, fx, fy, fz, tx, ty, tz]: change of the bias since the calibration, N and N*m, sensor axes, and seconds
+# since it was seen last. Needs `serve-load --track`. <UNSEEN>: it is not followed, or was not seen yet.
+def ftd_bias():
+  if not ftd_alive():
+    return [<GONE>, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+  end
+  local age = <AGE>
+  if <tracking> == 0 or age < 0:
+    return [<UNSEEN>, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+  end
+  return [0, age, <BIAS>]
 end
 """
 

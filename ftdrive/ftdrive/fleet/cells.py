@@ -19,7 +19,7 @@ from typing import Any, Final
 
 from ftdrive.cell.config import settings
 from ftdrive.errors import ConfigError
-from ftdrive.store.records import StoredCell, StoredResult
+from ftdrive.store.records import StoredCell, StoredResult, StoredWeighings
 
 FORMAT: Final = "ftdrive.cells/1"
 _NAME = re.compile(r"[\w.-]{1,40}")
@@ -76,14 +76,14 @@ def refuse_ambiguous(cells: Iterable[StoredCell]) -> None:
 
 
 class Owners:
-    """Finds the cell of a result: by the serial number of the arm, else by the address of the controller."""
+    """Finds the cell of a result or weighing: by the serial number of the arm, else the address of the controller."""
 
     def __init__(self, cells: Iterable[StoredCell]) -> None:
         cells = tuple(cells)
         self._by_serial = {cell.arm_serial: cell.name for cell in cells if cell.arm_serial}
         self._by_host = {cell.robot_host: cell.name for cell in cells if cell.robot_host and not cell.arm_serial}
 
-    def cell_of(self, result: StoredResult) -> str | None:
+    def cell_of(self, result: StoredResult | StoredWeighings) -> str | None:
         """Return the name of the cell; None if no cell has this arm."""
         by_serial = self._by_serial.get(result.arm_serial) if result.arm_serial else None
         return by_serial or (self._by_host.get(result.robot_host) if result.robot_host else None)

@@ -101,7 +101,8 @@ def compensated_file(source: Path, folder: Path, task: bytes) -> bytes:
     try:
         reader = read_with_calibration(source, calibration, given["calibration_name"])
         output = Path(mkdtemp(dir=folder)) / f"result{source.suffix}"
-        numbers, _ = compensated(reader, frame_of(given), output, estimate_bias=given["bias"] == "estimate")
+        estimate = given["bias"] == "estimate"
+        numbers, _ = compensated(reader, frame_of(given), output, estimate_bias=estimate, overlap=False)
     except BadRecording as error:  # the report names the recording, which here may be a temporary file
         raise BadRecording(error.problem) from error
     return f"{output}\n{json.dumps(numbers)}".encode()

@@ -30,6 +30,10 @@ SURE: Final = 1e-4
 """Largest p-value of a turned base: one in 50 fleets of 200 cells shows one by chance."""
 LATE: Final = timedelta(days=1)
 """A verification that is due today is not late yet."""
+MANY_WEIGHINGS: Final = 10
+"""With fewer on a day no share of refusals is worth a word."""
+RECENT: Final = timedelta(days=3)
+"""Refusals of earlier days are past."""
 
 
 def findings(observed: Observed, states: Sequence[CellState]) -> tuple[FleetFinding, ...]:
@@ -40,6 +44,7 @@ def findings(observed: Observed, states: Sequence[CellState]) -> tuple[FleetFind
         *_bases(observed),
         *_payloads(newest),
         *temperature_findings(observed),
+        *_refused_weighings(states, observed),
     )
 
 
@@ -56,6 +61,27 @@ def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[FleetF
         if len(cells) > 1:
             what = f"The verifications of {listed(cells)} are late, that of {worst} by {days} d"
         yield FleetFinding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
+
+
+# ----------------------------------------------------------------------------------------------------------- weighings
+
+
+def _refused_weighings(states: Sequence[CellState], observed: Observed) -> Iterator[FleetFinding]:
+    """Yield the cells that could not weigh most parts of their last day."""
+    first = (observed.now - RECENT).date().isoformat()
+    for one in states:
+        if one.weighings is None or one.weighings.day < first:
+            continue
+        refused = sum(one.weighings.refused.values())
+        tried = refused + one.weighings.number
+        if tried >= MANY_WEIGHINGS and 2 * refused > tried:
+            code = max(one.weighings.refused.items(), key=lambda found: found[1])[0]
+            yield FleetFinding(
+                "weighing",
+                (one.cell,),
+                f"{one.cell}: {refused} of {tried} weighings with {one.tool or 'its tool'} were refused on "
+                f"{one.weighings.day}, mostly as '{code}': run `ftdrive weigh` there to see why",
+            )
 
 
 # ---------------------------------------------------------------------------------------------------------------- base

@@ -11,7 +11,7 @@ from ftdrive.http_gate import Gate, hidden_host
 
 try:
     from prometheus_client import CollectorRegistry, start_http_server
-    from prometheus_client.core import GaugeMetricFamily
+    from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
     from prometheus_client.registry import Collector
 except ImportError:
     raise ConfigError("metrics need prometheus-client: pip install 'ftdrive[fleet]'") from None
@@ -48,15 +48,33 @@ OF_TOOL: Final[Mapping[str, tuple[str, Callable[[CellState], float | None]]]] = 
         "Temperature of the sensor in its last result; absent if it reports none.",
         lambda one: one.temperature_C,
     ),
+    "ftdrive_weighing_mass_kilograms": (
+        "Mass of the part that was weighed last.",
+        lambda one: None if one.weighings is None else one.weighings.mass_kg,
+    ),
+    "ftdrive_weighing_sigma_kilograms": (
+        "Standard deviation of that mass, without the scale of the sensor.",
+        lambda one: None if one.weighings is None else one.weighings.mass_sigma_kg,
+    ),
+    "ftdrive_weighing_timestamp_seconds": (
+        "When that part was weighed.",
+        lambda one: (
+            None
+            if one.weighings is None or one.weighings.last_utc is None
+            else datetime.fromisoformat(one.weighings.last_utc).timestamp()
+        ),
+    ),
 }
 """Metrics with the labels `TOOL`: what they mean, and their value; a value of None is left out."""
 TOOL: Final = ("cell", "tool")
 CELL_INFO: Final = "ftdrive_cell_info"
 CELL_INFO_LABELS: Final = (*TOOL, "arm_serial", "sensor_serial", "sensor_model", "calibration", "verdict", "emulated")
+WEIGHINGS: Final = "ftdrive_weighings_total"
+REFUSALS: Final = "ftdrive_weighings_refused_total"
 FINDING: Final = "ftdrive_finding"
 STORE_UP: Final = "ftdrive_store_up"
 STATE_TIME: Final = "ftdrive_state_timestamp_seconds"
-NAMES: Final = (*OF_TOOL, CELL_INFO, FINDING, STORE_UP, STATE_TIME)
+NAMES: Final = (*OF_TOOL, WEIGHINGS, REFUSALS, CELL_INFO, FINDING, STORE_UP, STATE_TIME)
 """All metrics."""
 
 
@@ -121,7 +139,7 @@ class MetricsServer(Collector):
         self._server.server_close()
         self._thread.join()
 
-    def collect(self) -> Iterator[GaugeMetricFamily]:
+    def collect(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
         """Yield the metrics; called by a thread for each scrape."""
         reading = self._reading  # the server may set another one meanwhile
         if reading is None:
@@ -142,6 +160,15 @@ class MetricsServer(Collector):
                 if value is not None:
                     family.add_metric([one.cell, one.tool or ""], value)
             yield family
+        weighings = CounterMetricFamily(WEIGHINGS, "Parts weighed on the last day.", labels=TOOL)
+        refusals = CounterMetricFamily(REFUSALS, "Weighings refused on the last day.", labels=(*TOOL, "code"))
+        for one in cells:
+            if one.weighings is not None:
+                weighings.add_metric([one.cell, one.tool or ""], one.weighings.number)
+                for code, number in one.weighings.refused.items():
+                    refusals.add_metric([one.cell, one.tool or "", code], number)
+        yield weighings
+        yield refusals
         finding = GaugeMetricFamily(FINDING, "1 for each cell of a finding.", labels=("kind", "cell"))
         for kind, cell in sorted({(one.kind, cell) for one in reading.fleet.findings for cell in one.cells}):
             finding.add_metric([kind, cell], 1)

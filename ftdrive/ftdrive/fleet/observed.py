@@ -9,7 +9,7 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftdrive.fleet.cells import Owners
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification, StoredWeighings
 from ftdrive.store.store import Store
 
 WINDOW: Final = timedelta(days=90)
@@ -50,12 +50,14 @@ class Observed:
     """Verifications by calibration, the oldest first; none without a time, or older than `WINDOW`."""
     changes: Mapping[str, BiasChanges]
     """By calibration, where its verifications have them."""
+    weighings: Mapping[tuple[str | None, str | None, bool], StoredWeighings]
+    """The last weighing by cell and tool, and whether the cell was emulated."""
     now: datetime
 
     @classmethod
     def read(cls, store: Store, now: datetime) -> Self:
         """Read the store; raises `BadStore`."""
-        cells, newest, recent = store.fleet(NEWEST, now - WINDOW)
+        cells, newest, recent, weighings = store.fleet(NEWEST, now - WINDOW)
         owners = Owners(cells)
         results: dict[str, list[StoredResult]] = {cell.name: [] for cell in cells}
         for one in newest:
@@ -66,7 +68,8 @@ class Observed:
             checks.setdefault(check.calibration_id, []).append(check)
         known = [one for found in results.values() for one in found if one.id in checks]
         changes = {one.id: found for one in known if (found := _changes(one, checks[one.id])) is not None}
-        return cls(tuple(cells), results, checks, changes, now)
+        last = {(owners.cell_of(one), one.tool, one.emulated): one for one in weighings}
+        return cls(tuple(cells), results, checks, changes, last, now)
 
     def newest(self, cell: StoredCell) -> Iterator[StoredResult]:
         """Yield the newest result of each tool in use, in the order of their names.

@@ -7,7 +7,7 @@ import numpy as np
 from ftdrive import __version__
 from ftdrive.fleet.observed import WINDOW, BiasChanges, Observed, when
 from ftdrive.fleet.state import CellState, Fleet
-from ftdrive.fleet.words import attention, due_in_words, summary, verified_in_words
+from ftdrive.fleet.words import attention, due_in_words, summary, verified_in_words, weighed_in_words
 from ftdrive.report.page import templates, with_code
 from ftdrive.runs.verification_record import age_in_words
 
@@ -84,5 +84,6 @@ def _words(state: CellState, now: datetime) -> dict[str, str]:
         "age": "-" if state.calibrated is None else age_in_words(now - state.calibrated),
         "verified": verified_in_words(state, now),
         "due": due_in_words(state.due, now),
+        "weighed": weighed_in_words(state, now),
         "drift": "-" if drift is None else f"{drift.level_sigmas:.1f} σ",
     }

@@ -1,5 +1,6 @@
 """The state of a fleet: what the status, its page, the metrics and the messages show."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Literal
@@ -17,6 +18,23 @@ class BiasDrift:
     """Whether a component has begun to drift; a steady offset is none."""
     words: str
     """Such as "force bias x drifts by 0.12 N a week since 2026-03-02"; empty if `found` is false."""
+
+
+@dataclass(frozen=True, slots=True)
+class Weighings:
+    """Of one tool on its last day with weighings."""
+
+    day: str
+    """As ISO 8601, UTC."""
+    number: int
+    """Of parts that were weighed."""
+    refused: Mapping[str, int]
+    """How often nothing was weighed, by the code of the reason."""
+    last_utc: str | None
+    """When the last part was weighed; None if every weighing of that day was refused or found nothing."""
+    mass_kg: float | None
+    """Of the last part."""
+    mass_sigma_kg: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +62,8 @@ class CellState:
     temperature_C: float | None = None
     drift: BiasDrift | None = None
     """None with too few verifications."""
+    weighings: Weighings | None = None
+    """None without any in the last 90 days."""
     emulated: bool = False
     """Whether the calibration was made in an emulated cell."""
 
@@ -64,7 +84,7 @@ class CellState:
         return {**plain, "is_due": self.is_due(now)}
 
 
-FindingKind = Literal["payload", "temperature", "base", "overdue"]
+FindingKind = Literal["payload", "temperature", "base", "overdue", "weighing"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,6 +38,14 @@ def verified_in_words(state: CellState, now: datetime) -> str:
     return f"{'' if state.passed else 'FAILED '}{age_in_words(now - state.verified)}"
 
 
+def weighed_in_words(state: CellState, now: datetime) -> str:
+    """Write mass and age of the last weighing, such as "0.250 kg 3 h"."""
+    found = state.weighings
+    if found is None or found.mass_kg is None or found.last_utc is None:
+        return "-"
+    return f"{found.mass_kg:.3f} kg {age_in_words(now - datetime.fromisoformat(found.last_utc))}"
+
+
 def summary(fleet: Fleet, now: datetime) -> str:
     """Count the cells and tools that need attention, such as "200 cells: 2 failed, 5 drifting, 12 due"."""
     tools, cells = fleet.cells, {one.cell for one in fleet.cells}

@@ -52,7 +52,9 @@ class MotionTracker:
         self._size = samples_in_reading(rate_Hz)
         self._step_s = self._size / rate_Hz
         self._hold = round(_HOLD_S * rate_Hz)
-        self._mass_kg, self._parameters = mass_kg, parameters
+        by_acceleration = accelerated(mass_kg, parameters.p_sensor_com_m) @ parameters.R_flange_sensor.T
+        self._felt_by_change = -by_acceleration / self._step_s**2
+        """(6, 3) wrench by the change of a step of the centre of mass to the next, flange axes, m."""
         self._p_flange_com_m = np.nan_to_num(p_flange_sensor_m) + parameters.R_flange_sensor @ parameters.p_sensor_com_m
         self._earlier: Array | None = None
         self._since = self._hold
@@ -72,25 +74,27 @@ class MotionTracker:
         n, k = len(R_base_flange), self._size
         if not n:
             return np.zeros(0, np.int8), np.zeros((0, 6))
-        p_base_com_m = np.nan_to_num(p_base_flange_m) + R_base_flange @ self._p_flange_com_m
-        poses = np.concatenate([R_base_flange.reshape(n, 9), p_base_com_m], axis=1)
+        p_base_com_m = np.nan_to_num(p_base_flange_m) + (R_base_flange.reshape(-1, 3) @ self._p_flange_com_m).reshape(
+            n, 3
+        )
+        poses = np.concatenate([R_base_flange.reshape(n, 9).T, p_base_com_m.T])  # (12, n), for sums along long rows
         if self._earlier is None:
-            self._earlier = np.repeat(poses[:1], 3 * k, axis=0)
-        poses = np.concatenate([self._earlier, poses])
-        self._earlier = poses[n:]
-        sums = np.cumsum(poses, axis=0) / k  # means, because joint noise in single poses looks like motion
-        moved = sums[2 * k :] - 2 * sums[k:-k] + sums[: -2 * k]
-        before, moved = moved[:n], moved[k:]
-        far = np.abs(moved)
-        moves = (far[:, :9] > _STILL_RAD).any(axis=1) | (far[:, 9:] > _STILL_M).any(axis=1)
+            self._earlier = np.repeat(poses[:, :1], 3 * k, axis=1)
+        poses = np.concatenate([self._earlier, poses], axis=1)
+        self._earlier = poses[:, n:].copy()
+        sums = np.cumsum(poses, axis=1) / k  # means, because joint noise in single poses looks like motion
+        moved = sums[:, 2 * k :] - 2 * sums[:, k:-k] + sums[:, : -2 * k]
+        before, moved = moved[:, :n], moved[:, k:]
+        change, far = moved - before, np.abs(moved)
+        moves = (far[:9] > _STILL_RAD).any(axis=0) | (far[9:] > _STILL_M).any(axis=0)
         newest = np.maximum.accumulate(np.where(moves, np.arange(n), -1 - self._since))
         self._since = int(n - 1 - newest[-1])
         moving = np.arange(n) - newest < self._hold
-        felt = self._felt(R_base_flange, far[:, 9:], (moved - before)[:, 9:])
+        felt = self._felt(R_base_flange, moved[9:], change[9:])
         if not (moving.any() or self._classes.any()):  # the usual block of a live stream, in half the time
             return np.full(n, REST, np.int8), felt
         speed = self._rate(moved) / self._step_s
-        changes = self._rate(moved - before) / self._step_s**2 > ACCELERATION_RAD_S2 + speed**2
+        changes = self._rate(change) / self._step_s**2 > ACCELERATION_RAD_S2 + speed**2
         fast = _SPEEDS.searchsorted(speed)
         number = 1 + fast + np.minimum(fast, SLOW) + (changes & (fast < SLOW))
         present = np.where(moves, number, REST).astype(np.int8)
@@ -104,19 +108,15 @@ class MotionTracker:
     @staticmethod
     def _rate(moved: Array) -> Array:
         """Angle (n,) by which orientations, and positions at `_LEVER_M`, have moved."""
-        return np.asarray(
-            np.sqrt(np.square(moved[:, :9]).sum(axis=1) / 2) + np.linalg.norm(moved[:, 9:], axis=1) / _LEVER_M
-        )
+        squares = np.square(moved)
+        return np.asarray(np.sqrt(squares[:9].sum(axis=0) / 2) + np.sqrt(squares[9:].sum(axis=0)) / _LEVER_M)
 
-    def _felt(self, R_base_flange: Array, far_m: Array, second_m: Array) -> Array:
-        felt = np.linalg.norm(far_m, axis=1) > _FELT_M
+    def _felt(self, R_base_flange: Array, moved_m: Array, change_m: Array) -> Array:
+        felt = np.square(moved_m).sum(axis=0) > _FELT_M**2
         wrench = np.zeros((len(felt), 6))
         if felt.any():
-            parameters = self._parameters
-            R_base_sensor = R_base_flange[felt] @ parameters.R_flange_sensor
-            inertial_N = -self._mass_kg / self._step_s**2 * second_m[felt]
-            wrench[felt, :3] = np.einsum("nij,ni->nj", R_base_sensor, inertial_N)
-            wrench[felt, 3:] = np.cross(parameters.p_sensor_com_m, wrench[felt, :3])
+            change_flange_m = np.einsum("nij,in->nj", R_base_flange[felt], change_m[:, felt])
+            wrench[felt] = change_flange_m @ self._felt_by_change.T
         return wrench
 
 

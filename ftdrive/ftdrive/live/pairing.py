@@ -358,6 +358,7 @@ def estimate_delay(samples: Iterable[FtSamples], states: Iterable[ArmStates], es
     """
     for _ in range(_PASSES):
         before_s = estimator.delay_s
-        estimator.learn(paired_blocks(samples, states, before_s))
+        # in seconds of the whole, whatever the blocks, which keep few poses in memory
+        estimator.learn([Paired.concatenate(list(paired_blocks(samples, states, before_s)))])
         if abs(estimator.delay_s - before_s) < _CONVERGED_S:
             break

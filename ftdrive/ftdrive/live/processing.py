@@ -4,12 +4,14 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from threading import RLock
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.compensation import Compensator
 from ftcalib.extras.inertia import inertial_wrench, motion_of_poses
+from ftcalib.extras.temperature import BiasTemperature, with_bias_change
 from ftcalib.extras.update import Calibrated
 from ftcalib.extras.weighing import Weight, holding
 from ftcalib.files import JSON
@@ -31,6 +33,7 @@ from ftdrive.live.samples import (
     StreamEvent,
     StreamInfo,
     StreamStatus,
+    Tracked,
     Tracking,
     WrenchFrame,
 )
@@ -48,6 +51,17 @@ _KNOT_S = 0.002
 _REACH_S = 0.015
 """Half the time over which poses give the acceleration: longer ones lose the edges of a move, and are later."""
 _DRIFT_SIGMAS = 5.0
+_STEP_K, _NOTED_K = 0.05, 1.0
+"""Changes of the temperature that move the bias, and that are an event."""
+
+
+class _Reference(NamedTuple):
+    """The empty tool as calibrated, or since a tare."""
+
+    empty: Calibrated
+    t_ns: int
+    temperature_C: float | None
+    """Of the sensor then."""
 
 
 class Processor:
@@ -61,6 +75,8 @@ class Processor:
         Without it, `standard_stages`.
     false_alarm_rate : float
         Share of independent readings of a free tool beyond the limit. See `ftdrive.live.contact`.
+    temperature : BiasTemperature, optional
+        Of the sensor: `warm` then corrects the bias.
 
     Raises
     ------
@@ -75,6 +91,7 @@ class Processor:
         stages: Stages | None = None,
         *,
         false_alarm_rate: float = FALSE_ALARM_RATE,
+        temperature: BiasTemperature | None = None,
     ) -> None:
         self.info = info
         self._lock = RLock()  # frame, stages and tare may come from another thread
@@ -86,9 +103,16 @@ class Processor:
         self._held: Weight | None = None
         self.reading = np.zeros(6)
         """Mean of the newest 20 ms minus the load, sensor axes, about its origin."""
-        self._tares: list[tuple[Calibrated, int]] = [(calibration, 0)]
+        made_C = calibration.provenance.get("temperature_C")
+        self._temperature = None if made_C is None else temperature
+        self._now_C = self._noted_C = made_C
+        self._references = [_Reference(calibration, 0, made_C)]
+        self._empty: Calibrated = calibration
+        """The newest reference at the present temperature."""
+        self._bias_change = np.zeros(6)
+        """Of that, since the calibration."""
         self._expected: Calibrated = calibration
-        """The load after tares, with a part that is held."""
+        """The same with a part that is held."""
         likely_error = calibration.likely_error()
         self._usual_error_N = float(likely_error[0])
         beyond = np.repeat((likely_error**2 - np.square(calibration.predicted_error())).clip(0.0) / 3, 3)
@@ -245,7 +269,7 @@ class Processor:
             self._held = weight
             load = self._loaded(self.info.calibration)
             self._compensator = Compensator(load.parameters, response=load.response)
-            self._expected = self._loaded(self._tares[-1][0])
+            self._expected = self._loaded(self._empty)
             self._motion = self._motion_tracker()
             self._test.restart()
 
@@ -264,7 +288,7 @@ class Processor:
     def _free(self, rows: Paired) -> tuple[Array, Array, Array]:
         """Return the residual of a free tool at rest, (n, 6), its weight (n, 6) and the bias (6,)."""
         gravity = rows.R_base_flange.reshape(-1, 9) @ self._compensator.matrix.T
-        bias = self._compensator.offset if self.tare_wrench is None else self._compensator.offset + self.tare_wrench
+        bias = self._compensator.offset + self._bias_change
         return rows.raw - gravity - bias, gravity, np.asarray(bias)
 
     def _inertial(self, buffer: Paired) -> tuple[Array, int]:
@@ -398,13 +422,18 @@ class Processor:
             delay_s=delay[0],
             delay_sigma_s=delay[1],
             tare=tare_wrench,
-            tare_t_host_ns=None if tare_wrench is None else self._tares[-1][1],
+            tare_t_host_ns=None if tare_wrench is None else self._references[-1].t_ns,
             drift_N_h=drift_N_h,
             drift_sigma_N_h=drift_sigma_N_h,
             contact_limit=self._test.limit,
             false_alarm_rate=self._test.false_alarm_rate,
-            tracked=None if self.track == "off" else self._following.tracked,
+            tracked=self.tracked,
         )
+
+    @property
+    def tracked(self) -> Tracked | None:
+        """Bias and part as followed; None unless they are, and before the first window."""
+        return None if self.track == "off" else self._following.tracked
 
     # ---------------------------------------------------------------------------------------------------------- events
 
@@ -458,10 +487,9 @@ class Processor:
     @property
     def tare_wrench(self) -> Array | None:
         """(6,) change of the bias by tares, N and N·m, sensor axes; None without a tare."""
-        if len(self._tares) == 1:
+        if len(self._references) == 1:
             return None
-        new, old = self._tares[-1][0].parameters, self.info.calibration.parameters
-        return np.concatenate([new.force_bias_N - old.force_bias_N, new.torque_bias_Nm - old.torque_bias_Nm])
+        return _bias(self._references[-1].empty) - _bias(self.info.calibration)
 
     def tare(self) -> StreamEvent:
         """Set the bias so that the free tool reads zero in the last half second, or refuse; see `try_tare`."""
@@ -470,10 +498,10 @@ class Processor:
                 return self.note("tare-refused", "tare refused: no sample has arrived yet; tare again", {})
             rows = Paired.concatenate(list(self._recent))
             rows = rows.rows(rows.t_host_ns >= self._newest_ns - round(TARE_S * 1e9))
-            update, text, values = try_tare(rows, self._tares[-1][0])
+            update, text, values = try_tare(rows, self._empty)
             if update is None:
                 return self.note("tare-refused", text, values)
-            self._set_tare([*self._tares, (update, self._newest_ns)])
+            self._set_tare([*self._references, _Reference(update, self._newest_ns, self._now_C)])
             return self.note("tare", text, values)
 
     def recent(self) -> Paired | None:
@@ -484,8 +512,8 @@ class Processor:
     def reference(self) -> tuple[Calibrated, float]:
         """Return the empty tool, and how many seconds ago it was tared; infinite without a tare."""
         with self._lock:
-            current, t_ns = self._tares[-1]
-            return current, (self._newest_ns - t_ns) * 1e-9 if len(self._tares) > 1 else float("inf")
+            tared = len(self._references) > 1
+            return self._empty, (self._newest_ns - self._references[-1].t_ns) * 1e-9 if tared else float("inf")
 
     @property
     def rest_sigma(self) -> Array | None:
@@ -496,17 +524,38 @@ class Processor:
     def undo_tare(self) -> StreamEvent:
         """Take the last tare back."""
         with self._lock:
-            if len(self._tares) == 1:
+            if len(self._references) == 1:
                 return self.note("tare-refused", "there is no tare to undo", {})
-            self._set_tare(self._tares[:-1])
+            self._set_tare(self._references[:-1])
             left = self.tare_wrench
             return self.note("tare-undone", "tare undone", {"tare": None if left is None else left.tolist()})
 
-    def _set_tare(self, tares: list[tuple[Calibrated, int]]) -> None:
-        before, self._tares = self.tare_wrench, tares
-        now = np.zeros(6) if self.tare_wrench is None else self.tare_wrench
-        self._expected = self._loaded(tares[-1][0])
-        self._drift.shift(now - (np.zeros(6) if before is None else before))
+    def warm(self, temperature_C: float) -> None:
+        """Correct the bias for this temperature of the sensor, if it is known how, and at which it was calibrated."""
+        if self._temperature is None or self._now_C is None or abs(temperature_C - self._now_C) < _STEP_K:
+            return
+        with self._lock:
+            self._now_C = temperature_C
+            self._refer()
+            if self._noted_C is None or abs(temperature_C - self._noted_C) < _NOTED_K:
+                return
+            self._noted_C = temperature_C
+            change, _ = self._temperature.change(self._references[-1].temperature_C or temperature_C, temperature_C)
+            text = f"sensor at {temperature_C:.1f} °C: bias corrected by {np.linalg.norm(change[:3]):.2f} N"
+            self.note("temperature", text, {"temperature_C": temperature_C, "change": change.tolist()})
+
+    def _refer(self) -> None:
+        """Take the newest reference, at the present temperature, as the empty tool."""
+        empty, _, then_C = self._references[-1]
+        if self._temperature is not None and then_C is not None and self._now_C is not None:
+            empty = with_bias_change(empty, *self._temperature.change(then_C, self._now_C))
+        before, self._bias_change = self._bias_change, _bias(empty) - _bias(self.info.calibration)
+        self._empty, self._expected = empty, self._loaded(empty)
+        self._drift.shift(self._bias_change - before)
+
+    def _set_tare(self, references: list[_Reference]) -> None:
+        self._references = references
+        self._refer()
         self._test.restart()
         self._filter = self._filter_of(self._stages)
 
@@ -522,10 +571,8 @@ class Processor:
             if any(event.kind == "load-step" for event in events):
                 self.hold(part_of(tracked))
             if (update := applied(self.info.calibration, tracked)) is not None:
-                before = np.zeros(6) if self.tare_wrench is None else self.tare_wrench
-                self._tares = [self._tares[0], (update, self._newest_ns)]
-                self._expected = self._loaded(update)
-                self._drift.shift((np.zeros(6) if self.tare_wrench is None else self.tare_wrench) - before)
+                self._references = [self._references[0], _Reference(update, self._newest_ns, self._now_C)]
+                self._refer()
 
     def _follow_drift(self, rows: Paired, residual: Array) -> None:
         noise = self._noise.of(REST)
@@ -539,6 +586,11 @@ class Processor:
             text = f"the bias drifts by {with_sigma(rate, sigma)} N/h (1 sigma); tare when the tool is free"
             self.note("drift", text, {"drift_N_h": rate, "sigma_N_h": sigma})
         self._drift_warned = rate > (0.5 if self._drift_warned else 1.0) * worth
+
+
+def _bias(load: Calibrated) -> Array:
+    p = load.parameters
+    return np.concatenate([p.force_bias_N, p.torque_bias_Nm])
 
 
 class ProcessedStream(ABC):
@@ -580,6 +632,11 @@ class ProcessedStream(ABC):
         self._track = track
         if (processor := getattr(self, "_processor", None)) is not None:  # else it is set when the stream is opened
             processor.track = track
+
+    @property
+    def tracked(self) -> Tracked | None:
+        """Bias and held part as followed; None unless `track` is set, and before the first look."""
+        return self._processor.tracked
 
     @property
     def stages(self) -> Stages:

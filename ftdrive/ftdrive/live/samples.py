@@ -273,6 +273,7 @@ EventKind = Literal[
     "load",
     "load-step",
     "tracked",
+    "temperature",
     "mark",
 ]
 

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
+from ftcalib.extras.temperature import BiasTemperature
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
@@ -126,7 +127,7 @@ class CompensatedStream(ProcessedStream):
             self._arm = stack.enter_context(closing(arm_device or build_arm(self.cell)))
             self._arm.open()
             arm, sensor = self._arm.identify(), self._sensor.identify()
-            self._calibration, self._name, self.warnings = self._chosen(arm, sensor)
+            self._calibration, self._name, self.warnings, self._temperature = self._chosen(arm, sensor)
             """What is doubtful about the calibration, and what could not be checked."""
             stack.callback(self._unfollow)
             self._follow()
@@ -140,7 +141,9 @@ class CompensatedStream(ProcessedStream):
             """As configured in the controller; None where it is not reported."""
             self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, status)
             frame, stages, false_alarm_rate = self._begin
-            self._processor = Processor(self.info, frame, stages, false_alarm_rate=false_alarm_rate)
+            self._processor = Processor(
+                self.info, frame, stages, false_alarm_rate=false_alarm_rate, temperature=self._temperature
+            )
             self.track = self._track
             delay_ms = self.cell.sensor.delay_ms
             delay = (
@@ -165,9 +168,12 @@ class CompensatedStream(ProcessedStream):
             raise ConfigError("this is a real cell: only a stream with simulate=True has a station")
         return self._given
 
-    def _chosen(self, arm: DeviceInfo, sensor: DeviceInfo) -> tuple[CalibrationResult, str, tuple[str, ...]]:
-        """Return the calibration, its name and warnings; it belongs to the devices and their mounting."""
+    def _chosen(
+        self, arm: DeviceInfo, sensor: DeviceInfo
+    ) -> tuple[CalibrationResult, str, tuple[str, ...], BiasTemperature | None]:
+        """Return the calibration of the devices and their mounting, its name, warnings, and what temperature does."""
         calibration, name, warnings = self._wanted, self._name, tuple[str, ...]()
+        temperature = None
         mount = self.cell.sensor.mount
         if isinstance(calibration, str):
             from ftdrive.store.tools import calibration_of_tool
@@ -175,10 +181,11 @@ class CompensatedStream(ProcessedStream):
             url = self.cell.store.url
             tool = calibration_of_tool(calibration, arm, sensor, mount, url=url, force=self._force)
             calibration, name, warnings = tool.calibration, str(tool.path), tool.warnings
+            temperature = tool.temperature
         belongs = belonging(calibration, {"arm": arm, "sensor": sensor}, mount)
         if belongs.others and not self._force:
             raise ConfigError(f"{belongs.others[0]}: calibrate this cell, or apply it all the same with --force")
-        return calibration, name, (*warnings, *belongs.others, *belongs.unknown)
+        return calibration, name, (*warnings, *belongs.others, *belongs.unknown), temperature
 
     def _described(
         self, arm: DeviceInfo, sensor: DeviceInfo, sensor_rate_Hz: float, arm_rate_Hz: float, status: ArmStatus
@@ -224,7 +231,9 @@ class CompensatedStream(ProcessedStream):
         """
         before, self._wanted = self._wanted, name
         try:
-            self._calibration, self._name, self.warnings = self._chosen(self.info.arm, self.info.sensor)
+            self._calibration, self._name, self.warnings, self._temperature = self._chosen(
+                self.info.arm, self.info.sensor
+            )
         except ConfigError:
             self._wanted = before
             raise
@@ -242,7 +251,13 @@ class CompensatedStream(ProcessedStream):
                 calibration_state=state,
             ),
         )
-        self._processor = Processor(self.info, old.frame, old.stages, false_alarm_rate=self._begin[2])
+        self._processor = Processor(
+            self.info,
+            old.frame,
+            old.stages,
+            false_alarm_rate=self._begin[2],
+            temperature=self._temperature,
+        )
         self.track = old.track
         for event in old.take_events():
             self._processor.note(event.kind, event.text, event.values, event.t_host_ns)
@@ -287,6 +302,8 @@ class CompensatedStream(ProcessedStream):
         if paired is None:
             return None
         self._processor.delay_sigma_s = self._pairing.delay_sigma_s
+        if (temperature_C := self._sensor.temperature_C()) is not None:
+            self._processor.warm(temperature_C)
         block = self._process(paired)
         return block if len(block) else None
 

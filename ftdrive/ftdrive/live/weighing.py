@@ -198,7 +198,7 @@ def weigh_in_motion(stream: ProcessedStream, since_ns: int = 0) -> Weight:
     """
     if stream.track == "off":
         raise ConfigError('the stream does not follow the load: open it with track="show" to weigh in motion')
-    rows, tracked = stream.recent(), stream.status().tracked
+    rows, tracked = stream.recent(), stream.tracked
     if rows is None or tracked is None or not np.isfinite(tracked.last_seen_s):
         raise CannotWeigh("samples")  # the first windows are no answer: an empty gripper is assumed
     t_ns = round(1e9 * tracked.t_s)

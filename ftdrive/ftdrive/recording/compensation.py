@@ -1,7 +1,7 @@
 """A recording of any length compensated in blocks, without a device."""
 
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Collection, Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from ftdrive.live.processing import Processor
 from ftdrive.live.samples import Block, Paired, StreamEvent, WrenchFrame
 from ftdrive.recording.files import RecordingReader
 from ftdrive.recording.recorder import Recorder
-from ftdrive.recording.recording import ROW, Header, Source, ahead, with_calibration
+from ftdrive.recording.recording import ROW, Header, Measured, Source, ahead, with_calibration
 from ftdrivers.interfaces import Array
 
 _NOISE_S = 30.0
@@ -77,6 +77,7 @@ def compensated(
     output: Path | None = None,
     *,
     estimate_bias: bool = False,
+    overlap: bool = True,
     show: Callable[[str], object] = lambda _: None,
 ) -> Compensated:
     """Compensate a recording of any length with the calibration of its header, bias and gravity subtracted.
@@ -92,6 +93,8 @@ def compensated(
         A new recording for the result, and for those events of the old one that still hold.
     estimate_bias : bool
         Whether `estimated_bias` replaces the bias of the calibration.
+    overlap : bool
+        Whether threads read and process the next blocks while one is written. A process of many does one after another.
     show : callable
         Gets what is done and how much of it, in words.
 
@@ -118,7 +121,7 @@ def compensated(
     """
     header, change = source.header, None
     if estimate_bias:
-        header, change = estimated_bias(source, show)
+        header, change = estimated_bias(source, overlap=overlap, show=show)
     info = header.info
     processor = Processor(info, frame)
     processor.learn_noise(_beginning(source, round(_NOISE_S * info.sensor_rate_Hz)))
@@ -130,17 +133,17 @@ def compensated(
             recorder = Recorder([output], info, header.configuration)
             stack.callback(recorder.discard)
         try:
-            for samples, events, share in ahead(source.blocks()):
-                block = processor.process(samples) if len(samples) else None
-                found.add(block, [one for one in events if one.kind in _KEPT], processor.take_events(), recorder)
-                show(f"Compensating: {share:.0%}")
-            found.add(processor.finish(), [], processor.take_events(), recorder)
+            blocks = _processed(ahead(source.blocks()) if overlap else source.blocks(), processor)
+            with closing(ahead(blocks) if overlap else blocks) as coming:  # so that no thread processes further
+                for block, old, new, share in coming:
+                    found.add(block, old, new, recorder)
+                    show(f"Compensating: {share:.0%}")
         except (BadDataset, BadRecording, KeyboardInterrupt) as error:
             if not found.samples:
                 raise
             failure = error
         processor.restart()  # a contact at the end is over
-        found.add(None, [], processor.take_events(), recorder)
+        found.add(None, [], [one for one in processor.take_events() if one.t_host_ns <= found.end_ns], recorder)
         if recorder is not None:
             recorder.close()
     numbers = {
@@ -152,6 +155,16 @@ def compensated(
         "cut": source.cut if failure is None else str(failure) or "interrupted",
     }
     return Compensated(numbers, failure)
+
+
+def _processed(
+    measured: Iterator[Measured], processor: Processor
+) -> Generator[tuple[Block | None, Sequence[StreamEvent], Sequence[StreamEvent], float], None, None]:
+    """Yield each block with the events of its recording that still hold, those of the processing, and its share."""
+    for samples, events, share in measured:
+        block = processor.process(samples) if len(samples) else None
+        yield block, [one for one in events if one.kind in _KEPT], processor.take_events(), share
+    yield processor.finish(), [], processor.take_events(), 1.0
 
 
 def _beginning(source: Source, samples: int) -> Iterator[Paired]:
@@ -169,7 +182,7 @@ class _Sums:
 
     def __init__(self) -> None:
         self.samples, self._gaps = 0, 0
-        self._begin_ns, self._end_ns, self._seq = 0, 0, 0
+        self._begin_ns, self.end_ns, self._seq = 0, 0, 0
         self._squares, self._largest = np.zeros((2, 2)), np.zeros((2, 2))  # raw and compensated, force and torque
         self._contacts: list[dict[str, Any]] = []
         self._delay: dict[str, Any] | None = None
@@ -184,7 +197,7 @@ class _Sums:
                 self._begin_ns, self._seq = int(block.t_host_ns[0]), int(block.seq[0]) - 1
             self.samples += len(block)
             self._gaps += int(np.count_nonzero(np.diff(block.seq, prepend=self._seq) != 1))
-            self._end_ns, self._seq = int(block.t_host_ns[-1]), int(block.seq[-1])
+            self.end_ns, self._seq = int(block.t_host_ns[-1]), int(block.seq[-1])
             for i, wrench in enumerate((block.raw, block.wrench)):
                 norms = np.square(wrench) @ _OF_FORCE_AND_TORQUE
                 self._squares[i] += norms.sum(axis=0)
@@ -208,7 +221,7 @@ class _Sums:
         )
         return {
             "samples": self.samples,
-            "duration_s": (self._end_ns - self._begin_ns) * 1e-9,
+            "duration_s": (self.end_ns - self._begin_ns) * 1e-9,
             "raw": raw,
             "compensated": compensated,
             "contacts": self._contacts,
@@ -223,7 +236,7 @@ def _contact(event: StreamEvent, start_ns: int) -> dict[str, Any]:
 
 
 def estimated_bias(
-    source: Source, show: Callable[[str], object] = lambda _: None
+    source: Source, *, overlap: bool = True, show: Callable[[str], object] = lambda _: None
 ) -> tuple[Header, dict[str, list[float]]]:
     """Estimate the bias from a recording of a mostly free tool; keep all other parameters and their uncertainty.
 
@@ -249,7 +262,7 @@ def estimated_bias(
     readings, orientations = [np.empty((0, 6))], [np.empty((0, 3, 3))]
     waiting: list[Paired] = []
     with suppress(BadRecording):  # the pass that follows ends there too
-        for samples, _, share in ahead(source.blocks()):
+        for samples, _, share in ahead(source.blocks()) if overlap else source.blocks():
             show(f"Estimating the bias: {share:.0%}")
             paired = Paired.concatenate([*waiting, samples])
             whole = len(paired) // size * size

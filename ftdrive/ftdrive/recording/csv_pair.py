@@ -1,31 +1,30 @@
 """Wrench and orientation of another program, as two CSV files on one clock, each at its own rate."""
 
-import csv
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
 from ftcalib import CalibrationResult
-from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns, rotations_of
-from ftcalib.data.dwell_mean import CHANNELS
+from ftcalib.data.dataset import rotations_of
 from ftcalib.errors import BadDataset
 from ftdrive.live.delay import DelayEstimator
 from ftdrive.live.pairing import estimate_delay, paired_blocks
 from ftdrive.live.samples import Paired, Stages, StreamInfo, WrenchFrame
+from ftdrive.recording.number_table import ORIENTATION, WRENCH, Part, Wanted, mean_rate_Hz, read_table
 from ftdrive.recording.recording import PIECE_ROWS, Header, Measured
 from ftdrive.runs.run import versions
 from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtSamples
 
+T = TypeVar("T")
 _WHOLE = 10**6
 """Seconds: the delay is estimated from all of a recording."""
 _MEAN_S = 0.008
-_READ_BYTES, _LONGEST_LINE = 1 << 21, 1 << 14
 _NEAR = 100
 """Samples before and after a step that show whether it is a gap."""
 _ROUNDS = 20
@@ -58,7 +57,7 @@ class CsvPair:
         self, wrench: Path, orientation: Path, calibration: CalibrationResult, name: str, delay_s: float | None
     ) -> None:
         self._wrench, self._states = wrench, _Again(partial(read_orientation, orientation))
-        rate_Hz, unknown = _rate_Hz(wrench, CHANNELS), np.full(3, np.nan)
+        rate_Hz, unknown = mean_rate_Hz(wrench, WRENCH), np.full(3, np.nan)
         info = StreamInfo(
             calibration=calibration,
             calibration_name=name,
@@ -67,7 +66,7 @@ class CsvPair:
             tool="",
             utc_offset_ns=0,
             sensor_rate_Hz=rate_Hz,
-            arm_rate_Hz=_rate_Hz(orientation, ()),
+            arm_rate_Hz=mean_rate_Hz(orientation, ORIENTATION),
             p_flange_sensor_m=unknown,
             R_flange_tcp=np.eye(3),
             p_flange_tcp_m=unknown,
@@ -87,21 +86,27 @@ class CsvPair:
                 yield from (block.rows(slice(i, i + PIECE_ROWS)) for i in range(0, len(block), PIECE_ROWS))
 
         waiting: list[Paired] = []
-        for paired in paired_blocks(samples(), self._states, self.delay_s):
-            rows = Paired.concatenate([*waiting, paired])
-            if len(rows) >= PIECE_ROWS:  # as of other recordings, because the contact test goes in steps
-                yield Measured(rows.rows(slice(PIECE_ROWS)), (), share[0])
-            waiting = [rows.rows(slice(PIECE_ROWS if len(rows) >= PIECE_ROWS else 0, None))]
+        failure: BadDataset | None = None
+        try:
+            for paired in paired_blocks(samples(), self._states, self.delay_s):
+                rows = Paired.concatenate([*waiting, paired])
+                if len(rows) >= PIECE_ROWS:  # as of other recordings, because the contact test goes in steps
+                    yield Measured(rows.rows(slice(PIECE_ROWS)), (), share[0])
+                waiting = [rows.rows(slice(PIECE_ROWS if len(rows) >= PIECE_ROWS else 0, None))]
+        except BadDataset as error:
+            failure = error
         if any(map(len, waiting)):
-            yield Measured(waiting[0], (), 1.0)
+            yield Measured(waiting[0], (), share[0])
+        if failure is not None:
+            raise failure
 
     def _estimated_delay(self) -> tuple[float, float]:
         """Return the delay and its sigma, from means over `_MEAN_S`."""
         info = self.header.info
         size = max(1, round(_MEAN_S * info.sensor_rate_Hz))
-        means = [FtSamples.concatenate(list(_means(self._wrench, size)))]
+        means = list(_before_a_fault(_means(self._wrench, size)))
         estimator = DelayEstimator(info.calibration, info.p_flange_sensor_m, window=_WHOLE)
-        estimate_delay(means, self._states, estimator)
+        estimate_delay(means, _Again(lambda: _before_a_fault(iter(self._states))), estimator)
         return estimator.delay_s, estimator.sigma_s
 
 
@@ -115,10 +120,22 @@ class _Again:
         return self._states()
 
 
+def _before_a_fault(parts: Iterator[T]) -> Iterator[T]:
+    """Yield the parts before a fault, if there are any; the pass that follows reports it."""
+    count = 0
+    try:
+        for part in parts:
+            yield part
+            count += 1
+    except BadDataset:
+        if not count:
+            raise
+
+
 def _means(path: Path, size: int) -> Iterator[FtSamples]:
     """Yield the mean wrench of each so many samples, numbered, at their mean time."""
     t_s, wrench, count = np.empty(0), np.empty((0, 6)), 0
-    for part in _table(path, CHANNELS):
+    for part in _table(path, WRENCH):
         t_s, wrench = np.concatenate([t_s, part.t_s]), np.concatenate([wrench, part.numbers])
         n = len(t_s) // size
         t_ns = _ns(t_s[: n * size].reshape(n, size).mean(axis=1))
@@ -134,7 +151,7 @@ def read_wrench(path: Path) -> Iterator[tuple[FtSamples, int]]:
     """
     known, number = 0, 0
     t_s, wrench, place = np.empty(0), np.empty((0, 6)), 0
-    for part in chain(_table(path, CHANNELS), [None]):
+    for part in chain(_table(path, WRENCH), [None]):
         if part is not None:
             t_s, wrench, place = np.concatenate([t_s, part.t_s]), np.concatenate([wrench, part.numbers]), part.place
             if len(t_s) <= known + 2 * _NEAR:
@@ -191,7 +208,7 @@ def read_orientation(path: Path) -> Iterator[ArmStates]:
 
     The orientation is a matrix r11..r33, a quaternion qx, qy, qz, qw, or a rotation vector rx, ry, rz in rad.
     """
-    for part in _table(path, ()):
+    for part in _table(path, ORIENTATION):
         try:
             R = rotations_of(part.names, part.numbers)
         except BadDataset as error:
@@ -204,69 +221,16 @@ def _ns(t_s: Array) -> NDArray[np.int64]:
     return np.rint(t_s * 1e9).astype(np.int64)
 
 
-class _Part(NamedTuple):
-    """Consecutive rows of a table."""
-
-    t_s: Array
-    """(n,)"""
-    numbers: Array
-    """(n, k)"""
-    names: Sequence[str]
-    place: int
-    """Bytes of the file up to the end of these rows."""
-
-
-def _columns(path: Path, head: bytes, wanted: Sequence[str]) -> tuple[list[str], Sequence[str]]:
-    """Return the names of all columns, and the wanted ones; those of an orientation if `wanted` is empty."""
-    names = [name.strip() for name in next(csv.reader([head.decode("utf-8-sig", "replace")]), [])]
-    found = wanted or orientation_columns(names)
-    if not {"t", *found} <= set(names):
-        words = ", ".join(wanted) or ORIENTATION_FORMS
-        raise BadDataset(f"{path.name}: the first row must name t and {words}; it names {', '.join(names)}")
-    return names, found
-
-
-def _table(path: Path, wanted: Sequence[str]) -> Iterator[_Part]:
-    """Read some columns in parts. Raises `BadDataset` behind the last valid part."""
+def _table(path: Path, wanted: Wanted) -> Iterator[Part]:
+    """Read a table in parts, with its times in order. Raises `BadDataset` behind the last valid part."""
     count, last_s = 0, -np.inf
-    with path.open("rb") as file:
-        names, found = _columns(path, file.readline(), wanted)
-        use = [names.index(name) for name in ("t", *found)]
-        while lines := file.readlines(_READ_BYTES):
-            try:
-                table = _numbers(lines, use)
-            except ValueError as error:
-                raise BadDataset(f"{path.name}: {error}: correct this line") from error
-            wrong = ~np.isfinite(table).all(axis=1) | (np.diff(table[:, 0], prepend=last_s) < 0)
-            if wrong.any():
-                row = int(np.argmax(wrong))
-                where = f"row {count + row + 1}: a number is not finite, or t = {table[row, 0]:g} goes back"
-                raise BadDataset(f"{path.name}: {where}")
-            if len(table):
-                count, last_s = count + len(table), float(table[-1, 0])
-                yield _Part(table[:, 0], table[:, 1:], found, file.tell())
-
-
-def _numbers(lines: Sequence[bytes], use: Sequence[int]) -> Array:
-    """Parse some columns. Raises `ValueError`."""
-    return np.loadtxt([line.decode(errors="replace") for line in lines], delimiter=",", usecols=use, ndmin=2)
-
-
-def _rate_Hz(path: Path, wanted: Sequence[str]) -> float:
-    """Return the mean rate of the rows of a file, by its first and last row and the number of its lines."""
-    with path.open("rb") as file:
-        names, _ = _columns(path, file.readline(), wanted)
-        first, lines = file.readline(), 1
-        last = tail = first
-        while part := file.read(_READ_BYTES):
-            lines += part.count(b"\n")
-            tail = (tail + part)[-_LONGEST_LINE:]
-    *_, last = [first, *(line for line in tail.splitlines() if line.strip())]
-    count = lines + (not tail.endswith(b"\n")) if first.strip() else 0
-    if count < 2:
-        raise BadDataset(f"{path.name}: it has {count} rows: at least 2 are needed")
-    try:
-        begin, end = (_numbers([line], [names.index("t")]) for line in (first, last))
-    except ValueError as error:
-        raise BadDataset(f"{path.name}: {error}: correct this line") from error
-    return (count - 1) / max(float((end - begin)[0, 0]), 1e-9)
+    for part in read_table(path, wanted):
+        finite = np.isfinite(part.t_s) & np.isfinite(part.numbers).all(axis=1)
+        wrong = ~finite | (np.diff(part.t_s, prepend=last_s) < 0)
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            where = f"row {count + row + 1}: a number is not finite, or t = {part.t_s[row]:g} goes back"
+            raise BadDataset(f"{path.name}: {where}")
+        if len(part.t_s):
+            count, last_s = count + len(part.t_s), float(part.t_s[-1])
+            yield part

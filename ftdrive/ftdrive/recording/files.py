@@ -15,6 +15,7 @@ from ftdrive.recording.growing_file import partial_of
 from ftdrive.recording.mcap_file import McapFile, read_mcap
 from ftdrive.recording.parquet_file import ParquetFile, read_parquet
 from ftdrive.recording.recording import (
+    FORMAT,
     ROW,
     Header,
     Measured,
@@ -23,6 +24,15 @@ from ftdrive.recording.recording import (
     Rows,
     measured,
 )
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is a recording of `ftdrive record`, by its ending; a CSV by its first line."""
+    ending = Path(path.name.removesuffix(".partial")).suffix
+    if ending == ".csv" and path.is_file():
+        with path.open("rb") as file:
+            return file.readline(100).startswith(f"# {FORMAT.partition('/')[0]}/".encode())
+    return ending in ENDINGS and ending != ".csv"
 
 
 class RecordingFile(Protocol):

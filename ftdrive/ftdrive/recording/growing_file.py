@@ -30,13 +30,14 @@ class GrowingFile:
         """Bytes so far."""
         return self._file.tell()
 
-    def add(self, content: bytes) -> int:
+    def add(self, *contents: bytes) -> int:
         """Append; return where it begins. After an error the file holds what it held before."""
         start = self._file.tell()
         try:
-            left = memoryview(content)
-            while left:
-                left = left[self._file.write(left) :]
+            for content in contents:
+                left = memoryview(content)
+                while left:
+                    left = left[self._file.write(left) :]
         except OSError:
             self._file.seek(start)
             self._file.truncate()

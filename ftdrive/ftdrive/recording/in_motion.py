@@ -1,9 +1,7 @@
 """A calibration in motion from files, read piece by piece: a recording, or two CSV files of another program."""
 
-import csv
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
-from itertools import islice
 from math import isfinite
 from pathlib import Path
 
@@ -11,29 +9,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Known, Setup
-from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns, rotations_of
-from ftcalib.data.dwell_mean import CHANNELS
+from ftcalib.data.dataset import rotations_of
 from ftcalib.errors import BadDataset
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
 from ftdrive.recording.compensation import NEEDED
-from ftdrive.recording.files import ENDINGS, RecordingReader
-from ftdrive.recording.recording import FORMAT, Header
+from ftdrive.recording.files import RecordingReader
+from ftdrive.recording.number_table import ORIENTATION, WRENCH, Wanted, read_table
+from ftdrive.recording.recording import Header
 from ftdrive.runs.new_tool import require_same_cell
 from ftdrive.runs.run import made_now
 
-_PIECE = 1 << 16
 _POSITION = ("x", "y", "z")
-
-
-def is_recording(path: Path) -> bool:
-    """Whether a file is a recording of `ftdrive record`, by its ending; a CSV by its first line."""
-    ending = Path(path.name.removesuffix(".partial")).suffix
-    if ending == ".csv" and path.is_file():
-        with path.open("rb") as file:
-            return file.readline(100).startswith(f"# {FORMAT.partition('/')[0]}/".encode())
-    return ending in ENDINGS and ending != ".csv"
 
 
 def solve_recording(
@@ -121,8 +109,8 @@ def read_in_motion(path: Path) -> tuple[Means, Means, Header]:
 def read_wrench_file(path: Path) -> Means:
     """Read columns t in s, fx, fy, fz in N, tx, ty, tz in N·m. Raises `BadDataset` or `OSError`."""
     means = Means()
-    for t_s, numbers, _ in _pieces(path, lambda _: CHANNELS, ", ".join(CHANNELS)):
-        _add(means, path, t_s, numbers)
+    for part in read_table(path, WRENCH):
+        _add(means, path, part.t_s, part.numbers)
     return means
 
 
@@ -132,17 +120,17 @@ def read_pose_file(path: Path) -> Means:
     The orientation is r11..r33, qx, qy, qz, qw, or rx, ry, rz in rad. Raises `BadDataset` or `OSError`.
     """
 
-    def wanted(names: Sequence[str]) -> Sequence[str]:
-        return [*orientation_columns(names), *(_POSITION if set(_POSITION) <= set(names) else ())]
+    def pose(names: Sequence[str]) -> Sequence[str]:
+        return [*ORIENTATION.choose(names), *(_POSITION if set(_POSITION) <= set(names) else ())]
 
     means = Means()
-    for t_s, numbers, names in _pieces(path, wanted, ORIENTATION_FORMS):
-        of_orientation = tuple(name for name in names if name not in _POSITION)
+    for part in read_table(path, Wanted(pose, ORIENTATION.words)):
+        of_orientation = tuple(name for name in part.names if name not in _POSITION)
         try:
-            R = rotations_of(of_orientation, numbers[:, : len(of_orientation)]).reshape(-1, 9)
+            R = rotations_of(of_orientation, part.numbers[:, : len(of_orientation)]).reshape(-1, 9)
         except BadDataset as error:
             raise BadDataset(f"{path.name}: {error}") from error
-        _add(means, path, t_s, np.hstack([R, numbers[:, len(of_orientation) :]]))
+        _add(means, path, part.t_s, np.hstack([R, part.numbers[:, len(of_orientation) :]]))
     return means
 
 
@@ -151,21 +139,3 @@ def _add(means: Means, path: Path, t_s: Array, values: Array) -> None:
         means.add(t_s, values)
     except BadDataset as error:
         raise BadDataset(f"{path.name}: {error}") from error
-
-
-def _pieces(
-    path: Path, columns_of: Callable[[Sequence[str]], Sequence[str]], wanted: str
-) -> Iterator[tuple[Array, Array, Sequence[str]]]:
-    """Give times (n,), the columns that are chosen by the names of all (n, k), and their names."""
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
-        names = [name.strip() for name in next(csv.reader(file), [])]
-        found = columns_of(names)
-        if not {"t", *found} <= set(names):
-            raise BadDataset(f"{path.name}: the first row must name t and {wanted}; it names {', '.join(names)}")
-        order = [names.index(name) for name in ("t", *found)]
-        while lines := list(islice(file, _PIECE)):
-            try:
-                table = np.loadtxt(lines, delimiter=",", usecols=order, ndmin=2)
-            except ValueError as error:
-                raise BadDataset(f"{path.name}: {error}: correct this line") from error
-            yield table[:, 0], table[:, 1:], found

@@ -18,6 +18,7 @@ import struct
 import zlib
 from collections.abc import Collection, Generator, Mapping, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -121,28 +122,29 @@ class ParquetFile(GrowingFile):
         return table_of(rows, self._start_ns or 0, self._header.info.utc_offset_ns)
 
     def _write_group(self) -> None:
-        rows = np.concatenate([np.zeros(0, ROW), *self._waiting])
-        if not len(rows) and not self._new:
+        n = sum(map(len, self._waiting))
+        if not n and not self._new:
             return
-        heads, bodies, sizes = [], [], []
-        for column in self._table(rows).values():
-            plain = np.packbits(column, bitorder="little") if column.dtype == bool else np.ascontiguousarray(column)
+        heads, bodies, pages, sizes = list[bytes](), list[bytes](), list[list[int]](), list[int]()
+        tables = [self._table(rows) for rows in self._waiting or [np.zeros(0, ROW)]]
+        for name in self._kinds:
+            column = np.concatenate([table[name] for table in tables])
+            plain = np.packbits(column, bitorder="little") if column.dtype == bool else column
             body = self._compress(plain.data)
             crc = zlib.crc32(body)
-            numbers = _struct({1: (_I32, len(rows)), 2: (_I32, _PLAIN), 3: (_I32, _RLE), 4: (_I32, _RLE)})
+            numbers = _struct({1: (_I32, n), 2: (_I32, _PLAIN), 3: (_I32, _RLE), 4: (_I32, _RLE)})
             page = [0, plain.nbytes, len(body), crc - (crc >> 31 << 32)]
             head = _struct({**{place: (_I32, number) for place, number in enumerate(page, 1)}, 5: (_STRUCT, numbers)})
             heads.append(head)
             bodies.append(body)
+            pages.append([len(head), len(body), crc])
             sizes.append(plain.nbytes)
-        pages = [[len(head), len(body), zlib.crc32(body)] for head, body in zip(heads, bodies, strict=True)]
         events = list(map(event_text, self._new))
-        record = _record({"rows": len(rows), "pages": dict(zip(self._kinds, pages, strict=True)), "events": events})
-        content = [record, *(part for pair in zip(heads, bodies, strict=True) for part in pair)]
-        place = self.add(b"".join(content)) + len(record)
-        if len(rows):
-            self._groups.append(self._group(place, pages, sizes, len(rows)))
-        self.samples += len(rows)
+        record = _record({"rows": n, "pages": dict(zip(self._kinds, pages, strict=True)), "events": events})
+        place = self.add(record, *chain.from_iterable(zip(heads, bodies, strict=True))) + len(record)
+        if n:
+            self._groups.append(self._group(place, pages, sizes, n))
+        self.samples += n
         self._events += self._new
         self._waiting, self._new = [], []
 

@@ -4,7 +4,7 @@ The pose is stored as a quaternion, so that all formats hold the same bits.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import accumulate, pairwise
@@ -90,17 +90,16 @@ def rows_of(samples: Block | Paired) -> Rows:
     return rows
 
 
-def paired_of(rows: Rows) -> Paired:
+def paired_of(*parts: Rows) -> Paired:
     """Return samples as measured, each with its pose; columns that were not read are 0."""
-    read = rows.dtype.names or ()
+
+    def column(name: str) -> NDArray[Any]:
+        if name in (parts[0].dtype.names or ()):
+            return np.concatenate([rows[name] for rows in parts])
+        return np.zeros((sum(map(len, parts)), *ROW[name].shape), ROW[name].base)
+
     names = [item.name for item in fields(Paired) if item.name != "R_base_flange"]
-    columns = {
-        name: np.ascontiguousarray(rows[name])
-        if name in read
-        else np.zeros((len(rows), *ROW[name].shape), ROW[name].base)
-        for name in names
-    }
-    return Paired(R_base_flange=matrices(rows["quaternion_base_flange"]), **columns)
+    return Paired(R_base_flange=matrices(column("quaternion_base_flange")), **{name: column(name) for name in names})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -299,7 +298,7 @@ def divided(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
         )
 
 
-def ahead(items: Iterator[T]) -> Iterator[T]:
+def ahead(items: Iterator[T]) -> Generator[T, None, None]:
     """Give items of which a thread always makes the next one; errors come in their place."""
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, items, None)
@@ -310,21 +309,21 @@ def ahead(items: Iterator[T]) -> Iterator[T]:
 
 def measured(pieces: Iterable[Piece]) -> Iterator[Measured]:
     """Give samples as measured in blocks of `PIECE_ROWS`, however they are stored, up to an error."""
-    waiting, events, share, failure = list[Rows](), list[StreamEvent](), 0.0, None
+    waiting, count, events, share, failure = list[Rows](), 0, list[StreamEvent](), 0.0, None
     try:
         for piece in pieces:
-            waiting.append(piece.rows)
+            rows = piece.rows
             events += piece.events
             share = piece.share
-            if sum(map(len, waiting)) >= PIECE_ROWS:
-                rows = np.concatenate(waiting)
-                for end in range(PIECE_ROWS, len(rows) + 1, PIECE_ROWS):
-                    yield Measured(paired_of(rows[end - PIECE_ROWS : end]), events, share)
-                    events = []
-                waiting = [rows[len(rows) // PIECE_ROWS * PIECE_ROWS :]]
+            while count + len(rows) >= PIECE_ROWS:
+                here = PIECE_ROWS - count
+                yield Measured(paired_of(*waiting, rows[:here]), events, share)
+                waiting, count, events, rows = [], 0, [], rows[here:]
+            waiting.append(rows)
+            count += len(rows)
     except BadRecording as error:
         failure = error
-    if events or any(map(len, waiting)):
-        yield Measured(paired_of(np.concatenate(waiting)), events, share)
+    if events or count:
+        yield Measured(paired_of(*waiting), events, share)
     if failure is not None:
         raise failure

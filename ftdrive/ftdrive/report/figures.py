@@ -14,7 +14,6 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftdrive.errors import ConfigError
-from ftdrive.planning.show.words import JOINTS
 from ftdrive.report.fit_sections import SUSPICIOUS_SIGMAS
 from ftdrive.report.origin_sections import LIMIT_SIGMAS
 from ftdrive.report.words import label_of, shown_poses
@@ -174,6 +173,8 @@ def _dots(axes: Any, directions: Any, **style: Any) -> None:
 
 
 def _sweep(figure: Any, facts: Facts) -> None:
+    from ftdrive.planning.show.words import JOINTS
+
     axes, sweep = figure.add_subplot(), Sweep.from_dict(facts["motion"]["sweep"])
     t_s = np.linspace(0.0, sweep.duration_s, 400)
     q_deg = np.degrees(sweep.at(t_s))
@@ -184,14 +185,18 @@ def _sweep(figure: Any, facts: Facts) -> None:
 
 
 def _correlation(figure: Any, facts: Facts) -> None:
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_rgba
+
     axes = figure.add_subplot()
     matrix = np.abs(np.array(facts["correlation"]["matrix"]))
     n = len(matrix)
     axes.grid(visible=False)
     axes.spines[:].set_visible(False)
-    for i, j in np.argwhere(matrix > INVISIBLE):
-        # the strength is opacity, so that 0 is the page itself
-        axes.fill([j, j + 1, j + 1, j], [i, i, i + 1, i + 1], color=SERIES[0], alpha=float(matrix[i, j]), linewidth=0)
+    seen = np.argwhere(matrix > INVISIBLE)
+    corners = seen[:, None, ::-1] + [[0, 0], [1, 0], [1, 1], [0, 1]]
+    colours = [to_rgba(SERIES[0], matrix[i, j]) for i, j in seen]  # the strength is opacity: 0 is the page itself
+    axes.add_collection(PolyCollection(list(corners), facecolors=colours, linewidth=0), autolim=False)
     for edge in range(0, n + 1, 3):
         axes.plot([0, n], [edge, edge], color=GRID, linewidth=0.8)
         axes.plot([edge, edge], [0, n], color=GRID, linewidth=0.8)
@@ -217,7 +222,7 @@ def _methods(figure: Any, facts: Facts) -> None:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.grid(visible=False, axis="y")
         axes.set_xlabel(label)
-        axes.tick_params(which="minor", length=0)
+        axes.minorticks_off()
     force.invert_yaxis()
 
 

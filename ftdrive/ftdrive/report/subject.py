@@ -122,6 +122,7 @@ def _of_data(source: Path, options: SolveOptions) -> Subject:
         result = CalibrationResult.load(run.calibration_path)
     if result is None or result.provenance.get("dataset_sha256") != data.dataset.sha256():
         result = solve(data.dataset, options.method, **solved_with, provenance=data.provenance)
+        solved_with |= {"default": result} if options.method == "ml" else {}
     command = " ".join(["ftdrive solve", shlex.quote(str(source)), *options.words])
     return Subject(source, result, command, data.dataset, run, data.records, solved_with)
 

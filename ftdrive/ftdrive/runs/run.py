@@ -32,6 +32,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from itertools import count, takewhile
 from pathlib import Path
@@ -458,5 +459,10 @@ def command_line() -> list[str]:
 
 def versions() -> dict[str, str]:
     """Return the versions of the software behind a result."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
     found = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
     return found | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}

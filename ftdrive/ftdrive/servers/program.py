@@ -8,24 +8,33 @@ program must look at the counter and never at a number alone.
 import threading
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
 from ftcalib.extras.weighing import Weight
-from ftdrive.live.samples import Block, StreamInfo
+from ftdrive.live.samples import Block, StreamInfo, Tracking
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.live.weighing import WEIGH_S, CannotWeigh, Scale, load_values
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import Array
 
-INTEGERS: Final = ("state", "code", "condition", "number", "live")
+if TYPE_CHECKING:
+    from ftdrive.store.weighing_log import WeighingLog
+
+INTEGERS: Final = ("state", "code", "condition", "number", "live", "tracking")
 DOUBLES: Final = (
     *("fx", "fy", "fz", "tx", "ty", "tz"),
     *("mass", "mass_sigma", "least_mass"),
     *("com_x", "com_y", "com_z", "com_sigma_x", "com_sigma_y", "com_sigma_z"),
 )
 """What the input registers hold from the first one on, of each kind."""
+TRACKED: Final = ("bias_fx", "bias_fy", "bias_fz", "bias_tx", "bias_ty", "bias_tz", "bias_age")
+"""Further doubles where bias and part are followed."""
+TRACKINGS: Final[tuple[Tracking, ...]] = ("off", "show", "apply")
+"""What `tracking` counts: where it is 0, the registers of `TRACKED` are not those of the service."""
+NEVER_S: Final = -1.0
+"""Age of the last look at the bias, before the first one."""
 
 STALE_S: Final = 0.05
 """Without a sample for so long the wrench counts as stale."""
@@ -85,23 +94,34 @@ class Registers(Protocol):
         """Close the connection."""
 
 
+def doubles_of(track: Tracking) -> tuple[str, ...]:
+    """Return what the double registers hold."""
+    return DOUBLES if track == "off" else DOUBLES + TRACKED
+
+
 class ProgramService:
     """Answers one program.
 
     Parameters
     ----------
     stream : CompensatedStream
-        Open, in the frame that the program gets; read here.
+        Open, in the frame that the program gets; read here. With `stream.track` the program gets the tracked bias too.
     connect : callable
-        Opens the registers; called again after they were lost.
+        Opens the registers, as many as `INTEGERS` and `doubles_of(stream.track)`; called again after they were lost.
     say : callable
         Takes a sentence for the operator, from any thread.
+    log : WeighingLog, optional
+        Keeps the answers.
     """
 
     def __init__(
-        self, stream: CompensatedStream, connect: Callable[[], Registers], say: Callable[[str], object]
+        self,
+        stream: CompensatedStream,
+        connect: Callable[[], Registers],
+        say: Callable[[str], object],
+        log: "WeighingLog | None" = None,
     ) -> None:
-        self._stream, self._connect, self._say = stream, connect, say
+        self._stream, self._connect, self._say, self._log = stream, connect, say, log
         self._registers: Registers | None = connect()
         self._scale = Scale(stream)
         self._lock = threading.Lock()
@@ -149,6 +169,7 @@ class ProgramService:
                 self._say("Samples arrive again.")
             silent = False
             self.take(block)
+            self._stream.take_events()  # nothing records them, and they would pile up as long as the service runs
 
     def stop(self) -> None:
         """Write that the service has ended, and close."""
@@ -200,13 +221,22 @@ class ProgramService:
         busy = self._busy is not None
         number = self._busy[0] if self._busy is not None else self._answered or 0
         state = State.BUSY if busy and self._state is not State.STOPPED else self._state
-        integers = [int(state), 0 if busy else self._code, int(self._condition), number, self._live]
+        tracking = TRACKINGS.index(self._stream.track)
+        integers = [int(state), 0 if busy else self._code, int(self._condition), number, self._live, tracking]
+        tracked = self._tracked() if tracking else []
         try:
-            self._registers.write(integers, [*self._wrench.tolist(), *self._weight.tolist()])
+            self._registers.write(integers, [*self._wrench.tolist(), *self._weight.tolist(), *tracked])
         except DeviceError as error:
             self._say(f"{error}. Trying again.")
             self._registers.close()
             self._registers = None
+
+    def _tracked(self) -> list[float]:
+        """Return the tracked change of the bias since the calibration, and the age of the last look at it."""
+        tracked = self._stream.tracked
+        if tracked is None or not np.isfinite(tracked.last_seen_s):
+            return [0.0] * 6 + [NEVER_S]
+        return [*tracked.bias.tolist(), tracked.last_seen_s + max(self._newest_ns * 1e-9 - tracked.t_s, 0.0)]
 
     def _judge(self, block: Block) -> Condition:
         """Return what touches the tool; a load that is not known pulls along gravity."""
@@ -244,6 +274,8 @@ class ProgramService:
             except CannotWeigh as refusal:
                 if refusal.code not in _WAITS or (t_ns - since_ns) * 1e-9 > PATIENCE_S:
                     self._answer(refusal.code)
+                    if self._log is not None:
+                        self._log.refused(refusal.code)
             else:
                 self._answer("")
 
@@ -261,7 +293,10 @@ class ProgramService:
         self._weight = np.array([*mass, *(_placed(weight, info) if known else np.zeros(6))])
         self._stream.hold(weight if known else None)
         text = f"weighed for the program: {weight.mass_kg:.4f} kg"
-        self._stream.note("load", text, load_values(weight, info))
+        values = load_values(weight, info)
+        self._stream.note("load", text, values)
+        if self._log is not None:
+            self._log.weighed(values)
 
     def _zero(self, since_ns: int) -> None:
         self._scale.zero(since_ns)

@@ -11,7 +11,8 @@ import numpy as np
 from ftcalib.data.averaging_time import averaging_time
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, mean_and_covariance, noise_level
 from ftcalib.model import Array
-from ftcalib.routine import PoseRecord, Sampling
+from ftcalib.routine import PoseRecord
+from ftcalib.sampling import Sampling
 from ftdrive.errors import ConfigError, SupervisorGone
 from ftdrive.planning.approach import arm_moves, plan_approach
 from ftdrive.planning.cell_plan import certifier_for, speeds_of

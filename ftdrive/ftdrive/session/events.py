@@ -1,7 +1,7 @@
 """Events of a session: the screen shows them, `--json` writes them, the run folder keeps them."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any, Literal
@@ -45,7 +45,7 @@ class Event:
         """Return what `--json` writes, one object a line; arrays become lists, NaN and infinity null."""
         name = "".join(f"-{c.lower()}" if c.isupper() else c for c in type(self).__name__).lstrip("-")
         return {"schema_version": SCHEMA_VERSION, "event": name} | {
-            key: _plain(value) for key, value in asdict(self).items()
+            each.name: _plain(getattr(self, each.name)) for each in fields(self)
         }
 
 

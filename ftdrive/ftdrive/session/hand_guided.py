@@ -14,7 +14,8 @@ import numpy as np
 
 from ftcalib.data.dwell_mean import CHANNELS, restless_channels
 from ftcalib.model import Array
-from ftcalib.routine import MOVED_RAD, PoseRecord, Sampling, Stage, TourPose, take_pose, turned_rad
+from ftcalib.routine import MOVED_RAD, PoseRecord, Stage, TourPose, take_pose, turned_rad
+from ftcalib.sampling import Sampling
 from ftdrive.session.events import Compared, Estimated, SensorEvents, State, StateChanged
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key

@@ -15,7 +15,8 @@ import numpy as np
 from ftcalib.assessment import described_cell
 from ftcalib.errors import TooFewSamples
 from ftcalib.model import Array
-from ftcalib.routine import Sampling, Stage, TourPose, take_pose
+from ftcalib.routine import Stage, TourPose, take_pose
+from ftcalib.sampling import Sampling
 from ftdrive.checks.devices import SLOWEST_SLIDER
 from ftdrive.errors import Declined, NotAccepted, PlanRefused, SupervisorGone
 from ftdrive.planning.approach import arm_moves, plan_approach

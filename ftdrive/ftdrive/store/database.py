@@ -1,6 +1,5 @@
 """The database behind a store: its address, its lock, the version of its tables, and its errors in words."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -23,6 +22,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from ftdrive.errors import BadStore, ConfigError
+from ftdrive.store.records import user_folder
 from ftdrive.store.tables import RECORDS, SCHEMA, metadata, schema
 
 _BYTE_ORDER: Final = {"sqlite": "BINARY", "postgresql": "C"}
@@ -33,9 +33,7 @@ _WRITERS: Final = 0x66746472697665
 
 def default_file() -> Path:
     """Return the store of a user; it need not exist."""
-    home = os.environ.get("XDG_DATA_HOME", "")
-    folder = Path(home) if Path(home).is_absolute() else Path("~/.local/share").expanduser()
-    return folder / "ftdrive" / "store.sqlite"
+    return user_folder() / "store.sqlite"
 
 
 class Database:
@@ -173,4 +171,6 @@ class Database:
 
 def all_paths(connection: Connection) -> set[str]:
     """Return the path of every record, in an index of any version."""
-    return {path for table in RECORDS.values() for path in connection.scalars(select(table.c.path))}
+    kept = {*inspect(connection).get_table_names()}
+    tables = [table for table in RECORDS.values() if table.name in kept]
+    return {path for table in tables for path in connection.scalars(select(table.c.path))}

@@ -1,72 +1,20 @@
 """What a list of results says: trends of bias and payload, ages, failed verifications, temperatures."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from datetime import datetime
 from itertools import groupby
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
-from ftcalib.extras.trend import FEWEST, Trend, trend
-from ftcalib.model import PARAMETER_NAMES, Array
-from ftcalib.rounding import with_sigma
 from ftdrive.store.records import StoredResult, StoredVerification
 
-SIGNIFICANT: Final = 0.01
-"""Largest p-value of a trend that counts."""
+if TYPE_CHECKING:
+    from ftdrive.store.trends import QuantityTrend
+
 OLD_DAYS: Final = 30.0
 """A calibration that was neither made nor verified for so long should be verified."""
 OTHER_TEMPERATURE_K: Final = 10.0
-SHORTEST_DAYS: Final = 3.0
-"""Results within fewer days have no trend: a change per 30 days would be extrapolated too far."""
-
-_MONTH_DAYS = 30.0
-_VECTORS: Final = {
-    "force bias": ("force_bias_N", "N", 1.0),
-    "torque bias": ("torque_bias_Nm", "N·m", 1.0),
-    "centre of mass": ("p_sensor_com_m", "mm", 1e3),
-}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class QuantityTrend:
-    """Linear change of one quantity over the results of one tool on one sensor, arm and mount."""
-
-    tool: str
-    sensor_serial: str | None
-    quantity: str
-    unit: str
-    trend: Trend
-    """Per 30 days, in `unit`."""
-
-    @property
-    def is_significant(self) -> bool:
-        """Whether chance explains it in less than one case of 100."""
-        return self.trend.p_value < SIGNIFICANT
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields as JSON."""
-        return {
-            "tool": self.tool,
-            "sensor_serial": self.sensor_serial,
-            "quantity": self.quantity,
-            "unit": f"{self.unit} per 30 days",
-            "slope": self.trend.slope.tolist(),
-            "sigma": self.trend.sigma.tolist(),
-            "p_value": self.trend.p_value,
-            "n": self.trend.n,
-            "significant": self.is_significant,
-        }
-
-    def __str__(self) -> str:
-        pairs = zip(self.trend.slope, self.trend.sigma, strict=True)
-        numbers = ", ".join(with_sigma(slope, sigma, "+") for slope, sigma in pairs)
-        verdict = "significant" if self.is_significant else "not significant"
-        return (
-            f"{self.tool}, {self.quantity}: {numbers} {self.unit} per 30 days (1 sigma, {self.trend.n} results), "
-            f"{verdict} (p = {self.trend.p_value:.2g})"
-        )
+_FEWEST = 3
+"""Results with a trend."""
 
 
 def age_days(created_utc: str | None, now: datetime) -> float | None:
@@ -74,18 +22,14 @@ def age_days(created_utc: str | None, now: datetime) -> float | None:
     return None if created_utc is None else (now - datetime.fromisoformat(created_utc)).total_seconds() / 86400
 
 
-def drifts(results: Sequence[StoredResult]) -> list[QuantityTrend]:
+def drifts(results: Sequence[StoredResult]) -> list["QuantityTrend"]:
     """Fit the trends of each tool with three results or more over three days; a rejected result does not count."""
-    found = []
-    for series in _series(results):
-        for quantity, unit, rows in _quantities(series):
-            days = {row[0] for row in rows}
-            if len(days) < FEWEST or max(days) - min(days) < SHORTEST_DAYS:
-                continue
-            t, values, covariance = (np.array(column) for column in zip(*rows, strict=True))
-            drift = trend(t / _MONTH_DAYS, values, covariance)
-            found.append(QuantityTrend(str(series[0].tool), series[0].sensor_serial, quantity, unit, drift))
-    return found
+    long = [series for series in _series(results) if len(series) >= _FEWEST]
+    if not long:  # numpy takes as long as all else of a short list
+        return []
+    from ftdrive.store.trends import trends_of
+
+    return [one for series in long for one in trends_of(series)]
 
 
 def warnings(
@@ -120,30 +64,3 @@ def _series(results: Sequence[StoredResult]) -> Iterator[list[StoredResult]]:
     accepted.sort(key=lambda one: (cell(one), one.created_utc))
     for _, series in groupby(accepted, cell):
         yield list(series)
-
-
-def _quantities(series: Sequence[StoredResult]) -> Iterator[tuple[str, str, list[tuple[float, Array, Array]]]]:
-    """Yield each quantity with its unit, and (days, value, covariance) of the results that have estimated it.
-
-    A value that equals an earlier one was copied by an update; one without variance was taken as known.
-    """
-    first = datetime.fromisoformat(str(series[0].created_utc))
-    days = [(datetime.fromisoformat(str(one.created_utc)) - first).total_seconds() / 86400 for one in series]
-    for quantity, (name, unit, scale) in _VECTORS.items():
-        rows = slice(PARAMETER_NAMES.index(f"{name}.x"), PARAMETER_NAMES.index(f"{name}.z") + 1)
-        values = [scale * getattr(one.parameters, name) for one in series]
-        covariances = [scale**2 * one.covariance[rows, rows] for one in series]
-        yield quantity, unit, _estimated(days, values, covariances)
-    masses = [np.array([one.mass_kg]) for one in series]
-    yield "mass", "kg", _estimated(days, masses, [np.array([[one.mass_sigma_kg**2]]) for one in series])
-
-
-def _estimated(
-    days: Sequence[float], values: Sequence[Array], covariances: Sequence[Array]
-) -> list[tuple[float, Array, Array]]:
-    kept = list[tuple[float, Array, Array]]()
-    for day, value, covariance in zip(days, values, covariances, strict=True):
-        copied = any(np.array_equal(value, earlier) for _, earlier, _ in kept)
-        if not copied and np.linalg.eigvalsh(covariance)[0] > 1e-12 * np.trace(covariance) > 0:
-            kept.append((day, value, covariance))
-    return kept

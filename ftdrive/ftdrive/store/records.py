@@ -1,20 +1,21 @@
 """What the store keeps: of a run folder, read from its files, and of a cell, as it was configured."""
 
 import hashlib
+import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
+from math import isfinite
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_object
-from ftcalib.model import Array, Parameters
 from ftdrive.runs.verification_record import EMULATED, FORMAT, marks_of
+from ftdrive.runs.weighings import FILES, FOLDER, WeighingsFile, is_weighings
 
-_NUMBERS = tuple(field.name for field in fields(Parameters))
+if TYPE_CHECKING:  # a list of results needs no numpy
+    from ftcalib.model import Array, Parameters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,13 +64,19 @@ class StoredResult:
         return tool_in_words(self.tool, emulated=self.emulated)
 
     @property
-    def parameters(self) -> Parameters:
+    def parameters(self) -> "Parameters":
         """Estimates; with `covariance` they make a `ftcalib.extras.difference.Estimated`."""
-        return Parameters(**{name: np.array(self.numbers[name]) for name in _NUMBERS})
+        import numpy as np
+
+        from ftcalib.model import Parameters
+
+        return Parameters(**{one.name: np.array(self.numbers[one.name]) for one in fields(Parameters)})
 
     @property
-    def covariance(self) -> Array:
+    def covariance(self) -> "Array":
         """(15, 15) of the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
+        import numpy as np
+
         return np.array(self.numbers["covariance"], dtype=np.float64)
 
     @property
@@ -127,7 +134,64 @@ class StoredCell:
     tool: str | None
 
 
-Record = StoredResult | StoredVerification
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredWeighings:
+    """The weighings of one day (UTC) with one calibration on one arm: a file, or the sum of several."""
+
+    id: str
+    """Name of the file without its ending."""
+    path: str
+    day: str
+    """As ISO 8601."""
+    tool: str | None
+    arm_serial: str | None
+    sensor_serial: str | None
+    robot_host: str | None
+    calibration_id: str | None
+    emulated: bool
+    size: int
+    """Bytes that were read; a file that has more is read again."""
+    weighings: int
+    """Of a part: an empty gripper does not count."""
+    refusals: dict[str, int]
+    """By the codes of `ftdrive.runs.weighings.REFUSALS`."""
+    last_utc: str | None
+    """Of the last part."""
+    mass_kg: float | None
+    mass_sigma_kg: float | None
+
+    @property
+    def tool_in_words(self) -> str:
+        """Name of the tool, and whether the cell was emulated."""
+        return tool_in_words(self.tool, emulated=self.emulated)
+
+
+Record = StoredResult | StoredVerification | StoredWeighings
+
+
+def user_folder() -> Path:
+    """Return the folder of the user's store and weighings; it need not exist."""
+    home = os.environ.get("XDG_DATA_HOME", "")
+    folder = Path(home) if Path(home).is_absolute() else Path("~/.local/share").expanduser()
+    return folder / "ftdrive"
+
+
+def summed(days: Iterable[StoredWeighings]) -> list[StoredWeighings]:
+    """Sum up the files of each tool and arm, and keep the last weighing; the oldest first.
+
+    A tool has several files on a day if it was calibrated meanwhile.
+    """
+    found = dict[tuple[object, ...], StoredWeighings]()
+    for one in sorted(days, key=lambda one: (one.day, one.last_utc or "", one.id)):
+        key = (one.tool, one.arm_serial, one.robot_host, one.emulated)
+        before = found.pop(key, None)
+        found[key] = one if before is None or before.day != one.day else _with_counts(one, before)
+    return [*found.values()]
+
+
+def _with_counts(one: StoredWeighings, before: StoredWeighings) -> StoredWeighings:
+    refusals = {code: number + before.refusals[code] for code, number in one.refusals.items()}
+    return replace(one, weighings=one.weighings + before.weighings, refusals=refusals)
 
 
 def tool_in_words(tool: str | None, *, emulated: bool) -> str:
@@ -137,22 +201,27 @@ def tool_in_words(tool: str | None, *, emulated: bool) -> str:
     return EMULATED if tool in (None, "emulated") else f"{tool} {EMULATED}"
 
 
-def mass_sigma_kg(parameters: Parameters, covariance: Array, g_m_s2: float) -> float:
+def mass_sigma_kg(parameters: "Parameters", covariance: "Array", g_m_s2: float) -> float:
     """Return one standard deviation of the mass from the covariance (15, 15) alone."""
+    import numpy as np
+
     force = parameters.gravity_force_base_N
     down = force / (np.linalg.norm(force) or 1.0)
     return float(np.sqrt(np.maximum(down @ covariance[3:6, 3:6] @ down, 0.0))) / g_m_s2
 
 
 def record_paths(folders: Iterable[Path]) -> list[Path]:
-    """Return the files that become records, of runs or of the runs in folders, each once and by name."""
+    """Return the files that become records, of runs or of the runs in folders, each once and by name.
+
+    A folder of weighings counts as a run.
+    """
     runs = set[Path]()
     for folder in (one.resolve() for one in folders):
         if _is_run(folder):
             runs.add(folder)
         elif folder.is_dir():
             runs.update(filter(_is_run, folder.iterdir()))
-    names = ("calibration*.json", "verification*.json")
+    names = ("calibration*.json", "verification*.json", FILES)
     return [path for run in sorted(runs) for name in names for path in sorted(run.glob(name))]
 
 
@@ -169,13 +238,13 @@ def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
 
 def _is_run(folder: Path) -> bool:
     try:
-        return (folder / "run.json").is_file()
+        return (folder / "run.json").is_file() or (folder.name == FOLDER and folder.is_dir())
     except OSError:  # a folder of another user
         return False
 
 
 def read_record(path: Path) -> Record:
-    """Read one file of a run folder; fields that this version does not know are ignored.
+    """Read one file of a run folder or of weighings; fields that this version does not know are ignored.
 
     Raises
     ------
@@ -183,7 +252,33 @@ def read_record(path: Path) -> Record:
         The file is damaged or of another format.
     OSError
     """
+    if is_weighings(path):
+        file = WeighingsFile(path)
+        file.read()
+        return weighings_of(file)
     return _verification(path) if path.name.startswith("verification") else _result(path)
+
+
+def weighings_of(file: WeighingsFile) -> StoredWeighings:
+    """Return what was read of a file of weighings."""
+    header, last = file.header, file.last
+    return StoredWeighings(
+        id=file.path.stem,
+        path=str(file.path),
+        day=_text(header.get("day")) or "",
+        tool=_text(header.get("tool")),
+        arm_serial=_text(header.get("arm_serial")),
+        sensor_serial=_text(header.get("sensor_serial")),
+        robot_host=_text(header.get("robot_host")),
+        calibration_id=_text(header.get("calibration_id")),
+        emulated=header.get("emulated") is True,
+        size=file.size,
+        weighings=file.weighings,
+        refusals=dict(file.refusals),
+        last_utc=_utc(last.get("t_utc")),
+        mass_kg=_number(last.get("mass_kg")),
+        mass_sigma_kg=_number(last.get("mass_sigma_kg")),
+    )
 
 
 def _result(path: Path) -> StoredResult:
@@ -213,7 +308,7 @@ def _result(path: Path) -> StoredResult:
         mass_kg=result.mass_kg,
         g_m_s2=result.g_m_s2,
         numbers={
-            **{name: getattr(result.parameters, name).tolist() for name in _NUMBERS},
+            **{one.name: getattr(result.parameters, one.name).tolist() for one in fields(result.parameters)},
             "covariance": result.covariance.tolist(),
         },
         dataset_sha256=_text(provenance.get("dataset_sha256")),
@@ -269,7 +364,7 @@ def _text(value: Any) -> str | None:
 
 
 def _number(value: Any) -> float | None:
-    usable = isinstance(value, int | float) and not isinstance(value, bool) and np.isfinite(value)
+    usable = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
     return float(value) if usable else None
 
 

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
 
+from ftdrive.runs.weighings import is_weighings
 from ftdrive.store import tables
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import (
@@ -17,8 +18,10 @@ from ftdrive.store.records import (
     StoredCell,
     StoredResult,
     StoredVerification,
+    StoredWeighings,
     read_records,
     record_paths,
+    summed,
 )
 
 WAIT_S = 5.0
@@ -35,6 +38,8 @@ class Indexed:
 
     results: int
     verifications: int
+    weighings: int
+    """Files, each of one day."""
     unreadable: tuple[str, ...]
     """Files that were left out, each with the reason."""
 
@@ -79,7 +84,8 @@ class Store:
     def index(self, *folders: Path) -> Indexed:
         """Add what is new in these run folders, or in the run folders that they contain.
 
-        A file that is known by its path is not read again, because no file of a run is ever overwritten.
+        A file that is known by its path is not read again, because no file of a run is ever overwritten. One of
+        weighings is, if it has grown.
         """
         paths = record_paths(folders)
         with self._current.reading() as connection:
@@ -96,6 +102,11 @@ class Store:
         parents = {Path(path).parent.parent for path in known}
         gone = [path for path in known if not Path(path).exists() and Path(path).parent.parent.is_dir()]
         return self._add(record_paths([*folders, *parents]), forget=gone)
+
+    def put_weighings(self, record: StoredWeighings) -> None:
+        """Insert the weighings of a day, or replace them."""
+        with self._current.writing() as connection:
+            self._write(connection, [record])
 
     def put_cells(self, cells: Iterable[StoredCell]) -> None:
         """Insert cells, or replace those of the same name: all or none."""
@@ -115,8 +126,9 @@ class Store:
         if records or forget:
             with self._current.writing() as connection:
                 self._write(connection, records, forget)
-        results = sum(isinstance(one, StoredResult) for one in records)
-        return Indexed(results, len(records) - results, unreadable)
+        kinds = (StoredResult, StoredVerification, StoredWeighings)
+        results, verifications, weighings = (sum(isinstance(one, kind) for one in records) for kind in kinds)
+        return Indexed(results, verifications, weighings, unreadable)
 
     def _write(self, connection: Connection, records: Sequence[Record], forget: Sequence[str] = ()) -> None:
         """Insert records; of two files with the same content the first by path counts, whatever the order."""
@@ -154,21 +166,35 @@ class Store:
         """Return the newest verification of a calibration, if there is one."""
         return next(reversed(self.verifications(calibration_id)), None)
 
+    def weighings(self, most: int, tool: str | None = None) -> list[StoredWeighings]:
+        """Return the last days with weighings, or those of a tool, the oldest first."""
+        table = tables.weighings
+        query = select(table).order_by(table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id).limit(most)
+        if tool is not None:
+            query = query.where(table.c.tool == tool)
+        return self._read(query, tables.to_weighings)[::-1]
+
+    def last_weighings(self, since_day: str, tool: str | None = None) -> list[StoredWeighings]:
+        """Return the last day with weighings of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
+        return summed(self._read(_last_weighings(since_day, tool), tables.to_weighings))
+
     def cells(self) -> list[StoredCell]:
         """Return all cells by name."""
         return sorted(self._read(select(tables.cells), tables.to_cell), key=lambda cell: cell.name)
 
     def fleet(
         self, newest: int, since: datetime
-    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification]]:
+    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[StoredWeighings]]:
         """Return what a fleet needs, in one look at the database: cells, results and checks, the oldest first.
+
+        Also `last_weighings`.
 
         Parameters
         ----------
         newest : int
             Results of each tool on each arm that are not rejected.
         since : datetime
-            Verifications made then or later.
+            Verifications and weighings made then or later.
         """
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
         checks = select(*tables.CHECK).where(tables.verifications.c.created_utc >= start)
@@ -176,7 +202,9 @@ class Store:
             cells = _rows(connection, select(tables.cells), tables.to_cell)
             results = _rows(connection, _newest_accepted(newest), tables.to_result)
             found = _rows(connection, checks, tables.to_check)
-        return sorted(cells, key=lambda cell: cell.name), results, sorted(found, key=lambda check: check.created_utc)
+            weighings = _rows(connection, _last_weighings(start[:10]), tables.to_weighings)
+        cells.sort(key=lambda cell: cell.name)
+        return cells, results, sorted(found, key=lambda check: check.created_utc), summed(weighings)
 
     def _read(self, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
         with self._current.reading() as connection:
@@ -187,10 +215,17 @@ def _rows(connection: Connection | None, query: Select[Any], make: Callable[[Row
     return [] if connection is None else [make(row) for row in connection.execute(query).all()]
 
 
-def _known(connection: Connection, paths: Iterable[Path]) -> set[str]:
-    """Return those of the paths that have a record."""
+def _known(connection: Connection, paths: Sequence[Path]) -> set[str]:
+    """Return those of the paths that have a record of the whole file."""
     texts = [str(path) for path in paths]
-    return {path for table in tables.RECORDS.values() for path in _paths_where(connection, table, table.c.path, texts)}
+    known = {path for table in tables.RECORDS.values() for path in _paths_where(connection, table, table.c.path, texts)}
+    growing = [path for path in paths if str(path) in known and is_weighings(path)]
+    for start in range(0, len(growing), _MOST):
+        sizes = {str(path): path.stat().st_size for path in growing[start : start + _MOST]}
+        table = tables.weighings
+        read = connection.execute(select(table.c.path, table.c.size).where(table.c.path.in_(sizes))).all()
+        known -= {path for path, size in read if size != sizes[path]}
+    return known
 
 
 def _paths_where(connection: Connection, table: Table, column: Column[Any], values: Sequence[str]) -> Iterator[str]:
@@ -212,3 +247,15 @@ def _newest_accepted(most: int) -> Select[Any]:
     )
     found = ranked.subquery()
     return _oldest_first(table).where(table.c.id.in_(select(found.c.id).where(found.c.rank <= most)))
+
+
+def _last_weighings(since_day: str, tool: str | None = None) -> Select[Any]:
+    """Select the files of the last day of each tool on each arm."""
+    table = tables.weighings
+    key = (table.c.tool, table.c.arm_serial, table.c.robot_host, table.c.emulated)
+    rank = func.rank().over(partition_by=key, order_by=table.c.day.desc()).label("rank")
+    ranked = select(table.c.id, rank).where(table.c.day >= since_day)
+    if tool is not None:
+        ranked = ranked.where(table.c.tool == tool)
+    found = ranked.subquery()
+    return select(table).where(table.c.id.in_(select(found.c.id).where(found.c.rank == 1)))

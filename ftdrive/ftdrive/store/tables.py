@@ -1,6 +1,7 @@
 """The tables of the store as this version reads and writes them, and their rows as records.
 
-A change of a column of results or verifications raises `SCHEMA`: an older index is then built again from its files.
+A change of a column of results, verifications or weighings raises `SCHEMA`: an older index is then built again from
+its files.
 """
 
 from collections.abc import Mapping, Sequence
@@ -9,9 +10,17 @@ from typing import Any, Final
 
 from sqlalchemy import JSON, Boolean, Column, Float, Integer, MetaData, Row, String, Table, false
 
-from ftdrive.store.records import BriefVerification, Record, StoredCell, StoredResult, StoredVerification
+from ftdrive.runs.weighings import REFUSALS
+from ftdrive.store.records import (
+    BriefVerification,
+    Record,
+    StoredCell,
+    StoredResult,
+    StoredVerification,
+    StoredWeighings,
+)
 
-SCHEMA: Final = 3
+SCHEMA: Final = 4
 """Version of the index, kept in the database."""
 
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
@@ -52,6 +61,20 @@ verifications: Final = Table(
     Column("temperature_C", Float),
     *(Column(f"{name}_{axis}", Float) for name in _WRENCHES for axis in _WRENCH),
 )
+weighings: Final = Table(
+    "ftdrive_weighings",
+    metadata,
+    Column("id", String, primary_key=True),
+    Column("path", String, nullable=False),
+    Column("day", String, nullable=False, index=True),
+    *(Column(name, String) for name in ("tool", "arm_serial", "sensor_serial", "robot_host", "calibration_id")),
+    Column("emulated", Boolean, nullable=False),
+    Column("size", Integer, nullable=False),
+    Column("weighings", Integer, nullable=False),
+    *(Column(f"refused_{code}", Integer, nullable=False) for code in REFUSALS),
+    Column("last_utc", String),
+    *(Column(name, Float) for name in ("mass_kg", "mass_sigma_kg")),
+)
 cells: Final = Table(
     "ftdrive_cells",
     metadata,
@@ -60,7 +83,11 @@ cells: Final = Table(
     Column("verify_every_days", Float, nullable=False),
     *(Column(name, String) for name in ("arm_serial", "robot_host", "sensor_url", "tool")),
 )
-RECORDS: Final[Mapping[type[Record], Table]] = {StoredResult: results, StoredVerification: verifications}
+RECORDS: Final[Mapping[type[Record], Table]] = {
+    StoredResult: results,
+    StoredVerification: verifications,
+    StoredWeighings: weighings,
+}
 
 CHECK: Final = [
     *(verifications.c[name] for name in BriefVerification._fields[:-1]),
@@ -73,6 +100,7 @@ _SINGLE = tuple(column.name for column in verifications.columns if not column.na
 def to_row(record: Record | StoredCell) -> dict[str, Any]:
     """Return a record by columns."""
     row = asdict(record)
+    row |= {f"refused_{code}": number for code, number in row.pop("refusals", {}).items()}
     for name in _WRENCHES if isinstance(record, StoredVerification) else ():
         values = row.pop(name) or [None] * len(_WRENCH)
         row |= {f"{name}_{axis}": value for axis, value in zip(_WRENCH, values, strict=True)}
@@ -97,6 +125,13 @@ def to_verification(row: Row[Any]) -> StoredVerification:
         bias_change_sigma=_wrench(row[-12:-6]),
         calibration_sigma=_wrench(row[-6:]),
     )
+
+
+def to_weighings(row: Row[Any]) -> StoredWeighings:
+    """Return a row of `weighings` as a record."""
+    values = row._asdict()
+    refusals = {code: values.pop(f"refused_{code}") for code in REFUSALS}
+    return StoredWeighings(**values, refusals=refusals)
 
 
 def to_check(row: Sequence[Any]) -> BriefVerification:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadCalibration
+from ftcalib.extras.temperature import BiasTemperature
 from ftdrive.checks.devices import belonging
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.store.records import StoredResult, read_records, record_paths
@@ -23,6 +24,8 @@ class Tool:
     calibration: CalibrationResult
     path: Path
     warnings: tuple[str, ...]
+    temperature: BiasTemperature | None = None
+    """How the bias of the sensor follows its temperature, where that predicts other runs better."""
 
 
 def calibration_of_tool(
@@ -70,7 +73,8 @@ def calibration_of_tool(
     ours = [one for one in accepted if _may_belong(one, arm, sensor)]
     for one in (one for one in ours if one.tool == name):
         if (loaded := _load(one)) and not belonging(loaded, {"arm": arm, "sensor": sensor}, mount).others:
-            return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)))
+            found = _temperature(store, one, results)
+            return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)), found)
     if force:
         for one in (one for one in accepted if one.tool == name):
             if loaded := _load(one, accept_edited=True):
@@ -100,6 +104,21 @@ def _load(one: StoredResult, *, accept_edited: bool = False) -> CalibrationResul
         return CalibrationResult.load(Path(one.path), accept_edited=accept_edited)
     except (BadCalibration, OSError):
         return None
+
+
+def _temperature(store: Store, one: StoredResult, results: Iterable[StoredResult]) -> BiasTemperature | None:
+    """Return what the other runs of the sensor show, if the temperature of this one is known."""
+    from ftdrive.store.temperature import temperatures
+
+    if one.temperature_C is None:
+        return None
+    try:
+        checks = store.verifications()
+    except BadStore:
+        return None
+    same = (one.sensor_serial, one.arm_serial, one.mount)
+    alike = [each for each in results if (each.sensor_serial, each.arm_serial, each.mount) == same]
+    return next((found.fit for found in temperatures(alike, checks) if any(found.fit.predicts)), None)
 
 
 def _failed(store: Store, one: StoredResult) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from ftcalib.extras.weighing import Weight
 from ftcalib.rounding import with_sigma
@@ -10,6 +11,9 @@ from ftdrive.live.stream import CompensatedStream
 from ftdrive.live.weighing import FAULTS, WEIGH_S, WORDS, CannotWeigh, Scale, count_of, load_values, weigh_in_motion
 from ftdrive.recording import Recorder
 from ftdrivers.errors import DeviceError
+
+if TYPE_CHECKING:
+    from ftdrive.store.weighing_log import WeighingLog
 
 RECOVER_S = 10.0
 """So long a device may be silent."""
@@ -43,6 +47,8 @@ class Weighing:
         Weigh what the arm carries, in motion too.
     part_kg : float, optional
         Mass of one part.
+    log : WeighingLog, optional
+        Keeps each new weight or fault.
     """
 
     def __init__(
@@ -53,8 +59,10 @@ class Weighing:
         joins: bool,
         part_kg: float | None,
         moving: bool = False,
+        log: "WeighingLog | None" = None,
     ) -> None:
         self.stream, self.part_kg = stream, part_kg
+        self._log = log
         self.joins, self._moving = joins, moving
         self._recorder = recorder
         self._scale = Scale(stream)
@@ -111,6 +119,8 @@ class Weighing:
             lasts = shown.refusal in (*FAULTS, "count") and now_s - fault_since_s > WEIGH_S
             if lasts:
                 fault_since_s = float("inf")  # reported once
+                if self._log is not None and shown.refusal is not None:
+                    self._log.refused(shown.refusal)
             yield shown, lasts or (shown.refusal is None and self._is_new(shown))
 
     def _weighed(self) -> Shown:
@@ -133,8 +143,18 @@ class Weighing:
             if abs(weight.mass_kg - last.mass_kg) >= weight.least_kg:
                 self._scale = Scale(self.stream)  # another load
         self._last = weight
-        self.stream.note("load", line_of(shown), load_values(weight, self.stream.info) | {"count": shown.count})
+        values = load_values(weight, self.stream.info) | {"count": shown.count}
+        self.stream.note("load", line_of(shown), values)
+        if self._log is not None:
+            self._log.weighed(values)
         return True
+
+    def given_up(self, shown: Shown) -> CannotWeigh:
+        """Return the error of the only weight that was wanted, after `PATIENCE_S`."""
+        code = shown.refusal or "samples"
+        if self._log is not None and code not in (*FAULTS, "count"):  # these are kept already
+            self._log.refused(code)
+        return CannotWeigh(code, shown.weight)
 
 
 def line_of(shown: Shown) -> str:

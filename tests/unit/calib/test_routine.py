@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import TooFewSamples
 from ftcalib.model import Array
-from ftcalib.routine import PoseRecord, Sampling, TourPose, dataset_from, drift_check, take_pose
+from ftcalib.routine import PoseRecord, TourPose, dataset_from, drift_check, take_pose
+from ftcalib.sampling import Sampling
 
 
 @dataclass

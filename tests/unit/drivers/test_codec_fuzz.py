@@ -7,7 +7,7 @@ from tests.benchmarks.fuzz import KEPT_BYTES, Target, fuzz, targets
 
 @pytest.mark.parametrize("target", targets(), ids=lambda target: target.name)
 def test_only_documented_exceptions(target: Target) -> None:
-    outcome = fuzz(target, 200, seed=2, batch=100)
+    outcome = fuzz(target, 100, seed=2, batch=50)
     assert not outcome.undocumented
     assert outcome.kept_bytes < KEPT_BYTES
     assert outcome.refused < outcome.inputs  # some golden frames stay as they are

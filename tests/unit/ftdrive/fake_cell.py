@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftcalib.routine import Sampling
+from ftcalib.sampling import Sampling
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
 from ftdrive.planning.cell_plan import certifier_for, plan_for
@@ -64,6 +64,12 @@ NOISE = np.repeat([0.02, 0.001], 3)
 def _flange(q_rad: tuple[float, ...]) -> tuple[Array, Array]:
     at = MODEL.frames(np.array(q_rad))
     return at.R_base_flange[0], at.flange_m[0]
+
+
+@lru_cache(maxsize=1000)
+def _free_wrench(q_rad: tuple[float, ...]) -> Array:
+    force = _flange(q_rad)[0].T @ [0, 0, -1.2 * 9.81]
+    return np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
 
 
 class FakeArm(RobotArm):
@@ -233,10 +239,7 @@ class FakeSensor(ForceTorqueSensor):
         return self._newest
 
     def _wrenches(self, n: int) -> Array:
-        R_base_flange, _ = _flange(tuple(self.arm.q.tolist()))
-        force = R_base_flange.T @ [0, 0, -1.2 * 9.81]
-        free = np.add(np.r_[force, np.cross([0.01, 0, 0.06], force)], [1, 2, 3, 0.1, 0.2, 0.3])
-        return free + self.push + self.rng.normal(0, self.noise, (n, 6))
+        return _free_wrench(tuple(self.arm.q.tolist())) + self.push + self.rng.normal(0, self.noise, (n, 6))
 
     def collect(self, duration_s: float) -> FtSamples:
         self.check()
@@ -436,7 +439,7 @@ class Lab:
         return Run(folder)
 
     def stops(self) -> list[int]:
-        return [record.stop for record in self.run().records()]
+        return self.run().stops()
 
     def said(self) -> str:
         return "\n".join(event.words for event in self.operator.of(Noted))

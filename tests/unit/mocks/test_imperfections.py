@@ -56,7 +56,7 @@ EVEN, ENDED = slice(700, 2500), slice(3200, None)
 """Samples at even speed, and behind the stop, which ends at 3.12 s."""
 
 
-@pytest.mark.parametrize("joint", [0, 4])
+@pytest.mark.parametrize("joint", [0, pytest.param(4, marks=pytest.mark.slow)])
 def test_turning_joints_make_a_ripple_as_large_as_that_of_a_real_arm(joint: int) -> None:
     ripple = vibration(joint, ripple=1.0)
     size = ripple[EVEN].std(axis=0)
@@ -65,6 +65,7 @@ def test_turning_joints_make_a_ripple_as_large_as_that_of_a_real_arm(joint: int)
     assert not ripple[ENDED].any()
 
 
+@pytest.mark.slow
 def test_the_ripple_has_the_lines_of_the_motor_and_little_below_3_Hz() -> None:
     ripple = vibration(4, ripple=1.0)[EVEN, 0]
     power = np.abs(np.fft.rfft(ripple * np.hanning(len(ripple)))) ** 2

@@ -25,6 +25,8 @@ def index(folders: Sequence[Path], url: str | None) -> None:
     for words in indexed.unreadable:
         messages.print(hanging(" left out: ", words))
     added = f"{counted(indexed.results, 'result')} and {counted(indexed.verifications, 'verification')}"
+    if indexed.weighings:
+        added += f" and {counted(indexed.weighings, 'day')} of weighings"
     answer.print(f" {added} added to {found.name}")
     if cells := found.cells():
         owners = Owners(cells)

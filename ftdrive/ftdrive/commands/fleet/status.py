@@ -13,7 +13,7 @@ from ftdrive.commands.common import JSON, STORE, NewFile, open_store, require_ex
 if TYPE_CHECKING:
     from ftdrive.fleet.state import CellState, Fleet
 
-_TITLES = ("cell", "tool", "verdict", "age", "verified", "drift, σ", "due")
+_TITLES = ("cell", "tool", "verdict", "age", "verified", "drift, σ", "due", "weighed")
 
 
 @click.command()
@@ -24,8 +24,8 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     """List all cells: what is due, and what drifts.
 
     The columns are the age of the calibration, that of the last verification, the drift of the bias in sigmas of a
-    verification, and when the next one is due. A cell has one line for each tool in use. Below the list is what needs
-    attention, with what to do. The exit code is 0 also then.
+    verification, when the next one is due, and the last weighing if there is one. A cell has one line for each tool in
+    use. Below the list is what needs attention, with what to do. The exit code is 0 also then.
 
     `ftdrive fleet add` adds cells, `ftdrive fleet index` adds runs from other computers.
     """
@@ -53,14 +53,16 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         from ftdrive.fleet.words import attention, summary
         from ftdrive.terminal.table import print_table
 
-        print_table(_TITLES, [_row(one, now) for one in fleet.cells], folding={"cell", "tool"})
+        shown = len(_TITLES) if any(one.weighings for one in fleet.cells) else -1
+        rows = [_row(one, now)[:shown] for one in fleet.cells]
+        print_table(_TITLES[:shown], rows, folding={"cell", "tool"})
         answer.print(summary(fleet, now), style="bold")
         for words in attention(fleet, now):
             answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
 def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
-    from ftdrive.fleet.words import due_in_words, verified_in_words
+    from ftdrive.fleet.words import due_in_words, verified_in_words, weighed_in_words
     from ftdrive.runs.verification_record import age_in_words
 
     drift = "-"
@@ -74,6 +76,7 @@ def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
         verified_in_words(one, now),
         drift,
         due_in_words(one.due, now),
+        weighed_in_words(one, now),
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ftcalib.model import cross
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.kinematics import Frames, frames
 from ftdrive.planning.geometry.shapes import Bodies
@@ -270,7 +271,7 @@ def _edges(lift: Array, end: int, *housings: _Housing) -> list[_Part]:
     The arm is hollow there, between its tube and the housings; nothing should be planned to go in.
     """
     (first, *_), (second, *_) = housings
-    side = np.cross(lift, second - first)
+    side = cross(lift, second - first)
     side /= np.linalg.norm(side, axis=1)[:, None]
     inwards = HUB_ROUNDING_M if end == 0 else -HUB_ROUNDING_M
     bars = []

@@ -75,7 +75,7 @@ def wrist_rotation(psi_rad: Array, q5_rad: Array, q6_rad: Array) -> Array:
         (sp * c5 * c6 + cp * s6, -sp * c5 * s6 + cp * c6, -sp * s5),
         (s5 * c6, -s5 * s6, c5),
     )
-    return np.moveaxis(np.array(rows), 2, 0)
+    return np.array(rows).transpose(2, 0, 1)
 
 
 def wrist_inverse(q_arm_rad: ArrayLike, R_base_flange: Array) -> Array:

@@ -68,7 +68,7 @@ def sigmas(result: CalibrationResult, truth: Parameters) -> Array:
     return np.asarray(result.parameters.difference(truth) / np.sqrt(np.diag(result.covariance)))
 
 
-@pytest.mark.parametrize("position", [10, 12, 17, 21])
+@pytest.mark.parametrize("position", [10, 21])
 @pytest.mark.parametrize(("after", "code"), [(SHIFTED, "com_shifted"), (LIGHTER, "load_changed")])
 def test_poses_of_two_loads_are_refused(after: Parameters, code: str, position: int) -> None:
     result = session(after, position, seed=position)
@@ -92,12 +92,12 @@ def test_poses_count_as_they_were_taken_not_as_they_stand() -> None:
     assert result.findings[0].values["pose"] == np.flatnonzero(rows == 12)[0] + 1
 
 
-@pytest.mark.parametrize("measured", [True, False])
 @pytest.mark.parametrize(
-    ("after", "code"), [(TARED, "bias_stepped"), (TURNED, "sensor_turned"), (OTHER, "sensor_changed")]
+    ("after", "code", "measured"),
+    [(TARED, "bias_stepped", False), (TURNED, "sensor_turned", True), (OTHER, "sensor_changed", False)],
 )
 def test_other_changes_are_named_before_the_drift_that_they_look_like(
-    after: Parameters, code: str, *, measured: bool
+    after: Parameters, code: str, measured: bool
 ) -> None:
     result = session(after, 13, seed=4, measured=measured)
     first = result.findings[0]
@@ -109,7 +109,7 @@ def test_rows_of_two_sensors_are_named() -> None:
     assert session(OTHER, slice(1, None, 2), seed=1).findings[0].code == "sensors_alternate"
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("after", [TOOL, TARED])
 def test_a_quiet_run_and_one_that_was_tared_are_not_refused(after: Parameters, seed: int) -> None:
     result = session(after, 12, seed)
@@ -118,9 +118,8 @@ def test_a_quiet_run_and_one_that_was_tared_are_not_refused(after: Parameters, s
     assert np.abs(sigmas(result, TOOL)[sure]).max() < 4.5
 
 
-@pytest.mark.parametrize("measured", [True, False])
-@pytest.mark.parametrize("seed", range(3))
-def test_a_random_walk_is_no_step(seed: int, *, measured: bool) -> None:
+@pytest.mark.parametrize(("seed", "measured"), [(0, True), (1, False)])
+def test_a_random_walk_is_no_step(seed: int, measured: bool) -> None:
     walk = np.cumsum(10 * SIGMA * np.random.default_rng(seed).normal(size=(24, 6)), axis=0)
     found = {one.code for one in session(TOOL, 12, seed, added=walk, measured=measured).findings}
     assert not found & {"bias_stepped", "com_shifted", "load_changed", "sensor_turned", "sensor_changed"}

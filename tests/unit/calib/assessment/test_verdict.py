@@ -373,11 +373,10 @@ DISAGREE = {"orientations_inverted", "axes_disagree", "weight_upwards", "forces_
         (["fx", "fy"], "axes_disagree", [["torque", ["-x", "-y", "z"]], ["force", ["-x", "-y", "z"]]]),
     ],
 )
-@pytest.mark.parametrize("seed", [17, 18])
 def test_reversed_channels_are_detected(
-    reversed_channels: list[str], code: str, corrections: list[object] | None, seed: int
+    reversed_channels: list[str], code: str, corrections: list[object] | None
 ) -> None:
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(17)
     R = Rotation.random(18, rng=rng).as_matrix()
     signs = [-1.0 if channel in reversed_channels else 1.0 for channel in F + T]
     result = solved(R, noisy(rng, R) * signs)

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
@@ -50,6 +51,7 @@ def simulated(verifications: int, calibrations: int) -> list[list[BiasChange]]:
     return found
 
 
+@pytest.mark.slow
 def test_both_sigmas_are_those_of_a_simulation() -> None:
     """Verifications of one calibration scatter by `sigma`, their means by `calibration_sigma`."""
     found = simulated(20, 100)

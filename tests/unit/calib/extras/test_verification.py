@@ -246,6 +246,7 @@ def test_an_error_that_a_fit_of_six_poses_cannot_find_is_no_false_alarm() -> Non
         assert verify(calibration, R, wrench, noise_of(6), fitted=fitted).passed
 
 
+@pytest.mark.slow
 def test_a_walk_that_a_fit_of_six_poses_finds_in_part_is_no_false_alarm() -> None:
     for seed in (19, 56, 61):  # taken in part for a slope or noise, or all for noise
         rng = np.random.default_rng(seed)
@@ -266,7 +267,7 @@ def test_a_change_is_found_all_the_same() -> None:
     assert (found.passed, found.change) == (False, "bias")
 
 
-@pytest.mark.parametrize("poses", [24, 6])
+@pytest.mark.parametrize("poses", [24, pytest.param(6, marks=pytest.mark.slow)])
 def test_hysteresis_is_no_false_alarm_and_hides_no_change(poses: int) -> None:
     R, new = special(range(1, 25)) if poses == 24 else special(SUBSET_6), orientations(6)
     lag = 0.002

@@ -50,6 +50,7 @@ class Gripper:
         )
 
 
+@pytest.mark.slow
 def test_sigmas_hold_after_a_zero_in_the_same_pose() -> None:
     errors, com = [], []
     for seed in range(100):
@@ -70,6 +71,7 @@ def test_sigmas_hold_after_a_zero_in_the_same_pose() -> None:
     assert np.mean(com) < 1.2  # along gravity it is assumed, and mostly nearer
 
 
+@pytest.mark.slow
 def test_without_a_zero_the_sigma_covers_half_a_newton_of_drift() -> None:
     for seed in range(30):
         gripper = Gripper(seed)

@@ -143,7 +143,9 @@ def test_errors_are_at_the_cramer_rao_bound(kind: str, runs: int) -> None:
     assert stats.kstest(p_values, "uniform").pvalue > 1e-3
 
 
-@pytest.mark.parametrize(("n", "degrees", "weight_in_sigma"), [(6, 180, 10), (12, 40, 30), (24, 20, 30)])
+@pytest.mark.parametrize(
+    ("n", "degrees", "weight_in_sigma"), [(6, 180, 10), (12, 40, 30), pytest.param(24, 20, 30, marks=pytest.mark.slow)]
+)
 def test_no_start_reaches_a_lower_minimum(n: int, degrees: float, weight_in_sigma: float) -> None:
     sigma = SIGMA * 100 / weight_in_sigma
     for seed in range(8):
@@ -180,7 +182,7 @@ def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
 # What is not sensor noise
 
 
-@pytest.mark.parametrize(("n", "bumped"), [(24, 6), (12, 3)])
+@pytest.mark.parametrize(("n", "bumped"), [pytest.param(24, 6, marks=pytest.mark.slow), (12, 3)])
 @pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: bool) -> None:
     error, least, missed, false = np.zeros(5), np.zeros(5), 0, 0
@@ -345,7 +347,7 @@ def random_known(name: str, p: Parameters, rng: np.random.Generator) -> Known:
     ],
 )
 def test_knowledge_is_used_for_what_it_is_worth(name: str, unknowns: int) -> None:
-    runs = 8
+    runs = 4
     distance, chi2 = [], []
     for seed in range(runs):
         rng = np.random.default_rng(seed)
@@ -484,7 +486,7 @@ def test_the_blocks_of_the_inverse_are_those_of_the_dense_one(n: int) -> None:
     np.testing.assert_allclose(beside, inverse[range(n - 1), :, range(1, n)], atol=1e-12)
 
 
-@pytest.mark.parametrize("bumped", [0, 12])
+@pytest.mark.parametrize("bumped", [pytest.param(0, marks=pytest.mark.slow), 12])
 def test_among_many_poses_larger_noise_rejects_none_and_bumped_poses_are_rejected(bumped: int) -> None:
     rng = np.random.default_rng(4)
     p, R = truth(rng), haar(rng, 600)

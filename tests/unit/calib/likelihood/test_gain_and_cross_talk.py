@@ -95,6 +95,7 @@ def test_the_error_of_the_prediction_is_as_stated() -> None:
     assert 4 < np.mean(distances) < 10
 
 
+@pytest.mark.slow
 def test_nothing_is_found_in_a_sensor_without_error() -> None:
     found = 0
     for seed in range(60):
@@ -167,8 +168,9 @@ def test_it_is_kept_in_the_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(document["response"]["force_gain"], result.response.force_gain)
 
 
-@pytest.mark.parametrize("seeds", [12, pytest.param(100, marks=pytest.mark.slow)])
-def test_sigmas_of_the_tool_include_what_gain_and_cross_talk_hide(seeds: int) -> None:
+@pytest.mark.slow
+def test_sigmas_of_the_tool_include_what_gain_and_cross_talk_hide() -> None:
+    seeds = 100
     z, compensation = [], []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)

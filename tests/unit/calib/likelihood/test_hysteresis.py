@@ -66,6 +66,7 @@ def test_the_shown_error_is_that_of_a_prediction_that_knows_no_swing() -> None:
     assert np.std(best.left_out_residuals[1:]) == pytest.approx(np.std(lag), rel=0.3)
 
 
+@pytest.mark.slow
 def test_it_is_not_found_where_there_is_none() -> None:
     found = sum("hysteresis" in fit(*session(seed, 0.0), np.diag(SIGMA**2)).components for seed in range(30))
     assert found <= 1

@@ -171,7 +171,7 @@ def test_minima_are_distinct_ascending_and_stationary(seed: int) -> None:
         assert all(cost(Q, m.R @ near) > m.cost for near in around)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_brute_force_finds_no_other_minimum(seed: int) -> None:
     Q = wishart(seed)
     if seed % 2:

@@ -115,7 +115,7 @@ def other_poses(swept: Recorded) -> Recorded:
     [
         (lambda s: replace(s, t_pose_s=s.t_pose_s + 0.5), "clock_offset"),
         (compensated, "wrench_compensated"),
-        (other_poses, "other_recording"),
+        pytest.param(other_poses, "other_recording", marks=pytest.mark.slow),
         (lambda s: replace(s, wrench=s.wrench * [1, -1, 1, -1, 1, -1]), "forces_reversed"),
         (lambda _: record(TRUTH, sweep(SWEEP_S, (0.17, 0.17, 0.17)), SWEEP_S, 1), "motion_narrow"),
     ],

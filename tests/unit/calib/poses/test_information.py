@@ -125,12 +125,12 @@ def test_published_table_of_fixed_sets(numbers: tuple[int, ...], figures: list[f
 @pytest.mark.parametrize(
     ("degrees", "figures"),
     [
-        (120, [1.23, 1.7, 0.126, 0.084, 0.0102, 0.0177, 0.13]),
+        pytest.param(120, [1.23, 1.7, 0.126, 0.084, 0.0102, 0.0177, 0.13], marks=pytest.mark.slow),
         pytest.param(90, [1.55, 2.6, 0.131, 0.084, 0.0104, 0.0183, 0.14], marks=pytest.mark.slow),
         pytest.param(60, [2.8, 6.3, 0.167, 0.087, 0.0131, 0.0250, 0.17], marks=pytest.mark.slow),
         (45, [4.1, 11, 0.220, 0.093, 0.0177, 0.0347, 0.22]),
         pytest.param(30, [6.3, 24, 0.325, 0.105, 0.0285, 0.0535, 0.32], marks=pytest.mark.slow),
-        (15, [13, 82, 0.64, 0.11, 0.060, 0.109, 0.62]),
+        pytest.param(15, [13, 82, 0.64, 0.11, 0.060, 0.109, 0.62], marks=pytest.mark.slow),
     ],
 )
 def test_published_table_of_chosen_sets_in_cones(degrees: int, figures: list[float]) -> None:

@@ -454,7 +454,7 @@ def test_the_ways_to_stop(
 @pytest.mark.parametrize(
     "trouble", [{}, {"stopping_works": False}, {"hanging": {"stop", "tcp_offset"}}, {"hanging": {"stop", "progress"}}]
 )
-@pytest.mark.parametrize("delay_s", [0.3, 0.311, 0.333, 0.347, 0.402, 0.404])
+@pytest.mark.parametrize("delay_s", [0.3, 0.333, 0.404])
 def test_a_move_that_is_stopped_reports_the_stop(
     arm: UrArm, controller: Controller, clock: FakeClock, trouble: dict[str, Any], delay_s: float
 ) -> None:

@@ -3,6 +3,9 @@
 import json
 import sqlite3
 from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,12 +15,17 @@ import pytest
 
 from ftcalib import CalibrationResult
 from ftdrive import cli
-from ftdrive.commands.common import index_run
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.commands.common import Source, index_run
+from ftdrive.commands.live_source import open_log
 from ftdrive.runs.run import Run
+from ftdrive.runs.weighings import FOLDER, WeighingsFile
 from ftdrive.session import session
 from ftdrive.store.database import default_file
+from ftdrive.store.records import user_folder
 from ftdrive.store.store import Store
-from tests.unit.ftdrive.live.simulated import calibrated
+from ftdrive.store.tables import SCHEMA
+from tests.unit.ftdrive.live.simulated import calibrated, info
 from tests.unit.ftdrive.store.run_folders import new_run, result, verified
 
 Ran = tuple[int, str, str]
@@ -86,6 +94,28 @@ def test_as_json_it_is_one_object(run: Callable[..., Ran], runs: Path) -> None:
     assert json.loads(run("history", runs, "--json")[1])["store"] is None
 
 
+def test_the_last_weighing_of_each_tool_is_a_line_and_days_are_a_table(run: Callable[..., Ran], runs: Path) -> None:
+    assert "No weighings. `ftdrive weigh`" in run("history", "--weighings")[2]
+    run("history", "--index", runs)
+    days = [(datetime.now(UTC) - timedelta(days=27 - n)).date().isoformat() for n in range(28)]
+    for n, day in enumerate(days):
+        file = WeighingsFile.of(user_folder() / FOLDER, {"tool": "gripper", "arm_serial": "arm-1"}, day)
+        part = {"t_utc": f"{day}T10:15:00+00:00", "is_something": True, "mass_sigma_kg": 1e-3, "mass_kg": 0.2 + n / 1e3}
+        file.append([part, {"refused": "cable"}, {"refused": "cable"}])
+    run("history", "--index", user_folder() / FOLDER)
+    (line,) = [one for one in run("history")[1].splitlines() if one.startswith("last weighing: ")]
+    assert line == f"last weighing: gripper, {days[-1]} 10:15: 0.2270 ± 0.0010 kg; 1 part, 2 refused on this day"
+    assert "last weighing" not in run("history", "--tool", "drill")[1]
+    table = run("history", "--weighings")[1].splitlines()
+    assert len(table) == 1 + 20
+    assert table[-1].split()[:7] == [days[-1], "arm-1", "gripper", "1", "2", "cable", "10:15:00"]
+    found = json.loads(run("history", "--weighings", "--json")[1])["weighings"]
+    assert [one["day"] for one in found] == days[-20:]
+    assert found[-1]["refusals"]["cable"] == 2
+    assert json.loads(run("history", "--json")[1])["last_weighings"][0]["mass_kg"] == 0.227
+    assert run("history", runs, "--weighings")[0] == 2
+
+
 def test_rebuilt_a_deleted_run_is_gone_and_a_damaged_one_is_named(run: Callable[..., Ran], runs: Path) -> None:
     run("history", "--index", runs)
     (runs / "gripper-0" / "calibration.json").write_text("{")
@@ -105,12 +135,12 @@ def test_a_store_that_cannot_be_used_is_one_sentence(
 ) -> None:
     Store().index(runs)
     with sqlite3.connect(default_file()) as connection:
-        connection.execute("UPDATE ftdrive_schema SET version = 4")
+        connection.execute(f"UPDATE ftdrive_schema SET version = {SCHEMA + 1}")
     connection.close()
     for arguments in (["history"], ["history", "--index", runs], ["diff", "abcd", "abcd"]):
         code, out, err = run(*arguments)
         assert (code, out) == (6, "")
-        assert "has version 4, this ftdrive uses version 3: install a newer ftdrive" in err
+        assert f"has version {SCHEMA + 1}, this ftdrive uses version {SCHEMA}: install a newer ftdrive" in err
     monkeypatch.setenv("FTDRIVE_STORE_URL", "mysql://host/db")
     code, _, err = run("history")
     assert (code, "begins with mysql" in err) == (2, True)
@@ -248,3 +278,22 @@ def test_the_temperature_is_a_column_if_a_sensor_reports_it(run: Callable[..., R
     titles, row, _ = run("history", tmp_path / "warm")[1].splitlines()
     assert titles.split()[-1] == "°C"
     assert row.split()[-1] == "31"
+
+
+@pytest.mark.parametrize("emulated", [False, True])
+def test_weighings_are_kept_with_a_calibration_of_a_file(
+    emulated: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    calibration = result(1, station={} if emulated else None)
+    config = CellConfig(RobotConfig(host="10.0.0.7"), SensorConfig("ati-can://can0"))
+    stream: Any = SimpleNamespace(info=replace(info(calibration), emulated=emulated), cell=config)
+    source = Source(None, None, False, None, None, None, emulated)
+    with ExitStack() as stack:
+        assert (open_log(source, stream, stack, print) is None) == emulated
+        log = open_log(source._replace(path=tmp_path), stream, stack, print)
+        assert log is not None
+        log.refused("cable")
+    (day,) = Store().weighings(9)
+    assert (day.tool, day.calibration_id, day.robot_host) == ("gripper", calibration.id, "10.0.0.7")
+    assert (day.emulated, day.refusals["cable"], day.last_utc) == (emulated, 1, None)

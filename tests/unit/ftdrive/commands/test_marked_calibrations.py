@@ -53,7 +53,9 @@ USES = {
 }
 
 
-@pytest.mark.parametrize("name", USES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "fleet" else name for name in USES]
+)
 def test_an_edited_calibration_is_refused_unless_it_is_forced_and_then_marked(
     name: str, run: Callable[..., Ran]
 ) -> None:

@@ -2,6 +2,8 @@
 
 import errno
 import json
+import re
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -316,6 +318,53 @@ def test_damage_and_control_c_keep_what_was_before(
     assert (len(found.rows), found.cut) == (kept, "")
     assert 8192 <= kept <= 16_400
     np.testing.assert_array_equal(found.rows["seq"], (1 << 33) + np.arange(kept))
+
+
+KILLED = """
+import os, signal, sys
+from ftdrive.cli import main
+from ftdrive.recording.growing_file import GrowingFile
+
+add = GrowingFile.add
+
+def killed_amid(file, *contents):
+    if file.samples == 16384:
+        content = b"".join(contents)
+        add(file, content[: len(content) // 2])
+        os.kill(os.getpid(), signal.SIGKILL)
+    return add(file, *contents)
+
+GrowingFile.add = killed_amid
+sys.exit(main())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ending", [".mcap", ".csv", ".parquet"])
+def test_kill_9_amid_a_write_leaves_all_blocks_before(
+    ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path, target = Path("a.parquet"), f"b{ending}"
+    recorder = Recorder([path], info(), {})
+    for start in range(0, 65_600, 8200):
+        recorder.write(block(8200, start, step_ns=2_000_000))
+    recorder.close()
+    command = ["compensate", str(path), "-o", target]
+    outcome = subprocess.run([sys.executable, "-c", KILLED, *command], capture_output=True, text=True, check=False)
+    assert (outcome.returncode, outcome.stdout, outcome.stderr) == (-signal.SIGKILL, "", "")
+    assert not Path(target).exists()
+    assert cli.run(command) == 6
+    assert f"`ftdrive convert {target}.partial NEW{ending}`" in " ".join(capsys.readouterr().err.split())
+    assert cli.run(["convert", f"{target}.partial", f"kept{ending}", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert err.count(f"{target}.partial is incomplete") == 1
+    assert re.search(r"\): \d+\.\d s of it are saved\.", " ".join(err.split()))
+    Path(f"{target}.partial").unlink()
+    assert cli.run(command) == 0
+    kept, whole = read_recording(f"kept{ending}").rows, read_recording(target).rows
+    assert json.loads(out)["samples"] == len(kept) == 16384
+    assert kept.tobytes() == whole[: len(kept)].tobytes()
 
 
 @pytest.mark.parametrize(

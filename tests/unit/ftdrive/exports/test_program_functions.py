@@ -9,13 +9,14 @@ from ftdrive.commands.export import urscript
 from ftdrive.exports.program_functions import functions
 
 
-@pytest.mark.parametrize("first", [24, 33])
-def test_every_name_has_its_register(first: int) -> None:
+@pytest.mark.parametrize(("first", "doubles"), [(24, 22), (26, 22), (27, 15), (33, 15)])
+def test_every_name_has_its_register(first: int, doubles: int) -> None:
     text = functions(first, example=True)
     assert "<" not in text.replace("<=", "").replace(" < ", "")
     assert f"read_input_integer_register({first + 4})" in text
-    assert f"read_input_float_register({first + 14})" in text
-    assert f"read_input_float_register({first + 15})" not in text
+    assert ("def ftd_bias" in text) == (doubles == 22), "the tracked bias has no room behind a later register"
+    assert f"read_input_float_register({first + doubles - 1})" in text
+    assert f"read_input_float_register({first + doubles})" not in text
     assert "read_input_integer_register(23)" not in text
 
 

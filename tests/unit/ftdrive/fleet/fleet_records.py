@@ -12,7 +12,15 @@ from ftcalib.model import Array
 from ftdrive.fleet.observed import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification
+from ftdrive.runs.weighings import REFUSALS
+from ftdrive.store.records import (
+    BriefVerification,
+    StoredCell,
+    StoredResult,
+    StoredVerification,
+    StoredWeighings,
+    summed,
+)
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.live.simulated import calibrated
 
@@ -84,6 +92,29 @@ def daily(of: StoredResult, days: int, seed: int = 0, added: Array | None = None
     return [check(of, days - 1 - i, bias_change=(SIGMA * row).tolist(), **more) for i, row in enumerate(values)]
 
 
+def weighed(name: str, days_ago: float, **more: Any) -> StoredWeighings:
+    """The last weighing of the cell `name`."""
+    at = time(days_ago)
+    values: dict[str, Any] = {
+        "id": f"weighings-{name}-{days_ago:g}",
+        "path": f"/weighings/{name}-{days_ago:g}.ndjson",
+        "tool": "gripper",
+        "arm_serial": f"arm-{name}",
+        "sensor_serial": f"ft-{name}",
+        "robot_host": f"host-{name}",
+        "calibration_id": f"{name}-1",
+        "emulated": False,
+        "size": 1000,
+        "day": at[:10],
+        "weighings": 7,
+        "refusals": dict.fromkeys(REFUSALS, 0) | {"cable": 2},
+        "last_utc": at,
+        "mass_kg": 0.25,
+        "mass_sigma_kg": 1e-3,
+    }
+    return StoredWeighings(**(values | more))
+
+
 def time(days_ago: float) -> str:
     return (NOW - timedelta(days=days_ago)).isoformat(timespec="microseconds")
 
@@ -104,14 +135,15 @@ class FakeStore:
     kept_cells: Sequence[StoredCell] = ()
     kept_results: Sequence[StoredResult] = ()
     kept_checks: Sequence[StoredVerification] = field(default_factory=list)
+    kept_weighings: Sequence[StoredWeighings] = ()
 
     def cells(self) -> list[StoredCell]:
         return sorted(self.kept_cells, key=lambda one: one.name)
 
     def fleet(
         self, newest: int, since: datetime
-    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification]]:
-        return self.cells(), self._newest_accepted(newest), self._checks(since)
+    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[StoredWeighings]]:
+        return self.cells(), self._newest_accepted(newest), self._checks(since), summed(self.kept_weighings)
 
     def _newest_accepted(self, most: int) -> list[StoredResult]:
         found = sorted(self.kept_results, key=lambda one: (one.created_utc or "", one.id), reverse=True)
@@ -134,12 +166,22 @@ class FakeStore:
         return max(found, key=lambda one: one.created_utc or "", default=None)
 
 
-def store(cells: Sequence[StoredCell], results: Sequence[StoredResult], checks: Sequence[Any] = ()) -> Store:
-    return cast("Store", FakeStore(cells, results, checks))
+def store(
+    cells: Sequence[StoredCell],
+    results: Sequence[StoredResult],
+    checks: Sequence[Any] = (),
+    weighings: Sequence[StoredWeighings] = (),
+) -> Store:
+    return cast("Store", FakeStore(cells, results, checks, weighings))
 
 
-def fleet(cells: Sequence[StoredCell], results: Sequence[StoredResult], checks: Sequence[Any] = ()) -> Fleet:
-    return fleet_state(store(cells, results, checks), NOW)
+def fleet(
+    cells: Sequence[StoredCell],
+    results: Sequence[StoredResult],
+    checks: Sequence[Any] = (),
+    weighings: Sequence[StoredWeighings] = (),
+) -> Fleet:
+    return fleet_state(store(cells, results, checks, weighings), NOW)
 
 
 def observed(cells: Sequence[StoredCell], results: Sequence[StoredResult], checks: Sequence[Any] = ()) -> Observed:

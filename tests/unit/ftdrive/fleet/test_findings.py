@@ -9,7 +9,7 @@ import pytest
 from ftcalib.model import Array
 from ftdrive.fleet.state import FleetFinding
 from ftdrive.store.records import StoredResult
-from tests.unit.ftdrive.fleet.fleet_records import cell, check, daily, fleet, result
+from tests.unit.ftdrive.fleet.fleet_records import cell, check, daily, fleet, result, weighed
 from tests.unit.ftdrive.live.simulated import calibrated
 
 MASS_KG = result("a", 1).mass_kg
@@ -136,3 +136,24 @@ def test_late_verifications_are_one_finding() -> None:
     assert one.words == "The verifications of a and b are late, that of a by 23 d: run `ftdrive fleet verify --due`"
     (alone,) = fleet([cell("a")], results).findings
     assert alone.words.startswith("The verification of a is late by 23 d")
+
+
+@pytest.mark.parametrize(
+    ("weighings", "refusals", "days_ago", "named"),
+    [
+        (10, {"cable": 8, "moving": 3}, 1.0, True),
+        (10, {"cable": 8, "moving": 2}, 1.0, False),
+        (2, {"cable": 7}, 1.0, False),
+        (0, {"cable": 90}, 5.0, False),
+    ],
+    ids=["most", "half", "few", "past"],
+)
+def test_a_cell_that_cannot_weigh_most_parts_is_named(
+    weighings: int, refusals: dict[str, int], days_ago: float, named: bool
+) -> None:
+    last = weighed("a", days_ago, weighings=weighings, refusals=refusals)
+    cells = [cell(name, verify_every_days=1000.0) for name in "ab"]
+    findings = fleet(cells, [result("a", 9), result("b", 9)], (), [last, weighed("b", 0.0)]).findings
+    assert [(one.kind, one.cells) for one in findings] == ([("weighing", ("a",))] if named else [])
+    if named:
+        assert "11 of 21 weighings with gripper were refused on 2026-11-21, mostly as 'cable'" in findings[0].words

@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.fleet.metrics import NAMES, MetricsServer
-from ftdrive.fleet.state import FleetFinding
+from ftdrive.fleet.state import FleetFinding, Weighings
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
 
 Samples = dict[tuple[str, str], float]
@@ -86,6 +86,24 @@ def test_every_field_of_a_cell_is_a_metric_and_what_is_unknown_is_absent(server:
     }
 
 
+def test_weighings_are_a_mass_a_time_and_counters(server: MetricsServer) -> None:
+    at = NOW - timedelta(hours=1)
+    some = Weighings("2026-11-22", 40, {"cable": 3, "contact": 1}, at.isoformat(), 0.25, 1e-3)
+    none = Weighings("2026-11-22", 0, {"cable": 5}, None, None, None)
+    server.update(reading(cell("A", weighings=some), cell("B", weighings=none), cell("C")))
+    found = samples(server)
+    assert {name: value for name, value in found.items() if name[0].startswith("ftdrive_weighing_")} == {
+        ("ftdrive_weighing_mass_kilograms", "A"): 0.25,
+        ("ftdrive_weighing_sigma_kilograms", "A"): 1e-3,
+        ("ftdrive_weighing_timestamp_seconds", "A"): at.timestamp(),
+    }
+    assert {cell: value for (name, cell), value in found.items() if name == "ftdrive_weighings_total"} == {
+        "A": 40,
+        "B": 0,
+    }
+    assert 'ftdrive_weighings_refused_total{cell="A",code="contact",tool="gripper"} 1.0' in scraped(server)
+
+
 def test_a_cell_that_disappears_disappears(server: MetricsServer) -> None:
     assert samples(server) == {}
     server.update(reading(cell("A"), cell("B")))
@@ -102,18 +120,24 @@ def test_tools_of_a_cell_are_distinguished_and_any_name_is_escaped(server: Metri
     assert marks == {("gripper", "false"), ("drill", "true")}
     masses = {tuple(one.labels.values()): one.value for one in families["ftdrive_tool_mass_kilograms"].samples}
     assert masses == {(name, "gripper"): 1.25, (name, "drill"): 2.0}
-    assert families.keys() == set(NAMES)
+    assert families.keys() == {one.removesuffix("_total") for one in NAMES}, (
+        "the parser leaves the end of a counter out"
+    )
 
 
 def test_names_and_units_are_those_prometheus_asks_for(server: MetricsServer) -> None:
     promtool = shutil.which("promtool")
     if promtool is None:
         pytest.skip("promtool is not installed")
-    server.update(reading(cell("A", temperature_C=30.0)))
+    weighings = Weighings("2026-11-22", 40, {"cable": 3}, NOW.isoformat(), 0.25, 1e-3)
+    server.update(reading(cell("A", temperature_C=30.0, weighings=weighings)))
     command = [promtool, "check", "metrics"]
     checked = subprocess.run(command, input=scraped(server), capture_output=True, text=True, check=False)
     assert checked.stdout == ""
-    assert checked.stderr.splitlines() == ['ftdrive_tool_mass_kilograms use base unit "grams" instead of "kilograms"']
+    names = ("tool_mass", "weighing_mass", "weighing_sigma")
+    assert checked.stderr.splitlines() == [
+        f'ftdrive_{name}_kilograms use base unit "grams" instead of "kilograms"' for name in names
+    ]
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "203.0.113.7"])

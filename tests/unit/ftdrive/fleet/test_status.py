@@ -5,9 +5,9 @@ from datetime import timedelta
 import numpy as np
 
 from ftdrive.fleet.status import fleet_state
-from ftdrive.fleet.words import attention, summary
+from ftdrive.fleet.words import attention, summary, weighed_in_words
 from ftdrive.store.store import Store
-from tests.unit.ftdrive.fleet.fleet_records import NOW, cell, check, daily, fleet, result
+from tests.unit.ftdrive.fleet.fleet_records import NOW, cell, check, daily, fleet, result, time, weighed
 
 
 def test_the_newest_accepted_calibration_of_each_tool_counts() -> None:
@@ -146,3 +146,28 @@ def test_a_store_gives_the_same_state_as_its_records(store_url: str) -> None:
         store._write(connection, [made, other, *more, *checks])
     assert fleet_state(store, NOW) == fleet(cells, [made, other, *more], checks)
     assert [one.id for one in store.fleet(2, NOW)[1] if one.tool is None] == ["b-210", "b-200"]
+
+
+def test_the_last_weighing_is_that_of_the_same_cell_tool_and_kind_of_cell() -> None:
+    results = [result("a", 20, tool="drill"), result("a", 3), result("b", 1, emulated=True), result("c", 1)]
+    weighings = [
+        weighed("a", 2.0),
+        weighed("a", 5.0, mass_kg=0.9, robot_host="an older address"),
+        weighed("a", 0.0, emulated=True),
+        weighed("b", 0.0, mass_kg=0.4, emulated=True),
+        weighed("c", 1.0, last_utc=None, mass_kg=None, mass_sigma_kg=None, weighings=0),
+        weighed("x", 0.0),
+    ]
+    states = fleet([cell("a"), cell("b"), cell("c")], results, (), weighings).cells
+    found = [(one.cell, one.tool, one.weighings and one.weighings.mass_kg) for one in states]
+    assert found == [("a", "drill", None), ("a", "gripper", 0.25), ("b", "gripper", 0.4), ("c", "gripper", None)]
+    gripper = states[1].to_dict(NOW)["weighings"]
+    assert gripper == {
+        "day": time(2.0)[:10],
+        "number": 7,
+        "refused": {"cable": 2},
+        "last_utc": time(2.0),
+        "mass_kg": 0.25,
+        "mass_sigma_kg": 1e-3,
+    }
+    assert [weighed_in_words(one, NOW) for one in states] == ["-", "0.250 kg 2 d", "0.400 kg 0 min", "-"]

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
+from ftcalib.extras.temperature import BiasTemperature
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.errors import ConfigError
 from ftdrive.library import open_stream
@@ -19,6 +20,8 @@ from ftdrive.live.contact import Contact
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.source import read_calibration
+from ftdrive.store import tools as named_tools
+from ftdrive.store.tools import Tool
 from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmStates, DeviceInfo, FtSamples, Health
@@ -80,7 +83,7 @@ class Link:
         for left_s in self.clock.looks(timeout_s):
             if self._due() > self.sent and not self.silent:
                 break
-            self.clock.advance(min(left_s, 0.005))
+            self.clock.advance(min(left_s, 0.02))
         if self.silent and timeout_s:
             self.clock.advance(0.3)
         if self.silent:
@@ -96,6 +99,10 @@ class Link:
 
 class Sensor(Link):
     push = np.zeros(6)
+    now_C: float | None = None
+
+    def temperature_C(self) -> float | None:
+        return self.now_C
 
     def rows(self, numbers: Any, t_ns: Any) -> FtSamples:
         rng = np.random.default_rng(int(numbers[0]) if len(numbers) else 0)
@@ -350,3 +357,32 @@ def test_a_stream_is_opened_from_paths(cell: Cell, tmp_path: Any) -> None:
     assert read_calibration(tmp_path).mass_kg == pytest.approx(cell.calibration.mass_kg)  # as a run folder
     with pytest.raises(ConfigError, match="no calibration"):
         open_stream(cell.config)
+
+
+def test_the_bias_follows_the_temperature_of_the_sensor(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    slope, sigma = np.array([0.2, 0, 0, 0, 0, 0.01]), np.full(6, 1e-3)
+    errors = np.full(2, 0.1), np.full(2, 0.5)
+    warmth = BiasTemperature(slope, sigma, 12, 20.0, 40.0, *errors, np.zeros(2))
+    made = replace(cell.calibration, provenance={**cell.calibration.provenance, "temperature_C": 25.0})
+    monkeypatch.setattr(named_tools, "calibration_of_tool", lambda *_, **__: Tool(made, Path("c.json"), (), warmth))
+    cell.sensor.now_C = 25.0
+
+    def wait(seconds: float) -> None:
+        end_s = cell.clock.now_s() + seconds
+        until(stream, lambda: cell.clock.now_s() > end_s)
+
+    with CompensatedStream(cell.config, "gripper") as stream:
+        wait(1.5)
+        cell.sensor.now_C = 31.0
+        cell.sensor.push = 6 * slope
+        wait(1.0)
+        wrench = stream.read().wrench.mean(axis=0)
+        assert np.abs(wrench / NOISE).max() < 3, "what the temperature does is no force"
+        (event,) = [event for event in stream.take_events() if event.kind == "temperature"]
+        assert event.values == {"temperature_C": 31.0, "change": pytest.approx((6 * slope).tolist())}
+        assert stream.tare().kind == "tare"
+        assert stream.status().tare == pytest.approx(6 * slope, abs=0.1)
+        cell.sensor.now_C, cell.sensor.push = 33.0, 8 * slope
+        wait(1.0)
+        assert np.abs(stream.read().wrench.mean(axis=0) / NOISE).max() < 3, "from the tare on only what came after it"
+        assert not stream.read().in_contact.any()

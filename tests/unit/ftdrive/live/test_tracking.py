@@ -60,6 +60,7 @@ class Program:
             self.off.append(float(np.abs((self.last.bias - bias) / self.last.sigma).max()))
 
 
+@pytest.mark.slow
 def test_parts_and_contacts_do_not_reach_the_bias() -> None:
     program, steps = Program(1), list[float]()
     program.turn(30)

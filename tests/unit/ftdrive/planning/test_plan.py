@@ -42,7 +42,9 @@ def planned(certifier: Certifier, q: Array = USUAL_POSTURE_RAD, poses: int = 24,
     return plan_tour(certifier, q, poses, speeds=speeds or Speeds(), guess=guess_of(certifier))
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    "model", [model if model in {"UR3e", "UR10e"} else pytest.param(model, marks=pytest.mark.slow) for model in MODELS]
+)
 def test_figures_of_the_constant_tour(model: str) -> None:
     plan = planned(certifier_of(model), speeds=NO_TIP_LIMIT)
     document = plan.to_dict()

@@ -141,7 +141,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> Any:
 @pytest.mark.parametrize(
     ("plugin", "topics", "pose_topic"),
     [
-        (StoragePlugin.SQLITE3, ("/ft", "/pose"), None),
+        pytest.param(StoragePlugin.SQLITE3, ("/ft", "/pose"), None, marks=pytest.mark.slow),
         pytest.param(StoragePlugin.MCAP, ("/ft", "/pose"), "/pose", marks=pytest.mark.slow),
         (StoragePlugin.MCAP, ("/ft", "/tf", "/tf_static"), "tf?base=base&flange=flange"),
         pytest.param(

@@ -12,7 +12,7 @@ from ftcalib.errors import BadDataset
 from ftcalib.model import predict
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
-from ftdrive.recording import Header, Recording, read_recording
+from ftdrive.recording import Header, Recording, number_table, read_recording
 from ftdrive.recording.compensation import compensated, estimated_bias
 from ftdrive.recording.csv_pair import CsvPair, numbers_of
 from ftdrive.recording.recording import rows_of
@@ -143,6 +143,23 @@ def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(orientation: st
     assert (fixed.delay_s, fixed.delay_sigma_s) == (0.0, 0.0)
     assert rms < 1.2 * np.sqrt(3) * 0.002
     assert compensated(fixed, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"] > 1.5 * rms
+
+
+@pytest.mark.parametrize("damaged", ["wrench.csv", "poses.csv"])
+def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
+    damaged: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = write_pair(tmp_path, 0.012, "qx,qy,qz,qw")
+    lines = (tmp_path / damaged).read_text().splitlines()
+    lines[len(lines) * 2 // 3] = "?"
+    (tmp_path / damaged).write_text("\n".join(lines))
+    monkeypatch.setattr(number_table, "_READ_BYTES", 1 << 14)
+    found = CsvPair(*files, calibration(), "c", None)
+    assert found.delay_s == pytest.approx(0.012, abs=2e-3)
+    numbers, failure = compensated(found, WrenchFrame(), tmp_path / "new.csv")
+    assert isinstance(failure, BadDataset)
+    assert f"{damaged}, after row" in numbers["cut"]
+    assert 4000 < numbers["samples"] == len(read_recording(tmp_path / "new.csv").rows) <= 5100
 
 
 @pytest.mark.parametrize(

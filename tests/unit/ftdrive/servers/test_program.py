@@ -7,7 +7,7 @@ import pytest
 
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import WrenchFrame
-from ftdrive.servers.program import DOUBLES, INTEGERS, ProgramService
+from ftdrive.servers.program import CODES, INTEGERS, ProgramService, doubles_of
 from ftdrivers.errors import StreamBroken
 from tests.unit.ftdrive.live.simulated import calibrated, info
 from tests.unit.ftdrive.live.test_weighing import NOTHING, POSE, part, rests
@@ -21,14 +21,26 @@ class FakeRegisters:
         """Of a program before."""
         self.written: list[dict[str, float]] = []
         self.broken = False
+        self.names = INTEGERS + doubles_of("off")
 
     def write(self, integers: list[int], doubles: list[float]) -> None:
         if self.broken:
             raise StreamBroken("the cable is cut")
-        self.written.append(dict(zip((*INTEGERS, *DOUBLES), [*integers, *doubles], strict=True)))
+        self.written.append(dict(zip(self.names, [*integers, *doubles], strict=True)))
 
     def close(self) -> None:
         pass
+
+
+class FakeLog:
+    def __init__(self) -> None:
+        self.kept: list[float | str] = []
+
+    def weighed(self, values: dict[str, Any]) -> None:
+        self.kept.append(round(values["mass_kg"], 2))
+
+    def refused(self, code: str) -> None:
+        self.kept.append(code)
 
 
 class Cell:
@@ -40,7 +52,10 @@ class Cell:
         )
         self.registers = FakeRegisters()
         self.said: list[str] = []
-        self.service = ProgramService(cast("Any", self.stream), lambda: self.registers, self.said.append)
+        self.log = FakeLog()
+        self.service = ProgramService(
+            cast("Any", self.stream), lambda: self.registers, self.said.append, cast("Any", self.log)
+        )
 
     def run(self, seconds: float) -> dict[str, float]:
         n = 0
@@ -106,6 +121,22 @@ def test_a_zero_with_a_part_is_refused() -> None:
     assert cell.ask(6, ZERO, 0.8)["code"] == 8
 
 
+def test_the_tracked_bias_ages_while_a_contact_hides_it() -> None:
+    drifted = np.array([0.4, -0.3, 0.2, 0, 0, 0])
+    cell = Cell((POSE, drifted), (POSE, drifted + np.array([5.0, 8.0, 0, 0, 0, 0])), seconds=2.0)
+    assert cell.run(0.1)["tracking"] == 0
+    cell.stream.track = "show"
+    cell.registers.names = INTEGERS + doubles_of("show")
+    new = cell.run(0.1)
+    assert (new["tracking"], new["bias_age"], new["bias_fx"]) == (1, -1, 0), "not seen yet"
+    seen = cell.run(1.7)
+    assert 0 <= seen["bias_age"] < 1
+    assert [seen["bias_fx"], seen["bias_fy"], seen["bias_fz"]] == pytest.approx(drifted[:3], abs=0.1)
+    hidden = cell.run(1.5)
+    assert hidden["bias_age"] > 1
+    assert hidden["bias_fy"] == pytest.approx(-0.3, abs=0.1)
+
+
 def test_a_lost_controller_is_reported_once() -> None:
     cell = Cell((POSE, NOTHING))
     cell.run(0.1)
@@ -113,3 +144,20 @@ def test_a_lost_controller_is_reported_once() -> None:
     cell.run(0.1)
     assert len(cell.said) == 1
     assert "cable is cut" in cell.said[0]
+
+
+def test_answers_of_weighings_are_kept_and_others_are_not() -> None:
+    push = np.array([0, 8.0, 0, 0, 0, 0])
+    cell = Cell((POSE, NOTHING), (POSE, part(POSE, 0.8)), (POSE, part(POSE, 0.8)), (POSE, push), seconds=1.5)
+    cell.run(0.2)
+    assert cell.ask(6, ZERO)["state"] == 1
+    assert cell.ask(7, STATUS, 0.02)["state"] == 1
+    assert cell.ask(8, 99, 0.02)["state"] == 3
+    cell.run(0.6)
+    assert cell.ask(9, WEIGH)["state"] == 1
+    cell.run(2.2)
+    assert cell.ask(10, WEIGH)["state"] == 3
+    assert cell.log.kept == [
+        0.8,
+        next(name for name, code in CODES.items() if code == cell.registers.written[-1]["code"]),
+    ]

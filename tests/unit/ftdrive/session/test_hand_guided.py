@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import solve
 from ftcalib.errors import TooFewSamples
-from ftcalib.model import Array
-from ftcalib.routine import PoseRecord, Sampling, dataset_from, drift_check
+from ftcalib.model import Array, cross
+from ftcalib.routine import PoseRecord, dataset_from, drift_check
+from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
 from ftdrive.session.events import Compared, Estimated, Event, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.guards import Limits
@@ -91,8 +92,8 @@ class Cell(ForceTorqueSensor):
         k = int(np.searchsorted(self.starts, t_s, side="right")) - 1
         dwell, into_s = self.dwells[k], t_s - self.starts[k]
         if into_s <= dwell.seconds or k == len(self.dwells) - 1:
-            turned = Rotation.from_rotvec([dwell.creep_rad_s * into_s, 0, 0])
-            return dwell.at * turned, dwell.creep_rad_s, k
+            turned = Rotation.from_rotvec([dwell.creep_rad_s * into_s, 0, 0]) if dwell.creep_rad_s else None
+            return dwell.at if turned is None else dwell.at * turned, dwell.creep_rad_s, k
         way = (self.dwells[k + 1].at * dwell.at.inv()).as_rotvec()
         return Rotation.from_rotvec(way * (into_s - dwell.seconds) / MOVE_S) * dwell.at, 0.7, k
 
@@ -144,8 +145,8 @@ class Cell(ForceTorqueSensor):
         wrench = []
         for some in np.array_split(t, max(1, len(t) // 20)):  # the arm stands still for a tenth of a second each time
             R, _, k = self._where(some[0])
-            force = R.inv().apply([0, 0, -12.0])
-            load = np.concatenate([force, np.cross(COM_M, force)])
+            force = [0, 0, -12.0] @ R.as_matrix()
+            load = np.concatenate([force, cross(COM_M, force)])
             wrench.append(load + self.dwells[k].wrench(some - self.starts[k]))
         n = len(t)
         return FtSamples(

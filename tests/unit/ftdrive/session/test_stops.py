@@ -104,7 +104,19 @@ FAULTS: dict[str, tuple[int, Callable[[Lab], None], Callable[[Lab], None], type[
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "a protective stop",
+        "an emergency stop",
+        "a silent sensor",
+        "a silent controller",
+        *(
+            pytest.param(fault, marks=pytest.mark.slow)
+            for fault in ("a joint pushed off", "reduced mode", "a stuck sensor", "another client's program")
+        ),
+    ],
+)
 def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: Lab) -> None:
     hazard, inject, repair, _ = FAULTS[fault]
     lab.arm.at_move[4] = lambda: inject(lab)

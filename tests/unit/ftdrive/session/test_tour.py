@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftcalib.routine import Sampling
+from ftcalib.sampling import Sampling
 from ftdrive.cell.config import WorkcellConfig
 from ftdrive.errors import Declined, NotAccepted
 from ftdrive.planning.cell_plan import certifier_for
@@ -130,7 +130,9 @@ def test_how_long_to_average_is_chosen_from_the_noise_of_the_sensor(lab: Lab) ->
     assert f"average {average_s:.1f} s at each pose" in " ".join(note.words for note in lab.operator.of(Noted))
 
 
-@pytest.mark.parametrize("sampling", [Sampling(), Sampling(average_s=0.3, noise_record_s=0.0)])
+@pytest.mark.parametrize(
+    "sampling", [pytest.param(Sampling(), marks=pytest.mark.slow), Sampling(average_s=0.3, noise_record_s=0.0)]
+)
 def test_what_is_predicted_before_it_moves_comes_true(sampling: Sampling, lab: Lab) -> None:
     lab.cell = replace(lab.cell, sampling=sampling, tool=replace(lab.cell.tool, mass_kg=1.2))
     outcome = lab.calibrate()
@@ -187,7 +189,7 @@ def test_a_pose_that_is_skipped_where_the_arm_stands_counts_against_the_plan(lab
     assert "poses are missing" in lab.said()
 
 
-@pytest.mark.parametrize(("key", "answer"), [(Key.PAUSE, "resume"), (Key.PAUSE, "back"), (Key.STOP, "")])
+@pytest.mark.parametrize(("key", "answer"), [(Key.PAUSE, "back"), (Key.STOP, "")])
 def test_a_move_that_was_broken_off_counts_against_the_plan(key: Key, answer: str, lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(key)
     lab.operator.answers["poses are saved"] = [answer, "resume"]
@@ -284,7 +286,7 @@ def test_a_way_that_moves_the_whole_arm_asks_for_its_room(lab: Lab) -> None:
     )
 
 
-@pytest.mark.parametrize(("away_deg", "assumed"), [((0.0, 0.0), True), ((0.0, 9.0), True), ((9.0, 0.0), False)])
+@pytest.mark.parametrize(("away_deg", "assumed"), [((0.0, 9.0), True), ((9.0, 0.0), False)])
 def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_known(
     away_deg: tuple[float, float], assumed: bool, lab: Lab
 ) -> None:

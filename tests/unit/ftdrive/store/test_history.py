@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftcalib.model import Array
-from ftdrive.store.history import QuantityTrend, age_days, drifts, warnings
+from ftcalib.model import BIASES, Array
+from ftdrive.store.history import age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
+from ftdrive.store.temperature import temperatures
+from ftdrive.store.trends import QuantityTrend
 from tests.unit.ftdrive.live.simulated import calibrated
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
 
@@ -134,3 +136,26 @@ def test_another_temperature_is_named(tmp_path: Path, now_C: float, words: str) 
 def test_an_unknown_time_has_no_age() -> None:
     assert age_days(None, FIRST) is None
     assert age_days("2026-02-28T00:00:00.000000+00:00", FIRST) == 1.0
+
+
+def test_the_temperature_of_a_sensor_is_fitted_over_calibrations_and_verifications(tmp_path: Path) -> None:
+    slope = np.array([0.3, 0, -0.2, 0, 0.005, 0])
+    rng = np.random.default_rng(4)
+    first = result(0, np.zeros(15), temperature_C=25.0)
+    folder = new_run(tmp_path, "first", first)
+    for day, T in enumerate([22.0, 34.0, 28.0, 31.0, 24.0, 36.0], start=1):
+        change = (T - 25) * slope + rng.normal(size=6) * 0.01 * np.repeat([1, 0.03], 3)
+        values = {"value": change.tolist(), "sigma": [0.01] * 3 + [3e-4] * 3, "calibration_sigma": [1e-3] * 6}
+        verified(new_run(tmp_path, f"check-{day}"), first.id, day, temperature_C=T, bias_change=values)
+    step = np.zeros(15)
+    step[BIASES] = 10 * slope
+    new_run(tmp_path, "warm", result(8, step, temperature_C=35.0))
+    verified(folder, "of no known calibration", 9, temperature_C=60.0)
+    (found,) = temperatures(*records(tmp_path))
+    assert (found.fit.n, found.fit.coldest_C, found.fit.warmest_C) == (8, 22.0, 36.0)
+    assert np.abs((found.fit.slope - slope) / found.fit.sigma).max() < 4
+    assert found.to_dict()["applied"] == [True, True]
+    force, torque = found.lines()
+    assert "temperature, ft-1, force bias: +0." in force
+    assert force.endswith("applied by --tool")
+    assert "N·m/K (1 sigma, 8 runs, 22 to 36 °C)" in torque

@@ -81,6 +81,7 @@ def test_rebuilt_twice_it_is_identical_and_the_same_as_one_that_grew(runs: Path,
     assert len(grown) == 4 + 2 + 1  # one row has the version
 
 
+@pytest.mark.slow
 def test_it_is_the_same_in_every_database_whatever_its_order_of_texts(
     runs: Path, tmp_path: Path, postgres: Server
 ) -> None:

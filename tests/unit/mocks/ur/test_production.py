@@ -98,6 +98,7 @@ def test_a_held_part_weighs_on_the_sensor(watched: Watched) -> None:
         assert np.linalg.norm(felt_N - weight_N) < 4.0 * watched.mass_kg[k], "the rest is inertia"
 
 
+@pytest.mark.slow
 def test_a_seed_repeats_itself_and_contacts_can_be_left_out(tmp_path: Path, watched: Watched) -> None:
     def repeated(name: str, **how: Any) -> Watched:
         return Watched(tmp_path / name, 1.6, slip_m=0.005, **how)

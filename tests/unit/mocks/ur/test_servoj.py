@@ -64,7 +64,7 @@ def follow(robot: Robot, seconds: float) -> dict[str, NDArray[np.float64]]:
     return {name: np.array(values, dtype=float) for name, values in rows.items()}
 
 
-@pytest.mark.parametrize("scale", [1.0, 20.0])
+@pytest.mark.parametrize("scale", [pytest.param(1.0, marks=pytest.mark.slow), 20.0])
 def test_the_arm_follows_behind_by_the_lookahead_and_its_servo_lag(scale: float) -> None:
     robot = new_robot(time_scale=scale)
     robot.arm.speed_fraction = 0.5  # the slider does not act on servoj

@@ -150,7 +150,9 @@ def test_lids_and_edges_of_the_meshes_are_inside(model: str) -> None:
         assert outside.min() < 0.001, (name, point_mm)
 
 
-@pytest.mark.parametrize(("model", "tool"), [("UR3e", TOOLS[0]), ("UR16e", TOOLS[3])])
+@pytest.mark.parametrize(
+    ("model", "tool"), [("UR3e", TOOLS[0]), pytest.param("UR16e", TOOLS[3], marks=pytest.mark.slow)]
+)
 def test_constant_tour_is_clear(model: str, tool: tuple[Cylinder, ...]) -> None:
     poses = constant_tour(STANDS)
     moves = poses, np.roll(poses, -1, axis=0)

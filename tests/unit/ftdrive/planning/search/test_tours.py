@@ -53,7 +53,7 @@ def test_constant_tour_takes_24_moves_of_90_degrees_and_leaves_cables_alone() ->
     assert len(np.unique(shapes, axis=0)) == len(np.unique(shapes[list(DIFFERENT_SHAPES)], axis=0)) == 6
 
 
-@pytest.mark.parametrize(("model", "q6_deg"), [("UR5e", -170), ("UR3e", 80)])
+@pytest.mark.parametrize(("model", "q6_deg"), [pytest.param("UR5e", -170, marks=pytest.mark.slow), ("UR3e", 80)])
 @pytest.mark.parametrize("poses", [pytest.param(24, marks=pytest.mark.slow), 12])
 def test_wrist_3_stays_within_200_degrees_of_where_it_stands(model: str, q6_deg: float, poses: int) -> None:
     certifier = certifier_of(model)
@@ -102,7 +102,7 @@ def test_cone_tour_stays_in_its_cone_clear_and_says_what_the_cone_allows(
     assert "times that of all 24" in plan.why[-1]
 
 
-@pytest.mark.parametrize("lean_rad", [np.pi / 2, np.radians(26.6)])
+@pytest.mark.parametrize("lean_rad", [np.pi / 2, pytest.param(np.radians(26.6), marks=pytest.mark.slow)])
 def test_the_cone_is_about_straight_down_however_the_arm_is_mounted(lean_rad: float) -> None:
     certifier = certifier_of(scene=Scene(lean_rad=lean_rad))
     plan = plan_cone(certifier, poses=8, half_angle_rad=np.radians(40), speeds=Speeds(), guess=guess_of(certifier))

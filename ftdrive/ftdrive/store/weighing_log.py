@@ -1,0 +1,154 @@
+"""Keeps the weighings of a running program: in its file of the day, and in the store."""
+
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from threading import Thread
+from time import monotonic
+from typing import Any, Final
+
+from ftcalib.errors import DataError
+from ftcalib.files import JSON
+from ftdrive.errors import ConfigError
+from ftdrive.runs.weighings import FOLDER, WeighingsFile
+from ftdrive.store.records import user_folder, weighings_of
+
+EVERY_S: Final = 30.0
+"""Time between two writes to the store."""
+_GOODBYE_S: Final = 6.0
+"""So long the end of a program waits for the last write: a store is waited for 5 s."""
+_MOST_WAITING: Final = 1000
+"""Lines that wait for a disk; then the oldest are lost."""
+_NOT_INDEXED: Final = "Weighings are kept but not in the history yet"
+_Line = tuple[str, Mapping[str, JSON]]
+"""Day and content."""
+
+
+class WeighingLog:
+    """Writes in a thread of its own, so that a slow disk or database never delays a stream.
+
+    A failed write is reported once, and repeated with the next.
+
+    Parameters
+    ----------
+    origin : mapping
+        `tool`, `calibration_id`, `arm_serial`, `sensor_serial`, `robot_host` and `emulated`.
+    url : str, optional
+        Of the store.
+    say : callable
+        Takes a sentence for the operator, from any thread.
+    folder : Path, optional
+        Of the files; by default that of the user.
+    every_s : float
+        Time between two writes to the store, s.
+    now : callable
+        Returns the time, UTC.
+    """
+
+    def __init__(
+        self,
+        origin: Mapping[str, JSON],
+        url: str | None,
+        say: Callable[[str], object],
+        *,
+        folder: Path | None = None,
+        every_s: float = EVERY_S,
+        now: Callable[[], datetime] = lambda: datetime.now(UTC),
+    ) -> None:
+        self._origin, self._url, self._say, self._every_s, self._now = origin, url, say, every_s, now
+        self._folder = folder or user_folder() / FOLDER
+        self._lines = SimpleQueue[_Line | None]()
+        self._waiting = list[_Line]()
+        self._file: WeighingsFile | None = None
+        self._is_new = False
+        """Whether the file has lines that the store lacks."""
+        self._lacks_older = True
+        """Whether the store may lack other files of the folder."""
+        self._store: Any = None
+        self._said = set[str]()
+        self._thread = Thread(target=self._run, daemon=True, name="weighings")
+        self._thread.start()
+
+    def weighed(self, values: Mapping[str, JSON]) -> None:
+        """Keep a weighing, as `ftdrive.live.weighing.load_values` has it; returns at once."""
+        self._put(values)
+
+    def refused(self, code: str) -> None:
+        """Keep that nothing was weighed, and why; returns at once."""
+        self._put({"refused": code})
+
+    def close(self) -> None:
+        """Write what is left; waits for some seconds at most."""
+        self._lines.put(None)
+        self._thread.join(_GOODBYE_S)
+
+    def _put(self, values: Mapping[str, JSON]) -> None:
+        t_utc = self._now().isoformat(timespec="milliseconds")
+        self._lines.put((t_utc[:10], {"t_utc": t_utc, **values}))
+
+    # -------------------------------------------------------------------------------------------------- its own thread
+
+    def _run(self) -> None:
+        self._attempt(_NOT_INDEXED, self._open)
+        due_s, ends = monotonic(), False
+        while not ends:
+            new = self._next(max(0.0, due_s - monotonic()) if self._is_new else None)
+            ends = None in new
+            self._waiting = [*self._waiting, *(one for one in new if one is not None)][-_MOST_WAITING:]
+            if self._waiting:
+                self._attempt("Weighings are not kept", self._append)
+            if self._is_new and (ends or monotonic() >= due_s):
+                self._index()
+                due_s = monotonic() + self._every_s
+
+    def _next(self, timeout_s: float | None) -> list[_Line | None]:
+        """Wait for lines; None is the end."""
+        try:
+            found = [self._lines.get(timeout=timeout_s)]
+        except Empty:
+            return []
+        while not self._lines.empty():
+            found.append(self._lines.get())
+        return found
+
+    def _open(self) -> None:
+        """Import the database, before there is anything to write."""
+        from ftdrive.store.store import Store
+
+        self._store = Store(self._url)
+
+    def _append(self) -> None:
+        while self._waiting:
+            day = self._waiting[0][0]
+            if self._file is None or self._file.header["day"] != day:
+                if self._is_new:
+                    self._index()
+                self._file = WeighingsFile.of(self._folder, self._origin, day)
+            self._file.append([line for at, line in self._waiting if at == day])
+            self._waiting = [one for one in self._waiting if one[0] != day]
+            self._is_new = True
+
+    def _index(self) -> None:
+        self._attempt(_NOT_INDEXED, self._put_weighings)
+
+    def _put_weighings(self) -> None:
+        if self._store is None:
+            self._open()
+        if self._lacks_older:
+            self._store.index(self._folder)  # what an outage kept from the store
+            self._lacks_older = False
+        if self._file is not None:
+            self._file.read()
+            self._store.put_weighings(weighings_of(self._file))
+        self._is_new = False
+
+    def _attempt(self, failure: str, write: Callable[[], None]) -> bool:
+        try:
+            write()
+        except (OSError, DataError, ConfigError) as error:
+            if failure not in self._said:
+                self._said.add(failure)
+                self._say(f" {failure}, because {error}.")
+            return False
+        return True
