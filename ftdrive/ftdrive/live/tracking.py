@@ -38,7 +38,8 @@ _GYRATION_M = 0.08
 _PLACED_M = 0.03
 """A part whose centre of mass is known so well turns about it."""
 _FIRST_WINDOWS, _MOST_WINDOWS = 3, 200
-"""The first noise of a state counts as so many windows; the noise follows within so many."""
+"""The first noise of a state counts as so many windows, few because vibration is less in a window than in the readings
+that show it; the noise follows within so many."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
