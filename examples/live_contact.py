@@ -2,11 +2,14 @@
 
 import ftdrive
 
+released: list[ftdrive.Contact] = []
+
 
 def on_contact(contact: ftdrive.Contact) -> None:
     """Print the beginning of a contact, 60 ms later, and its end."""
     if contact.over:
         print(f"released after {contact.duration_s:.0f} s, peak {contact.peak_N:.0f} N")
+        released.append(contact)
     else:
         print("contact")
 
@@ -20,6 +23,6 @@ with ftdrive.open_stream(simulate=True, on_contact=on_contact) as stream:
         if sample.t_s > begin_s + 3 and not pushed:  # the noise of the free tool is known
             stream.station.control(do="push", wrench=[0, 0, -8, 0, 0, 0], seconds=1.0)
             pushed = True
-        if sample.t_s > begin_s + 5:
+        if released and sample.t_s > 1e-9 * released[0].last_ns + 1:
             print(f"free again: {sample.force_N.round() + 0.0} N, {sample.frame}")
             break

@@ -37,7 +37,7 @@ class Echo(BaseHTTPRequestHandler):
 def port() -> Iterator[int]:
     """A web server behind a gate."""
     server = HTTPServer(("127.0.0.1", 0), Echo)
-    thread = Thread(target=server.serve_forever)
+    thread = Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
     with closing(Gate(("127.0.0.1", 0), lambda _: ("127.0.0.1", server.server_port))) as gate:
         yield gate.port
