@@ -269,7 +269,7 @@ def estimated_bias(
             waiting = [paired.rows(slice(whole, None))]
             left = calibration.compensate(paired.raw[:whole], paired.R_base_flange[:whole])
             readings.append(left.reshape(-1, size, 6).mean(axis=1))
-            orientations.append(paired.R_base_flange[:whole][size // 2 :: size])
+            orientations.append(paired.R_base_flange[:whole][size // 2 :: size].copy())  # a view keeps the block
     reading, R = np.concatenate(readings), np.concatenate(orientations)
     if len(reading) < _LEAST_READINGS:
         seconds = len(reading) * _READING_S + sum(map(len, waiting)) / info.sensor_rate_Hz
