@@ -313,3 +313,18 @@ def test_a_sweep_without_heartbeat_stops(
     clock.advance(STOPS_ITSELF_S)
     assert controller.goal_rad is None
     assert script.registers.outputs[1] == -2
+
+
+def test_a_silent_controller_is_lost_after_its_limit_and_not_before(
+    arm: UrArm, script: Script, clock: FakeClock
+) -> None:
+    control = control_of(arm)
+    script.registers.far.silent = True
+    limit_s, step_s, waited_s = control._timing.stale_s, control._clock.poll_s, 0.0
+    assert control._pause(), "it has just been heard"
+    while control._pause():
+        clock.advance(step_s)
+        waited_s += step_s
+        assert waited_s < 2 * limit_s
+    assert waited_s == pytest.approx(limit_s, abs=3 * step_s)
+    assert "the controller sent nothing for" in str(control._failure)
