@@ -112,12 +112,12 @@ def _temperature(store: Store, one: StoredResult, results: Iterable[StoredResult
 
     if one.temperature_C is None:
         return None
-    try:
-        checks = store.verifications()
-    except BadStore:
-        return None
     same = (one.sensor_serial, one.arm_serial, one.mount)
     alike = [each for each in results if (each.sensor_serial, each.arm_serial, each.mount) == same]
+    try:
+        checks = [check for each in alike for check in store.verifications(each.id)]
+    except BadStore:
+        return None
     return next((found.fit for found in temperatures(alike, checks) if any(found.fit.predicts)), None)
 
 
