@@ -64,7 +64,7 @@ class Compensator:
         matrix = np.concatenate([by_force, skew(parameters.p_sensor_com_m) @ by_force])
         if response is not None:
             matrix += np.concatenate([response.force_gain, response.cross_talk_m]) @ by_force
-        offset = np.concatenate([parameters.force_bias_N, parameters.torque_bias_Nm])
+        offset = parameters.bias
         self.matrix: Reals = matrix.astype(self.dtype)
         self.offset: Reals = offset.astype(self.dtype)
         self.matrix.setflags(write=False)

@@ -70,6 +70,11 @@ class Parameters:
                 raise ValueError(f"{field.name} has shape {value.shape}, expected {shape}")
             object.__setattr__(self, field.name, value)
 
+    @property
+    def bias(self) -> Array:
+        """(6,) of force and torque, N and N·m."""
+        return np.concatenate([self.force_bias_N, self.torque_bias_Nm])
+
     def moved(self, step: Array) -> Self:
         """Apply an error vector.
 
@@ -157,8 +162,7 @@ def predict(parameters: Parameters, R_base_flange: Rotations) -> Array:
     array([0.   , 0.   , 9.807, 0.   , 0.   , 0.   ])
     """
     R_base_flange = matrices_of(R_base_flange)
-    bias = np.concatenate([parameters.force_bias_N, parameters.torque_bias_Nm])
-    return np.asarray(gravity_wrench(parameters, R_base_flange) + bias)
+    return np.asarray(gravity_wrench(parameters, R_base_flange) + parameters.bias)
 
 
 def jacobian(parameters: Parameters, R_base_flange: Array) -> Array:
@@ -222,6 +226,11 @@ def angle_between(R1: Array, R2: Array) -> Array:
     """Angle in rad, shape (...), between rotations of shape (..., 3, 3) each; accurate for small angles too."""
     chord = np.linalg.norm(np.asarray(R1) - R2, axis=(-2, -1)) / math.sqrt(8)
     return np.asarray(2 * np.arcsin(np.minimum(chord, 1.0)))
+
+
+def angle_between_vectors(a: Array, b: Array) -> float:
+    """Angle in rad between two vectors (3,) of any length; accurate for small angles too."""
+    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
 def nearest_rotation(M: Array) -> Array:

@@ -178,7 +178,7 @@ def _groups(n: int) -> Iterator[tuple[slice | None, NDArray[np.bool_]]]:
 
 def _misfits(p: Parameters, R: Array, wrench: Array, scale: Array, groups: NDArray[np.bool_]) -> dict[str, Array]:
     """Squared misfit (k,) of each kind of change of each group (k, n), in closed form; the parameters stay."""
-    y, g, C = (wrench - _bias(p)) / scale, gravity_wrench(p, R) / scale, _columns(p, R) / scale[:, None]
+    y, g, C = (wrench - p.bias) / scale, gravity_wrench(p, R) / scale, _columns(p, R) / scale[:, None]
     d, count = y - g, groups.sum(axis=1)[:, None, None]
 
     def sums(of_rows: Array) -> Array:
@@ -209,7 +209,7 @@ def _misfits(p: Parameters, R: Array, wrench: Array, scale: Array, groups: NDArr
 
 def _refined(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, rows: Rows) -> Change:
     """Undo the change of some rows, and improve it together with all parameters by linear least squares."""
-    y, g, own = wrench - _bias(p), gravity_wrench(p, R), KINDS[code]
+    y, g, own = wrench - p.bias, gravity_wrench(p, R), KINDS[code]
     undone, turn, step = y.copy(), np.eye(3), np.zeros(6)
     if code in ("sensor_turned", "sensor_changed"):
         mean_y, mean_g = (x[rows].mean(axis=0) if code == "sensor_changed" else np.zeros(6) for x in (y, g))
@@ -230,7 +230,7 @@ def _refined(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, ro
         "shift_mm": 1e3 * _length(moved[COM]),
     }
     criterion = wrench.size * np.log(max(misfit, 1e-300)) + len(own) * np.log(wrench.size)
-    return Change(code, rows, values, undone - C @ x[: len(own)] + _bias(p), misfit, float(criterion))
+    return Change(code, rows, values, undone - C @ x[: len(own)] + p.bias, misfit, float(criterion))
 
 
 def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
@@ -255,10 +255,6 @@ def _columns(p: Parameters, R: Array) -> Array:
 
 def _turned(wrench: Array, turn: Array) -> Array:
     return np.asarray((wrench.reshape(-1, 2, 3) @ turn.T).reshape(-1, 6))
-
-
-def _bias(p: Parameters) -> Array:
-    return np.concatenate([p.force_bias_N, p.torque_bias_Nm])
 
 
 def _length(vector: Array) -> float:

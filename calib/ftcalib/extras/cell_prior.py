@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import chdtrc as chi2_sf
 
 from ftcalib.errors import NotObservable
-from ftcalib.model import Array, Parameters, angle_between, skew
+from ftcalib.model import Array, Parameters, angle_between, angle_between_vectors, skew
 from ftcalib.result import CalibrationResult
 
 FALSE_ALARMS = 1e-4
@@ -96,7 +96,7 @@ class CellPrior:
             if not freedom or chi2_sf(freedom, left) >= FALSE_ALARMS:
                 turned = float(angle_between(old.R_flange_sensor, new.R_flange_sensor))
                 if kept == _MOUNTING:
-                    turned = float(np.arctan2(np.linalg.norm(np.cross(down(old), down(new))), down(old) @ down(new)))
+                    turned = angle_between_vectors(down(old), down(new))
                 explained.append((left, f"{cause}, by {np.degrees(turned):.2g}°"))
         misfit = f"chi2 {chi2:.0f} for {dof} degrees of freedom"
         if not explained:

@@ -6,14 +6,13 @@ like a temperature by chance widens the sigma of c. What a fit predicts of a run
 temperature that does not predict such runs better than the other runs alone is of no use, however steep its slope.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import fdtrc as f_sf
 
-from ftcalib.extras.update import Calibrated, Update
-from ftcalib.model import BIASES, Array
+from ftcalib.model import Array
 
 FEWEST = 6
 """Runs."""
@@ -127,18 +126,3 @@ def _fitted(X: Array, walk: Array, y: Array, noise: Array) -> _Fit:
     scattered = np.tensordot(weights, np.square(x[:, -1] - mean[-1]), 1)
     rms = float(np.sqrt(np.mean(np.square(np.tensordot(weights, left_out, 1)))))
     return _Fit(mean, np.sqrt(weights @ variance + scattered), rms)
-
-
-def with_bias_change(calibration: Calibrated, change: Array, sigma: Array) -> Update:
-    """Return a calibration or an update of it whose bias has changed by so much (6,), and its error by sigma (6,)."""
-    p, response = calibration.parameters, calibration.response
-    new = replace(p, force_bias_N=p.force_bias_N + change[:3], torque_bias_Nm=p.torque_bias_Nm + change[3:])
-    if response is not None:
-        response = replace(response, covariance=_wider(response.covariance, sigma))
-    return Update(new, _wider(calibration.covariance, sigma), 0.0, 0, "bias", response=response)
-
-
-def _wider(covariance: Array, sigma: Array) -> Array:
-    covariance = np.array(covariance)
-    covariance[BIASES, BIASES] += sigma**2
-    return covariance

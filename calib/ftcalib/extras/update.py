@@ -5,7 +5,7 @@ all readings, both in the weights (generalised least squares) and in the covaria
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -68,6 +68,32 @@ class Update:
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", read_only(self.covariance))
         object.__setattr__(self, "residuals", read_only(self.residuals))
+
+
+def with_bias_change(calibration: Calibrated, change: Array, sigma: Array, *, measured: bool = False) -> Update:
+    """Return a calibration or an update of it whose bias has changed by so much.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult or Update
+    change, sigma : array, shape (6,)
+        N and N·m, sensor axes; one standard deviation.
+    measured : bool
+        Whether sigma is that of the new bias itself, and not of the change alone.
+    """
+
+    def changed(covariance: Array) -> Array:
+        covariance = np.array(covariance)
+        if measured:
+            covariance[BIASES], covariance[:, BIASES] = 0.0, 0.0
+        covariance[BIASES, BIASES] += sigma**2
+        return covariance
+
+    p, response = calibration.parameters, calibration.response
+    new = replace(p, force_bias_N=p.force_bias_N + change[:3], torque_bias_Nm=p.torque_bias_Nm + change[3:])
+    if response is not None:
+        response = replace(response, covariance=changed(response.covariance))
+    return Update(new, changed(calibration.covariance), 0.0, 0, "bias", response=response)
 
 
 def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noise: Array, kind: str) -> Update:

@@ -95,7 +95,7 @@ def wrench_of(load: Load, motion: Motion, *, bias: bool = True) -> Array:
     torque -= _vee(Q.T @ motion.Omega_rad2_s2 @ Q @ np.tensordot(load.inertia, _SECOND_MOMENTS, 1))
     K, X = np.tensordot(load.response[:5], GAIN, 1), np.tensordot(load.response[5:], CROSS_TALK_M, 1)
     wrench = np.hstack([u + u @ K, torque + u @ X])
-    return wrench + np.concatenate([static.force_bias_N, static.torque_bias_Nm]) if bias else wrench
+    return wrench + static.bias if bias else wrench
 
 
 def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:

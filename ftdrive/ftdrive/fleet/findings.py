@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtrc as chi2_sf
 
-from ftcalib.model import Array, skew
+from ftcalib.model import Array, angle_between_vectors, skew
 from ftdrive.fleet.observed import Observed, when
 from ftdrive.fleet.state import CellState, FleetFinding
 from ftdrive.fleet.temperature import temperature_findings
@@ -117,7 +117,7 @@ def _turned(before: StoredResult, after: StoredResult) -> tuple[float, float]:
     if not min(weights) > 0:
         return 0.0, 1.0
     old, new = (np.array(force) / weight for force, weight in zip(forces, weights, strict=True))
-    angle = float(np.arctan2(np.linalg.norm(np.cross(old, new)), old @ new))
+    angle = angle_between_vectors(old, new)
     if angle <= TILTED_RAD:
         return angle, 1.0
     across = np.linalg.svd(skew(old))[0][:, :2]  # (3, 2)

@@ -1,15 +1,13 @@
 """Bias and held part of a stream: from its samples to what is shown, written and, if wanted, applied."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
-from ftcalib.extras.update import Update
+from ftcalib.extras.update import Update, with_bias_change
 from ftcalib.extras.weighing import LEAST_SIGMAS, Weight
-from ftcalib.model import BIASES, Array
 from ftcalib.rounding import with_sigma
 from ftdrive.live.noise import NoiseEstimator
 from ftdrive.live.samples import Paired, StreamEvent, StreamInfo, Tracked
@@ -91,23 +89,7 @@ def applied(calibration: CalibrationResult, tracked: Tracked) -> Update | None:
     """Return the calibration with the tracked bias; None while that is not known well."""
     if not (tracked.sigma < _APPLIED).all():
         return None
-    p = calibration.parameters
-    new = replace(
-        p,
-        force_bias_N=p.force_bias_N + tracked.bias[:3],
-        torque_bias_Nm=p.torque_bias_Nm + tracked.bias[3:],
-    )
-    response = calibration.response
-    if response is not None:
-        response = replace(response, covariance=_with_bias(response.covariance, tracked.sigma))
-    return Update(new, _with_bias(calibration.covariance, tracked.sigma), 0.0, 0, "bias", response=response)
-
-
-def _with_bias(covariance: Array, sigma: Array) -> Array:
-    covariance = np.array(covariance)
-    covariance[BIASES], covariance[:, BIASES] = 0.0, 0.0
-    covariance[BIASES, BIASES] = sigma**2
-    return covariance
+    return with_bias_change(calibration, tracked.bias, tracked.sigma, measured=True)
 
 
 def part_of(tracked: Tracked) -> Weight | None:

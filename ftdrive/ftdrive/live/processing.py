@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ftcalib.compensation import Compensator
 from ftcalib.extras.inertia import inertial_wrench, motion_of_poses
-from ftcalib.extras.temperature import BiasTemperature, with_bias_change
-from ftcalib.extras.update import Calibrated
+from ftcalib.extras.temperature import BiasTemperature
+from ftcalib.extras.update import Calibrated, with_bias_change
 from ftcalib.extras.weighing import Weight, holding
 from ftcalib.files import JSON
 from ftcalib.rounding import with_sigma
@@ -60,8 +60,8 @@ class _Reference(NamedTuple):
 
     empty: Calibrated
     t_ns: int
-    temperature_C: float | None
-    """Of the sensor then."""
+    temperature_C: float
+    """Of the sensor then; NaN where it is not known."""
 
 
 class Processor:
@@ -103,8 +103,8 @@ class Processor:
         self._held: Weight | None = None
         self.reading = np.zeros(6)
         """Mean of the newest 20 ms minus the load, sensor axes, about its origin."""
-        made_C = calibration.provenance.get("temperature_C")
-        self._temperature = None if made_C is None else temperature
+        known_C = calibration.provenance.get("temperature_C")
+        self._temperature, made_C = (None, np.nan) if known_C is None else (temperature, float(known_C))
         self._now_C = self._noted_C = made_C
         self._references = [_Reference(calibration, 0, made_C)]
         self._empty: Calibrated = calibration
@@ -489,7 +489,7 @@ class Processor:
         """(6,) change of the bias by tares, N and N·m, sensor axes; None without a tare."""
         if len(self._references) == 1:
             return None
-        return _bias(self._references[-1].empty) - _bias(self.info.calibration)
+        return self._references[-1].empty.parameters.bias - self.info.calibration.parameters.bias
 
     def tare(self) -> StreamEvent:
         """Set the bias so that the free tool reads zero in the last half second, or refuse; see `try_tare`."""
@@ -532,24 +532,24 @@ class Processor:
 
     def warm(self, temperature_C: float) -> None:
         """Correct the bias for this temperature of the sensor, if it is known how, and at which it was calibrated."""
-        if self._temperature is None or self._now_C is None or abs(temperature_C - self._now_C) < _STEP_K:
+        if self._temperature is None or abs(temperature_C - self._now_C) < _STEP_K:
             return
         with self._lock:
             self._now_C = temperature_C
             self._refer()
-            if self._noted_C is None or abs(temperature_C - self._noted_C) < _NOTED_K:
+            if abs(temperature_C - self._noted_C) < _NOTED_K:
                 return
             self._noted_C = temperature_C
-            change, _ = self._temperature.change(self._references[-1].temperature_C or temperature_C, temperature_C)
+            change, _ = self._temperature.change(self._references[-1].temperature_C, temperature_C)
             text = f"sensor at {temperature_C:.1f} °C: bias corrected by {np.linalg.norm(change[:3]):.2f} N"
             self.note("temperature", text, {"temperature_C": temperature_C, "change": change.tolist()})
 
     def _refer(self) -> None:
         """Take the newest reference, at the present temperature, as the empty tool."""
         empty, _, then_C = self._references[-1]
-        if self._temperature is not None and then_C is not None and self._now_C is not None:
+        if self._temperature is not None:
             empty = with_bias_change(empty, *self._temperature.change(then_C, self._now_C))
-        before, self._bias_change = self._bias_change, _bias(empty) - _bias(self.info.calibration)
+        before, self._bias_change = self._bias_change, empty.parameters.bias - self.info.calibration.parameters.bias
         self._empty, self._expected = empty, self._loaded(empty)
         self._drift.shift(self._bias_change - before)
 
@@ -586,11 +586,6 @@ class Processor:
             text = f"the bias drifts by {with_sigma(rate, sigma)} N/h (1 sigma); tare when the tool is free"
             self.note("drift", text, {"drift_N_h": rate, "sigma_N_h": sigma})
         self._drift_warned = rate > (0.5 if self._drift_warned else 1.0) * worth
-
-
-def _bias(load: Calibrated) -> Array:
-    p = load.parameters
-    return np.concatenate([p.force_bias_N, p.torque_bias_Nm])
 
 
 class ProcessedStream(ABC):

@@ -8,11 +8,12 @@ program must look at the counter and never at a number alone.
 import threading
 from collections.abc import Callable
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol, get_args
 
 import numpy as np
 
 from ftcalib.extras.weighing import Weight
+from ftcalib.model import angle_between_vectors
 from ftdrive.live.samples import Block, StreamInfo, Tracking
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.live.weighing import WEIGH_S, CannotWeigh, Scale, load_values
@@ -31,7 +32,7 @@ DOUBLES: Final = (
 """What the input registers hold from the first one on, of each kind."""
 TRACKED: Final = ("bias_fx", "bias_fy", "bias_fz", "bias_tx", "bias_ty", "bias_tz", "bias_age")
 """Further doubles where bias and part are followed."""
-TRACKINGS: Final[tuple[Tracking, ...]] = ("off", "show", "apply")
+TRACKINGS: Final[tuple[Tracking, ...]] = get_args(Tracking)
 """What `tracking` counts: where it is 0, the registers of `TRACKED` are not those of the service."""
 NEVER_S: Final = -1.0
 """Age of the last look at the bias, before the first one."""
@@ -245,7 +246,7 @@ class ProgramService:
         R_base_sensor = block.R_base_flange[-1] @ self._stream.info.calibration.R_flange_sensor
         force_N = R_base_sensor @ self._stream.contact_reading()[:3]
         down = self._stream.info.calibration.gravity_force_base_N
-        leans_rad = _angle(force_N, down)
+        leans_rad = angle_between_vectors(force_N, down)
         return Condition.UNKNOWN_LOAD if min(leans_rad, np.pi - leans_rad) < _ALIKE_RAD else Condition.CONTACT
 
     # -------------------------------------------------------------------------------------------------------- requests
@@ -308,7 +309,3 @@ def _placed(weight: Weight, info: StreamInfo) -> Array:
     R = info.calibration.R_flange_sensor
     p_m, C = info.p_flange_sensor_m + R @ weight.p_sensor_com_m, R @ weight.com_covariance @ R.T
     return np.concatenate([p_m, np.sqrt(np.diag(C))])
-
-
-def _angle(a: Array, b: Array) -> float:
-    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))

@@ -82,7 +82,7 @@ def temperatures(
         made[one.id] = found, one
         if one.update in (None, "tool") and one.created_utc is not None and one.temperature_C is not None:
             sigma = np.sqrt(np.diag(one.covariance)[BIASES])
-            found.append(_Run(one.created_utc, one.temperature_C, _bias(one), sigma))
+            found.append(_Run(one.created_utc, one.temperature_C, one.parameters.bias, sigma))
     for check in verifications:
         if check.calibration_id not in made or not (check.passed or check.change == "bias"):
             continue
@@ -90,17 +90,14 @@ def temperatures(
         change, sigma_6 = check.bias_change, check.bias_change_sigma
         if change is None or sigma_6 is None or check.created_utc is None or check.temperature_C is None:
             continue
-        found.append(_Run(check.created_utc, check.temperature_C, _bias(calibration) + change, np.array(sigma_6)))
+        found.append(
+            _Run(check.created_utc, check.temperature_C, calibration.parameters.bias + change, np.array(sigma_6))
+        )
     return [
         SensorTemperature(serial, arm, mount, fit)
         for (serial, arm, mount), found in runs.items()
         if (fit := _fit(sorted(found, key=lambda run: run.created_utc))) is not None
     ]
-
-
-def _bias(one: StoredResult) -> Array:
-    p = one.parameters
-    return np.concatenate([p.force_bias_N, p.torque_bias_Nm])
 
 
 def _fit(runs: Sequence[_Run]) -> BiasTemperature | None:

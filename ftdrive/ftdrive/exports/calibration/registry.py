@@ -8,7 +8,7 @@ import numpy as np
 
 from ftcalib import CalibrationResult
 from ftcalib.files import JSON
-from ftcalib.model import angle_between
+from ftcalib.model import angle_between, angle_between_vectors
 from ftdrive.errors import NotAccepted
 from ftdrive.exports.calibration import complete, models, robots, ros1, ros2
 from ftdrive.exports.calibration.difference import compensations, largest_difference
@@ -101,7 +101,7 @@ def _lost(calibration: CalibrationResult, target: Format) -> Iterator[str]:
     """Name what the calibration has and the target cannot express, beyond rounding."""
     down = np.array([0.0, 0.0, -1.0])
     gravity = calibration.gravity_force_base_N
-    tilt_rad = float(np.arctan2(np.linalg.norm(np.cross(down, gravity)), down @ gravity))
+    tilt_rad = angle_between_vectors(down, gravity)
     turn_rad = float(angle_between(calibration.R_flange_sensor, np.eye(3)))
     if "tilt" not in target.expresses and tilt_rad > 1e-9:
         yield f"the base tilt of {degrees(tilt_rad):.3g}°"

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from ftcalib.extras.temperature import BiasTemperature, bias_temperature, with_bias_change
+from ftcalib.extras.temperature import BiasTemperature, bias_temperature
+from ftcalib.extras.update import with_bias_change
 from ftcalib.model import BIASES, Array
 from tests.unit.ftdrive.live.simulated import calibrated
 
