@@ -1,7 +1,9 @@
 """Plant small errors in a copy of the project, one at a time, and print which of them the fast tests find.
 
-The tests of `ftdrive/ftdrive/session/x.py` are those of `tests/unit/ftdrive/session` or, where there is no such folder,
-of the next one up: first the files that import the module, then the rest.
+A mutant is given to every test file that reaches its line, by the coverage of one run of all fast tests. First those
+of its own folder: of `ftdrive/ftdrive/session/x.py`, `tests/unit/ftdrive/session`. A line that runs when its module is
+imported, or only in other processes, is given to its folder and to the files that reach any line of the module.
+Slow tests and those of ROS 2 are not tried: read what survives, because they may find it, or it may change nothing.
 """
 
 import argparse
@@ -19,7 +21,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+from coverage import CoverageData
+
 PROJECT = Path(__file__).parents[2]
+NO_TESTS = 5  # the exit code of pytest where all tests of the files are slow
 
 SWAPPED: dict[type[ast.AST], list[type[ast.AST]]] = {
     ast.Add: [ast.Sub], ast.Sub: [ast.Add], ast.Mult: [ast.Div], ast.Div: [ast.Mult], ast.Pow: [ast.Mult],
@@ -93,30 +98,56 @@ def mutants_of(path: Path) -> Iterator[Mutant]:
         yield from (Mutant(path, node.lineno, span, before, after) for after in changes(node))
 
 
-def tests_of(path: Path) -> list[str]:
-    """Test files of the folder that mirrors the module's, those that import it first."""
+def folder_of_tests(path: Path) -> Path:
+    """The folder of unit tests that mirrors the module's or, where there is none, the next one up."""
     top, *package_path = path.parent.parts
-    folder = Path(PROJECT, "tests/unit", top, *package_path[1:])
-    while not folder.is_dir():
+    folder = Path("tests/unit", top, *package_path[1:])
+    while not (PROJECT / folder).is_dir():
         folder = folder.parent
-    package = re.escape(".".join(package_path))
-    name = re.compile(rf"{package}\.{path.stem}\b|from {package} import .*\b{path.stem}\b")
-    files = sorted(folder.rglob("test_*.py"), key=lambda file: (not name.search(file.read_text()), file))
-    return [str(file.relative_to(PROJECT)) for file in files]
+    return folder
+
+
+def reach_of(root: Path, data_file: Path) -> None:
+    """Run the fast tests of the copy and write which of them reaches each line."""
+    packages = [f"--cov={package.parent}" for package in root.glob("*/*/__init__.py") if package.parts[-3] != "tests"]
+    options = ["-q", "-p", "no:cacheprovider", "--cov-context=test", "--cov-report=", *packages]
+    environment = {**environment_of(root), "COVERAGE_FILE": str(data_file)}
+    if subprocess.run([sys.executable, "-m", "pytest", *options], cwd=root, env=environment, check=False).returncode:
+        sys.exit("Without a mutant the tests fail. Fix them.")
+
+
+def tests_of(mutant: Mutant, reach: CoverageData) -> list[str]:
+    """Test files of the mutant's folder, those that import its module first, then all others that reach it."""
+    module = next((file for file in reach.measured_files() if Path(file).match(f"*/{mutant.path}")), None)
+    contexts = reach.contexts_by_lineno(module) if module else {}
+    of_line, of_module = (
+        {file for line in lines for test in contexts.get(line, []) if (file := test.partition("::")[0])}
+        for lines in ([mutant.line], contexts)
+    )
+    folder = folder_of_tests(mutant.path)
+    at_home = {str(file.relative_to(PROJECT)) for file in (PROJECT / folder).rglob("test_*.py")}
+    imports = re.compile(rf"\b{mutant.path.stem}\b")
+
+    def order(file: str) -> tuple[bool, bool, bool, str]:
+        return file not in at_home, not imports.search((PROJECT / file).read_text()), "tests/unit" not in file, file
+
+    return sorted(of_line or at_home | of_module, key=order)
+
+
+def environment_of(root: Path) -> dict[str, str]:
+    packages = os.pathsep.join(str(root / top) for top in ("ftdrive", "calib", "drivers", "mocks"))
+    return {**os.environ, "PYTHONPATH": packages}
 
 
 def outcome(root: Path, tests: list[str], limit_s: float) -> str:
     command = [sys.executable, "-m", "pytest", "-x", "-q", "-n0", "-p", "no:cacheprovider", *tests]
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(str(root / top) for top in ("ftdrive", "calib", "drivers", "mocks")),
-    }
     quiet = subprocess.DEVNULL
+    environment = environment_of(root)
     with subprocess.Popen(
         command, cwd=root, env=environment, stdout=quiet, stderr=quiet, start_new_session=True
     ) as run:
         try:
-            return "survived" if run.wait(limit_s) == 0 else "killed"
+            return "survived" if run.wait(limit_s) in {0, NO_TESTS} else "killed"
         except subprocess.TimeoutExpired:
             os.killpg(run.pid, signal.SIGKILL)
             return "too slow"
@@ -129,8 +160,8 @@ def main() -> None:
     )
     parser.add_argument("--number", type=int, default=20, help="of mutants (default 20)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--tests", nargs="+", help="tests to run for every mutant, instead of those of its folder")
-    parser.add_argument("--limit", type=float, default=300.0, help="seconds for the tests of one mutant (default 300)")
+    parser.add_argument("--reach", type=Path, help="coverage of an earlier sample of the same tree; else written")
+    parser.add_argument("--limit", type=float, default=900.0, help="seconds for the tests of one mutant (default 900)")
     options = parser.parse_args()
 
     patterns = [path if path.endswith(".py") else f"{path}/**/*.py" for path in options.paths]
@@ -139,14 +170,17 @@ def main() -> None:
     drawn = random.Random(options.seed).sample(every, min(options.number, len(every)))
     sys.stdout.write(f"{len(drawn)} of {len(every)} mutants\n")
     with TemporaryDirectory() as folder:
-        root = shutil.copytree(PROJECT, Path(folder, "project"), ignore=shutil.ignore_patterns(".*", "__pycache__"))
-        for tests in {tuple(options.tests or sorted(tests_of(mutant.path))) for mutant in drawn}:
-            if outcome(root, list(tests), options.limit) != "survived":
-                sys.exit(f"Without a mutant {' '.join(tests)} fail or take longer than {options.limit:g} s. Fix them.")
+        left_out = shutil.ignore_patterns(".git", ".venv", ".*_cache", "__pycache__")
+        root = shutil.copytree(PROJECT, Path(folder, "project"), ignore=left_out)
+        data_file = options.reach.resolve() if options.reach else Path(folder, "reach")
+        if not data_file.exists():
+            reach_of(root, data_file)
+        reach = CoverageData(str(data_file))
+        reach.read()
         ends = []
         for mutant in drawn:
             mutant.plant(root)
-            ends.append(outcome(root, options.tests or tests_of(mutant.path), options.limit))
+            ends.append(outcome(root, tests_of(mutant, reach), options.limit))
             shutil.copy2(PROJECT / mutant.path, root / mutant.path)
             print(f"{ends[-1]:8} {mutant}", flush=True)  # noqa: T201
     sys.stdout.write(f"{ends.count('survived')} of {len(drawn)} survived\n")
