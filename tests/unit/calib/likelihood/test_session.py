@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib import Parameters
@@ -101,8 +102,11 @@ def test_variances_start_at_the_mean_square_of_the_used_poses_or_at_their_noise(
     np.testing.assert_allclose(own.start(problem, groups), [0.09, SIGMA_NM**2, SIGMA_NM**2, 0.09 / 240])
 
 
-def test_poses_are_taken_in_the_order_of_time() -> None:
-    order = np.random.default_rng(0).permutation(24)
+@pytest.mark.parametrize(
+    "order",
+    [np.arange(24), np.arange(24)[::-1], np.r_[0, 23:0:-1], np.r_[23, 0:23], np.random.default_rng(0).permutation(24)],
+)
+def test_poses_are_taken_in_the_order_of_time(order: NDArray[np.intp]) -> None:
     t_s = np.arange(24.0)[order] * 3 + 100
     cov = np.eye(6) * (1 + order)[:, None, None]
     own = Session(R24[order], predict(TOOL, R24)[order], cov, t_s, "auto", NOTHING_KNOWN)
@@ -110,6 +114,9 @@ def test_poses_are_taken_in_the_order_of_time() -> None:
     np.testing.assert_array_equal(own.wrench, predict(TOOL, R24))
     np.testing.assert_array_equal(own.cov[:, 0, 0], np.arange(1.0, 25))
     np.testing.assert_allclose(own.time, np.arange(24))
+
+
+def test_time_counts_in_mean_intervals() -> None:
     np.testing.assert_array_equal(pose_times(np.full(4, 7.0)), np.arange(4))
     np.testing.assert_array_equal(pose_times(np.array([2.0, np.nan, 3.0])), np.arange(3))
     np.testing.assert_allclose(pose_times(np.array([8.0, 2.0, 4.0])), [2, 0, 2 / 3])
