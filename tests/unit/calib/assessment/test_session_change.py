@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
-from ftcalib.assessment.session_change import likeliest_change
+from ftcalib.assessment.faults import rough_fit
+from ftcalib.assessment.session_change import _groups, likeliest_change
 from ftcalib.likelihood.gain_and_cross_talk import SIZE, response_columns
 from ftcalib.model import Parameters, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
@@ -135,3 +136,55 @@ def test_gain_and_cross_talk_of_a_fit_hide_no_part_of_a_change() -> None:
     # Beside 15 free parameters the sigma of a step between two halves is about that of a mean of 4 poses.
     lighter_N = np.linalg.norm(LIGHTER.gravity_force_base_N) - np.linalg.norm(TOOL.gravity_force_base_N)
     assert change.values["change_N"] == pytest.approx(lighter_N, abs=3 * SIGMA[0] / 2)
+
+
+COUNT = np.arange(24)
+STEP_N = np.array([0.2, 0, 0.1])
+STEPPED = replace(TOOL, force_bias_N=TOOL.force_bias_N + STEP_N, torque_bias_Nm=TOOL.torque_bias_Nm - 0.01)
+TOUCHED = replace(OTHER, torque_bias_Nm=TOOL.torque_bias_Nm + np.array([0.03, 0, 0.04]))
+
+
+@pytest.mark.parametrize(
+    ("rows", "measured"),
+    [(COUNT >= 3, True), (COUNT >= 10, False), (COUNT >= 21, True), (COUNT % 2 == 1, False)],
+)
+@pytest.mark.parametrize(
+    ("after", "code", "values"),
+    [
+        (STEPPED, "bias_stepped", {"force_N": np.sqrt(0.05), "torque_Nm": np.sqrt(3e-4)}),
+        (SHIFTED, "com_shifted", {"shift_mm": np.sqrt(5.0)}),
+        (LIGHTER, "load_changed", {"change_N": -0.03 * np.linalg.norm(TOOL.gravity_force_base_N)}),
+        (TURNED, "sensor_turned", {"turn_deg": 5.0}),
+        (TOUCHED, "sensor_changed", {"turn_deg": 70.0, "force_N": np.sqrt(48.0), "torque_Nm": 0.05}),
+    ],
+)
+def test_a_change_is_as_large_as_it_is_and_can_be_undone(
+    after: Parameters, code: str, values: dict[str, float], rows: NDArray[np.bool_], measured: bool
+) -> None:
+    wrench = np.where(rows[:, None], predict(after, ORIENTATIONS), predict(TOOL, ORIENTATIONS))
+    wrench += 0.01 * np.random.default_rng(5).normal(0, SIGMA, wrench.shape)
+    change = likeliest_change(rough_fit(ORIENTATIONS, wrench), ORIENTATIONS, wrench, SIGMA if measured else None)
+    assert change is not None
+    assert (change.code, change.takes_turns) == (code, not rows[22])
+    assert change.first == np.flatnonzero(rows)[0]
+    assert {name: change.values[name] for name in values} == pytest.approx(values, rel=0.02)
+    left = change.corrected - predict(rough_fit(ORIENTATIONS, change.corrected), ORIENTATIONS)
+    assert np.sqrt(np.mean((left / SIGMA) ** 2)) < 0.1
+    if measured:
+        assert change.misfit < 1e-3
+
+
+@pytest.mark.parametrize("n", [12, 13])
+def test_changes_are_tried_that_leave_three_poses_on_each_side(n: int) -> None:
+    found = [(pure, [row.tolist() for row in groups]) for pure, groups in _groups(n)]
+    half = n // 2
+
+    def later(first: int) -> list[bool]:
+        return [k >= first for k in range(n)]
+
+    assert found == [
+        (None, [later(first) for first in range(3, n - 2)]),
+        (slice(0, half), [later(first) for first in range(half, n - 2)]),
+        (slice(half, n), [[not one for one in later(first)] for first in range(3, half + 1)]),
+        (slice(0, n, 2), [[k % 2 == 1 for k in range(n)]]),
+    ]
