@@ -376,8 +376,9 @@ def test_arrays_of_another_shape_or_without_numbers_are_refused() -> None:
     ):
         with pytest.raises(ValueError, match=r"the motion's .* finite numbers"):
             MotionResult(inertia, 0.01, 0.05, covariance, 0.9)
-    for name, value in (("weights", np.ones(9)), ("measured_sigma", np.full(6, np.nan)), ("cable_shift", np.ones(14))):
+    wrong: dict[str, Any] = {"weights": np.ones(9), "measured_sigma": np.full(6, np.nan), "cable_shift": np.ones(14)}
+    for name, value in wrong.items():
         with pytest.raises(ValueError, match=f"{name} must be"):
             replace(RESULT, **{name: value})
-    right = {"measured_sigma": np.ones(6), "weights": np.ones(10), "cable_shift": np.ones(15)}
+    right: dict[str, Any] = {"measured_sigma": np.ones(6), "weights": np.ones(10), "cable_shift": np.ones(15)}
     assert replace(RESULT, **right).weights is not None
