@@ -222,6 +222,15 @@ def test_what_is_always_needed_is_not_dropped() -> None:
     assert _pruned(p, at, 0).components == ALL[:2]
 
 
+def test_a_component_that_brings_little_is_not_dropped_with_one_that_brings_nothing() -> None:
+    small = np.array([0.004 / 400])
+    p = problem(np.random.default_rng(4), 30, (ROTATION,), small)
+    alone = maximise(p, (ROTATION,), small)
+    assert 2 < alone.loglik - point(p, (), np.zeros(0)).loglik < 4  # enough for itself, not for two
+    both = point(p, (ROTATION, ALL[1]), np.append(alone.theta, 1e-12))
+    assert _pruned(p, both, 0).components == (ROTATION,)
+
+
 def test_a_turn_of_the_flange_is_distinguished_from_white_noise() -> None:
     rng = np.random.default_rng(8)
     turned = problem(rng, 40, (ROTATION,), np.array([0.3 / 400]))
