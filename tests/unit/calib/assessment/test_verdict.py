@@ -456,6 +456,17 @@ def test_a_second_solution_counts_in_noise_as_it_is(delta: float, noise_factor: 
     assert close.values["probability_percent"] == 50
 
 
+def test_of_a_rejected_result_only_units_are_suspected_of_the_payload() -> None:
+    rejected, broken = replace(FITTED, second_basin_chi2=2.0), FITTED.wrench.copy()
+    broken[:, 5] = broken[0, 5]
+    mass_kg = WEIGHT_N / 9.80665
+    for payload_kg, code in ((2.5 * mass_kg, "payload_mismatch"), (4.448 * mass_kg, "payload_units")):
+        setup = Setup(payload_kg=payload_kg, sensor_mass_kg=0.0)
+        assert (code in codes(judge(rejected, setup=setup))) == (code == "payload_units")
+        assert code in codes(judge(FITTED, setup=setup))
+        assert code not in codes(judge(replace(rejected, wrench=broken), setup=setup))
+
+
 @pytest.mark.parametrize(("sigmas", "significant"), [(4.9, False), (5.1, True)])
 def test_a_weight_is_one_from_five_sigmas_on(sigmas: float, significant: bool) -> None:
     along = FITTED.parameters.gravity_force_base_N / WEIGHT_N

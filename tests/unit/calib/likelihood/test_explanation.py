@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 from ftcalib import Parameters
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.explanation import _are_gaussian, _criterion, _limit, _membership, _stand_out
-from ftcalib.likelihood.outliers import Kept, fewest_kept
-from ftcalib.likelihood.session import Session, white
+from ftcalib.likelihood.outliers import Kept, agreeing_poses, fewest_kept
+from ftcalib.likelihood.session import Session, inverses, white
 from ftcalib.likelihood.variance_components import FORCE, Component, Point, component, point
 from ftcalib.model import Array, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
@@ -42,6 +42,22 @@ def usual(n: int) -> Array:
 
 def test_a_majority_must_agree() -> None:
     assert [fewest_kept(n) for n in (4, 7, 8, 11, 12, 13, 24)] == [4, 7, 7, 7, 8, 8, 15]
+
+
+@pytest.mark.parametrize(("bumped", "enough"), [(0, True), (6, True), (9, True), (10, False)])
+def test_poses_that_agree_are_found_from_any_minimum(bumped: int, enough: bool) -> None:
+    rng = np.random.default_rng(2)
+    residuals = SIGMA * rng.normal(size=(24, 6))
+    good = np.arange(24) >= bumped
+    residuals[~good] += 60 * SIGMA * rng.normal(size=(bumped, 6))
+    own = session(24, residuals)
+    away = [TOOL.moved(turn * np.eye(15)[1]) for turn in (3.1, 1.0, 0.0)]
+    found = agreeing_poses(own.descent, inverses(own.cov), away)
+    assert (found is not None) == enough
+    if found is not None:
+        np.testing.assert_array_equal(found[1], good)
+        only = session(24, residuals).descent.minima(inverses(own.cov) * good[:, None, None])[0].parameters
+        np.testing.assert_allclose(found[0].difference(only), 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("n", [8, 24])
