@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
 from ftcalib.assessment.faults import rough_fit
-from ftcalib.assessment.session_change import _groups, likeliest_change
+from ftcalib.assessment.session_change import _groups, likeliest_change, minus_two_log_likelihood
+from ftcalib.likelihood.fit import fit
 from ftcalib.likelihood.gain_and_cross_talk import SIZE, response_columns
-from ftcalib.model import Parameters, predict
+from ftcalib.model import Parameters, jacobian, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
 
 Array = NDArray[np.float64]
@@ -188,3 +190,28 @@ def test_changes_are_tried_that_leave_three_poses_on_each_side(n: int) -> None:
         (slice(half, n), [[not one for one in later(first)] for first in range(3, half + 1)]),
         (slice(0, n, 2), [[k % 2 == 1 for k in range(n)]]),
     ]
+
+
+def test_the_likelihood_is_that_of_the_dense_covariance_less_what_components_must_bring() -> None:
+    rng = np.random.default_rng(7)
+    wrench = predict(TOOL, ORIENTATIONS) + rng.normal(0, SIGMA, (24, 6))
+    wrench += np.cumsum(rng.normal(0, 5 * SIGMA, (24, 6)), axis=0)
+    found = fit(ORIENTATIONS, wrench, np.diag(SIGMA**2), drift="random-walk")
+    assert found.components.keys() == {"walk_force_N", "walk_torque_Nm"}
+    W = found.noise.solve(np.eye(144).reshape(24, 6, 144)).reshape(144, 144)
+    J, e = jacobian(found.parameters, ORIENTATIONS).reshape(144, 15), found.residuals.ravel()
+    logdet = np.linalg.slogdet(J.T @ W @ J)[1] - np.linalg.slogdet(W)[1]
+    assert minus_two_log_likelihood(found) == pytest.approx(logdet + e @ W @ e + 2 * (2 + 2), abs=1e-4)
+
+
+def test_a_rejected_pose_costs_the_limit_and_a_logarithm_beyond_it() -> None:
+    wrench = predict(TOOL, ORIENTATIONS) + np.random.default_rng(8).normal(0, SIGMA, (24, 6))
+    wrench[5] += 30 * SIGMA
+    found = fit(ORIENTATIONS, wrench, np.diag(SIGMA**2), drift="none")
+    assert np.flatnonzero(found.weights == 0).tolist() == [5]
+    others = fit(np.delete(ORIENTATIONS, 5, 0), np.delete(wrench, 5, 0), np.diag(SIGMA**2), drift="none")
+    e, S = found.left_out_residuals[5], found.left_out_cov[5]
+    limit, distance = stats.chi2.isf(1e-3, 6), e @ np.linalg.solve(S, e)
+    cost = np.linalg.slogdet(S)[1] + limit + 6 * np.log(distance / limit)
+    assert found.components == others.components == {}
+    assert minus_two_log_likelihood(found) - minus_two_log_likelihood(others) == pytest.approx(cost, abs=0.01)

@@ -209,6 +209,18 @@ def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: 
     assert (error / least < 4).all()
 
 
+def test_a_walk_that_only_bumped_poses_need_goes_with_them() -> None:
+    rng = np.random.default_rng(3)
+    p, R = truth(rng), haar(rng, 24)
+    push = rng.normal(size=(6, 3))
+    push *= (WEIGHT_N * rng.uniform(0.2, 1, 6) / np.linalg.norm(push, axis=1))[:, None]
+    wrench = predict(p, R) + noise(rng, 24)
+    wrench[:6] += np.concatenate([push, np.cross(0.1 * rng.normal(size=(6, 3)), push)], axis=1)
+    best = fit(R, wrench, WHITE)
+    assert np.flatnonzero(best.weights == 0).tolist() == list(range(6))
+    assert (best.components, best.drift) == ({}, None)
+
+
 def test_seven_poses_are_never_split_into_right_and_wrong() -> None:
     rng = np.random.default_rng(3)
     p, R = truth(rng), haar(rng, 7)
