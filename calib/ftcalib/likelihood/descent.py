@@ -59,7 +59,7 @@ class Descent:
             reference[:, 9] = self.wrench[:CHUNK].mean(axis=0)
             gram = wrench_gram(self.R, self.wrench, reference)
             rows = [0, 1, 2, *range(6, 16)]
-            Q = rotation_minima.force_cost_from_gram(gram[np.ix_(rows, rows)] * np.trace(separate[0, :3, :3]) / 3)
+            Q = rotation_minima.force_cost_from_gram(gram[np.ix_(rows, rows)])
             statistics, start_from = (Statistics.of_gram(gram, W[0], reference) for W in (weights, separate))
         else:
             weights, separate = (np.broadcast_to(W, (n, 6, 6)) for W in (weights, separate))

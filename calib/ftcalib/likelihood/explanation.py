@@ -171,7 +171,7 @@ def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
             kept = _membership(session, kept, distances, at)
             if not (kept == best.kept).all():
                 problem = session.linearised(p, kept)
-                at = maximise(problem, at.components, at.theta)
+                at = select(problem, at.components, at.theta, (), len(always))  # what only rejected poses needed goes
                 continue
         if set(at.components) == chosen:  # all others have been tried
             break

@@ -10,7 +10,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import BadCalibration, CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.likelihood.gain_and_cross_talk import COMMON_GAIN, SIZE, Response, hidden_covariance
 from ftcalib.model import predict
+from ftcalib.published.yu import weight_and_tilt
+from ftcalib.result import DriftResult, MotionResult, _weight_and_tilt_sigma, require_positive_definite
 
 RNG = np.random.default_rng(1)
 R = Rotation.random(10, rng=RNG).as_matrix()
@@ -250,3 +253,132 @@ def test_a_flipped_bit_is_refused_or_changes_nothing(tmp_path: Path) -> None:
 def test_provenance_must_be_writable() -> None:
     with pytest.raises(ValueError, match="provenance cannot be written"):
         solve(DATA, provenance={"x": object()})
+
+
+@pytest.mark.parametrize("F_b", [[0.6, -0.4, -20.0], [12.0, 5.0, -3.0], [-4.0, -9.0, 2.0], [3.0, 10.0, 0.0]])
+def test_sigmas_of_weight_and_tilt_are_those_of_their_derivative(F_b: list[float]) -> None:
+    force, h = np.array(F_b), 1e-6
+    A = 0.01 * np.random.default_rng(5).normal(size=(3, 5))
+    derivative = np.transpose(
+        [(np.array(weight_and_tilt(force + h * e)) - weight_and_tilt(force - h * e)) / (2 * h) for e in np.eye(3)]
+    )
+    expected = np.sqrt(np.diag(derivative @ A @ A.T @ derivative.T))
+    np.testing.assert_allclose(_weight_and_tilt_sigma(force, A @ A.T), expected, rtol=1e-6)
+    large = _weight_and_tilt_sigma(force, 1e6 * np.eye(3))
+    assert large[1:] == (np.pi, np.pi)
+    assert large[0] == pytest.approx(1e3)
+
+
+def test_a_weight_of_zero_has_the_sigma_of_its_components() -> None:
+    found = _weight_and_tilt_sigma(np.zeros(3), np.diag([1.0, 4.0, 4.0]))
+    assert found == pytest.approx((3.0, np.pi, np.pi))
+
+
+@pytest.mark.parametrize(("least", "accepted"), [(-0.9e-6, True), (-1.1e-6, False), (0.5, True)])
+def test_a_covariance_may_be_indefinite_by_rounding(least: float, accepted: bool) -> None:
+    units = 10.0 ** np.arange(-3, 2)
+    covariance = np.eye(5)
+    covariance[0, 3] = covariance[3, 0] = 1 - least
+    covariance *= np.outer(units, units)
+    known = np.zeros((7, 7))
+    known[:5, :5] = covariance
+    for one in (covariance, known):  # what is exactly known has no variance
+        if accepted:
+            require_positive_definite(one)
+        else:
+            with pytest.raises(ValueError, match="positive definite"):
+                require_positive_definite(one)
+    require_positive_definite(np.zeros((7, 7)))
+
+
+def response(gain: float, cross_talk: float) -> Response:
+    coefficients = np.append(np.full(5, gain), np.full(6, cross_talk))
+    covariance = np.zeros((15 + SIZE, 15 + SIZE))
+    covariance[:15, :15] = RESULT.covariance
+    covariance[15:, 15:] = 1e-9 * np.eye(SIZE)
+    return Response(coefficients, covariance)
+
+
+def test_sigmas_of_the_tool_allow_for_what_is_hidden() -> None:
+    shift = np.arange(15.0) * 1e-4
+    found = response(0.03, 0.02)
+    one = replace(RESULT, response=found, gain_sigma=found.gain_sigma, cable_shift=shift)
+    hidden = hidden_covariance(RESULT.parameters, found.gain_sigma, found.cross_talk_sigma_m)
+    np.testing.assert_allclose(one.tool_covariance - RESULT.covariance, hidden + np.outer(shift, shift), atol=1e-12)
+    assert one.scale_sigma == pytest.approx(COMMON_GAIN * found.gain_sigma)
+    lagging = replace(one, components={"hysteresis": 0.01})
+    assert lagging.scale_sigma == pytest.approx(np.hypot(one.scale_sigma, 0.01))
+    assert (RESULT.scale_sigma, replace(RESULT, components={"hysteresis": 0.001}).scale_sigma) == (0.002, 0.002)
+    # All of the scale counts once, in the weight and in the force along it.
+    along_N = np.abs(RESULT.gravity_force_base_N)
+    of_estimates = _weight_and_tilt_sigma(RESULT.gravity_force_base_N, RESULT.covariance[3:6, 3:6])[0]
+    for result in (RESULT, one, lagging):
+        weight_N = np.hypot(of_estimates, result.scale_sigma * RESULT.weight_N)
+        assert result.sigma["weight_N"] == pytest.approx(weight_N)
+        assert result.sigma["mass_kg"] == pytest.approx(weight_N / 9.81)
+        cable_N = 0.0 if result.cable_shift is None else shift[3:6]
+        expected = np.sqrt(np.diag(RESULT.covariance)[3:6] + (result.scale_sigma * along_N) ** 2 + cable_N**2)
+        np.testing.assert_allclose(result.sigma["gravity_force_base_N"], expected)
+    exact = RESULT.covariance.copy()
+    exact[:3], exact[:, :3] = 0.0, 0.0
+    np.testing.assert_array_equal(replace(RESULT, covariance=exact, cable_shift=shift).sigma["R_flange_sensor"], 0)
+
+
+def test_the_id_is_of_all_that_compensation_depends_on() -> None:
+    motion = MotionResult(np.eye(3), 0.01, 0.05, np.eye(23), 0.9)
+    covariance = RESULT.covariance * 1.01
+    changes: list[dict[str, Any]] = [
+        {"covariance": covariance},
+        {"gain_sigma": 0.01},
+        {"g_m_s2": 9.8},
+        {"response": response(0.01, 0.0)},
+        {"motion": motion},
+        {"motion": replace(motion, delay_s=0.02)},
+        {"motion": replace(motion, inertia_kg_m2=2 * np.eye(3))},
+    ]
+    ids = [replace(RESULT, **change).id for change in changes]
+    assert len({RESULT.id, *ids}) == len(changes) + 1
+    assert replace(RESULT, motion=replace(motion, used_share=0.5)).id == ids[4]
+
+
+def test_noise_explains_the_residuals_unless_a_test_says_otherwise() -> None:
+    for p_value, explains in ((0.9e-3, False), (1.1e-3, True), (None, False)):
+        assert replace(RESULT, p_value=p_value).noise_explains == explains
+    assert replace(RESULT, p_value=None, quality={}).noise_explains
+    motion = MotionResult(np.eye(3), 0.01, 0.05, np.eye(23), 0.9)
+    assert replace(RESULT, p_value=None, motion=motion).noise_explains
+    np.testing.assert_array_equal(replace(RESULT, quality={}).likely_error(), RESULT.predicted_error())
+    old = {name: value for name, value in RESULT.quality.items() if not name.startswith("next_use")}
+    left_out = [RESULT.quality["loo_force_rms_N"], RESULT.quality["loo_torque_rms_Nm"]]
+    np.testing.assert_array_equal(replace(RESULT, quality=old).likely_error(), left_out)
+
+
+def test_a_motion_has_its_sigmas_and_is_read_as_written() -> None:
+    motion = MotionResult(np.eye(3), 0.01, 0.05, np.diag(np.arange(23.0) ** 2), 0.9, ({"t_s": 1.0},))
+    np.testing.assert_array_equal(motion.sigma["inertia_kg_m2"], [[15, 18, 19], [18, 16, 20], [19, 20, 17]])
+    assert (motion.sigma["height_m"], motion.sigma["delay_s"]) == (21, 22)
+    again = MotionResult.from_dict(motion.to_dict())
+    assert again is not None
+    assert again.to_dict() == motion.to_dict()
+    assert MotionResult.from_dict({}) is None
+
+
+def test_arrays_of_another_shape_or_without_numbers_are_refused() -> None:
+    good = np.zeros(6)
+    for bad in (np.zeros(5), np.full(6, np.nan)):
+        for change, sigma in ((bad, good), (good, bad)):
+            with pytest.raises(ValueError, match=r"the drift's .* six finite numbers"):
+                DriftResult(change, sigma)
+    for inertia, covariance in (
+        (np.eye(2), np.eye(23)),
+        (np.eye(3), np.eye(22)),
+        (np.eye(3), np.full((23, 23), np.inf)),
+    ):
+        with pytest.raises(ValueError, match=r"the motion's .* finite numbers"):
+            MotionResult(inertia, 0.01, 0.05, covariance, 0.9)
+    wrong: dict[str, Any] = {"weights": np.ones(9), "measured_sigma": np.full(6, np.nan), "cable_shift": np.ones(14)}
+    for name, value in wrong.items():
+        with pytest.raises(ValueError, match=f"{name} must be"):
+            replace(RESULT, **{name: value})
+    right: dict[str, Any] = {"measured_sigma": np.ones(6), "weights": np.ones(10), "cable_shift": np.ones(15)}
+    assert replace(RESULT, **right).weights is not None

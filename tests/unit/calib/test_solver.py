@@ -162,6 +162,13 @@ def test_noise_that_was_not_measured_is_estimated_from_the_residuals() -> None:
     np.testing.assert_allclose(np.sqrt(np.mean(np.square(stated), axis=0)), SIGMA[[0, 3]], rtol=0.1)
 
 
+def test_a_closed_form_takes_its_residuals_as_the_noise_that_was_not_measured() -> None:
+    wrench = noisy(np.random.default_rng(6), R24, white(24))
+    result = solve(dataset(R24, wrench), "srom")
+    assert result.chi2 == pytest.approx(result.dof)
+    assert (result.dof, result.noise_source, result.drift) == (6 * 24 - 15, "residuals", None)
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_turning_base_or_sensor_or_shuffling_rows_turns_and_shuffles_the_answer(method: Method) -> None:
     rng = np.random.default_rng(5)

@@ -72,3 +72,34 @@ def test_without_a_significant_weight_no_direction_is_compared() -> None:
     askew = Rotation.from_rotvec([2.0, 0, 0]).as_matrix()
     known = Known(mass_kg=1.0, gravity_direction_base=(1, 0, 0), R_flange_sensor=askew)
     assert [one.code for one in contradicted(known, 4, light)] == ["known_mass"]
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "upwards", "corrections"),
+    [
+        (90.0, False, [["wrench", ["-y", "x", "z"]]]),
+        (90.0, True, [["wrench", ["y", "-x", "-z"]]]),  # mirrored forces read like a weight that pulls upwards
+        (95.0, False, [["wrench", ["-y", "x", "z"]]]),
+        (96.5, False, []),
+        (5.0, False, []),  # in the right order
+        (45.0, False, []),
+    ],
+)
+def test_axes_in_another_order_are_named(turn_deg: float, upwards: bool, corrections: list[object]) -> None:
+    turn = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
+    down = np.array([0.0, 0, 10.0 if upwards else -10.0])
+    mount = Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix()
+    found = replace(FOUND, R_flange_sensor=mount @ turn, gravity_force_base_N=down)
+    (finding,) = contradicted(Known(R_flange_sensor=mount), 4, found)
+    assert (finding.code, finding.values["corrections"]) == ("known_mounting", corrections)
+    assert finding.values["off_deg"] == pytest.approx(turn_deg)
+    # Where only the turn about z is open, a tilt is no order of axes.
+    flat = replace(FOUND, R_flange_sensor=Rotation.from_euler("x", 90, degrees=True).as_matrix())
+    (finding,) = contradicted(Known(yaw_only=True), 4, flat)
+    assert (finding.values["off_deg"], finding.values["corrections"]) == (pytest.approx(90), [])
+
+
+@pytest.mark.parametrize(("off", "units"), [(1.03, [["lbf", "N·m"]]), (1.05, [])])
+def test_a_unit_is_named_where_it_makes_the_masses_agree(off: float, units: list[object]) -> None:
+    (finding,) = contradicted(Known(mass_kg=off * 4.4482216 * 10 / STANDARD_GRAVITY_M_S2), 4)
+    assert finding.values["units"] == units

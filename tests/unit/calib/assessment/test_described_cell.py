@@ -1,5 +1,6 @@
 """A result that contradicts the described cell is usable at best, and its findings say why."""
 
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, Setup, solve
-from ftcalib.assessment.described_cell import LEAN_DEG, lean_from, payload
+from ftcalib.assessment.described_cell import _OTHER_ORDERS, LEAN_DEG, directions, lean_from, payload, tool
 from ftcalib.model import predict
 from ftcalib.poses.information import special
 
@@ -103,7 +104,129 @@ def test_a_base_that_is_level_or_may_be_does_not_lean(angle_deg: float, sigma_N:
     assert lean_from(np.array([0.0, 0, -1]), gravity_N, np.eye(3) * sigma_N**2).is_significant == significant
 
 
+@pytest.mark.parametrize(("shift", "order"), [(1, "w, x, y, z"), (-1, "x, y, z, w")])
+def test_orientations_in_another_order_and_inverted_are_turned_by_fixed_rotations(shift: int, order: str) -> None:
+    true = Rotation.random(5, rng=0).as_matrix()
+    as_read = Rotation.from_quat(np.roll(Rotation.from_matrix(true).as_quat(), shift, axis=1)).inv().as_matrix()
+    U = _OTHER_ORDERS[order]
+    V = (U @ as_read[0]).T @ true[0]
+    np.testing.assert_allclose(U @ as_read @ V, true, atol=1e-12)
+
+
+NO_LEAN = Parameters(np.eye(3), np.array([0.0, 0, -20]), np.zeros(3), np.array([0.0, 0, 0.05]), np.zeros(3))
+CERTAIN = np.diag(np.repeat(1e-12, 15))
+
+
+def tilted(angle_deg: float) -> Parameters:
+    angle = np.radians(angle_deg)
+    return replace(NO_LEAN, gravity_force_base_N=20 * np.array([0.0, np.sin(angle), -np.cos(angle)]))
+
+
+@pytest.mark.parametrize(
+    ("off_deg", "undeclared", "declared"),
+    [
+        (0.1, None, None),
+        (0.3, None, "base_leans"),
+        (9.9, None, "base_leans"),
+        (10.1, "gravity_tilted", "gravity_off_mounting"),
+        (59.9, "gravity_tilted", "gravity_off_mounting"),
+        (60.1, "mounting_undeclared", "gravity_off_mounting"),
+        (134.9, "mounting_undeclared", "gravity_off_mounting"),
+        (135.1, "weight_upwards", "weight_upwards"),
+    ],
+)
+def test_gravity_off_the_mounting_is_named_by_its_angle(
+    off_deg: float, undeclared: str | None, declared: str | None
+) -> None:
+    for setup, code in ((Setup(), undeclared), (Setup(up_in_base=(0, 0, 2)), declared)):
+        found = directions(tilted(off_deg), CERTAIN, setup)
+        assert [one.code for one in found] == [code] * (code is not None)
+        for one in found:
+            assert one.values["lean_deg" if code == "base_leans" else "off_deg"] == pytest.approx(off_deg)
+            if "direction" in one.values:
+                np.testing.assert_allclose(one.values["direction"], tilted(off_deg).gravity_force_base_N / 20)
+
+
+@pytest.mark.parametrize(
+    ("inside_m", "sigma_m", "reversed_torques"),
+    [
+        (-0.3, 1e-6, False),
+        (0.009, 1e-6, False),
+        (0.011, 1e-6, True),
+        (0.029, 0.01, False),
+        (0.031, 0.01, True),
+        (0.49, 1e-6, True),
+        (0.51, 1e-6, False),
+    ],
+)
+def test_a_centre_of_mass_behind_the_sensor_shows_reversed_torques(
+    inside_m: float, sigma_m: float, reversed_torques: bool
+) -> None:
+    mount = Rotation.from_rotvec([0.5, -0.2, 0.4]).as_matrix()
+    behind = replace(NO_LEAN, R_flange_sensor=mount, p_sensor_com_m=mount.T @ [0.2, 0.1, -inside_m])
+    covariance = CERTAIN.copy()
+    covariance[9:12, 9:12] = mount.T @ np.diag([1.0, 1.0, sigma_m**2]) @ mount
+    found = directions(behind, covariance, Setup())
+    assert [one.code for one in found] == ["torques_reversed"] * reversed_torques
+    if found:
+        assert found[0].values["inside_mm"] == pytest.approx(1e3 * inside_m)
+    upwards = replace(behind, gravity_force_base_N=np.array([0.0, 0, 20]))
+    (found_up,) = directions(upwards, covariance, Setup())
+    assert found_up.code == ("forces_reversed" if reversed_torques or inside_m > 0.5 else "weight_upwards")
+
+
 # ------------------------------------------------------------------------------------------------------------- the tool
+
+
+@pytest.mark.parametrize(
+    ("load_kg", "tool_kg", "sigma_kg", "code"),
+    [
+        (0.29, 0.2, 0.0, None),
+        (0.31, 0.2, 0.0, "tool_mass_mismatch"),
+        (1.29, 1.0, 0.0, None),
+        (1.31, 1.0, 0.0, "tool_mass_mismatch"),
+        (1.79, 1.0, 0.2, None),
+        (1.81, 1.0, 0.2, "tool_mass_mismatch"),
+        (1.4, 10.0, 0.0, "tool_mass_mismatch"),
+        (0.07, 1.0, 0.0, "weight_compensated"),  # a remainder
+        (0.14, 1.0, 0.0, "tool_mass_mismatch"),
+    ],
+)
+def test_a_mass_is_compared_with_that_of_the_tool(
+    load_kg: float, tool_kg: float, sigma_kg: float, code: str | None
+) -> None:
+    weight = replace(NO_LEAN, gravity_force_base_N=9.8 * load_kg * np.array([0.6, 0, -0.8]))
+    across = np.array([0.8, 0, 0.6])
+    covariance = CERTAIN.copy()
+    covariance[3:6, 3:6] += 100 * np.outer(across, across)
+    covariance[3:6, 3:6] += (9.8 * sigma_kg) ** 2 * np.outer([0.6, 0, -0.8], [0.6, 0, -0.8])
+    found = tool(weight, covariance, Setup(tool_mass_kg=tool_kg), 9.8)
+    assert [one.code for one in found] == [code] * (code is not None)
+    if code == "tool_mass_mismatch":
+        assert found[0].values["load_kg"] == pytest.approx(load_kg)
+        assert found[0].values["units"] == []
+    elif code:
+        assert found[0].values["weight_N"] == pytest.approx(9.8 * load_kg)
+
+
+@pytest.mark.parametrize(
+    ("beyond_m", "sigma_m", "severity"),
+    [(0.009, 0.0, None), (0.011, 0.0, "limit"), (0.099, 0.0, "limit"), (0.101, 0.0, "reject"), (0.049, 0.01, None)],
+)
+@pytest.mark.parametrize("height_m", [0.04, None])
+def test_a_centre_of_mass_beyond_the_tool_is_named_by_its_distance(
+    beyond_m: float, sigma_m: float, severity: str | None, height_m: float | None
+) -> None:
+    covariance = CERTAIN.copy()
+    covariance[9:12, 9:12] += sigma_m**2 * np.eye(3)
+    tip_m = 0.09  # above the flange; the sensor may be at its face where its height is not described
+    far = replace(NO_LEAN, p_sensor_com_m=np.array([0.0, 0, tip_m + beyond_m - (height_m or 0.0)]))
+    found = tool(far, covariance, Setup(cylinders_m=[(0.0, tip_m, 0.08)], sensor_height_m=height_m), 9.8)
+    assert [one.severity for one in found] == [severity] * (severity is not None)
+    for one in found:
+        assert one.values["outside_mm"] == pytest.approx(1e3 * beyond_m, abs=0.2)
+        assert one.values["origin"] == ("flange" if height_m else "sensor")
+        assert bool(one.values["units"]) == (far.p_sensor_com_m[2] > 0.1)
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from ftcalib import (
     read_csv,
     solve,
 )
-from ftcalib.assessment.faults import least_rms, rough_fit
+from ftcalib.assessment.faults import _Rough, broken_channels, constant_weight, least_rms, rough_fit
 from ftcalib.known import Known
 from ftcalib.model import Array, predict
 
@@ -307,3 +307,71 @@ def test_no_rotation_leaves_less_than_the_bound() -> None:
             rms = np.sqrt(np.mean(np.sum(left[:, :3] ** 2, axis=1)))
             assert least_rms(orientations, wrench[:, :3]) <= rms
     assert least_rms(orientations, wrench[:, :3]) > 0.1 * rms  # inverted orientations can be left out by it
+
+
+def test_a_weight_that_pulls_upwards_is_as_unlikely_as_residuals_e_times_as_large() -> None:
+    _, R, wrench = session(1)
+    rough = _Rough.of(R, wrench)
+    F_b = rough.parameters.gravity_force_base_N
+    down = F_b / np.linalg.norm(F_b)
+    aside = np.cross(down, [1.0, 0, 0])
+    fits = np.log(rough.force_rms_N * rough.torque_rms_Nm)
+    for up, penalty in ((-3 * down, 0.0), (aside, 0.5), (0.2 * down, 1.0)):
+        assert rough.score(up) == pytest.approx(fits + penalty)
+    inside = _Rough.of(R, wrench * [1, 1, 1, -1, -1, -1])  # a centre of mass on the robot's side of the sensor
+    assert (rough.outwards, inside.outwards) == (True, False)
+    assert inside.score(-down) == pytest.approx(fits + 0.5)
+
+
+def test_a_rough_fit_leaves_what_it_says() -> None:
+    _, R, wrench = session(1)
+    rough = _Rough.of(R, wrench)
+    force, torque = np.hsplit(wrench - predict(rough.parameters, R), 2)
+    rms = [np.sqrt(np.mean(np.sum(part**2, axis=1))) for part in (force, torque)]
+    assert (rough.force_rms_N, rough.torque_rms_Nm) == pytest.approx(tuple(rms), rel=1e-6)
+    weight_N = np.linalg.norm(rough.parameters.gravity_force_base_N)
+    spread_Nm = np.sqrt(np.var(wrench[:, 3:], axis=0).sum())
+    assert rough.shares == pytest.approx((rms[0] / weight_N, rms[1] / spread_Nm), rel=1e-6)
+    np.testing.assert_allclose(rough.weight_sensor_N, wrench[:, :3] - force - rough.parameters.force_bias_N)
+
+
+@pytest.mark.parametrize(
+    ("off_deg", "spread", "constant"), [(9.9, 0.049, True), (10.1, 0.049, False), (9.9, 0.051, False)]
+)
+def test_a_constant_force_that_points_down_is_a_weight_in_base_axes(
+    off_deg: float, spread: float, constant: bool
+) -> None:
+    up = np.array([0.0, 2.0, 0.0])
+    mean = 20 * np.array([np.sin(np.radians(off_deg)), -np.cos(np.radians(off_deg)), 0.0])
+    wrench = np.tile(np.append(mean, np.zeros(3)), (12, 1))
+    wrench[:, 2] += 20 * spread * np.where(np.arange(12) % 2, 1, -1)
+    found = constant_weight(wrench, up)
+    assert [one.code for one in found] == ["constant_force"] * constant
+
+
+@pytest.mark.parametrize(("share", "coarse"), [(0.0048, False), (0.0052, True)])
+def test_readings_are_coarse_where_rounding_adds_to_their_spread(share: float, coarse: bool) -> None:
+    """Rounding to a step has the standard deviation of a uniform distribution."""
+    steps = np.random.default_rng(2).integers(-400, 400, (40, 6)).astype(np.float64)
+    steps[:3] = [[0], [1], [3]]
+    spread = np.array([np.sqrt(np.var(part, axis=0).sum()) for part in np.hsplit(steps, 2)])
+    steps[3:] *= 1 / np.sqrt(12) / (share * spread[0])  # so many steps wide
+    steps = np.round(steps)
+    found = broken_channels(0.5 * steps, np.tile(np.eye(3), (40, 1, 1)))
+    assert [one.code for one in found if one.code == "quantised"] == ["quantised"] * coarse
+    if coarse:
+        assert found[0].values["step_N"] == pytest.approx(0.5)
+    uneven = 0.5 * steps + 0.01 * np.random.default_rng(3).normal(size=steps.shape)
+    assert broken_channels(uneven, np.tile(np.eye(3), (40, 1, 1))) == []
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_limit_is_one_that_three_poses_read(side: int) -> None:
+    _, R, wrench = session(1)
+    order = np.argsort(side * wrench[:, 4])[::-1]
+    wrench[order[:2], 4] = wrench[order[0], 4]
+    assert broken_channels(wrench, R) == []
+    wrench[order[:3], 4] = wrench[order[0], 4]
+    (finding,) = broken_channels(wrench, R)
+    assert (finding.code, finding.values["channel"]) == ("saturated", "ty")
+    assert finding.values["poses"] == sorted((order[:3] + 1).tolist())

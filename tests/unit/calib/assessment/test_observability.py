@@ -1,6 +1,7 @@
 """Observability of poses: exact ranks, correct reasons, and advice that helps."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from ftcalib import NotObservable, Parameters
 from ftcalib.assessment.observability import (
     AMBIGUOUS_GAP,
     NOMINAL,
+    Observability,
     assess,
     different_orientations,
     require_observable,
     require_orientations,
+    scaled_information,
     second_minimum,
     wrong_basin_probability,
 )
@@ -226,3 +229,44 @@ def test_odds_of_the_second_solution() -> None:
     assert wrong_basin_probability(0) == 0.5
     assert wrong_basin_probability(2) == pytest.approx(0.27, abs=0.01)
     assert wrong_basin_probability(12) == pytest.approx(0.0025, abs=1e-4)
+
+
+SOUND = Observability(4, 15, 0.99e4, (), (), np.zeros((0, 3, 3)), 0.021)
+
+
+def test_a_set_is_sound_up_to_its_limits() -> None:
+    assert SOUND.sound
+    assert not replace(SOUND, orientations=3).sound
+    assert not replace(SOUND, rank=14).sound
+    assert not replace(SOUND, condition=1.01e4).sound
+    assert not replace(SOUND, second_gap=0.019).sound
+
+
+@pytest.mark.parametrize(
+    ("ambiguities", "advice", "sentence"),
+    [
+        ((), (), "the poses determine all parameters (condition 9.9e+03, gap 0.021)."),
+        (("a",), (), "a."),
+        (("a", "b"), ("x",), "a: b; add a pose: from the last one, x."),
+        (("a", "b", "c"), ("x", "y"), "a: b, and c; add 2 poses, each from the last one: x; y."),
+    ],
+)
+def test_reason_and_advice_are_one_sentence(
+    ambiguities: tuple[str, ...], advice: tuple[str, ...], sentence: str
+) -> None:
+    assert replace(SOUND, ambiguities=ambiguities, advice=advice).sentence() == sentence
+
+
+@pytest.mark.parametrize(("com_m", "lever_m"), [(0.08, 0.08), (0.01, 0.025)])
+def test_information_counts_poses(com_m: float, lever_m: float) -> None:
+    weight_N = 20.0
+    tool = replace(NOMINAL, gravity_force_base_N=np.array([0, 0, -weight_N]), p_sensor_com_m=np.array([0, 0, com_m]))
+    information = scaled_information(R24, tool)
+    in_torque_noise = (lever_m / 0.025) ** 2  # by which torques at the lever exceed their usual noise
+    np.testing.assert_allclose(information[6:9, 6:9], 24 * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(information[12:, 12:], 24 * in_torque_noise * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(information[9:12, 9:12], 24 * 2 / 3 * in_torque_noise * np.eye(3), atol=1e-9)
+    noise = weight_N**2 * np.diag(np.repeat([1.0, 0.025**2], 3))
+    np.testing.assert_allclose(scaled_information(R24, tool, np.tile(noise, (24, 1, 1))), information, atol=1e-9)
+    louder = scaled_information(R24, tool, np.tile(4 * noise, (24, 1, 1)))
+    np.testing.assert_allclose(louder, information / 4, atol=1e-9)

@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
-from ftcalib.assessment.session_change import likeliest_change
+from ftcalib.assessment.faults import rough_fit
+from ftcalib.assessment.session_change import _groups, likeliest_change, minus_two_log_likelihood
+from ftcalib.likelihood.fit import fit
 from ftcalib.likelihood.gain_and_cross_talk import SIZE, response_columns
-from ftcalib.model import Parameters, predict
+from ftcalib.model import Parameters, jacobian, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
 
 Array = NDArray[np.float64]
@@ -135,3 +138,80 @@ def test_gain_and_cross_talk_of_a_fit_hide_no_part_of_a_change() -> None:
     # Beside 15 free parameters the sigma of a step between two halves is about that of a mean of 4 poses.
     lighter_N = np.linalg.norm(LIGHTER.gravity_force_base_N) - np.linalg.norm(TOOL.gravity_force_base_N)
     assert change.values["change_N"] == pytest.approx(lighter_N, abs=3 * SIGMA[0] / 2)
+
+
+COUNT = np.arange(24)
+STEP_N = np.array([0.2, 0, 0.1])
+STEPPED = replace(TOOL, force_bias_N=TOOL.force_bias_N + STEP_N, torque_bias_Nm=TOOL.torque_bias_Nm - 0.01)
+TOUCHED = replace(OTHER, torque_bias_Nm=TOOL.torque_bias_Nm + np.array([0.03, 0, 0.04]))
+
+
+@pytest.mark.parametrize(
+    ("rows", "measured"),
+    [(COUNT >= 3, True), (COUNT >= 10, False), (COUNT >= 21, True), (COUNT % 2 == 1, False)],
+)
+@pytest.mark.parametrize(
+    ("after", "code", "values"),
+    [
+        (STEPPED, "bias_stepped", {"force_N": np.sqrt(0.05), "torque_Nm": np.sqrt(3e-4)}),
+        (SHIFTED, "com_shifted", {"shift_mm": np.sqrt(5.0)}),
+        (LIGHTER, "load_changed", {"change_N": -0.03 * np.linalg.norm(TOOL.gravity_force_base_N)}),
+        (TURNED, "sensor_turned", {"turn_deg": 5.0}),
+        (TOUCHED, "sensor_changed", {"turn_deg": 70.0, "force_N": np.sqrt(48.0), "torque_Nm": 0.05}),
+    ],
+)
+def test_a_change_is_as_large_as_it_is_and_can_be_undone(
+    after: Parameters, code: str, values: dict[str, float], rows: NDArray[np.bool_], measured: bool
+) -> None:
+    wrench = np.where(rows[:, None], predict(after, ORIENTATIONS), predict(TOOL, ORIENTATIONS))
+    wrench += 0.01 * np.random.default_rng(5).normal(0, SIGMA, wrench.shape)
+    change = likeliest_change(rough_fit(ORIENTATIONS, wrench), ORIENTATIONS, wrench, SIGMA if measured else None)
+    assert change is not None
+    assert (change.code, change.takes_turns) == (code, not rows[22])
+    assert change.first == np.flatnonzero(rows)[0]
+    assert {name: change.values[name] for name in values} == pytest.approx(values, rel=0.02)
+    left = change.corrected - predict(rough_fit(ORIENTATIONS, change.corrected), ORIENTATIONS)
+    assert np.sqrt(np.mean((left / SIGMA) ** 2)) < 0.1
+    if measured:
+        assert change.misfit < 1e-3
+
+
+@pytest.mark.parametrize("n", [12, 13])
+def test_changes_are_tried_that_leave_three_poses_on_each_side(n: int) -> None:
+    found = [(pure, [row.tolist() for row in groups]) for pure, groups in _groups(n)]
+    half = n // 2
+
+    def later(first: int) -> list[bool]:
+        return [k >= first for k in range(n)]
+
+    assert found == [
+        (None, [later(first) for first in range(3, n - 2)]),
+        (slice(0, half), [later(first) for first in range(half, n - 2)]),
+        (slice(half, n), [[not one for one in later(first)] for first in range(3, half + 1)]),
+        (slice(0, n, 2), [[k % 2 == 1 for k in range(n)]]),
+    ]
+
+
+def test_the_likelihood_is_that_of_the_dense_covariance_less_what_components_must_bring() -> None:
+    rng = np.random.default_rng(7)
+    wrench = predict(TOOL, ORIENTATIONS) + rng.normal(0, SIGMA, (24, 6))
+    wrench += np.cumsum(rng.normal(0, 5 * SIGMA, (24, 6)), axis=0)
+    found = fit(ORIENTATIONS, wrench, np.diag(SIGMA**2), drift="random-walk")
+    assert found.components.keys() == {"walk_force_N", "walk_torque_Nm"}
+    W = found.noise.solve(np.eye(144).reshape(24, 6, 144)).reshape(144, 144)
+    J, e = jacobian(found.parameters, ORIENTATIONS).reshape(144, 15), found.residuals.ravel()
+    logdet = np.linalg.slogdet(J.T @ W @ J)[1] - np.linalg.slogdet(W)[1]
+    assert minus_two_log_likelihood(found) == pytest.approx(logdet + e @ W @ e + 2 * (2 + 2), abs=1e-4)
+
+
+def test_a_rejected_pose_costs_the_limit_and_a_logarithm_beyond_it() -> None:
+    wrench = predict(TOOL, ORIENTATIONS) + np.random.default_rng(8).normal(0, SIGMA, (24, 6))
+    wrench[5] += 30 * SIGMA
+    found = fit(ORIENTATIONS, wrench, np.diag(SIGMA**2), drift="none")
+    assert np.flatnonzero(found.weights == 0).tolist() == [5]
+    others = fit(np.delete(ORIENTATIONS, 5, 0), np.delete(wrench, 5, 0), np.diag(SIGMA**2), drift="none")
+    e, S = found.left_out_residuals[5], found.left_out_cov[5]
+    limit, distance = stats.chi2.isf(1e-3, 6), e @ np.linalg.solve(S, e)
+    cost = np.linalg.slogdet(S)[1] + limit + 6 * np.log(distance / limit)
+    assert found.components == others.components == {}
+    assert minus_two_log_likelihood(found) - minus_two_log_likelihood(others) == pytest.approx(cost, abs=0.01)

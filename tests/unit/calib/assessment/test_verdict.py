@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,14 +17,23 @@ from ftcalib.assessment.faults import faults
 from ftcalib.assessment.verdict import (
     Quality,
     _drift,
+    _errors,
+    _noise,
+    _poses,
+    _response,
+    _second_solution,
+    _some_runs,
+    _Statistics,
+    _weight,
     expected_error,
     judge,
+    out_of_line,
     strong_correlations,
     successive_correlation,
 )
 from ftcalib.data.dataset import read_csv
 from ftcalib.likelihood.fit import DriftEstimate
-from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
+from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response, predicted_covariance
 from ftcalib.model import Array, jacobian, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
 
@@ -417,6 +428,177 @@ def test_wrong_units_of_torque_are_detected(
     values = the(code, result).values
     assert values["distance_mm" if factor < 1 else "distance_m"] == pytest.approx(distance, rel=0.02)
     assert values.get("units") == suspects
+
+
+# Limits
+
+
+FITTED = fit(R24, noisy(np.random.default_rng(30), R24), white(24))
+WEIGHT_N = float(np.linalg.norm(FITTED.parameters.gravity_force_base_N))
+
+
+def statistics(**values: Any) -> _Statistics:
+    """Of 24 good poses, except for these values."""
+    usual = {"used": np.ones(24, bool), "weight_N": WEIGHT_N, "residual_sigma": np.ones(24), "worst_pose": 3}
+    usual |= {"lag1": 0.3, "lag1_p": 0.5, "largest_share": 0.001, "noise_factor": 1.0, "chi2_p": 0.5}
+    one = SimpleNamespace(**usual | values)
+    one.fits_measured_noise = one.chi2_p is not None and one.chi2_p >= 1e-3
+    return cast(_Statistics, one)
+
+
+@pytest.mark.parametrize(("delta", "found"), [(11.9, True), (12.1, False)])
+@pytest.mark.parametrize("noise_factor", [0.5, 2.0])
+def test_a_second_solution_counts_in_noise_as_it_is(delta: float, noise_factor: float, found: bool) -> None:
+    scale = FITTED.chi2 / FITTED.dof / noise_factor**2
+    noisier = replace(FITTED, wrench_cov=FITTED.wrench_cov * scale, second_basin_chi2=delta * max(1, noise_factor**2))
+    assert [one.code for one in _second_solution(noisier)] == ["second_solution"] * found
+    (close,) = _second_solution(replace(FITTED, second_basin_chi2=-1.0))
+    assert close.values["probability_percent"] == 50
+
+
+def test_of_a_rejected_result_only_units_are_suspected_of_the_payload() -> None:
+    rejected, broken = replace(FITTED, second_basin_chi2=2.0), FITTED.wrench.copy()
+    broken[:, 5] = broken[0, 5]
+    mass_kg = WEIGHT_N / 9.80665
+    for payload_kg, code in ((2.5 * mass_kg, "payload_mismatch"), (4.448 * mass_kg, "payload_units")):
+        setup = Setup(payload_kg=payload_kg, sensor_mass_kg=0.0)
+        assert (code in codes(judge(rejected, setup=setup))) == (code == "payload_units")
+        assert code in codes(judge(FITTED, setup=setup))
+        assert code not in codes(judge(replace(rejected, wrench=broken), setup=setup))
+
+
+@pytest.mark.parametrize(("sigmas", "significant"), [(4.9, False), (5.1, True)])
+def test_a_weight_is_one_from_five_sigmas_on(sigmas: float, significant: bool) -> None:
+    along = FITTED.parameters.gravity_force_base_N / WEIGHT_N
+    across = np.cross(along, [1.0, 0, 0])
+    covariance = 1e-9 * np.eye(15)
+    covariance[3:6, 3:6] += (WEIGHT_N / sigmas) ** 2 * np.outer(along, along) + 1e3 * np.outer(across, across)
+    found = _weight(replace(FITTED, covariance=covariance), WEIGHT_N, Setup())
+    assert [one.code for one in found] == ["weight_insignificant"] * (not significant)
+
+
+@pytest.mark.parametrize(
+    ("factor", "share", "severity"),
+    [(2.9, 0.009, "note"), (3.1, 0.009, "limit"), (2.9, 0.011, "limit")],
+)
+def test_more_noise_than_measured_is_minor_up_to_three_times_and_one_percent(
+    factor: float, share: float, severity: str
+) -> None:
+    loud = replace(FITTED, components={"walk_force_N": 0.1, "white_force_N": 0.0})
+    (finding,) = _noise(loud, statistics(chi2_p=0.9e-3, noise_factor=factor, largest_share=share))
+    assert (finding.severity, finding.values["components"]) == (severity, {"walk_force_N": 0.1})
+    assert _noise(loud, statistics(chi2_p=1.1e-3, noise_factor=factor)) == []
+    assert [one.code for one in _noise(loud, statistics(chi2_p=None))] == ["noise_unknown"]
+
+
+def test_poses_are_pointed_at_beyond_their_limits() -> None:
+    def found(fitted: IndependentFit = FITTED, **values: Any) -> list[str]:
+        return [one.code for one in _poses(fitted, statistics(**values), "note")]
+
+    assert found() == []
+    assert found(lag1_p=0.9e-3) == ["residuals_alike"]
+    assert found(lag1_p=1.1e-3) == []
+    for n, codes_of_few in ((5, ["poses_rejected", "few_poses"]), (6, ["poses_rejected"])):
+        assert found(used=np.arange(24) < n) == codes_of_few
+    limit = np.sqrt(chi2.isf(1e-3 / 24, 6) / 6)
+    for typical in (0.5, 3.0):
+        sigmas = np.full(24, typical)
+        for off, codes_of_far in ((0.99, []), (1.01, ["pose_deviates"])):
+            sigmas[3] = off * limit * max(typical, 1.0)
+            assert found(residual_sigma=sigmas) == codes_of_far
+            assert out_of_line(sigmas, np.arange(24) != 5) == [3] * bool(codes_of_far) + [5]
+    sigmas[[3, 4, 5, 6]] = 1e6
+    assert found(residual_sigma=sigmas, used=np.arange(24) < 5) == ["poses_rejected", "few_poses"]
+    cov = np.zeros((24, 6, 6))
+    for rows, unchecked in ((12, ["poses_unchecked"]), (13, []), (0, [])):
+        cov[:, 1, 1] = np.where(np.arange(24) < rows, 1.01, 0.99) * WEIGHT_N**2
+        uncertain = cast(IndependentFit, SimpleNamespace(left_out_cov=cov))
+        assert found(uncertain) == unchecked
+    assert found(uncertain, weight_N=0.9 * WEIGHT_N, used=np.arange(24) < 6) == ["poses_rejected"]
+
+
+def test_errors_count_relative_to_the_weight_at_a_lever() -> None:
+    used = np.arange(24) > 1
+    for com_m, lever_m in ((0.05, 0.1), (0.3, 0.3)):
+        com = com_m * np.array([0.6, 0.0, 0.8])
+        truth = replace(TRUTH, p_sensor_com_m=com)
+        sigma = np.repeat([0.05, 0.04 * lever_m * WEIGHT_N / np.sqrt(3)], 3)
+        wrench = noisy(np.random.default_rng(31), R24, truth, sigma)
+        loud = fit(R24, wrench, white(24, sigma), start=truth, weights=used.astype(float))
+        largest, (finding,), left_out = _errors(loud, used, WEIGHT_N)
+        length = [np.sqrt(np.mean(np.sum(part[used] ** 2, axis=1))) for part in np.hsplit(loud.left_out_residuals, 2)]
+        assert left_out == pytest.approx(tuple(length))
+        residual_Nm = np.sqrt(np.mean(np.sum(loud.residuals[used, 3:] ** 2, axis=1)))
+        assert (finding.code, finding.severity, finding.values["source"]) == ("torque_error", "limit", "residuals")
+        assert finding.values["error_Nm"] == pytest.approx(residual_Nm)
+        assert finding.values["lever_m"] == pytest.approx(lever_m, rel=0.01)
+        assert largest == pytest.approx(residual_Nm / WEIGHT_N / finding.values["lever_m"])
+        assert (finding.values["share_percent"], finding.values["limit_percent"]) == (100 * largest, 2)
+
+
+def test_the_next_use_has_the_noise_that_explains_the_residuals_or_else_those_of_left_out_poses() -> None:
+    wrench = noisy(np.random.default_rng(32), R24)
+    measured, unknown = fit(R24, wrench, white(24)), fit(R24, wrench)
+    expected = expected_error(measured.parameters, measured.covariance)
+    quality, other = judge(measured), judge(unknown)
+    assert (quality.next_use_force_rms_N, quality.next_use_torque_rms_Nm) == pytest.approx(expected)
+    left_out = other.loo_force_rms_N, other.loo_torque_rms_Nm
+    assert (other.next_use_force_rms_N, other.next_use_torque_rms_Nm) == pytest.approx(left_out)
+
+
+def test_many_poses_are_looked_at_in_runs() -> None:
+    np.testing.assert_array_equal(_some_runs(None, 3999), np.arange(3999))
+    np.testing.assert_array_equal(_some_runs(None, 4000), np.arange(4000).reshape(20, 2, 100)[:, 0].ravel())
+    backwards = np.arange(6.0)[::-1]
+    np.testing.assert_array_equal(_some_runs(backwards, 6), [5, 4, 3, 2, 1, 0])
+    np.testing.assert_array_equal(_some_runs(np.where(backwards == 2, np.nan, backwards), 6), np.arange(6))
+
+
+@pytest.mark.parametrize(
+    ("change", "is_cause", "found"),
+    [
+        ([0.029, 0, 0, 0, 0, 0], True, None),
+        ([0.031, 0, 0, 0, 0, 0], True, ("note", 0.031, 0.0)),
+        ([0.39, 0, 0, 0, 0, 0], True, ("note", 0.39, 0.0)),
+        ([0.41, 0, 0, 0, 0, 0], True, ("limit", 0.41, 0.0)),
+        ([0.41, 0, 0, 0, 0, 0], False, ("note", 0.41, 0.0)),
+        ([0, 0, 0, 0, 0.039, 0], True, ("note", 0.0, 0.039)),
+        ([0, 0, 0, 0, 0.041, 0], True, ("limit", 0.0, 0.041)),  # at the lever 0.41 N
+    ],
+)
+def test_a_drift_is_named_from_three_sigmas_on_and_limits_from_two_percent_of_the_weight(
+    change: list[float], is_cause: bool, found: tuple[str, float, float] | None
+) -> None:
+    drift = DriftEstimate(np.array(change), np.repeat([0.01, 0.001], 3), np.zeros((2, 6)))
+    ahead = DriftAhead(np.zeros(6), np.zeros(6), np.zeros(6))
+    findings = _drift(drift, ahead, 20.0, is_cause=is_cause)
+    named = [(one.severity, one.values["force_N"], one.values["torque_Nm"]) for one in findings]
+    assert named == ([] if found is None else [found])
+    if change[4]:
+        still = DriftAhead(np.zeros(6), np.zeros(6), np.array([0, 0, 0, 0, 0.041**2, 0]))
+        assert _drift(drift, still, 20.0, is_cause=True)[0].severity == "limit"
+
+
+@pytest.mark.parametrize(("sigmas", "certain"), [(2.9, False), (3.1, True)])
+def test_a_response_is_named_from_three_sigmas_on(sigmas: float, certain: bool) -> None:
+    covariance = np.diag(np.append(np.zeros(15), np.full(SIZE, 0.001**2)))
+    for k, code in ((2, "axes_mixed"), (8, "cross_talk")):
+        coefficients = sigmas * 0.001 * np.eye(SIZE)[k]
+        (finding,) = _response(Response(coefficients, covariance))
+        assert finding.code == (code if certain else "response_small")
+
+
+@pytest.mark.parametrize(("share", "doubted"), [(0.39, True), (0.41, False)])
+def test_known_values_are_doubted_where_the_data_leave_less_than_four_tenths_without_them(
+    share: float, doubted: bool
+) -> None:
+    free = fit(R24, noisy(np.random.default_rng(33), R24), white(24))
+    rms = np.sqrt(np.mean(np.sum(free.residuals[:, :3] ** 2, axis=1)))
+    scale = 0.5 / rms  # so large that the misfit matters
+    free = replace(free, wrench=predict(free.parameters, R24) + scale * free.residuals)
+    off = 0.5 * np.sqrt(1 / share**2 - 1)
+    constrained = replace(free, wrench=free.wrench + off * np.eye(6)[2])
+    assert ("known_values_misfit_force" in codes(judge(constrained, unconstrained=free))) == doubted
 
 
 # Real sessions

@@ -1,8 +1,11 @@
 """Maximum likelihood: as good as the data allow, in the right basin, with the noise the data show."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from ftcalib import Parameters
@@ -206,6 +209,18 @@ def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: 
     assert (error / least < 4).all()
 
 
+def test_a_walk_that_only_bumped_poses_need_goes_with_them() -> None:
+    rng = np.random.default_rng(3)
+    p, R = truth(rng), haar(rng, 24)
+    push = rng.normal(size=(6, 3))
+    push *= (WEIGHT_N * rng.uniform(0.2, 1, 6) / np.linalg.norm(push, axis=1))[:, None]
+    wrench = predict(p, R) + noise(rng, 24)
+    wrench[:6] += np.concatenate([push, np.cross(0.1 * rng.normal(size=(6, 3)), push)], axis=1)
+    best = fit(R, wrench, WHITE)
+    assert np.flatnonzero(best.weights == 0).tolist() == list(range(6))
+    assert (best.components, best.drift) == ({}, None)
+
+
 def test_seven_poses_are_never_split_into_right_and_wrong() -> None:
     rng = np.random.default_rng(3)
     p, R = truth(rng), haar(rng, 7)
@@ -306,6 +321,43 @@ def test_left_out_poses_are_predicted_as_by_a_new_fit(drift: Drift) -> None:
         x = np.linalg.solve(J[rest].T @ W @ J[rest], J[rest].T @ W @ e[rest])
         expected = e[own] - J[own] @ x - V[np.ix_(own, rest)] @ W @ (e[rest] - J[rest] @ x)
         np.testing.assert_allclose(best.left_out_residuals[k], expected, atol=1e-7)
+
+
+def test_a_drift_is_the_best_linear_prediction_and_its_sigma_that_of_its_error() -> None:
+    rng = np.random.default_rng(6)
+    _, R, wrench, _ = drifting(rng, 12, "walk")
+    best = fit(R, wrench, np.diag((SIGMA / 10) ** 2), drift="random-walk")
+    walk = np.repeat([best.components["walk_force_N"], best.components["walk_torque_Nm"]], 3)
+    centre = np.eye(12) - 1 / 12
+    steps = np.arange(1.0, 13)
+    K = np.kron(centre @ np.minimum.outer(steps, steps) @ centre, np.diag(walk**2))
+    V = K + block_diag(*best.noise.D)
+    J, e = jacobian(best.parameters, R).reshape(72, 15), best.residuals.ravel()
+    W = np.linalg.inv(V)
+    P = W - W @ J @ np.linalg.inv(J.T @ W @ J) @ J.T @ W
+    change = np.kron(np.eye(12)[11] - np.eye(12)[0], np.eye(6))
+    assert best.drift is not None
+    np.testing.assert_allclose(best.drift.bias, (K @ P @ e).reshape(12, 6), atol=1e-7)
+    np.testing.assert_allclose(best.drift.change, change @ K @ P @ e, atol=1e-7)
+    sigma = np.sqrt(np.diag(change @ (K - K @ P @ K) @ change.T))
+    np.testing.assert_allclose(best.drift.sigma, sigma, rtol=1e-6)
+
+
+def test_a_second_minimum_is_worse_by_chi2_or_by_the_likelihood_of_its_own_noise() -> None:
+    rng = np.random.default_rng(11)
+    p, R = truth(rng), haar(rng, 8)
+    best = fit(R, predict(p, R) + noise(rng, 8), WHITE, drift="none")
+    minima = best.minima[0], replace(best.minima[0], chi2=best.minima[0].chi2 + 9), replace(best.minima[0], chi2=1e9)
+    assert replace(best, minima=minima[:1]).second_basin_chi2 is None
+    assert replace(best, minima=minima, components={"gain": 0.01}).second_basin_chi2 == pytest.approx(9)
+    estimated = replace(best, minima=minima, components={"white_force_N": 0.1})
+
+    def loglik(chi2: float) -> float:
+        """Of residuals with the standard deviation that fits them best."""
+        return float(-best.dof * np.log(np.sqrt(chi2 / best.dof)) - best.dof / 2)
+
+    odds = 2 * (loglik(minima[0].chi2) - loglik(minima[1].chi2))
+    assert estimated.second_basin_chi2 == pytest.approx(odds)
 
 
 # What is known before

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
@@ -13,7 +14,14 @@ from ftcalib.assessment.verdict import _response
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.component_selection import with_walks_instead
 from ftcalib.likelihood.fit import Fit, fit
-from ftcalib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN, LEVER_M, Response, response_columns
+from ftcalib.likelihood.gain_and_cross_talk import (
+    CROSS_TALK_M,
+    GAIN,
+    LEVER_M,
+    Response,
+    hidden_covariance,
+    response_columns,
+)
 from ftcalib.likelihood.session import Session
 from ftcalib.likelihood.variance_components import FORCE, RESPONSE, component, maximise
 from ftcalib.model import Array, gravity_wrench, predict
@@ -233,3 +241,69 @@ def test_it_is_found_along_the_axes_that_have_it() -> None:
 def test_a_damaged_response_is_refused() -> None:
     with pytest.raises(ValueError, match="coefficients"):
         Response(np.zeros(10), np.eye(26))
+
+
+def coefficients_of(M: Array, L: Array) -> Array:
+    """Coefficients (11,) of the parts of two matrices that show: symmetric, the gain without trace."""
+    gain, cross_talk = (M + M.T) / 2 - np.trace(M) / 3 * np.eye(3), (L + L.T) / 2
+    return np.concatenate(
+        [
+            np.linalg.lstsq(basis.reshape(-1, 9).T, part.ravel())[0]
+            for basis, part in ((GAIN, gain), (CROSS_TALK_M, cross_talk))
+        ]
+    )
+
+
+def test_the_size_of_the_entries_is_that_of_the_whole_matrix() -> None:
+    rng, gains, cross_talks_m = np.random.default_rng(0), [], []
+    for M, L in rng.normal(size=(1500, 2, 3, 3)):
+        response = Response(coefficients_of(0.02 * M, 0.003 * L), np.zeros((26, 26)))
+        gains.append(response.gain_sigma**2)
+        cross_talks_m.append(response.cross_talk_sigma_m**2)
+    assert np.sqrt(np.mean(gains)) == pytest.approx(0.02, rel=0.04)
+    assert np.sqrt(np.mean(cross_talks_m)) == pytest.approx(0.003, rel=0.04)
+    # What is uncertain counts like what was found.
+    found = coefficients_of(0.02 * M, 0.003 * L)
+    unsure = Response(np.zeros(11), np.diag(np.append(np.zeros(15), found**2)))
+    sure = Response(found, np.zeros((26, 26)))
+    assert (unsure.gain_sigma, unsure.cross_talk_sigma_m) == pytest.approx((sure.gain_sigma, sure.cross_talk_sigma_m))
+
+
+def test_sigmas_of_the_entries_are_those_of_their_coefficients() -> None:
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(26, 30))
+    response = Response(rng.normal(size=11), A @ A.T)
+    drawn = rng.multivariate_normal(np.zeros(11), response.covariance[15:, 15:], 20_000)
+    for name, entries in (
+        ("force_gain", np.tensordot(drawn[:, :5], GAIN, 1)),
+        ("cross_talk_m", np.tensordot(drawn[:, 5:], CROSS_TALK_M, 1)),
+    ):
+        np.testing.assert_allclose(response.sigma[name], entries.std(axis=0), rtol=0.03)
+
+
+def test_parts_that_no_orientation_shows_are_as_large_as_those_that_do() -> None:
+    """A whole gain and cross-talk read like other parameters and their visible part."""
+    rng, p = np.random.default_rng(2), truth(np.random.default_rng(3))
+    moved = []
+    for M, L in rng.normal(size=(2500, 2, 3, 3)):
+        gain, cross_talk_m = 0.02 * M, 0.003 * L
+        # (1 + gain) u = exp(antisymmetric) (1 + mean gain) u + ..., p x u + L u = (p + shift) x u + ...
+        turn = [(gain[j, i] - gain[i, j]) / 2 for i, j in ((1, 2), (2, 0), (0, 1))]
+        shift = [(cross_talk_m[j, i] - cross_talk_m[i, j]) / 2 for i, j in ((1, 2), (2, 0), (0, 1))]
+        common = np.trace(gain) / 3
+        zero = np.zeros(3)
+        b, P = common * p.gravity_force_base_N, -common * p.p_sensor_com_m
+        moved.append(np.concatenate([turn, b, zero, np.add(shift, P), zero]))
+    expected = np.cov(np.transpose(moved), bias=True)
+    hidden = hidden_covariance(p, 0.02, 0.003)
+    # Student's distribution is wider: the size is known from 5 and 6 numbers.
+    wider = np.repeat([stats.t(5).var(), stats.t(5).var(), 1.0, stats.t(6).var(), 1.0], 3)
+    np.testing.assert_allclose(np.diag(hidden)[:9], (wider * np.diag(expected))[:9], rtol=0.1)
+    np.testing.assert_allclose(
+        hidden[3:6, 9:12], stats.t(5).var() * expected[3:6, 9:12], atol=0.1 * np.abs(hidden[3:6, 9:12]).max()
+    )
+    along = p.p_sensor_com_m / np.linalg.norm(p.p_sensor_com_m)
+    shifted = stats.t(6).var() * 0.003**2 / 2
+    assert along @ hidden[9:12, 9:12] @ along == pytest.approx(shifted + stats.t(5).var() * 0.02**2 / 3 * 0.08**2)
+    assert not hidden[6:9].any()
+    assert not hidden[12:].any()

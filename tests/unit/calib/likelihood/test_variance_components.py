@@ -5,21 +5,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.integrate import quad
 
-from ftcalib.likelihood.component_selection import _pruned, select, with_slopes_instead
+from ftcalib.likelihood.component_selection import _pruned, rivals, select, with_slopes_instead
 from ftcalib.likelihood.session_noise import Noise, centred, walk_times
 from ftcalib.likelihood.variance_components import (
     FORCE,
+    HYSTERESIS,
+    RESPONSE,
     ROTATION,
     TORQUE,
     Component,
     Linearised,
     component,
+    doubt,
     estimates,
     estimates_of_unknown_variances,
+    expected_variances,
     maximise,
     point,
     score,
+    units,
 )
 from ftcalib.model import Array
 
@@ -216,6 +222,15 @@ def test_what_is_always_needed_is_not_dropped() -> None:
     assert _pruned(p, at, 0).components == ALL[:2]
 
 
+def test_a_component_that_brings_little_is_not_dropped_with_one_that_brings_nothing() -> None:
+    small = np.array([0.004 / 400])
+    p = problem(np.random.default_rng(4), 30, (ROTATION,), small)
+    alone = maximise(p, (ROTATION,), small)
+    assert 2 < alone.loglik - point(p, (), np.zeros(0)).loglik < 4  # enough for itself, not for two
+    both = point(p, (ROTATION, ALL[1]), np.append(alone.theta, 1e-12))
+    assert _pruned(p, both, 0).components == (ROTATION,)
+
+
 def test_a_turn_of_the_flange_is_distinguished_from_white_noise() -> None:
     rng = np.random.default_rng(8)
     turned = problem(rng, 40, (ROTATION,), np.array([0.3 / 400]))
@@ -251,3 +266,101 @@ def test_many_poses_show_their_noise() -> None:
     p = problem(np.random.default_rng(9), 1000, ALL[:2], THETA[:2])
     at = point(p, ALL[:2], THETA[:2])
     np.testing.assert_array_equal(estimates_of_unknown_variances(p, at)[1], estimates(p, at)[1])
+
+
+GAINS, CROSS_TALK = RESPONSE
+
+
+def small(n: int = 12, bumped: int = 2) -> Linearised:
+    """A problem of constant columns: 5 of gain as large as 0.5, of which each counts by itself."""
+    rng = np.random.default_rng(11)
+    turn = np.zeros((n, 6, 3))
+    turn[:, :3], turn[:, 3:] = 2.0, 1.0
+    response, hysteresis = rng.normal(size=(n, 6, 11)), rng.normal(size=(n, 6, 12))
+    response[..., :5] = 0.5
+    D = np.tile(np.diag(np.repeat([0.04, 0.01], 3)), (n, 1, 1))
+    D[:bumped] *= 100.0
+    J, r, kept = rng.normal(size=(n, 6, 8)), rng.normal(size=(n, 6)), np.arange(n) >= bumped
+    prior = np.zeros((8, 8)), np.zeros(8)
+    return Linearised(J, r, prior, turn, D, np.arange(n, dtype=float), kept, False, response, hysteresis, 0.5)
+
+
+def test_each_component_has_its_columns() -> None:
+    p = small()
+    np.testing.assert_array_equal(p.X[..., p.columns(GAINS)], p.response[..., :5])
+    np.testing.assert_array_equal(p.X[..., p.columns(CROSS_TALK)], p.response[..., 5:])
+    np.testing.assert_array_equal(p.X[..., p.columns(HYSTERESIS)], p.hysteresis)
+    slopes = centred(p.time)[:, None, None] * np.eye(6)
+    np.testing.assert_array_equal(p.X[..., p.columns(component("slope", TORQUE))], slopes[..., 3:])
+    np.testing.assert_array_equal(p.X[..., -1], p.r)
+    assert all(p.columns(component(kind, FORCE)) is None for kind in ("white", "walk"))
+    assert p.columns(ROTATION) is None
+
+
+def test_numbers_and_limits_of_the_components() -> None:
+    p = small()
+    sizes = {ROTATION: 20, GAINS: 5, CROSS_TALK: 6, HYSTERESIS: 12}
+    sizes |= {component("white", FORCE): 30, component("walk", [4]): 10, component("slope", TORQUE): 3}
+    assert {c: p.size(c) for c in sizes} == sizes
+    limits = {ROTATION: np.radians(3), GAINS: 0.05, CROSS_TALK: 1.5 * 0.05, HYSTERESIS: 0.03}
+    assert {c: p.largest(c) for c in limits} == pytest.approx({c: limit**2 for c, limit in limits.items()})
+    assert p.largest(component("walk", FORCE)) == np.inf
+    assert (ROTATION.needed, GAINS.needed, CROSS_TALK.needed, HYSTERESIS.needed) == (2, 3, 3, 3)
+    worth = point(p, (component("white", FORCE), GAINS), np.array([0.1, 0.05**2]))
+    assert worth.worth == pytest.approx(worth.loglik - 5)
+    assert worth.too_large
+    assert not point(p, (component("white", FORCE), GAINS), np.array([0.1, 0.99 * 0.05**2])).too_large
+
+
+def test_in_units_a_component_is_as_large_as_the_white_noise_of_the_used_poses() -> None:
+    p = small()
+    at = point(p, (), np.zeros(0))
+    expected = {
+        component("white", FORCE): 0.04,
+        component("white", range(6)): 0.025,
+        component("slope", TORQUE): 0.01,
+        component("walk", TORQUE): 0.01 / 10,
+        ROTATION: min(0.04 / 2**2, 0.01 / 1**2),
+        GAINS: 0.01 / (10 * 0.5**2),
+    }
+    np.testing.assert_allclose(units(p, at, list(expected)), list(expected.values()))
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5, 1e-3])
+def test_the_expected_white_noise_is_that_of_a_normal_likelihood_and_a_uniform_sigma(share: float) -> None:
+    white = component("white", FORCE)
+    p = problem(np.random.default_rng(12), 8, (white,), np.array([0.05]))
+    best = maximise(p, (white,), np.array([0.05]))
+    at = point(p, (white,), share * best.theta)
+    slope, information = score(p, at, (white,), at.theta)
+    variance = at.theta[0]
+    gradient, curvature = slope[0] / variance, information[0, 0] / variance**2
+
+    def density(sigma: float) -> float:
+        v = sigma**2 - variance
+        return float(np.exp(gradient * v - curvature * v**2 / 2))
+
+    most = np.sqrt(variance + 9 / np.sqrt(curvature) + 2 * abs(gradient) / curvature)
+    mean = quad(lambda s: s**2 * density(s), 0, most)[0] / quad(density, 0, most)[0]
+    np.testing.assert_allclose(expected_variances(p, at), max(mean, variance), rtol=1e-2)
+
+
+def test_other_variances_are_right_by_the_odds_of_their_likelihood() -> None:
+    rng, n = np.random.default_rng(5), 30
+    p, turn, response = small(n, 0), rng.normal(size=(n, 6, 3)), rng.normal(size=(n, 6, 11))
+    r = 0.2 * rng.normal(size=(n, 6)) + response[..., :5] @ (0.04 * rng.normal(size=5))
+    r += (turn @ (0.03 * rng.normal(size=(n, 3, 1))))[..., 0]
+    p = replace(p, turn=turn, response=response, r=r, D=np.tile(0.04 * np.eye(6), (n, 1, 1)))
+    best = maximise(p, (GAINS, ROTATION), np.full(2, 0.02**2))
+    found = rivals(p, best, [GAINS, CROSS_TALK, ROTATION, HYSTERESIS])
+    (added, _), (alike, _), (lagging, _) = found
+    assert added.components == (GAINS, ROTATION, HYSTERESIS)
+    assert dict(zip(alike.components, alike.theta, strict=True))[CROSS_TALK] == best.theta[0]
+    assert lagging.components == (GAINS, HYSTERESIS)
+    rest = 1 - sum(share for _, share in found)
+    bonus = (0.0, 0.0, -1.0)  # hysteresis must bring more than the rotations in whose place it is
+    for (other, share), less in zip(found, bonus, strict=True):
+        assert share / rest == pytest.approx(np.exp(min(other.loglik - best.loglik + less, 0.0)))
+    x, C = estimates(p, best)
+    y, D = estimates(p, lagging)
+    np.testing.assert_allclose(doubt(p, best, [(lagging, 0.25)]), 0.25 * (D - C + np.outer(y - x, y - x)), atol=1e-12)

@@ -1,0 +1,129 @@
+"""When poses stand out, and what it costs to reject them."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from ftcalib import Parameters
+from ftcalib.known import Constraints, Known
+from ftcalib.likelihood.explanation import _are_gaussian, _criterion, _limit, _membership, _stand_out
+from ftcalib.likelihood.outliers import Kept, agreeing_poses, fewest_kept
+from ftcalib.likelihood.session import Session, inverses, white
+from ftcalib.likelihood.variance_components import FORCE, Component, Point, component, point
+from ftcalib.model import Array, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
+
+R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+TOOL = Parameters(
+    Rotation.from_euler("ZYX", [50, 10, 175], degrees=True).as_matrix(),
+    np.array([0.3, -0.2, -20.0]),
+    np.array([3.0, -2, 8]),
+    np.array([0.03, -0.02, 0.06]),
+    np.array([0.1, 0.2, -0.3]),
+)
+SIGMA = np.repeat([0.05, 0.002], 3)
+FARTHEST = stats.chi2.isf(1e-3, 6)
+
+
+def session(n: int, residuals: Array | float = 0.0) -> Session:
+    R = np.resize(R24, (n, 3, 3))
+    return Session(R, predict(TOOL, R) + residuals, white(0.05, 0.002), None, "none", Constraints(Known(), 9.8))
+
+
+def at(own: Session, kept: Kept, components: tuple[Component, ...] = (), theta: tuple[float, ...] = ()) -> Point:
+    return point(own.linearised(TOOL, kept), components, np.array(theta))
+
+
+def usual(n: int) -> Array:
+    """Squared distances as Gaussian noise has them."""
+    return np.asarray(stats.chi2.ppf((np.arange(n) + 0.5) / n, 6))
+
+
+def test_a_majority_must_agree() -> None:
+    assert [fewest_kept(n) for n in (4, 7, 8, 11, 12, 13, 24)] == [4, 7, 7, 7, 8, 8, 15]
+
+
+@pytest.mark.parametrize(("bumped", "enough"), [(0, True), (6, True), (9, True), (10, False)])
+def test_poses_that_agree_are_found_from_any_minimum(bumped: int, enough: bool) -> None:
+    rng = np.random.default_rng(2)
+    residuals = SIGMA * rng.normal(size=(24, 6))
+    good = np.arange(24) >= bumped
+    residuals[~good] += 60 * SIGMA * rng.normal(size=(bumped, 6))
+    own = session(24, residuals)
+    away = [TOOL.moved(turn * np.eye(15)[1]) for turn in (3.1, 1.0, 0.0)]
+    found = agreeing_poses(own.descent, inverses(own.cov), away)
+    assert (found is not None) == enough
+    if found is not None:
+        np.testing.assert_array_equal(found[1], good)
+        only = session(24, residuals).descent.minima(inverses(own.cov) * good[:, None, None])[0].parameters
+        np.testing.assert_allclose(found[0].difference(only), 0, atol=1e-6)
+
+
+@pytest.mark.parametrize("n", [8, 24])
+def test_one_pose_in_fifty_sessions_stands_out_by_chance(n: int) -> None:
+    limit = stats.chi2.isf(0.02 / n, 6)
+    for far, stands_out in ((0.99 * limit, False), (1.01 * limit, True)):
+        assert _stand_out(session(n), np.append(usual(n)[:-1], far)) == stands_out
+    assert not _stand_out(session(7), np.append(usual(7)[:-1], 1000.0))
+
+
+@pytest.mark.parametrize(("share", "stand_out"), [(0.58, True), (0.62, False)])
+def test_many_poses_stand_out_where_the_median_is_small_for_their_mean(share: float, stand_out: bool) -> None:
+    """Of Gaussian noise the median is 5.35 and the mean 6."""
+    median = 2.0
+    mean = 6 * median / stats.chi2.median(6) / share
+    distances = np.array([median] * 13 + [(24 * mean - 13 * median) / 11] * 11)
+    assert distances.max() < stats.chi2.isf(0.02 / 24, 6)
+    assert _stand_out(session(24), distances) == stand_out
+
+
+@pytest.mark.parametrize(("n", "off", "gaussian"), [(500, 0.98, True), (500, 1.02, False), (499, 0.98, False)])
+def test_noise_is_gaussian_where_its_distribution_is(n: int, off: float, gaussian: bool) -> None:
+    critical = stats.kstwobign.isf(0.01) / np.sqrt(n)
+    share = np.maximum((np.arange(n) + 0.5) / n - off * critical, 1e-12)
+    assert _are_gaussian(session(n), stats.chi2.ppf(share, 6)) == gaussian
+
+
+def test_a_pose_is_rejected_beyond_what_one_in_a_thousand_exceeds() -> None:
+    own, kept = session(24), np.arange(24) > 4
+    assert _limit(own, at(own, kept)) == pytest.approx(FARTHEST)
+    estimated = at(own, kept, (component("white", FORCE),), (0.01,))
+    assert _limit(own, estimated) == pytest.approx(6 * stats.f.isf(1e-3, 6, 6 * 19 - 15))
+
+
+def test_the_worst_are_rejected_first_and_taken_back_when_they_fit() -> None:
+    own, everything = session(24), np.ones(24, bool)
+
+    def rejected(kept: Kept, **distances: float) -> list[int]:
+        values = np.full(24, 6.0)
+        for row, value in distances.items():
+            values[int(row[1:])] = value
+        return np.flatnonzero(~_membership(own, kept, values, at(own, kept))).tolist()
+
+    near, far = 0.99 * FARTHEST, 1.01 * FARTHEST
+    assert rejected(everything, p3=far, p5=near) == [3]
+    assert rejected(everything, p3=far, p5=100.0, p7=26.0) == [5, 7]  # a quarter of the worst is 25
+    before = everything.copy()
+    before[[1, 2]] = False
+    assert rejected(before, p1=near, p2=far) == [2]
+    assert rejected(before, p1=1000.0, p2=far, p3=far) == [1, 2, 3]  # the worst of the used ones counts
+    assert rejected(before, **{f"p{k}": far for k in range(9)}) == list(range(9))
+    assert rejected(before, **{f"p{k}": far for k in range(10)}) == [1, 2]  # too many: nothing changes
+
+
+@pytest.mark.parametrize("scale", [1.0, 10.0, 30.0])
+@pytest.mark.parametrize(("components", "theta"), [((), ()), ((component("white", FORCE),), (0.001,))])
+def test_a_rejected_pose_costs_the_limit_and_beyond_it_a_logarithm(
+    scale: float, components: tuple[Component, ...], theta: tuple[float, ...]
+) -> None:
+    """Without a pose the likelihood lacks its density, of which the squared distance is a part."""
+    others = np.arange(24) != 7
+    residuals = SIGMA * np.random.default_rng(1).normal(size=(24, 6)) * np.where(others, 1.0, scale)[:, None]
+    own = session(24, residuals)
+    counts, rejected = at(own, np.ones(24, bool), components, theta), at(own, others, components, theta)
+    e, S = counts.left_out()
+    distance, limit = float(e[7] @ np.linalg.solve(S[7], e[7])), _limit(own, rejected)
+    assert (distance > limit) == (scale > 1)
+    gained = _criterion(own, rejected, np.where(others, 6.0, distance)) - _criterion(own, counts, np.full(24, 6.0))
+    assert gained == pytest.approx(limit + 6 * np.log(max(distance / limit, 1.0)) - distance, abs=1e-4)

@@ -1,0 +1,180 @@
+"""A session before the fit: what is open, what counts as noise, and which components the data may show."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ftcalib import Parameters
+from ftcalib.known import Constraints, Known
+from ftcalib.likelihood.descent import Minimum
+from ftcalib.likelihood.session import Drift, Session, inverses, white
+from ftcalib.likelihood.session_noise import pose_times
+from ftcalib.likelihood.variance_components import FORCE, RESPONSE, TORQUE, Component, component
+from ftcalib.model import Array, jacobian, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
+
+R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+TOOL = Parameters(
+    Rotation.from_euler("ZYX", [50, 10, 175], degrees=True).as_matrix(),
+    np.array([0.3, -0.2, -20.0]),
+    np.array([3.0, -2, 8]),
+    np.array([0.03, -0.02, 0.06]),
+    np.array([0.1, 0.2, -0.3]),
+)
+SIGMA_N, SIGMA_NM = 0.05, 0.002
+NOTHING_KNOWN = Constraints(Known(), 9.8)
+
+
+def session(
+    R: Array,
+    *,
+    measured: bool = True,
+    drift: Drift = "auto",
+    known: Constraints = NOTHING_KNOWN,
+    residuals: Array | float = 0.0,
+    t_s: Array | None = None,
+) -> Session:
+    cov = white(SIGMA_N, SIGMA_NM) if measured else None
+    return Session(R, predict(TOOL, R) + residuals, cov, t_s, drift, known)
+
+
+def minimum(information: Array) -> Minimum:
+    return Minimum(TOOL, 0.0, information)
+
+
+def names(components: list[Component]) -> set[str]:
+    return {one.name for one in components}
+
+
+@pytest.mark.parametrize("open_directions", [0, 1, 2, 9])
+def test_a_session_lacks_rank_however_many_directions_are_open(open_directions: int) -> None:
+    information = np.diag(np.repeat([0.0, 3.0], [open_directions, 15 - open_directions]))
+    assert session(R24).lacks_rank(minimum(information)) == bool(open_directions)
+
+
+@pytest.mark.parametrize(("left", "lacks"), [(1.8e-9, True), (2.2e-9, False)])
+def test_directions_are_open_whatever_their_units(left: float, lacks: bool) -> None:
+    alike = np.eye(15)
+    alike[3, 7] = alike[7, 3] = 1 - left  # eigenvalues `left` and 2 - `left`
+    units = 10.0 ** np.arange(-7, 8)
+    assert session(R24).lacks_rank(minimum(alike * np.outer(units, units))) == lacks
+
+
+def test_degrees_of_freedom_are_numbers_read_less_numbers_estimated() -> None:
+    kept = np.arange(24) % 4 > 0
+    for known, fewer in ((Known(), 0), (Known(mass_kg=2.0), 1), (Known(R_flange_sensor=np.eye(3)), 3)):
+        constraints = Constraints(known, 9.8)
+        assert session(R24, known=constraints).dof(kept) == 6 * 18 - (15 - fewer)
+        assert session(R24, known=constraints, drift="linear").dof(kept) == 6 * 18 - (15 - fewer) - 6
+    two = session(R24[:2], known=Constraints(Known(R_flange_sensor=np.eye(3)), 9.8))
+    assert two.lacks_rank(minimum(np.eye(15)))  # 12 numbers for 12 unknowns leave nothing to judge them by
+    three = session(R24[:3], known=Constraints(Known(R_flange_sensor=np.eye(3)), 9.8))
+    assert not three.lacks_rank(minimum(np.eye(15)))
+
+
+def test_noise_that_was_not_measured_is_at_least_a_thousandth_of_the_residuals_and_rounding() -> None:
+    residuals = np.tile([0.3, -0.3, 0.3, -0.01, 0.01, 0.01], (24, 1)) * np.where(np.arange(24) % 2, 1, -1)[:, None]
+    own = session(R24, measured=False, residuals=residuals)
+    np.testing.assert_allclose(own.least_noise(TOOL)[5], white(0.3e-3, 0.01e-3))
+    largest_N = np.abs(own.wrench[:, :3]).max()
+    np.testing.assert_allclose(own.cov[5], white(1e-12 * largest_N, 0.025e-12 * largest_N))
+    exact = session(R24, measured=False)
+    np.testing.assert_allclose(exact.least_noise(TOOL), np.broadcast_to(exact.cov, (24, 6, 6)))
+
+
+@pytest.mark.parametrize(("share", "exact"), [(0.9e-10, True), (1.1e-10, False)])
+def test_data_are_exact_to_their_rounding_only_where_their_noise_is_unknown(share: float, exact: bool) -> None:
+    residuals = np.zeros((24, 6))
+    residuals[7, 1] = -share * np.abs(predict(TOOL, R24)[:, :3]).max()
+    residuals[:, 3:] = 0.1  # the forces decide
+    assert session(R24, measured=False, residuals=residuals).is_exact(TOOL) == exact
+    assert not session(R24, residuals=residuals).is_exact(TOOL)
+
+
+def test_variances_start_at_the_mean_square_of_the_used_poses_or_at_their_noise() -> None:
+    residuals = np.tile([0.3, -0.3, 0.3, 0.0, 0.0, 0.0], (24, 1))
+    residuals[0] = 100.0
+    own = session(R24, residuals=residuals)
+    problem = own.linearised(TOOL, np.arange(24) > 0)
+    np.testing.assert_array_equal(own.start(problem, []), np.zeros(0))
+    groups = [component("white", FORCE), component("white", TORQUE), component("white", [4]), component("walk", FORCE)]
+    np.testing.assert_allclose(own.start(problem, groups), [0.09, SIGMA_NM**2, SIGMA_NM**2, 0.09 / 240])
+
+
+@pytest.mark.parametrize(
+    "order",
+    [np.arange(24), np.arange(24)[::-1], np.r_[0, 23:0:-1], np.r_[23, 0:23], np.random.default_rng(0).permutation(24)],
+)
+def test_poses_are_taken_in_the_order_of_time(order: NDArray[np.intp]) -> None:
+    t_s = np.arange(24.0)[order] * 3 + 100
+    cov = np.eye(6) * (1 + order)[:, None, None]
+    own = Session(R24[order], predict(TOOL, R24)[order], cov, t_s, "auto", NOTHING_KNOWN)
+    np.testing.assert_array_equal(own.R, R24)
+    np.testing.assert_array_equal(own.wrench, predict(TOOL, R24))
+    np.testing.assert_array_equal(own.cov[:, 0, 0], np.arange(1.0, 25))
+    np.testing.assert_allclose(own.time, np.arange(24))
+
+
+def test_time_counts_in_mean_intervals() -> None:
+    np.testing.assert_array_equal(pose_times(np.full(4, 7.0)), np.arange(4))
+    np.testing.assert_array_equal(pose_times(np.array([2.0, np.nan, 3.0])), np.arange(3))
+    np.testing.assert_allclose(pose_times(np.array([8.0, 2.0, 4.0])), [2, 0, 2 / 3])
+
+
+GAINS = {one.name for one in RESPONSE}
+WHITES, WALKS = {"white_force_N", "white_torque_Nm"}, {"walk_force_N", "walk_torque_Nm"}
+
+
+@pytest.mark.parametrize(
+    ("n", "candidates"),
+    [
+        (5, set()),
+        (6, {*WHITES, "rotation_rad", *WALKS}),
+        (7, {*GAINS, *WHITES, "rotation_rad", *WALKS}),
+        (11, {*GAINS, *WHITES, "rotation_rad", *WALKS}),
+        (12, {*GAINS, *WHITES, "rotation_rad", *WALKS, "hysteresis"}),
+        (49, {*GAINS, *WHITES, "rotation_rad", *WALKS, "hysteresis"}),
+    ],
+)
+def test_poses_show_what_so_many_can_separate(n: int, candidates: set[str]) -> None:
+    R = np.resize(R24, (n, 3, 3))
+    assert session(R).always() == []
+    assert names(session(R).candidates()) == candidates
+    assert names(session(R, drift="none").candidates()) == candidates - WALKS
+    assert names(session(R, drift="linear").candidates()) == candidates - WALKS
+    walking = session(R, drift="random-walk")
+    assert (names(walking.always()), names(walking.candidates())) == (WALKS, candidates - WALKS)
+    unknown = session(R, measured=False)
+    assert names(unknown.always()) == (WHITES if n > 5 else {"white_force_N"})
+    late = {"rotation_rad", *WALKS} if n < 12 else set()
+    assert names(unknown.candidates()) == candidates - WHITES - late
+    if n == 5:
+        assert unknown.always()[0].share == pytest.approx((1, 1, 1, 0.025**2, 0.025**2, 0.025**2))
+
+
+def test_from_fifty_poses_on_each_axis_walks_by_itself() -> None:
+    axes = {f"walk_{axis}" for axis in ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")}
+    found = names(session(np.resize(R24, (50, 3, 3))).candidates())
+    assert axes <= found
+    assert not WALKS & found
+
+
+def test_what_was_known_before_counts_beside_the_data() -> None:
+    known = Constraints(Known(gravity_direction_base=(0, 0, -1), direction_tolerance_rad=0.01, mass_kg=2.0), 9.8)
+    problem = session(R24, known=known).linearised(TOOL, np.ones(24, bool))
+    A, residual = known.measurements(TOOL)
+    Z = known.free(TOOL)
+    assert Z.shape == (15, 14)
+    np.testing.assert_allclose(problem.J, jacobian(TOOL, R24) @ Z)
+    np.testing.assert_allclose(problem.prior[0], (A @ Z).T @ (A @ Z))
+    np.testing.assert_allclose(problem.prior[1], (A @ Z).T @ residual)
+    np.testing.assert_array_equal(problem.turn, jacobian(TOOL, R24)[..., :3])
+    assert problem.lever == pytest.approx(0.07 / 0.05)
+
+
+def test_noise_is_inverted_pose_by_pose() -> None:
+    A = np.random.default_rng(1).normal(size=(3, 6, 9))
+    cov = A @ np.swapaxes(A, 1, 2)
+    for each in (cov, np.broadcast_to(cov[0], (3, 6, 6))):
+        np.testing.assert_allclose(inverses(each) @ each, np.tile(np.eye(6), (3, 1, 1)), atol=1e-9)
