@@ -70,6 +70,13 @@ def test_a_tare_is_no_drift_on_any_day_after_it(size: float) -> None:
             assert found is None or not found.found.any()
 
 
+def test_verifications_since_a_tare_are_enough_or_too_few() -> None:
+    for since, enough in ((FEWEST, True), (FEWEST - 1, False)):
+        d = series(DAILY) + np.where(np.arange(90) >= 90 - since, 500.0, 0.0)[:, None]
+        found = drift_onset(DAILY, d, np.ones(d.shape), COMMON)
+        assert (found is not None) == enough
+
+
 def test_a_drift_after_a_tare_is_found() -> None:
     d = series(DAILY) + np.where(DAILY > 30, 500.0, 0.0)[:, None]
     d[:, 2] += ramp(DAILY, 55.0, 1.5)
