@@ -119,11 +119,11 @@ def test_the_covariance_of_a_tare_covers_noise_and_the_old_errors() -> None:
     R = tilted(20, 70)
     for n in (1, 2):
         distances = []
-        for seed in range(60):
+        for seed in range(30):
             update = tare(calibration(truth(), seed=seed), R[:n], [dwell(truth(), R[i], rng, 40) for i in range(n)])
             error = truth().difference(update.parameters)
             distances.append(error @ np.linalg.solve(update.covariance, error))
-        assert np.mean(distances) == pytest.approx(15, rel=0.15)  # covariances of 40 samples are themselves uncertain
+        assert np.mean(distances) == pytest.approx(15, rel=0.2)  # covariances of 40 samples are themselves uncertain
 
 
 def test_a_tare_makes_the_tared_pose_more_certain_than_others() -> None:

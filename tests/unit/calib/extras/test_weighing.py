@@ -86,7 +86,7 @@ def test_without_a_zero_the_sigma_covers_half_a_newton_of_drift() -> None:
 
 def test_several_poses_show_the_whole_centre_of_mass() -> None:
     z = []
-    for seed in range(40):
+    for seed in range(20):
         gripper = Gripper(seed)
         weight = gripper.weigh(calibrated(12, seed % 20), *(gripper.turn() for _ in range(3)))
         assert weight.line is None
