@@ -1,5 +1,6 @@
 """The bias against temperature: what the fit finds, what it takes for chance, and what it applies."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.stats import f, multivariate_normal
 
 from ftcalib.extras.temperature import _SHARES, BiasTemperature, bias_temperature
 from ftcalib.extras.update import with_bias_change
+from ftcalib.likelihood.gain_and_cross_talk import Response
 from ftcalib.model import BIASES, Array
 from tests.unit.ftdrive.live.simulated import calibrated
 
@@ -124,3 +126,20 @@ def test_a_changed_bias_widens_its_sigma_alone() -> None:
     wider = np.diag(after.covariance - before.covariance)
     assert wider[BIASES] == pytest.approx((0.1 * step) ** 2)
     assert np.count_nonzero(wider) == 6
+
+
+def test_a_measured_bias_has_its_own_sigma_also_beside_a_gain() -> None:
+    joint = np.eye(26) + 0.1
+    before = replace(calibrated(), covariance=joint[:15, :15], response=Response(np.full(11, 0.01), joint))
+    step = np.arange(1.0, 7.0)
+    added, measured = (with_bias_change(before, step, 0.1 * step, measured=measured) for measured in (False, True))
+    for after in (added, measured):
+        assert after.response is not None
+        np.testing.assert_array_equal(after.response.covariance[:15, :15], after.covariance)
+        np.testing.assert_array_equal(after.response.coefficients, np.full(11, 0.01))
+        kept = np.setdiff1d(np.arange(26), np.arange(15)[BIASES])
+        np.testing.assert_array_equal(after.response.covariance[np.ix_(kept, kept)], joint[np.ix_(kept, kept)])
+    np.testing.assert_allclose(np.diag(added.covariance)[BIASES], 1.1 + (0.1 * step) ** 2)
+    assert added.covariance[6, 0] == joint[6, 0]
+    np.testing.assert_allclose(np.diag(measured.covariance)[BIASES], (0.1 * step) ** 2)
+    assert np.count_nonzero(measured.covariance[6]) == 1

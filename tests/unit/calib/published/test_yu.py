@@ -85,6 +85,7 @@ def test_srom_names_what_is_missing_repeated_or_off() -> None:
     assert "missing 3, 17." in refusal(turned("z", 5) @ np.delete(R24, [2, 16], axis=0))
     scattered = Rotation.random(24, rng=np.random.default_rng(0)).as_matrix()
     assert "use LROM" in refusal(scattered).replace("Use", "use")
+    assert "no pose has one of them" in refusal(R24[:0])
 
 
 def test_srom_gravity_force_has_the_sign_of_every_component() -> None:
