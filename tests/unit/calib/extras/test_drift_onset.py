@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.stats import chi2, f
 
 from ftcalib.extras.drift_onset import FEWEST, LEAST_DAYS, DriftOnset, drift_onset
 from ftcalib.model import Array
@@ -69,6 +70,13 @@ def test_a_tare_is_no_drift_on_any_day_after_it(size: float) -> None:
             assert found is None or not found.found.any()
 
 
+def test_verifications_since_a_tare_are_enough_or_too_few() -> None:
+    for since, enough in ((FEWEST, True), (FEWEST - 1, False)):
+        d = series(DAILY) + np.where(np.arange(90) >= 90 - since, 500.0, 0.0)[:, None]
+        found = drift_onset(DAILY, d, np.ones(d.shape), COMMON)
+        assert (found is not None) == enough
+
+
 def test_a_drift_after_a_tare_is_found() -> None:
     d = series(DAILY) + np.where(DAILY > 30, 500.0, 0.0)[:, None]
     d[:, 2] += ramp(DAILY, 55.0, 1.5)
@@ -101,6 +109,35 @@ def test_a_change_of_units_changes_nothing_else() -> None:
     assert small is not None
     np.testing.assert_allclose(small.p_value, one.p_value, rtol=1e-6)
     np.testing.assert_allclose(small.slope, 1e-3 * one.slope, rtol=1e-6)
+
+
+@pytest.mark.parametrize("since", [0.0, 30.0])
+def test_the_likeliest_onset_is_that_of_generalised_least_squares(since: float) -> None:
+    """Verifications differ in sigma; the error of an old calibration limits the level of the bias no more."""
+    rng = np.random.default_rng(7)
+    t = since + np.cumsum(rng.uniform(2.0, 9.0, 12))
+    sigma, common = rng.uniform(0.5, 2.0, (12, 2)), np.array([0.4, 0.8])
+    d = 1.5 * sigma * rng.normal(size=(12, 2)) + np.outer(ramp(t, t[5], 1.5), [1.0, -1.0])
+    found = drift_onset(t, d, sigma, common)
+    assert found is not None
+    onsets = [*([0.0] if since == 0 else []), *t[t <= t[-1] - LEAST_DAYS]]
+    for k in range(2):
+        V = np.diag(sigma[:, k] ** 2) + (common[k] ** 2 if since == 0 else 1e6)
+        W = np.linalg.inv(V)
+        fits = []
+        for onset in onsets:
+            x = np.maximum(t - onset, 0.0)
+            slope = x @ W @ d[:, k] / (x @ W @ x)
+            fits.append((slope**2 * (x @ W @ x), slope, 1 / np.sqrt(x @ W @ x), onset))
+        chi2_of_slope, slope, error, onset = max(fits)
+        scatter = (d[:, k] @ W @ d[:, k] - chi2_of_slope) / 9
+        assert scatter > 1
+        assert found.t0_days[k] == onset
+        assert found.slope[k] == pytest.approx(slope, rel=1e-4)
+        assert found.sigma[k] == pytest.approx(error * np.sqrt(scatter), rel=1e-4)
+        assert found.p_value[k] == pytest.approx(
+            max(chi2.sf(chi2_of_slope, 1), f.sf(chi2_of_slope / scatter, 1, 9)), rel=1e-3
+        )
 
 
 def test_irregular_and_weekly_verifications() -> None:

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
+from scipy.linalg import block_diag
+from scipy.stats import binomtest, chi2, f, linregress
 
 from ftcalib.extras.trend import trend
 from ftcalib.model import Array
@@ -45,6 +46,36 @@ def test_the_unit_of_time_does_not_matter() -> None:
     days, seconds = trend(t, values, covariance), trend(1.7e9 + 86400 * t, values, covariance)
     assert seconds.p_value == pytest.approx(days.p_value, rel=1e-6)
     assert 86400 * seconds.slope == pytest.approx(days.slope, rel=1e-6)
+
+
+def test_one_number_has_the_line_of_a_plain_regression() -> None:
+    rng = np.random.default_rng(4)
+    t = np.sort(rng.uniform(10, 100, 9))
+    y = 2.0 + 0.03 * t + rng.normal(size=9)
+    line = linregress(t, y)
+    by_scatter, stated = (trend(t, y[:, None], np.full((9, 1, 1), sigma**2)) for sigma in (0.1, 10.0))
+    assert by_scatter.slope == pytest.approx([line.slope])
+    assert by_scatter.sigma == pytest.approx([line.stderr])
+    assert by_scatter.p_value == pytest.approx(line.pvalue)
+    sigma = 10.0 / np.sqrt(np.sum((t - t.mean()) ** 2))
+    assert stated.slope == pytest.approx([line.slope])
+    assert stated.sigma == pytest.approx([sigma])
+    assert stated.p_value == pytest.approx(chi2.sf((line.slope / sigma) ** 2, 1))
+
+
+def test_an_uncertain_estimate_counts_less_in_every_direction() -> None:
+    t, values, covariance = series(np.random.default_rng(5), 6, np.array([0.1, 0.0, 0.0]))
+    X = np.concatenate([np.hstack([np.eye(3), at * np.eye(3)]) for at in t])
+    W = np.linalg.inv(block_diag(*covariance))
+    C = np.linalg.inv(X.T @ W @ X)
+    x = C @ X.T @ W @ values.ravel()
+    left = values.ravel() - X @ x
+    scatter = left @ W @ left / 12
+    slope_chi2 = x[3:] @ np.linalg.solve(C[3:, 3:], x[3:])
+    found = trend(t, values, covariance)
+    assert found.slope == pytest.approx(x[3:])
+    assert found.sigma == pytest.approx(np.sqrt(np.diag(C)[3:] * max(scatter, 1.0)))
+    assert found.p_value == pytest.approx(max(chi2.sf(slope_chi2, 3), f.sf(slope_chi2 / 3 / scatter, 3, 12)))
 
 
 @pytest.mark.parametrize("t", [[0.0, 1.0], [1.0, 1.0, 1.0]])

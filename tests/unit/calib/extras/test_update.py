@@ -1,5 +1,6 @@
 """Another payload and a new tare on an old calibration: exact without noise, honest with it, refused when needed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from ftcalib.extras.tare import tare
 from ftcalib.extras.update import BLOCKS, Update, reestimate, updated
 from ftcalib.likelihood.gain_and_cross_talk import Response, response_columns
 from ftcalib.model import Array, jacobian, predict
+from tests.first_order import assert_same, propagated
 
 NOISE = np.diag(np.repeat([0.05**2, (0.025 * 0.05) ** 2], 3))
 
@@ -117,11 +119,11 @@ def test_the_covariance_of_a_tare_covers_noise_and_the_old_errors() -> None:
     R = tilted(20, 70)
     for n in (1, 2):
         distances = []
-        for seed in range(60):
+        for seed in range(30):
             update = tare(calibration(truth(), seed=seed), R[:n], [dwell(truth(), R[i], rng, 40) for i in range(n)])
             error = truth().difference(update.parameters)
             distances.append(error @ np.linalg.solve(update.covariance, error))
-        assert np.mean(distances) == pytest.approx(15, rel=0.15)  # covariances of 40 samples are themselves uncertain
+        assert np.mean(distances) == pytest.approx(15, rel=0.2)  # covariances of 40 samples are themselves uncertain
 
 
 def test_a_tare_makes_the_tared_pose_more_certain_than_others() -> None:
@@ -213,19 +215,46 @@ def test_every_kind_of_update_is_exact_without_noise(kind: str) -> None:
     assert update.chi2 < 1e-12
 
 
-@pytest.mark.parametrize("kind", ["mounting", "all", "bias and payload"])
-def test_the_covariance_of_every_kind_covers_noise_and_the_old_errors(kind: str) -> None:
+def test_the_covariance_covers_noise_and_the_old_errors() -> None:
     rng = np.random.default_rng(15)
     R = Rotation.random(5, rng=rng).as_matrix()
     distances, misfits = [], []
     for seed in range(30):
         wrench = predict(truth(), R) + rng.multivariate_normal(np.zeros(6), NOISE, size=5)
-        update = reestimate(calibration(truth(), seed=seed), R, wrench, joint(5), kind)
+        update = reestimate(calibration(truth(), seed=seed), R, wrench, joint(5), "all")
         error = truth().difference(update.parameters)
         distances.append(error @ np.linalg.solve(update.covariance, error))
         misfits.append(update.chi2 / update.dof)
     assert np.mean(distances) == pytest.approx(15, rel=0.3)  # 5 sigma of the mean of 30
     assert np.mean(misfits) == pytest.approx(1, rel=0.2)
+
+
+@pytest.mark.parametrize(("kind", "gain"), [*((kind, False) for kind in BLOCKS), ("all", True)])
+def test_the_covariance_is_that_of_first_order(kind: str, gain: bool) -> None:
+    """Of readings and of the old calibration, whose errors are kept where nothing is estimated."""
+    n = 4 if kind == "all" else 3
+    R, start = Rotation.random(n, rng=np.random.default_rng(21)).as_matrix(), calibration(truth(), 6)
+    if gain:
+        start, _ = with_response(start)
+    C, now = start.covariance if start.response is None else start.response.covariance, start.parameters
+    if "weight" in BLOCKS[kind]:
+        now = replace(now, gravity_force_base_N=1.4 * now.gravity_force_base_N)
+    if "centre of mass" in BLOCKS[kind]:
+        now = replace(now, p_sensor_com_m=np.array([0.03, 0.04, 0.06]))
+    y = predict(now, R) if start.response is None else predict(now, R) + start.response.wrench(now, R)
+
+    def updated_by(e: Array, shift: Array) -> Array:
+        response = None if start.response is None else Response(start.response.coefficients + e[15:], C)
+        moved = Update(start.parameters.moved(e[:15]), start.covariance, 0.0, 0, response=response)
+        new = reestimate(moved, R, y + shift.reshape(n, 6), joint(n), kind)
+        kept = np.zeros(0) if new.response is None else new.response.coefficients
+        return np.concatenate([start.parameters.difference(new.parameters), kept])
+
+    found = reestimate(start, R, y, joint(n), kind)
+    expected = propagated(lambda e: updated_by(e, np.zeros(6 * n)), C)
+    expected += propagated(lambda e: updated_by(np.zeros(len(C)), e), joint(n))
+    covariance = found.covariance if found.response is None else found.response.covariance
+    assert_same(covariance, expected, 0.04 if gain else 1e-3)  # the derivatives are without the gain of 1 %
 
 
 def test_poses_that_do_not_determine_the_parameters_are_rejected() -> None:
@@ -266,3 +295,5 @@ def test_shapes_that_do_not_fit_are_rejected() -> None:
         reestimate(exact(truth()), tilted(0), predict(truth(), R), joint(2), "payload")
     with pytest.raises(BadDataset, match="R_base_flange"):
         tare(exact(truth()), R, [dwell(truth(), R[0], np.random.default_rng(0))])
+    with pytest.raises(BadDataset, match="there is no dwell"):
+        tare(exact(truth()), R, [])

@@ -13,6 +13,7 @@ from ftcalib.extras.update import Calibrated
 from ftcalib.extras.weighing import Weight, drift_since, holding, weigh
 from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
 from ftcalib.model import Array, Parameters, predict
+from tests.first_order import assert_same, propagated
 from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, G, calibrated
 
 NEAR = 2 * TRUTH.p_sensor_com_m
@@ -85,7 +86,7 @@ def test_without_a_zero_the_sigma_covers_half_a_newton_of_drift() -> None:
 
 def test_several_poses_show_the_whole_centre_of_mass() -> None:
     z = []
-    for seed in range(40):
+    for seed in range(20):
         gripper = Gripper(seed)
         weight = gripper.weigh(calibrated(12, seed % 20), *(gripper.turn() for _ in range(3)))
         assert weight.line is None
@@ -156,6 +157,104 @@ def test_a_gain_that_was_found_acts_on_the_part() -> None:
     np.testing.assert_allclose(weight.p_sensor_com_m, gripper.com_m, atol=1e-9)
 
 
+def rough(seed: int = 1, *, gain: bool = False) -> tuple[Parameters, Array, Response | None]:
+    """Parameters with large and correlated errors, their covariance, and gain and cross-talk if wanted."""
+    rng = np.random.default_rng(seed)
+    size = 26 if gain else 15
+    sigma = np.concatenate([np.repeat([0.01, 0.05, 0.04, 5e-4, 3e-3], 3), np.full(size - 15, 5e-3)])
+    root = sigma[:, None] * (np.eye(size) + 0.3 * rng.normal(size=(size, size)))
+    C = root @ root.T
+    return TRUTH, C, Response(0.01 * rng.normal(size=11), C) if gain else None
+
+
+class Known:
+    """A calibration of given parameters."""
+
+    def __init__(self, parameters: Parameters, covariance: Array, response: Response | None) -> None:
+        self.parameters, self.covariance, self.response = parameters, covariance[:15, :15], response
+
+
+def moved(known: Known, error: Array) -> Known:
+    response, C = known.response, known.covariance
+    if response is not None:
+        C, response = response.covariance, Response(response.coefficients + error[15:], response.covariance)
+    return Known(known.parameters.moved(error[:15]), C, response)
+
+
+@pytest.mark.parametrize("gain", [False, True])
+def test_the_covariance_has_all_errors_of_readings_and_calibration(gain: bool) -> None:
+    gripper, (tool, C, response) = Gripper(5), rough(gain=gain)
+    reference = Known(tool, C, response)
+    R = np.array([gripper.turn() for _ in range(3)])
+    part = np.array([gripper.part(one) for one in R])
+    y = predict(tool, R) + part
+    if response is not None:
+        y += response.wrench(tool, R)
+        y[:, :3] += part[:, :3] @ response.force_gain.T
+        y[:, 3:] += part[:, :3] @ response.cross_talk_m.T
+    noise, drift, turn_rad = (
+        np.tile(np.diag((0.3 * NOISE) ** 2), (3, 1, 1)),
+        3 * NOISE[::-1] * [1, 1, 1, 0.02, 0.02, 0.02],
+        4e-3,
+    )
+
+    def weighed(y: Array, reference: Known = reference, R: Array = R) -> Weight:
+        options: dict[str, Any] = {"drift": drift, "g_m_s2": G, "orientation_sigma_rad": turn_rad}
+        return weigh(reference, R, y, noise, p_sensor_near_m=gripper.com_m, **options)
+
+    def turned(e: Array) -> Array:
+        return np.asarray(R @ Rotation.from_rotvec(e.reshape(3, 3)).as_matrix())
+
+    found = weighed(y)
+    x, covariance = found.moment
+    np.testing.assert_allclose(x, gripper.mass_kg * np.append(1.0, gripper.com_m), rtol=1e-9)
+    expected = (
+        propagated(lambda e: weighed(y + e.reshape(3, 6)).moment[0], np.kron(np.eye(3), noise[0]))
+        + propagated(lambda e: weighed(y + e).moment[0], np.diag(drift**2))
+        + propagated(lambda e: weighed(y, moved(reference, e)).moment[0], C)
+        + propagated(lambda e: weighed(y, reference, turned(e)).moment[0], turn_rad**2 * np.eye(9))
+    )
+    assert_same(covariance, expected, 0.02)
+    assert found.mass_sigma_kg == pytest.approx(np.sqrt(covariance[0, 0]))
+    assert found.least_kg == pytest.approx(4 * found.mass_sigma_kg)
+    com = propagated(lambda e: (x + e)[1:] / (x + e)[0], covariance)
+    assert_same(found.com_covariance, com)
+    assert found.chi2 < 1e-6
+    assert (found.dof, found.poses) == (17, 3)
+
+
+@pytest.mark.parametrize("gain", [False, True])
+def test_the_covariance_of_a_tool_with_a_part_has_the_errors_of_both(gain: bool) -> None:
+    tool, C, response = rough(2, gain=gain)
+    empty = Known(tool, C, response)
+    rng = np.random.default_rng(3)
+    root = np.array([0.02, 1e-3, 1e-3, 1e-3])[:, None] * (np.eye(4) + 0.3 * rng.normal(size=(4, 4)))
+    x, x_cov = np.array([0.8, 0.01, -0.02, 0.09]), root @ root.T
+
+    def joined(e: Array, x: Array = x) -> Array:
+        weight = Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1, moment=(x, x_cov))
+        load = holding(moved(empty, e), weight, G)
+        extra = np.zeros(0) if load.response is None else load.response.coefficients
+        return np.concatenate([tool.difference(load.parameters), extra])
+
+    found = holding(empty, Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1, moment=(x, x_cov)), G)
+    expected = propagated(joined, C) + propagated(lambda e: joined(np.zeros(len(C)), x + e), x_cov)
+    assert_same(found.covariance if found.response is None else found.response.covariance, expected)
+
+
+def test_one_pose_shows_the_centre_of_mass_only_across_gravity() -> None:
+    gripper = Gripper(4)
+    R = gripper.turn()
+    weight = gripper.weigh(calibrated(), R)
+    u = gripper.part(R)[:3] / np.linalg.norm(gripper.part(R)[:3])
+    assert weight.line is not None
+    assert abs(weight.line @ u) == pytest.approx(1, abs=1e-3)
+    assert weight.line @ weight.com_covariance @ weight.line == pytest.approx(0.1**2, rel=0.02)
+    assert np.sqrt(np.linalg.eigvalsh(weight.com_covariance)[:2]).max() < 5e-3
+    assert abs((weight.p_sensor_com_m - NEAR) @ u) < 0.02
+    assert (weight.dof, weight.poses) == (5, 1)
+
+
 def test_a_tool_with_a_part_predicts_both() -> None:
     z2 = []
     for seed in range(40):
@@ -178,5 +277,6 @@ def test_a_tool_without_weight_has_no_direction_of_gravity() -> None:
 
 
 def test_drift_grows_and_ends() -> None:
-    assert drift_since(36.0)[0] == pytest.approx(0.05)
+    assert drift_since(36.0).tolist() == pytest.approx([0.05] * 3 + [1.5e-3] * 3)
+    assert not drift_since(-5.0).any()
     assert drift_since(NEVER).tolist() == [1.0] * 3 + [0.03] * 3

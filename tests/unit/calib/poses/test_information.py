@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, solve
 from ftcalib.errors import NotObservable
-from ftcalib.model import Array, angle_between, predict
+from ftcalib.model import Array, angle_between, jacobian, predict
 from ftcalib.poses.information import (
     SUBSET_6,
     T12,
@@ -20,7 +20,15 @@ from ftcalib.poses.information import (
     second_basin,
     special,
 )
-from ftcalib.poses.selection import LEAST_GAP, choose, cone_candidates, next_pose
+from ftcalib.poses.selection import (
+    LEAST_GAP,
+    PRIOR,
+    WEIGHT_OF_PLANE,
+    choose,
+    cone_candidates,
+    greedy_and_exchange,
+    next_pose,
+)
 from tests.pose_sets import AMBIGUOUS_6, SUBSET_8, SUBSET_12, efficiency, optimised
 
 ALL = special(range(1, 25))
@@ -309,6 +317,55 @@ def test_next_pose_is_the_best_by_brute_force() -> None:
     predictions = [predicted_sigma(np.concatenate([R, c[None]]), GUESS) for c in candidates]
     cost = [(p.force_rms_N / 0.2) ** 2 + (p.torque_rms_Nm / 0.005) ** 2 for p in predictions]
     assert ranked[0] == np.argmin(cost)
+    R = optimised(8)  # which has no second solution: then the whole order is that of the cost
+    ranked = next_pose(R, candidates, GUESS)
+    predictions = [predicted_sigma(np.concatenate([R, c[None]]), GUESS) for c in candidates]
+    cost = [(p.force_rms_N / 0.2) ** 2 + (p.torque_rms_Nm / 0.005) ** 2 for p in predictions]
+    in_order = np.array(cost)[ranked]
+    assert (np.diff(in_order) > -1e-3 * in_order[1:]).all()
+
+
+@pytest.mark.parametrize("pinned", [(), (3, 8)])
+def test_no_exchange_of_one_candidate_improves_a_choice(pinned: tuple[int, ...]) -> None:
+    rows = np.random.default_rng(5).normal(size=(14, 4)) * [3.0, 1.0, 1.0, 0.3]
+
+    def error(chosen: list[int]) -> float:
+        return float(np.trace(np.linalg.inv(1e-3 * np.eye(4) + rows[chosen].T @ rows[chosen])))
+
+    def gains(chosen: list[int]) -> Array:
+        return np.array([error(chosen) - error([*chosen, k]) for k in range(len(rows))])
+
+    found = greedy_and_exchange(gains, 5, pinned).tolist()
+    assert tuple(found[: len(pinned)]) == pinned
+    assert len(set(found)) == 5
+    others = [k for k in range(14) if k not in found]
+    exchanged = [error([*found[:i], k, *found[i + 1 :]]) for i in range(len(pinned), 5) for k in others]
+    assert min(exchanged) >= error(found)
+    greedy = list(pinned)
+    while len(greedy) < 5:
+        greedy.append(max((k for k in range(14) if k not in greedy), key=lambda k: gains(greedy)[k]))
+    assert error(found) < 0.999 * error(greedy)
+
+
+def test_a_choice_is_a_local_optimum_of_its_criterion() -> None:
+    """Variances of rotation, weight and force bias, and 0.3 of those of a constant and the direction of gravity."""
+    guess = replace(FORCES_ONLY, R_flange_sensor=Rotation.random(rng=np.random.default_rng(1)).as_matrix())
+    candidates = Rotation.random(25, rng=np.random.default_rng(6)).as_matrix()
+
+    def error(chosen: list[int]) -> float:
+        R = candidates[chosen]
+        p = guess.parameters
+        J = jacobian(p, R)[:, :3, :9].reshape(-1, 9) * guess.scale[:9] / guess.weight_N
+        u = np.column_stack([predict(p, R)[:, :3] / guess.weight_N, np.ones(len(R))])
+        return float(
+            np.trace(np.linalg.inv(PRIOR * np.eye(9) + J.T @ J))
+            + WEIGHT_OF_PLANE * np.trace(np.linalg.inv(PRIOR * np.eye(4) + u.T @ u))
+        )
+
+    chosen = choose(candidates, 6, guess).tolist()
+    assert second_basin(candidates[chosen], guess)[0] > LEAST_GAP
+    others = [k for k in range(25) if k not in chosen]
+    assert min(error([*chosen[:i], k, *chosen[i + 1 :]]) for i in range(6) for k in others) > 0.999999 * error(chosen)
 
 
 def test_published_greedy_against_random() -> None:

@@ -44,6 +44,15 @@ def test_chosen_poses_are_far_from_the_fit_and_more_informative_than_others(n: i
     assert information(R[chosen]) > np.quantile(others, 0.95)
 
 
+def test_no_other_pose_of_the_farther_half_is_more_informative() -> None:
+    R = candidates(60)
+    chosen = choose_verification_poses(R, FITTED, 3).tolist()
+    far = np.argsort(-distance_rad(R, FITTED))[:30].tolist()
+    assert set(chosen) <= set(far)
+    exchanged = [information(R[[*chosen[:i], k, *chosen[i + 1 :]]]) for i in range(3) for k in far if k not in chosen]
+    assert max(exchanged) <= information(R[chosen]) * (1 + 1e-6)
+
+
 def test_two_poses_differ_in_tilt() -> None:
     R = candidates()
     first, second = DOWN @ R[choose_verification_poses(R, FITTED, 2)]

@@ -8,7 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import NotObservable, Parameters
 from ftcalib.model import Array, predict
-from ftcalib.published.yu import SPECIAL_R_flange_base, lrom, special_numbers, srom, srom_gravity_force, weight_and_tilt
+from ftcalib.published.yu import (
+    _SUMS,
+    SPECIAL_R_flange_base,
+    lrom,
+    special_numbers,
+    srom,
+    srom_gravity_force,
+    weight_and_tilt,
+)
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
 TRUTH = Parameters(
@@ -33,9 +41,16 @@ def test_the_24_are_the_rotations_of_the_cube_in_the_papers_order() -> None:
     np.testing.assert_array_equal(np.linalg.det(SPECIAL_R_flange_base), 1)
     assert len({R.tobytes() for R in SPECIAL_R_flange_base + 0.0}) == 24
     np.testing.assert_array_equal(SPECIAL_R_flange_base.sum(axis=0), 0)
-    # Eqs 15-17: the first four add up to 4 e1 e1^T, the next four to its negative.
-    np.testing.assert_array_equal(SPECIAL_R_flange_base[:4].sum(axis=0), np.diag([4, 0, 0]))
-    np.testing.assert_array_equal(SPECIAL_R_flange_base[4:8].sum(axis=0), np.diag([-4, 0, 0]))
+
+
+def test_every_sum_leaves_one_entry_of_the_orientations() -> None:
+    """Eqs 15-23: of p_kj, 4 e_j e_k^T from the forces that are added, and its negative from those subtracted."""
+    for k, sums in enumerate(_SUMS):
+        for j, both in enumerate(sums):
+            for numbers, sign in zip(both, (4, -4), strict=True):
+                entry = np.zeros((3, 3))
+                entry[j, k] = sign
+                np.testing.assert_array_equal(SPECIAL_R_flange_base[np.array(numbers) - 1].sum(axis=0), entry)
 
 
 def test_srom_knows_its_orientations_in_any_order() -> None:
@@ -78,13 +93,14 @@ def test_srom_names_what_is_missing_repeated_or_off() -> None:
 
     assert "missing 3, 17. Use LROM or ML" in refusal(np.delete(R24, [2, 16], axis=0))
     assert "missing 5; repeated 9." in refusal(np.concatenate([np.delete(R24, 4, axis=0), R24[8:9]]))
-    assert "repeated 1." in refusal(np.concatenate([R24, R24[:1]]))
+    assert "each: repeated 1." in refusal(np.concatenate([R24, R24[:1]]))
     bent = R24.copy()
     bent[6] = turned("y", 2.0) @ bent[6]
     assert re.search(r"missing 7; .*row 7 is 2\.00° from orientation 7", refusal(bent))
     assert "missing 3, 17." in refusal(turned("z", 5) @ np.delete(R24, [2, 16], axis=0))
     scattered = Rotation.random(24, rng=np.random.default_rng(0)).as_matrix()
     assert "use LROM" in refusal(scattered).replace("Use", "use")
+    assert "no pose has one of them" in refusal(R24[:0])
 
 
 def test_srom_gravity_force_has_the_sign_of_every_component() -> None:

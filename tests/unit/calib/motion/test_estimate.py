@@ -1,0 +1,273 @@
+"""The fit of rows in motion: its equations against dense ones, the rows that it leaves out, and what it states."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+
+from ftcalib.model import Array, skew
+from ftcalib.motion.estimate import (
+    DELAY_S,
+    GYRATION_M,
+    HEIGHT_M,
+    KNOT_S,
+    TOUCH_N,
+    TOUCH_NM,
+    _first_kept,
+    _local,
+    _Problem,
+    _untouched,
+    _without_contact,
+    fit,
+    rough_delay,
+)
+from ftcalib.motion.model import CROSS_TALK, DELAY, GAINS, HEIGHT, INERTIA, SIZE, Load, jacobian, wrench_of
+from ftcalib.motion.noise import Noise
+from ftcalib.motion.samples import Motion, Rows
+from tests.moving_load import Truth
+from tests.unit.calib.motion.test_motion import load_of
+
+G = 9.80665
+ROW_S = 0.12
+SIGMA = np.repeat([0.2, 0.01], 3)
+ALL_ON = {"gain": 0.01, "cross_talk": 3e-3, "walk_N": 0.05, "walk_Nm": 2e-3}
+
+
+def rows_of(
+    n: int, load: Load, *, seed: int = 0, turn_rad: float = 3.0, sigma: Array = SIGMA, row_s: float = ROW_S
+) -> Rows:
+    """Rows of a random motion of this load, with white noise."""
+    rng = np.random.default_rng(seed)
+    turns = Rotation.from_rotvec(turn_rad * rng.uniform(-1, 1, (n, 3)))
+    omega, alpha = rng.normal(size=(2, n, 3))
+    motion = Motion(
+        (turns * Rotation.from_euler("x", 180, degrees=True)).as_matrix(),
+        rng.normal(size=(n, 3)),
+        skew(alpha) + skew(omega) @ skew(omega),
+    )
+    rate = Motion.of_columns(rng.normal(size=(n, 21)))
+    wrench = wrench_of(load, motion.earlier(load.delay_s, rate)) + sigma * rng.normal(size=(n, 6))
+    t: Array = np.arange(n) * np.float64(row_s)
+    return Rows(t, wrench, motion, rate, np.linalg.norm(omega, axis=1), 0.0, row_s)
+
+
+def all_kept(rows: Rows) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    return np.ones(len(rows), np.bool_)
+
+
+WHITE = Noise(SIGMA[None], np.ones((1, 6, 1)), np.eye(6))
+
+
+class Dense:
+    """The same problem as one matrix: readings in their noise, and the covariance of what is expected."""
+
+    def __init__(self, problem: _Problem, load: Load, drift: Array) -> None:
+        rows = problem.rows
+        motion = rows.motion.earlier(load.delay_s, rows.rate)
+        knots = len(problem.knots)
+        hats = np.maximum(1 - np.abs(rows.t_s[:, None] - problem.knots) / np.diff(problem.knots)[0], 0)
+        self.r = ((rows.wrench - wrench_of(load, motion) - hats @ drift) / SIGMA).ravel()
+        on_knots = np.einsum("nk,ij->nikj", hats, np.eye(6)).reshape(len(rows), 6, -1)
+        self.J = (np.concatenate([jacobian(load, motion, rows.rate), on_knots], axis=2) / SIGMA[:, None]).reshape(
+            6 * len(rows), -1
+        )
+        self.steps = np.tril(np.ones((knots, knots)), -1)[:, :-1] * np.sqrt(np.diff(problem.knots)[0])
+        self.mean_free = np.eye(knots) - 1 / knots
+        self.value = np.concatenate([load.vector, drift.ravel()])
+        self.mass_kg = load.mass_kg
+
+    def expected(self, sizes: dict[str, float]) -> Array:
+        """Covariance of inertia, height, delay, gain, cross-talk and knots of the bias; the static values have none."""
+        variance = np.zeros(SIZE)
+        variance[INERTIA], variance[HEIGHT], variance[DELAY] = (
+            (self.mass_kg * GYRATION_M**2) ** 2,
+            HEIGHT_M**2,
+            DELAY_S**2,
+        )
+        variance[GAINS], variance[CROSS_TALK] = sizes["gain"] ** 2, sizes["cross_talk"] ** 2
+        walk = np.diag(np.repeat([sizes["walk_N"] ** 2, sizes["walk_Nm"] ** 2], 3))
+        root = self.mean_free @ self.steps
+        return np.asarray(block_diag(np.diag(variance[15:]), np.kron(root @ root.T, walk)))
+
+    def solution(self, sizes: dict[str, float]) -> tuple[Array, Array, float, float]:
+        """Values, covariance of the static ones, cost, and -2 log restricted likelihood."""
+        X, Z, K = self.J[:, :15], self.J[:, 15:], self.expected(sizes)
+        y = self.r + Z @ self.value[15:]  # about values of 0
+        S = np.eye(len(y)) + Z @ K @ Z.T
+        SX = np.linalg.solve(S, X)
+        C = np.linalg.inv(X.T @ SX)
+        step = C @ SX.T @ y
+        left = y - X @ step
+        cost = float(left @ np.linalg.solve(S, left))
+        values = np.concatenate([step, K @ Z.T @ np.linalg.solve(S, left)])
+        return values, C, cost, float(cost + np.linalg.slogdet(S)[1] - np.linalg.slogdet(C)[1])
+
+
+@pytest.fixture(scope="module")
+def posed() -> tuple[_Problem, Load, Array]:
+    truth = replace(load_of(Truth(), 3e-3), delay_s=0.01)
+    rows = rows_of(45, truth, row_s=0.4)
+    problem = _Problem(rows, None, G, point_mass=False)
+    rng = np.random.default_rng(1)
+    near = truth.moved(1e-3 * rng.normal(size=SIZE))
+    drift = rng.normal(size=(len(problem.knots), 6)) * np.repeat([0.05, 2e-3], 3)
+    return problem, near, drift - drift.mean(axis=0)
+
+
+def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[_Problem, Load, Array]) -> None:
+    problem, _, _ = posed
+    assert len(problem.knots) == 1 + round(44 * 0.4 / KNOT_S)
+    assert (problem.knots[0], problem.knots[-1]) == (0.0, problem.rows.t_s[-1])
+    np.testing.assert_allclose(problem.hats(problem.knots), np.eye(len(problem.knots)), atol=1e-12)
+    np.testing.assert_allclose(problem.hats(problem.rows.t_s).sum(axis=1), 1)
+    for seconds, knots in ((1.0, 2), (12.0, 3), (124.0, 25), (500.0, 25)):
+        n = round(seconds / ROW_S)
+        few = replace(problem.rows[np.zeros(n, np.intp)], t_s=np.arange(n) * np.float64(ROW_S))
+        assert len(_Problem(few, None, G, point_mass=False).knots) == knots
+
+
+@pytest.mark.parametrize("off", [(), ("gain",), ("cross_talk", "walk_Nm"), ("walk_N",), tuple(ALL_ON)])
+def test_a_step_is_that_of_generalised_least_squares(posed: tuple[_Problem, Load, Array], off: tuple[str, ...]) -> None:
+    problem, load, drift = posed
+    sizes = {name: 0.0 if name in off else size for name, size in ALL_ON.items()}
+    sums = problem.sums(load, drift, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
+    dense = Dense(problem, load, drift)
+    assert sums[2] == pytest.approx(float(dense.r @ dense.r))
+    found = problem.solved(sizes, sums, load, drift)
+    values, covariance, cost, criterion = dense.solution(sizes)
+    step = np.concatenate([found.step[:SIZE], problem.centred @ found.step[SIZE:]])
+    sigma = np.sqrt(np.diag(found.covariance))[:15]
+    np.testing.assert_allclose((step + dense.value)[:15] / sigma, values[:15] / sigma, atol=1e-4)
+    scale = np.abs(values[15:]).reshape(-1) + 1e-9
+    np.testing.assert_allclose((step + dense.value)[15:] / scale, values[15:] / scale, atol=1e-4)
+    np.testing.assert_allclose(
+        found.covariance[:15, :15] / np.outer(sigma, sigma), covariance / np.outer(sigma, sigma), atol=1e-6
+    )
+    assert found.cost == pytest.approx(cost, rel=1e-8)
+    larger = {name: 2 * size for name, size in sizes.items()}
+    other = problem.solved(larger, sums, load, drift).criterion
+    assert other - found.criterion == pytest.approx(dense.solution(larger)[3] - criterion, abs=1e-5)
+    none = problem.solved({}, sums, load, drift).criterion
+    assert none - found.criterion == pytest.approx(dense.solution(dict.fromkeys(ALL_ON, 0.0))[3] - criterion, abs=1e-5)
+    taken = problem.absorbed(load, problem.rows[:20], found)
+    T = block_diag(np.eye(SIZE), problem.centred)
+    J = dense.J[:120].reshape(20, 6, -1) * SIGMA[:, None] @ T
+    np.testing.assert_allclose(
+        np.einsum("nik,njk->nij", taken, taken), J @ found.covariance @ np.swapaxes(J, 1, 2), rtol=1e-6, atol=1e-9
+    )
+
+
+def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[_Problem, Load, Array]) -> None:
+    """More rows than are summed at once, noise that is correlated, and rows that are left out."""
+    _, load, _ = posed
+    rows = rows_of(1010, load, seed=4)
+    wide = _Problem(rows, None, G, point_mass=False)
+    drift = np.zeros((len(wide.knots), 6))
+    kept = all_kept(rows)
+    kept[990:995] = False
+    filters = np.zeros((2, 6, 2))
+    filters[0, :, 0], filters[1] = 1.0, [1.25, -0.75]
+    noise = Noise(SIGMA[None] * np.array([[1.0], [3.0]]), filters, np.eye(6))
+    state = np.arange(1010, dtype=np.intp) % 2
+    H, b, chi2 = wide.sums(load, drift, noise, kept, state)
+    unit = (rows.wrench - wide.predicted(load, rows)) / noise.scale[state]
+    J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / noise.scale[state][:, :, None]
+    white, derivative = unit.copy(), J.copy()
+    for k in np.flatnonzero(kept):
+        if k > 0 and kept[k - 1]:
+            white[k], derivative[k] = 1.25 * unit[k] - 0.75 * unit[k - 1], 1.25 * J[k] - 0.75 * J[k - 1]
+    white, derivative = white[kept].ravel(), derivative[kept].reshape(-1, SIZE)
+    assert chi2 == pytest.approx(float(white @ white))
+    np.testing.assert_allclose(H[:SIZE, :SIZE], derivative.T @ derivative, rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(b[:SIZE], derivative.T @ white, rtol=1e-9, atol=1e-6)
+
+
+def test_rows_beside_a_contact_are_left_out_unless_nothing_fits() -> None:
+    distance = np.full(30, 43.0)  # 1e-7 of chi-square is 43.8
+    distance[10] = 45.0
+    assert np.flatnonzero(~_without_contact(distance)).tolist() == [8, 9, 10, 11, 12]
+    distance[[0, 29]] = 100.0
+    assert np.flatnonzero(~_without_contact(distance)).tolist() == [0, 1, 2, 8, 9, 10, 11, 12, 27, 28, 29]
+    for touched, left_out in ((21, 23), (22, 0)):  # of 30; two more are beside them
+        assert np.count_nonzero(~_without_contact(np.where(np.arange(30) < touched, 100.0, 0.0))) == left_out
+
+
+@pytest.mark.parametrize(("channel", "limit"), [(1, TOUCH_N), (4, TOUCH_NM)])
+def test_a_guarded_motion_has_contact_only_above_a_touch(channel: int, limit: float) -> None:
+    residuals = np.zeros((9, 6))
+    for size, left_out in ((0.95, 0), (1.05, 5)):
+        residuals[4, channel] = -size * limit
+        assert np.count_nonzero(~_untouched(residuals)) == left_out
+
+
+def test_noise_of_a_row_is_that_around_it() -> None:
+    unit, kept = np.ones((9, 6)), np.ones(9, np.bool_)
+    unit[4] = 5.0
+    kept[7] = False
+    unit[7] = 100.0
+    local = _local(unit, kept)
+    burst = np.sqrt((1 + 1 + 25 + 1) / 4)
+    np.testing.assert_allclose(local, [1, 1, 1, burst, burst, burst, 1, 1, 1])
+
+
+def test_contact_is_first_judged_by_the_quiet_rows_of_each_state() -> None:
+    truth = load_of(Truth())
+    rows = rows_of(400, truth, seed=2, sigma=np.zeros(6))
+    rng = np.random.default_rng(3)
+    resting = np.arange(400) < 100
+    noise = np.where(resting, 0.3, 1.0)[:, None] * SIGMA * rng.normal(size=(400, 6))
+    noise[[150, 250, 50]] = np.outer([2.5, 5.5, 2.5], SIGMA)
+    rows = replace(rows, wrench=rows.wrench + noise, speed_rad_s=np.where(resting, 0.0, 1.0))
+    problem = _Problem(rows, None, G, point_mass=False)
+    assert np.flatnonzero(~_first_kept(problem, truth)).tolist() == [*range(48, 53), *range(248, 253)]
+    pushed = replace(rows, wrench=rows.wrench + np.where(resting, 20.0, 0.0)[:, None] * SIGMA)
+    assert not _first_kept(_Problem(pushed, None, G, point_mass=False), truth)[:100].any()
+
+
+def test_a_delay_is_found_roughly_beside_contact() -> None:
+    truth = replace(load_of(Truth()), delay_s=0.03)
+    rows = rows_of(150, truth)
+    rows.wrench[:30] += 8.0
+    assert rough_delay(rows, None, G) == pytest.approx(0.03, abs=2e-3)
+
+
+def test_a_walk_of_the_bias_is_found() -> None:
+    rows = rows_of(200, load_of(Truth()), seed=5, turn_rad=0.6, sigma=4 * SIGMA)
+    steps = np.random.default_rng(6).normal(size=(200, 6)) * np.sqrt(ROW_S)
+    walk = np.cumsum(steps, axis=0) * np.repeat([0.3, 0.012], 3)
+    found = fit(replace(rows, wrench=rows.wrench + walk), None, G)
+    assert 0.1 < found.components["walk_N"] < 0.5
+    assert found.drift_change is not None
+    change, sigma = found.drift_change
+    np.testing.assert_allclose(found.drift[-1] - found.drift[0], change)
+    assert np.abs((change - walk[-1] + walk[0]) / sigma).max() < 4
+    assert (sigma < 3 * np.repeat([0.3, 0.012], 3) * np.sqrt(200 * ROW_S)).all()
+    assert np.corrcoef(found.drift[:, 2], walk[:, 2])[0, 1] > 0.9
+
+
+def test_another_mounting_costs_what_its_own_fit_does() -> None:
+    rows = rows_of(100, load_of(Truth()), seed=5, turn_rad=0.6, sigma=20 * SIGMA)
+    found = fit(rows, None, G)
+    assert found.drift_change is None
+    assert found.kept.all()
+    np.testing.assert_allclose(found.sigma, np.tile(20 * SIGMA, (100, 1)), rtol=0.2)
+    assert found.distance.mean() == pytest.approx(6, rel=0.1)
+    expected = np.r_[np.full(6, found.load.mass_kg * GYRATION_M**2), HEIGHT_M, DELAY_S]
+    np.testing.assert_allclose(found.prior_share, np.sqrt(np.diag(found.covariance))[15:23] / expected)
+    costs = []
+    for start in _Problem(rows, None, G, point_mass=False).starts():
+        load = start
+        for _ in range(8):
+            motion = rows.motion.earlier(load.delay_s, rows.rate)
+            left = (rows.wrench - wrench_of(load, motion)) / found.sigma
+            J = jacobian(load, motion, rows.rate)[:, :, : GAINS.start] / found.sigma[:, :, None]
+            rows_of_prior = np.hstack([np.zeros((8, 15)), np.diag(1 / expected)])
+            y = np.append(left.ravel(), -load.vector[15 : GAINS.start] / expected)
+            step = np.linalg.lstsq(np.vstack([J.reshape(-1, GAINS.start), rows_of_prior]), y, rcond=None)[0]
+            load = load.moved(np.append(step, np.zeros(SIZE - GAINS.start)))
+        costs.append(float(y @ y))
+    assert len(costs) == 2
+    assert found.second_basin_chi2 == pytest.approx(max(costs) - min(costs), rel=0.05)
+    assert found.chi2 == pytest.approx(min(costs), rel=0.02)

@@ -1,0 +1,145 @@
+"""Noise of rows in motion: its states, its correlation, and rows made independent, against their definitions."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
+
+from ftcalib.model import Array
+from ftcalib.motion.noise import FEWEST, ORDER, Noise, _filters, _of_equal_order, runs, states
+
+REST, SLOW, QUICK = np.zeros(100), np.linspace(0.1, 0.5, 150), np.linspace(0.6, 2.0, 150)
+
+
+def kept(count: int) -> NDArray[np.bool_]:
+    return np.ones(count, np.bool_)
+
+
+def test_rest_is_a_state_and_classes_of_speed_have_as_many_rows_each() -> None:
+    speed = np.concatenate([REST, SLOW, QUICK])
+    assert np.bincount(states(speed, kept(400))).tolist() == [100, 100, 100, 100]
+    assert states(speed, kept(400)).tolist() == sorted(states(speed, kept(400)))
+    for moving, classes in ((2 * FEWEST - 1, 1), (2 * FEWEST, 2), (3 * FEWEST - 1, 2), (3 * FEWEST, 3)):
+        state = states(np.append(REST, np.linspace(0.03, 1, moving)), kept(100 + moving))
+        assert np.bincount(state)[0] == 100
+        assert state.max() == classes
+
+
+def test_states_that_few_kept_rows_show_are_joined_with_others() -> None:
+    speed = np.concatenate([REST[:FEWEST], SLOW])
+    assert np.bincount(states(speed, kept(len(speed)))).tolist() == [FEWEST, 50, 50, 50]
+    unkept = kept(len(speed))
+    unkept[0] = False
+    assert np.bincount(states(speed, unkept)).tolist() == [FEWEST + 50, 50, 50]
+    few_moving = np.concatenate([REST, SLOW[:FEWEST]])
+    assert np.bincount(states(few_moving, kept(100 + FEWEST))).tolist() == [100, FEWEST]
+    assert not states(few_moving[:-1], kept(99 + FEWEST)).any()
+
+
+def test_a_run_ends_at_a_gap() -> None:
+    t = np.cumsum([5.0, 0.1, 0.14, 0.1, 0.16, 0.1, 0.4, 0.1, 0.1])
+    assert runs(t, 0.1).tolist() == [0, 1, 2, 3, 0, 1, 0, 1, 2]
+
+
+def correlated(rng: np.random.Generator, n: int, *poles: float) -> Array:
+    """An autoregression, with these coefficients of the rows before."""
+    return np.asarray(lfilter([1.0], np.append(1.0, -np.array(poles)), rng.normal(size=n + 100))[100:])
+
+
+def test_predictors_solve_the_equations_of_yule_and_walker() -> None:
+    x = 3.0 * correlated(np.random.default_rng(1), 2000, 0.5, -0.3, 0.4)
+    place = np.arange(2000) % 500
+    filters = _filters(x, place, bursts=False)
+    lags = []
+    for lag in range(4):
+        pairs = np.concatenate([run[lag:] * run[: len(run) - lag] for run in x.reshape(4, 500)])
+        lags.append(pairs.mean())
+    r = np.array(lags) / lags[0]
+    assert filters.shape == (4, 4)
+    for k in range(4):
+        a = solve_toeplitz(r[:k], r[1 : k + 1]) if k else np.zeros(0)
+        expected = np.append(1.0, -a) / np.sqrt(1 - a @ r[1 : k + 1])
+        np.testing.assert_allclose(filters[k], np.pad(expected, (0, 3 - k)), rtol=1e-9)
+
+
+def test_the_order_is_that_of_least_bic_and_at_most_one_a_25_rows() -> None:
+    rng = np.random.default_rng(2)
+    place = np.arange(1500)
+    orders = [len(_filters(rng.normal(size=1500), place, bursts=False)) - 1 for _ in range(20)]
+    assert orders.count(0) >= 18
+    seventh = correlated(rng, 1500, *np.zeros(6), 0.4), correlated(rng, 1500, *np.zeros(5), 0.4)
+    assert [len(_filters(x, place, bursts=False)) - 1 for x in seventh] == [0, ORDER]
+    slow = np.sin(2 * np.pi * 0.1 * np.arange(74))  # predicted by two rows before
+    assert [len(_filters(slow[:n], place[:n], bursts=False)) - 1 for n in (24, 49, 74)] == [0, 1, 2]
+
+
+def test_weak_noise_at_low_frequencies_is_white_in_bursts() -> None:
+    rng = np.random.default_rng(3)
+    place = np.arange(1000)
+    low, high = correlated(rng, 1000, 0.7), correlated(rng, 1000, -0.7)
+    assert [len(_filters(x, place, bursts=True)) for x in (low, high)] == [2, 1]
+    assert [len(_filters(x, place, bursts=False)) for x in (low, high)] == [2, 2]
+    constant = _filters(np.ones(1000), place, bursts=True)[1]
+    np.testing.assert_allclose(constant[:2], [1 / np.sqrt(1 - 0.98**2), -0.98 / np.sqrt(1 - 0.98**2)])
+
+
+def test_a_channel_of_lower_order_keeps_its_last_predictor() -> None:
+    one, three = np.array([[2.0]]), np.array([[1.0, 0, 0], [1.1, -0.5, 0], [1.2, -0.6, 0.2]])
+    stacked = _of_equal_order([one, three])
+    np.testing.assert_array_equal(stacked[:, 1], three)
+    np.testing.assert_array_equal(stacked[:, 0], [[2.0, 0, 0]] * 3)
+
+
+def noisy(n: int = 1200) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of two runs in which channels are correlated and the second half is three times as loud; state and place."""
+    rng = np.random.default_rng(4)
+    white = np.column_stack([correlated(rng, n, 0.6) for _ in range(6)])
+    mixed = white @ (np.eye(6) + 0.3 * rng.normal(size=(6, 6))) * np.repeat([1.0, 0.03], 3)
+    state, place = np.repeat(np.arange(2, dtype=np.intp), n // 2), np.tile(np.arange(n // 2, dtype=np.intp), 2)
+    return mixed * np.array([1.0, 3.0])[state][:, None], state, place
+
+
+def test_rows_become_independent_and_of_unit_variance() -> None:
+    r, state, place = noisy()
+    noise = Noise.of(r, np.zeros((len(r), 6, 0)), state, place)
+    white = noise.whitened(r[:, :, None], state, place)[:, :, 0]
+    np.testing.assert_allclose(white.T @ white / len(r), np.eye(6), atol=1e-8)
+    assert np.abs(white[1:].T @ white[:-1] / len(r)).max() < 0.15
+    assert np.abs(np.mean(white[1:] * white[:-1], axis=0)).max() < 0.1
+    common = np.sqrt(np.mean(r**2, axis=0))
+    for k in (0, 1):
+        unit = (r / common)[state == k]
+        groups = np.sqrt([np.mean(unit[:, :3] ** 2), np.mean(unit[:, 3:] ** 2)])
+        np.testing.assert_allclose(noise.scale[k], common * np.repeat(groups, 3))
+
+
+def test_a_row_is_predicted_from_those_before_it_in_its_run() -> None:
+    r, state, place = noisy()
+    noise = Noise.of(r, np.zeros((len(r), 6, 0)), state, place)
+    X = np.stack([r, 2 * r], axis=2)
+    white = noise.whitened(X, state, place)
+    order = len(noise.filters) - 1
+    assert order >= 1
+    for row in (0, 1, 5, 600, 601, 900):
+        seen = min(place[row], order)
+        values = [noise.filters[seen, :, lag] * r[row - lag] / noise.scale[state[row - lag]] for lag in range(seen + 1)]
+        np.testing.assert_allclose(white[row, :, 0], noise.root @ np.sum(values, axis=0))
+    np.testing.assert_allclose(white[:, :, 1], 2 * white[:, :, 0])
+
+
+def test_what_a_fit_has_taken_from_the_residuals_counts() -> None:
+    """A root of the covariance of the prediction acts as so many more samples of each row."""
+    r, state, place = noisy()
+    taken = np.stack([0.5 * r, 0.2 * r], axis=2)
+    plain, noise = (Noise.of(r, some, state, place) for some in (np.zeros((len(r), 6, 0)), taken))
+    np.testing.assert_allclose(noise.scale, np.sqrt(1 + 0.5**2 + 0.2**2) * plain.scale)
+    white = noise.whitened(r[:, :, None], state, place)[:, :, 0]
+    np.testing.assert_allclose(white.T @ white / len(r), np.eye(6) / (1 + 0.5**2 + 0.2**2), atol=1e-8)
+
+
+@pytest.mark.parametrize("n", [40, 60])
+def test_few_rows_are_enough(n: int) -> None:
+    r = np.random.default_rng(5).normal(size=(n, 6))
+    noise = Noise.of(r, np.zeros((n, 6, 0)), np.zeros(n, np.intp), np.arange(n))
+    assert np.isfinite(noise.whitened(r[:, :, None], np.zeros(n, np.intp), np.arange(n))).all()
