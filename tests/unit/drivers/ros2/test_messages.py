@@ -22,38 +22,9 @@ from ftdrivers.ros2.poses import Joints, Poses, Transforms
 from ftdrivers.ros2.sensor import Ros2Sensor
 from ftdrivers.ros2.subscription import Received
 from tests.ros2.seven_joints import JOINTS, URDF, flange, posture
+from tests.unit.drivers.ros2.graph_in_memory import joints, pose, tf, wrench
 
 NAN = float("nan")
-
-
-def header(t_s: float, frame: str = "base") -> Any:
-    sec, nanosec = divmod(round(t_s * 1e9), 10**9)
-    return SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec), frame_id=frame)
-
-
-def vector(*values: float) -> Any:
-    return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
-
-
-def pose(t_s: float = 5.0, p: Any = (0, 0, 1), q: Any = (0, 0, 0, 1)) -> Any:
-    return SimpleNamespace(header=header(t_s), pose=SimpleNamespace(position=vector(*p), orientation=vector(*q)))
-
-
-def joints(t_s: float, names: list[str], position: Any) -> Any:
-    return SimpleNamespace(header=header(t_s), name=names, position=position)
-
-
-def tf(*parts: tuple[float, str, str], q: Any = (0, 0, 0, 1)) -> Any:
-    moved = SimpleNamespace(translation=vector(0, 0, 1), rotation=vector(*q))
-    made = [
-        SimpleNamespace(header=header(t, parent), child_frame_id=child, transform=moved) for t, parent, child in parts
-    ]
-    return SimpleNamespace(transforms=made)
-
-
-def wrench(t_s: float = 5.0, frame: str = "ft", fx: float = 1.0) -> Any:
-    parts = SimpleNamespace(force=vector(fx, 2, 3), torque=vector(4, 5, 6))
-    return SimpleNamespace(header=header(t_s, frame), wrench=parts)
 
 
 @pytest.fixture
