@@ -55,6 +55,18 @@ def test_can_addresses() -> None:
     assert sensor.name == "ATI CAN sensor 0x20 on slcan /dev/ttyACM0"
 
 
+def test_ethernet_addresses() -> None:
+    sensor = sensor_from_url("ati-netft://192.168.1.1")
+    assert isinstance(sensor, NetFtSensor)
+    assert (sensor._rdt_port, sensor._http_port) == (49152, 80)
+    sensor = sensor_from_url("ati-netft://192.168.1.1?rdt_port=65535&http_port=1")
+    assert isinstance(sensor, NetFtSensor)
+    assert (sensor._rdt_port, sensor._http_port) == (65535, 1)
+    for query in ("rdt_port=65536", "http_port=65536", "rdt_port=0", "http_port=0"):
+        with pytest.raises(BadUrl, match="allowed are 1 to 65535"):
+            sensor_from_url(f"ati-netft://192.168.1.1?{query}")
+
+
 def test_serial_addresses() -> None:
     sensor = sensor_from_url("ati-serial:///dev/serial/by-id/usb-FTDI_My%20Box-if00?calibration=2")
     assert isinstance(sensor, AtiSerialSensor)

@@ -34,6 +34,7 @@ def test_it_opens_with_the_first_pose(graph: Graph) -> None:
     assert state.t_host_ns == graph.clock.now_ns()
     assert state.p_base_flange_m.tolist() == [0, 0, 1]
     assert np.isnan(state.q_rad).all()
+    assert state.q_rad.shape == (6,)
     graph.clock.advance(0.3)
     with pytest.raises(ConnectError, match=r"no message of /arm/pose arrived"):
         arm.open()  # the pose is too old: a new connection, to a driver that has ended
@@ -123,7 +124,8 @@ def test_a_follower_reads_every_pose_in_order(graph: Graph) -> None:
     arm = opened(graph)
     with arm.follow() as follow:
         begin_s = graph.clock.now_s()
-        assert len(follow.read(0.05).t_host_ns) == 0
+        nothing = follow.read(0.05)
+        assert [value.shape for value in (nothing.q_rad, nothing.R_base_flange)] == [(0, 6), (0, 3, 3)]
         assert graph.clock.now_s() - begin_s == pytest.approx(0.05)
         for number in range(1, 4):
             graph.later(0.01 * number, TOPIC, pose(5 + 0.1 * number))
@@ -141,6 +143,16 @@ def test_a_follower_reads_every_pose_in_order(graph: Graph) -> None:
     arm.open()
     with pytest.raises(StreamBroken, match="the arm was closed; follow it again"):
         follow.read(0.1)
+
+
+def test_one_of_two_followers_ends_alone(graph: Graph) -> None:
+    arm = opened(graph)
+    with arm.follow() as first:
+        with arm.follow():
+            pass
+        graph.later(0.01, TOPIC, pose(5.1))
+        assert len(first.read(0.1).t_host_ns) == 1
+    assert arm._followers == []
 
 
 @pytest.mark.parametrize(("back_s", "is_other"), [(0.0, False), (0.45, False), (0.52, True)])

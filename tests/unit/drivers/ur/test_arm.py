@@ -102,6 +102,12 @@ def test_bad_targets_never_leave_the_house(arm: UrArm, controller: Controller, q
     assert "move" not in controller.did
 
 
+@pytest.mark.parametrize(("setting", "source"), [("auto", "assumed"), ("script", "configured")])
+def test_the_control_path_is_a_fact(arm: UrArm, setting: ControlSetting, source: str) -> None:
+    arm._setting = setting
+    assert arm.identify().facts["control"].source == source
+
+
 def test_a_new_arm_opens_no_connection_and_closes() -> None:
     arm = UrArm(HOST, model="ur5e", speed_rad_s=radians(60))
     arm.stop()

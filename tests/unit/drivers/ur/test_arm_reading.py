@@ -14,7 +14,13 @@ from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.sample import Sample
 from ftdrivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
-from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, ReaderInMemory, pose_from_ur
+from tests.unit.drivers.ur.controller_in_memory import (
+    CYCLE_S,
+    Controller,
+    ReaderInMemory,
+    ServicesInMemory,
+    pose_from_ur,
+)
 
 
 @pytest.fixture
@@ -402,9 +408,13 @@ def test_a_controller_that_lacks_what_is_needed_is_refused(controller: Controlle
         ReaderInMemory(controller, "UR5e")
 
 
-def test_another_model_is_refused(controller: Controller) -> None:
+def test_another_model_is_refused(controller: Controller, monkeypatch: pytest.MonkeyPatch) -> None:
     info = ReaderInMemory(controller, None).info
     assert (info.model, info.serial, info.firmware) == ("UR5e", "20225500001", "5.15.0")
+    monkeypatch.setattr(ServicesInMemory, "polyscope", lambda _: "5.15.0.1261331")
+    assert ReaderInMemory(controller, None).info.firmware == "5.15.0.1261331"  # as reported
+    monkeypatch.setattr(ServicesInMemory, "polyscope", lambda _: None)
+    assert ReaderInMemory(controller, None).info.firmware == "5.15.0"  # that of RTDE
     assert ReaderInMemory(controller, "UR7e").info.model == "UR7e"  # its newer name
     with pytest.raises(ConnectError, match="UR5e, not a UR10e"):
         ReaderInMemory(controller, "UR10e")
