@@ -2,13 +2,11 @@
 
 import json
 import os
-import sys
 import threading
 import time
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,8 +23,6 @@ from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript.player import Player
 from ftdrivers.transcript.recorder import Passage, Transcript, Writer
 from ftdrivers.transcript.taps import recording
-from ftdrivers.wires.parity import ask_for_marks
-from ftdrivers.wires.serial_port import SerialPort
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.ati_serial import AtiSerialBox
 from ftmocks.sensors.bota import BotaBox
@@ -198,43 +194,6 @@ def ati(cell_time: Any) -> Iterator[str]:
     device.stop()
 
 
-def read_through(player: Player, request: bytes, size: int) -> tuple[bytes, list[int]]:
-    with player as path:
-        port = SerialPort("sensor", path, 1_250_000, even_parity=True)
-        port.open()
-        try:
-            port.write(request)
-            data, damaged, deadline = b"", list[int](), time.monotonic() + 5
-            while len(data) < size:
-                assert time.monotonic() < deadline
-                more, places = port.read_marked(size - len(data))
-                damaged += [len(data) + place for place in places]
-                data += more
-        finally:
-            port.close()
-    return data, damaged
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
-@pytest.mark.parametrize(
-    ("parity_marks", "read", "damaged"), [(True, b"ab\xffc", [1]), (False, b"a\xff\x00b\xff\xffc", [])]
-)
-def test_recorded_marks_are_played_as_marks(parity_marks: bool, read: bytes, damaged: list[int]) -> None:
-    recorded = made_up((0.00, True, b"?"), (0.01, False, b"a\xff\x00b\xff\xffc"))
-    player = Player(replace(recorded, parity_marks=parity_marks))
-    assert read_through(player, b"?", len(read)) == (read, damaged)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
-def test_marks_are_not_played_before_the_driver_is_ready_for_them() -> None:
-    recorded = made_up((0.00, True, b"?"), (0.01, False, b"\xff\x00b"))
-    player = Player(replace(recorded, passages=recorded.passages[1:], parity_marks=True))
-    with player as path, serial.Serial(path, timeout=0.1) as port:
-        assert port.read(1) == b""  # it has not asked for marks
-        ask_for_marks(port)
-        assert port.read(3) == b"\xff\x00b"
-
-
 def test_ports_without_parity_have_no_marks(tmp_path: Path, ati: str) -> None:
     path = tmp_path / "plain.jsonl"
     writer = Writer(path, {"url": "x", "duration_s": 1})
@@ -334,10 +293,3 @@ def test_a_request_that_was_not_recorded_ends_in_silence_with_a_reason(dialogue:
     assert "63 64" in player.divergence
     port.write(b"cd")
     assert is_silent(port)
-
-
-def test_a_player_that_is_never_opened_ends() -> None:
-    before = threading.active_count()
-    with Player(DIALOGUE):
-        pass
-    assert threading.active_count() == before

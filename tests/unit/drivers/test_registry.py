@@ -47,12 +47,29 @@ def test_can_addresses() -> None:
     assert sensor.name == "ATI CAN sensor 0x7F on socketcan can0"
     assert (sensor._bus._bitrate, sensor._slot, sensor._sign) == (500_000, 3, -1)
     assert (sensor._unit_codes, sensor._counts_per_unit) == (None, None)
+    sensor = sensor_from_url("ati-can://can0")
+    assert isinstance(sensor, AtiCanSensor)
+    assert (sensor._bus._bitrate, sensor._base, sensor._slot) == (250_000, 0x20, 0)
     sensor = sensor_from_url("ati-can://can0?units=lbf,N-mm&counts=1000000,2000000")
     assert isinstance(sensor, AtiCanSensor)
     assert (sensor._unit_codes, sensor._counts_per_unit) == ((1, 4), (1_000_000, 2_000_000))
     sensor = sensor_from_url("ati-can:///dev/ttyACM0?interface=slcan")
     assert isinstance(sensor, AtiCanSensor)
     assert sensor.name == "ATI CAN sensor 0x20 on slcan /dev/ttyACM0"
+
+
+@pytest.mark.parametrize(
+    ("scheme", "setting"),
+    [
+        ("ati-serial", (1_250_000, True)),
+        ("robotous-serial", (115_200, False)),
+        ("robotiq-ft300", (19_200, False)),
+        ("bota", (460_800, False)),
+    ],
+)
+def test_a_serial_sensor_has_the_bit_rate_and_parity_of_its_manual(scheme: str, setting: tuple[int, bool]) -> None:
+    port = vars(sensor_from_url(f"{scheme}:///dev/ttyUSB0"))["_port"]
+    assert (port._baud, port._even_parity) == setting
 
 
 def test_ethernet_addresses() -> None:

@@ -1,12 +1,19 @@
 """A recorded wire that is played in memory: what is sent when, which requests may be left out, and what diverges."""
 
 import math
-from dataclasses import dataclass, field
+import os
+import sys
+import threading
+import time
+from dataclasses import dataclass, field, replace
 
 import pytest
+import serial
 
 from ftdrivers.transcript.player import Player, _Terminal
 from ftdrivers.transcript.recorder import Passage, Transcript
+from ftdrivers.wires.parity import ask_for_marks
+from ftdrivers.wires.serial_port import SerialPort
 from tests.fake_clock import FakeClock
 
 OPENED_NS = 7_000_000_000
@@ -125,6 +132,65 @@ def test_what_comes_unasked_keeps_its_times_and_waits_while_the_driver_is_full()
     assert wire.player._play() == math.inf
 
 
+def test_a_driver_is_answered_on_a_pseudo_terminal_until_it_closes_it() -> None:
+    player = Player(recorded((0.0, True, b"ab"), (0.0, False, b"1"), (0.0, True, b"cd"), (0.01, False, b"2")))
+    with player as path:
+        thread = player._thread
+        assert thread is not None
+        with serial.Serial(path, timeout=5.0) as port:
+            port.write(b"a")
+            port.write(b"b")
+            assert port.read(1) == b"1"
+            port.write(b"cd")
+            assert port.read(1) == b"2"
+        thread.join(5.0)
+        assert not thread.is_alive()
+
+
+def read_through(player: Player, request: bytes, size: int) -> tuple[bytes, list[int]]:
+    with player as path:
+        port = SerialPort("sensor", path, 1_250_000, even_parity=True)
+        port.open()
+        try:
+            port.write(request)
+            data, damaged, deadline = b"", list[int](), time.monotonic() + 5
+            while len(data) < size:
+                assert time.monotonic() < deadline
+                more, places = port.read_marked(size - len(data))
+                damaged += [len(data) + place for place in places]
+                data += more
+        finally:
+            port.close()
+    return data, damaged
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
+@pytest.mark.parametrize(
+    ("parity_marks", "read", "damaged"), [(True, b"ab\xffc", [1]), (False, b"a\xff\x00b\xff\xffc", [])]
+)
+def test_recorded_marks_are_played_as_marks(parity_marks: bool, read: bytes, damaged: list[int]) -> None:
+    marked = recorded((0.00, True, b"?"), (0.01, False, b"a\xff\x00b\xff\xffc"))
+    player = Player(replace(marked, parity_marks=parity_marks))
+    assert read_through(player, b"?", len(read)) == (read, damaged)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
+def test_marks_are_not_played_before_the_driver_is_ready_for_them() -> None:
+    marked = recorded((0.00, True, b"?"), (0.01, False, b"\xff\x00b"))
+    player = Player(replace(marked, passages=marked.passages[1:], parity_marks=True))
+    with player as path, serial.Serial(path, timeout=0.1) as port:
+        assert port.read(1) == b""  # it has not asked for marks
+        ask_for_marks(port)
+        assert port.read(3) == b"\xff\x00b"
+
+
+def test_a_player_that_is_never_opened_ends() -> None:
+    before = threading.active_count()
+    with Player(DIALOGUE):
+        pass
+    assert threading.active_count() == before
+
+
 def test_how_much_is_left() -> None:
     wire = Played(DIALOGUE)
     assert wire.player.left_s == pytest.approx(0.31)
@@ -135,6 +201,32 @@ def test_how_much_is_left() -> None:
     wire.ask(b"cd")
     wire.answers(0.1)
     assert wire.player.left_s == 0
+
+
+def test_frames_are_played_by_an_adapter() -> None:
+    frames = recorded((0.0, True, b"t2050\r"), (0.0, False, b"t20520102\r"))
+    with Player(replace(frames, frames=True)) as path, serial.Serial(path, timeout=5.0) as port:
+        port.write(b"C\rS5\rO\rt2050\r")
+        assert port.read(10) == b"t20520102\r"
+
+
+def test_what_the_driver_does_not_accept_yet_is_sent_later_and_in_order() -> None:
+    terminal, data = _Terminal(recorded()), bytes(range(256)) * 1000
+    driver = os.open(terminal.open(), os.O_RDWR | os.O_NOCTTY)
+    try:
+        terminal.send(data)
+        assert terminal.is_full
+        read = os.read(driver, 100)
+        terminal.send(b"end")
+        while terminal.is_full:
+            read += os.read(driver, 65536)
+            terminal.send(b"")
+        while not read.endswith(b"end"):
+            read += os.read(driver, 65536)
+        assert read == data + b"end"
+    finally:
+        os.close(driver)
+        terminal.close()
 
 
 def test_commands_to_an_adapter_are_left_out() -> None:

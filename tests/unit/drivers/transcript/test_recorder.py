@@ -138,7 +138,9 @@ def test_reads_within_two_milliseconds_are_one_line_with_the_time_of_the_first(t
         clock.advance(step_s)
         writer.received(data)
     clock.advance(0.001)
+    assert not writer.has_port
     writer.event("open", port="/dev/ttyX", parity_marks=True)
+    assert writer.has_port
     writer.sent(b"\x10")
     writer.end(error=None, **END)
     made = Transcript.load(tmp_path / "a.jsonl")
@@ -149,7 +151,6 @@ def test_reads_within_two_milliseconds_are_one_line_with_the_time_of_the_first(t
     ]
     assert (made.opened_ns - begin_ns, made.parity_marks, made.frames) == (13_100_000, True, False)
     assert made.end["samples"] == END["samples"]
-    assert writer.has_port
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import fields
 from itertools import pairwise
 from math import inf, nan, radians
@@ -83,6 +84,12 @@ def test_absurd_speeds_and_accelerations_are_refused(speed: float, arm: UrArm, c
     with pytest.raises(ValueError, match="acceleration_rad_s2"):
         arm.move_to(q, timeout_s=5, guard=no_guard, acceleration_rad_s2=speed)
     assert "move" not in controller.did
+
+
+@pytest.mark.parametrize(("stop_deg_s2", "is_allowed"), [(59.5, False), (60, True), (300, True), (300.5, False)])
+def test_a_stop_has_a_usual_deceleration(stop_deg_s2: float, is_allowed: bool) -> None:
+    with nullcontext() if is_allowed else pytest.raises(ValueError, match=r"choose 1\.05 to 5\.23"):
+        UrArm(HOST, stop_rad_s2=radians(stop_deg_s2))
 
 
 def test_unknown_models_are_refused_with_the_known_ones() -> None:
