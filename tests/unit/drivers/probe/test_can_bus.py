@@ -124,3 +124,11 @@ def test_five_whole_samples_are_enough(table: Table, whole: int) -> None:
     with table.can(turns, Stream([STREAM] * whole, 0.02, has_end=False)) as wire:
         answers = probe_can("can0", interface="socketcan", bitrate=1_000_000, clock=wire.clock)
     assert [answer.url for answer in answers] == (["robotous-can://can0"] if whole == 5 else [None])
+
+
+@pytest.mark.parametrize("whole", [4, 5])
+def test_half_a_sample_of_an_ati_sensor_does_not_count(table: Table, whole: int) -> None:
+    sample = ["200 00000064012C01F4", "201 FF38FE70FDA8"]
+    with table.can([], Stream([*[sample] * whole, sample[:1]], 0.02, has_end=False)) as wire:
+        (answer,) = probe_can("can0", interface="socketcan", bitrate=250_000, clock=wire.clock)
+    assert bool(answer.url) == (whole == 5)

@@ -94,7 +94,10 @@ WRONG_ENDS: tuple[dict[str, Any], ...] = (
         ("", "empty"),
         ('{"format": "ftdrive.transcript/2"}', "first line"),
         ("[]", "first line"),
-        ('{"format": "ftdrive.transcript/1"}', "url"),
+        ('{"format": "ftdrive.transcript/1"}', "url or duration_s is missing"),
+        ('{"format": "ftdrive.transcript/1", "url": "x"}', "url or duration_s is missing"),
+        ('{"format": "ftdrive.transcript/1", "duration_s": 1}', "url or duration_s is missing"),
+        (OPENED.replace('"event": "open"', '"event": "note"'), "the driver opened no port"),
         ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}', "no port"),
         (
             '{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns": 1, "dir": "rx", "hex": "0"}',
@@ -142,6 +145,7 @@ def test_reads_within_two_milliseconds_are_one_line_with_the_time_of_the_first(t
     writer.event("open", port="/dev/ttyX", parity_marks=True)
     assert writer.has_port
     writer.sent(b"\x10")
+    writer.event("open", port="/dev/ttyX", parity_marks=False)  # opened again
     writer.end(error=None, **END)
     made = Transcript.load(tmp_path / "a.jsonl")
     assert [(one.t_ns - begin_ns, one.sent, one.data) for one in made.passages] == [

@@ -115,6 +115,12 @@ def test_the_control_path_is_a_fact(arm: UrArm, setting: ControlSetting, source:
     assert arm.identify().facts["control"].source == source
 
 
+def test_a_whole_turn_is_within_the_range_of_a_joint(arm: UrArm) -> None:
+    arm.within_safety_limits([0, -1.5, 1.5, 0, 0, radians(360)])
+    with pytest.raises(ValueError, match="every joint ends at 360 degrees"):
+        arm.within_safety_limits([0, -1.5, 1.5, 0, 0, -radians(360.001)])
+
+
 def test_a_new_arm_opens_no_connection_and_closes() -> None:
     arm = UrArm(HOST, model="ur5e", speed_rad_s=radians(60))
     arm.stop()
