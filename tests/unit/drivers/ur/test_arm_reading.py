@@ -455,3 +455,32 @@ def test_normal_and_reduced_mode_are_no_fault(reader: Reader, bits: int) -> None
     fault = replace(sample, program_state=4).program_fault()
     assert fault is not None
     assert "paused" in fault.found
+
+
+ROBOT_MODES = """
+-1 no controller, 0 disconnected, 1 safety not confirmed, 2 booting, 3 power off, 4 power on, 5 idle, 6 backdrive,
+7 running, 8 updating firmware, 9 unknown"""
+SAFETY_MODES = """
+1 normal, 2 reduced, 3 protective stop, 4 recovery, 5 safeguard stop, 6 system emergency stop, 7 robot emergency stop,
+8 violation, 9 fault, 10 joint identification, 11 undefined, 12 unknown"""
+PROGRAM_STATES = "0 stopping, 1 stopped, 2 playing, 3 pausing, 4 paused, 5 resuming, 6 unknown"
+SAFETY_BITS = """
+2 protective stop, 3 recovery mode, 4 safeguard stop, 5 emergency stop, 6 emergency stop, 7 emergency stop,
+8 safety violation or fault, 9 safety violation or fault, 10 stop for a safety reason"""
+
+
+def rows(table: str) -> list[tuple[int, str]]:
+    return [(int(number), words) for number, words in (one.split(maxsplit=1) for one in table.split(","))]
+
+
+def test_numbers_have_the_names_of_the_rtde_guide(reader: Reader) -> None:
+    sample = reader.look()
+    for number, words in rows(ROBOT_MODES):
+        assert replace(sample, robot_mode=number).status().robot_mode.startswith(words)
+        assert replace(sample, robot_mode=number).measures == (words in {"idle", "backdrive", "running"})
+    for number, words in rows(SAFETY_MODES):
+        assert replace(sample, safety_mode=number).status().safety_mode.startswith(words)
+    for number, words in rows(PROGRAM_STATES):
+        assert replace(sample, program_state=number).status().program.startswith(words)
+    for number, words in rows(SAFETY_BITS):
+        assert str(replace(sample, safety_bits=1 | 1 << number).safety_fault()).startswith(f"{words} (safety status")
