@@ -19,7 +19,15 @@ from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import Control, ControlSetting
 from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
-from tests.unit.drivers.ur.controller_in_memory import HOST, ControlInMemory, Controller, MakeArm, away, no_guard
+from tests.unit.drivers.ur.controller_in_memory import (
+    HOST,
+    ControlInMemory,
+    Controller,
+    MakeArm,
+    ServicesInMemory,
+    away,
+    no_guard,
+)
 
 on_ur_rtde = pytest.mark.parametrize("path", ["ur-rtde"], indirect=True)
 
@@ -113,6 +121,29 @@ def test_bad_targets_never_leave_the_house(arm: UrArm, controller: Controller, q
 def test_the_control_path_is_a_fact(arm: UrArm, setting: ControlSetting, source: str) -> None:
     arm._setting = setting
     assert arm.identify().facts["control"].source == source
+
+
+@pytest.mark.parametrize(
+    ("version", "simulated", "asks"),
+    [((5, 6, 0, 1), False, True), ((5, 5, 9, 9), False, False), ((5, 15, 0, 1), True, False)],
+)
+def test_an_arm_that_is_not_in_remote_control_is_not_moved(
+    make_arm: MakeArm,
+    controller: Controller,
+    monkeypatch: pytest.MonkeyPatch,
+    version: tuple[int, ...],
+    simulated: bool,
+    asks: bool,
+) -> None:
+    controller.version = version
+    monkeypatch.setattr(ServicesInMemory, "in_remote_control", lambda _: False)
+    for module in (opening, arm_module):
+        monkeypatch.setattr(module, "SIMULATORS", (HOST,) if simulated else ())
+    arm = make_arm()
+    with pytest.raises(ConnectError, match="is not in remote control") if asks else nullcontext():
+        arm.open(control=True)
+    arm.open()
+    assert arm.in_remote_control() is (False if asks else None)
 
 
 def test_a_whole_turn_is_within_the_range_of_a_joint(arm: UrArm) -> None:
