@@ -145,6 +145,7 @@ def test_a_driver_is_answered_on_a_pseudo_terminal_until_it_closes_it() -> None:
             assert port.read(1) == b"2"
         thread.join(5.0)
         assert not thread.is_alive()
+    assert player._thread is None
 
 
 def read_through(player: Player, request: bytes, size: int) -> tuple[bytes, list[int]]:

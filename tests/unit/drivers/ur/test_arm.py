@@ -131,7 +131,7 @@ def test_an_arm_that_is_not_in_remote_control_is_not_moved(
     make_arm: MakeArm,
     controller: Controller,
     monkeypatch: pytest.MonkeyPatch,
-    version: tuple[int, ...],
+    version: tuple[int, int, int, int],
     simulated: bool,
     asks: bool,
 ) -> None:
