@@ -101,6 +101,12 @@ def test_a_request_may_be_left_out_with_its_answer() -> None:
     assert wire.player.divergence is None
 
 
+def test_a_request_without_an_answer_may_be_left_out() -> None:
+    wire = Played(recorded((0.0, True, b"ab"), (0.0, True, b"cd"), (0.01, False, b"3"), (0.02, True, b"ef")))
+    wire.ask(b"cd")
+    assert wire.answers(0.02) == b"3"
+
+
 def test_two_requests_may_arrive_at_once() -> None:
     wire = Played(recorded((0.0, True, b"ab"), (0.0, True, b"cd"), (0.01, False, b"3")))
     wire.ask(b"abcd")
