@@ -384,7 +384,9 @@ def test_poses_without_power_over_the_joints_are_not_read(
     controller: Controller, full_rate: Reader, clock: FakeClock
 ) -> None:
     with full_rate.follow() as follow:
-        clock.advance(0.01)
+        clock.advance(0.004)
+        controller.robot_mode = 5  # idle: powered, brakes closed
+        clock.advance(0.006)
         controller.robot_mode = 3
         clock.advance(0.01)
         assert len(follow.read(0.0)) == 5
