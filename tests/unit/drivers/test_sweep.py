@@ -50,6 +50,8 @@ def test_nothing_exceeds_the_largest_value(sweep: Sweep, order: int) -> None:
 
 def test_a_slower_sweep_has_the_same_path() -> None:
     sweep = Sweep(CENTRE, [[0.5, 0.1]] * 3, [[0.6, 3.0]] * 3, [[0.0, 1.0]] * 3, 10.0, 2.0)
+    wrist = np.add(CENTRE[3:], 0.5 * np.sin(0.6 * 5) + 0.1 * np.sin(3.0 * 5 + 1.0))  # between the ramps
+    assert np.allclose(sweep.at(5.0), [[*CENTRE[:3], *wrist]])
     t = np.linspace(0, 10, 101)
     assert np.allclose(sweep.slower(0.5).at(2 * t), sweep.at(t))
     assert np.allclose(sweep.slower(0.5).largest(1), sweep.largest(1) / 2, rtol=0.05)
