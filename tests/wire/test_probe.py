@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from ftdrivers.errors import ConnectError
-from ftdrivers.probe import serial_line as module
 from ftdrivers.probe.serial_line import probe
 from ftdrivers.registry import sensor_from_url
 from ftmocks.sensors.ati_can import AtiCanNode
@@ -66,28 +65,6 @@ def test_the_address_of_a_port_with_a_strange_name_works(tmp_path: Path, cell_ti
             assert len(sensor.collect(0.2).seq)
     finally:
         box.stop()
-
-
-def test_a_silent_port_is_asked_by_readings_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    heard: list[bytes | None] = []
-
-    def hear(_port: str, _known: Any, request: bytes | None, _duration_s: float, _clock: Any) -> bytes:
-        heard.append(request)
-        return b""
-
-    monkeypatch.setattr(module, "_hear", hear)
-    assert probe("/dev/ttyX") is None
-    first_question = next(i for i, request in enumerate(heard) if request)
-    assert all(request is None for request in heard[:first_question])
-    assert first_question >= 4  # it has listened at every speed before
-    modbus_reads, robotous_model = bytes([3]), bytes.fromhex("5501")
-    for request in filter(None, heard):
-        assert request[1:2] == modbus_reads or request.startswith(robotous_model)
-
-
-def test_bytes_of_something_else_are_no_sensor() -> None:
-    for noise in (bytes(20_000), np.random.default_rng(0).bytes(20_000), b"hello\r\n" * 1000):
-        assert not any(known.streams(noise) for known in module._KNOWN)
 
 
 def test_a_port_that_is_not_there() -> None:

@@ -1,16 +1,12 @@
 """What a sensor and its driver say to each other, recorded, and played to the driver again."""
 
-import itertools
 import json
-import math
 import os
-import sys
 import threading
 import time
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,14 +17,12 @@ import pytest
 import serial
 
 from ftdrivers.clock import Clock, Follower
-from ftdrivers.errors import BadTranscript, ConnectError
+from ftdrivers.errors import ConnectError
 from ftdrivers.interfaces import DeviceInfo, ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript.player import Player
 from ftdrivers.transcript.recorder import Passage, Transcript, Writer
 from ftdrivers.transcript.taps import recording
-from ftdrivers.wires.parity import ask_for_marks
-from ftdrivers.wires.serial_port import SerialPort
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.ati_serial import AtiSerialBox
 from ftmocks.sensors.bota import BotaBox
@@ -200,43 +194,6 @@ def ati(cell_time: Any) -> Iterator[str]:
     device.stop()
 
 
-def read_through(player: Player, request: bytes, size: int) -> tuple[bytes, list[int]]:
-    with player as path:
-        port = SerialPort("sensor", path, 1_250_000, even_parity=True)
-        port.open()
-        try:
-            port.write(request)
-            data, damaged, deadline = b"", list[int](), time.monotonic() + 5
-            while len(data) < size:
-                assert time.monotonic() < deadline
-                more, places = port.read_marked(size - len(data))
-                damaged += [len(data) + place for place in places]
-                data += more
-        finally:
-            port.close()
-    return data, damaged
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
-@pytest.mark.parametrize(
-    ("parity_marks", "read", "damaged"), [(True, b"ab\xffc", [1]), (False, b"a\xff\x00b\xff\xffc", [])]
-)
-def test_recorded_marks_are_played_as_marks(parity_marks: bool, read: bytes, damaged: list[int]) -> None:
-    recorded = made_up((0.00, True, b"?"), (0.01, False, b"a\xff\x00b\xff\xffc"))
-    player = Player(replace(recorded, parity_marks=parity_marks))
-    assert read_through(player, b"?", len(read)) == (read, damaged)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
-def test_marks_are_not_played_before_the_driver_is_ready_for_them() -> None:
-    recorded = made_up((0.00, True, b"?"), (0.01, False, b"\xff\x00b"))
-    player = Player(replace(recorded, passages=recorded.passages[1:], parity_marks=True))
-    with player as path, serial.Serial(path, timeout=0.1) as port:
-        assert port.read(1) == b""  # it has not asked for marks
-        ask_for_marks(port)
-        assert port.read(3) == b"\xff\x00b"
-
-
 def test_ports_without_parity_have_no_marks(tmp_path: Path, ati: str) -> None:
     path = tmp_path / "plain.jsonl"
     writer = Writer(path, {"url": "x", "duration_s": 1})
@@ -264,62 +221,6 @@ def test_a_sensor_that_fails_leaves_a_transcript_that_fails_alike(tmp_path: Path
     assert not any(not passage.sent for passage in transcript.passages)
     with Player(transcript, clock) as port, pytest.raises(ConnectError):
         look(sensor_from_url(transcript.url_at(port), clock=clock), 1.0)
-
-
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    header = {"url": "x", "duration_s": 1}
-    (tmp_path / "a.jsonl").write_text("mine")
-    with pytest.raises(FileExistsError, match=r"a\.jsonl"):
-        Writer(tmp_path / "a.jsonl", header)
-    first = Writer(tmp_path / "b.jsonl", header)
-    with pytest.raises(FileExistsError, match="partial"):
-        Writer(tmp_path / "b.jsonl", header)
-    (tmp_path / "b.jsonl").write_text("mine")
-    with pytest.raises(FileExistsError, match="partial"):
-        first.end()
-    assert (tmp_path / "b.jsonl").read_text() == "mine"
-    assert (tmp_path / "a.jsonl").read_text() == "mine"
-
-
-def test_a_folder_that_is_not_there_is_said_to_be_the_fault(tmp_path: Path) -> None:
-    path = tmp_path / "nope" / "a.jsonl"
-    with pytest.raises(OSError, match=f"^{path} cannot be written .No such file"):
-        Writer(path, {"url": "x", "duration_s": 1})
-
-
-def test_a_file_without_a_name_is_said_to_be_the_fault() -> None:
-    with pytest.raises(FileExistsError, match="give another name"):
-        Writer(Path(), {"url": "x", "duration_s": 1})
-
-
-def test_a_transcript_of_nothing_can_be_thrown_away(tmp_path: Path) -> None:
-    writer = Writer(tmp_path / "a.jsonl", {"url": "x", "duration_s": 1})
-    assert not writer.has_port
-    writer.discard()
-    writer.discard()
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_bytes_of_both_directions_keep_their_order(tmp_path: Path) -> None:
-    writer = Writer(tmp_path / "a.jsonl", {"url": "x", "duration_s": 1})
-    for data in (b"\x01", b"\x02"):
-        writer.received(data)  # within 2 ms, hence one line
-    writer.sent(b"\x10")
-    writer.sent(b"\x11")
-    writer.received(b"\x03")
-    writer.end(error=None)
-    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
-    assert lines[0]["format"] == "ftdrive.transcript/1"
-    merged = [(kind, "".join(line["hex"] for line in group)) for kind, group in by_direction(lines)]
-    assert merged == [("rx", "0102"), ("tx", "1011"), ("rx", "03")]
-    assert [line["hex"] for line in lines if line.get("dir") == "tx"] == ["10", "11"]  # one line a write
-    assert [line["t_ns"] for line in lines[1:]] == sorted(line["t_ns"] for line in lines[1:])
-    assert lines[-1]["event"] == "end"
-
-
-def by_direction(lines: list[dict[str, Any]]) -> Iterator[tuple[str, list[dict[str, Any]]]]:
-    passages = (line for line in lines if "dir" in line)
-    return ((kind, list(group)) for kind, group in itertools.groupby(passages, key=lambda line: str(line["dir"])))
 
 
 def made_up(*passages: tuple[float, bool, bytes]) -> Transcript:
@@ -392,70 +293,3 @@ def test_a_request_that_was_not_recorded_ends_in_silence_with_a_reason(dialogue:
     assert "63 64" in player.divergence
     port.write(b"cd")
     assert is_silent(port)
-
-
-def test_a_player_that_is_never_opened_ends() -> None:
-    before = threading.active_count()
-    with Player(DIALOGUE):
-        pass
-    assert threading.active_count() == before
-
-
-OPENED = '{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns": 1, "event": "open"}\n'
-END = {
-    "identity": {"model": "A", "serial": "1"},
-    "samples": 5,
-    "mean_force_N": [1, 2, 3],
-    "mean_torque_Nm": [0.1, 0.2, 0.3],
-}
-
-WRONG_ENDS: tuple[dict[str, Any], ...] = (
-    {"identity": {}},
-    {"identity": "bota"},
-    {"mean_force_N": [1, 2]},
-    {"mean_force_N": ["1", "2", "3"]},
-    {"mean_torque_Nm": None},
-    {"mean_torque_Nm": [1, 2, math.nan]},
-)
-
-
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("", "empty"),
-        ('{"format": "ftdrive.transcript/2"}', "first line"),
-        ("[]", "first line"),
-        ('{"format": "ftdrive.transcript/1"}', "url"),
-        ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}', "no port"),
-        (
-            '{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns": 1, "dir": "rx", "hex": "0"}',
-            "line 2",
-        ),
-        ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns"', "line 2"),
-        ("\x00\x01", "line 1"),
-        ('{"format": "ftdrive.transcript/1", "url": "x", "duration_s": 1}\n{"t_ns": 1e999, "event": "open"}', "line 2"),
-        ("[" * 100_000, "line 1|line 0"),
-        *(
-            (OPENED.replace('"duration_s": 1', f'"duration_s": {duration_s}'), "line 1")
-            for duration_s in ("0", "-1", "NaN", "Infinity", "1" + "0" * 400)
-        ),
-        ('{"format": "ftdrive.transcript/1", "url": "bota://[x", "duration_s": 1}', r"line 1: .*bota://\[x: Invalid"),
-        (OPENED + f'{{"t_ns": 1{"0" * 400}, "dir": "rx", "hex": "00"}}', "line 3"),
-        *(
-            (OPENED + json.dumps({"t_ns": 9, "event": "end", "error": None} | END | wrong), "line 3")
-            for wrong in WRONG_ENDS
-        ),
-    ],
-)
-def test_what_is_no_transcript_is_refused(tmp_path: Path, text: str, says: str) -> None:
-    (tmp_path / "bad.jsonl").write_text(text)
-    with pytest.raises(BadTranscript, match=says):
-        Transcript.load(tmp_path / "bad.jsonl")
-
-
-@pytest.mark.parametrize(
-    ("end", "is_broken_off"),
-    [({}, True), ({"error": "interrupted"}, True), ({"error": None}, False), ({"error": "x"}, False)],
-)
-def test_a_recording_without_its_end_is_broken_off(end: dict[str, Any], is_broken_off: bool) -> None:
-    assert replace(DIALOGUE, end=end).is_broken_off == is_broken_off

@@ -72,7 +72,6 @@ class Ros2Arm(ReadOnlyArm):
         self._recent: deque[StampedPose] = deque()
         self._newest: ArmState | None = None
         self._failure: ProtocolError | None = None
-        self._dropped = 0
 
     def open(self, *, control: bool = False) -> None:
         """Subscribe and wait for the first pose. Raises `ConnectError`; always if control is requested."""
@@ -81,7 +80,7 @@ class Ros2Arm(ReadOnlyArm):
             if self._failure is None and self._age_s() < _STALE_S:
                 return
             self.close()
-        self._reader, self._failure, self._newest, self._dropped = pose_reader_of(self._host), None, None, 0
+        self._reader, self._failure, self._newest = pose_reader_of(self._host), None, None
         self._recent.clear()
         self._ros = Node("ftdrive_arm")
         self._ros.spin()
@@ -144,7 +143,6 @@ class Ros2Arm(ReadOnlyArm):
                 newest = self._newest
                 t_s = 1e-9 * pose.t_ns
                 if newest is not None and t_s <= newest.t_device_s:
-                    self._dropped += 1
                     if t_s < newest.t_device_s - _BACK_S:
                         self._failure = ProtocolError(
                             f"the stamps of {topic} went back by {newest.t_device_s - t_s:.1f} s",

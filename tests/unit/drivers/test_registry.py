@@ -47,12 +47,41 @@ def test_can_addresses() -> None:
     assert sensor.name == "ATI CAN sensor 0x7F on socketcan can0"
     assert (sensor._bus._bitrate, sensor._slot, sensor._sign) == (500_000, 3, -1)
     assert (sensor._unit_codes, sensor._counts_per_unit) == (None, None)
+    sensor = sensor_from_url("ati-can://can0")
+    assert isinstance(sensor, AtiCanSensor)
+    assert (sensor._bus._bitrate, sensor._base, sensor._slot) == (250_000, 0x20, 0)
     sensor = sensor_from_url("ati-can://can0?units=lbf,N-mm&counts=1000000,2000000")
     assert isinstance(sensor, AtiCanSensor)
     assert (sensor._unit_codes, sensor._counts_per_unit) == ((1, 4), (1_000_000, 2_000_000))
     sensor = sensor_from_url("ati-can:///dev/ttyACM0?interface=slcan")
     assert isinstance(sensor, AtiCanSensor)
     assert sensor.name == "ATI CAN sensor 0x20 on slcan /dev/ttyACM0"
+
+
+@pytest.mark.parametrize(
+    ("scheme", "setting"),
+    [
+        ("ati-serial", (1_250_000, True)),
+        ("robotous-serial", (115_200, False)),
+        ("robotiq-ft300", (19_200, False)),
+        ("bota", (460_800, False)),
+    ],
+)
+def test_a_serial_sensor_has_the_bit_rate_and_parity_of_its_manual(scheme: str, setting: tuple[int, bool]) -> None:
+    port = vars(sensor_from_url(f"{scheme}:///dev/ttyUSB0"))["_port"]
+    assert (port._baud, port._even_parity) == setting
+
+
+def test_ethernet_addresses() -> None:
+    sensor = sensor_from_url("ati-netft://192.168.1.1")
+    assert isinstance(sensor, NetFtSensor)
+    assert (sensor._rdt_port, sensor._http_port) == (49152, 80)
+    sensor = sensor_from_url("ati-netft://192.168.1.1?rdt_port=65535&http_port=1")
+    assert isinstance(sensor, NetFtSensor)
+    assert (sensor._rdt_port, sensor._http_port) == (65535, 1)
+    for query in ("rdt_port=65536", "http_port=65536", "rdt_port=0", "http_port=0"):
+        with pytest.raises(BadUrl, match="allowed are 1 to 65535"):
+            sensor_from_url(f"ati-netft://192.168.1.1?{query}")
 
 
 def test_serial_addresses() -> None:

@@ -26,6 +26,9 @@ def test_it_begins_and_ends_at_rest(sweep: Sweep) -> None:
         assert np.allclose(sweep.at(t), CENTRE)
         assert np.allclose(sweep.at(t, 1), 0)
         assert np.allclose(sweep.at(t, 2), 0, atol=1e-9)
+    outside = -0.1, sweep.duration_s + 0.1
+    assert np.array_equal(sweep.at(outside), [CENTRE, CENTRE])
+    assert not any(sweep.at(outside, order).any() for order in (1, 2, 3))
     assert not np.ptp(sweep.at(np.linspace(0, 10, 50)), axis=0)[:3].any()
 
 
@@ -47,6 +50,8 @@ def test_nothing_exceeds_the_largest_value(sweep: Sweep, order: int) -> None:
 
 def test_a_slower_sweep_has_the_same_path() -> None:
     sweep = Sweep(CENTRE, [[0.5, 0.1]] * 3, [[0.6, 3.0]] * 3, [[0.0, 1.0]] * 3, 10.0, 2.0)
+    wrist = np.add(CENTRE[3:], 0.5 * np.sin(0.6 * 5) + 0.1 * np.sin(3.0 * 5 + 1.0))  # between the ramps
+    assert np.allclose(sweep.at(5.0), [[*CENTRE[:3], *wrist]])
     t = np.linspace(0, 10, 101)
     assert np.allclose(sweep.slower(0.5).at(2 * t), sweep.at(t))
     assert np.allclose(sweep.slower(0.5).largest(1), sweep.largest(1) / 2, rtol=0.05)
@@ -56,5 +61,6 @@ def test_a_slower_sweep_has_the_same_path() -> None:
 @pytest.mark.parametrize("wrong", [{"duration_s": 3.0}, {"centre_rad": CENTRE[:5]}, {"ramp_s": float("nan")}])
 def test_an_impossible_sweep_is_refused(wrong: dict[str, object]) -> None:
     good = Sweep(CENTRE, [[0.5, 0.1]] * 3, [[0.6, 3.0]] * 3, [[0.0, 1.0]] * 3, 10.0, 2.0).to_dict()
+    assert Sweep.from_dict({**good, "duration_s": 4.0}).ramp_s == 2.0  # up and down at once
     with pytest.raises(ValueError, match=r"sweep|ramps"):
         Sweep.from_dict({**good, **wrong})

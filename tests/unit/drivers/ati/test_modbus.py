@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from ftdrivers.ati import modbus
 from ftdrivers.errors import ProtocolError
+from ftdrivers.wires.modbus import Refused
 from ftdrivers.wires.status_word import describe_status
 
 V1 = bytes.fromhex("00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50")
@@ -32,6 +33,15 @@ i16 = st.integers(-32768, 32767)
 def test_wrong_replies_are_refused(request_: bytes, reply: str, message: str) -> None:
     with pytest.raises(ProtocolError, match=message):
         modbus.check_reply(request_, bytes.fromhex(reply))
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [(1, "illegal function"), (2, "illegal register"), (3, "illegal value"), (4, "device failure or locked")],
+)
+def test_a_refusal_has_the_words_of_the_protocol(code: int, words: str) -> None:
+    with pytest.raises(Refused, match=words):
+        modbus.check_reply(modbus.read_registers(modbus.STATUS, 1), modbus.frame(0x83, bytes([code])))
 
 
 def block(**change: bytes) -> bytes:

@@ -181,7 +181,7 @@ def test_silence_ends_the_stream() -> None:
     with Box() as box, box.sensor() as sensor:
         box.mute = True
         heard_s = sensor.latest(timeout_s=0.5).t_host_ns[0] / 1e9
-        with pytest.raises(StreamBroken, match="ended"):
+        with pytest.raises(StreamBroken, match=r"ended \(nothing arrived for 0\.3"):
             sensor.collect(60.0)
         # 0.3 s, a read in between, and what was on its way
         assert box.time.of_drivers.now_s() - heard_s == pytest.approx(0.36, abs=0.06)
@@ -269,7 +269,11 @@ def test_rate_and_range_are_the_devices() -> None:
         assert rating.value == pytest.approx((25, 25, 50, 0.25, 0.25, 0.25))
         assert sensor.health().nominal_rate_Hz == 500
         assert "/netftcalapi.xml?index=3" in box.asked
-    with Box() as box, box.sensor() as sensor:  # a page without either
+    other_units = PAGE.replace(b">N<", b">lbf<").replace(b">Nm<", b">lbf-in<")
+    with Box(pages=(other_units, b"")) as box, box.sensor() as sensor:  # a page without either
+        facts = sensor.identify().facts
+        assert facts["counts_per_N"].value == pytest.approx(1e6 / 4.4482216152605)
+        assert facts["counts_per_Nm"].value == pytest.approx(1e6 / 0.1129848290276167)
         assert "range" not in sensor.identify().facts
         assert math.isnan(sensor.health().nominal_rate_Hz)
         assert set(box.asked) == {"/netftapi2.xml"}

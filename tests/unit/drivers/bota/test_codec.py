@@ -28,6 +28,12 @@ def test_frame() -> None:
     assert sample.temperature_C == 25.5
 
 
+def test_bits_of_the_status() -> None:
+    names = [codec.STATUS_BITS[bit.bit_length() - 1] for bit in (1, codec.OVERRANGE, codec.INVALID, codec.RAW)]
+    assert names == ["application too slow", "overrange", "invalid measurement", "raw measurement"]
+    assert sorted(codec.STATUS_BITS) == [0, 1, 2, 3]
+
+
 @pytest.mark.parametrize("at", range(37))
 def test_a_changed_byte_is_noticed(at: int) -> None:
     damaged = bytearray(FRAME)

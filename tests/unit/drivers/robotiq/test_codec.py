@@ -57,3 +57,9 @@ def test_identity() -> None:
     assert codec.decode_serial([0, 0, 0, 0]) == "not reported"
     assert codec.decode_firmware([0x4654, 0x5302, 0x0001]) == "FTS-2.0.1"
     assert codec.decode_firmware([0, 2, 0x0001]) == "2.0.1"
+    for letters in ([0x4620, 0x5300], [0x467F, 0x5300], [0x4654, 0x8000]):  # a space, DEL, none of ASCII
+        assert codec.decode_serial([*letters, 1234, 0]) == "1234"
+    assert codec.decode_serial([0x217E, 0x4100, 12, 0]) == "!~A-0012"
+    for words in ([*letters, 1], [*letters, -1, 0], [*letters, 0x10000, 0]):
+        with pytest.raises(ProtocolError, match="expected 4 registers"):
+            codec.decode_serial(words)

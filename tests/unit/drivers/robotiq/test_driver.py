@@ -1,13 +1,15 @@
 """The Robotiq driver as a table of bytes: golden start-up and goodbye, and awkward answers."""
 
+import struct
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError
+from ftdrivers.errors import ConnectError, DeviceFault
 from ftdrivers.interfaces import Fact
 from ftdrivers.robotiq.sensor import RobotiqFt300
 from ftdrivers.wires.crc import crc16_modbus
@@ -89,6 +91,17 @@ def test_a_device_that_does_not_answer(table: Table) -> None:
     with wire, pytest.raises(ConnectError, match="no reply"):
         Sensor(wire.clock).open()
     assert wire.clock.now_s() - start_s == pytest.approx(3 * (0.05 + 0.2), abs=0.2)
+
+
+@pytest.mark.parametrize(("count", "is_end"), [(32767, True), (-32768, True), (32766, False), (-32767, False)])
+def test_a_count_at_the_end_of_its_range_is_a_fault(table: Table, count: int, is_end: bool) -> None:
+    body = b"\x20\x4e" + struct.pack("<6h", 0, 0, count, 0, 0, 0)
+    frames = Stream.of(body + crc16_modbus(body).to_bytes(2, "little"), 0.01, STARTED)
+    with table.serial([HALT, SERIAL, FIRMWARE, (START, frames), HALT]) as wire:
+        sensor = Sensor(wire.clock)
+        with pytest.raises(DeviceFault, match="end of its range") if is_end else nullcontext():
+            sensor.open()
+        sensor.close()
 
 
 @pytest.mark.parametrize(("rate_Hz", "hint"), [(62.5, "latency_timer"), (80.0, "lost"), (100.0, "")])

@@ -81,7 +81,8 @@ def test_settings_are_confirmed_or_refused() -> None:
 def test_text() -> None:
     assert codec.decode_text(b"\x01RFT60-HA01\0\0\0\0\0") == "RFT60-HA01"
     assert codec.decode_text(b"\x02A1 " + b" " * 12) == "A1"
-    for bad in (bytes(16), b"\x01\xff" + bytes(14)):
+    assert codec.decode_text(b"\x01RFT 60~".ljust(16, b"\0")) == "RFT 60~"
+    for bad in (bytes(16), b"\x01\xff" + bytes(14), b"\x01A\x7f" + bytes(13), b"\x01A\x1fB" + bytes(12)):
         with pytest.raises(ProtocolError, match="not text"):
             codec.decode_text(bad)
 

@@ -93,6 +93,15 @@ def test_can_carries_the_same_commands(table: Table, rate_Hz: int | None, period
     assert len(samples) == pytest.approx(0.15 / period_s, abs=3)
 
 
+def test_what_was_damaged_before_the_stream_is_not_lost(table: Table) -> None:
+    turns = on_uart(ANSWERS, Stream.of(frame(SAMPLE)))
+    turns[1] = turns[1][0], b"\x55" * 40 + turns[1][1]  # in the first answer
+    turns[3] = turns[3][0], b"\x55" * 40 + turns[3][1]
+    with table.serial(turns) as wire, uart(wire) as sensor:
+        assert sensor._damaged_before > 0
+        assert sensor.health().lost == 0
+
+
 def test_foreign_frames_between_halves_do_not_matter(table: Table) -> None:
     first, second = halves(SAMPLE)
     mixed = Stream.of([first, "003 0011223344556677", second], 0.005)

@@ -15,6 +15,7 @@ from ftcalib import CalibrationDataset, solve
 from ftcalib.errors import AcceptanceError, DataError, FtdriveError
 from ftdrive.checks.devices import check_compensated
 from ftdrivers.errors import BadUrl, DeviceError, ProtocolError
+from ftdrivers.interfaces import FtSamples
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.ros2.arm import Ros2Arm, pose_reader_of
 from ftdrivers.ros2.kinematics import Chain
@@ -22,38 +23,9 @@ from ftdrivers.ros2.poses import Joints, Poses, Transforms
 from ftdrivers.ros2.sensor import Ros2Sensor
 from ftdrivers.ros2.subscription import Received
 from tests.ros2.seven_joints import JOINTS, URDF, flange, posture
+from tests.unit.drivers.ros2.graph_in_memory import joints, pose, tf, wrench
 
 NAN = float("nan")
-
-
-def header(t_s: float, frame: str = "base") -> Any:
-    sec, nanosec = divmod(round(t_s * 1e9), 10**9)
-    return SimpleNamespace(stamp=SimpleNamespace(sec=sec, nanosec=nanosec), frame_id=frame)
-
-
-def vector(*values: float) -> Any:
-    return SimpleNamespace(**dict(zip("xyzw", values, strict=False)))
-
-
-def pose(t_s: float = 5.0, p: Any = (0, 0, 1), q: Any = (0, 0, 0, 1)) -> Any:
-    return SimpleNamespace(header=header(t_s), pose=SimpleNamespace(position=vector(*p), orientation=vector(*q)))
-
-
-def joints(t_s: float, names: list[str], position: Any) -> Any:
-    return SimpleNamespace(header=header(t_s), name=names, position=position)
-
-
-def tf(*parts: tuple[float, str, str], q: Any = (0, 0, 0, 1)) -> Any:
-    moved = SimpleNamespace(translation=vector(0, 0, 1), rotation=vector(*q))
-    made = [
-        SimpleNamespace(header=header(t, parent), child_frame_id=child, transform=moved) for t, parent, child in parts
-    ]
-    return SimpleNamespace(transforms=made)
-
-
-def wrench(t_s: float = 5.0, frame: str = "ft", fx: float = 1.0) -> Any:
-    parts = SimpleNamespace(force=vector(fx, 2, 3), torque=vector(4, 5, 6))
-    return SimpleNamespace(header=header(t_s, frame), wrench=parts)
 
 
 @pytest.fixture
@@ -104,6 +76,21 @@ def test_a_sensor_numbers_and_stamps_its_samples() -> None:
     assert samples.t_device_s == pytest.approx([5.0, 5.002], abs=1e-9)
     assert samples.seq.tolist() == [0, 1]
     assert samples.wrench[0].tolist() == [1, 2, 3, 4, 5, 6]
+
+
+def test_numbers_that_are_missing_are_lost_messages() -> None:
+    sensor = Ros2Sensor("/ft")
+    for number in (3, 4, 8, 9, 12):
+        sensor._queue.put(Received(wrench(5 + 0.01 * number), 7, number))
+    sensor._read_block()
+    assert sensor._lost == 3 + 2
+    sensor._newest = FtSamples.of([7], [12], np.zeros((1, 6)), t_device_s=[5.12])
+    sensor._queue.put(Received(wrench(5.2), 7, 15))
+    sensor._read_block()
+    assert sensor._lost == 5 + 2
+    sensor._queue.put(Received(wrench(5.3), 7, 3))  # another publisher counts from the beginning
+    sensor._read_block()
+    assert sensor._lost == 7
 
 
 def _read_tf(*messages: tuple[str, Any]) -> None:

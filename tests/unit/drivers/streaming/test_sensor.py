@@ -569,6 +569,11 @@ class TestAway:
             sensor.time.advance(0.79)
             assert sensor.health().received == 2
             assert sensor.connects == 1
+            sensor.time.stall(3600.0)
+            sensor.time.advance(0.79)
+            assert sensor.connects == 1
+            sensor.time.advance(0.07)  # 0.5 s, and 0.3 s of silence
+            assert sensor.connects == 2
 
     def test_a_collect_across_a_pause_too_short_to_be_seen_is_an_error(self, sensor: FakeSensor) -> None:
         sensor.stream(1, 0.005)

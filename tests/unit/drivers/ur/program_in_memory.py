@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ftdrivers.errors import StreamBroken
 from ftdrivers.ur import opening, script_control
 from ftdrivers.ur.control import STOP_RAD_S2
-from ftdrivers.ur.control_program import OUTPUTS
+from ftdrivers.ur.control_program import INPUTS, OUTPUTS
 from ftdrivers.ur.primary import Message
 from ftdrivers.ur.script_control import ScriptControl
 from ftdrivers.ur.timing import UrTiming
@@ -149,6 +149,7 @@ class Link:
     def write(self, values: Sequence[float]) -> None:
         if self.closed:
             raise OSError("closed")
+        assert len(values) == len(INPUTS)
         if not self.cut:
             self.registers.inputs = values
 

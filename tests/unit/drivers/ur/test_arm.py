@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import fields
 from itertools import pairwise
 from math import inf, nan, radians
@@ -18,7 +19,15 @@ from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import Control, ControlSetting
 from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
-from tests.unit.drivers.ur.controller_in_memory import HOST, ControlInMemory, Controller, MakeArm, away, no_guard
+from tests.unit.drivers.ur.controller_in_memory import (
+    HOST,
+    ControlInMemory,
+    Controller,
+    MakeArm,
+    ServicesInMemory,
+    away,
+    no_guard,
+)
 
 on_ur_rtde = pytest.mark.parametrize("path", ["ur-rtde"], indirect=True)
 
@@ -85,6 +94,12 @@ def test_absurd_speeds_and_accelerations_are_refused(speed: float, arm: UrArm, c
     assert "move" not in controller.did
 
 
+@pytest.mark.parametrize(("stop_deg_s2", "is_allowed"), [(59.5, False), (60, True), (300, True), (300.5, False)])
+def test_a_stop_has_a_usual_deceleration(stop_deg_s2: float, is_allowed: bool) -> None:
+    with nullcontext() if is_allowed else pytest.raises(ValueError, match=r"choose 1\.05 to 5\.23"):
+        UrArm(HOST, stop_rad_s2=radians(stop_deg_s2))
+
+
 def test_unknown_models_are_refused_with_the_known_ones() -> None:
     with pytest.raises(ValueError, match=r"'kr6' .*UR5e"):
         UrArm(HOST, model="kr6")
@@ -100,6 +115,41 @@ def test_bad_targets_never_leave_the_house(arm: UrArm, controller: Controller, q
     with pytest.raises(ValueError, match=says):
         arm.within_safety_limits(q_rad)
     assert "move" not in controller.did
+
+
+@pytest.mark.parametrize(("setting", "source"), [("auto", "assumed"), ("script", "configured")])
+def test_the_control_path_is_a_fact(arm: UrArm, setting: ControlSetting, source: str) -> None:
+    arm._setting = setting
+    assert arm.identify().facts["control"].source == source
+
+
+@pytest.mark.parametrize(
+    ("version", "simulated", "asks"),
+    [((5, 6, 0, 1), False, True), ((5, 5, 9, 9), False, False), ((5, 15, 0, 1), True, False)],
+)
+def test_an_arm_that_is_not_in_remote_control_is_not_moved(
+    make_arm: MakeArm,
+    controller: Controller,
+    monkeypatch: pytest.MonkeyPatch,
+    version: tuple[int, int, int, int],
+    simulated: bool,
+    asks: bool,
+) -> None:
+    controller.version = version
+    monkeypatch.setattr(ServicesInMemory, "in_remote_control", lambda _: False)
+    for module in (opening, arm_module):
+        monkeypatch.setattr(module, "SIMULATORS", (HOST,) if simulated else ())
+    arm = make_arm()
+    with pytest.raises(ConnectError, match="is not in remote control") if asks else nullcontext():
+        arm.open(control=True)
+    arm.open()
+    assert arm.in_remote_control() is (False if asks else None)
+
+
+def test_a_whole_turn_is_within_the_range_of_a_joint(arm: UrArm) -> None:
+    arm.within_safety_limits([0, -1.5, 1.5, 0, 0, radians(360)])
+    with pytest.raises(ValueError, match="every joint ends at 360 degrees"):
+        arm.within_safety_limits([0, -1.5, 1.5, 0, 0, -radians(360.001)])
 
 
 def test_a_new_arm_opens_no_connection_and_closes() -> None:

@@ -14,7 +14,13 @@ from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.sample import Sample
 from ftdrivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
-from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, ReaderInMemory, pose_from_ur
+from tests.unit.drivers.ur.controller_in_memory import (
+    CYCLE_S,
+    Controller,
+    ReaderInMemory,
+    ServicesInMemory,
+    pose_from_ur,
+)
 
 
 @pytest.fixture
@@ -378,7 +384,9 @@ def test_poses_without_power_over_the_joints_are_not_read(
     controller: Controller, full_rate: Reader, clock: FakeClock
 ) -> None:
     with full_rate.follow() as follow:
-        clock.advance(0.01)
+        clock.advance(0.004)
+        controller.robot_mode = 5  # idle: powered, brakes closed
+        clock.advance(0.006)
         controller.robot_mode = 3
         clock.advance(0.01)
         assert len(follow.read(0.0)) == 5
@@ -402,9 +410,13 @@ def test_a_controller_that_lacks_what_is_needed_is_refused(controller: Controlle
         ReaderInMemory(controller, "UR5e")
 
 
-def test_another_model_is_refused(controller: Controller) -> None:
+def test_another_model_is_refused(controller: Controller, monkeypatch: pytest.MonkeyPatch) -> None:
     info = ReaderInMemory(controller, None).info
     assert (info.model, info.serial, info.firmware) == ("UR5e", "20225500001", "5.15.0")
+    monkeypatch.setattr(ServicesInMemory, "polyscope", lambda _: "5.15.0.1261331")
+    assert ReaderInMemory(controller, None).info.firmware == "5.15.0.1261331"  # as reported
+    monkeypatch.setattr(ServicesInMemory, "polyscope", lambda _: None)
+    assert ReaderInMemory(controller, None).info.firmware == "5.15.0"  # that of RTDE
     assert ReaderInMemory(controller, "UR7e").info.model == "UR7e"  # its newer name
     with pytest.raises(ConnectError, match="UR5e, not a UR10e"):
         ReaderInMemory(controller, "UR10e")
@@ -445,3 +457,32 @@ def test_normal_and_reduced_mode_are_no_fault(reader: Reader, bits: int) -> None
     fault = replace(sample, program_state=4).program_fault()
     assert fault is not None
     assert "paused" in fault.found
+
+
+ROBOT_MODES = """
+-1 no controller, 0 disconnected, 1 safety not confirmed, 2 booting, 3 power off, 4 power on, 5 idle, 6 backdrive,
+7 running, 8 updating firmware, 9 unknown"""
+SAFETY_MODES = """
+1 normal, 2 reduced, 3 protective stop, 4 recovery, 5 safeguard stop, 6 system emergency stop, 7 robot emergency stop,
+8 violation, 9 fault, 10 joint identification, 11 undefined, 12 unknown"""
+PROGRAM_STATES = "0 stopping, 1 stopped, 2 playing, 3 pausing, 4 paused, 5 resuming, 6 unknown"
+SAFETY_BITS = """
+2 protective stop, 3 recovery mode, 4 safeguard stop, 5 emergency stop, 6 emergency stop, 7 emergency stop,
+8 safety violation or fault, 9 safety violation or fault, 10 stop for a safety reason"""
+
+
+def rows(table: str) -> list[tuple[int, str]]:
+    return [(int(number), words) for number, words in (one.split(maxsplit=1) for one in table.split(","))]
+
+
+def test_numbers_have_the_names_of_the_rtde_guide(reader: Reader) -> None:
+    sample = reader.look()
+    for number, words in rows(ROBOT_MODES):
+        assert replace(sample, robot_mode=number).status().robot_mode.startswith(words)
+        assert replace(sample, robot_mode=number).measures == (words in {"idle", "backdrive", "running"})
+    for number, words in rows(SAFETY_MODES):
+        assert replace(sample, safety_mode=number).status().safety_mode.startswith(words)
+    for number, words in rows(PROGRAM_STATES):
+        assert replace(sample, program_state=number).status().program.startswith(words)
+    for number, words in rows(SAFETY_BITS):
+        assert str(replace(sample, safety_bits=1 | 1 << number).safety_fault()).startswith(f"{words} (safety status")

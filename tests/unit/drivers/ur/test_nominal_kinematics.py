@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ftdrivers.ur.kinematics import MODELS, Pose, flange_poses, forward, model_named
+from ftmocks import kinematics as emulator
 from tests.unit.drivers.ur.controller_in_memory import pose_from_ur
 
 # The constant tour: (number of the orientation, psi, q5, q6) in degrees, psi = q2 + q3 + q4.
@@ -46,6 +47,20 @@ def test_stretched_ur5e_by_hand() -> None:
     pose = forward(MODELS["UR5e"], [0.0] * 6)
     assert np.allclose(pose.p_m, [-0.425 - 0.3922, -0.1333 - 0.0996, 0.1625 - 0.0997], atol=1e-12)
     assert np.allclose(pose.R @ [0, 0, 1], [0, -1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(("long", "a2_a3_m"), [("UR8long", 1.6138), ("UR15", 1.1639), ("UR18", 0.8139)])
+def test_stretched_arms_that_are_not_emulated(long: str, a2_a3_m: float) -> None:
+    assert np.allclose(forward(MODELS[long], [0.0] * 6).p_m, [-a2_a3_m, -0.3258, 0.0825], atol=1e-12)
+
+
+def test_every_model_agrees_with_the_emulator_written_apart() -> None:
+    q = [0.3, -1.1, 0.7, -0.4, 1.2, 0.5]
+    emulated = {**emulator.MODELS, "UR7e": emulator.MODELS["UR5e"], "UR12e": emulator.MODELS["UR10e"]}
+    assert set(emulated) == set(MODELS) - {"UR8long", "UR15", "UR18"}
+    for name, parameters in emulated.items():
+        pose = forward(MODELS[name], q)
+        assert np.allclose(np.column_stack([pose.R, pose.p_m]), emulator.forward(parameters, q)[:3], atol=1e-12), name
 
 
 @given(st.lists(st.tuples(pose_lists, pose_lists), max_size=4))

@@ -84,6 +84,7 @@ def test_raw_wrench_is_scaled_as_configured(controller: SubscriptionInMemory, se
     np.testing.assert_allclose(samples.wrench[0], [100, -20, 5, 0.5, -0.2, 0.1])
     assert samples.counts.shape == (len(samples), 0)
     assert len(samples) > 30
+    assert sensor.health().lost == 0
     assert (np.diff(samples.seq) == 1).all()
     np.testing.assert_allclose(np.diff(samples.t_device_s), 0.002, atol=1e-9)
     assert "ft_raw_wrench" in info.model

@@ -46,6 +46,11 @@ def test_a_false_header_costs_no_frame() -> None:
     assert frames.feed(inside[3:] + inside + inside) == [(1, inside), (2, inside)]
 
 
+def test_a_header_of_one_byte_may_stand_before_that_of_a_frame() -> None:
+    frames, good = Deframer(b"A", 4, lambda frame: sum(frame[1:3]) & 0xFF == frame[3]), b"A\x01\x02\x03"
+    assert frames.feed(b"A" + good + b"AA" + good) == [(1, good), (3, good)]
+
+
 @pytest.mark.parametrize(
     ("junk", "missing"),
     [(b"AB...", 1), (b"A", 1), (b"A" * 6, 1), (b"B" * 12, 2), (frame(b"abc")[:-1] + b"?", 1), (b"ABAB", 1)],

@@ -1,0 +1,242 @@
+"""A recorded wire that is played in memory: what is sent when, which requests may be left out, and what diverges."""
+
+import math
+import os
+import sys
+import threading
+import time
+from dataclasses import dataclass, field, replace
+
+import pytest
+import serial
+
+from ftdrivers.transcript.player import Player, _Terminal
+from ftdrivers.transcript.recorder import Passage, Transcript
+from ftdrivers.wires.parity import ask_for_marks
+from ftdrivers.wires.serial_port import SerialPort
+from tests.fake_clock import FakeClock
+
+OPENED_NS = 7_000_000_000
+
+
+def recorded(*passages: tuple[float, bool, bytes]) -> Transcript:
+    """Make a transcript of passages: seconds since the port was opened, whether the driver sent it, and the bytes."""
+    made = tuple(Passage(OPENED_NS + round(1e9 * t_s), sent, data) for t_s, sent, data in passages)
+    return Transcript({"url": "x:///y", "duration_s": 1.0}, OPENED_NS, made, {})
+
+
+@dataclass
+class Far:
+    """The driver's side, which accepts what is sent until it is full."""
+
+    sent: list[bytes] = field(default_factory=list)
+    is_full: bool = False
+
+    def send(self, data: bytes) -> None:
+        self.sent.append(data)
+
+
+class Played:
+    """A player whose thread takes its turns in the test."""
+
+    def __init__(self, transcript: Transcript) -> None:
+        self.clock, self.far = FakeClock(), Far()
+        self.player = Player(transcript, self.clock)
+        self.player._far = self.far  # type: ignore[assignment]
+        self.player._t = self.clock.now_s()  # the driver has opened the port
+
+    def ask(self, data: bytes) -> None:
+        self.player._asked += data
+        self.player._listen()
+
+    def answers(self, after_s: float = 0.0) -> bytes:
+        """Let the time pass and return what was sent meanwhile."""
+        self.far.sent.clear()
+        end_s = self.clock.now_s() + after_s
+        while (wait_s := self.player._play()) < math.inf and self.clock.now_s() + wait_s <= end_s + 1e-9:
+            assert wait_s > 0
+            self.clock.advance(wait_s)
+        self.clock.advance(end_s - self.clock.now_s())
+        return b"".join(self.far.sent)
+
+
+DIALOGUE = recorded(
+    (0.30, True, b"ab"), (0.35, False, b"1"), (0.55, False, b"2"), (0.60, True, b"cd"), (0.61, False, b"3")
+)
+
+
+def test_a_request_is_answered_after_the_recorded_time() -> None:
+    wire = Played(DIALOGUE)
+    assert wire.answers(9.0) == b""  # nothing before the first request
+    wire.ask(b"a")
+    assert wire.answers(1.0) == b""  # it is not whole
+    wire.ask(b"b")
+    assert wire.answers(0.049) == b""
+    assert wire.answers(0.002) == b"1"
+    assert wire.answers(0.198) == b""
+    assert wire.answers(0.002) == b"2"
+    assert wire.answers(5.0) == b""
+    wire.ask(b"cd")
+    assert wire.answers(0.009) == b""
+    assert wire.answers(0.002) == b"3"
+    assert wire.player._play() == math.inf
+    assert wire.player.divergence is None
+
+
+@pytest.mark.parametrize(("early_s", "is_sent"), [(0.04, True), (0.06, False)])
+def test_what_the_device_sends_before_a_request_that_comes_early(early_s: float, is_sent: bool) -> None:
+    wire = Played(DIALOGUE)
+    wire.ask(b"ab")
+    assert wire.answers(0.25 - early_s) == b"1"
+    wire.far.sent.clear()
+    wire.ask(b"cd")
+    assert wire.far.sent == ([b"2"] if is_sent else [])
+    assert wire.answers(0.02) == b"3"
+
+
+def test_a_request_may_be_left_out_with_its_answer() -> None:
+    wire = Played(DIALOGUE)
+    wire.ask(b"cd")
+    assert wire.answers(1.0) == b"3"
+    assert wire.player.divergence is None
+
+
+def test_a_request_without_an_answer_may_be_left_out() -> None:
+    wire = Played(recorded((0.0, True, b"ab"), (0.0, True, b"cd"), (0.01, False, b"3"), (0.02, True, b"ef")))
+    wire.ask(b"cd")
+    assert wire.answers(0.02) == b"3"
+
+
+def test_two_requests_may_arrive_at_once() -> None:
+    wire = Played(recorded((0.0, True, b"ab"), (0.0, True, b"cd"), (0.01, False, b"3")))
+    wire.ask(b"abcd")
+    assert wire.answers(0.02) == b"3"
+    wire.ask(b"xy")  # the driver says goodbye, or the recording was broken off
+    assert (wire.player.divergence, bytes(wire.player._asked)) == (None, b"")
+
+
+def test_a_request_that_was_not_recorded_ends_in_silence_with_a_reason() -> None:
+    wire = Played(DIALOGUE)
+    wire.ask(b"ab")
+    wire.ask(b"ax")
+    assert wire.player.divergence == "the driver sent 61 78, the recording has 63 64"
+    assert wire.answers(1.0) == b""
+    wire.ask(b"cd")
+    assert wire.answers(1.0) == b""
+
+
+def test_what_comes_unasked_keeps_its_times_and_waits_while_the_driver_is_full() -> None:
+    wire = Played(recorded((0.1, False, b"1"), (0.2, False, b"2")))
+    assert wire.answers(0.11) == b"1"
+    wire.far.is_full = True
+    assert wire.player._play() == pytest.approx(0.09)
+    wire.clock.advance(0.1)
+    wire.far.sent.clear()
+    assert wire.player._play() == pytest.approx(0.001)  # a look each millisecond
+    assert wire.far.sent == [b"", b"2"]  # the rest first
+    wire.far.is_full = False
+    assert wire.player._play() == math.inf
+
+
+def test_a_driver_is_answered_on_a_pseudo_terminal_until_it_closes_it() -> None:
+    player = Player(recorded((0.0, True, b"ab"), (0.0, False, b"1"), (0.0, True, b"cd"), (0.01, False, b"2")))
+    with player as path:
+        thread = player._thread
+        assert thread is not None
+        with serial.Serial(path, timeout=5.0) as port:
+            port.write(b"a")
+            port.write(b"b")
+            assert port.read(1) == b"1"
+            port.write(b"cd")
+            assert port.read(1) == b"2"
+        thread.join(5.0)
+        assert not thread.is_alive()
+    assert player._thread is None
+
+
+def read_through(player: Player, request: bytes, size: int) -> tuple[bytes, list[int]]:
+    with player as path:
+        port = SerialPort("sensor", path, 1_250_000, even_parity=True)
+        port.open()
+        try:
+            port.write(request)
+            data, damaged, deadline = b"", list[int](), time.monotonic() + 5
+            while len(data) < size:
+                assert time.monotonic() < deadline
+                more, places = port.read_marked(size - len(data))
+                damaged += [len(data) + place for place in places]
+                data += more
+        finally:
+            port.close()
+    return data, damaged
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
+@pytest.mark.parametrize(
+    ("parity_marks", "read", "damaged"), [(True, b"ab\xffc", [1]), (False, b"a\xff\x00b\xff\xffc", [])]
+)
+def test_recorded_marks_are_played_as_marks(parity_marks: bool, read: bytes, damaged: list[int]) -> None:
+    marked = recorded((0.00, True, b"?"), (0.01, False, b"a\xff\x00b\xff\xffc"))
+    player = Player(replace(marked, parity_marks=parity_marks))
+    assert read_through(player, b"?", len(read)) == (read, damaged)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere no marks are asked for")
+def test_marks_are_not_played_before_the_driver_is_ready_for_them() -> None:
+    marked = recorded((0.00, True, b"?"), (0.01, False, b"\xff\x00b"))
+    player = Player(replace(marked, passages=marked.passages[1:], parity_marks=True))
+    with player as path, serial.Serial(path, timeout=0.1) as port:
+        assert port.read(1) == b""  # it has not asked for marks
+        ask_for_marks(port)
+        assert port.read(3) == b"\xff\x00b"
+
+
+def test_a_player_that_is_never_opened_ends() -> None:
+    before = threading.active_count()
+    with Player(DIALOGUE):
+        pass
+    assert threading.active_count() == before
+
+
+def test_how_much_is_left() -> None:
+    wire = Played(DIALOGUE)
+    assert wire.player.left_s == pytest.approx(0.31)
+    wire.ask(b"ab")
+    assert wire.player.left_s == pytest.approx(0.26)
+    wire.answers(0.1)
+    assert wire.player.left_s == pytest.approx(0.06)
+    wire.ask(b"cd")
+    wire.answers(0.1)
+    assert wire.player.left_s == 0
+
+
+def test_frames_are_played_by_an_adapter() -> None:
+    frames = recorded((0.0, True, b"t2050\r"), (0.0, False, b"t20520102\r"))
+    with Player(replace(frames, frames=True)) as path, serial.Serial(path, timeout=5.0) as port:
+        port.write(b"C\rS5\rO\rt2050\r")
+        assert port.read(10) == b"t20520102\r"
+
+
+def test_what_the_driver_does_not_accept_yet_is_sent_later_and_in_order() -> None:
+    terminal, data = _Terminal(recorded()), bytes(range(256)) * 1000
+    driver = os.open(terminal.open(), os.O_RDWR | os.O_NOCTTY)
+    try:
+        terminal.send(data)
+        assert terminal.is_full
+        read = os.read(driver, 100)
+        terminal.send(b"end")
+        while terminal.is_full:
+            read += os.read(driver, 65536)
+            terminal.send(b"")
+        while not read.endswith(b"end"):
+            read += os.read(driver, 65536)
+        assert read == data + b"end"
+    finally:
+        os.close(driver)
+        terminal.close()
+
+
+def test_commands_to_an_adapter_are_left_out() -> None:
+    terminal = _Terminal(recorded())
+    assert terminal._frames_of(b"C\rS5\rO\rt2050\rT0000012") == b"t2050\r"
+    assert terminal._frames_of(b"30\rr02A3\rR000000010\rV\r") == b"T000001230\rr02A3\rR000000010\r"
