@@ -118,7 +118,7 @@ def test_a_load_and_a_contact_are_events_with_their_time_and_size() -> None:
     assert load.size == pytest.approx(0.9, abs=4 * load.sigma)
     assert load.sigma < 0.02
     begin_s = program.t_s
-    program._pass(5, np.zeros(3), np.array([0.0, 3.0, -4.0, 0.2, 0.0, 0.0]))
+    program._pass(5, np.zeros(3), np.array([0.0, 3.0, -4.0, 4.0, 0.0, 0.0]))
     program.turn(12)
     contact = program.events[-1]
     assert (contact.kind, contact.t_s) == ("contact", pytest.approx(begin_s, abs=3.1 * WINDOW_S))
@@ -265,3 +265,15 @@ def test_the_error_of_the_calibration_is_in_the_sigma() -> None:
     with_it, without = (tracker.update(replace(WINDOW, systematic=one)).sigma for tracker, one in pairs)
     np.testing.assert_allclose(np.square(with_it) - np.square(without), variance)
     np.testing.assert_allclose(without, np.repeat([1.0, 0.03], 3), rtol=1e-3)  # of a sensor that was not seen yet
+
+
+def test_the_bias_walks_and_the_likelihood_of_walks_is_forgotten() -> None:
+    tracker = Tracker(1.0, np.zeros(3))
+    tracker.update(replace(WINDOW, t_s=100.0))
+    tracker._likelihood = np.arange(4.0)
+    tracked = tracker.update(replace(WINDOW, t_s=1900.0))
+    np.testing.assert_allclose(tracker._likelihood, np.arange(4.0) * np.exp(-0.5))  # half an hour
+    weights = np.exp(tracker._likelihood) / np.exp(tracker._likelihood).sum()
+    assert tracked.walk_N == pytest.approx(weights @ [0.1, 0.3, 1.0, 3.0])
+    variance = 1.0 + weights @ np.square([0.1, 0.3, 1.0, 3.0]) / 2
+    np.testing.assert_allclose(tracked.sigma, np.sqrt(variance) * np.repeat([1.0, 0.03], 3))
