@@ -106,3 +106,10 @@ def test_blocks_of_any_size_make_the_same_means() -> None:
     assert sum(added) == 10
     np.testing.assert_allclose(whole.force_rate_N_h, pieces.force_rate_N_h)
     assert DriftFilter().force_rate_N_h == (0.0, pytest.approx(5.0))
+
+
+def test_a_usual_bias_at_the_beginning_is_no_contact() -> None:
+    for bias in (np.array([3.0, 0, 0, 0, 0, 0]), np.array([0, 0, 0, 0.09, 0, 0])):
+        drift = DriftFilter()
+        second(drift, 0, bias)
+        np.testing.assert_allclose(drift._x[:, 0], bias, rtol=0.02)

@@ -96,3 +96,9 @@ def test_an_accelerated_load_pulls_back_at_its_centre_of_mass() -> None:
     begin_s = t_s[np.flatnonzero(felt.any(axis=1))[0]]
     assert 0.2 < begin_s < 0.225  # at 2 mm/s, long before 10 mm/s are a motion
     assert not states.any()
+
+
+def test_fast_motion_is_not_divided_by_acceleration() -> None:
+    t_s, omega, speed = seconds(1.2), 20.0, 0.5
+    angle = speed * t_s + 2.2 / omega**2 * np.sin(omega * t_s)  # from 0.39 to 0.61 rad/s, beyond 1.5 + speed²
+    assert set(follow(angle)[0][600:].tolist()) == {5}
