@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
 from ftcalib.model import Array
@@ -31,7 +32,7 @@ class Known:
 
 def judged(
     test: ContactTest, residual: Array, predicted: Array, state: int, felt: Array, inertia: Inertia
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     calibration = calibrated()
     test.expect((calibration.parameters, calibration.covariance, calibration.response), MASS_KG, tensor_known=False)
     n = len(residual)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array
@@ -13,7 +14,7 @@ CENTRED = TRUTH.R_flange_sensor @ -TRUTH.p_sensor_com_m
 """Origin of a sensor whose centre of mass is that of the flange, so that turning does not move it."""
 
 
-def follow(angle_rad: Array, p_m: Array | None = None, origin_m: Array = CENTRED) -> tuple[Array, Array]:
+def follow(angle_rad: Array, p_m: Array | None = None, origin_m: Array = CENTRED) -> tuple[NDArray[np.int8], Array]:
     """States and wrench of a flange that turns by these angles about z and is at these places."""
     R = Rotation.from_rotvec(np.outer(angle_rad, [0.0, 0.0, 1.0])).as_matrix()
     p = np.zeros((len(R), 3)) if p_m is None else p_m

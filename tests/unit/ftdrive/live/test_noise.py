@@ -16,7 +16,7 @@ PULL = np.vstack([np.eye(3), np.zeros((3, 3))]) * 1.5
 
 
 def samples(readings: int, seed: int = 1) -> Array:
-    return np.random.default_rng(seed).standard_normal((readings * SIZE, 6)) @ MIXED.T
+    return np.asarray(np.random.default_rng(seed).standard_normal((readings * SIZE, 6)) @ MIXED.T)
 
 
 def learnt(residual: Array, state: int = REST, estimator: NoiseEstimator | None = None) -> NoiseEstimator:
