@@ -83,3 +83,14 @@ def test_the_error_of_the_delay_is_as_its_sigma_says() -> None:
         assert 5e-5 < estimator.sigma_s < 1.5e-4  # 6,000 numbers of 0.05 N, of a force that changes by 10 N/s
         left.append((estimator.delay_s - 0.004) / estimator.sigma_s)
     assert 0.4 < np.sqrt(np.mean(np.square(left))) < 1.6
+
+
+def test_every_second_is_one_piece_whatever_the_blocks() -> None:
+    rows = paired(np.tile(np.eye(3), (3500, 1, 1)))
+    for block in (3500, 700, 90):
+        estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M)
+        pieces = [
+            piece for i in range(0, 3500, block) for piece in estimator._whole_seconds(rows.rows(slice(i, i + block)))
+        ]
+        assert [(piece.seq[0], len(piece)) for piece in pieces] == [(0, 1000), (1000, 1000), (2000, 1000)]
+        assert sum(map(len, estimator._pending)) == 500
