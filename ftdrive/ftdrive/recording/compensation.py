@@ -298,14 +298,6 @@ def estimated_bias(
     return with_calibration(source.header, estimated, name), change_dict
 
 
-def free_samples(left: Array, rate_Hz: float) -> NDArray[np.bool_]:
-    """Return which samples (n,) belong to readings of a free tool; `left` (n, 6) is what the calibration leaves."""
-    size = max(1, round(_READING_S * rate_Hz))
-    whole = len(left) // size * size
-    free = np.repeat(_free(left[:whole].reshape(-1, size, 6).mean(axis=1)), size)
-    return np.concatenate([free, np.zeros(len(left) - whole, bool)])
-
-
 def _free(reading: Array) -> NDArray[np.bool_]:
     """Return which readings (n, 6) are near the median of those that are, in units of their own spread."""
     free = np.ones(len(reading), bool)

@@ -1,8 +1,10 @@
 """An emulated cell that cannot be started."""
 
+from typing import Any
+
 import pytest
 
-from ftdrive.cell.emulated import Station
+from ftdrive.cell.emulated import Station, _options
 from ftdrive.errors import ConfigError
 
 
@@ -10,3 +12,20 @@ def test_another_system_than_linux_has_no_emulated_cell(monkeypatch: pytest.Monk
     monkeypatch.setattr("sys.platform", "darwin")
     with pytest.raises(ConfigError, match=r"needs Linux.* use recorded data"), Station():
         pass
+
+
+@pytest.mark.parametrize(
+    ("values", "sensor", "options"),
+    [
+        ({}, "netft", "--mount floor"),
+        ({"tool.mass_kg": 1.2, "workcell.mounting": "wall"}, "netft", "--mass 1.2 --mount wall"),
+        ({"sensor.height_mm": 33.0}, "netft", "--sensor-origin 0,0,0.033 --mount floor"),
+        ({"sensor.mass_kg": 0.25}, "netft", "--sensor-mass-kg 0.25 --mount floor"),
+        ({"sensor.mass_kg": 0.25}, "ur-ft", "--mount floor"),  # that sensor is part of the arm
+        ({"workcell.mounting": 30.0}, "netft", "--mount floor --tilt-deg 0,30.0"),
+    ],
+)
+def test_a_station_has_the_tool_and_the_mounting_of_the_configuration(
+    values: dict[str, Any], sensor: str, options: str
+) -> None:
+    assert " ".join(_options(values, sensor)) == options

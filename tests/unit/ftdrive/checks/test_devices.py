@@ -461,3 +461,12 @@ def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -
 def test_the_error_of_an_arm_that_names_no_cure_gets_one(own: str, shown: str) -> None:
     check = diagnosis.check_unreachable(StreamBroken("ur5:30004 was lost (x; y)", own), "ur5")
     assert (check.found, check.fix) == ("ur5:30004 was lost (x; y)", shown)
+
+
+def test_a_wrench_without_the_weight_of_the_tool_is_compensated() -> None:
+    cell = CellConfig(RobotConfig(""), SensorConfig(""), ToolConfig(mass_kg=2.0))
+    for share, state in ((0.0, "warning"), (0.095, "warning"), (0.1, "ok"), (1.0, "ok")):
+        check = diagnosis.check_compensated(np.tile([0.0, 12.0 * share, -16.0 * share, 9.0, 9.0, 9.0], (50, 1)), cell)
+        assert check.state == state
+        assert f"{20 * share:.1f} N at rest, the tool weighs 19.6 N" in check.found
+    assert diagnosis.check_compensated(np.ones((50, 6)), replace(cell, tool=ToolConfig())).state == "skipped"

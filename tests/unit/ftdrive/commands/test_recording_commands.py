@@ -220,8 +220,9 @@ def test_a_conversion_is_complete_and_says_what_was_cut(
     recorder.close()
     assert cli.run(["convert", "a.csv", "b.mcap", "--json"]) == 0
     out, err = capsys.readouterr()
-    assert json.loads(out)["samples"] == 1800
-    assert json.loads(out)["complete"]
+    answer = json.loads(out)
+    assert (answer["samples"], answer["gaps"], answer["complete"]) == (1800, 0, True)
+    assert answer["duration_s"] == pytest.approx(read_recording(Path("b.mcap")).duration_s)
     assert read_recording(Path("b.mcap")).rows.tobytes() == read_recording(Path("a.csv")).rows.tobytes()
     assert cli.run(["convert", "b.csv.partial", "b.parquet", "--json"]) == 0
     out, err = capsys.readouterr()

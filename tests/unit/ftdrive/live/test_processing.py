@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
+from ftcalib.extras.temperature import BiasTemperature
 from ftcalib.model import Array, predict
 from ftcalib.result import MotionResult
 from ftdrive.errors import ConfigError
@@ -458,3 +459,27 @@ def test_without_drift_there_is_no_warning() -> None:
     rate, sigma = processor._drift.force_rate_N_h
     assert rate < 5 * sigma
     assert "drift" not in kinds(processor)
+
+
+def test_the_bias_follows_the_temperature_in_small_steps_and_events_in_large_ones() -> None:
+    slope = np.array([0.3, 0.4, 0.0, 0.0, 0.0, 0.01])
+    errors = np.full(2, 0.1), np.full(2, 0.5)
+    warmth = BiasTemperature(slope, np.full(6, 1e-3), 12, 15.0, 40.0, *errors, np.zeros(2))
+    made = calibrated()
+    known = replace(made, provenance={**made.provenance, "temperature_C": 20.0})
+    processor = Processor(info(known), temperature=warmth)
+    for temperature_C, bias_C in ((20.04, 20.0), (20.06, 20.06), (20.95, 20.95)):
+        processor.warm(temperature_C)
+        np.testing.assert_allclose(processor._bias_change, slope * (bias_C - 20.0), atol=1e-12)
+        assert not kinds(processor)
+    processor.warm(21.04)
+    (event,) = processor.take_events()
+    assert (event.kind, event.text) == ("temperature", "sensor at 21.0 °C: bias corrected by 0.52 N")
+    assert event.values["change"] == pytest.approx((slope * 1.04).tolist())
+    processor.warm(22.0)  # less than 1 °C after the last event
+    processor.warm(20.02)
+    assert kinds(processor) == ["temperature"]
+    for unknown in (Processor(info(made), temperature=warmth), Processor(info(known))):
+        unknown.warm(35.0)
+        assert not unknown._bias_change.any()
+        assert not kinds(unknown)

@@ -1,12 +1,16 @@
 """Bias and part of a program that picks, carries, places and touches, while the bias drifts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import multivariate_normal
 
 from ftcalib.model import Array
+from ftdrive.live.motion import REST
 from ftdrive.live.samples import LoadEvent, Tracked
-from ftdrive.live.tracking import Tracker, Window
+from ftdrive.live.tracking import Tracker, Window, _corrected, _less, _log_likelihood, _observed, _place
 
 NOISE = np.repeat([0.08, 0.004], 3)
 G_M_S2, WINDOW_S = 9.81, 0.15
@@ -98,4 +102,180 @@ def test_the_uncertainty_grows_while_the_bias_cannot_be_seen() -> None:
     assert after is not None
     assert before.last_seen_s == pytest.approx(2 * WINDOW_S)  # two windows wait
     assert after.last_seen_s == pytest.approx(502 * WINDOW_S)
-    assert (after.sigma > 1.1 * before.sigma).all()
+    grown = np.square(after.sigma) - np.square(before.sigma)
+    walks_N = np.square([0.1, 0.3, 1.0, 3.0]) * 500 * WINDOW_S / 3600  # what each of them does in this time
+    assert 2 * walks_N[0] < grown[:3].min() <= grown[:3].max() < walks_N[3]
+    np.testing.assert_allclose(grown[3:], grown[:3].mean() * 0.03**2, rtol=0.1)
+
+
+def test_a_load_and_a_contact_are_events_with_their_time_and_size() -> None:
+    program = Program(3)
+    program.turn(20)
+    program.part_kg, begin_s = 0.9, program.t_s
+    program.turn(16)
+    (load,) = program.events
+    assert load.kind == "load"
+    assert load.t_s == pytest.approx(begin_s, abs=3.1 * WINDOW_S)
+    assert load.size == pytest.approx(0.9, abs=4 * load.sigma)
+    assert load.sigma < 0.02
+    begin_s = program.t_s
+    program._pass(5, np.zeros(3), np.array([0.0, 3.0, -4.0, 4.0, 0.0, 0.0]))
+    program.turn(12)
+    contact = program.events[-1]
+    assert contact.kind == "contact"
+    assert contact.t_s == pytest.approx(begin_s, abs=3.1 * WINDOW_S)
+    assert contact.size == pytest.approx(5.0, abs=0.6)
+    program.part_kg = 0.0
+    program.turn(16)
+    assert [event.kind for event in program.events] == ["load", "contact", "load"]
+    assert program.events[-1].size == pytest.approx(-0.9, abs=4 * program.events[-1].sigma)
+    assert max(program.off) < 3.5
+
+
+WINDOW = Window(
+    t_s=0.0,
+    residual=np.zeros(6),
+    felt_m_s2=np.array([1.0, -2.0, -9.0]),
+    lever_s2=np.array([[-3.0, 1.0, 0.5], [0.2, -2.0, 0.7], [0.4, -0.6, -1.5]]),
+    p_sensor_near_m=np.array([0.01, -0.02, 0.12]),
+    noise=np.diag([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]),
+    state=1,
+    systematic=np.zeros((6, 6)),
+    turning_rad_s2=2.0,
+    tensor_Nm=0.05,
+    p_base_flange_m=np.zeros(3),
+)
+
+
+def covariances(rng: np.random.Generator, n: int, size: int) -> Array:
+    roots = rng.standard_normal((n, size, size))
+    return roots @ np.swapaxes(roots, 1, 2) + np.eye(size)
+
+
+@pytest.mark.parametrize("p_m", [None, np.array([0.03, 0.01, 0.2])])
+def test_a_part_is_a_point_mass(p_m: Array | None) -> None:
+    at_m = WINDOW.p_sensor_near_m if p_m is None else p_m
+    force_N = 1.5 * (WINDOW.felt_m_s2 - WINDOW.lever_s2 @ at_m)
+    bias = np.arange(6.0)
+    wrench = _observed(WINDOW, p_m) @ np.r_[bias, 1.5, 1.5 * at_m]
+    np.testing.assert_allclose(wrench, bias + np.r_[force_N, np.cross(at_m, force_N)])
+
+
+def test_a_place_is_known_from_3_cm_on_and_of_a_part_only() -> None:
+    x, P = np.r_[np.zeros(6), 2.0, 0.2, 0.4, 0.6], np.zeros((10, 10))
+    for at, known in ((0.0599, True), (0.0601, False)):
+        P[range(7, 10), range(7, 10)] = at**2 / 3
+        place = _place(x, P)
+        assert (place is not None) == known
+        if place is not None:
+            np.testing.assert_allclose(place, [0.1, 0.2, 0.3])
+    assert _place(np.r_[np.zeros(6), 0.0199, np.zeros(3)], 0 * P) is None
+    assert _place(np.r_[np.zeros(6), 0.0201, np.zeros(3)], 0 * P) is not None
+
+
+def test_a_correction_is_that_of_the_information_form() -> None:
+    rng = np.random.default_rng(4)
+    x, P, C = rng.standard_normal((2, 10)), covariances(rng, 2, 10), covariances(rng, 1, 6)[0]
+    H, y = rng.standard_normal((6, 10)), rng.standard_normal(6)
+    found, found_P = _corrected(x, P, y, C, H)
+    likelihood = _log_likelihood(x, P, y, C, H)
+    expected = []
+    for k in range(2):
+        information = np.linalg.inv(P[k]) + H.T @ np.linalg.inv(C) @ H
+        np.testing.assert_allclose(np.linalg.inv(found_P[k]), information)
+        np.testing.assert_allclose(
+            information @ found[k], np.linalg.inv(P[k]) @ x[k] + H.T @ np.linalg.solve(C, y), atol=1e-9
+        )
+        expected.append(multivariate_normal(H @ x[k], H @ P[k] @ H.T + C).logpdf(y))
+    assert likelihood[1] - likelihood[0] == pytest.approx(expected[1] - expected[0])
+
+
+def test_states_are_mixed_by_the_likelihood_of_their_walks() -> None:
+    tracker, rng = Tracker(1.0, np.zeros(3)), np.random.default_rng(5)
+    tracker._likelihood = np.log([1.0, 2.0, 3.0, 4.0]) - 700.0
+    x, P = rng.standard_normal((4, 10)), covariances(rng, 4, 10)
+    mean, covariance = tracker._mixed(x, P)
+    weights = np.array([0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(mean, weights @ x)
+    second = sum(w * (one + np.outer(at, at)) for w, at, one in zip(weights, x, P, strict=True))
+    np.testing.assert_allclose(covariance, second - np.outer(mean, mean), atol=1e-9)
+
+
+def test_vibration_shakes_a_part_as_it_shakes_the_tool() -> None:
+    tracker = Tracker(2.0, np.array([0.0, 0.0, 0.1]))
+    still = replace(WINDOW, turning_rad_s2=0.0, tensor_Nm=0.0)
+    moment = np.array([0.0, 0.03, 0.04])  # a quarter of that of the tool
+    scale = np.repeat([1.5, 1.25], 3)  # half the mass of the tool
+    np.testing.assert_allclose(tracker._covariance(still, 1.0, moment), np.diag(np.diag(WINDOW.noise) * scale**2))
+    np.testing.assert_allclose(tracker._covariance(replace(still, state=REST), 1.0, moment), WINDOW.noise)
+    turning = tracker._covariance(WINDOW, 1.0, moment) - tracker._covariance(still, 1.0, moment)
+    inertia_kg_m2 = 1.0 * 0.08**2  # of a part whose radius of gyration is 8 cm
+    np.testing.assert_allclose(turning, np.diag([0, 0, 0, *[(inertia_kg_m2 * 2.0) ** 2 + 0.05**2] * 3]), atol=1e-12)
+
+
+def test_a_far_window_counts_less_as_by_students_distribution() -> None:
+    assert (_less(0.0), _less(6.0)) == (1.0, 1.0)
+    assert _less(26.0) == pytest.approx(30 / 10)  # weight of t with 4 degrees of freedom in 6 dimensions
+
+
+def test_a_part_is_new_once_gravity_has_turned_or_the_arm_has_gone() -> None:
+    def turned(angle_rad: float) -> Window:
+        return replace(WINDOW, felt_m_s2=9.0 * np.array([0.0, np.sin(angle_rad), -np.cos(angle_rad)]))
+
+    def gone(*p_m: float) -> Window:
+        return replace(turned(0.0), p_base_flange_m=np.array(p_m))
+
+    assert not Tracker._moved([turned(0.0), turned(0.249), turned(0.0)])
+    assert Tracker._moved([turned(0.0), turned(0.251), turned(0.0)])
+    assert not Tracker._moved([gone(1, 2, 3), gone(1.1, 2.1, 3.04), gone(1, 2, 3)])
+    assert Tracker._moved([gone(1, 2, 3), gone(1.1, 2.1, 3.06), gone(1, 2, 3)])
+    assert not Tracker._moved([gone(np.nan, np.nan, np.nan)] * 2)
+
+
+@pytest.mark.parametrize("walk_N", [0.0, 3.0])
+def test_noise_and_walk_are_learnt(walk_N: float) -> None:
+    rng, tracker = np.random.default_rng(6), Tracker(1.2, np.array([0.0, 0.0, 0.06]))
+    noise, bias = NOISE * [1, 2, 1, 1, 0.5, 1], np.zeros(6)
+    step = walk_N * np.repeat([1.0, 0.03], 3) / 60  # in a second, of what it is in an hour
+    squares = list[float]()
+    for k in range(150):
+        bias = bias + step * rng.standard_normal(6)
+        down = np.array([np.sin(k), np.cos(k), 0.5 * np.sin(k / 3)])
+        still = replace(
+            WINDOW,
+            t_s=float(k),
+            residual=bias + noise * rng.standard_normal(6),
+            noise=np.diag(np.square(1.5 * NOISE)),
+            state=REST,
+            felt_m_s2=9.8 * down / np.linalg.norm(down),
+            lever_s2=np.zeros((3, 3)),
+            turning_rad_s2=0.0,
+            tensor_Nm=0.0,
+        )
+        tracked = tracker.update(still)
+        squares.append(float(np.square((tracked.bias - bias) / tracked.sigma).mean()))
+    assert 0.5 < np.mean(squares[50:]) < 2.0
+    assert abs(np.log(tracked.walk_N / max(walk_N, 0.2))) < np.log(2)
+    if not walk_N:
+        learnt = np.sqrt(np.diag(tracker._covariance(still, 0.0, np.zeros(3))))
+        np.testing.assert_allclose(learnt, noise, rtol=0.2)
+
+
+def test_the_error_of_the_calibration_is_in_the_sigma() -> None:
+    variance = np.array([0.1, 0.2, 0.3, 0.004, 0.005, 0.006])
+    pairs = [(Tracker(1.0, np.zeros(3)), systematic) for systematic in (np.diag(variance), np.zeros((6, 6)))]
+    with_it, without = (tracker.update(replace(WINDOW, systematic=one)).sigma for tracker, one in pairs)
+    np.testing.assert_allclose(np.square(with_it) - np.square(without), variance)
+    np.testing.assert_allclose(without, np.repeat([1.0, 0.03], 3), rtol=1e-3)  # of a sensor that was not seen yet
+
+
+def test_the_bias_walks_and_the_likelihood_of_walks_is_forgotten() -> None:
+    tracker = Tracker(1.0, np.zeros(3))
+    tracker.update(replace(WINDOW, t_s=100.0))
+    tracker._likelihood = np.arange(4.0)
+    tracked = tracker.update(replace(WINDOW, t_s=1900.0))
+    np.testing.assert_allclose(tracker._likelihood, np.arange(4.0) * np.exp(-0.5))  # half an hour
+    weights = np.exp(tracker._likelihood) / np.exp(tracker._likelihood).sum()
+    assert tracked.walk_N == pytest.approx(weights @ [0.1, 0.3, 1.0, 3.0])
+    variance = 1.0 + weights @ np.square([0.1, 0.3, 1.0, 3.0]) / 2
+    np.testing.assert_allclose(tracked.sigma, np.sqrt(variance) * np.repeat([1.0, 0.03], 3))

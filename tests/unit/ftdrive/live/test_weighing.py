@@ -1,15 +1,28 @@
 """Weighing a stream: rest, refusals, tare as the zero, poses, parts."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import ftdrive
+from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.model import Array
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Paired
-from ftdrive.live.weighing import WORDS, CannotWeigh, Scale, count_of, load_values, weigh_in_motion
+from ftdrive.live.weighing import (
+    WORDS,
+    CannotWeigh,
+    Scale,
+    _reading,
+    _unexplained,
+    count_of,
+    load_values,
+    weigh_in_motion,
+)
 from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, TRUTH, G, calibrated, info, paired
 
 POSE = Rotation.from_euler("xz", [170, 25], degrees=True).as_matrix()
@@ -61,6 +74,11 @@ def test_a_tare_is_the_zero() -> None:
     values = load_values(weight, source.info)
     p_flange_m = P_FLANGE_SENSOR_M + TRUTH.R_flange_sensor @ weight.p_sensor_com_m
     np.testing.assert_allclose(values["p_flange_com_m"], p_flange_m, atol=1e-4)
+    C = TRUTH.R_flange_sensor @ weight.com_covariance @ TRUTH.R_flange_sensor.T
+    np.testing.assert_allclose(values["p_flange_com_sigma_m"], np.sqrt(np.diag(C)), rtol=0.01)
+    without = load_values(weight, info(calibrated(), height=False))
+    assert (without["p_flange_com_m"], without["p_flange_com_sigma_m"]) == (None, None)
+    assert without["p_sensor_com_m"] == values["p_sensor_com_m"]
 
 
 def test_the_library_waits_for_rest_and_joins_poses() -> None:
@@ -168,3 +186,22 @@ def test_parts_are_counted_or_not() -> None:
     assert refusal.value.code == "count"
     with pytest.raises(CannotWeigh):
         count_of(weight, 0.001)  # sigma is larger than such a part
+
+
+def test_a_mean_of_few_samples_counts_less() -> None:
+    for n, factor in ((50, 1.2), (500, 1.02)):
+        rows = paired(np.tile(POSE, (n, 1, 1)), rate_Hz=2.0 * n)
+        R, mean = _reading(rows, np.full(6, np.inf))
+        dwell = mean_and_covariance(rows.raw)
+        np.testing.assert_array_equal(R, POSE)
+        np.testing.assert_array_equal(mean.mean, dwell.mean)
+        np.testing.assert_allclose(mean.covariance, factor * dwell.covariance)
+
+
+def test_what_a_fit_does_not_explain_is_in_the_reading() -> None:
+    for explained, variance in ((True, np.zeros(6)), (False, np.repeat([(0.05**2 - 0.03**2) / 3, 0.0], 3))):
+        calibration = SimpleNamespace(
+            noise_explains=explained, likely_error=lambda: (0.05, 0.002), predicted_error=lambda: (0.03, 0.003)
+        )
+        stub: Any = SimpleNamespace(calibration=calibration)
+        np.testing.assert_allclose(_unexplained(stub), variance)

@@ -13,8 +13,9 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Scene
 from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of
+from ftdrive.planning.search.nodes import WRIST_6_RAD
 from ftdrive.planning.show.words import plan_in_words
-from ftdrive.planning.sweep_planner import at_speed, plan_sweep
+from ftdrive.planning.sweep_planner import at_speed, plan_sweep, winds_little
 
 SPEEDS = Speeds()
 STOP_RAD_S2 = float(np.radians(300))
@@ -104,3 +105,45 @@ def test_the_words_name_joints_and_proof(plan: Plan) -> None:
 def test_impossible_durations_and_cells_are_refused() -> None:
     with pytest.raises(ConfigError, match="10 to 120 s"):
         planned(certifier_of(), seconds=5.0)
+
+
+@pytest.mark.parametrize("better", [(0.5, 1.0, 1.0), (1.0, 0.5, 1.0), (1.0, 1.0, 0.5)])
+def test_a_curve_is_better_if_any_error_is_smaller(
+    plan: Plan, monkeypatch: pytest.MonkeyPatch, better: tuple[float, float, float]
+) -> None:
+    assert plan.sweep is not None
+    scores = []
+    for errors in ((2.0, 3.0, 5.0), (2.0 * better[0], 3.0 * better[1], 5.0 * better[2]), (0.2, 0.3, 0.5)):
+        monkeypatch.setattr(sweep_planner, "predicted", lambda *_, errors=errors: errors)
+        scores.append(sweep_planner._score(certifier_of().arm, plan.sweep, guess_of(certifier_of(), 1.2)))
+    assert scores[2] < scores[1] < scores[0]
+
+
+def test_the_rows_of_a_sweep_are_its_motion_and_their_rates(plan: Plan) -> None:
+    assert plan.sweep is not None
+    arm, sweep, h = certifier_of().arm, plan.sweep, 1e-3
+    found, rate = sweep_planner._motion(arm, sweep)
+    t = np.arange(0.0, sweep.duration_s, 0.12)
+
+    def columns(t: np.ndarray) -> np.ndarray:
+        before, at, after = (arm.frames(sweep.at(t + k * h)) for k in (-1, 0, 1))
+        R = at.R_base_flange
+        a = (before.flange_m - 2 * at.flange_m + after.flange_m) / h**2
+        Rdd = (before.R_base_flange - 2 * R + after.R_base_flange) / h**2
+        turning = (np.swapaxes(R, 1, 2) @ Rdd).reshape(-1, 9)
+        return np.hstack([R.reshape(-1, 9), np.einsum("nji,nj->ni", R, a), turning])
+
+    np.testing.assert_allclose(found.columns(), columns(t), atol=0.02)
+    np.testing.assert_allclose(rate.columns(), (columns(t + 5 * h) - columns(t - 5 * h)) / (10 * h), atol=0.1)
+
+
+def test_wrist_3_winds_little_around_the_present_angle(plan: Plan) -> None:
+    assert plan.sweep is not None
+    most = np.abs(plan.sweep.at(np.arange(0.0, plan.sweep.duration_s, 0.001))[:, 5] - USUAL_POSTURE_RAD[5]).max()
+    for off_rad, winds in ((WRIST_6_RAD - most - 0.01, True), (WRIST_6_RAD - 0.5 * most, False)):
+        q = np.array(USUAL_POSTURE_RAD)
+        assert winds_little(plan.sweep, q)
+        q[5] -= off_rad
+        below = winds_little(plan.sweep, q)
+        q[5] += 2 * off_rad
+        assert (below and winds_little(plan.sweep, q)) == winds

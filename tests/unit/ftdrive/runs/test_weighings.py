@@ -26,7 +26,11 @@ def test_every_reason_has_a_count() -> None:
 
 def test_several_writers_share_one_file(tmp_path: Path) -> None:
     first, second = (WeighingsFile.of(tmp_path / "weighings", ORIGIN, DAY) for _ in range(2))
-    assert first.path == second.path
+    assert (
+        first.path == second.path == tmp_path / "weighings" / "weighings-2026-11-26-4c9c470a.ndjson"
+    )  # of any version
+    reordered = dict(reversed(ORIGIN.items()))
+    assert WeighingsFile.of(tmp_path / "weighings", reordered, DAY).path == first.path
     assert WeighingsFile.of(tmp_path, {**ORIGIN, "tool": "drill"}, DAY).path.name != first.path.name
     first.append([part(0.1)])
     first.read()

@@ -278,3 +278,38 @@ def test_a_cylinder_that_cannot_be_is_refused(sizes: tuple[float, float, float])
 def test_a_tool_of_nothing_is_refused() -> None:
     with pytest.raises(ConfigError, match="tool is empty"):
         ArmModel("UR5e", [])
+
+
+def along(axis: str, centre: tuple[float, float, float], half_m: float, radius_m: float, rounding_m: float) -> Bodies:
+    return one(centre, np.eye(3)["xyz".index(axis)], half_m, radius_m, rounding_m)
+
+
+@pytest.mark.parametrize(
+    ("other", "distance_m"),
+    [
+        (along("z", (0.0, 0.0, 0.5), 0.2, 0.03, 0.02), 0.2),  # lid to lid
+        (along("x", (0.0, 0.0, 0.3), 0.2, 0.03, 0.02), 0.17),  # side to lid
+        (along("x", (0.0, 0.2, 0.0), 0.4, 0.03, 0.02), 0.12),  # side to side, crossed
+        (along("z", (0.3, 0.0, 0.4), 0.1, 0.05, 0.02), np.hypot(0.2, 0.2)),  # rim to rim
+        (along("z", (0.3, 0.4, 0.0), 0.1, 0.0, 0.02), 0.45),  # side to a capsule
+    ],
+)
+def test_distances_of_cylinders_by_hand(other: Bodies, distance_m: float) -> None:
+    body = along("z", (0.0, 0.0, 0.0), 0.1, 0.05, 0.01)
+    for pair in ((body, other), (other, body)):
+        assert separation(*pair, np.array([np.inf]))[0] == pytest.approx(distance_m - 0.03, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("body", "distance_m"),
+    [
+        (along("z", (0.2, 0.2, 0.5), 0.1, 0.05, 0.02), 0.2),  # lid to face
+        (along("x", (0.2, 0.3, -0.2), 0.3, 0.05, 0.02), 0.25),  # side to face
+        (along("z", (-0.2, -0.3, 0.15), 0.02, 0.05, 0.02), 0.45),  # side to edge
+        (along("z", (0.2, 0.3, 0.15), 0.02, 0.05, 0.02), -0.98),  # inside: no depth is computed
+    ],
+)
+def test_distances_from_a_box_by_hand(body: Bodies, distance_m: float) -> None:
+    low, high = np.array([0.1, 0.1, 0.1]), np.array([0.3, 0.5, 0.2])
+    found = separation_from_box(body, low, high)[0]
+    assert found == pytest.approx(distance_m - 0.02, abs=2e-5) if distance_m > 0 else found <= 0

@@ -1,0 +1,159 @@
+"""The distance of a reading from a free tool, its limit, and what joins readings to contacts."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
+from ftcalib.model import Array
+from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia, _hotelling
+from ftdrive.live.noise import Noise
+from tests.unit.ftdrive.live.simulated import calibrated
+
+RATE_HZ, SIZE = 1000.0, 20
+"""A reading is 0.02 s."""
+MASS_KG = 1.5
+BEYOND = np.repeat([1e-4, 1e-6], 3)
+RNG = np.random.default_rng(3)
+ROOT = RNG.standard_normal((6, 6)) * np.repeat([0.05, 0.002], 3)[:, None]
+NOISE = Noise(np.eye(6), ROOT @ ROOT.T, np.diag(np.repeat([1e-3, 1e-5], 3)), 300.0)
+R = np.linalg.qr(RNG.standard_normal((3, 3)))[0]
+FRICTION_AXIS = np.array([0.0, 0.6, 0.8])
+
+
+class Known:
+    """The noise of every state."""
+
+    def of(self, _: int) -> Noise:
+        return NOISE
+
+
+def judged(
+    test: ContactTest, residual: Array, predicted: Array, state: int, felt: Array, inertia: Inertia
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    calibration = calibrated()
+    test.expect((calibration.parameters, calibration.covariance, calibration.response), MASS_KG, tensor_known=False)
+    n = len(residual)
+    motion: Any = np.full(n, state, np.int8), np.tile(felt, (n, 1))
+    noise: Any = Known()
+    poses = np.tile(R, (n, 1, 1))
+    return test.judge(residual, predicted, poses, motion, noise, delay_sigma_s=0.003, inertia=inertia)
+
+
+def test_the_limit_is_that_of_an_estimated_covariance() -> None:
+    rng, dof, n = np.random.default_rng(1), 20, 10_000
+    samples, readings = rng.standard_normal((n, dof, 6)), rng.standard_normal((n, 6))
+    squared = np.einsum(
+        "ni,ni->n", readings, np.linalg.solve(np.swapaxes(samples, 1, 2) @ samples / dof, readings[..., None])[..., 0]
+    )
+    for rate in (0.1, 0.02):
+        assert (squared > _hotelling(rate, dof)).mean() == pytest.approx(rate, rel=0.1)
+    assert _hotelling(0.01, 6.0) == float("inf") > _hotelling(0.01, 6.1)
+
+
+@pytest.mark.parametrize("state", [0, 2])
+@pytest.mark.parametrize("inertia", Inertia)
+def test_the_distance_has_all_that_is_not_known_in_its_covariance(state: int, inertia: Inertia) -> None:
+    test = ContactTest(RATE_HZ, 1e-4, BEYOND, FRICTION_AXIS)
+    residual = RNG.standard_normal((2 * SIZE, 6)) * np.repeat([0.2, 0.01], 3)
+    predicted = np.outer(np.arange(2 * SIZE), [0.02, 0.01, -0.03, 1e-3, 2e-3, -1e-3])
+    felt = np.array([0.1, 0.2, 0.0, 0.003, 0.002, 0.0])
+    readings, chi2, beyond = judged(test, residual, predicted, state, felt, inertia)
+    reading = residual[SIZE:].mean(axis=0)
+    np.testing.assert_allclose(readings[-1], reading, atol=1e-12)
+    calibration = calibrated()
+    uncertainty = predicted_covariance(calibration.parameters, calibration.covariance, calibration.response, R)
+    covariance = uncertainty + np.diag(BEYOND) + NOISE.reading + NOISE.wander
+    if state:
+        tool_kg_m2 = MASS_KG * 0.08**2
+        acceleration_m_s2 = {Inertia.UNKNOWN: 1.0, Inertia.COARSE: 0.3, Inertia.EXACT: 0.0}[inertia]
+        for axis in np.eye(3):
+            force_N = MASS_KG * acceleration_m_s2 * axis
+            pull = np.r_[force_N, np.cross(calibration.parameters.p_sensor_com_m, force_N)]
+            covariance += np.outer(pull, pull)
+            turn = np.r_[np.zeros(3), tool_kg_m2 * 2.5 * axis]
+            covariance += np.outer(turn, turn)
+        friction = 0.15 * np.r_[np.zeros(3), FRICTION_AXIS]
+        covariance += np.outer(friction, friction)
+        change = predicted[-1] - predicted[-1 - SIZE]
+        inexact = change * np.hypot(0.003, 0.005) / 0.02
+    else:
+        inexact = felt
+    covariance += np.outer(inexact, inexact)
+    assert chi2[-1] == pytest.approx(reading @ np.linalg.solve(covariance, reading))
+    assert test.limit == _hotelling(1e-4, NOISE.dof)
+    np.testing.assert_array_equal(beyond, chi2 > test.limit)
+    np.testing.assert_allclose(test.uncertainty, uncertainty + np.diag(BEYOND))
+    restarted = judged(test, np.zeros((0, 6)), np.zeros((0, 6)), state, felt, inertia)
+    assert [len(one) for one in restarted] == [0, 0, 0]
+
+
+def test_at_rest_a_small_load_becomes_the_offset_of_the_free_tool() -> None:
+    test, load = ContactTest(RATE_HZ, 1e-4, BEYOND), np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    nothing, step = np.zeros(6), 10 * SIZE
+    for k in range(1, 31):
+        _, _, beyond = judged(test, np.tile(load, (step, 1)), np.zeros((step, 6)), 0, nothing, Inertia.EXACT)
+        assert not beyond.any()
+        np.testing.assert_allclose(test._offset, (1 - 0.9**k) * load, atol=1e-12)
+        assert test._share == pytest.approx(0.9 ** (2 * k))
+
+
+def test_the_offset_follows_no_farther_than_drift_and_the_error_of_the_calibration() -> None:
+    test, load = ContactTest(RATE_HZ, 1e-40, BEYOND), np.array([0.8, 0.0, 0.0, 0.03, 0.0, 0.0])
+    nothing, step = np.zeros(6), 10 * SIZE
+    for k in range(1, 21):
+        judged(test, np.tile(k / 20 * load, (step, 1)), np.zeros((step, 6)), 0, nothing, Inertia.EXACT)
+    for _ in range(30):
+        judged(test, np.tile(load, (step, 1)), np.zeros((step, 6)), 0, nothing, Inertia.EXACT)
+    sigma = np.sqrt(np.diag(test.uncertainty))
+    np.testing.assert_allclose(test._offset[[0, 3]], [0.5 + 3 * sigma[0], 0.015 + 3 * sigma[3]])
+    before = test._offset.copy()
+    judged(test, np.tile(load, (step, 1)), np.zeros((step, 6)), 1, nothing, Inertia.EXACT)
+    np.testing.assert_array_equal(test._offset, before)  # not in motion
+
+
+def test_a_contact_has_a_line_of_force() -> None:
+    force_N, at_m = np.array([3.0, 0.0, -4.0]), np.array([0.1, 0.02, 0.05])
+    contact = Contact(2 * 10**9, 5 * 10**9, 5.0, np.r_[force_N, np.cross(at_m, force_N)])
+    assert (contact.t_s, contact.duration_s) == (2.0, 3.0)
+    np.testing.assert_allclose(contact.direction, [0.6, 0.0, -0.8])
+    np.testing.assert_allclose(contact.line_m, at_m - (at_m @ force_N) * force_N / 25.0)
+    torque = Contact(0, 1, 0.0, np.array([0.0, 0, 0, 0, 0, 1.0]))
+    assert not torque.direction.any()
+    assert not torque.line_m.any()
+
+
+@pytest.mark.parametrize(("soon", "begin"), [(False, 40), (True, 20)])
+@pytest.mark.parametrize("block", [1000, 7])
+def test_three_readings_in_a_row_begin_a_contact_and_end_it(soon: bool, begin: int, block: int) -> None:
+    n, start, stop = 400, 100, 250
+    t_ns = np.arange(n) * 10**6
+    beyond = (np.arange(n) >= start) & (np.arange(n) < stop)
+    readings = np.outer(np.where(np.arange(n) == 200, 9.0, 2.0) * beyond, [0.6, 0.8, 0, 0, 0, 0.1])
+    tracker, in_contact, changes = ContactTracker(RATE_HZ), [], []
+    for i in range(0, n, block):
+        part = slice(i, i + block)
+        m = len(t_ns[part])
+        found, changed = tracker.follow(t_ns[part], beyond[part], readings[part], np.full(m, soon))
+        in_contact.append(found)
+        changes += changed
+    expected = (np.arange(n) >= start + begin) & (np.arange(n) < stop + 40)
+    np.testing.assert_array_equal(np.concatenate(in_contact), expected)
+    began, over = changes
+    assert (began.over, over.over) == (False, True)
+    assert began.begin_ns == over.begin_ns == start * 10**6
+    assert over.last_ns == (stop - 1) * 10**6
+    assert over.peak_N == pytest.approx(9.0)
+    np.testing.assert_allclose(over.peak, readings[200])
+    assert tracker.end() == []
+
+
+def test_an_open_contact_ends_with_the_recording() -> None:
+    tracker = ContactTracker(RATE_HZ)
+    beyond, readings = np.ones(60, np.bool_), np.tile([1.0, 0, 0, 0, 0, 0], (60, 1))
+    (began,) = tracker.follow(np.arange(60) * 10**6, beyond, readings, np.zeros(60, np.bool_))[1]
+    (over,) = tracker.end()
+    assert (began.over, over.over, over.last_ns) == (False, True, 59 * 10**6)
+    assert not tracker.follow(np.arange(60, 90) * 10**6, beyond[:30], readings[:30], np.zeros(30, np.bool_))[0].any()

@@ -1,0 +1,105 @@
+"""States of motion at their limits, and the wrench of an accelerated load."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ftcalib.model import Array
+from ftdrive.live.motion import REST, STATES, MotionTracker
+from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, TRUTH
+
+RATE_HZ, MASS_KG = 1000.0, 1.5
+CENTRED = TRUTH.R_flange_sensor @ -TRUTH.p_sensor_com_m
+"""Origin of a sensor whose centre of mass is that of the flange, so that turning does not move it."""
+
+
+def follow(angle_rad: Array, p_m: Array | None = None, origin_m: Array = CENTRED) -> tuple[NDArray[np.int8], Array]:
+    """States and wrench of a flange that turns by these angles about z and is at these places."""
+    R = Rotation.from_rotvec(np.outer(angle_rad, [0.0, 0.0, 1.0])).as_matrix()
+    p = np.zeros((len(R), 3)) if p_m is None else p_m
+    return MotionTracker(RATE_HZ, MASS_KG, TRUTH, origin_m).follow(R, p)
+
+
+def seconds(duration_s: float) -> Array:
+    return np.arange(0, duration_s, 1 / RATE_HZ)
+
+
+@pytest.mark.parametrize(
+    ("speed", "state"),
+    [(0.0098, REST), (0.0104, 1), (0.147, 1), (0.153, 3), (0.393, 3), (0.407, 5), (0.69, 5), (0.71, STATES - 1)],
+)
+def test_speeds_have_classes(speed: float, state: int) -> None:
+    t_s = seconds(0.6)
+    assert follow(speed * t_s)[0][-1] == state
+    lever_m = 0.5 if speed > 0.1 else 1.0  # what counts as motion at all is 0.01 rad/s and 0.01 m/s
+    assert follow(0 * t_s, np.outer(lever_m * speed * t_s, [0.0, -1.0, 0.0]))[0][-1] == state
+
+
+def test_an_unknown_position_does_not_move_and_an_unknown_sensor_turns_about_the_flange() -> None:
+    t_s = seconds(0.3)
+    unknown = np.full((len(t_s), 3), np.nan)
+    assert not follow(0 * t_s, unknown)[0].any()
+    np.testing.assert_array_equal(
+        follow(1.0 * t_s, unknown, np.full(3, np.nan))[1], follow(1.0 * t_s, origin_m=np.zeros(3))[1]
+    )
+
+
+@pytest.mark.parametrize(("turn", "steady"), [(1.0, 1), (0.0, 1)])
+def test_a_change_of_speed_has_its_own_class(turn: float, steady: int) -> None:
+    t_s, omega = seconds(1.2), 20.0
+    for acceleration, state in ((1.4, steady), (1.75, steady + 1)):
+        angle = acceleration / omega**2 * np.sin(omega * t_s)
+        states, _ = follow(turn * angle, np.outer((1 - turn) * 0.5 * angle, [0.6, 0.8, 0.0]))
+        assert states[-1] == state
+
+
+def test_an_even_fast_turn_is_no_change_of_speed() -> None:
+    t_s, speed = seconds(0.8), 0.38
+    for omega, state in ((4.15, 3), (4.5, 4)):  # the acceleration is beyond 1.5 in both
+        radius_m = 0.5 * speed / omega
+        circle = radius_m * np.stack([np.cos(omega * t_s), np.sin(omega * t_s), 0 * t_s], axis=1)
+        assert (speed * omega > 1.5 + speed**2) == (state == 4)
+        assert follow(0 * t_s, circle)[0][-1] == state
+
+
+def test_rest_begins_half_a_second_after_the_last_motion_and_a_state_rings_for_less() -> None:
+    t_s = seconds(3.0)
+    fast_until_s, slow_until_s = 1.0, 2.0
+    angle = 0.8 * np.minimum(t_s, fast_until_s) + 0.1 * np.clip(t_s - fast_until_s, 0, slow_until_s - fast_until_s)
+    states, _ = follow(angle)
+    first = {state: t_s[np.flatnonzero((states == state) & (t_s > 0.5))[0]] for state in (1, REST)}
+    assert 1.4 < first[1] < 1.46
+    assert 2.5 < first[REST] < 2.56
+    assert states[0] == REST
+    assert t_s[np.flatnonzero(states)[0]] < 0.02  # soon after the begin
+
+
+def test_blocks_of_any_size_have_the_same_states() -> None:
+    t_s = seconds(2.0)
+    angle, p_m = 0.05 * np.sin(9 * t_s) * (t_s < 1.2), np.outer(0.02 * np.sin(7 * t_s) * (t_s < 1.0), [1, 2, 0])
+    R = Rotation.from_rotvec(np.outer(angle, [0.6, 0.0, 0.8])).as_matrix()
+    states, felt = MotionTracker(RATE_HZ, MASS_KG, TRUTH, P_FLANGE_SENSOR_M).follow(R, p_m)
+    tracker, pieces = MotionTracker(RATE_HZ, MASS_KG, TRUTH, P_FLANGE_SENSOR_M), []
+    for piece in np.split(np.arange(len(t_s)), [0, 1, 8, 300, 301, 900, 1500]):
+        pieces.append(tracker.follow(R[piece], p_m[piece]))
+    np.testing.assert_array_equal(np.concatenate([one for one, _ in pieces]), states)
+    np.testing.assert_allclose(np.concatenate([one for _, one in pieces]), felt, atol=1e-6)
+
+
+def test_an_accelerated_load_pulls_back_at_its_centre_of_mass() -> None:
+    t_s, R = seconds(0.5), Rotation.from_euler("xyz", [150, 20, 40], degrees=True).as_matrix()
+    acceleration = np.array([0.01, 0.0, 0.0])
+    tracker = MotionTracker(RATE_HZ, MASS_KG, TRUTH, P_FLANGE_SENSOR_M)
+    states, felt = tracker.follow(np.tile(R, (len(t_s), 1, 1)), np.outer(t_s**2 / 2, acceleration))
+    force_N = -MASS_KG * acceleration @ (R @ TRUTH.R_flange_sensor)
+    np.testing.assert_allclose(felt[-1], np.r_[force_N, np.cross(TRUTH.p_sensor_com_m, force_N)], atol=1e-6)
+    begin_s = t_s[np.flatnonzero(felt.any(axis=1))[0]]
+    assert 0.2 < begin_s < 0.225  # at 2 mm/s, long before 10 mm/s are a motion
+    assert not states.any()
+
+
+def test_fast_motion_is_not_divided_by_acceleration() -> None:
+    t_s, omega, speed = seconds(1.2), 20.0, 0.5
+    angle = speed * t_s + 2.2 / omega**2 * np.sin(omega * t_s)  # from 0.39 to 0.61 rad/s, beyond 1.5 + speed²
+    assert set(follow(angle)[0][600:].tolist()) == {5}

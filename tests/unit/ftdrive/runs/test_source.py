@@ -1,0 +1,42 @@
+"""What else a place says beside its poses."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ftcalib import CalibrationDataset, Known
+from ftcalib.errors import BadDataset
+from ftcalib.model import STANDARD_GRAVITY_M_S2
+from ftdrive.runs.run import Run
+from ftdrive.runs.source import read_source
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    R, wrench, covariance = (np.tile(one, (3, 1, 1)) for one in (np.eye(3), np.zeros(6), np.eye(6)))
+    path = tmp_path / "dataset.json"
+    CalibrationDataset(R, wrench[:, 0], covariance, np.zeros(3, np.int64), np.full(3, np.nan)).save(path)
+    return path
+
+
+@pytest.mark.parametrize(("up", "down"), [(None, (0.0, 0.0, -1.0)), ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0))])
+def test_a_known_direction_of_gravity_is_that_of_the_mounting(
+    dataset: Path, up: tuple[float, float, float] | None, down: tuple[float, float, float]
+) -> None:
+    found = read_source(dataset, "R_base_flange", Known(gravity_direction_base=(0, 0, -1), mass_kg=2.0), up)
+    known = found.circumstances["known"]
+    np.testing.assert_array_equal(known.gravity_direction_base, down)
+    assert known.mass_kg == 2.0
+    assert found.circumstances["g_m_s2"] == STANDARD_GRAVITY_M_S2
+    assert found.provenance.get("up_in_base") == (None if up is None else list(up))
+    free = read_source(dataset, "R_base_flange", Known(mass_kg=2.0), up).circumstances["known"]
+    assert free.gravity_direction_base is None
+    assert read_source(dataset, "R_base_flange").circumstances["known"] is None
+
+
+def test_a_recording_in_motion_has_no_poses(tmp_path: Path) -> None:
+    run = Run.create(tmp_path, "gripper", {})
+    run.motion_path.touch()
+    with pytest.raises(BadDataset, match="in motion"):
+        read_source(run.folder, "R_base_flange")
