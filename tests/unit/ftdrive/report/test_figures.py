@@ -22,14 +22,14 @@ def drawn() -> Iterator[Draw]:
     figures, checked = list[Any](), set[str]()
 
     class Unsaved(matplotlib.figure.Figure):
-        def savefig(self, file: Any, **_: Any) -> None:
+        def savefig(self, fname: Any, **_: Any) -> None:
             if name not in checked:  # it takes longer than the rest
                 checked.add(name)
                 box = self.get_tightbbox(FigureCanvasAgg(self).get_renderer())  # type: ignore[no-untyped-call]
                 assert min(box.x0, box.y0) >= 0
                 assert box.x1 <= WIDTH_IN
                 assert box.y1 <= self.get_figheight()
-            file.write('<svg viewBox="0 0 1 1"></svg>')
+            fname.write('<svg viewBox="0 0 1 1"></svg>')
             figures.append(self)
 
     name = ""
@@ -138,7 +138,7 @@ def test_methods_are_bars_within_whole_decades(drawn: Draw) -> None:
     for axes, values, limits, unit in zip(
         figure.axes, ([0.8, 0.12], [50, 3]), ((0.01, 1), (1, 100)), ("N rms", "mN·m rms"), strict=True
     ):
-        np.testing.assert_allclose([bar.get_width() for bar in axes.patches], values)
+        assert [bar.get_width() for bar in axes.patches] == pytest.approx(values)
         assert [to_hex(bar.get_facecolor()) for bar in axes.patches] == [SERIES[0], SERIES[1]]
         assert axes.get_xlim() == pytest.approx(limits)
         assert (axes.get_xscale(), axes.get_xlabel()) == ("log", unit)
