@@ -187,6 +187,13 @@ def test_a_busy_broker_at_the_start_is_an_outage(monkeypatch: pytest.MonkeyPatch
     assert not fleet.wake.is_set()
 
 
+def test_a_failed_attempt_without_a_reason_is_no_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet = Fleet(monkeypatch)
+    fleet.messages.update(reading(cell("A")))
+    fleet.client.on_connect_fail(fleet.client, None)
+    assert fleet.said == [LOST.format("no connection")]
+
+
 @pytest.mark.parametrize("answers", [True, False])
 def test_the_end_is_published_if_the_broker_answers(answers: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     fleet = Fleet(monkeypatch)

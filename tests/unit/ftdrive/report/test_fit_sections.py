@@ -77,7 +77,7 @@ def test_gain_and_cross_talk_have_their_units() -> None:
 def test_the_error_is_listed_with_its_worst_direction() -> None:
     one = {"map": [[0.01, 0.02]], "rms": 0.0152, "largest": 0.0231, "axes": "+z", "words": "up"}
     other = {"map": [[0.001, 0.002]], "rms": 0.00125, "largest": 0.00231, "axes": "-x", "words": "along -x"}
-    facts = {
+    facts: dict[str, Any] = {
         "error_map": {"force_N": one, "torque_Nm": other},
         "error": {"words": "0.02 N rms", "cross_validated": True},
     }
@@ -118,7 +118,7 @@ def test_methods_are_compared_where_they_have_a_result() -> None:
     assert section.tables[0].rows[2][-2:] == ("-", "-")
     assert section.tables[1].rows == [("srom", "23 poses")]
     assert section.figures[0].alt.endswith("lrom has the smallest force error.")
-    none = {"force_N": None, "torque_Nm": None, "reason": "No poses.", "methods": []}
+    none: dict[str, Any] = {"force_N": None, "torque_Nm": None, "reason": "No poses.", "methods": []}
     assert cross_validation({"cross_validation": none}).text == ["Methods are not compared. No poses."]
     alone = cross_validation({"cross_validation": {**none, "reason": "", "methods": methods[2:3]}})
     assert (alone.figures, len(alone.tables)) == ([], 1)

@@ -114,6 +114,8 @@ def page() -> Page:
 
 def test_page_and_markdown_show_the_numbers_of_the_result() -> None:
     markdown = report(facts(), "md")
+    captions = {table.caption for section in sections_of(facts()) for table in section.tables} - {""}
+    assert {line[:-1] for line in markdown.splitlines() if line.endswith(":")} == captions
     for text in (markdown, page().text):
         assert result().id in text
         assert result().verdict.upper() in text

@@ -106,6 +106,7 @@ def test_a_scale_without_a_zero_asks_for_one() -> None:
     hint = "   not zeroed: press z with an empty gripper"
     assert scale.sigma == f"sigma 100 g, smallest mass 400 g{hint}"
     assert scale.line == "nothing: -0.00 ± 0.10 kg, less than 0.4 kg"
+    assert hint in Scale(FakeWeighing(Shown(replace(NOTHING, least_kg=0.101), None))).sigma
     assert hint not in Scale(FakeWeighing(Shown(replace(NOTHING, least_kg=0.099), None))).sigma
 
 
