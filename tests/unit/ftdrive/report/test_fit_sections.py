@@ -39,14 +39,15 @@ def estimated(result: Any, strong: Any = (), motion: Any = None) -> Any:
 
 def test_only_what_was_known_beforehand_is_fixed() -> None:
     sigma = np.full(15, 1e-3)
-    sigma[6:9] = 0.0, 1e-13, 1e-8
+    sigma[6:10] = 0.0, 1e-13, 1e-8, 1e-13
     table = estimated(replace(calibration(), covariance=np.diag(sigma**2))).tables[0]
     rows = {row[0]: row[1:] for row in table.rows}
     assert rows["force bias x, N"] == ("1.0000", "fixed")
     assert rows["force bias y, N"] == ("-2.0000", "fixed")
     assert rows["force bias z, N"] == ("0.000010000", "0.000000010")
+    assert rows["centre of mass x, mm"] == ("10.0000", "fixed")
     assert rows["torque bias y, N·m"] == ("-0.2000", "0.0010")
-    assert [values[1] for values in rows.values()].count("fixed") == 2
+    assert [values[1] for values in rows.values()].count("fixed") == 3
 
 
 def test_the_strongest_correlations_are_named() -> None:
@@ -154,6 +155,7 @@ def test_each_residual_is_in_the_table_and_the_worst_is_named() -> None:
     ]
     assert section.tables[0].caption == "Table of the residuals"
     assert section.figures[0].alt.endswith("the largest is 7.0 at pose R12.")
+    assert "none above the dashed line at 1.9." in section.figures[0].caption
     assert "against the order of the poses" in section.figures[1].alt
     assert "against time" in left(POSES[:2]).figures[1].alt
 

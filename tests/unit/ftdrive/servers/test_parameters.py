@@ -1,5 +1,6 @@
 """What clients may set of a stream, by Foxglove and by ROS 2: checked, and all of it or nothing."""
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -78,7 +79,7 @@ def test_foxglove_sets_all_or_nothing() -> None:
         "deadband_Nm": 0.0,
     }
     assert [one.name for one in parameters.on_get_parameters(client, ["axes", "bias"])] == ["axes", "bias"]
-    changes = {"axes": "tcp", "about": [0.0, 0.0, 0.1], "lowpass_Hz": 40.0, "notch_Hz": 0.0}
+    changes: dict[str, Any] = {"axes": "tcp", "about": [0.0, 0.0, 0.1], "lowpass_Hz": 40.0, "notch_Hz": 0.0}
     found = parameters.on_set_parameters(client, [Parameter(name, value=value) for name, value in changes.items()])
     assert {one.name: one.get_value() for one in found} == {**shown, **changes}
     before = stream.frame, stream.stages
@@ -94,13 +95,17 @@ class FakeNode:
     def __init__(self, **given: Any) -> None:
         self.given = given
         self.declared: dict[str, Any] = {}
+        self._changed: Callable[[list[Any]], Any]
 
     def declare_parameter(self, name: str, value: Any, descriptor: Any) -> Any:
         self.declared[name] = descriptor
         return SimpleNamespace(value=self.given.get(name, value))
 
     def add_on_set_parameters_callback(self, callback: Any) -> None:
-        self.set = lambda **values: callback([SimpleNamespace(name=name, value=one) for name, one in values.items()])
+        self._changed = callback
+
+    def set(self, **values: Any) -> Any:
+        return self._changed([SimpleNamespace(name=name, value=one) for name, one in values.items()])
 
 
 @pytest.fixture(autouse=True)
