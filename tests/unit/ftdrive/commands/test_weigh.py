@@ -30,6 +30,10 @@ class Scale:
         self.stream = SimpleNamespace(clock=FakeClock(), info=replace(INFO, emulated=True))
         self._states: Sequence[tuple[Shown, bool]] = states
         self.raises: bool | None = None
+        self.zeros = 0
+
+    def zero(self) -> None:
+        self.zeros += 1
 
     def states(self, *, raises: bool = False) -> Iterator[tuple[Shown, bool]]:
         self.raises = raises
@@ -88,6 +92,44 @@ def test_json_has_the_weight_and_why_there_is_none(capsys: pytest.CaptureFixture
     assert weight["calibration_id"] == INFO.calibration.id
     assert weight["marks"] == ["EMULATED"]
     assert (refused["refused"], refused["mass_kg"]) == ("cable", 0.81234)
+
+
+def weighed(scale: Scale, monkeypatch: pytest.MonkeyPatch, *options: str) -> tuple[dict[str, Any], str]:
+    """Run the command on a scale; return how it was opened, and stdout."""
+    opened: dict[str, Any] = {}
+
+    def open_source(_source: object, _frame: object, _stack: object, track: str) -> Any:
+        opened["track"] = track
+        return scale.stream
+
+    def weighing(_stream: object, _recorder: object, **named: Any) -> Any:
+        opened.update(named)
+        return scale
+
+    monkeypatch.setattr("ftdrive.commands.live_source.open_source", open_source)
+    monkeypatch.setattr("ftdrive.commands.live_source.open_log", lambda *_: None)
+    monkeypatch.setattr("ftdrive.terminal.weighing.Weighing", weighing)
+    outcome = CliRunner().invoke(cli, ["weigh", "--simulate", *options])
+    assert outcome.exit_code == 0, outcome.output
+    return opened, outcome.stdout
+
+
+def test_in_motion_one_answer_to_a_part_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    carried = [
+        (Shown(replace(one, poses=0, in_motion=True), None), True) for one in (replace(PART, mass_kg=0.001), PART)
+    ]
+    opened, out = weighed(Scale(*carried), monkeypatch, "--moving", "--once", "--count", "0.4")
+    assert (opened["track"], opened["moving"], opened["joins"], opened["part_kg"]) == ("show", True, False, 0.4)
+    assert out.startswith("0.8123 ")
+
+
+def test_a_zero_comes_first_and_then_a_part_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    scale = Scale((EMPTY, True), (ONE, True), (TWO, True))
+    opened, out = weighed(scale, monkeypatch, "--zero", "--once", "--poses", "2")
+    assert (opened["track"], opened["moving"], opened["joins"], scale.zeros) == ("off", False, True, 1)
+    assert out.startswith("0.3000 ")
+    opened, out = weighed(Scale((EMPTY, True)), monkeypatch, "--once")
+    assert (opened["joins"], out.startswith("nothing: ")) == (False, True)
 
 
 @pytest.mark.parametrize("option", [("--zero",), ("--poses", "2")])
