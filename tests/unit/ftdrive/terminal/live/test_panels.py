@@ -10,9 +10,8 @@ from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.terminal.live import panels
 from ftdrive.terminal.live.panels import line_of_force, others, sphere
 from ftdrive.terminal.live.view import Line, View
-from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, SIGMA, TARE
+from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, SIGMA, TARE, FakeStream
 from tests.unit.ftdrive.terminal.live.test_summary import Rig, reading_of
-from tests.unit.ftdrive.terminal.test_live_screen import FakeStream
 
 SENSOR = WrenchFrame("sensor", "sensor")
 
