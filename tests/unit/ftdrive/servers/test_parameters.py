@@ -13,7 +13,7 @@ from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.servers.parameter_values import checked_value
 from ftdrive.servers.parameters import Parameters
 from ftdrive.servers.ros2 import parameters as of_ros2
-from ftdrive.servers.ros2.parameters import NodeParameters
+from ftdrive.servers.ros2.parameters import Fixed, NodeParameters
 
 FRAME = WrenchFrame("base", "tcp")
 
@@ -128,6 +128,7 @@ def test_a_node_declares_what_it_has_and_what_cannot_change() -> None:
     assert {name for name, one in node.declared.items() if one.read_only} == fixed
     assert all(one.description and one.dynamic_typing for one in node.declared.values())
     assert len(node.declared) == 16
+    assert NodeParameters(FakeNode(), FRAME, "").fixed == Fixed(500.0, False, "base", "tool0", "ft_sensor", False)
 
 
 @pytest.mark.parametrize(
