@@ -323,7 +323,7 @@ _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callabl
     "time_residuals": (3.8, (0.65, 0.1, 0.5, 0.35), _time_residuals),
     "noise": (3.6, (0.65, 0.1, 0.65, 0.1), _noise),
     "coverage": (2.7, (0.1, 0.1, 0.1, 0.1), _coverage),
-    "sweep": (2.6, (0.65, 0.1, 0.5, 0.1), _sweep),
-    "comparison": (3.8, (1.15, 0.2, 0.5, 0.1), _comparison),
+    "sweep": (2.6, (0.65, 0.2, 0.5, 0.1), _sweep),
+    "comparison": (3.8, (1.2, 0.2, 0.5, 0.1), _comparison),
 }
 """Height and margins (left, right, bottom, top) in inches and how to draw it, by name."""

@@ -6,12 +6,14 @@ from typing import ClassVar
 from textual.app import App, ComposeResult
 from textual.widgets import Digits, Static
 
+from ftcalib.extras.weighing import Weight
 from ftcalib.rounding import to_place_of
 from ftdrive.errors import NotAccepted
-from ftdrive.terminal.weighing import Shown, Weighing, line_of
-from ftdrivers.errors import DeviceError
+from ftdrive.terminal.weighing import Shown, Weighing, line_of, number_of
 
 _REFRESH_S = 0.1
+_UNZEROED_KG = 0.1
+"""With a larger smallest mass the drift since the calibration decides, and a zero helps."""
 
 
 class _Reader(threading.Thread):
@@ -22,7 +24,7 @@ class _Reader(threading.Thread):
         self._weighing = weighing
         self.shown = Shown(None, "samples")
         self.note = ""
-        self.failure: DeviceError | None = None
+        self.failure: BaseException | None = None
         self.zero_requested = False
         self.ends = False
 
@@ -35,8 +37,9 @@ class _Reader(threading.Thread):
                     return
                 if self.zero_requested:
                     self.zero_requested = False
+                    self.shown = Shown(None, "samples")  # the number of before would look live
                     self.note = self._zero()
-        except DeviceError as error:
+        except BaseException as error:  # the main thread raises it
             self.failure = error
 
     def _zero(self) -> str:
@@ -57,7 +60,12 @@ class WeighApp(App[None]):
 
     ENABLE_COMMAND_PALETTE = False
     CSS = "Screen { layout: vertical; } Digits { margin: 1 2 0 2; } Static { margin: 0 2; } #keys { dock: bottom; }"
-    BINDINGS: ClassVar = [("z", "zero", "zero"), ("p", "poses", "poses"), ("q", "quit", "quit")]
+    BINDINGS: ClassVar = [
+        ("z", "zero", "zero"),
+        ("p", "poses", "poses"),
+        ("q", "quit", "quit"),
+        ("ctrl+c", "quit", "quit"),
+    ]
 
     def __init__(self, weighing: Weighing) -> None:
         super().__init__()
@@ -66,55 +74,60 @@ class WeighApp(App[None]):
 
     def compose(self) -> ComposeResult:
         """Yield the widgets."""
-        yield Static(f"ftdrive weigh   tool {self._weighing.stream.info.tool}")
+        info = self._weighing.stream.info
+        yield Static("   ".join(["ftdrive weigh", f"tool {info.tool}", *info.marks]), markup=False)
         yield Digits("-", id="mass")
         yield Static("", id="sigma")
-        yield Static("", id="line")
-        yield Static("", id="note")
-        yield Static(" z zero the empty gripper   p join poses of one load   q quit", id="keys")
+        yield Static("", id="line", markup=False)
+        yield Static("", id="note", markup=False)
+        keys = "" if self._weighing.moving else "z zero the empty gripper   p join poses of one load   "
+        yield Static(f"{keys}q quit", id="keys")
 
     def on_mount(self) -> None:
         """Start reading."""
         self.reader.start()
-        self.set_interval(_REFRESH_S, self._show)
+        self.set_interval(_REFRESH_S, self.draw)
 
-    def _show(self) -> None:
+    def draw(self) -> None:
+        """Show the present state."""
         if self.reader.failure is not None:
             self.exit()
             return
         shown = self.reader.shown
-        weight = shown.weight if shown.refusal is None else None
+        weight = shown.weight if shown.refusal in {None, "count"} else None  # what cannot be counted has a mass
         self.query_one("#mass", Digits).update(
-            "- - -" if weight is None else f"{to_place_of(weight.mass_kg, weight.mass_sigma_kg)} kg"
+            "- - -" if weight is None else f"{to_place_of(weight.mass_kg, weight.mass_sigma_kg, ' z')} kg"
         )
-        self.query_one("#sigma", Static).update(
-            "" if weight is None else _sigma_line(shown, joins=self._weighing.joins)
-        )
+        self.query_one("#sigma", Static).update("" if weight is None else self._sigma_line(weight, shown.count))
         self.query_one("#line", Static).update(line_of(shown))
         self.query_one("#note", Static).update(self.reader.note)
 
     def action_zero(self) -> None:
         """Tare the empty gripper."""
-        self.reader.note = "zero: half a second …"
-        self.reader.zero_requested = True
+        if not self._weighing.moving:
+            self.reader.note = "zero: waits for half a second at rest …"
+            self.reader.zero_requested = True
 
     def action_poses(self) -> None:
         """Join the poses of one load from now on, or stop that."""
-        self._weighing.joins = not self._weighing.joins
+        if not self._weighing.moving:
+            self._weighing.joins = not self._weighing.joins
 
-
-def _sigma_line(shown: Shown, *, joins: bool) -> str:
-    weight = shown.weight
-    assert weight is not None  # noqa: S101 - the caller has checked it
-    parts = "" if shown.count is None else f"{shown.count} parts   "
-    poses = f"   {weight.poses} poses joined, turn the tool for more" if joins else ""
-    sigma_g, least_g = 1e3 * weight.mass_sigma_kg, 1e3 * weight.least_kg
-    zero = "   zero first: drift since the calibration" if least_g > 100 else ""
-    return f"{parts}sigma {sigma_g:.2g} g, smallest mass {least_g:.2g} g{zero}{poses}"
+    def _sigma_line(self, weight: Weight, count: int | None) -> str:
+        sigma_g, least_g = (to_place_of(1e3 * kg, 1e3 * kg) for kg in (weight.mass_sigma_kg, weight.least_kg))
+        parts = "" if count is None else f"{number_of(count, 'part')}   "
+        words = f"{parts}sigma {sigma_g} g, smallest mass {least_g} g"
+        if self._weighing.moving:
+            return words
+        if self._weighing.joins:
+            words += f"   {number_of(weight.poses, 'pose')} joined, turn the tool for more"
+        if weight.least_kg > _UNZEROED_KG:
+            words += "   not zeroed: press z with an empty gripper"
+        return words
 
 
 def run_weigh(weighing: Weighing) -> None:
-    """Show the scale until the user quits. Raises the failure of the stream."""
+    """Show the scale until the user quits. Raises what ends it otherwise: of a device, or of the recording."""
     app = WeighApp(weighing)
     try:
         app.run()

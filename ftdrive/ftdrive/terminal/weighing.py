@@ -63,7 +63,7 @@ class Weighing:
     ) -> None:
         self.stream, self.part_kg = stream, part_kg
         self._log = log
-        self.joins, self._moving = joins, moving
+        self.joins, self.moving = joins, moving
         self._recorder = recorder
         self._scale = Scale(stream)
         self._last: Weight | None = None
@@ -125,7 +125,7 @@ class Weighing:
 
     def _weighed(self) -> Shown:
         try:
-            weight = weigh_in_motion(self.stream) if self._moving else self._scale.weigh(more=self.joins)
+            weight = weigh_in_motion(self.stream) if self.moving else self._scale.weigh(more=self.joins)
             return Shown(weight, None, None if self.part_kg is None else count_of(weight, self.part_kg))
         except CannotWeigh as refusal:
             if refusal.code not in ("unsteady", "samples"):  # then it may be the same load as before
@@ -167,8 +167,13 @@ def line_of(shown: Shown) -> str:
     assert weight is not None  # noqa: S101 - without a refusal there is a weight
     if not weight.is_something:
         return f"nothing: {with_sigma(weight.mass_kg, weight.mass_sigma_kg)} kg, less than {weight.least_kg:.2g} kg"
-    parts = "" if shown.count is None else f"{shown.count} part{'' if shown.count == 1 else 's'}, "
+    parts = "" if shown.count is None else f"{number_of(shown.count, 'part')}, "
     com = ", ".join(
         with_sigma(1e3 * x, 1e3 * s) for x, s in zip(weight.p_sensor_com_m, weight.com_sigma_m, strict=True)
     )
     return f"{parts}{with_sigma(weight.mass_kg, weight.mass_sigma_kg)} kg at ({com}) mm from the sensor origin"
+
+
+def number_of(count: int, name: str) -> str:
+    """Return "1 part", "2 parts"."""
+    return f"{count} {name}{'' if count == 1 else 's'}"

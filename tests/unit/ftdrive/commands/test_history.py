@@ -161,6 +161,11 @@ def test_two_calibrations_are_compared_by_file_run_and_id(run: Callable[..., Ran
     code, out, _ = run("diff", first.id, second.id)
     assert code == 0
     assert out.splitlines()[-1].startswith("They differ significantly (chi2 ")
+    scales = np.repeat([np.degrees(1), 1.0, 1.0, 1e3, 1.0], 3)  # of the rows, in °, N, N, mm, N·m
+    for line, one, scale in zip(out.splitlines()[4:19], by_id["parameters"], scales, strict=True):
+        assert float(line[34:46]) == pytest.approx(scale * one["sigma"], rel=0.06)
+        change = 0.0 if "same" in line else float(line[22:34])
+        assert change == pytest.approx(scale * one["change"], abs=0.06 * scale * one["sigma"])
     assert out.splitlines()[-1].endswith("): force bias.")
     assert run("diff", first.id, first.id)[1].splitlines()[-1] == "The calibrations are the same."
 

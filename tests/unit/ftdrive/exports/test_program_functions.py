@@ -1,6 +1,7 @@
 """The functions for a UR program: complete, for any first register. tests/wire runs them."""
 
 import json
+from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -20,8 +21,14 @@ def test_every_name_has_its_register(first: int, doubles: int) -> None:
     assert "read_input_integer_register(23)" not in text
 
 
-def test_the_command_prints_or_saves() -> None:
+def test_the_command_prints_or_saves(tmp_path: Path) -> None:
     plain = CliRunner().invoke(urscript, ["--first", "26"]).stdout
     assert plain == functions(26)
     answer = json.loads(CliRunner().invoke(urscript, ["--json", "--example"]).stdout)
-    assert answer["text"] == functions(24, example=True)
+    assert (answer["text"], answer["file"]) == (functions(24, example=True), None)
+    path = tmp_path / "ftd.script"
+    saved = CliRunner().invoke(urscript, ["-o", str(path)]).stdout
+    assert "".join(saved.split()) == f"Saved{path}"
+    assert path.read_text() == functions(24)
+    answer = json.loads(CliRunner().invoke(urscript, ["--json", "-o", str(tmp_path / "two.script")]).stdout)
+    assert answer["file"] == str(tmp_path / "two.script")

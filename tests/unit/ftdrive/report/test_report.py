@@ -114,6 +114,8 @@ def page() -> Page:
 
 def test_page_and_markdown_show_the_numbers_of_the_result() -> None:
     markdown = report(facts(), "md")
+    captions = {table.caption for section in sections_of(facts()) for table in section.tables} - {""}
+    assert {line[:-1] for line in markdown.splitlines() if line.endswith(":")} == captions
     for text in (markdown, page().text):
         assert result().id in text
         assert result().verdict.upper() in text
@@ -126,14 +128,19 @@ def test_page_and_markdown_show_the_numbers_of_the_result() -> None:
     assert mass.split("|")[2].strip() in page().text.split()
     assert markdown.count("\n| ml |") == 1
     assert all(section.title in page().text for section in sections_of(facts()))
+    assert [section.name for section in sections_of(facts())] == [
+        *("estimates", "error", "cross-validation", "residuals", "drift"),
+        *("noise", "coverage", "tour", "comparison", "provenance"),
+    ]
 
 
 def test_a_result_in_motion_is_not_reported_as_poses() -> None:
     motion = MotionResult(2e-3 * np.eye(3), 0.003, 0.04, 1e-8 * np.eye(23), 0.9)
     found = facts_of(Subject(Path("sweep"), replace(result(), motion=motion), ""))
     named = {section.name: section for section in sections_of(found)}
-    assert "motion" in named
-    assert not named.keys() & {"cross-validation", "noise"}
+    assert list(named) == [
+        *("estimates", "error", "motion", "residuals", "coverage", "tour", "comparison", "provenance"),
+    ]
     assert "parts of the motion" in named["estimates"].text[0]
     assert [figure.name for figure in named["residuals"].figures] == ["time_residuals"]
 

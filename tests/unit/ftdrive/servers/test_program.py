@@ -146,6 +146,85 @@ def test_a_lost_controller_is_reported_once() -> None:
     assert "cable is cut" in cell.said[0]
 
 
+class Unsteady:
+    """A stream that reads a list of blocks and errors, then is interrupted."""
+
+    def __init__(self, stream: Any, *reads: Any) -> None:
+        self.stream, self.reads, self.taken = stream, list(reads), 0
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+    def read(self) -> Any:
+        if not self.reads:
+            raise KeyboardInterrupt
+        found = self.reads.pop(0)
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def take_events(self) -> list[Any]:
+        self.taken += 1
+        return []
+
+
+def test_a_silent_stream_is_reported_once_and_its_return_too() -> None:
+    cell = Cell((POSE, NOTHING))
+    blocks = [cell.stream.read() for _ in range(3)]
+    broken = StreamBroken("no sample for 0.3 s")
+    unsteady = Unsteady(cell.stream, broken, broken, *blocks[:2], broken, blocks[2])
+    cell.service._stream = cast("Any", unsteady)
+    heard: list[Any] = []
+    cell.service.on_block = heard.append
+    with pytest.raises(KeyboardInterrupt):
+        cell.service._serve()
+    lost, again = "no sample for 0.3 s. The program sees a stale wrench.", "Samples arrive again."
+    assert cell.said == [lost, again, lost, again]
+    assert (heard, unsteady.taken, len(cell.registers.written)) == (blocks, 3, 3)
+
+
+def test_a_program_sees_that_the_service_has_ended() -> None:
+    cell = Cell((POSE, NOTHING))
+    cell.run(0.1)
+    closed: list[bool] = []
+    cell.registers.close = lambda: closed.append(True)  # type: ignore[method-assign]
+    cell.service.stop()
+    last = cell.registers.written[-1]
+    assert (last["state"], last["condition"], closed) == (0, 3, [True])
+
+
+def test_a_wrench_without_new_samples_is_stale_and_a_lost_controller_is_called_again() -> None:
+    cell = Cell((POSE, NOTHING))
+    cell.run(0.1)
+    service, clock = cell.service, cell.stream.clock
+    service._newest_ns = clock.now_ns() - 10**8
+    service._ends = cast("Any", Turns(service, cell.registers))
+    written = len(cell.registers.written)
+    service._watch()
+    assert [one["condition"] for one in cell.registers.written[written:]] == [3], "once"
+    assert cell.said == ["The controller answers again."]
+    assert service._registers is cell.registers
+    service._connect = lambda: (_ for _ in ()).throw(StreamBroken("still off"))
+    service._registers = None
+    service._reconnect()
+    assert service._registers is None
+    assert cell.ask(9, STATUS, 0.02)["state"], "nothing is written to nobody"
+
+
+class Turns:
+    """Lets `_watch` look five times; before the third the controller is lost, before the fourth samples are new."""
+
+    def __init__(self, service: Any, registers: FakeRegisters) -> None:
+        self.service, self.registers, self.turn = service, registers, 0
+
+    def wait(self, seconds: float) -> bool:
+        if seconds == 0.02:
+            self.turn += 1
+        if self.turn == 3:
+            self.service._registers = None
+        return self.turn > 5
+
+
 def test_answers_of_weighings_are_kept_and_others_are_not() -> None:
     push = np.array([0, 8.0, 0, 0, 0, 0])
     cell = Cell((POSE, NOTHING), (POSE, part(POSE, 0.8)), (POSE, part(POSE, 0.8)), (POSE, push), seconds=1.5)

@@ -24,7 +24,7 @@ from ftdrive.terminal.console import messages
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.layout import frame
 from ftdrive.terminal.live.summary import Summary
-from ftdrive.terminal.live_screen import LiveApp, run_live
+from ftdrive.terminal.live_screen import LiveApp, _press, run_live
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import FREE, INFO, R_BASE_FLANGE, SIGMA, START_NS, FakeStream, Scenario
@@ -103,6 +103,16 @@ def test_every_size_is_filled_exactly(scenario: Scenario) -> None:
             lines = frame(view, width, height)
             assert {line.width for line in lines} == {width}
             assert len(lines) == height
+
+
+@pytest.mark.parametrize(("rate_Hz", "lowpass_Hz"), [(7000.0, 40.0), (100.0, 25.0)])
+def test_the_low_pass_fits_the_rate_of_the_sensor(rate_Hz: float, lowpass_Hz: float) -> None:
+    feed = MagicMock()
+    feed.stream.info.sensor_rate_Hz, feed.stream.stages = rate_Hz, Stages()
+    _press(feed, "4")
+    assert feed.stream.stages == Stages(lowpass_Hz=lowpass_Hz)
+    _press(feed, "4")
+    assert feed.stream.stages == Stages()
 
 
 def test_a_stale_screen_shows_no_number_that_looks_live() -> None:

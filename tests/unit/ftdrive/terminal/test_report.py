@@ -16,11 +16,21 @@ from ftcalib.compare import Compared, compare
 from ftcalib.errors import NotObservable
 from ftcalib.model import predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
-from ftcalib.result import Method
+from ftcalib.result import DriftResult, Method
+from ftcalib.routine import DriftCheck
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.console import answer, messages
-from ftdrive.terminal.report import error_in_words, errors_in_sigma, print_comparison, print_result
+from ftdrive.terminal.report import (
+    drift_in_use,
+    drift_in_words,
+    error_in_words,
+    errors_in_sigma,
+    poses_in_words,
+    print_comparison,
+    print_result,
+)
+from tests.unit.ftdrive.exports.calibration.example import calibration as followed
 from tests.unit.ftdrive.fake_cell import Lab
 
 SIGMA = np.repeat([2e-3, 1e-4], 3)
@@ -289,3 +299,84 @@ def test_a_narrow_terminal_gets_no_vectors_and_nothing_is_cut(
     assert ("force bias" in lines[0]) == vectors
     for line, one in zip(lines[2:], compared, strict=True):
         assert f" {one.mass_kg:.5f} " in line
+
+
+def rows_of(text: str) -> dict[str, list[str]]:
+    """The table of a result: name and cells."""
+    lines = [re.split(r"\s{2,}", line.strip()) for line in text.splitlines()]
+    return {
+        name: cells for name, *cells in lines if cells and name.rpartition(", ")[2] in {"kg", "mm", "N", "N·m", "deg"}
+    }
+
+
+def test_the_table_has_the_estimates_in_the_units_that_it_names(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(messages, "verbose", True)
+    print_result(followed(gravity_N=2 * 9.80665 * np.array([np.sin(0.02), 0.0, -np.cos(0.02)])))
+    found = {name: float(cells[0]) for name, cells in rows_of(capsys.readouterr().out).items()}
+    vectors = {
+        "centre of mass {}, mm": (10.0, -20.0, 50.0),
+        "force bias {}, N": (1.0, -2.0, 0.0),
+        "torque bias {}, N·m": (0.1, -0.2, 0.3),
+        "flange to sensor {}, deg": (0.0, 0.0, 90.0),
+        "gravity in base {}, N": (0.3922, 0.0, -19.6094),
+    }
+    expected = {name.format(axis): v for name, values in vectors.items() for axis, v in zip("xyz", values, strict=True)}
+    tilt = {"mass, kg": 2.0, "base tilt alpha, deg": 0.0, "base tilt beta, deg": -np.degrees(0.02)}
+    assert found == pytest.approx({**expected, **tilt}, abs=6e-4)
+
+
+def test_the_truth_stands_beside_with_the_error_in_sigmas(capsys: pytest.CaptureFixture[str]) -> None:
+    truth = followed().to_dict() | {
+        "mass_kg": 2.0 - 3 * followed().sigma["mass_kg"],
+        "force_bias_N": [0.995, -2.0, 0.0],
+    }
+    print_result(followed(), truth=truth)
+    out = capsys.readouterr().out
+    rows = rows_of(out)
+    assert rows["mass, kg"][-1] == "+3.0"
+    assert rows["force bias x, N"] == ["0.9950", "1.0000", "0.0010", "+5.0"]
+    assert "truth: a free tool reads 0.0050 N, 0.00000 N·m rms; before 19.7 N, 0.96 N·m" in out
+
+
+def drifted(change: float, *, torque: float = 0.0, elapsed_s: float = 120.0) -> DriftCheck:
+    return DriftCheck(np.array([change, 0, 0, torque, 0, 0]), np.repeat([0.01, 0.001], 3), elapsed_s)
+
+
+RETAKEN = "after the return to it"
+
+
+@pytest.mark.parametrize(
+    ("drift", "words", "bad"),
+    [
+        (drifted(0.039), "first pose again after 120 s, 0.039 N, 0.0000 N·m away: none seen", False),
+        (drifted(-0.041), "first pose again after 120 s, 0.041 N, 0.0000 N·m away: 0.021 N/min", True),
+        (drifted(0.0, torque=0.006), "first pose again after 120 s, 0.000 N, 0.0060 N·m away: 0.003 N·m/min", True),
+        (drifted(0.5, elapsed_s=-6), f"first pose, repeated 6 s {RETAKEN}, 0.500 N, 0.0000 N·m away: 5 N/min", True),
+        (drifted(1.0, elapsed_s=0.1), "first pose again after 0 s, 1.000 N, 0.0000 N·m away: 60 N/min", True),
+    ],
+)  # fmt: skip
+def test_a_drift_is_that_of_a_minute_if_it_exceeds_the_noise(drift: DriftCheck, words: str, bad: bool) -> None:
+    assert drift_in_words(drift) == (words, bad)
+
+
+def test_a_drift_in_the_fit_is_said_with_what_it_means_for_the_next_use(capsys: pytest.CaptureFixture[str]) -> None:
+    drift = DriftResult(np.array([0.3, 0.0, 0.4, 0.0, 0.03, 0.04]), np.array([0.01, 0.02, 0.01, 1e-3, 2e-3, 1e-3]))
+    quality = {
+        "last_bias_offset": [0.0, 0.25, 0, 0, 0, 0.01],
+        "bias_growth_per_min": [0, 0.3, 0.4, 0, 0, 0.002],
+        "worst_pose": 3,
+        "residual_sigma": [1.0, 1.0, 2.34],
+        "loo_force_rms_N": 0.01,
+        "loo_torque_rms_Nm": 0.001,
+    }
+    print_result(replace(followed(), drift=drift, quality=quality), drift=drifted(0.5))
+    lines = " ".join(capsys.readouterr().out.split())
+    assert "drift: first pose again" in lines
+    assert "drift in the fit: 0.500 ± 0.020 N, 0.0500 ± 0.0020 N·m from the first pose to the last" in lines
+    assert "next use: at the last pose the bias was 0.25 N, 0.01 N·m off its mean" in lines
+    assert "it moves 0.5 N, 0.002 N·m a minute. Tare before use." in lines
+    assert drift_in_use(followed()) is None
+    assert (poses_in_words(replace(followed(), quality=quality)) or "").startswith("pose 3, 2.3 sigma; each pose")
+    assert poses_in_words(followed()) is None

@@ -36,7 +36,7 @@ from ftdrive.session.events import (
 from ftdrive.session.operator import Key, Question
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator
-from ftdrive.terminal.screen import Screen, SessionView, frame, open_operator
+from ftdrive.terminal.screen import Screen, SessionView, _drift, frame, open_operator
 
 RESUME = "ftdrive calibrate --resume runs/2026-11-20T211503Z-gripper_a"
 VALUES: dict[str, Any] = {
@@ -193,6 +193,15 @@ def test_the_first_pose_seen_again_shows_the_drift() -> None:
     assert any("0.500 N" in line and "15 N/min" in line for line in drawn(drifted))
     fitted = estimated(values=VALUES | {"drift": np.full(6, 0.3)}, sigma=SIGMA | {"drift": np.full(6, 0.02)})
     assert any("drift  0.520 ± 0.020 N" in line for line in drawn(view(*MIDDLE, fitted)))
+
+
+def test_only_a_drift_beyond_the_noise_is_yellow() -> None:
+    for again, style in ((0.0, ""), (0.5, "bold yellow")):
+        assert _drift(view(pose(1, 19), pose(2, 19, mean=np.array([again, 0, 0, 0, 0, 0])))).style == style
+    for sigma, style, words in ((0.07, "yellow", "pose"), (0.08, "", "pose, perhaps")):
+        fitted = estimated(values=VALUES | {"drift": np.full(6, 0.3)}, sigma=SIGMA | {"drift": np.full(6, sigma)})
+        found = _drift(view(*MIDDLE, fitted))
+        assert (found.style, found.plain.endswith(words)) == (style, True)
 
 
 def test_a_drift_of_the_force_alone_is_shown_without_torque() -> None:
@@ -365,6 +374,16 @@ def test_a_pipe_has_no_keys() -> None:
     assert not Keyboard.usable(reading)
     os.close(reading)
     os.close(writing)
+
+
+@pytest.mark.parametrize(("foreground", "usable"), [(7, True), (8, False)])
+def test_a_background_job_reads_no_keys(foreground: int, usable: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "isatty", lambda _: True)
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: foreground)
+    monkeypatch.setattr(os, "getpgrp", lambda: 7)
+    assert Keyboard.usable(0) is usable
+    monkeypatch.setattr(os, "isatty", lambda _: False)
+    assert not Keyboard.usable(0)
 
 
 @contextmanager

@@ -133,16 +133,17 @@ def test_notes_have_all_digits() -> None:
 
 
 def in_motion() -> CalibrationResult:
-    moments = np.diag([2.0, 2.4, 1.4]) * 1e-3
-    moments[0, 1] = moments[1, 0] = 1e-4
+    moments = np.array([[2.0, 0.1, -0.2], [0.1, 2.4, 0.3], [-0.2, 0.3, 1.4]]) * 1e-3
     return replace(calibration(), motion=MotionResult(moments, 0.003, 0.02, np.eye(23) * 1e-8, 1.0))
 
 
 def test_an_inertia_from_motion_is_written() -> None:
     found = {name: export(in_motion(), name, MEASURED, max_force_error_N=1e3) for name in ("urdf", "mujoco")}
-    assert 'ixx="0.002"' in found["urdf"].text
-    assert 'ixy="0.0001"' in found["urdf"].text
-    assert 'fullinertia="0.002 0.0024 0.0014 0.0001 0.0 0.0"' in found["mujoco"].text
+    written = re.findall(r'i([xyz]{2})="(\S+)"', found["urdf"].text)
+    moments = {"xx": 0.002, "yy": 0.0024, "zz": 0.0014, "xy": 0.0001, "xz": -0.0002, "yz": 0.0003}
+    assert {axes: float(value) for axes, value in written} == moments
+    in_order = re.findall(r'fullinertia="([^"]*)"', found["mujoco"].text)[0].split()
+    assert [float(one) for one in in_order] == list(moments.values())
     assert all("identified from motion" in "".join(one.notes) for one in found.values())
 
 

@@ -1,0 +1,135 @@
+"""How `ftdrive doctor` examines an arm and a push, with devices that answer from a list."""
+
+from functools import partial
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from ftdrive.checks import devices
+from ftdrive.checks.check import Check
+from ftdrive.commands import doctor
+from ftdrive.commands.doctor import _check_clock, _check_poses, _examine_push, _print
+from ftdrivers.errors import DeviceTimeout
+from tests.fake_clock import FakeClock
+
+LOST = DeviceTimeout("no state for 0.3 s", "look at the cable")
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+class Arm:
+    """Its clock is fast by `pace`; after `until` looks it is silent."""
+
+    def __init__(self, clock: FakeClock, pace: float = 1.0, until: int = 10**6) -> None:
+        self.clock, self.pace, self.until, self.looks = clock, pace, until, 0
+
+    def status(self) -> Any:
+        self.looks += 1
+        if self.looks > self.until:
+            raise LOST
+        return SimpleNamespace(t_host_ns=self.clock.now_ns(), t_device_s=self.pace * self.clock.now_s())
+
+    def state(self) -> Any:
+        if not self.until:
+            raise LOST
+        return SimpleNamespace(p_base_flange_m=np.array([0.1, -0.2, 0.3456]), R_base_flange=TURN)
+
+
+@pytest.mark.parametrize(("pace", "until", "state"), [(1.0, 10**6, "ok"), (1.02, 10**6, "warning"), (1.0, 5, "failed")])
+def test_the_clock_of_the_arm_is_compared_over_some_seconds(pace: float, until: int, state: str) -> None:
+    clock = FakeClock()
+    begin_s = clock.now_s()
+    check = _check_clock(cast("Any", Arm(clock, pace, until)), clock)
+    assert (check.name, check.state == "ok") == ("clock.pace", state == "ok")
+    if state == "failed":
+        assert (check.state, check.found, check.fix) == (state, "no state for 0.3 s", "look at the cable")
+    else:
+        assert doctor._CLOCK_S <= clock.now_s() - begin_s < doctor._CLOCK_S + 0.1
+
+
+def test_the_pose_is_read_in_millimetres(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = FakeClock()
+    monkeypatch.setattr(devices, "check_link", lambda *_, **__: Check("robot.link", "ok", "fast"))
+    status = cast("Any", SimpleNamespace(tcp_offset=np.zeros(6)))
+    found = _check_poses(cast("Any", Arm(clock)), status, clock)
+    assert found[0].found == "TCP offset read; flange at (100, -200, 346) mm in base"
+    assert [one.name for one in found] == ["robot.flange", "robot.link"]
+    (failed,) = _check_poses(cast("Any", Arm(clock, until=0)), status, clock)
+    assert (failed.state, failed.fix) == ("failed", "look at the cable")
+    (skipped,) = _check_poses(cast("Any", Arm(clock)), cast("Any", SimpleNamespace(tcp_offset=None)), clock)
+    assert skipped.state == "skipped"
+
+
+class Sensor:
+    """Reads a bias; then windows of 10, 25 and -30 N along y, and the bias again."""
+
+    def __init__(self, *, silent: bool = False) -> None:
+        self.forces_N, self.silent = [0.0, 10.0, 25.0, -30.0], silent
+        self.collected_s: list[float] = []
+
+    def collect(self, duration_s: float) -> Any:
+        self.collected_s.append(duration_s)
+        if self.silent:
+            raise LOST
+        push_N = self.forces_N.pop(0) if self.forces_N else 0.0
+        return SimpleNamespace(wrench=np.tile([1.0, 2.0 + push_N, 3.0, 0.0, 0.0, 0.0], (5, 1)))
+
+
+def examined(device: Any, monkeypatch: pytest.MonkeyPatch, line: str = "\n", station: Any = None) -> Any:
+    given: list[Any] = []
+
+    def check_push(*arguments: Any) -> Any:
+        given.extend(arguments)
+        return Check("push.sign", "ok", "found"), {}
+
+    monkeypatch.setattr(devices, "check_push", check_push)
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(readline=lambda: line))
+    blame = partial(lambda name, error: Check(name, "failed", error.found))
+    check, _ = _examine_push(device, cast("Any", Arm(FakeClock())), np.eye(3), -1, station, cast("Any", blame))
+    return check, given
+
+
+def test_the_largest_change_during_the_push_counts(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sensor = Sensor()
+    check, (change_N, R_base_flange, R_flange_sensor, sign) = examined(sensor, monkeypatch)
+    assert check.state == "ok"
+    np.testing.assert_allclose(change_N, [0, -30, 0])
+    np.testing.assert_array_equal(R_base_flange, TURN)
+    np.testing.assert_array_equal(R_flange_sensor, np.eye(3))
+    assert sign == -1
+    assert sum(sensor.collected_s[1:]) == pytest.approx(doctor._PUSH_S)
+    assert "Push the tool along +X of the base" in capsys.readouterr().err
+
+
+def test_an_emulated_push_is_along_x_of_the_base_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[Any] = []
+    station = SimpleNamespace(control=lambda **named: asked.append(named["wrench"]))
+    examined(Sensor(), monkeypatch, station=station)
+    pushed, ended = np.array(asked)
+    np.testing.assert_allclose(TURN @ pushed[:3], [doctor._SIMULATED_PUSH_N, 0, 0], atol=1e-12)
+    assert not ended.any()
+
+
+def test_without_a_reading_or_a_push_there_is_no_sign(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert examined(None, monkeypatch)[0].state == "skipped"
+    assert examined(Sensor(), monkeypatch, line="")[0].found == "no push: the standard input is closed"
+    assert examined(Sensor(silent=True), monkeypatch)[0].state == "failed"
+
+
+def test_each_subject_is_named_once_and_a_fix_follows_what_is_wrong(capsys: pytest.CaptureFixture[str]) -> None:
+    checks = [
+        Check("robot.remote", "ok", "remote control on", "none"),
+        Check("robot.speed", "warning", "slider at 30 %", "raise it"),
+        Check("sensor.noise", "failed", "saturated", "take the load off"),
+    ]
+    _print(checks)
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert [line.split()[0] for line in lines] == ["robot", "!", "fix:", "sensor", "fix:", "Not"]
+    assert lines[2].split("fix: ")[1] == "raise it"
+    _print(checks[:2])
+    assert capsys.readouterr().out.endswith(" Usable; see the lines with !\n")
+    _print(checks[:1])
+    assert capsys.readouterr().out.endswith(" All checks passed.\n")

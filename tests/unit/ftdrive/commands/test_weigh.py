@@ -1,0 +1,139 @@
+"""What `ftdrive weigh` prints without a screen: each new weight once, or the one that was asked for."""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+from click.testing import CliRunner
+
+from ftdrive.cli import cli
+from ftdrive.commands.weigh import _print
+from ftdrive.errors import ConfigError
+from ftdrive.live.weighing import CannotWeigh
+from ftdrive.terminal.weighing import Shown
+from tests.fake_clock import FakeClock
+from tests.unit.ftdrive.terminal.fake_stream import INFO
+from tests.unit.ftdrive.terminal.test_weigh_screen import PART
+
+EMPTY = Shown(replace(PART, mass_kg=0.001), None)
+ONE, TWO = Shown(PART, None), Shown(replace(PART, mass_kg=0.3, poses=2), None)
+CABLE, MOVING = Shown(PART, "cable"), Shown(None, "moving")
+
+
+class Scale:
+    """A scale that shows one state after the other, each second."""
+
+    def __init__(self, *states: tuple[Shown, bool]) -> None:
+        self.stream = SimpleNamespace(clock=FakeClock(), info=replace(INFO, emulated=True))
+        self._states: Sequence[tuple[Shown, bool]] = states
+        self.raises: bool | None = None
+        self.zeros = 0
+
+    def zero(self) -> None:
+        self.zeros += 1
+
+    def states(self, *, raises: bool = False) -> Iterator[tuple[Shown, bool]]:
+        self.raises = raises
+        for one in self._states:
+            self.stream.clock.sleep(1.0)
+            yield one
+
+    def given_up(self, shown: Shown) -> CannotWeigh:
+        return CannotWeigh(shown.refusal or "samples")
+
+
+def printed(
+    scale: Scale,
+    capsys: pytest.CaptureFixture[str],
+    *,
+    once: bool = False,
+    waits: bool = False,
+    poses: int = 1,
+    as_json: bool = False,
+) -> list[str]:
+    _print(cast("Any", scale), once=once, waits=waits, poses=poses, as_json=as_json)
+    return capsys.readouterr().out.splitlines()
+
+
+def test_each_new_weight_and_fault_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    scale = Scale((MOVING, False), (EMPTY, True), (EMPTY, False), (CABLE, True), (ONE, True))
+    lines = printed(scale, capsys)
+    assert [line.split()[0] for line in lines] == ["nothing:", "not", "0.8123"]
+    assert scale.raises is False
+
+
+def test_once_ends_with_the_first_weight(capsys: pytest.CaptureFixture[str]) -> None:
+    states = (CABLE, True), (EMPTY, True), (ONE, True), (TWO, True), (ONE, True)
+    scale = Scale(*states)
+    assert printed(scale, capsys, once=True)[0].startswith("nothing:")
+    assert scale.raises is True
+    assert printed(Scale(*states), capsys, once=True, poses=2)[0].startswith("0.3000 ")
+    (line,) = printed(Scale(*states), capsys, once=True, waits=True)  # after a zero it waits for a part
+    assert line.startswith("0.8123 ")
+
+
+def test_once_gives_up_after_ten_seconds_unless_it_waits_for_a_part(capsys: pytest.CaptureFixture[str]) -> None:
+    late = [(MOVING, False)] * 10
+    assert printed(Scale(*late[:-1], (ONE, True)), capsys, once=True)
+    with pytest.raises(CannotWeigh) as error:
+        printed(Scale(*late, (MOVING, False), (ONE, True)), capsys, once=True)
+    assert error.value.code == "moving"
+    assert printed(Scale(*late, (MOVING, False), (ONE, True)), capsys, once=True, waits=True)
+    assert printed(Scale(*late, (MOVING, False), (ONE, True)), capsys)
+
+
+def test_json_has_the_weight_and_why_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    scale = Scale((replace(ONE, count=3), True), (CABLE, True))
+    weight, refused = map(json.loads, printed(scale, capsys, as_json=True))
+    assert (weight["schema_version"], weight["mass_kg"], weight["count"], weight["refused"]) == (1, 0.81234, 3, None)
+    assert weight["calibration_id"] == INFO.calibration.id
+    assert weight["marks"] == ["EMULATED"]
+    assert (refused["refused"], refused["mass_kg"]) == ("cable", 0.81234)
+
+
+def weighed(scale: Scale, monkeypatch: pytest.MonkeyPatch, *options: str) -> tuple[dict[str, Any], str]:
+    """Run the command on a scale; return how it was opened, and stdout."""
+    opened: dict[str, Any] = {}
+
+    def open_source(_source: object, _frame: object, _stack: object, track: str) -> Any:
+        opened["track"] = track
+        return scale.stream
+
+    def weighing(_stream: object, _recorder: object, **named: Any) -> Any:
+        opened.update(named)
+        return scale
+
+    monkeypatch.setattr("ftdrive.commands.live_source.open_source", open_source)
+    monkeypatch.setattr("ftdrive.commands.live_source.open_log", lambda *_: None)
+    monkeypatch.setattr("ftdrive.terminal.weighing.Weighing", weighing)
+    outcome = CliRunner().invoke(cli, ["weigh", "--simulate", *options])
+    assert outcome.exit_code == 0, outcome.output
+    return opened, outcome.stdout
+
+
+def test_in_motion_one_answer_to_a_part_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    carried = [
+        (Shown(replace(one, poses=0, in_motion=True), None), True) for one in (replace(PART, mass_kg=0.001), PART)
+    ]
+    opened, out = weighed(Scale(*carried), monkeypatch, "--moving", "--once", "--count", "0.4")
+    assert (opened["track"], opened["moving"], opened["joins"], opened["part_kg"]) == ("show", True, False, 0.4)
+    assert out.startswith("0.8123 ")
+
+
+def test_a_zero_comes_first_and_then_a_part_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    scale = Scale((EMPTY, True), (ONE, True), (TWO, True))
+    opened, out = weighed(scale, monkeypatch, "--zero", "--once", "--poses", "2")
+    assert (opened["track"], opened["moving"], opened["joins"], scale.zeros) == ("off", False, True, 1)
+    assert out.startswith("0.3000 ")
+    opened, out = weighed(Scale((EMPTY, True)), monkeypatch, "--once")
+    assert (opened["joins"], out.startswith("nothing: ")) == (False, True)
+
+
+@pytest.mark.parametrize("option", [("--zero",), ("--poses", "2")])
+def test_weighing_in_motion_needs_neither_zero_nor_poses(option: tuple[str, ...]) -> None:
+    outcome = CliRunner().invoke(cli, ["weigh", "--simulate", "--moving", *option])
+    assert isinstance(outcome.exception, ConfigError)
+    assert "leave out --zero and --poses" in str(outcome.exception)

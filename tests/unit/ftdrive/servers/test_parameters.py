@@ -1,0 +1,173 @@
+"""What clients may set of a stream, by Foxglove and by ROS 2: checked, and all of it or nothing."""
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from foxglove import Parameter
+
+from ftdrive.errors import ConfigError
+from ftdrive.live.samples import Stages, WrenchFrame
+from ftdrive.servers.parameter_values import checked_value
+from ftdrive.servers.parameters import Parameters
+from ftdrive.servers.ros2 import parameters as of_ros2
+from ftdrive.servers.ros2.parameters import Fixed, NodeParameters
+
+FRAME = WrenchFrame("base", "tcp")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "wanted"),
+    [
+        ("axes", "flange", "flange"),
+        ("about", "sensor", "sensor"),
+        ("about", [0, 0.1, -0.2], (0.0, 0.1, -0.2)),
+        ("bias", False, False),
+        ("inertia", True, True),
+        ("notch_Hz", 20, 20.0),
+        ("lowpass_Hz", 0, None),
+        ("lowpass_Hz", 0.0, None),
+        ("deadband_N", 0, 0.0),
+        ("deadband_Nm", 0.5, 0.5),
+    ],
+)
+def test_a_value_is_taken_as_the_stages_have_it(name: str, value: Any, wanted: Any) -> None:
+    found = checked_value(name, value)
+    assert (found, type(found)) == (wanted, type(wanted))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "fix"),
+    [
+        ("axes", "tool", "set one of sensor, flange, base, tcp"),
+        ("axes", 1, "set one of"),
+        ("about", "base", "or x, y, z in metres from the flange"),
+        ("about", [0.1, 0.2], "x, y, z"),
+        ("about", [0.1, 0.2, True], "x, y, z"),
+        ("about", [0.1, 0.2, float("nan")], "x, y, z"),
+        ("about", [0.1, 0.2, "3"], "x, y, z"),
+        ("gravity", 1, "set true or false"),
+        ("notch_Hz", -1, "set a frequency; 0 switches the filter off"),
+        ("lowpass_Hz", True, "set a frequency"),
+        ("lowpass_Hz", float("inf"), "set a frequency"),
+        ("deadband_N", -0.1, "set a number from 0"),
+        ("deadband_Nm", "1", "set a number from 0"),
+        ("tara", True, "there is no such parameter"),
+    ],
+)
+def test_another_value_is_rejected_with_those_that_are_right(name: str, value: Any, fix: str) -> None:
+    with pytest.raises(ConfigError, match=rf"{name} cannot be .*: .*{fix}"):
+        checked_value(name, value)
+
+
+def test_foxglove_sets_all_or_nothing() -> None:
+    stream = SimpleNamespace(frame=FRAME, stages=Stages(notch_Hz=30.0))
+    warned: list[str] = []
+    parameters, client = Parameters(cast("Any", stream), warned.append), cast("Any", None)
+    shown = {one.name: one.get_value() for one in parameters.on_get_parameters(client, [])}
+    assert shown == {
+        "axes": "base",
+        "about": "tcp",
+        "bias": True,
+        "gravity": True,
+        "inertia": False,
+        "notch_Hz": 30.0,
+        "lowpass_Hz": 0.0,
+        "deadband_N": 0.0,
+        "deadband_Nm": 0.0,
+    }
+    assert [one.name for one in parameters.on_get_parameters(client, ["axes", "bias"])] == ["axes", "bias"]
+    changes: dict[str, Any] = {"axes": "tcp", "about": [0.0, 0.0, 0.1], "lowpass_Hz": 40.0, "notch_Hz": 0.0}
+    found = parameters.on_set_parameters(client, [Parameter(name, value=value) for name, value in changes.items()])
+    assert {one.name: one.get_value() for one in found} == {**shown, **changes}
+    before = stream.frame, stream.stages
+    assert before == (WrenchFrame("tcp", (0.0, 0.0, 0.1)), Stages(lowpass_Hz=40.0))
+    parameters.on_set_parameters(client, [Parameter("axes", value="base"), Parameter("bias", value=3.0)])
+    assert (stream.frame, stream.stages) == before
+    assert warned == ["bias cannot be 3.0: set true or false"]
+
+
+class FakeNode:
+    """A node whose arguments of ROS give some values; they arrive as rclpy has them."""
+
+    def __init__(self, **given: Any) -> None:
+        self.given = given
+        self.declared: dict[str, Any] = {}
+        self._changed: Callable[[list[Any]], Any]
+
+    def declare_parameter(self, name: str, value: Any, descriptor: Any) -> Any:
+        self.declared[name] = descriptor
+        return SimpleNamespace(value=self.given.get(name, value))
+
+    def add_on_set_parameters_callback(self, callback: Any) -> None:
+        self._changed = callback
+
+    def set(self, **values: Any) -> Any:
+        return self._changed([SimpleNamespace(name=name, value=one) for name, one in values.items()])
+
+
+@pytest.fixture(autouse=True)
+def _no_ros2(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = SimpleNamespace(ParameterDescriptor=SimpleNamespace, SetParametersResult=SimpleNamespace)
+    monkeypatch.setattr(of_ros2, "ros2_module", lambda _: fake)
+
+
+def test_a_node_declares_what_it_has_and_what_cannot_change() -> None:
+    node = FakeNode(about=(0.0, 0.0, 0.2), rate=100, lowpass_Hz=20.0, publish_base_tf=True, sensor_frame="wrist/ft")
+    found = NodeParameters(node, FRAME, "gripper")
+    assert (found.frame, found.stages, found.tool) == (
+        WrenchFrame("base", (0.0, 0.0, 0.2)),
+        Stages(lowpass_Hz=20.0),
+        "gripper",
+    )
+    assert (found.fixed.rate, found.fixed.sensor_frame, found.fixed.base_frame) == (100, "wrist/ft", "base")
+    assert found.fixed.publish_base_tf
+    fixed = {"rate", "reliable", "base_frame", "flange_frame", "sensor_frame", "publish_base_tf"}
+    assert {name for name, one in node.declared.items() if one.read_only} == fixed
+    assert all(one.description and one.dynamic_typing for one in node.declared.values())
+    assert len(node.declared) == 16
+    assert NodeParameters(FakeNode(), FRAME, "").fixed == Fixed(500.0, False, "base", "tool0", "ft_sensor", False)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "fix"),
+    [
+        ("rate", 0.9, "set 1 to 2000 Hz"),
+        ("rate", 2001, "set 1 to 2000 Hz"),
+        ("rate", True, "set 1 to 2000 Hz"),
+        ("rate", "fast", "set 1 to 2000 Hz"),
+        ("reliable", 1, "set true or false"),
+        ("base_frame", "1base", "a letter first"),
+        ("base_frame", "", "a letter first"),
+        ("flange_frame", True, "a letter first"),
+    ],
+)
+def test_a_node_with_a_wrong_fixed_parameter_does_not_start(name: str, value: Any, fix: str) -> None:
+    with pytest.raises(ConfigError, match=f"the parameter {name} cannot be {value!r}: .*{fix}"):
+        NodeParameters(FakeNode(**{name: value}), FRAME, "")
+
+
+def test_the_limits_of_the_rate_are_rates() -> None:
+    assert [NodeParameters(FakeNode(rate=rate), FRAME, "").fixed.rate for rate in (1, 2000)] == [1, 2000]
+
+
+def test_a_node_applies_all_changes_or_none() -> None:
+    node, applied = FakeNode(), list[Any]()
+    found = NodeParameters(node, FRAME, "")
+    assert node.set(axes="sensor").successful
+    found.apply = lambda *now: applied.append(now)
+    assert node.set(about=np.array([0.0, 0.1, 0.2]), bias=False, tool="drill", use_sim_time=True).successful
+    now = WrenchFrame("sensor", (0.0, 0.1, 0.2)), Stages(bias=False), "drill"
+    assert applied == [now]
+    assert (found.frame, found.stages, found.tool) == now
+    for changes, reason in (
+        ({"gravity": False, "tool": 3}, "tool cannot be 3: set the name of a tool"),
+        ({"gravity": False, "axes": "x"}, "axes cannot be 'x'"),
+    ):
+        refused = node.set(**changes)
+        assert not refused.successful
+        assert reason in refused.reason
+    assert applied == [now]
+    assert found.stages == Stages(bias=False)

@@ -1,0 +1,108 @@
+"""What the panels of the live screen compute: places, angles and frames, from readings with known numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ftcalib.model import Array
+from ftdrive.live.samples import Stages, WrenchFrame
+from ftdrive.terminal.live import panels
+from ftdrive.terminal.live.panels import line_of_force, others, sphere
+from ftdrive.terminal.live.view import Line, View
+from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, SIGMA, TARE, FakeStream
+from tests.unit.ftdrive.terminal.live.test_summary import Rig, reading_of
+
+SENSOR = WrenchFrame("sensor", "sensor")
+
+
+@pytest.fixture(scope="module")
+def view() -> View:
+    return Rig(FakeStream("contact")).run(30)
+
+
+def text(line: Line) -> str:
+    return "".join(part.text for part in line.parts)
+
+
+@pytest.mark.parametrize(
+    ("force_N", "at_m", "words"),
+    [
+        ([0, 0, -10], [0.03, 0.0, 0.0], "line of force 30 mm from tcp, +x"),
+        ([8, 0, 0], [0.0, 0.0, -0.12], "line of force 120 mm from tcp, -z"),
+        ([0, 5, 0], [0.0004, 0.0, 0.0], "line of force passes through tcp"),
+        ([0, 5, 0], [0.0006, 0.0, 0.0], "line of force 1 mm from tcp, +x"),
+        ([0, 0, 0.41], [0.03, 0.0, 0.0], "line of force 30 mm from tcp, +x"),
+        ([0, 0, 0.39], [0.03, 0.0, 0.0], ""),
+    ],
+)
+def test_the_line_of_force_passes_where_the_torque_says(
+    force_N: list[float], at_m: list[float], words: str, view: View
+) -> None:
+    wrench = np.concatenate([force_N, np.cross(at_m, force_N)])
+    reading = replace(reading_of(view), wrench=wrench, in_contact=True, sigma=SIGMA)
+    assert text(line_of_force(reading)) == words
+    assert text(line_of_force(replace(reading, in_contact=False))) == ""
+
+
+def test_the_wrench_is_shown_with_fewer_stages_and_in_other_frames(view: View) -> None:
+    push = np.array([1.0, -2.0, -5.0, 0.1, 0.2, -0.3])
+    reading = replace(reading_of(view), raw=FREE + TARE + push, R_base_flange=R_BASE_FLANGE, frame=SENSOR)
+    lines = [text(line) for line in others(replace(view, reading=reading), 100)]
+    found = {line[:21].strip(): [float(one) for one in line[21:].split()] for line in lines[1:]}
+    assert lines[0].split() == ["in", "sensor", "@", "sensor", "Fx", "Fy", "Fz", "Tx", "Ty", "Tz"]
+    rounded = {"as measured": FREE + TARE + push, "without bias": FREE + push - BIAS, "and without gravity": push}
+    for name, wrench in rounded.items():
+        np.testing.assert_allclose(found[name], wrench, atol=0.0051)
+    R_flange_sensor = PARAMETERS.R_flange_sensor
+    np.testing.assert_allclose(found["flange @ flange"][:3], R_flange_sensor @ push[:3], atol=0.0051)
+    below = np.cross([0, 0, 0.035], R_flange_sensor @ push[:3])  # the sensor is 35 mm below the flange
+    np.testing.assert_allclose(found["flange @ flange"][3:], R_flange_sensor @ push[3:] + below, atol=0.00051)
+    np.testing.assert_allclose(found["base @ tcp"][:3], R_BASE_FLANGE @ R_flange_sensor @ push[:3], atol=0.0051)
+    silent = [text(line) for line in others(replace(view, reading=reading, silent="the arm"), 100)]
+    assert all(line.count("--.--") == 6 for line in silent[1:])
+
+
+def directions(*angles_deg: float) -> Array:
+    """Directions at these angles from that of gravity, in flange axes."""
+    down = R_BASE_FLANGE.T @ PARAMETERS.gravity_force_base_N
+    down /= np.linalg.norm(down)
+    across = np.cross(down, [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across)
+    return np.array([np.cos(a) * down + np.sin(a) * across for a in np.radians(angles_deg)])
+
+
+def test_the_sphere_says_how_near_the_calibrated_orientations_are(view: View) -> None:
+    reading = replace(reading_of(view), R_base_flange=R_BASE_FLANGE)
+    lines = sphere(replace(view, reading=reading, calibrated=directions(70, 23, 110)), 80)
+    words = [text(line)[2 * panels._DISC + 6 :].strip() for line in lines]
+    covariance = view.info.calibration.wrench_covariance(R_BASE_FLANGE)
+    variances = np.diag(covariance)
+    assert words[1:9] == [
+        "direction of gravity",
+        "in flange axes",
+        "● now",
+        "∘ calibrated: 3",
+        "nearest 23° away",
+        "",
+        "calibration sigma here",
+        f"{np.sqrt(variances[:3].sum()):.3f} N, {1e3 * np.sqrt(variances[3:].sum()):.2f} mN·m",
+    ]
+    assert sum(text(line).count("●") for line in lines) == 2  # one is in the words
+    unknown = sphere(replace(view, reading=reading, calibrated=None), 80)
+    assert "calibrated:" not in "".join(map(text, unknown))
+
+
+@pytest.mark.parametrize(
+    ("stages", "words"),
+    [
+        (Stages(), "contact wrench"),
+        (Stages(gravity=False), "weight included"),
+        (Stages(bias=False), "bias included"),
+        (Stages(bias=False, gravity=False), "as measured"),
+    ],
+)
+def test_what_is_left_in_the_wrench_is_named(stages: Stages, words: str, view: View) -> None:
+    reading = replace(reading_of(view), stages=stages, frame=WrenchFrame("flange", (0.0, 0.01, -0.15)))
+    line = text(panels.provenance(replace(view, reading=reading), 120))
+    assert line.rstrip().endswith(f"{words}, flange @ (0,10,-150) mm")
