@@ -42,3 +42,14 @@ def with_sigma(value: SupportsFloat, sigma: float, sign: str = "") -> str:
     ('1.1865 ± 0.0011', '-0 ± 47')
     """
     return f"{to_place_of(value, sigma, sign)} ± {to_place_of(sigma, sigma)}"
+
+
+def counted(number: int, noun: str) -> str:
+    """Write a number with its noun.
+
+    Examples
+    --------
+    >>> counted(1, "result"), counted(2, "result")
+    ('1 result', '2 results')
+    """
+    return f"{number} {noun}{'' if number == 1 else 's'}"

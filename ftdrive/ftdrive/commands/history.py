@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftcalib.rounding import with_sigma
+from ftcalib.rounding import counted, with_sigma
 from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
 from ftdrive.terminal.text import echo
 
@@ -148,7 +148,7 @@ def _day_row(one: "StoredWeighings") -> tuple[str, ...]:
 
 def _weighing_in_words(one: "StoredWeighings") -> str:
     refused = sum(one.refusals.values())
-    counts = f"{one.weighings} part{'' if one.weighings == 1 else 's'}, {refused} refused on this day"
+    counts = f"{counted(one.weighings, 'part')}, {refused} refused on this day"
     time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
     return f"{one.tool_in_words}, {time}: {_mass_in_words(one)}; {counts}"
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Final
 
+from ftcalib.rounding import counted
 from ftdrive.fleet.state import CellState, Fleet
 from ftdrive.runs.verification_record import age_in_words
 
@@ -14,11 +15,6 @@ def listed(names: Sequence[str]) -> str:
     """Write names in a sentence, such as "a, b and c"; of many only the first."""
     shown = list(names) if len(names) <= MOST + 1 else [*names[:MOST], f"{len(names) - MOST} more"]
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
-
-
-def counted(number: int, noun: str) -> str:
-    """Write a number with its noun, such as "1 result" or "2 results"."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def due_in_words(due: datetime | None, now: datetime) -> str:

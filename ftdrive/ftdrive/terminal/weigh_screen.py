@@ -7,9 +7,9 @@ from textual.app import App, ComposeResult
 from textual.widgets import Digits, Static
 
 from ftcalib.extras.weighing import Weight
-from ftcalib.rounding import to_place_of
+from ftcalib.rounding import counted, to_place_of
 from ftdrive.errors import NotAccepted
-from ftdrive.terminal.weighing import Shown, Weighing, line_of, number_of
+from ftdrive.terminal.weighing import Shown, Weighing, line_of
 
 _REFRESH_S = 0.1
 _UNZEROED_KG = 0.1
@@ -115,12 +115,12 @@ class WeighApp(App[None]):
 
     def _sigma_line(self, weight: Weight, count: int | None) -> str:
         sigma_g, least_g = (to_place_of(1e3 * kg, 1e3 * kg) for kg in (weight.mass_sigma_kg, weight.least_kg))
-        parts = "" if count is None else f"{number_of(count, 'part')}   "
+        parts = "" if count is None else f"{counted(count, 'part')}   "
         words = f"{parts}sigma {sigma_g} g, smallest mass {least_g} g"
         if self._weighing.moving:
             return words
         if self._weighing.joins:
-            words += f"   {number_of(weight.poses, 'pose')} joined, turn the tool for more"
+            words += f"   {counted(weight.poses, 'pose')} joined, turn the tool for more"
         if weight.least_kg > _UNZEROED_KG:
             words += "   not zeroed: press z with an empty gripper"
         return words

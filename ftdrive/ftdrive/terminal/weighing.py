@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ftcalib.extras.weighing import Weight
-from ftcalib.rounding import with_sigma
+from ftcalib.rounding import counted, with_sigma
 from ftdrive.errors import NotAccepted
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.live.weighing import FAULTS, WEIGH_S, WORDS, CannotWeigh, Scale, count_of, load_values, weigh_in_motion
@@ -167,13 +167,8 @@ def line_of(shown: Shown) -> str:
     assert weight is not None  # noqa: S101 - without a refusal there is a weight
     if not weight.is_something:
         return f"nothing: {with_sigma(weight.mass_kg, weight.mass_sigma_kg)} kg, less than {weight.least_kg:.2g} kg"
-    parts = "" if shown.count is None else f"{number_of(shown.count, 'part')}, "
+    parts = "" if shown.count is None else f"{counted(shown.count, 'part')}, "
     com = ", ".join(
         with_sigma(1e3 * x, 1e3 * s) for x, s in zip(weight.p_sensor_com_m, weight.com_sigma_m, strict=True)
     )
     return f"{parts}{with_sigma(weight.mass_kg, weight.mass_sigma_kg)} kg at ({com}) mm from the sensor origin"
-
-
-def number_of(count: int, name: str) -> str:
-    """Return "1 part", "2 parts"."""
-    return f"{count} {name}{'' if count == 1 else 's'}"

@@ -121,7 +121,7 @@ class _Report:
 
     def words(self) -> Iterator[str]:
         """Give the numbers, then one line for each recording with contacts or gaps, and for each that failed."""
-        from ftdrive.fleet.words import counted
+        from ftcalib.rounding import counted
 
         found = self.to_dict()
         yield (

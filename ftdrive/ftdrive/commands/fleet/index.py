@@ -16,8 +16,9 @@ def index(folders: Sequence[Path], url: str | None) -> None:
 
     If cells were added, arms that belong to none of them are listed.
     """
+    from ftcalib.rounding import counted
     from ftdrive.fleet.cells import Owners
-    from ftdrive.fleet.words import counted, listed
+    from ftdrive.fleet.words import listed
     from ftdrive.terminal.console import answer, hanging, messages
 
     found = open_store(url)
