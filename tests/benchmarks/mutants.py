@@ -1,8 +1,8 @@
 """Plant small errors in a copy of the project, one at a time, and print which of them the fast tests find.
 
-A mutant is given to every test file that reaches its line, by the coverage of one run of all fast tests. First those
-of its own folder: of `ftdrive/ftdrive/session/x.py`, `tests/unit/ftdrive/session`. A line that runs when its module is
-imported, or only in other processes, is given to its folder and to the files that reach any line of the module.
+A mutant is given to the test files of its own folder, which is `tests/unit/ftdrive/session` for
+`ftdrive/ftdrive/session/x.py`, and to every other one that reaches its line, by the coverage of one run of all fast
+tests. For a line that runs only when its module is imported, or in other processes: that reaches the module.
 Slow tests and those of ROS 2 are not tried: read what survives, because they may find it, or it may change nothing.
 """
 
@@ -117,7 +117,7 @@ def reach_of(root: Path, data_file: Path) -> None:
 
 
 def tests_of(mutant: Mutant, reach: CoverageData) -> list[str]:
-    """Test files of the mutant's folder, those that import its module first, then all others that reach it."""
+    """Test files of the mutant's folder, those that name its module first, then all others that reach it."""
     module = next((file for file in reach.measured_files() if Path(file).match(f"*/{mutant.path}")), None)
     contexts = reach.contexts_by_lineno(module) if module else {}
     of_line, of_module = (
@@ -126,12 +126,12 @@ def tests_of(mutant: Mutant, reach: CoverageData) -> list[str]:
     )
     folder = folder_of_tests(mutant.path)
     at_home = {str(file.relative_to(PROJECT)) for file in (PROJECT / folder).rglob("test_*.py")}
-    imports = re.compile(rf"\b{mutant.path.stem}\b")
+    name = re.compile(rf"\b{mutant.path.stem}\b")
 
     def order(file: str) -> tuple[bool, bool, bool, str]:
-        return file not in at_home, not imports.search((PROJECT / file).read_text()), "tests/unit" not in file, file
+        return file not in at_home, not name.search((PROJECT / file).read_text()), "tests/unit" not in file, file
 
-    return sorted(of_line or at_home | of_module, key=order)
+    return sorted(at_home | (of_line or of_module), key=order)
 
 
 def environment_of(root: Path) -> dict[str, str]:
