@@ -3,32 +3,20 @@
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.spatial.transform import Rotation
 
-from ftcalib import Parameters
-from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.explanation import _are_gaussian, _criterion, _limit, _membership, _stand_out
 from ftcalib.likelihood.outliers import Kept, agreeing_poses, fewest_kept
-from ftcalib.likelihood.session import Session, inverses, white
+from ftcalib.likelihood.session import Session, inverses
 from ftcalib.likelihood.variance_components import FORCE, Component, Point, component, point
-from ftcalib.model import Array, predict
-from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib.model import Array
+from tests.unit.calib.likelihood.sessions import R24, SIGMA_N, SIGMA_NM, TOOL, session
 
-R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
-TOOL = Parameters(
-    Rotation.from_euler("ZYX", [50, 10, 175], degrees=True).as_matrix(),
-    np.array([0.3, -0.2, -20.0]),
-    np.array([3.0, -2, 8]),
-    np.array([0.03, -0.02, 0.06]),
-    np.array([0.1, 0.2, -0.3]),
-)
-SIGMA = np.repeat([0.05, 0.002], 3)
+SIGMA = np.repeat([SIGMA_N, SIGMA_NM], 3)
 FARTHEST = stats.chi2.isf(1e-3, 6)
 
 
-def session(n: int, residuals: Array | float = 0.0) -> Session:
-    R = np.resize(R24, (n, 3, 3))
-    return Session(R, predict(TOOL, R) + residuals, white(0.05, 0.002), None, "none", Constraints(Known(), 9.8))
+def tour(n: int, residuals: Array | float = 0.0) -> Session:
+    return session(np.resize(R24, (n, 3, 3)), drift="none", residuals=residuals)
 
 
 def at(own: Session, kept: Kept, components: tuple[Component, ...] = (), theta: tuple[float, ...] = ()) -> Point:
@@ -50,13 +38,13 @@ def test_poses_that_agree_are_found_from_any_minimum(bumped: int, enough: bool) 
     residuals = SIGMA * rng.normal(size=(24, 6))
     good = np.arange(24) >= bumped
     residuals[~good] += 60 * SIGMA * rng.normal(size=(bumped, 6))
-    own = session(24, residuals)
+    own = tour(24, residuals)
     away = [TOOL.moved(turn * np.eye(15)[1]) for turn in (3.1, 1.0, 0.0)]
     found = agreeing_poses(own.descent, inverses(own.cov), away)
     assert (found is not None) == enough
     if found is not None:
         np.testing.assert_array_equal(found[1], good)
-        only = session(24, residuals).descent.minima(inverses(own.cov) * good[:, None, None])[0].parameters
+        only = tour(24, residuals).descent.minima(inverses(own.cov) * good[:, None, None])[0].parameters
         np.testing.assert_allclose(found[0].difference(only), 0, atol=1e-6)
 
 
@@ -64,8 +52,8 @@ def test_poses_that_agree_are_found_from_any_minimum(bumped: int, enough: bool) 
 def test_one_pose_in_fifty_sessions_stands_out_by_chance(n: int) -> None:
     limit = stats.chi2.isf(0.02 / n, 6)
     for far, stands_out in ((0.99 * limit, False), (1.01 * limit, True)):
-        assert _stand_out(session(n), np.append(usual(n)[:-1], far)) == stands_out
-    assert not _stand_out(session(7), np.append(usual(7)[:-1], 1000.0))
+        assert _stand_out(tour(n), np.append(usual(n)[:-1], far)) == stands_out
+    assert not _stand_out(tour(7), np.append(usual(7)[:-1], 1000.0))
 
 
 @pytest.mark.parametrize(("share", "stand_out"), [(0.58, True), (0.62, False)])
@@ -75,25 +63,25 @@ def test_many_poses_stand_out_where_the_median_is_small_for_their_mean(share: fl
     mean = 6 * median / stats.chi2.median(6) / share
     distances = np.array([median] * 13 + [(24 * mean - 13 * median) / 11] * 11)
     assert distances.max() < stats.chi2.isf(0.02 / 24, 6)
-    assert _stand_out(session(24), distances) == stand_out
+    assert _stand_out(tour(24), distances) == stand_out
 
 
 @pytest.mark.parametrize(("n", "off", "gaussian"), [(500, 0.98, True), (500, 1.02, False), (499, 0.98, False)])
 def test_noise_is_gaussian_where_its_distribution_is(n: int, off: float, gaussian: bool) -> None:
     critical = stats.kstwobign.isf(0.01) / np.sqrt(n)
     share = np.maximum((np.arange(n) + 0.5) / n - off * critical, 1e-12)
-    assert _are_gaussian(session(n), stats.chi2.ppf(share, 6)) == gaussian
+    assert _are_gaussian(tour(n), stats.chi2.ppf(share, 6)) == gaussian
 
 
 def test_a_pose_is_rejected_beyond_what_one_in_a_thousand_exceeds() -> None:
-    own, kept = session(24), np.arange(24) > 4
+    own, kept = tour(24), np.arange(24) > 4
     assert _limit(own, at(own, kept)) == pytest.approx(FARTHEST)
     estimated = at(own, kept, (component("white", FORCE),), (0.01,))
     assert _limit(own, estimated) == pytest.approx(6 * stats.f.isf(1e-3, 6, 6 * 19 - 15))
 
 
 def test_the_worst_are_rejected_first_and_taken_back_when_they_fit() -> None:
-    own, everything = session(24), np.ones(24, bool)
+    own, everything = tour(24), np.ones(24, bool)
 
     def rejected(kept: Kept, **distances: float) -> list[int]:
         values = np.full(24, 6.0)
@@ -120,7 +108,7 @@ def test_a_rejected_pose_costs_the_limit_and_beyond_it_a_logarithm(
     """Without a pose the likelihood lacks its density, of which the squared distance is a part."""
     others = np.arange(24) != 7
     residuals = SIGMA * np.random.default_rng(1).normal(size=(24, 6)) * np.where(others, 1.0, scale)[:, None]
-    own = session(24, residuals)
+    own = tour(24, residuals)
     counts, rejected = at(own, np.ones(24, bool), components, theta), at(own, others, components, theta)
     e, S = counts.left_out()
     distance, limit = float(e[7] @ np.linalg.solve(S[7], e[7])), _limit(own, rejected)
