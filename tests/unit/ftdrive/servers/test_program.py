@@ -208,7 +208,7 @@ def test_a_wrench_without_new_samples_is_stale_and_a_lost_controller_is_called_a
     service._registers = None
     service._reconnect()
     assert service._registers is None
-    assert cell.ask(9, STATUS, 0.02)["state"], "nothing is written to nobody"
+    assert cell.ask(9, STATUS, 0.02)["state"], "without registers nothing is written"
 
 
 class Turns:
