@@ -10,14 +10,15 @@ from typing import Any, Self
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
 from ftdrive.planning.cell_plan import certifier_for, plan_for
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
-from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.certify import Certificate, Certifier
+from ftdrive.planning.geometry.kinematics import Frames
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
 from ftdrive.runs.outcome import Outcome
@@ -389,6 +390,29 @@ def planned_once(cell: CellConfig, certifier: Certifier, q_rad: Array, poses: in
     return _planned(cell, certifier.arm.name, tuple(q_rad.tolist()), poses)
 
 
+_certify, _certificates = Certifier.certify, dict[tuple[object, ...], Certificate]()
+_frames, _known_frames = ArmModel.frames, dict[tuple[str, bytes], Frames]()
+
+
+def certify_once(certifier: Certifier, start_rad: ArrayLike, end_rad: ArrayLike, *, tight: bool = True) -> Certificate:
+    """As `Certifier.certify`, but the same moves are proven once: a session proves its plan again before it moves."""
+    moves = np.stack([start_rad, end_rad])
+    arm = certifier.arm
+    key = (arm.name, arm.tool, repr(certifier.scene), certifier.margins, moves.tobytes(), tight)
+    if key not in _certificates:
+        _certificates[key] = _certify(certifier, *moves, tight=tight)
+    return _certificates[key]
+
+
+def frames_once(arm: ArmModel, q_rad: ArrayLike) -> Frames:
+    """As `ArmModel.frames`: a guard asks for those of the same postures at each look."""
+    q = np.asarray(q_rad, dtype=np.float64)
+    key = arm.name, q.tobytes()
+    if key not in _known_frames:
+        _known_frames[key] = _frames(arm, q)
+    return _known_frames[key]
+
+
 class Lab:
     """A fake cell and what a test wants of it."""
 
@@ -411,6 +435,8 @@ class Lab:
         monkeypatch.setattr(session, "build_arm", lambda _: self.arm)
         monkeypatch.setattr(session, "build_sensor", lambda _: self.sensor)
         monkeypatch.setattr(task, "plan_for", planned_once)
+        monkeypatch.setattr(Certifier, "certify", certify_once)
+        monkeypatch.setattr(ArmModel, "frames", frames_once)
         monkeypatch.setattr(along_plan, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
         monkeypatch.setattr("os.fsync", lambda _: None)  # the disk may be slow
