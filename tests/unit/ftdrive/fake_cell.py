@@ -37,6 +37,7 @@ from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.sweeping import Sweeping
+from ftdrive.session.task import Calibrating
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceFault
@@ -453,8 +454,16 @@ class Lab:
     def open_cell(self) -> OpenCell:
         return OpenCell(self.arm, self.sensor, self.clock, Journal(self.operator), Limits())
 
+    def _options(self, **options: Any) -> SessionOptions:
+        return SessionOptions(self.folder / "runs", poses=6, **options)
+
     def calibrate(self, **options: Any) -> Outcome | None:
-        return session.calibrate(self.cell, self.operator, SessionOptions(self.folder / "runs", poses=6, **options))
+        return session.calibrate(self.cell, self.operator, self._options(**options))
+
+    def take_poses(self, **options: Any) -> Run | None:
+        """As `calibrate`, for a test that does not ask what the poses give."""
+        chosen = self._options(**options)
+        return session.take_poses(Calibrating(self.cell, chosen.real), self.operator, chosen)
 
     def sweep(self, **options: Any) -> Run | None:
         chosen = SessionOptions(self.folder / "runs", mode="sweep", **options)
