@@ -237,6 +237,11 @@ def test_a_hold_shows_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> 
 
 
 def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None:
+    def drift(event: Event) -> None:
+        if isinstance(event, PoseTaken):
+            lab.sensor.push = lab.sensor.push + np.array([0.1, 0, 0, 0, 0, 0])
+
+    lab.operator.on_event = drift
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
     with pytest.raises(Declined):
         lab.take_poses()
@@ -246,6 +251,8 @@ def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None
     assert outcome is not None
     assert outcome.run.folder == run.folder
     assert [event.stop for event in lab.operator.of(PoseTaken)] == [4, 5, 6, 7]
+    estimate = lab.operator.of(Estimated)[-1].values
+    assert estimate["force_bias_N"].tolist() == outcome.result.force_bias_N.tolist()  # their times are those on disk
     assert len((run.folder / "events.ndjson").read_text().splitlines()) > len(lab.operator.shown)
     first = run.calibration_path.read_bytes()
     lab.operator.shown.clear()

@@ -323,11 +323,11 @@ def test_a_sensor_that_fails_twice_at_a_pose_needs_a_person(lab: Lab) -> None:
 def test_a_full_disk_holds_before_the_arm_moves_on(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     commit, failed = Run.commit, list[int]()
 
-    def full(run: Run, record: PoseRecord) -> None:
+    def full(run: Run, record: PoseRecord) -> PoseRecord:
         if record.stop == 3 and not failed:
             failed.append(len(lab.arm.moves))
             raise OSError(28, "No space left on device")
-        commit(run, record)
+        return commit(run, record)
 
     monkeypatch.setattr(Run, "commit", full)
     lab.operator.answers["resume:"] = ["resume"]
