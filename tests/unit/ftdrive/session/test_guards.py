@@ -93,9 +93,9 @@ def test_an_arm_that_is_moved_while_it_should_stand_has_another_client() -> None
 
 
 def test_only_an_arm_that_comes_no_nearer_has_stalled() -> None:
-    looks = Looks(StallGuard(LIMITS))
+    looks, at = Looks(StallGuard(LIMITS)), state(START)
     for share in np.linspace(0, 1, 1500):  # 15 s for one move
-        assert looks.trips(state=state(START + share * (GOAL - START))) is None
+        assert looks.trips(state=replace(at, q_rad=START + share * (GOAL - START))) is None
     looks = Looks(StallGuard(LIMITS))
     trip = looks.trip(1010, status=replace(STATUS, speed_slider=0.0))
     assert (trip.hazard, "slider 0 %" in str(trip)) == (22, True)

@@ -207,7 +207,7 @@ def test_the_rate_of_a_drift_is_the_same_whichever_was_first(elapsed_s: float, w
 def test_an_approach_past_a_skipped_pose_is_shown_and_confirmed_by_the_operator(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lab.take_poses()  # trusted from here on
+    lab.trust()
     lab.operator.asked.clear()
     lab.operator.answers["Pose 3 of 7"] = ["s"] * 2
     lab.take_poses(mode="step")

@@ -98,9 +98,7 @@ def test_a_plan_for_any_speed_is_driven_at_no_more_than_is_allowed(lab: Lab) -> 
     speeds = Speeds(float(np.radians(180)), float(np.radians(80)), None)
     path = lab.folder / "plan.json"
     plan_tour(certifier, USUAL_POSTURE_RAD, 6, speeds=speeds, guess=guess_of(certifier)).save(path)
-    lab.take_poses(plan=path)
-    assert has_completed("A1", str(Plan.load(path).to_dict()["sha256"]))
-    lab.arm.moves.clear()
+    remember_completed("A1", Plan.load(path).sha256)
     lab.take_poses(plan=path, fast=True)
     fastest = 0.0
     for (start, *_), (goal, speed, _) in pairwise(lab.arm.moves):
@@ -290,9 +288,7 @@ def test_a_way_that_moves_the_whole_arm_asks_for_its_room(lab: Lab) -> None:
 def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_known(
     away_deg: tuple[float, float], assumed: bool, lab: Lab
 ) -> None:
-    lab.take_poses()
-    plan = lab.run().plan_path
-    lab.operator.asked.clear()
+    plan = lab.trust()
     elbow, wrist = away_deg
     lab.arm.q = lab.arm.q + np.radians([0, 0, elbow, 0, 0, wrist])
     lab.take_poses(plan=plan, fast=True)
@@ -303,7 +299,7 @@ def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_know
 
 
 def test_a_run_that_goes_on_from_elsewhere_is_confirmed_by_a_person(lab: Lab) -> None:
-    lab.take_poses()  # trusted from here on
+    lab.trust()
     for joint, assumed in ((5, True), (0, False)):
         lab.operator.asked.clear()
         lab.operator.shown.clear()
