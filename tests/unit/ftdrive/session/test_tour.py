@@ -242,7 +242,7 @@ def test_a_run_in_which_nothing_moved_does_not_count_as_complete(lab: Lab) -> No
 
 
 def test_a_dry_run_shows_all_and_moves_nothing(lab: Lab) -> None:
-    assert lab.take_poses(dry_run=True) is None
+    assert lab.calibrate(dry_run=True) is None
     assert lab.arm.moves == []
     assert lab.operator.asked == []
     assert not (lab.folder / "runs").exists()
