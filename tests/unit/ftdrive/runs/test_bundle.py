@@ -86,7 +86,7 @@ def test_no_text_of_a_bundle_has_an_address_or_a_name_and_serial_numbers_stay(ru
     header = json.loads(texts[f"{run.folder.name}/run.json"])
     assert header["config"]["robot"]["host"].startswith("<host-")
     assert header["said"]["config"].startswith("<home-1>/")
-    assert "numpy" in json.loads(texts["environment.json"])["packages"]
+    assert json.loads(texts["environment.json"])["packages"]["numpy"] == np.__version__
 
 
 def test_a_bundle_gives_the_result_of_its_run_to_the_last_digit(run: Run, bundled: tuple[Path, Bundled]) -> None:
