@@ -50,15 +50,15 @@ class Looks:
     def __init__(self, guard: Guard, *, moving: bool = True) -> None:
         self.guard = guard
         self.motion = ExpectedMotion(START, GOAL, moving=True) if moving else ExpectedMotion(GOAL, GOAL, moving=False)
+        self.state = state(START + 0.4 * (GOAL - START) if moving else GOAL)
         self.t_s, self.sample = 0.0, 0
         self.rng = np.random.default_rng(0)
         guard.begin(self.seen())
 
     def seen(self, *, new: bool = True, **different: Any) -> Seen:
         self.t_s, self.sample = self.t_s + 0.01, self.sample + new
-        q = START + 0.4 * (GOAL - START) if self.motion.moving else GOAL
         wrench = WEIGHT + self.rng.normal(0, 0.03, 6)
-        usual: dict[str, Any] = {"state": state(q), "status": STATUS, "wrench": wrench, "turn_rad_s": 0.0}
+        usual: dict[str, Any] = {"state": self.state, "status": STATUS, "wrench": wrench, "turn_rad_s": 0.0}
         return Seen(t_s=self.t_s, dt_s=0.01, motion=self.motion, sample=self.sample, **(usual | different))
 
     def trips(self, times: int = 1, *, new: bool = True, **different: Any) -> Tripped | None:

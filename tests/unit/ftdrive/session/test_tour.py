@@ -66,12 +66,13 @@ def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> 
 
 
 def test_the_journal_records_unanswered_questions(lab: Lab) -> None:
+    beside = lab.arm.q
     lab.take_poses(yes=True)  # a first run: --yes answers nothing
     assert {event.by for event in lab.operator.of(Asked)} == {"person"}
     lab.operator.shown.clear()
     lab.operator.asked.clear()
     lab.operator.answers["tool free"] = ["no"]
-    lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 5.0])
+    lab.arm.q = beside
     lab.take_poses(yes=True)
     assert lab.operator.asked == []
     answered = [(event.answer, event.by) for event in lab.operator.of(Asked)]
@@ -376,13 +377,14 @@ def test_step_mode_says_what_enter_does(lab: Lab) -> None:
 
 
 def test_step_mode_says_whether_enter_may_move_the_arm_to_the_first_pose(lab: Lab) -> None:
+    beside = lab.arm.q
     for yes, words in (
         (True, "shows it, joint"),
         (True, "shows it, and drives it where --yes may confirm it"),
         (False, "shows it, joint"),
     ):
         lab.operator.asked.clear()
-        lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 5.0])
+        lab.arm.q = beside
         lab.take_poses(mode="step", yes=yes)
         first = next(question.text for question in lab.operator.asked if question.text.startswith("Pose 1"))
         assert words in first
