@@ -86,6 +86,16 @@ def test_joints_that_leave_the_straight_line_are_seen() -> None:
         assert (trip.hazard, f"joint {joint + 1}" in str(trip)) == (2, True)
 
 
+@pytest.mark.parametrize("on_curve", [False, True])
+def test_base_and_shoulder_that_turn_may_leave_the_line_as_far_as_the_wrist(on_curve: bool) -> None:
+    looks, turn = Looks(PathGuard(LIMITS)), np.radians([40.0, 40, 0, 0, 0, 0])
+    curve = START + np.linspace(0, 1, 401)[:, None] * turn if on_curve else None
+    looks.motion = ExpectedMotion(START, START + turn, moving=True, curve_rad=curve)
+    aside = START + 0.5 * turn + np.radians([1.6, -1.6, 0, 0, 0, 0])
+    assert looks.trips(state=state(aside)) is None
+    assert looks.trip(state=state(aside + np.radians([0.8, -0.8, 0, 0, 0, 0]))).hazard == 2
+
+
 def test_an_arm_that_is_moved_while_it_should_stand_has_another_client() -> None:
     looks = Looks(PathGuard(LIMITS), moving=False)
     assert looks.trips(50) is None
