@@ -73,7 +73,9 @@ def contents(path: Path) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def test_no_text_of_a_bundle_has_an_address_or_a_name_and_serial_numbers_stay(run: Run, bundled: tuple[Path, Bundled]) -> None:
+def test_no_text_of_a_bundle_has_an_address_or_a_name_and_serial_numbers_stay(
+    run: Run, bundled: tuple[Path, Bundled]
+) -> None:
     path, done = bundled
     files = contents(path)
     texts = {name: content.decode() for name, content in files.items() if not name.endswith(".npz")}
