@@ -20,8 +20,8 @@ CABLE = np.array([0, 0, 0, 0, 0, 3.0])
 class Bench:
     """A scale on a recording of rests in one pose, on a fake clock."""
 
-    def __init__(self, *wrenches: Any, seconds: float = 2.0) -> None:
-        rows = rests(*((POSE, wrench) for wrench in wrenches), seconds=seconds)
+    def __init__(self, *wrenches: Any) -> None:
+        rows = rests(*((POSE, wrench) for wrench in wrenches), seconds=1.2)
         clock = FakeClock()
         rows = replace(rows, t_host_ns=rows.t_host_ns - rows.t_host_ns[0] + clock.now_ns())
         self.stream = ReplayedStream(info(calibrated()), rows, clock=clock)
