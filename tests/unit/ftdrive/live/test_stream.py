@@ -252,14 +252,15 @@ def test_a_stream_is_opened_by_the_name_of_a_tool(tools: Cell) -> None:
 
 def test_the_tool_is_switched_while_the_devices_stay_open(tools: Cell) -> None:
     tools.sensor.motion = tools.arm.motion = Motion()
-    with open_stream(tools.config, tool="drill", frame=WrenchFrame("base"), stages=Stages(lowpass_Hz=200.0)) as stream:
+    with open_stream(tools.config, tool="drill", stages=Stages(lowpass_Hz=200.0)) as stream:
+        stream.frame = WrenchFrame("base")
         until(stream, lambda: stream.status().delay_sigma_s < 0.02)
         before, sigma_s = stream.read(), stream.status().delay_sigma_s
         stream.mark("tool changed")
         event = stream.use_tool("gripper")
         after = stream.read()
         assert stream.status().delay_sigma_s == sigma_s
-        assert [one.kind for one in stream.take_events() if one.kind != "contact"] == ["mark", "tool"]
+        assert [one.kind for one in stream.take_events() if one.kind != "contact"] == ["frame", "mark", "tool"]
         with pytest.raises(ConfigError, match="'welder'"):
             stream.use_tool("welder")
         assert stream.info.tool == "gripper"

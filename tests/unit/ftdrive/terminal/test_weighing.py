@@ -21,7 +21,7 @@ class Bench:
     """A scale on a recording of rests in one pose, on a fake clock."""
 
     def __init__(self, *wrenches: Any) -> None:
-        rows = rests(*((POSE, wrench) for wrench in wrenches), seconds=1.2)
+        rows = rests(*((POSE, wrench) for wrench in wrenches), seconds=1.8)
         clock = FakeClock()
         rows = replace(rows, t_host_ns=rows.t_host_ns - rows.t_host_ns[0] + clock.now_ns())
         self.stream = ReplayedStream(info(calibrated()), rows, clock=clock)
