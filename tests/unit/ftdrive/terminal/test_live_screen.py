@@ -99,7 +99,8 @@ def test_screen(scenario: Scenario, size: tuple[int, int], snapshot: SnapshotAss
 @pytest.mark.parametrize("scenario", ["contact", "stale"])
 def test_every_size_is_filled_exactly(scenario: Scenario) -> None:
     view = Screen(scenario).summary.view()
-    for width, height in (*product((1, 40, 60, 79, 81, 119, 121), (1, 8, 16, 23, 25)), (121, 40), (200, 70)):
+    tall = (40, 40), (60, 70), (119, 70), (121, 40), (200, 70)
+    for width, height in (*product((1, 40, 60, 79, 81, 119, 121), (1, 8, 16, 23, 25)), *tall):
         lines = frame(view, width, height)
         assert {line.width for line in lines} == {width}
         assert len(lines) == height
