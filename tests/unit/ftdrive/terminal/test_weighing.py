@@ -30,7 +30,8 @@ class Bench:
         self.weighing = Weighing(cast("Any", self.stream), None, joins=False, part_kg=None, log=log)
 
 
-def test_each_part_and_each_fault_is_kept_once() -> None:
+def test_each_part_and_each_fault_is_kept_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ftdrive.live.replay.STEP_S", 0.05)
     bench = Bench(part(POSE, 0.8), NOTHING, part(POSE, 0.3) + CABLE)
     for _ in bench.weighing.states():
         if bench.stream.has_ended:
