@@ -4,6 +4,7 @@ import urllib.request
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
+from socketserver import BaseServer
 
 import pytest
 
@@ -14,6 +15,11 @@ from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fleet.fleets import cell, fleet
 
 Ran = tuple[int, str]
+
+
+@pytest.fixture(autouse=True)
+def _quick_shutdown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(BaseServer.serve_forever, "__defaults__", (0.01,))  # else half a second
 
 
 @pytest.fixture

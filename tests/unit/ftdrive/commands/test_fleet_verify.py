@@ -34,8 +34,8 @@ class Terminal(io.StringIO):
 class Lab:
     """Three cells whose sessions and operators are scripts."""
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.folder, self.url = folder, f"sqlite:///{folder / 'fleet.sqlite'}"
+    def __init__(self, url: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.url, self.folder = url, folder
         self.answers: list[str | Exception] = []
         self.asked: list[str] = []
         self.outcomes: list[str | BaseException] = []
@@ -44,12 +44,7 @@ class Lab:
         self._monkeypatch = monkeypatch
         monkeypatch.setattr(command, "verify_cell", self._session)
         monkeypatch.setattr("ftdrive.terminal.operators.PlainOperator", lambda: self)
-        self.store = Store(self.url)
-        now = datetime.now(UTC)
-        for n, name in enumerate(NAMES):
-            day = (now - timedelta(days=20 * n) - FIRST) / timedelta(days=1)
-            new_run(folder / name / "runs", f"run-{name}", result(day, serials=(f"arm-{name}", "ft-1")))
-            self.store.index(folder / name / "runs")
+        self.store = Store(url)
         self.put(*map(self.cell, NAMES))
 
     def cell(self, name: str, tool: str = "gripper", host: str = "") -> StoredCell:
@@ -109,11 +104,23 @@ class Lab:
         return code, out.getvalue().splitlines(), " ".join(err.getvalue().split())
 
 
+@pytest.fixture(scope="module")
+def indexed(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """The URL of a store and a folder with a run of each cell, which no test changes."""
+    folder = tmp_path_factory.mktemp("fleet")
+    url = f"sqlite:///{folder / 'fleet.sqlite'}"
+    for n, name in enumerate(NAMES):
+        day = (datetime.now(UTC) - timedelta(days=20 * n) - FIRST) / timedelta(days=1)
+        new_run(folder / name / "runs", f"run-{name}", result(day, serials=(f"arm-{name}", "ft-1")))
+        Store(url).index(folder / name / "runs")
+    return url, folder
+
+
 @pytest.fixture
-def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
+def lab(indexed: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    return Lab(tmp_path, monkeypatch)
+    return Lab(*indexed, monkeypatch)
 
 
 @pytest.mark.parametrize("terminals", ["", "i", "e"])

@@ -21,13 +21,14 @@ from ftdrive.commands import live
 from ftdrive.live.processing import Processor
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block, Stages, WrenchFrame
+from ftdrive.terminal.live import feed
 from ftdrive.terminal.live.layout import plain
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.live.simulated import NOISE, calibrated, dwells, info, paired
 
 
-def replayed(seconds: float = 2.0, **options: Any) -> ReplayedStream:
+def replayed(seconds: float = 1.2, **options: Any) -> ReplayedStream:
     rows = paired(dwells(1, round(seconds * 1000), seed=1), push=np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
     return ReplayedStream(info(calibrated()), rows, clock=FakeClock(), **options)
 
@@ -51,7 +52,7 @@ def run(arguments: list[str], *more: str) -> Any:
 
 def test_each_line_is_the_mean_of_a_tenth_of_a_second(arguments: list[str]) -> None:
     lines = [json.loads(line) for line in run(arguments, "--json").stdout.splitlines()]
-    assert len(lines) == pytest.approx(19, abs=2)
+    assert len(lines) == pytest.approx(11, abs=2)
     for line in lines:
         assert line["compensated"]["force_N"] == pytest.approx([1.0, 2.0, 3.0], abs=6 * NOISE[0] / 10)
         assert line["sigma"]["force_N"] == pytest.approx(NOISE[:3] / 10, rel=0.3)
@@ -103,7 +104,7 @@ def test_a_file_gets_a_line_for_each_reading(arguments: list[str]) -> None:
     for more in (["--plain"], []):
         result = run(arguments, *more)
         lines = result.stdout.splitlines()
-        assert len(lines) == pytest.approx(19, abs=2)
+        assert len(lines) == pytest.approx(11, abs=2)
         assert all(re.match(r"\d+\.\d s   F( +-?\d+\.\d{3}){3} N   T", line) for line in lines)
         assert lines[-1].endswith("(sensor axes, about the sensor origin)   contact")
         assert "F " not in result.stderr
@@ -184,7 +185,8 @@ def test_a_silent_device_is_shown_and_no_old_number() -> None:
     assert not re.search(r" Fx +[+-]?\d", shown)
 
 
-def test_a_failure_that_lasts_ends_the_command() -> None:
+def test_a_failure_that_lasts_ends_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feed, "_RETRY_S", 0.0)
     for failures, raises in ((1000, False), (1, True)):
         stream: Any = Interrupted(failures)
         with pytest.raises(DeviceTimeout):

@@ -1,6 +1,7 @@
 """A calibration that was edited by hand, or made in an emulated cell: refused, or marked in every output."""
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -22,14 +23,23 @@ SEED = 77
 """Of runs in an emulated cell, which no other test solves."""
 
 
+@pytest.fixture(scope="module")
+def peg(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recorded") / "peg.csv"
+    recorder = Recorder([path], info(), {})
+    recorder.write(block(1200))
+    recorder.close()
+    return path
+
+
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
+def run(
+    peg: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Ran]:
     """Run a command line beside `c.json` and a recording `peg.csv`; return exit code, stdout and stderr as one line."""
     monkeypatch.chdir(tmp_path)
     calibration().save(Path("c.json"))
-    recorder = Recorder([Path("peg.csv")], info(), {})
-    recorder.write(block(3000))
-    recorder.close()
+    shutil.copy(peg, "peg.csv")
 
     def run(*words: str) -> Ran:
         code = cli.run(list(words))
@@ -105,7 +115,10 @@ def emulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CalibrationResu
 
 
 @pytest.mark.usefixtures("emulated")
-def test_every_output_of_an_emulated_calibration_says_so(run: Callable[..., Ran]) -> None:
+def test_every_output_of_an_emulated_calibration_says_so(
+    run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ftdrive.report.page.draw", lambda *_: "")  # figures take most of the time
     for form in ("html", "md"):
         run("report", "e.json", "--format", form, "-o", f"report.{form}")
         text = Path(f"report.{form}").read_text(encoding="utf-8")

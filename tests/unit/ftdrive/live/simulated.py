@@ -114,9 +114,11 @@ class Motion:
         """What the sensor measures without noise, (n, 6)."""
         com_m = P_FLANGE_SENSOR_M + TRUTH.R_flange_sensor @ TRUTH.p_sensor_com_m
         h = 1e-3
-        before, now, after = (p + R @ com_m for R, p in map(self.pose, (t_s - h, t_s, t_s + h)))
+        n = len(t_s)
+        R, p = self.pose(np.concatenate([t_s - h, t_s, t_s + h]))
+        before, now, after = (p + R @ com_m).reshape(3, n, 3)
         acceleration = (after - 2 * now + before) / h**2
-        R = self.pose(t_s)[0]
+        R = R[n : 2 * n]
         mass_kg = np.linalg.norm(TRUTH.gravity_force_base_N) / G
         force_N = -mass_kg * np.einsum("nij,ni->nj", R @ TRUTH.R_flange_sensor, acceleration)
         inertial = np.concatenate([force_N, np.cross(TRUTH.p_sensor_com_m, force_N)], axis=1)

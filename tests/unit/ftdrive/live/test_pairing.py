@@ -157,7 +157,7 @@ def test_the_delay_between_the_links_is_found_from_motion(delay_s: float, touch:
 
 def test_vibration_and_noisy_poses_are_not_taken_for_a_delay() -> None:
     truth = Truth()
-    one = record(truth, sweep(20.0), 20.0, 3)
+    one = record(truth, sweep(12.0), 12.0, 3)
     samples = FtSamples.of(T0_NS + np.rint(1e9 * one.t_s).astype(np.int64), np.arange(len(one.t_s)), one.wrench)
     calibration = calibrated_from(truth.to_dict() | {"noise_force_N": 0.05, "noise_torque_Nm": 0.002})
     t_ns, unknown = T0_NS + np.rint(1e9 * one.t_pose_s).astype(np.int64), np.full((len(one.t_pose_s), 6), np.nan)

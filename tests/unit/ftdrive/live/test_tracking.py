@@ -96,14 +96,14 @@ def test_the_uncertainty_grows_while_the_bias_cannot_be_seen() -> None:
     program = Program(2)
     program.turn(30)
     before = program.last
-    program.touch(500)
+    program.touch(250)
     after = program.last
     assert before is not None
     assert after is not None
     assert before.last_seen_s == pytest.approx(2 * WINDOW_S)  # two windows wait
-    assert after.last_seen_s == pytest.approx(502 * WINDOW_S)
+    assert after.last_seen_s == pytest.approx(252 * WINDOW_S)
     grown = np.square(after.sigma) - np.square(before.sigma)
-    walks_N = np.square([0.1, 0.3, 1.0, 3.0]) * 500 * WINDOW_S / 3600  # what each of them does in this time
+    walks_N = np.square([0.1, 0.3, 1.0, 3.0]) * 250 * WINDOW_S / 3600  # what each of them does in this time
     assert 2 * walks_N[0] < grown[:3].min() <= grown[:3].max() < walks_N[3]
     np.testing.assert_allclose(grown[3:], grown[:3].mean() * 0.03**2, rtol=0.1)
 

@@ -23,6 +23,7 @@ from ftdrive.live.weighing import (
     load_values,
     weigh_in_motion,
 )
+from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, TRUTH, G, calibrated, info, paired
 
 POSE = Rotation.from_euler("xz", [170, 25], degrees=True).as_matrix()
@@ -31,10 +32,10 @@ NOTHING = np.zeros(6)
 
 
 def part(R: Array, mass_kg: float) -> Array:
-    """Wrench (6,) of a part."""
+    """Wrench (6,) or (n, 6) of a part."""
     down = TRUTH.gravity_force_base_N / np.linalg.norm(TRUTH.gravity_force_base_N)
     force_N = mass_kg * G * down @ (R @ TRUTH.R_flange_sensor)
-    return np.concatenate([force_N, np.cross(COM_M, force_N)])
+    return np.concatenate([force_N, np.cross(COM_M, force_N)], axis=-1)
 
 
 def inertia(R: Array, mass_kg: float, p_sensor_m: Array) -> Array:
@@ -53,13 +54,12 @@ def rests(*each: tuple[Array, Array], seconds: float = 1.0) -> Paired:
 
 
 def stream(rows: Paired) -> ReplayedStream:
-    return ReplayedStream(info(calibrated()), rows, speed=float("inf"))
+    return ReplayedStream(info(calibrated()), rows, clock=FakeClock())
 
 
 def read(source: ReplayedStream, seconds: float) -> None:
-    n = 0
-    while n < 1000 * seconds and not source.has_ended:
-        n += len(source.read())
+    source.clock.sleep(seconds)
+    source.read(0.0)
 
 
 def test_a_tare_is_the_zero() -> None:
@@ -83,7 +83,7 @@ def test_a_tare_is_the_zero() -> None:
 
 def test_the_library_waits_for_rest_and_joins_poses() -> None:
     poses = [POSE, Rotation.from_euler("x", 90, degrees=True).as_matrix(), np.eye(3)]
-    source = stream(rests(*((R, part(R, 1.5)) for R in poses)))
+    source = stream(rests(*((R, part(R, 1.5)) for R in poses), seconds=0.6))
     weight = ftdrive.weigh(source, poses=3)
     assert (weight.poses, weight.line) == (3, None)
     np.testing.assert_allclose(weight.p_sensor_com_m, COM_M, atol=4 * weight.com_sigma_m.max())
@@ -130,7 +130,7 @@ def carried(mass_kg: float, *, push: Array = NOTHING, empty_s: float = 6.0) -> R
     """An arm that turns without rest; after `empty_s` it has a part, and from 4 s later on a push."""
     t_s = np.arange(0, empty_s + 8.0, 1e-3)
     R = (Rotation.from_rotvec(np.outer(t_s, [0.3, 0.2, 0.1])) * Rotation.from_matrix(POSE)).as_matrix()
-    weight = np.array([part(one, mass_kg) for one in R]) + inertia(R, mass_kg, COM_M)
+    weight = part(R, mass_kg) + inertia(R, mass_kg, COM_M)
     tool_kg = float(np.linalg.norm(TRUTH.gravity_force_base_N)) / G
     wrench = inertia(R, tool_kg, TRUTH.p_sensor_com_m) + weight * (t_s > empty_s)[:, None]
     wrench[t_s > empty_s + 4] += push

@@ -49,7 +49,7 @@ def tf(*transforms: Any) -> Any:
 
 
 @lru_cache(maxsize=1)
-def data(seconds: float = 12.0) -> tuple[Any, ...]:
+def data(seconds: float = 8.0) -> tuple[Any, ...]:
     """Times of wrench and poses, the wrench, joint angles and poses; the clock of the sensor is 40 ms ahead."""
     t_wrench, t_pose = (np.float64(1e-9) * np.arange(0, round(1e9 * seconds), 10**9 // rate) for rate in (200, 100))
     noise = np.random.default_rng(1).normal(size=(len(t_wrench), 6)) * TRUTH["noise"]
@@ -72,6 +72,7 @@ TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
     "/joints": "sensor_msgs/msg/JointState",
 }
+TF = ("/ft", "/tf", "/tf_static")
 
 
 def bag(
@@ -86,26 +87,44 @@ def bag(
     t_wrench, t_pose, measured, q, quat, p = data()
     made: dict[str, list[tuple[float, Any]]] = {topic: [] for topic in topics}
 
-    def add(topic: str, row: int, t_s: float, one: Any) -> None:
-        if topic in made and (one := spoil(topic, row, one)) is not None:
-            made[topic].append((t_s, one))
-
-    for row, t_s in enumerate(t_wrench[:rows].tolist()):
-        parts = message("geometry_msgs/msg/Wrench", force=vector(measured[row, :3]), torque=vector(measured[row, 3:]))
-        add("/ft", row, t_s, message(TOPICS["/ft"], header=header(t_s, "ft"), wrench=parts))
     half = [0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]
-    add("/tf_static", 0, 9.0, tf(transform(0.0, "half", "flange", *half)))  # written late, as a latched message may be
-    for row, t_s in enumerate(t_pose[:rows].tolist()):
+
+    def ft(row: int, t_s: float) -> Any:
+        parts = message("geometry_msgs/msg/Wrench", force=vector(measured[row, :3]), torque=vector(measured[row, 3:]))
+        return message(TOPICS["/ft"], header=header(t_s, "ft"), wrench=parts)
+
+    def pose(row: int, t_s: float) -> Any:
         orientation = vector(quat[row], "Quaternion")
-        pose = message("geometry_msgs/msg/Pose", position=vector(p[row], "Point"), orientation=orientation)
-        add("/pose", row, t_s, message(TOPICS["/pose"], header=header(t_s), pose=pose))
+        at = message("geometry_msgs/msg/Pose", position=vector(p[row], "Point"), orientation=orientation)
+        return message(TOPICS["/pose"], header=header(t_s), pose=at)
+
+    def moving(row: int, t_s: float) -> Any:
         above = p[row] - Rotation.from_quat(quat[row]).apply(half[0])
         other = transform(t_s, "world", "camera", [1, 2, 3], [0, 0, 0, 1])
-        add("/tf", row, t_s, tf(other, transform(t_s, "base", "half", above, quat[row])))
+        return tf(other, transform(t_s, "base", "half", above, quat[row]))
+
+    def fixed(_row: int, _t_s: float) -> Any:
+        return tf(transform(0.0, "half", "flange", *half))
+
+    def joints(row: int, t_s: float) -> Any:
         none = np.zeros(0)
         named = [*JOINTS, "finger"]
         state = {"header": header(t_s, ""), "name": named, "position": np.append(q[row], 0.1)}
-        add("/joints", row, t_s, message(TOPICS["/joints"], **state, velocity=none, effort=none))
+        return message(TOPICS["/joints"], **state, velocity=none, effort=none)
+
+    makers: dict[str, Callable[[int, float], Any]] = {
+        "/ft": ft,
+        "/pose": pose,
+        "/tf": moving,
+        "/tf_static": fixed,
+        "/joints": joints,
+    }
+    late_s = [6.0]  # as a latched message may be
+    for topic in topics:
+        times_s = {"/ft": t_wrench[:rows].tolist(), "/tf_static": late_s}.get(topic, t_pose[:rows].tolist())
+        for row, t_s in enumerate(times_s):
+            if (one := spoil(topic, row, makers[topic](row, t_s))) is not None:
+                made[topic].append((t_s, one))
     with Writer(path, version=9, storage_plugin=plugin) as writer:
         for topic, messages in made.items():
             connection = writer.add_connection(topic, TOPICS[topic], typestore=STORE)
@@ -124,6 +143,24 @@ def numbers(result: Any) -> Any:
     return np.concatenate([np.ravel(value) for value in asdict(result.parameters).values()])
 
 
+def test_a_bag_with_transforms_is_solved_from_its_motion(tmp_path: Path) -> None:
+    (path,) = bag(tmp_path / "bag", plugin=StoragePlugin.MCAP, topics=TF).glob("*.mcap")  # a file of its own
+    assert is_bag(path)
+    found = read_bag(path, None, "tf?base=base&flange=flange")
+    t_wrench, t_pose, measured, _, quat, p = data()
+    assert np.allclose(found.t_wrench_s, t_wrench, rtol=0, atol=1e-9)
+    assert np.allclose(found.t_pose_s, t_pose, rtol=0, atol=1e-9)
+    assert np.array_equal(found.wrench, measured)
+    sign = np.sign(np.sum(quat * found.pose[:, :4], axis=1))
+    assert np.allclose(found.pose, np.hstack([sign[:, None] * quat, p]), rtol=0, atol=1e-12)
+    result = solve_recording(path, None, bag_means(found), known=None, point_mass=True, up_in_base=None)
+    assert result.motion is not None
+    assert abs(result.motion.delay_s - 0.04) < 1e-3
+    assert abs(result.mass_kg - TRUTH["mass_kg"]) < 3 * result.sigma["mass_kg"]
+    error_m = result.p_sensor_com_m - TRUTH["p_sensor_com_m"]
+    assert (np.abs(error_m) < 4 * np.array(result.sigma["p_sensor_com_m"])).all()
+
+
 @pytest.fixture(scope="module")
 def expected(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The same data as CSV, written here."""
@@ -138,18 +175,13 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return solve_recording(pair[0], pair, known=None, point_mass=True, up_in_base=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("plugin", "topics", "pose_topic"),
     [
-        pytest.param(StoragePlugin.SQLITE3, ("/ft", "/pose"), None, marks=pytest.mark.slow),
-        pytest.param(StoragePlugin.MCAP, ("/ft", "/pose"), "/pose", marks=pytest.mark.slow),
-        (StoragePlugin.MCAP, ("/ft", "/tf", "/tf_static"), "tf?base=base&flange=flange"),
-        pytest.param(
-            StoragePlugin.SQLITE3,
-            ("/ft", "/pose", "/joints"),
-            "/joints?urdf={urdf}&flange=flange&base=link0",
-            marks=pytest.mark.slow,
-        ),
+        (StoragePlugin.SQLITE3, ("/ft", "/pose"), None),
+        (StoragePlugin.MCAP, ("/ft", "/pose"), "/pose"),
+        (StoragePlugin.SQLITE3, ("/ft", "/pose", "/joints"), "/joints?urdf={urdf}&flange=flange&base=link0"),
     ],
 )
 def test_a_bag_is_solved_as_the_csv_of_the_same_data(
@@ -211,7 +243,6 @@ def retype(path: Path) -> None:
     file.write_text(file.read_text().replace("WrenchStamped", "Wrench"))
 
 
-TF = ("/ft", "/tf", "/tf_static")
 CASES: list[tuple[str, dict[str, Any], str | None, str | None, Any]] = [
     ("stamp 0", {"spoil": changed("/ft", set_stamp)}, None, None, None),
     ("not finite", {"spoil": changed("/ft", set_nan)}, None, None, None),
@@ -242,7 +273,7 @@ CASES: list[tuple[str, dict[str, Any], str | None, str | None, Any]] = [
 def test_a_bag_that_cannot_be_used_is_one_sentence(
     words: str, made: dict[str, Any], wrench_topic: str | None, pose_topic: str | None, damage: Any, tmp_path: Path
 ) -> None:
-    path = bag(tmp_path / "bag", **made, rows=300)
+    path = bag(tmp_path / "bag", **made, rows=60)
     if damage is not None:
         damage(path)
     with pytest.raises(FtdriveError) as error:

@@ -14,7 +14,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
 from ftdrive.recording import Header, Recording, number_table, read_recording
 from ftdrive.recording.compensation import compensated, estimated_bias
-from ftdrive.recording.csv_pair import CsvPair, numbers_of
+from ftdrive.recording.csv_pair import CsvPair, numbers_of, read_orientation
 from ftdrive.recording.recording import rows_of
 from ftdrivers.interfaces import Array
 from tests.unit.ftdrive.recorded import NOISE, TRUTH, calibration, info
@@ -116,25 +116,33 @@ def test_a_short_recording_shows_no_bias() -> None:
 
 def write_pair(folder: Path, delay_s: float, orientation: str) -> tuple[Path, Path]:
     """The recording as two files: wrench at 500 Hz, late by the delay, orientation at 125 Hz."""
-    source = recording(seconds=15.0)
+    source = recording(seconds=10.0)
     wrench, poses = folder / "wrench.csv", folder / "poses.csv"
     t_s = np.arange(len(source.rows)) / RATE_HZ + 100.0
     table = np.c_[t_s + delay_s, source.rows["raw"]]
-    np.savetxt(wrench, table, delimiter=",", header="t, fx,fy,fz,tx,ty,tz", comments="")
-    t_s = np.arange(-1.0, 16.0, 1 / 125)
+    np.savetxt(wrench, table, "%.12g", ",", header="t, fx,fy,fz,tx,ty,tz", comments="")
+    t_s = np.arange(-1.0, 11.0, 1 / 125)
     R = Rotation.from_matrix(turning(t_s))
     numbers = {
         "r11,r12,r13,r21,r22,r23,r31,r32,r33": R.as_matrix().reshape(-1, 9),
         "qx,qy,qz,qw": R.as_quat(),
         "rx,ry,rz": R.as_rotvec(),
     }[orientation]
-    np.savetxt(poses, np.c_[numbers, t_s + 100.0], delimiter=",", header=f"{orientation},t", comments="")
+    np.savetxt(poses, np.c_[numbers, t_s + 100.0], "%.12g", ",", header=f"{orientation},t", comments="")
     return wrench, poses
 
 
 @pytest.mark.parametrize("orientation", ["r11,r12,r13,r21,r22,r23,r31,r32,r33", "qx,qy,qz,qw", "rx,ry,rz"])
-def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(orientation: str, tmp_path: Path) -> None:
-    files = write_pair(tmp_path, 0.012, orientation)
+def test_orientations_are_read_as_matrices_quaternions_and_rotation_vectors(orientation: str, tmp_path: Path) -> None:
+    _, poses = write_pair(tmp_path, 0.0, orientation)
+    (states,) = read_orientation(poses)
+    t_s = np.arange(-1.0, 11.0, 1 / 125)
+    np.testing.assert_allclose(states.t_host_ns.astype(float), 1e9 * (t_s + 100), rtol=0, atol=2)
+    np.testing.assert_allclose(states.R_base_flange, turning(t_s), atol=1e-10)
+
+
+def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(tmp_path: Path) -> None:
+    files = write_pair(tmp_path, 0.012, "rx,ry,rz")
     found = CsvPair(*files, calibration(), "c", None)
     assert found.delay_s == pytest.approx(0.012, abs=1e-3)
     assert 0 < found.delay_sigma_s < 1e-3
@@ -153,13 +161,13 @@ def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
     lines = (tmp_path / damaged).read_text().splitlines()
     lines[len(lines) * 2 // 3] = "?"
     (tmp_path / damaged).write_text("\n".join(lines))
-    monkeypatch.setattr(number_table, "_READ_BYTES", 1 << 14)
+    monkeypatch.setattr(number_table, "_READ_BYTES", 1 << 15)
     found = CsvPair(*files, calibration(), "c", None)
     assert found.delay_s == pytest.approx(0.012, abs=2e-3)
     numbers, failure = compensated(found, WrenchFrame(), tmp_path / "new.csv")
     assert isinstance(failure, BadDataset)
     assert f"{damaged}, after row" in numbers["cut"]
-    assert 4000 < numbers["samples"] == len(read_recording(tmp_path / "new.csv").rows) <= 5100
+    assert 2600 < numbers["samples"] == len(read_recording(tmp_path / "new.csv").rows) <= 3400
 
 
 @pytest.mark.parametrize(

@@ -255,7 +255,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return files
 
 
-@pytest.mark.parametrize(("ending", "cuts", "least"), [(".mcap", 30, 5), (".csv", 30, 10), (".parquet", 5, 1)])
+@pytest.mark.parametrize(("ending", "cuts", "least"), [(".mcap", 16, 5), (".csv", 16, 10), (".parquet", 5, 1)])
 def test_a_file_cut_anywhere_is_read_up_to_there_or_rejected(
     small: Sequence[Path], ending: str, cuts: int, least: int, tmp_path: Path
 ) -> None:

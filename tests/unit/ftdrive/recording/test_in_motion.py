@@ -20,7 +20,7 @@ from tests.moving_load import Recorded, Truth, record, sweep
 from tests.unit.ftdrive.live.simulated import calibrated_from
 from tests.unit.ftdrive.recorded import info
 
-SECONDS = 10.0
+SECONDS = 7.0
 TRUTH = Truth(height_m=0.04)
 
 

@@ -55,7 +55,7 @@ def test_a_full_disk_leaves_partial_files_that_say_what_is_safe(
     ending: str, tmp_path: Path, fill_disk: Callable[[int], None]
 ) -> None:
     first, other = tmp_path / f"a{ending}", tmp_path / "b.csv"
-    fill_disk(1_000_000)
+    fill_disk(400_000)
     recorder = Recorder([first, other], info(), {})
     with pytest.raises(OSError, match="No space left") as failure:  # noqa: PT012  # some write fails
         for start in range(0, 5000, 100):

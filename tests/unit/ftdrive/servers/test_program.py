@@ -123,16 +123,16 @@ def test_a_zero_with_a_part_is_refused() -> None:
 
 def test_the_tracked_bias_ages_while_a_contact_hides_it() -> None:
     drifted = np.array([0.4, -0.3, 0.2, 0, 0, 0])
-    cell = Cell((POSE, drifted), (POSE, drifted + np.array([5.0, 8.0, 0, 0, 0, 0])), seconds=2.0)
+    cell = Cell((POSE, drifted), (POSE, drifted + np.array([5.0, 8.0, 0, 0, 0, 0])), seconds=1.5)
     assert cell.run(0.1)["tracking"] == 0
     cell.stream.track = "show"
     cell.registers.names = INTEGERS + doubles_of("show")
     new = cell.run(0.1)
     assert (new["tracking"], new["bias_age"], new["bias_fx"]) == (1, -1, 0), "not seen yet"
-    seen = cell.run(1.7)
+    seen = cell.run(1.2)
     assert 0 <= seen["bias_age"] < 1
     assert [seen["bias_fx"], seen["bias_fy"], seen["bias_fz"]] == pytest.approx(drifted[:3], abs=0.1)
-    hidden = cell.run(1.5)
+    hidden = cell.run(1.3)
     assert hidden["bias_age"] > 1
     assert hidden["bias_fy"] == pytest.approx(-0.3, abs=0.1)
 
@@ -227,14 +227,14 @@ class Turns:
 
 def test_answers_of_weighings_are_kept_and_others_are_not() -> None:
     push = np.array([0, 8.0, 0, 0, 0, 0])
-    cell = Cell((POSE, NOTHING), (POSE, part(POSE, 0.8)), (POSE, part(POSE, 0.8)), (POSE, push), seconds=1.5)
+    cell = Cell((POSE, NOTHING), (POSE, part(POSE, 0.8)), (POSE, push), seconds=1.2)
     cell.run(0.2)
     assert cell.ask(6, ZERO)["state"] == 1
     assert cell.ask(7, STATUS, 0.02)["state"] == 1
     assert cell.ask(8, 99, 0.02)["state"] == 3
     cell.run(0.6)
     assert cell.ask(9, WEIGH)["state"] == 1
-    cell.run(2.2)
+    cell.run(0.3)
     assert cell.ask(10, WEIGH)["state"] == 3
     assert cell.log.kept == [
         0.8,

@@ -17,10 +17,13 @@ ARM, SENSOR = DeviceInfo("ARM", "arm-1", "1"), DeviceInfo("SENSOR", "ft-1", "1")
 OTHER = DeviceInfo("SENSOR", "ft-2", "1")
 
 
-@pytest.fixture
-def url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A store of one cell with two tools and two mounts, and of another sensor."""
+@pytest.fixture(autouse=True)
+def _empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+
+
+def indexed(folder: Path) -> str:
+    """Make a store of one cell with two tools and two mounts, and of another sensor."""
     results = {
         "gripper-old": result(0),
         "gripper-new": result(10),
@@ -30,10 +33,21 @@ def url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
         "gripper-remounted": result(50, mount="adapter-b"),
     }
     for name, one in results.items():
-        new_run(tmp_path / "indexed", name, one)
-    url = f"sqlite:///{tmp_path / 'store.sqlite'}"
-    Store(url).index(tmp_path / "indexed")
+        new_run(folder / "indexed", name, one)
+    url = f"sqlite:///{folder / 'store.sqlite'}"
+    Store(url).index(folder / "indexed")
     return url
+
+
+@pytest.fixture(scope="module")
+def shared_url(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """For tests that change nothing."""
+    return indexed(tmp_path_factory.mktemp("store"))
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> str:
+    return indexed(tmp_path)
 
 
 def run_of(tool: Tool) -> str:
@@ -50,11 +64,11 @@ def run_of(tool: Tool) -> str:
     ],
 )
 def test_the_newest_accepted_one_of_this_cell_is_taken(
-    url: str, name: str, sensor: DeviceInfo, mount: str | None, run: str
+    shared_url: str, name: str, sensor: DeviceInfo, mount: str | None, run: str
 ) -> None:
-    found = calibration_of_tool(name, ARM, sensor, mount, url=url)
+    found = calibration_of_tool(name, ARM, sensor, mount, url=shared_url)
     assert (run_of(found), found.warnings) == (run, ())
-    assert found.calibration.id == Store(url).find(found.calibration.id)[0].id
+    assert found.calibration.id == Store(shared_url).find(found.calibration.id)[0].id
 
 
 @pytest.mark.parametrize(
@@ -66,24 +80,24 @@ def test_the_newest_accepted_one_of_this_cell_is_taken(
     ],
 )
 def test_a_tool_that_is_not_calibrated_here_is_refused(
-    url: str, name: str, sensor: DeviceInfo, mount: str | None, words: str
+    shared_url: str, name: str, sensor: DeviceInfo, mount: str | None, words: str
 ) -> None:
     with pytest.raises(ConfigError, match=words):
-        calibration_of_tool(name, ARM, sensor, mount, url=url)
+        calibration_of_tool(name, ARM, sensor, mount, url=shared_url)
 
 
-def test_forced_it_is_taken_from_another_cell_only_if_there_is_none(url: str) -> None:
-    assert run_of(calibration_of_tool("drill", ARM, OTHER, url=url, force=True)) == "drill"
-    assert run_of(calibration_of_tool("gripper", ARM, SENSOR, url=url, force=True)) == "gripper-new"
+def test_forced_it_is_taken_from_another_cell_only_if_there_is_none(shared_url: str) -> None:
+    assert run_of(calibration_of_tool("drill", ARM, OTHER, url=shared_url, force=True)) == "drill"
+    assert run_of(calibration_of_tool("gripper", ARM, SENSOR, url=shared_url, force=True)) == "gripper-new"
     with pytest.raises(ConfigError, match="welder"):
-        calibration_of_tool("welder", ARM, SENSOR, url=url, force=True)
+        calibration_of_tool("welder", ARM, SENSOR, url=shared_url, force=True)
 
 
-def test_without_a_serial_number_the_model_decides(url: str) -> None:
+def test_without_a_serial_number_the_model_decides(shared_url: str) -> None:
     unnamed = DeviceInfo("SENSOR", NOT_REPORTED, "1")
-    assert run_of(calibration_of_tool("gripper", ARM, unnamed, url=url)) == "gripper-elsewhere"
+    assert run_of(calibration_of_tool("gripper", ARM, unnamed, url=shared_url)) == "gripper-elsewhere"
     with pytest.raises(ConfigError):
-        calibration_of_tool("gripper", ARM, DeviceInfo("AXIA", NOT_REPORTED, "1"), url=url)
+        calibration_of_tool("gripper", ARM, DeviceInfo("AXIA", NOT_REPORTED, "1"), url=shared_url)
 
 
 def test_a_run_that_is_not_indexed_counts_and_one_that_is_gone_does_not(url: str, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -109,6 +110,11 @@ PAST: tuple[tuple[float, EventKind, str], ...] = (
 )
 
 
+@cache
+def transform_to(frame: WrenchFrame) -> FrameTransform:
+    return FrameTransform(frame, INFO)
+
+
 class FakeStream:
     """Blocks of samples, as fast as they are read.
 
@@ -172,7 +178,7 @@ class FakeStream:
             seq=np.arange(n) + self.blocks * n,
             status=np.zeros(n, np.uint32),
             raw=raw + TARE,
-            wrench=FrameTransform(self.frame, INFO)(wrench, rotations),
+            wrench=transform_to(self.frame)(wrench, rotations),
             chi2=np.where(in_contact, 812.0, 5.1),
             in_contact=in_contact,
             q_rad=np.zeros((n, 6)),

@@ -1,7 +1,6 @@
 """Commands in messages are those that the user can type."""
 
 import pytest
-from click.testing import CliRunner
 
 from ftdrive import cli
 from ftdrive.terminal.command_names import as_typed
@@ -37,9 +36,3 @@ def test_errors_and_next_steps_name_commands_as_they_can_be_typed(capsys: pytest
     assert cli.run(["push"]) == 2
     assert cli.run(["history"]) == 0
     assert "`uv run ftdrive calibrate` adds them" in capsys.readouterr().err
-
-
-def test_a_plan_ends_with_the_next_step() -> None:
-    outcome = CliRunner().invoke(cli.cli, ["plan", "--model", "ur5e", "--tool", "0:100:80", "--minimal"])
-    assert outcome.stderr.splitlines()[-2:] == ["Next", "   ftdrive calibrate   (asks before anything moves)"]
-    assert "Next" not in outcome.stdout

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from errno import ENOSPC, EPIPE
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
@@ -21,6 +22,8 @@ from ftdrive.cli import cli, in_a_sentence
 from ftdrive.cli import run as cli_run
 from ftdrive.commands.doctor import _print
 from ftdrive.errors import Declined
+from ftdrive.planning import cell_plan
+from ftdrive.planning.plan import Plan
 from ftdrive.session import session
 from ftdrive.session.events import Noted
 from ftdrive.session.operator import Question
@@ -86,9 +89,18 @@ def test_findings_of_doctor_and_their_cures_are_indented(
     assert others[cure + 1 :]
 
 
-def test_quiet_leaves_only_errors_and_the_answer() -> None:
-    shown, quiet = run(*PLAN, "--box", "900:900:0:950:950:10"), run("-q", *PLAN, "--box", "900:900:0:950:950:10")
+def test_quiet_leaves_only_errors_and_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan_for, plans = cell_plan.plan_for, list[Plan]()
+
+    def plan_once(*arguments: Any, **options: Any) -> Plan:
+        plans.extend([] if plans else [plan_for(*arguments, **options)])
+        return plans[0]
+
+    monkeypatch.setattr(cell_plan, "plan_for", plan_once)
+    shown, quiet = run(*PLAN), run("-q", *PLAN)
     assert "Predicted" in shown.stdout
+    assert shown.stderr.splitlines()[-2:] == ["Next", "   ftdrive calibrate   (asks before anything moves)"]
+    assert "Next" not in shown.stdout
     assert (quiet.exit_code, quiet.stderr, quiet.stdout) == (0, "", shown.stdout)
     assert '"steps"' in run("-q", *PLAN, "--json").stdout
 

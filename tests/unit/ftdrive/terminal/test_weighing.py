@@ -20,8 +20,8 @@ CABLE = np.array([0, 0, 0, 0, 0, 3.0])
 class Bench:
     """A scale on a recording of rests in one pose, on a fake clock."""
 
-    def __init__(self, *wrenches: Any, seconds: float = 2.0) -> None:
-        rows = rests(*((POSE, wrench) for wrench in wrenches), seconds=seconds)
+    def __init__(self, *wrenches: Any) -> None:
+        rows = rests(*((POSE, wrench) for wrench in wrenches), seconds=1.8)
         clock = FakeClock()
         rows = replace(rows, t_host_ns=rows.t_host_ns - rows.t_host_ns[0] + clock.now_ns())
         self.stream = ReplayedStream(info(calibrated()), rows, clock=clock)
@@ -30,7 +30,8 @@ class Bench:
         self.weighing = Weighing(cast("Any", self.stream), None, joins=False, part_kg=None, log=log)
 
 
-def test_each_part_and_each_fault_is_kept_once() -> None:
+def test_each_part_and_each_fault_is_kept_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ftdrive.live.replay.STEP_S", 0.05)
     bench = Bench(part(POSE, 0.8), NOTHING, part(POSE, 0.3) + CABLE)
     for _ in bench.weighing.states():
         if bench.stream.has_ended:

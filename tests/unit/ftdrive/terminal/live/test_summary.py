@@ -58,8 +58,8 @@ def test_the_result_does_not_depend_on_when_it_is_drawn() -> None:
 
 
 def test_peaks_are_of_single_samples_until_they_are_reset() -> None:
-    rig = Rig(FakeStream())
-    view = rig.run(620)  # a push of 8 N
+    rig = Rig(FakeStream(block_s=0.05))
+    view = rig.run(124)  # a push of 8 N
     assert view.peaks.high[2] == pytest.approx(7.8, abs=0.3)
     assert view.peaks.force_N == pytest.approx(8.1, abs=0.2)
     rig.summary.reset_peaks()
@@ -67,7 +67,7 @@ def test_peaks_are_of_single_samples_until_they_are_reset() -> None:
 
 
 def test_contact_lasts_from_its_first_sample() -> None:
-    view = Rig(FakeStream("contact")).run(1200)
+    view = Rig(FakeStream("contact", block_s=0.05)).run(240)
     assert view.contact_s == pytest.approx(12.0 - 11.604, abs=0.005)
 
 
@@ -81,8 +81,8 @@ def test_contact_lasts_from_its_first_sample() -> None:
 def test_extremes_of_another_frame_or_stage_are_forgotten(
     change: Callable[[FakeStream], None], keeps_history: bool
 ) -> None:
-    rig = Rig(FakeStream())
-    rig.run(620)
+    rig = Rig(FakeStream(block_s=0.05))
+    rig.run(124)
     change(rig.stream)
     view = rig.run(1)
     assert reading_of(view).frame == rig.stream.frame
@@ -91,10 +91,10 @@ def test_extremes_of_another_frame_or_stage_are_forgotten(
 
 
 def test_a_frozen_screen_stands_still() -> None:
-    rig = Rig(FakeStream())
-    before = rig.run(100)
+    rig = Rig(FakeStream(block_s=0.05))
+    before = rig.run(20)
     rig.summary.is_frozen = True
-    after = rig.run(600)
+    after = rig.run(120)
     assert reading_of(after).t_host_ns == reading_of(before).t_host_ns
     assert after.is_frozen
     rig.summary.is_frozen = False
