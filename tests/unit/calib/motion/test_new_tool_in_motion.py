@@ -14,7 +14,7 @@ from ftcalib.model import Parameters, predict
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Truth, means_of, record, sweep
 
-SECONDS = 8.0
+SECONDS = 6.0
 OLD = Truth()
 NEW = replace(OLD, mass_kg=0.7, p_sensor_com_m=np.array([-0.02, 0.01, 0.11]), bias=OLD.bias + 0.4)
 
