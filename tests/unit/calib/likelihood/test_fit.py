@@ -151,7 +151,7 @@ def test_errors_are_at_the_cramer_rao_bound(kind: str, runs: int) -> None:
 )
 def test_no_start_reaches_a_lower_minimum(n: int, degrees: float, weight_in_sigma: float) -> None:
     sigma = SIGMA * 100 / weight_in_sigma
-    for seed in range(8):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         p, R = truth(rng), haar(rng, n) if degrees == 180 else cone(rng, n, degrees)
         wrench = predict(p, R) + noise(rng, n, sigma)
@@ -188,25 +188,18 @@ def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
 @pytest.mark.parametrize(("n", "bumped"), [pytest.param(24, 6, marks=pytest.mark.slow), (12, 3)])
 @pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: bool) -> None:
-    error, least, missed, false = np.zeros(5), np.zeros(5), 0, 0
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        p, R = truth(rng), haar(rng, n)
-        push = rng.normal(size=(bumped, 3))
-        push *= (WEIGHT_N * rng.uniform(0.2, 1, bumped) / np.linalg.norm(push, axis=1))[:, None]
-        wrench = predict(p, R) + noise(rng, n)
-        wrench[:bumped] += np.concatenate([push, np.cross(0.1 * rng.normal(size=(bumped, 3)), push)], axis=1)
-        best = fit(R, wrench, WHITE if measured else None)
-        missed += int(best.weights[:bumped].sum())
-        false += int((best.weights[bumped:] == 0).sum())
-        error += squared(best, p)
-        least += bound(p, R[bumped:], np.linalg.inv(WHITE))
-        assert best.dof == 6 * int(best.weights.sum()) - 15
-        distances = squared_length(best.left_out_residuals, best.left_out_cov)
-        assert (distances[best.weights == 0] > 22).all()
-    assert missed <= 1
-    assert false <= 2
-    assert (error / least < 4).all()
+    rng = np.random.default_rng(0)
+    p, R = truth(rng), haar(rng, n)
+    push = rng.normal(size=(bumped, 3))
+    push *= (WEIGHT_N * rng.uniform(0.2, 1, bumped) / np.linalg.norm(push, axis=1))[:, None]
+    wrench = predict(p, R) + noise(rng, n)
+    wrench[:bumped] += np.concatenate([push, np.cross(0.1 * rng.normal(size=(bumped, 3)), push)], axis=1)
+    best = fit(R, wrench, WHITE if measured else None)
+    assert np.flatnonzero(best.weights == 0).tolist() == list(range(bumped))
+    assert best.dof == 6 * (n - bumped) - 15
+    distances = squared_length(best.left_out_residuals, best.left_out_cov)
+    assert (distances[:bumped] > 22).all()
+    assert (squared(best, p) / bound(p, R[bumped:], np.linalg.inv(WHITE)) < 4).all()
 
 
 def test_a_walk_that_only_bumped_poses_need_goes_with_them() -> None:
