@@ -74,8 +74,14 @@ TABLE_I = [
 ]
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize(("measured", "setup"), [*((True, setup) for setup in TABLE_I), (False, TABLE_I[-1])])
+@pytest.mark.parametrize(
+    ("method", "measured", "setup"),
+    [
+        *(("ml", True, setup) for setup in TABLE_I),
+        *((method, True, setup) for method in ("srom", "lrom") for setup in (TABLE_I[0], TABLE_I[-1])),
+        *((method, False, TABLE_I[-1]) for method in METHODS),
+    ],
+)
 def test_yu_table_1_is_exact_without_noise(method: Method, measured: bool, setup: tuple[Any, ...]) -> None:
     angles, F_b, P, F0, T0 = setup
     s_eR = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
