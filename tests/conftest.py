@@ -14,6 +14,8 @@ pytest_plugins = ["tests.postgres"]
 # A test run in the background inherits Ctrl-C as ignored, and so would every process that a test starts and interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+gc.disable()  # while modules and tests are loaded, which stay to the end
+
 # Before numpy is loaded: matrices are small, and the threads of two workers would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -39,9 +41,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Spare the garbage collector the modules and some thousand tests, which stay to the end."""
-    gc.collect()
+    """Leave the modules and some thousand tests out of what the garbage collector looks at."""
     gc.freeze()
+    gc.enable()
 
 
 settings.register_profile("fast", deadline=None, derandomize=True, max_examples=20)

@@ -15,7 +15,7 @@ _numbers = count()
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark all tests of this folder."""
     for item in items:
-        if _HERE in item.path.parents:
+        if item.path.parent == _HERE:
             item.add_marker(pytest.mark.ros2)
             item.add_marker(pytest.mark.filterwarnings("ignore::DeprecationWarning"))  # in rclpy and its imports
 
