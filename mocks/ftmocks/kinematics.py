@@ -7,6 +7,7 @@ Standard DH, one row per joint: ``T_i = Rz(theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i)`
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +52,12 @@ class Dh:
     alpha: Vector6
     max_speed: Vector6
 
+    @cached_property
+    def links(self) -> list[tuple[float, float, float, float, float]]:
+        """theta, a, d, and cosine and sine of alpha, link by link."""
+        rows = zip(self.theta, self.a, self.d, self.alpha, strict=True)
+        return [(theta, a, d, math.cos(alpha), math.sin(alpha)) for theta, a, d, alpha in rows]
+
     def disturbed(self, seed: int, angle_rad: float = 1e-3, length_m: float = 3e-4) -> "Dh":
         """The arm as a factory calibration would find it: every parameter off by a seeded normal deviation."""
         noise = np.random.default_rng([seed, 6]).normal(size=(4, 6))
@@ -69,13 +76,13 @@ class Dh:
 
 def vector6(values: Sequence[float] | Array) -> Vector6:
     """Six plain floats out of any sequence of six numbers."""
-    a, b, c, d, e, f = (float(v) for v in values)
+    a, b, c, d, e, f = map(float, values)
     return (a, b, c, d, e, f)
 
 
 def vector3(values: Sequence[float] | Array) -> Vector3:
     """Three plain floats out of any sequence of three numbers."""
-    x, y, z = (float(v) for v in values)
+    x, y, z = map(float, values)
     return (x, y, z)
 
 
@@ -114,7 +121,8 @@ def forward(dh: Dh, q: Sequence[float], joints: int = 6) -> Array:
     return _stack(_chain(dh, q)[joints])
 
 
-_Rows = tuple[float, ...]  # the upper three rows of a homogeneous matrix, row by row
+_Rows = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
+"""The upper three rows of a homogeneous matrix, row by row."""
 _IDENTITY: _Rows = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 
@@ -122,17 +130,16 @@ def _chain(dh: Dh, q: Sequence[float]) -> list[_Rows]:
     """Frames 0 to 6 in base, scalar arithmetic: a tenth of the cost of twelve small matrix products."""
     frames = [_IDENTITY]
     m = _IDENTITY
-    for i in range(6):
-        theta = q[i] + dh.theta[i]
-        c, s = math.cos(theta), math.sin(theta)
-        ca, sa = math.cos(dh.alpha[i]), math.sin(dh.alpha[i])
-        a, d = dh.a[i], dh.d[i]
-        rows: list[float] = []
-        for r in (0, 4, 8):
-            x, y, z, p = m[r], m[r + 1], m[r + 2], m[r + 3]
-            along, across = x * c + y * s, y * c - x * s
-            rows += [along, across * ca + z * sa, z * ca - across * sa, along * a + z * d + p]
-        m = tuple(rows)
+    for angle, (offset, a, d, ca, sa) in zip(q, dh.links, strict=True):
+        c, s = math.cos(angle + offset), math.sin(angle + offset)
+        x1, y1, z1, p1, x2, y2, z2, p2, x3, y3, z3, p3 = m
+        u1, v1 = x1 * c + y1 * s, y1 * c - x1 * s
+        u2, v2 = x2 * c + y2 * s, y2 * c - x2 * s
+        u3, v3 = x3 * c + y3 * s, y3 * c - x3 * s
+        first = u1, v1 * ca + z1 * sa, z1 * ca - v1 * sa, u1 * a + z1 * d + p1
+        second = u2, v2 * ca + z2 * sa, z2 * ca - v2 * sa, u2 * a + z2 * d + p2
+        third = u3, v3 * ca + z3 * sa, z3 * ca - v3 * sa, u3 * a + z3 * d + p3
+        m = first + second + third
         frames.append(m)
     return frames
 
@@ -285,7 +292,7 @@ def refine(dh: Dh, target: Array, seed: Sequence[float], tolerance: float = 1e-1
 
 def rotation(rotation_vector: Sequence[float] | Array) -> Array:
     """Rotation matrix (3, 3) of a rotation vector (rad)."""
-    x, y, z = (float(v) for v in rotation_vector)
+    x, y, z = map(float, rotation_vector)
     angle = math.sqrt(x * x + y * y + z * z)
     if angle < 1e-12:
         return np.array([[1.0, -z, y], [z, 1.0, -x], [-y, x, 1.0]])

@@ -30,6 +30,7 @@ DEVICES = ["ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "ReadOnly
 LIVE = ["CannotWeigh", "Contact", "Stages", "Weight", "WrenchFrame", "weigh"]
 OPENED = ["open_arm", "open_sensor", "open_stream", "plan_tour"]
 EMULATED = {"ForceTorqueSensor", "RobotArm", "Weight", "open_arm", "open_sensor", "open_stream", "weigh"}
+SLOW = EMULATED | {"compare"}  # every method of estimation
 
 
 def test_the_names_are_these() -> None:
@@ -81,7 +82,7 @@ def user_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in EMULATED)) for name in ftdrive.__all__]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in ftdrive.__all__]
 )
 def test_each_name_has_an_example_that_runs(
     name: str, user_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

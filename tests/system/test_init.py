@@ -14,6 +14,7 @@ from ftdrive.cell.config import load
 from ftdrive.cell.emulated import Station
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError, exit_code
+from ftdrive.planning.geometry.arm_model import SHAPES
 from ftdrivers.errors import ConnectError
 
 TOOL = ["--height", "33", "--tool", "0:33:80", "--tool", "33:200:100:0:5"]
@@ -72,10 +73,9 @@ def test_a_script_needs_no_questions(station: Station) -> None:
     assert cell.workcell.boxes_mm == ((500, 500, 0, 900, 900, 90),)
 
 
-def test_an_arm_without_a_measured_shape_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    with Station("serial", ["--polyscope", "3.15.0", "--time-scale", "1"]) as old:
-        monkeypatch.setenv("FTDRIVE_CLOCK", old.endpoints["clock"])
-        outcome = run("--robot", old.cell.robot.host, "--model", "ur5", "--sensor", old.cell.sensor.url, *TOOL, "--yes")
+def test_an_arm_without_a_measured_shape_is_reported(addresses: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(SHAPES, "UR5e")
+    outcome = run(*addresses, *TOOL, "--yes")
     assert outcome.exit_code == 0, outcome.output
     assert "calibrate --manual" in outcome.output
 

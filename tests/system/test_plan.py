@@ -67,7 +67,7 @@ def test_the_plan_says_whether_its_cell_was_measured(
         Path("ftdrive.toml").write_text(
             f'format = "ftdrive.config/1"\n[tool]\ncylinders_mm = [[0, 200, 100]]\n[workcell]\n{workcell}\n'
         )
-    outcome = run("plan", "--model", "ur5e", *tool, "--minimal", "--output", "plan.json")
+    outcome = run("plan", "--model", "ur5e", *tool, "--output", "plan.json")
     assert outcome.exit_code == 0, outcome.output
     assert ("for the eye only" in outcome.stderr) is not measured
     assert Plan.load(Path("plan.json")).measured is measured

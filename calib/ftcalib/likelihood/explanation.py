@@ -171,7 +171,7 @@ def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
             kept = _membership(session, kept, distances, at)
             if not (kept == best.kept).all():
                 problem = session.linearised(p, kept)
-                at = select(problem, at.components, at.theta, (), len(always))  # what only rejected poses needed goes
+                at = select(problem, at.components, at.theta, (), len(always))
                 continue
         if set(at.components) == chosen:  # all others have been tried
             break
@@ -185,13 +185,15 @@ def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
 def _settled(
     session: Session, p: Parameters, kept: Kept, problem: Linearised, at: Point
 ) -> tuple[Parameters, Linearised, Point]:
-    """Go down with the noise as it is and estimate its variances again, until they agree."""
+    """Go down with the noise as it is and estimate it again, until they agree."""
     for _ in range(ROUNDS):
         if at.squared_step < SETTLED:
             break
         p = session.descent.down(session.statistics(at.noise, p), p).parameters
         problem = session.linearised(p, kept)
         at = maximise(problem, at.components, at.theta)
+        if at.squared_step < SETTLED and not kept.all():  # drop what only rejected poses needed
+            at = select(problem, at.components, at.theta, (), len(session.always()))
     return p, problem, at
 
 

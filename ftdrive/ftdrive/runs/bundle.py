@@ -182,7 +182,7 @@ def _is_emulated(folder: Path) -> bool | None:
 
 def _environment(folder: Path) -> dict[str, Any]:
     """Return versions, and the checks of this computer and of the described cell."""
-    packages = {each.name: each.version for each in distributions()}
+    packages = {about["Name"]: about["Version"] for about in (each.metadata for each in distributions())}
     facts: dict[str, Any] = {
         "versions": versions(),
         "packages": dict(sorted(packages.items(), key=lambda item: item[0].lower())),

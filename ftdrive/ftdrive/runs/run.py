@@ -30,7 +30,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -283,8 +283,9 @@ class Run:
             )
         return header
 
-    def commit(self, record: PoseRecord) -> None:
-        """Write one pose; returns when it is on disk."""
+    def commit(self, record: PoseRecord) -> PoseRecord:
+        """Write one pose; returns it, as `records` reads it, when it is on disk."""
+        record = replace(record, clock_offset_ns=record.clock_offset_ns or self._clock_offset_ns)
         buffer = io.BytesIO()
         readings: dict[str, Any] = {
             f"{when}_{name}": np.asarray(getattr(reading, name))
@@ -298,11 +299,12 @@ class Run:
             number=np.array(record.pose.number),
             q_target_rad=record.pose.q_rad,
             steady=np.array(record.steady),
-            clock_offset_ns=np.array(record.clock_offset_ns or self._clock_offset_ns),
+            clock_offset_ns=np.array(record.clock_offset_ns),
             **readings,
             **{name: getattr(record.samples, name) for name in _SAMPLE_COLUMNS},
         )
         write_new(_next(self.folder / "poses" / f"{record.stop:02d}.npz"), buffer.getvalue())
+        return record
 
     def records(self) -> list[PoseRecord]:
         """Read every pose, in the order of the tour; of a pose taken again, the newest."""

@@ -103,13 +103,13 @@ class ExpectedMotion:
     moving: bool
     curve_rad: Array | None = None
     """(n, 6) dense points of a curve from start to goal."""
+    turns_rad: Array = field(init=False)
+    """How far each joint turns (6,)."""
 
-    @property
-    def turns_rad(self) -> Array:
-        """How far each joint turns (6,)."""
-        if self.curve_rad is None:
-            return np.abs(self.goal_rad - self.start_rad)
-        return np.asarray(np.ptp(self.curve_rad, axis=0))
+    def __post_init__(self) -> None:
+        curve = self.curve_rad
+        turns = np.abs(self.goal_rad - self.start_rad) if curve is None else np.ptp(curve, axis=0)
+        object.__setattr__(self, "turns_rad", turns)
 
     def nearest_rad(self, q_rad: Array) -> Array:
         """Return the point (6,) of the motion that is nearest to a posture (6,)."""

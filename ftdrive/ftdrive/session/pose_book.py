@@ -42,7 +42,7 @@ class PoseBook:
 
     def keep(self, record: PoseRecord, *, stops: int, settle_s: float, average_s: float) -> Estimated | Compared:
         """Commit and show a pose; return what the poses show now."""
-        self.run.commit(record)
+        record = self.run.commit(record)
         self.cell.journal.show(
             PoseTaken(
                 stop=record.stop,

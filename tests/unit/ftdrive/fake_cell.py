@@ -10,19 +10,21 @@ from typing import Any, Self
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
 from ftdrive.planning.cell_plan import certifier_for, plan_for
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
-from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.certify import Certificate, Certifier
+from ftdrive.planning.geometry.kinematics import Frames
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
 from ftdrive.runs.outcome import Outcome
 from ftdrive.runs.run import Run
 from ftdrive.session import along_plan, session, task
+from ftdrive.session.completed_plans import remember_completed
 from ftdrive.session.events import (
     Event,
     Noted,
@@ -36,6 +38,7 @@ from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.sweeping import Sweeping
+from ftdrive.session.task import Calibrating
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceFault
@@ -389,6 +392,29 @@ def planned_once(cell: CellConfig, certifier: Certifier, q_rad: Array, poses: in
     return _planned(cell, certifier.arm.name, tuple(q_rad.tolist()), poses)
 
 
+_certify, _certificates = Certifier.certify, dict[tuple[object, ...], Certificate]()
+_frames, _known_frames = ArmModel.frames, dict[tuple[str, bytes], Frames]()
+
+
+def certify_once(certifier: Certifier, start_rad: ArrayLike, end_rad: ArrayLike, *, tight: bool = True) -> Certificate:
+    """As `Certifier.certify`, but the same moves are proven once: a session proves its plan again before it moves."""
+    moves = np.stack([start_rad, end_rad])
+    arm = certifier.arm
+    key = (arm.name, arm.tool, repr(certifier.scene), certifier.margins, moves.tobytes(), tight)
+    if key not in _certificates:
+        _certificates[key] = _certify(certifier, *moves, tight=tight)
+    return _certificates[key]
+
+
+def frames_once(arm: ArmModel, q_rad: ArrayLike) -> Frames:
+    """As `ArmModel.frames`: a guard asks for those of the same postures at each look."""
+    q = np.asarray(q_rad, dtype=np.float64)
+    key = arm.name, q.tobytes()
+    if key not in _known_frames:
+        _known_frames[key] = _frames(arm, q)
+    return _known_frames[key]
+
+
 class Lab:
     """A fake cell and what a test wants of it."""
 
@@ -411,6 +437,8 @@ class Lab:
         monkeypatch.setattr(session, "build_arm", lambda _: self.arm)
         monkeypatch.setattr(session, "build_sensor", lambda _: self.sensor)
         monkeypatch.setattr(task, "plan_for", planned_once)
+        monkeypatch.setattr(Certifier, "certify", certify_once)
+        monkeypatch.setattr(ArmModel, "frames", frames_once)
         monkeypatch.setattr(along_plan, "Watcher", self._watcher)
         monkeypatch.setattr("shutil.which", lambda _: None)
         monkeypatch.setattr("os.fsync", lambda _: None)  # the disk may be slow
@@ -427,8 +455,23 @@ class Lab:
     def open_cell(self) -> OpenCell:
         return OpenCell(self.arm, self.sensor, self.clock, Journal(self.operator), Limits())
 
+    def _options(self, **options: Any) -> SessionOptions:
+        return SessionOptions(self.folder / "runs", poses=6, **options)
+
     def calibrate(self, **options: Any) -> Outcome | None:
-        return session.calibrate(self.cell, self.operator, SessionOptions(self.folder / "runs", poses=6, **options))
+        return session.calibrate(self.cell, self.operator, self._options(**options))
+
+    def take_poses(self, **options: Any) -> Run | None:
+        """As `calibrate`, for a test that does not ask what the poses give."""
+        chosen = self._options(**options)
+        return session.take_poses(Calibrating(self.cell, chosen.real), self.operator, chosen)
+
+    def trust(self) -> Path:
+        """Let the plan of this cell count as completed; return its file."""
+        path = self.folder / "trusted.json"
+        self.take_poses(dry_run=True, output=path)
+        remember_completed("A1", Plan.load(path).sha256)
+        return path
 
     def sweep(self, **options: Any) -> Run | None:
         chosen = SessionOptions(self.folder / "runs", mode="sweep", **options)

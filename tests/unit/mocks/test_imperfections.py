@@ -56,7 +56,7 @@ EVEN, ENDED = slice(700, 2500), slice(3200, None)
 """Samples at even speed, and behind the stop, which ends at 3.12 s."""
 
 
-@pytest.mark.parametrize("joint", [0, pytest.param(4, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("joint", [pytest.param(0, marks=pytest.mark.slow), 4])
 def test_turning_joints_make_a_ripple_as_large_as_that_of_a_real_arm(joint: int) -> None:
     ripple = vibration(joint, ripple=1.0)
     size = ripple[EVEN].std(axis=0)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrive.planning.geometry.scene import Scene
-from ftdrive.planning.geometry.shapes import Bodies, height_above, separation, separation_from_box
+from ftdrive.planning.geometry.shapes import Bodies, dot, height_above, separation, separation_from_box
 from ftdrivers.ur.kinematics import Array
 
 FIRST_STEP_RAD = np.radians(15)
@@ -85,8 +85,9 @@ class Certifier:
         q = np.asarray(q_rad, dtype=np.float64).reshape(-1, 6)
         row, pair = (index.ravel() for index in np.indices((len(q), len(self._margin_m))))
         needed = self._margin_m[pair]
-        touching = row[self._distance(q, row, pair, needed) <= needed]
-        return ~np.isin(np.arange(len(q)), touching)
+        free = np.ones(len(q), dtype=np.bool_)
+        free[row[self._distance(q, row, pair, needed) <= needed]] = False
+        return free
 
     def clear_around(self, q_rad: Array) -> bool:
         """Return whether all moves of a closed tour through joint vectors (n, 6) are proven clear."""
@@ -124,10 +125,10 @@ class Certifier:
             distance = self._distance(start[move] + middle[:, None] * turn[move], interval, pair, enough)
             np.minimum.at(nearest, (own, kind), distance)
             excess = distance - self._margin_m[pair]
-            order = np.argsort(-excess, kind="stable")
-            closer = excess[order] < least_excess[own[order]]
-            limited_by[own[order[closer]]] = pair[order[closer]]  # the last assignment is the closest
+            before = least_excess[own]
             np.minimum.at(least_excess, own, excess)
+            closest = (excess < before) & (excess == least_excess[own])
+            limited_by[own[closest]] = pair[closest]
             bound = distance - slack
             settled = bound > self._margin_m[pair]
             if tight:
@@ -149,32 +150,32 @@ class Certifier:
         return Certificate(clear, stated[:, 0], stated[:, 1], tuple(self._names[i] for i in limited_by))
 
     def _distance(self, q_rad: Array, row: NDArray[np.intp], pair: NDArray[np.intp], enough_m: Array) -> Array:
-        """Lower bounds of distances (k,) of some pairs at some joint vectors."""
+        """Lower bounds of distances (k,) of some pairs at some joint vectors; coarse where they are enough."""
         bodies = self.arm.bodies(q_rad)
-        n = len(self._pairs)
         distance = np.empty(len(pair))
-        own = pair < n
-        first, second = self._pairs[pair[own]].T
+        of_arm = pair < len(self._pairs)
+        own, others = np.flatnonzero(of_arm), np.flatnonzero(~of_arm)
+        first, second = self._pairs.take(pair[own], axis=0).T
         at = row[own]
-        gap = bodies.centre_m[at, first] - bodies.centre_m[at, second]
-        reach = bodies.reach_m
-        apart = np.sqrt((gap * gap).sum(axis=1)) - reach[first] - reach[second]
-        near = apart < enough_m[own]
-        apart[near] = separation(bodies[at[near], first[near]], bodies[at[near], second[near]], enough_m[own][near])
+        gap = bodies.centre_at(at, first) - bodies.centre_at(at, second)
+        apart = np.sqrt(dot(gap, gap)) - bodies.reach_m[first] - bodies.reach_m[second]
+        near = np.flatnonzero(apart < enough_m[own])
+        at, first, second = at[near], first[near], second[near]
+        apart[near] = separation(bodies.at(at, first), bodies.at(at, second), enough_m[own[near]])
         distance[own] = apart
-        body, thing = self._of_scene[pair[~own] - n].T
-        distance[~own] = self._to_scene(bodies, row[~own], body, thing)
+        body, thing = self._of_scene.take(pair[others] - len(self._pairs), axis=0).T
+        distance[others] = self._to_scene(bodies, row[others], body, thing, enough_m[others])
         return distance
 
     def _to_scene(
-        self, bodies: Bodies, row: NDArray[np.intp], body: NDArray[np.intp], thing: NDArray[np.intp]
+        self, bodies: Bodies, row: NDArray[np.intp], body: NDArray[np.intp], thing: NDArray[np.intp], enough_m: Array
     ) -> Array:
         distance = np.empty(len(row))
         for k, plane in enumerate(self.scene.planes):
-            at = thing == k
-            distance[at] = height_above(bodies[row[at], body[at]], np.array(plane.normal), plane.offset_m)
+            at = np.flatnonzero(thing == k)
+            distance[at] = height_above(bodies.at(row[at], body[at]), np.array(plane.normal), plane.offset_m)
         for k, box in enumerate(self.scene.boxes):
-            at = thing == len(self.scene.planes) + k
+            at = np.flatnonzero(thing == len(self.scene.planes) + k)
             corners = np.array(box.low_m), np.array(box.high_m)
-            distance[at] = separation_from_box(bodies[row[at], body[at]], *corners)
+            distance[at] = separation_from_box(bodies.at(row[at], body[at]), *corners, enough_m[at])
         return distance

@@ -14,6 +14,8 @@ from ftdrivers.ur.kinematics import Array
 
 PROJECTIONS = 24
 TINY_M = 1e-12
+CLOSE_M = 1e-5
+"""A lower bound that is as close to the true distance is good enough."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,25 +38,40 @@ class Bodies:
         """(...) Radius of a ball about the centre that holds the body."""
         return np.asarray(np.hypot(self.half_length_m, self.radius_m) + self.rounding_m)
 
-    def __getitem__(self, index: tuple[NDArray[np.intp], NDArray[np.intp]] | NDArray[np.bool_]) -> "Bodies":
-        """Take some of the bodies of (n, k): a pair of index arrays, or a mask of a flat list."""
-        columns = index[1] if isinstance(index, tuple) else index
+    def centre_at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> Array:
+        """Centres (m, 3) of some of the bodies of (n, k), one a pair of indices."""
+        return self.centre_m.reshape(-1, 3).take(row * len(self.half_length_m) + column, axis=0)
+
+    def at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> "Bodies":
+        """Take some of the bodies of (n, k), one a pair of indices."""
+        place = row * len(self.half_length_m) + column
         return Bodies(
-            self.centre_m[index],
-            self.axis[index],
-            self.half_length_m[columns],
-            self.radius_m[columns],
-            self.rounding_m[columns],
+            self.centre_m.reshape(-1, 3).take(place, axis=0),
+            self.axis.reshape(-1, 3).take(place, axis=0),
+            self.half_length_m.take(column),
+            self.radius_m.take(column),
+            self.rounding_m.take(column),
+        )
+
+    def some(self, index: NDArray[np.intp]) -> "Bodies":
+        """Take some of a flat list of bodies."""
+        return Bodies(
+            self.centre_m.take(index, axis=0),
+            self.axis.take(index, axis=0),
+            self.half_length_m.take(index),
+            self.radius_m.take(index),
+            self.rounding_m.take(index),
         )
 
 
-def _dot(a: Array, b: Array) -> Array:
+def dot(a: Array, b: Array) -> Array:
+    """Scalar products (...) of vectors (..., 3)."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def extent(bodies: Bodies, direction: Array) -> Array:
     """How far each body reaches along a unit direction, from its centre."""
-    along = _dot(bodies.axis, direction)
+    along = dot(bodies.axis, direction)
     across = np.sqrt(np.maximum(1 - along**2, 0.0))
     return bodies.half_length_m * np.abs(along) + bodies.radius_m * across + bodies.rounding_m
 
@@ -79,28 +96,34 @@ def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:
     # Capsules are judged exactly by their axes; flat ends are not.
     open_ = np.flatnonzero((bound < enough_m) & (a.radius_m + b.radius_m > 0))
     if len(open_):
-        mask = np.zeros(len(bound), dtype=np.bool_)
-        mask[open_] = True
-        inner_a, inner_b = (replace(body[mask], rounding_m=np.zeros(len(open_))) for body in (a, b))
-        grown = (a.rounding_m + b.rounding_m)[mask]
-        bound[mask] = np.maximum(bound[mask], _by_projections(inner_a, inner_b, between[mask]) - grown)
+        inner_a, inner_b = (replace(body.some(open_), rounding_m=np.zeros(len(open_))) for body in (a, b))
+        grown = (a.rounding_m + b.rounding_m)[open_]
+        bound[open_] = np.maximum(bound[open_], _by_projections(inner_a, inner_b, between[open_]) - grown)
     return np.asarray(bound)
 
 
-def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array) -> Array:
-    """Lower bound (k,) of the distance between each body and a box parallel to the base axes."""
+def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array, enough_m: Array) -> Array:
+    """Lower bound (k,) of the distance between each body and a box parallel to the base axes.
+
+    A body that is shown to be `enough_m` (k,) away is not looked at any more.
+    """
     centre, half = (low_m + high_m) / 2, (high_m - low_m) / 2
     point = bodies.centre_m
-    best = np.full(len(point), -np.inf)
+    best = np.full(len(point), -1.0)  # if a body intersects the box, the depth is not computed
+    open_ = np.arange(len(point))
     for _ in range(PROJECTIONS):
         on_box = np.clip(point, low_m, high_m)
         gap = on_box - point
-        length = np.sqrt(_dot(gap, gap))
+        length = np.sqrt(dot(gap, gap))
         u = gap / np.maximum(length, TINY_M)[:, None]
-        reach = _dot(u, centre - bodies.centre_m) - np.abs(u) @ half - extent(bodies, u)
-        best = np.maximum(best, np.where(length > TINY_M, reach, -np.inf))
-        point = _nearest(bodies, on_box)
-    return np.asarray(np.maximum(best, -1.0))  # the bodies intersect; the depth is not computed
+        reach = dot(u, centre - bodies.centre_m) - np.abs(u) @ half - extent(bodies, u)
+        best[open_] = np.maximum(best[open_], np.where(length > TINY_M, reach, -1.0))
+        still = np.flatnonzero((best[open_] < enough_m[open_]) & (length - bodies.rounding_m - best[open_] >= CLOSE_M))
+        if not len(still):
+            break
+        open_, bodies = open_[still], bodies.some(still)
+        point = _nearest(bodies, on_box[still])
+    return best
 
 
 def _by_projections(a: Bodies, b: Bodies, on_b: Array) -> Array:
@@ -110,23 +133,23 @@ def _by_projections(a: Bodies, b: Bodies, on_b: Array) -> Array:
         on_a = _nearest(a, on_b)
         on_b = _nearest(b, on_a)
         gap = on_b - on_a
-        length = np.sqrt(_dot(gap, gap))
+        length = np.sqrt(dot(gap, gap))
         u = gap / np.maximum(length, TINY_M)[:, None]
-        reach = _dot(u, b.centre_m - a.centre_m) - extent(a, u) - extent(b, u)
+        reach = dot(u, b.centre_m - a.centre_m) - extent(a, u) - extent(b, u)
         best[open_] = np.maximum(best[open_], np.where(length > TINY_M, reach, -1.0))
-        still = length - best[open_] >= 1e-5
-        if not still.any():
+        still = np.flatnonzero(length - best[open_] >= CLOSE_M)
+        if not len(still):
             break
-        open_, on_b, a, b = open_[still], on_b[still], a[still], b[still]
+        open_, on_b, a, b = open_[still], on_b[still], a.some(still), b.some(still)
     return best
 
 
 def _nearest(bodies: Bodies, point: Array) -> Array:
     """Point (k, 3) of each cylinder, without rounding, that is nearest to a given one."""
     from_centre = point - bodies.centre_m
-    along = _dot(from_centre, bodies.axis)
+    along = dot(from_centre, bodies.axis)
     across = from_centre - along[:, None] * bodies.axis
-    radius = np.sqrt(_dot(across, across))
+    radius = np.sqrt(dot(across, across))
     shrink = np.minimum(1.0, bodies.radius_m / np.maximum(radius, TINY_M))
     along = np.clip(along, -bodies.half_length_m, bodies.half_length_m)
     return np.asarray(bodies.centre_m + along[:, None] * bodies.axis + shrink[:, None] * across)
@@ -139,7 +162,7 @@ def _between_axes(a: Bodies, b: Bodies) -> tuple[Array, Array]:
     is exact (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
     """
     gap = a.centre_m - b.centre_m
-    cosine, on_a, on_b = _dot(a.axis, b.axis), _dot(a.axis, gap), _dot(b.axis, gap)
+    cosine, on_a, on_b = dot(a.axis, b.axis), dot(a.axis, gap), dot(b.axis, gap)
     sine2 = 1 - cosine**2
     s = np.where(sine2 > 1e-9, (cosine * on_b - on_a) / np.maximum(sine2, 1e-9), 0.0)
     s = np.clip(s, -a.half_length_m, a.half_length_m)
@@ -147,4 +170,4 @@ def _between_axes(a: Bodies, b: Bodies) -> tuple[Array, Array]:
     s = np.clip(cosine * t - on_a, -a.half_length_m, a.half_length_m)
     point = b.centre_m + t[:, None] * b.axis
     difference = a.centre_m + s[:, None] * a.axis - point
-    return point, np.sqrt(_dot(difference, difference))
+    return point, np.sqrt(dot(difference, difference))

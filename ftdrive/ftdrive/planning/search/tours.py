@@ -134,12 +134,12 @@ def shortest_tour(
         i, j = np.unravel_index(both.argmin(), both.shape)
         return np.array([groups[0][i], groups[1][j]]) if both[i, j] < FORBIDDEN_S else None
     rng = np.random.default_rng(0)
-    best = _improved(_nearest_neighbours(groups, cost) if start is None else start, groups, cost)
+    best, shortest_s = _improved(_nearest_neighbours(groups, cost) if start is None else start, group, groups, cost)
     for _ in range(shakes):
-        trial = _improved(_shaken(best, rng), groups, cost)
-        if _length(trial, cost) < _length(best, cost) - 1e-9:
-            best = trial
-    return best if _length(best, cost) < FORBIDDEN_S else None
+        trial, length_s = _improved(_shaken(best, rng), group, groups, cost)
+        if length_s < shortest_s - 1e-9:
+            best, shortest_s = trial, length_s
+    return best if shortest_s < FORBIDDEN_S else None
 
 
 class _Proof:
@@ -193,7 +193,7 @@ def _first_of_each_group(group: Nodes, most: int) -> Nodes:
 
 
 def _length(tour: Nodes, cost: Array) -> float:
-    return float(cost[tour, np.roll(tour, -1)].sum())
+    return float(cost[tour, np.concatenate([tour[1:], tour[:1]])].sum())
 
 
 def _nearest_neighbours(groups: list[Nodes], cost: Array) -> Nodes:
@@ -206,13 +206,13 @@ def _nearest_neighbours(groups: list[Nodes], cost: Array) -> Nodes:
     return np.array(tour)
 
 
-def _improved(tour: Nodes, groups: list[Nodes], cost: Array) -> Nodes:
-    of_node = {int(node): g for g, nodes in enumerate(groups) for node in nodes}
-    tour, length = _choice(tour, groups, of_node, cost), np.inf
+def _improved(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> tuple[Nodes, float]:
+    """Return a tour that no reversed part and no other choice shortens, and its length."""
+    tour, length = _choice(tour, group, groups, cost), np.inf
     while (now := _length(tour, cost)) < length - 1e-9:
         length = now
-        tour = _choice(_reversed_parts(tour, cost), groups, of_node, cost)
-    return tour
+        tour = _choice(_reversed_parts(tour, cost), group, groups, cost)
+    return tour, now
 
 
 def _reversed_parts(tour: Nodes, cost: Array) -> Nodes:
@@ -229,15 +229,15 @@ def _reversed_parts(tour: Nodes, cost: Array) -> Nodes:
         tour[i[best] + 1 : j[best] + 1] = tour[i[best] + 1 : j[best] + 1][::-1]
 
 
-def _choice(tour: Nodes, groups: list[Nodes], of_node: dict[int, int], cost: Array) -> Nodes:
+def _choice(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> Nodes:
     """Choose the best node of each group for the order of the groups in a closed tour."""
-    order = [groups[of_node[int(node)]] for node in tour]
+    order = [groups[g] for g in group[tour]]
     first = min(range(len(order)), key=lambda k: len(order[k]))
     order = order[first:] + order[:first]
-    total = cost[np.ix_(order[0], order[1])]  # (first, now)
+    total = cost[order[0][:, None], order[1]]  # (first, now)
     before = []
     for one, other in zip(order[1:], [*order[2:], order[0]], strict=True):
-        sums = total[:, :, None] + cost[np.ix_(one, other)]
+        sums = total[:, :, None] + cost[one[:, None], other]
         before.append(sums.argmin(axis=1))
         total = sums.min(axis=1)
     start = int(np.diagonal(total).argmin())

@@ -196,7 +196,7 @@ def test_what_was_thrown_away_is_counted_since_open() -> None:
         def wait_for(condition: Callable[[Health], bool]) -> None:
             while not condition(health := sensor.health()):
                 counted.append((health.duplicated, health.out_of_order, health.malformed))
-                time.sleep(0.002)
+                time.sleep(0.005)
 
         with sensor:
             wait_for(lambda health: (health.duplicated, health.out_of_order, health.malformed) == (1, 1, 1))

@@ -11,7 +11,8 @@ import subprocess
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import cache
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,8 @@ from tests.fake_clock import FakeClock
 
 CYCLE_S = 0.008
 HOST = "192.0.2.1"
+LETTERS = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "VECTOR3D": "3d", "VECTOR6D": "6d"}
+"""Of `struct`, for the types of outputs."""
 
 MakeArm = Callable[..., UrArm]
 
@@ -44,10 +47,15 @@ def pose_from_ur(pose: Sequence[float]) -> Pose:
     return Pose(Rotation.from_rotvec(pose[3:]).as_matrix(), np.array(pose[:3]))
 
 
-@lru_cache(maxsize=1)
+@cache  # most tests move on the same path
 def tcp_pose(*q_and_tcp: float) -> tuple[float, ...]:
     pose = forward(MODELS["UR5e"], q_and_tcp[:6]) @ pose_from_ur(q_and_tcp[6:])
     return (*pose.p_m, *Rotation.from_matrix(pose.R).as_rotvec())
+
+
+@cache
+def outputs_without(unknown: frozenset[str]) -> dict[str, str]:
+    return {name: kind for name, kind in OUTPUTS.items() if name not in unknown}
 
 
 class Controller:
@@ -110,7 +118,7 @@ class Controller:
 
     @property
     def _known(self) -> dict[str, str]:
-        return {name: kind for name, kind in OUTPUTS.items() if name not in self.unknown}
+        return outputs_without(frozenset(self.unknown))
 
     def read(self, timeout_s: float) -> list[bytes]:
         assert timeout_s <= 0.05
@@ -148,10 +156,9 @@ class Controller:
 
     def _packed(self) -> bytes:
         """Pack the sample, after the number of the recipe."""
-        sample = self.sample()
-        letters = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "VECTOR3D": "3d", "VECTOR6D": "6d"}
-        layout = ">B" + "".join(letters[kind] for kind in self._known.values())
-        return struct.pack(layout, 1, *(number for name in self._known for number in sample[name]))
+        sample, known = self.sample(), self._known
+        layout = ">B" + "".join(map(LETTERS.__getitem__, known.values()))
+        return struct.pack(layout, 1, *chain.from_iterable(map(sample.__getitem__, known)))
 
     def run(self, reader: Reader) -> None:
         """Send a sample every `period_s` to a reader that has nothing else to do."""

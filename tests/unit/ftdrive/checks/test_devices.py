@@ -57,6 +57,11 @@ def test_what_is_assumed_or_unknown_of_a_sensor_is_a_warning() -> None:
     assert "serial=" in str(found["sensor.identity"].fix)
     assert "range=300,30" in str(found["sensor.range"].fix)
     assert {check.state for check in diagnosis.check_identity(DeviceInfo("plain", "1", "2"))} == {"ok", "warning"}
+    for known in ("counts_per_N", "counts_per_Nm"):
+        half = diagnosis.check_identity(DeviceInfo("Nano", "FT1", "1", {known: Fact(1e6, "device")}))
+        assert [check.found for check in half if check.name == "sensor.counts"] == [
+            "the driver does not report its scale"
+        ]
 
 
 TOOL = ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),))

@@ -75,10 +75,10 @@ def test_refused_is_just_what_the_shoulder_is_never_clear_of(
     """By the bodies and distances that judge moves."""
     arm = ArmModel(model, [Cylinder(0.0, 0.06, 0.09)])
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (40, 6))
-    shoulder = arm.bodies(q)[np.arange(40), np.full(40, SHOULDER)]
+    shoulder = arm.bodies(q).at(np.arange(40), np.full(40, SHOULDER))
     plane, block = plane_from_mm((*normal, place)), box_from_mm(box)
     to_plane = height_above(shoulder, np.array(plane.normal), plane.offset_m).max()
-    to_box = separation_from_box(shoulder, np.array(block.low_m), np.array(block.high_m)).max()
+    to_box = separation_from_box(shoulder, np.array(block.low_m), np.array(block.high_m), np.full(40, np.inf)).max()
     for described, distance_m in ((cell(planes=[(*normal, place)]), to_plane), (cell(boxes=[box]), to_box)):
         try:
             require_possible(described, model)

@@ -12,8 +12,12 @@ from ftcalib.assessment import described_cell
 from ftdrive.cell.config import SensorConfig, ToolConfig
 from ftdrive.runs.outcome import circumstances_of, solve_records
 from ftdrive.runs.pose_hints import hints
+from ftdrive.runs.run import Run
 from ftdrive.session.events import Noted, PoseTaken, Weighed
+from ftdrive.session.options import SessionOptions
 from ftdrive.session.preflight import Before, check_payload
+from ftdrive.session.session import description_of
+from ftdrive.session.task import Calibrating
 from tests.edited_files import edit
 from tests.unit.ftdrive.fake_cell import Lab
 
@@ -91,7 +95,7 @@ def test_a_run_goes_on_with_the_mass_of_the_sensor_as_it_is_known_now(lab: Lab) 
 
 def test_a_controller_that_does_not_report_its_payload_is_not_compared(lab: Lab) -> None:
     lab.arm.set_status(payload_kg=None)
-    lab.calibrate()
+    lab.take_poses()
     assert lab.operator.of(Weighed) == []
     assert payload_notes(lab) == []
 
@@ -127,6 +131,6 @@ def test_a_session_saves_no_result_as_good_whose_tool_is_elsewhere_unless_it_was
 @pytest.mark.parametrize(("mounting", "up"), [("floor", (0, 0, 1)), ("ceiling", (0, 0, -1)), (None, None)])
 def test_a_mounting_counts_as_declared_only_if_it_was_given(mounting: str | None, up: Any, lab: Lab) -> None:
     lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting=mounting))
-    lab.calibrate()
-    found = circumstances_of(lab.run())[0]["setup"].up_in_base
+    description = description_of(Calibrating(lab.cell), SessionOptions(lab.folder), {})
+    found = circumstances_of(Run.create(lab.folder, "r", description))[0]["setup"].up_in_base
     assert found == (None if up is None else pytest.approx(up, abs=1e-12))

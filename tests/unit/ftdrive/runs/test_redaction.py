@@ -23,14 +23,14 @@ def test_equal_values_have_equal_placeholders_of_their_kind() -> None:
         "can://bus-9",
         "https://example.com/a",
         '{"host": "c3"}',
+        '{"host": "q"}',
         "/home/root/x",
     ):
         redaction.learn(text)
-    text = (
-        "10.1.2.3 and 10.1.2.4, 10.1.2.3; fe80::1 is no 12:30:45; cell-7 and cell-7.example.org, c3, bus-9, example.com"
-    )
+    text = "10.1.2.3 and 10.1.2.4, 10.1.2.3; fe80::1 is no 12:30:45; cell-7 and cell-7.example.org, c3, bus-9, q, "
+    text += "example.com"
     assert redaction.text(text) == (
-        "<ip-1> and <ip-2>, <ip-1>; <ip-3> is no 12:30:45; <host-2> and <host-1>, <host-3>, bus-9, example.com"
+        "<ip-1> and <ip-2>, <ip-1>; <ip-3> is no 12:30:45; <host-2> and <host-1>, <host-3>, bus-9, q, example.com"
     )
     assert redaction.counts == {"host": 3, "ip": 3}
     assert redaction.text("08:00:27:12:34:56 127.0.0.1 0.0.0.0 ::1 /home/root/a /home/u2/b") == (

@@ -50,15 +50,15 @@ class Looks:
     def __init__(self, guard: Guard, *, moving: bool = True) -> None:
         self.guard = guard
         self.motion = ExpectedMotion(START, GOAL, moving=True) if moving else ExpectedMotion(GOAL, GOAL, moving=False)
+        self.state = state(START + 0.4 * (GOAL - START) if moving else GOAL)
         self.t_s, self.sample = 0.0, 0
         self.rng = np.random.default_rng(0)
         guard.begin(self.seen())
 
     def seen(self, *, new: bool = True, **different: Any) -> Seen:
         self.t_s, self.sample = self.t_s + 0.01, self.sample + new
-        q = START + 0.4 * (GOAL - START) if self.motion.moving else GOAL
         wrench = WEIGHT + self.rng.normal(0, 0.03, 6)
-        usual: dict[str, Any] = {"state": state(q), "status": STATUS, "wrench": wrench, "turn_rad_s": 0.0}
+        usual: dict[str, Any] = {"state": self.state, "status": STATUS, "wrench": wrench, "turn_rad_s": 0.0}
         return Seen(t_s=self.t_s, dt_s=0.01, motion=self.motion, sample=self.sample, **(usual | different))
 
     def trips(self, times: int = 1, *, new: bool = True, **different: Any) -> Tripped | None:
@@ -86,6 +86,16 @@ def test_joints_that_leave_the_straight_line_are_seen() -> None:
         assert (trip.hazard, f"joint {joint + 1}" in str(trip)) == (2, True)
 
 
+@pytest.mark.parametrize("on_curve", [False, True])
+def test_base_and_shoulder_that_turn_may_leave_the_line_as_far_as_the_wrist(on_curve: bool) -> None:
+    looks, turn = Looks(PathGuard(LIMITS)), np.radians([40.0, 40, 0, 0, 0, 0])
+    curve = START + np.linspace(0, 1, 401)[:, None] * turn if on_curve else None
+    looks.motion = ExpectedMotion(START, START + turn, moving=True, curve_rad=curve)
+    aside = START + 0.5 * turn + np.radians([1.6, -1.6, 0, 0, 0, 0])
+    assert looks.trips(state=state(aside)) is None
+    assert looks.trip(state=state(aside + np.radians([0.8, -0.8, 0, 0, 0, 0]))).hazard == 2
+
+
 def test_an_arm_that_is_moved_while_it_should_stand_has_another_client() -> None:
     looks = Looks(PathGuard(LIMITS), moving=False)
     assert looks.trips(50) is None
@@ -93,9 +103,9 @@ def test_an_arm_that_is_moved_while_it_should_stand_has_another_client() -> None
 
 
 def test_only_an_arm_that_comes_no_nearer_has_stalled() -> None:
-    looks = Looks(StallGuard(LIMITS))
+    looks, at = Looks(StallGuard(LIMITS)), state(START)
     for share in np.linspace(0, 1, 1500):  # 15 s for one move
-        assert looks.trips(state=state(START + share * (GOAL - START))) is None
+        assert looks.trips(state=replace(at, q_rad=START + share * (GOAL - START))) is None
     looks = Looks(StallGuard(LIMITS))
     trip = looks.trip(1010, status=replace(STATUS, speed_slider=0.0))
     assert (trip.hazard, "slider 0 %" in str(trip)) == (22, True)

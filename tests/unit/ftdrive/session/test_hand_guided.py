@@ -283,9 +283,10 @@ class Outcome:
             with raises:
                 collect()
 
-    def commit(self, record: PoseRecord) -> None:
+    def commit(self, record: PoseRecord) -> PoseRecord:
         self.kept.append(record)
         self.person.shown.append(Noted(words=f"committed {record.stop}"))
+        return record
 
     @property
     def stops(self) -> list[int]:
@@ -636,9 +637,10 @@ def test_without_an_operator_it_ends_and_what_is_committed_stands() -> None:
     cell = Cell(dwells(*AROUND))
     person, kept = Person(cell, {}), list[PoseRecord]()
 
-    def commit(record: PoseRecord) -> None:
+    def commit(record: PoseRecord) -> PoseRecord:
         kept.append(record)
         person.gone = "the terminal was closed" if len(kept) == 2 else None
+        return record
 
     with pytest.raises(SupervisorGone, match="terminal"):
         guided(cell, person, SimpleNamespace(commit=commit), Fit(), Sampling(average_s=AVERAGE_S)).run((), "")

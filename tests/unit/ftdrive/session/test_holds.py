@@ -59,7 +59,7 @@ def test_a_way_that_is_not_confirmed_leads_back_to_the_hold(answer: str, lab: La
     lab.operator.answers["the way to pose 4"] = ["no"]
     moves: list[int] = []
     when_asked(lab, "resume:", lambda: moves.append(len(lab.arm.moves)))
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert moves == [4, 4]
     first, second = holds(lab)
     assert first == "paused by the operator"
@@ -73,7 +73,7 @@ def test_who_does_not_confirm_a_way_can_end_it_there_and_keeps_the_poses(lab: La
     lab.operator.answers["resume:"] = ["resume", "quit"]
     lab.operator.answers["the way to pose 4"] = ["no"]
     with pytest.raises(Declined, match="not confirmed: The arm goes"):
-        lab.calibrate()
+        lab.take_poses()
     assert len(lab.arm.moves) == 4
     assert lab.stops() == [1, 2, 3]
     assert f"--resume {lab.run().folder}" in lab.operator.of(Noted)[-1].words
@@ -83,7 +83,7 @@ def test_the_way_back_that_is_not_confirmed_is_not_gone_but_offered_again(lab: L
     lab.push_on_the_way(4)
     lab.operator.answers["resume:"] = ["back", "resume"]
     lab.operator.answers["the way back to pose 3"] = ["no"]
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert len(holds(lab)) == 2
     assert all("back" in answers for answers in lab.holds())
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
@@ -92,7 +92,7 @@ def test_the_way_back_that_is_not_confirmed_is_not_gone_but_offered_again(lab: L
 def test_a_tour_that_may_not_begin_yet_is_held_at_its_first_pose(lab: Lab) -> None:
     lab.operator.answers["Begin?"] = ["no"]
     lab.operator.answers["resume:"] = ["resume"]
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert [words.startswith("not confirmed: The arm stands") for words in holds(lab)] == [True]
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
 
@@ -101,7 +101,7 @@ def test_a_tour_that_may_not_begin_yet_is_held_at_its_first_pose(lab: Lab) -> No
 def test_a_no_before_the_first_motion_ends_the_session(words: str, lab: Lab) -> None:
     lab.operator.answers[words] = ["no"]
     with pytest.raises(Declined):
-        lab.calibrate()
+        lab.take_poses()
     assert holds(lab) == []
     assert lab.arm.moves == []
 
@@ -114,7 +114,7 @@ def test_an_emergency_stop_that_is_pressed_in_a_hold_brings_the_questions_again(
     pause_on_the_way(lab, 4)
     lab.operator.answers["resume:"] = ["resume"]
     when_asked(lab, "resume:", once(lambda: press_and_release(lab, mode)))
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     counts = mode != "protective stop"
     assert questions(lab) == 1 + counts
     rows = [event.hazard for event in lab.operator.of(GuardTripped)]
@@ -128,7 +128,7 @@ def test_the_questions_come_until_they_are_all_answered_with_yes(lab: Lab) -> No
     lab.operator.answers["resume:"] = ["resume", "resume"]
     lab.operator.answers["Is the emergency stop in reach"] = ["yes", "no"]
     when_asked(lab, "resume:", once(lambda: press_and_release(lab)))
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert questions(lab) == 3
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [11]
     assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet: not confirmed")]) == 1
@@ -139,7 +139,7 @@ def test_an_emergency_stop_that_is_still_pressed_is_refused_and_asked_about_once
     lab.operator.answers["resume:"] = ["resume", "resume"]
     pressed_then_not = iter([{"fault": DeviceFault("a stop"), "safety_mode": "robot emergency stop"}, {}])
     when_asked(lab, "resume:", lambda: lab.arm.set_status(**next(pressed_then_not)))
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     (refused,) = [event.words for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
     assert "safety: a stop" in refused
     assert questions(lab) == 2
@@ -160,7 +160,7 @@ def test_an_emergency_stop_that_is_pressed_at_a_question_counts_too(words: str, 
                 press_and_release(lab)
 
     when_asked(lab, words, press)
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert moves == [4, 4]
     assert questions(lab) == 3
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
@@ -171,7 +171,7 @@ def test_an_emergency_stop_between_two_steps_holds_the_arm_where_it_stands(lab: 
     when_asked(lab, "Pose 4 of 7", once(lambda: press_and_release(lab)))
     moves: list[int] = []
     when_asked(lab, "resume:", lambda: moves.append(len(lab.arm.moves)))
-    assert lab.calibrate(mode="step") is not None
+    assert lab.take_poses(mode="step") is not None
     assert moves == [3]
     assert holds(lab) == ["the arm stopped: a stop"]
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [11]
@@ -192,7 +192,7 @@ def test_an_arm_that_was_out_of_sight_is_resumed_after_a_new_question(lab: Lab) 
         lab.arm.at_look = lambda: None
 
     when_asked(lab, "resume:", once(out_of_sight))
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert questions(lab) == 2
     assert [event for event in lab.operator.of(Noted) if "out of sight" in event.words]
     assert lab.operator.of(GuardTripped) == []
@@ -204,7 +204,7 @@ def test_an_emergency_stop_at_the_first_questions_brings_them_again(words: str, 
     when_asked(lab, words, once(lambda: press_and_release(lab)))
     held_at: list[int] = []
     when_asked(lab, "resume:", lambda: held_at.append(len(lab.arm.moves)))
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert held_at == [0]
     assert questions(lab) == 2
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]

@@ -1,7 +1,8 @@
 """The fit while poses come in, what is said about what is missing, and what is said at the end about odd poses."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -71,17 +72,21 @@ def records(R_base_flange: Array) -> list[PoseRecord]:
     return [record(stop, R, stop) for stop, R in enumerate(R_base_flange, start=1)]
 
 
-def tour() -> list[PoseRecord]:
-    """24 poses and the return to the first."""
+@cache
+def taken_once() -> Sequence[PoseRecord]:
     numbers = [*TOUR, TOUR[0]]
     return [record(stop, R, n) for stop, (n, R) in enumerate(zip(numbers, special(numbers), strict=True), start=1)]
+
+
+def tour() -> list[PoseRecord]:
+    """24 poses and the return to the first."""
+    return list(taken_once())
 
 
 def run(taken: list[PoseRecord], running: RunningFit | None = None) -> Estimated:
     """Take all poses in and return what the last one gives, without a fit after each."""
     running = running or RunningFit()
     running._records = {one.stop: one for one in taken[:-1]}
-    running._refit()
     return running.add(taken[-1])
 
 
@@ -180,7 +185,8 @@ def follow(words: str, R: Array) -> Array:
 
 def test_a_bumped_pose_stands_out_when_it_comes_and_can_be_taken_again() -> None:
     running, taken = RunningFit(), tour()
-    quiet = run(taken[:14], running)
+    run(taken[:13], running)
+    quiet = running.add(taken[13])
     assert quiet.residual_sigma is not None
     assert quiet.residual_sigma < 5
     bumped = running.add(record(15, special([TOUR[14]])[0], TOUR[14], bump_N=1.0))
@@ -228,7 +234,7 @@ def test_an_arm_on_a_wall_is_seen_as_such_once_the_fit_knows() -> None:
         TRUTH.p_sensor_com_m,
         TRUTH.torque_bias_Nm,
     )
-    R = special(range(1, 25))
+    R = special(range(1, 15))  # not as many on each face
     event = run([record(stop, one, stop, truth=wall) for stop, one in enumerate(R, start=1)])
     assert event.faces == faces(-R[:, 1])
     estimate = RunningFit(down_base=(0, -1, 0)).add(record(1, R[0], 1, truth=wall))
@@ -250,9 +256,9 @@ def test_drift_is_shown_with_the_estimates() -> None:
 Disturbed = Callable[[int, Array, np.random.Generator], Array]
 
 
-def disturbed(wrench_of: Disturbed, seed: int = 0) -> list[PoseRecord]:
+def disturbed(wrench_of: Disturbed) -> list[PoseRecord]:
     """Take the tour with wrenches (6,) that depend on the stop, the orientation and chance."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     taken = []
     for one in tour():
         noise = one.samples.wrench - one.samples.wrench.mean(axis=0) + rng.normal(size=6) * SIGMA / np.sqrt(SAMPLES)
@@ -288,13 +294,12 @@ def test_nothing_is_said_of_quiet_runs_and_inexact_arms_and_no_pose_is_named_whe
         bias[:] += rng.normal(size=6) * np.repeat([0.03, 0.0005], 3)
         return np.asarray(predict(TRUTH, R) + bias)
 
-    for seed in range(2):
-        bias = np.zeros(6)
-        for wrench_of in (lambda _, R, __: predict(TRUTH, R), rough):
-            assert said(disturbed(wrench_of, seed)) == ()
-        for drifts in (drifting, wandering):
-            (hint,) = said(disturbed(drifts, seed))
-            assert hint.code == "sensor_drifts"
+    bias = np.zeros(6)
+    for wrench_of in (lambda _, R, __: predict(TRUTH, R), rough):
+        assert said(disturbed(wrench_of)) == ()
+    for drifts in (drifting, wandering):
+        (hint,) = said(disturbed(drifts))
+        assert hint.code == "sensor_drifts"
 
 
 def test_a_bumped_pose_is_named() -> None:
@@ -310,7 +315,7 @@ def test_a_cable_that_pulls_in_three_poses_is_named_with_them() -> None:
     assert found[-1].values["poses"] == [name(5), name(6), name(14)]
 
 
-@pytest.mark.parametrize("since", [6, 12, 20])
+@pytest.mark.parametrize("since", [6, pytest.param(20, marks=pytest.mark.slow)])
 def test_a_load_that_shifts_is_named_with_the_pose_from_which_on(since: int) -> None:
     shifted = replace(TRUTH, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.004, 0.002, 0]))
     change = changed(disturbed(lambda stop, R, _: predict(shifted if stop >= since else TRUTH, R)))

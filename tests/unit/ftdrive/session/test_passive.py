@@ -18,18 +18,26 @@ from ftdrive.session.operator import Key
 from ftdrive.session.passive import record_passively
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.fake_clock import FakeClock
-from tests.moving_load import Truth, programme, record
+from tests.moving_load import Recorded, Truth, programme, record
 
-SECONDS = 60.0
+SECONDS = 25.0
 STEP_S = 2.0
+
+
+def recording(contacts: Mapping[tuple[float, float], Any] | None = None) -> Recorded:
+    return record(Truth(vibrates_at_rest=False), programme(1, SECONDS)[0], SECONDS, 1, contacts=contacts)
+
+
+@pytest.fixture(scope="module")
+def free() -> Recorded:
+    return recording()
 
 
 class FakeCell:
     """Sensor, arm and journal of a free tool that a program moves."""
 
-    def __init__(self, *, stop_s: float = np.inf, contacts: Mapping[tuple[float, float], Any] | None = None) -> None:
+    def __init__(self, recorded: Recorded, *, stop_s: float = np.inf) -> None:
         self.clock, self.shown, self._stop_s = FakeClock(), list[Any](), stop_s
-        recorded = record(Truth(vibrates_at_rest=False), programme(1, SECONDS)[0], SECONDS, 1, contacts=contacts)
         nothing = np.zeros((len(recorded.t_pose_s), 6))
         start_ns = self._start_ns = self.clock.now_ns()
         self._samples = FtSamples.of(
@@ -72,8 +80,8 @@ def passively(cell: Any, folder: Path, seconds: float) -> Run:
     return run
 
 
-def test_it_ends_by_itself_when_the_result_is_good(tmp_path: Path) -> None:
-    cell = FakeCell()
+def test_it_ends_by_itself_when_the_result_is_good(free: Recorded, tmp_path: Path) -> None:
+    cell = FakeCell(free)
     run = passively(cell, tmp_path, SECONDS)
     duration_s = cell.shown[-1].duration_s
     assert 10 < duration_s < SECONDS - 2 * STEP_S
@@ -81,14 +89,14 @@ def test_it_ends_by_itself_when_the_result_is_good(tmp_path: Path) -> None:
     assert len(recording.samples) == pytest.approx(500 * duration_s, rel=0.05)
 
 
-def test_q_and_the_time_end_it_and_too_little_is_not_kept(tmp_path: Path) -> None:
-    by_key, by_time = FakeCell(stop_s=6.0), FakeCell()
+def test_q_and_the_time_end_it_and_too_little_is_not_kept(free: Recorded, tmp_path: Path) -> None:
+    by_key, by_time = FakeCell(free, stop_s=6.0), FakeCell(free)
     assert passively(by_key, tmp_path, SECONDS).motion_path.is_file()
     assert by_key.shown[-1].duration_s == pytest.approx(6.0, abs=STEP_S)
-    passively(by_time, tmp_path, 8.0)
-    assert by_time.shown[-1].duration_s == pytest.approx(8.0, abs=STEP_S)
+    passively(by_time, tmp_path, 6.0)
+    assert by_time.shown[-1].duration_s == pytest.approx(6.0, abs=STEP_S)
     with pytest.raises(Declined, match="record 10 s"):
-        passively(FakeCell(stop_s=2.0), tmp_path, SECONDS)
+        passively(FakeCell(free, stop_s=2.0), tmp_path, SECONDS)
 
 
 @pytest.mark.slow
@@ -96,7 +104,7 @@ def test_a_touch_below_that_of_a_guard_is_left_out_of_the_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     touches = {(start, start + 2.0): np.array([1.0, 0.0, -0.8, 0.0, 0.05, 0.0]) for start in np.arange(4.0, 25.0, 7.0)}
-    run = passively(FakeCell(contacts=touches), tmp_path, 25.0)
+    run = passively(FakeCell(recording(touches)), tmp_path, SECONDS)
     monkeypatch.setattr(outcome, "circumstances_of", lambda _: ({"setup": Setup()}, {}))
     found = outcome.solve_in_motion(run)
     assert found.verdict == "good"

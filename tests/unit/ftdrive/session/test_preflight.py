@@ -24,7 +24,7 @@ from tests.unit.ftdrive.fake_cell import Lab
 
 def refuse(lab: Lab, words: str) -> None:
     with pytest.raises(NotAccepted, match=words):
-        lab.calibrate()
+        lab.take_poses()
     assert lab.arm.moves == []
     assert lab.operator.asked == []
 
@@ -54,22 +54,22 @@ def test_a_controller_that_is_not_ready_is_refused(different: dict[str, Any], wo
 def test_a_tour_that_would_wind_up_the_cable_is_refused(lab: Lab, tmp_path: Path) -> None:
     lab.arm.q[5] = np.radians(-90)
     made_there = tmp_path / "there.json"
-    assert lab.calibrate(dry_run=True, output=made_there) is None
+    assert lab.take_poses(dry_run=True, output=made_there) is None
     assert "wrist 3 stands at -90°" in next(e.words for e in lab.operator.of(Checked) if e.name == "cable")
     lab.arm.q[5] = np.radians(160)
     lab.operator.shown.clear()
     refuse_plan = pytest.raises(NotAccepted, match=r"160°.* -?\d+° and -?\d+°")
     with refuse_plan:
-        lab.calibrate(plan=made_there)
+        lab.take_poses(plan=made_there)
     assert lab.arm.moves == []
 
 
 def test_a_plan_that_has_run_before_does_not_excuse_a_wound_cable(lab: Lab) -> None:
-    lab.calibrate()
+    lab.take_poses()
     lab.arm.q[5] -= 2 * np.pi
     lab.operator.shown.clear()
     with pytest.raises(NotAccepted, match="wrist 3 stands at"):
-        lab.calibrate(plan=lab.run().folder / "plan.json")
+        lab.take_poses(plan=lab.run().folder / "plan.json")
 
 
 @pytest.mark.parametrize(("outside_rad", "state"), [(1e-4, "ok"), (0.05, "failed")])
@@ -106,7 +106,7 @@ def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
     lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=1.5))
     words = f"twice the tool's weight is {share} % of the sensor's range"
     if passes:
-        assert lab.calibrate(dry_run=True) is None
+        assert lab.take_poses(dry_run=True) is None
         assert words in next(event.words for event in lab.operator.of(Checked) if event.name == "load")
     else:
         refuse(lab, f"{words}: take a larger sensor")
@@ -114,14 +114,14 @@ def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
 
 def test_a_speed_slider_that_doctor_calls_too_low_is_refused(lab: Lab) -> None:
     lab.arm.set_status(speed_slider=SLOWEST_SLIDER)
-    assert lab.calibrate(dry_run=True) is None
+    assert lab.take_poses(dry_run=True) is None
     lab.arm.set_status(speed_slider=SLOWEST_SLIDER - 0.01)
     assert check_speed(lab.arm.status()).state == "failed"
     refuse(lab, "slider: speed slider at 4%.*raise the speed slider at the pendant")
 
 
 def test_a_pose_the_controller_forbids_is_refused(lab: Lab) -> None:
-    assert lab.calibrate(dry_run=True) is None
+    assert lab.take_poses(dry_run=True) is None
     lab.arm.forbidden = lab.arm.q.round(12)
     lab.arm.within_safety_limits = lambda q_rad: q_rad[4] < 2.0  # type: ignore[method-assign]  # this arm only
     refuse(lab, "safety limits forbid")
@@ -140,7 +140,7 @@ def test_another_model_or_tcp_is_refused(lab: Lab) -> None:
 
 def test_another_arm_than_the_one_that_is_meant_is_refused(lab: Lab) -> None:
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="A1"))
-    assert lab.calibrate(dry_run=True) is None
+    assert lab.take_poses(dry_run=True) is None
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="B2"))
     refuse(lab, r"the arm at fake has serial A1, \[robot\] serial is B2")
 
@@ -156,11 +156,11 @@ def test_a_sensor_that_stumbles_once_is_opened_again(lab: Lab) -> None:
         raise StreamBroken("a write took too long")
 
     lab.sensor.collecting = stumble
-    assert lab.calibrate(dry_run=True) is None
+    assert lab.take_poses(dry_run=True) is None
     assert "trying once more" in " ".join(event.words for event in lab.operator.of(Noted))
     lab.sensor.failure = StreamBroken("gone for good")
     with pytest.raises(StreamBroken):
-        lab.calibrate(dry_run=True)
+        lab.take_poses(dry_run=True)
 
 
 def test_a_folder_that_cannot_be_written_is_refused(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,13 +172,13 @@ def test_a_folder_that_cannot_be_written_is_refused(lab: Lab, monkeypatch: pytes
 
 
 def test_a_plan_for_another_tool_is_refused(lab: Lab) -> None:
-    lab.calibrate()
+    lab.take_poses()
     plan = lab.run().plan_path
     lab.arm.moves.clear()
     lab.operator.asked.clear()
     lab.cell = replace(lab.cell, tool=ToolConfig(cylinders_mm=((0.0, 210.0, 100.0),)))
     with pytest.raises(NotAccepted, match="another tool"):
-        lab.calibrate(plan=plan)
+        lab.take_poses(plan=plan)
     assert lab.arm.moves == []
 
 
@@ -191,7 +191,7 @@ def test_a_program_of_another_client_is_refused_before_anything_is_done(
     lab.arm.program = program
     words = r"program is on the controller \(PLAYING pick\.urp\): stop it at the pendant, then start again"
     with pytest.raises(NotAccepted, match=words):
-        lab.calibrate(dry_run=dry_run)
+        lab.take_poses(dry_run=dry_run)
     assert (lab.arm.opened, lab.arm.moves, lab.operator.asked) == (1, [], [])
 
 
@@ -199,14 +199,14 @@ def test_what_a_killed_session_left_behind_is_waited_for(lab: Lab) -> None:
     lab.arm.program = "playing"
     lab.clock.at(0.3, lambda: setattr(lab.arm, "program", "stopping"))
     lab.clock.at(1.4, lambda: setattr(lab.arm, "program", "stopped"))
-    assert lab.calibrate(dry_run=True) is None
+    assert lab.take_poses(dry_run=True) is None
 
 
 def test_a_program_that_goes_on_is_none_that_was_left_behind(lab: Lab) -> None:
     lab.arm.program = "playing"
     lab.clock.at(1.6, lambda: setattr(lab.arm, "program", "stopped"))
     with pytest.raises(NotAccepted):
-        lab.calibrate(dry_run=True)
+        lab.take_poses(dry_run=True)
 
 
 def test_a_computer_that_stalls_does_not_refuse_a_program_that_has_ended_meanwhile(lab: Lab) -> None:
@@ -216,11 +216,11 @@ def test_a_computer_that_stalls_does_not_refuse_a_program_that_has_ended_meanwhi
 
     lab.arm.program = "playing"
     lab.clock.at(0.01, stall)
-    assert lab.calibrate(dry_run=True) is None
+    assert lab.take_poses(dry_run=True) is None
 
 
 def test_a_dry_run_takes_no_control_and_says_what_it_left_out(lab: Lab) -> None:
-    assert lab.calibrate(dry_run=True) is None
+    assert lab.take_poses(dry_run=True) is None
     assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
     assert "limits are not checked" in lab.said()
 
@@ -240,16 +240,16 @@ def test_an_old_controller_is_controlled_from_the_start_because_it_reports_no_po
         return right()
 
     lab.arm.state = state  # type: ignore[method-assign]  # this arm only
-    lab.calibrate()
+    lab.take_poses()
     assert lab.stops()[-1] == 7
 
 
 def test_local_control_is_refused_in_a_dry_run_too(lab: Lab) -> None:
     lab.arm.remote = False
     with pytest.raises(NotAccepted, match="remote: local control: press Local"):
-        lab.calibrate(dry_run=True)
+        lab.take_poses(dry_run=True)
     lab.arm.remote = None
-    assert lab.calibrate(dry_run=True) is None
+    assert lab.take_poses(dry_run=True) is None
 
 
 def link(lab: Lab, *, old: bool, late_s: Callable[[int], float]) -> Check:

@@ -39,7 +39,7 @@ from tests.unit.ftdrive.fake_cell import Lab
 def test_pause_holds_the_arm_on_its_way_and_goes_on_or_ends(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
     lab.operator.answers["resume: go on"] = ["resume"]
-    lab.calibrate()
+    lab.take_poses()
     assert lab.operator.states().count(State.HOLD) == 1
     assert lab.operator.of(GuardTripped) == []
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
@@ -47,13 +47,13 @@ def test_pause_holds_the_arm_on_its_way_and_goes_on_or_ends(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
     lab.operator.answers["resume: go on"] = ["quit"]
     with pytest.raises(Declined, match="paused by the operator"):
-        lab.calibrate()
+        lab.take_poses()
 
 
 def test_stop_ends_the_session_without_a_question_and_says_how_to_go_on(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
     with pytest.raises(Declined, match="stopped by the operator"):
-        lab.calibrate()
+        lab.take_poses()
     assert lab.arm.halted.is_set()
     assert State.HOLD not in lab.operator.states()
     assert "resume" not in lab.operator.asked[-1].text
@@ -63,7 +63,7 @@ def test_stop_ends_the_session_without_a_question_and_says_how_to_go_on(lab: Lab
 
 def test_skip_on_the_way_stops_the_arm_and_goes_round_that_pose(lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.SKIP)
-    lab.calibrate()
+    lab.take_poses()
     assert lab.taken() == [1, 2, 3, 5, 6, 7]
     assert lab.arm.stops == 1
     fourth = np.array(Plan.load(lab.run().plan_path).steps[3].q_rad)
@@ -82,7 +82,7 @@ def test_skip_while_a_pose_is_measured_skips_that_one(lab: Lab) -> None:
 
     skipped: list[bool] = []
     lab.sensor.collecting = skip
-    lab.calibrate()
+    lab.take_poses()
     assert lab.taken() == [1, 2, 3, 5, 6, 7]
     assert not [question for question in lab.operator.asked if "the way to pose 5" in question.text]
     assert len(lab.arm.moves) == 7
@@ -90,14 +90,14 @@ def test_skip_while_a_pose_is_measured_skips_that_one(lab: Lab) -> None:
 
 def test_skip_with_no_pose_under_way_skips_none(lab: Lab) -> None:
     lab.press((Key.SKIP, PoseTaken, 4), (Key.KEEP, StateChanged, 5))
-    lab.calibrate()
+    lab.take_poses()
     assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
     assert "none is under way" in lab.said()
 
 
 def test_keep_has_nothing_to_do_in_a_tour_and_says_so(lab: Lab) -> None:
     lab.press((Key.KEEP, PoseTaken, 3))
-    lab.calibrate()
+    lab.take_poses()
     assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
     assert lab.said().count("r to take it again") == 1
 
@@ -111,7 +111,7 @@ def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> Non
     again: list[bool] = []
     lab.sensor.collecting = redo  # while pose 6 is measured: pose 5 is the last that was shown
     lab.press((Key.REDO, PoseTaken, 1), (Key.REDO, StateChanged, 4))  # while the arm stands, and on its way
-    lab.calibrate()
+    lab.take_poses()
     assert lab.taken() == [1, 1, 2, 3, 3, 4, 5, 5, 6, 7]
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     assert "goes back to pose 3" in lab.said()
@@ -127,7 +127,7 @@ def test_redo_before_any_pose_or_twice_does_nothing_more(lab: Lab) -> None:
             lab.operator.keys.extend([Key.REDO, Key.REDO])
 
     lab.operator.on_event = twice
-    lab.calibrate()
+    lab.take_poses()
     assert lab.taken() == [1, 2, 2, 3, 4, 5, 6, 7]
     assert "no pose yet" in lab.said()
     assert "pose 2 is being taken" in lab.said()
@@ -168,7 +168,7 @@ def test_skip_of_the_first_pose_while_it_is_taken_again_keeps_it_and_names_the_r
 
 
 def test_a_pose_of_a_run_that_redo_names_stays_when_it_is_skipped(lab: Lab) -> None:
-    lab.calibrate()
+    lab.take_poses()
     lab.operator.shown.clear()
     lab.operator.answers["Pose 3 of 7"] = ["s"]
     outcome = lab.calibrate(resume=lab.run().folder, redo=(3,), mode="step")
@@ -181,7 +181,7 @@ def test_a_pose_of_a_run_that_redo_names_stays_when_it_is_skipped(lab: Lab) -> N
 
 
 def test_a_first_pose_that_is_repeated_after_its_return_gives_the_drift_between_the_two(lab: Lab) -> None:
-    lab.calibrate()
+    lab.take_poses()
     lab.sensor.push = np.array([0.5, 0, 0, 0, 0, 0])
     outcome = lab.calibrate(resume=lab.run().folder, redo=(1,))
     assert lab.taken()[-1] == 1
@@ -207,19 +207,19 @@ def test_the_rate_of_a_drift_is_the_same_whichever_was_first(elapsed_s: float, w
 def test_an_approach_past_a_skipped_pose_is_shown_and_confirmed_by_the_operator(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lab.calibrate()  # trusted from here on
+    lab.trust()
     lab.operator.asked.clear()
     lab.operator.answers["Pose 3 of 7"] = ["s"] * 2
-    lab.calibrate(mode="step")
+    lab.take_poses(mode="step")
     monkeypatch.setattr(tour, "_NEAR_RAD", np.pi)
-    lab.calibrate(mode="step")
+    lab.take_poses(mode="step")
     ways = [question for question in lab.operator.asked if "the way to pose 4" in question.text]
     assert ["skipped pose 3" in question.text for question in ways] == [False, True]
     assert [question.assumed for question in ways] == ["yes", None]
 
 
 def test_what_would_help_most_is_not_shown_where_the_plan_chooses(lab: Lab) -> None:
-    lab.calibrate()
+    lab.take_poses()
     assert {event.hint for event in lab.operator.of(Estimated)} == {""}
 
 
@@ -229,7 +229,7 @@ def test_a_hold_shows_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> 
     )
     lab.operator.answers["after fixing the cause"] = ["quit"]
     with pytest.raises(DeviceFault):
-        lab.calibrate()
+        lab.take_poses()
     (hold,) = [event for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
     assert str(lab.folder) not in hold.words + lab.operator.asked[-1].text
     assert "protective stop" in hold.words
@@ -237,15 +237,22 @@ def test_a_hold_shows_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> 
 
 
 def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None:
+    def drift(event: Event) -> None:
+        if isinstance(event, PoseTaken):
+            lab.sensor.push = lab.sensor.push + np.array([0.1, 0, 0, 0, 0, 0])
+
+    lab.operator.on_event = drift
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
     with pytest.raises(Declined):
-        lab.calibrate()
+        lab.take_poses()
     run = lab.run()
     lab.operator.shown.clear()
     outcome = lab.calibrate(resume=run.folder)
     assert outcome is not None
     assert outcome.run.folder == run.folder
     assert [event.stop for event in lab.operator.of(PoseTaken)] == [4, 5, 6, 7]
+    estimate = lab.operator.of(Estimated)[-1].values
+    assert estimate["force_bias_N"].tolist() == outcome.result.force_bias_N.tolist()  # their times are those on disk
     assert len((run.folder / "events.ndjson").read_text().splitlines()) > len(lab.operator.shown)
     first = run.calibration_path.read_bytes()
     lab.operator.shown.clear()
@@ -261,9 +268,9 @@ def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None
 def test_a_run_goes_on_in_its_own_mode_or_in_steps(begun: str, asked: str, in_steps: bool, lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
     with pytest.raises(Declined):
-        lab.calibrate(mode=begun)
+        lab.take_poses(mode=begun)
     lab.operator.asked.clear()
-    lab.calibrate(resume=lab.run().folder, mode=asked)
+    lab.take_poses(resume=lab.run().folder, mode=asked)
     steps = [question.text.split(",")[0] for question in lab.operator.asked if "Enter" in question.text]
     assert steps == [f"Pose {stop} of 7" for stop in (4, 5, 6, 7) if in_steps]
 
@@ -272,10 +279,10 @@ def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: La
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
     lab.operator.answers["resume:"] = ["quit"]
     with pytest.raises(Declined):
-        lab.calibrate()
+        lab.take_poses()
     run = lab.run()
     lab.operator.shown.clear()
-    assert lab.calibrate(resume=run.folder, dry_run=True) is None
+    assert lab.take_poses(resume=run.folder, dry_run=True) is None
     kinds = [type(event) for event in lab.operator.shown]
     assert kinds.count(RunOpened) == 1
     assert kinds.index(RunOpened) < kinds.index(Checked)
@@ -287,12 +294,12 @@ def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
     lab.operator.answers["resume:"] = ["quit"]
     with pytest.raises(Declined):
-        lab.calibrate()
+        lab.take_poses()
     lab.arm.moves.clear()
     lab.cell = replace(lab.cell, tool=ToolConfig(cylinders_mm=((0.0, 210.0, 100.0),)))
     for options in ({}, {"redo": (1,)}):
         with pytest.raises(NotAccepted, match="another tool"):
-            lab.calibrate(resume=lab.run().folder, **options)
+            lab.take_poses(resume=lab.run().folder, **options)
     assert lab.arm.moves == []
 
 
@@ -302,7 +309,7 @@ def broken_off(lab: Lab, url: str = "fake://", **facts: Any) -> Path:
     reports(lab, facts=facts)
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
     with pytest.raises(Declined):
-        lab.calibrate()
+        lab.take_poses()
     lab.arm.moves.clear()
     return lab.run().folder
 
@@ -330,10 +337,10 @@ def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
     edit(folder / "run.json", lambda header: header["devices"]["sensor"].update(model=model, serial=serial))
     reports(lab, *now)
     if not cure:
-        assert lab.calibrate(resume=folder) is not None
+        assert lab.take_poses(resume=folder) is not None
         return
     with pytest.raises(PlanRefused, match=f"{then[0]}, serial {then[1]}, connected is {now[0]}.*{cure}"):
-        lab.calibrate(resume=folder)
+        lab.take_poses(resume=folder)
     assert lab.arm.moves == []
 
 
@@ -341,10 +348,10 @@ def test_a_run_that_another_process_resumes_is_refused_before_anything_moves(lab
     folder = broken_off(lab)
     events = (folder / "events.ndjson").read_bytes()
     with Run(folder), pytest.raises(ConfigError, match=r"is in use by process \d+ on .* since "):
-        lab.calibrate(resume=folder)
+        lab.take_poses(resume=folder)
     assert lab.arm.moves == []
     assert (folder / "events.ndjson").read_bytes() == events
-    assert lab.calibrate(resume=folder) is not None
+    assert lab.take_poses(resume=folder) is not None
 
 
 def test_an_arm_without_a_serial_number_is_the_same_where_its_model_is(lab: Lab) -> None:
@@ -352,19 +359,19 @@ def test_an_arm_without_a_serial_number_is_the_same_where_its_model_is(lab: Lab)
     folder = broken_off(lab)
     lab.arm.identify = lambda: DeviceInfo("UR7e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
     with pytest.raises(PlanRefused, match="not reported, connected is UR7e"):
-        lab.calibrate(resume=folder)
+        lab.take_poses(resume=folder)
     lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
-    assert lab.calibrate(resume=folder) is not None
+    assert lab.take_poses(resume=folder) is not None
 
 
 def test_a_run_is_not_gone_on_with_the_other_sign(lab: Lab) -> None:
     folder = broken_off(lab)
     lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, sign=-1))
     with pytest.raises(PlanRefused, match=r"sign .*1 .*-1"):
-        lab.calibrate(resume=folder)
+        lab.take_poses(resume=folder)
     assert lab.arm.moves == []
     lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, sign=1))
-    assert lab.calibrate(resume=folder) is not None
+    assert lab.take_poses(resume=folder) is not None
 
 
 @pytest.mark.parametrize(
@@ -386,10 +393,10 @@ def test_a_run_is_not_gone_on_where_the_numbers_mean_something_else(
     lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, url=url))
     reports(lab, facts=begun | facts)
     if not changed:
-        assert lab.calibrate(resume=folder) is not None
+        assert lab.take_poses(resume=folder) is not None
         return
     with pytest.raises(PlanRefused, match=changed):
-        lab.calibrate(resume=folder)
+        lab.take_poses(resume=folder)
     assert lab.arm.moves == []
 
 
@@ -400,21 +407,21 @@ def test_a_run_is_not_gone_on_where_the_numbers_mean_something_else(
 def test_a_run_by_hand_goes_on_by_hand(mode: str, lab: Lab) -> None:
     lab.operator.keys = [Key.STOP]
     with pytest.raises(Declined, match="ended before the first pose"):
-        lab.calibrate(mode=mode)
+        lab.take_poses(mode=mode)
     run = lab.run()
     assert not lab.arm.control
     for asked in ("auto", mode):
         lab.operator.shown.clear()
         lab.operator.keys = [Key.STOP]
         with pytest.raises(Declined, match="ended before the first pose"):
-            lab.calibrate(resume=run.folder, mode=asked)
+            lab.take_poses(resume=run.folder, mode=asked)
         assert len(lab.operator.of(RunOpened)) == 1
     assert not lab.arm.control
     assert (run.folder / "run.json").exists()
     with pytest.raises(ConfigError, match=f"with --{mode} .* leave out --step"):
-        lab.calibrate(resume=run.folder, mode="step")
+        lab.take_poses(resume=run.folder, mode="step")
     with pytest.raises(ConfigError, match="leave out --redo"):
-        lab.calibrate(resume=run.folder, redo=(1,))
+        lab.take_poses(resume=run.folder, redo=(1,))
 
 
 def by_hand(lab: Lab, at_pose: Callable[[int], None] = lambda _: None) -> None:
@@ -446,7 +453,7 @@ def test_by_hand_on_a_wall_a_pose_is_shown_on_the_face_where_it_counts(lab: Lab)
     lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting="wall"))
     by_hand(lab, at_pose)
     with pytest.raises(KeyboardInterrupt):
-        lab.calibrate(mode="manual")
+        lab.take_poses(mode="manual")
     shown = np.array([event.gravity_flange for event in lab.operator.of(PoseTaken)])
     counted = [event.faces for event in lab.operator.of(Estimated)]
     assert counted == [faces(shown[:poses]) for poses in (1, 2, 3)]
@@ -459,36 +466,36 @@ def test_a_session_that_is_interrupted_says_how_to_solve_what_is_there(lab: Lab)
 
     by_hand(lab, at_pose)
     with pytest.raises(KeyboardInterrupt):
-        lab.calibrate(mode="manual")
+        lab.take_poses(mode="manual")
     words = lab.operator.of(Noted)[-1].words
     assert words.endswith(f"or solve them with {lab.run().solve_command}")
     assert lab.run().stops() == [1, 2, 3]
 
 
 def test_a_run_along_a_plan_does_not_go_on_by_hand(lab: Lab) -> None:
-    lab.calibrate()
+    lab.take_poses()
     with pytest.raises(ConfigError, match="along a plan"):
-        lab.calibrate(resume=lab.run().folder, mode="listen")
+        lab.take_poses(resume=lab.run().folder, mode="listen")
 
 
 @pytest.mark.parametrize("option", [{"dry_run": True}, {"fast": True}, {"plan": Path("plan.json")}])
 def test_by_hand_nothing_is_planned_or_moved(option: dict[str, Any], lab: Lab) -> None:
     with pytest.raises(ConfigError, match="leave out --" + next(iter(option)).replace("_", "-")):
-        lab.calibrate(mode="manual", **option)
+        lab.take_poses(mode="manual", **option)
     assert not (lab.folder / "runs").exists()
 
 
 def test_options_that_cannot_be_used_are_reported_before_anything_opens(lab: Lab) -> None:
-    lab.calibrate()
+    lab.take_poses()
     opened, run = lab.arm.opened, lab.run()
     with pytest.raises(ConfigError, match="name the run with --resume"):
-        lab.calibrate(redo=(3,))
+        lab.take_poses(redo=(3,))
     with pytest.raises(ConfigError, match="poses 1 to 7"):
-        lab.calibrate(resume=run.folder, redo=(7, 8))
+        lab.take_poses(resume=run.folder, redo=(7, 8))
     damaged = lab.folder / "damaged.json"
     damaged.write_text(run.plan_path.read_text().replace('"clearance_m"', '"clearance"', 1))
     with pytest.raises(PlanRefused):
-        lab.calibrate(plan=damaged)
+        lab.take_poses(plan=damaged)
     assert lab.arm.opened == opened
 
 
@@ -504,11 +511,11 @@ def test_a_cell_that_cannot_be_built_is_reported_before_its_sensor_opens(
     monkeypatch.setattr(session, "build_arm", refuse)
     monkeypatch.setattr(lab.sensor, "open", opened)
     with pytest.raises(ConfigError, match="driver"):
-        lab.calibrate()
+        lab.take_poses()
 
 
 def test_what_the_sensor_went_through_is_written_down(lab: Lab) -> None:
     lab.sensor.events = ((17, "connected again"),)
-    lab.calibrate()
+    lab.take_poses()
     reconnected = [event for event in lab.operator.of(Noted) if "connected again" in event.words]
     assert len(reconnected) == 1

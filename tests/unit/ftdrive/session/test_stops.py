@@ -151,14 +151,14 @@ def test_a_protective_stop_that_the_driver_reports_names_its_usual_causes_too(la
 
     lab.arm.at_move[4] = stop
     with pytest.raises(DeviceFault, match="wrong payload"):
-        lab.calibrate()
+        lab.take_poses()
     assert lab.operator.of(GuardTripped)[0].hazard == 10
 
 
 def test_a_controller_that_does_not_hear_the_stop_may_end_its_move(lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: setattr(lab.arm, "gone", DeviceTimeout("silent"))
     with pytest.raises(DeviceTimeout):
-        lab.calibrate()
+        lab.take_poses()
     holds = [event for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
     assert "ends the one move" in holds[0].words
 
@@ -168,7 +168,7 @@ def test_without_an_operator_the_reason_is_raised_and_the_poses_are_kept(fault: 
     hazard, inject, _, error = FAULTS[fault]
     lab.arm.at_move[4] = lambda: inject(lab)
     with pytest.raises(error):
-        lab.calibrate()
+        lab.take_poses()
     assert lab.stops() == [1, 2, 3]
     assert lab.operator.of(GuardTripped)[0].hazard == hazard
     assert f"--resume {lab.run().folder}" in lab.operator.of(Noted)[-1].words
@@ -181,7 +181,7 @@ def test_a_push_once_the_tool_is_known(lab: Lab) -> None:
     lab.arm.at_move[7] = push
     lab.operator.answers["resume:"] = ["quit"]
     with pytest.raises(DeviceFault, match="unexpected contact"):
-        lab.calibrate()
+        lab.take_poses()
     assert lab.operator.of(GuardTripped)[0].hazard == 14
 
 
@@ -191,7 +191,7 @@ def test_resume_before_the_cause_is_fixed_is_refused(lab: Lab) -> None:
     )
     lab.operator.answers["resume:"] = ["resume", "resume", "quit"]
     with pytest.raises(DeviceFault, match="protective stop"):
-        lab.calibrate()
+        lab.take_poses()
     assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]) == 2
     assert len(lab.arm.moves) == 3
 
@@ -205,7 +205,7 @@ def goals(lab: Lab) -> list[int]:
 def test_after_a_contact_the_arm_goes_back_or_round_it_where_a_person_says_so(lab: Lab) -> None:
     lab.push_on_the_way(4, 5, 7)  # to pose 4, back to pose 3, to pose 4 again
     lab.operator.answers["resume:"] = ["back", "back", "resume", "skip"]
-    lab.calibrate()
+    lab.take_poses()
     anywhere = ("resume", "skip", "back", "quit")
     assert lab.holds() == [anywhere, anywhere, ("resume", "skip", "quit"), anywhere]
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [14, 14, 14]
@@ -226,7 +226,7 @@ def test_after_a_contact_the_arm_goes_back_or_round_it_where_a_person_says_so(la
 
 
 def test_the_way_back_is_confirmed_by_a_person_though_the_plan_is_known(lab: Lab) -> None:
-    lab.calibrate()  # trusted from here on
+    lab.take_poses()  # trusted from here on
     for answer, words in (("resume", "the way to pose 4"), ("back", "the way back to pose 3")):
         lab.operator.asked.clear()
         lab.arm.moves.clear()
@@ -234,7 +234,7 @@ def test_the_way_back_is_confirmed_by_a_person_though_the_plan_is_known(lab: Lab
         lab.operator.answers["resume:"] = [answer, "quit"]
         lab.operator.answers["the way back"] = ["no"]
         with suppress(Declined):
-            lab.calibrate()
+            lab.take_poses()
         (way,) = [question for question in lab.operator.asked if words in question.text]
         assert (way.assumed is None) == (answer == "back")
     assert len(lab.arm.moves) == 3
@@ -252,21 +252,21 @@ def test_back_is_offered_only_on_the_way_from_a_pose_that_was_not_skipped(lab: L
 
     done: list[bool] = []
     lab.sensor.collecting = skip_then_pause
-    lab.calibrate()
+    lab.take_poses()
     assert lab.holds() == [("resume", "skip", "quit")] * 3
 
 
 def test_a_pause_without_an_operator_to_end_it_is_no_fault(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
     with pytest.raises(Declined, match="paused by the operator"):
-        lab.calibrate()
+        lab.take_poses()
 
 
 def test_resume_with_something_still_pushing_is_not_believed_though_the_tool_is_unknown(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: setattr(lab.sensor, "push", np.array([150.0, 0, 0, 0, 0, 0]))
     lab.operator.answers["resume:"] = ["resume", "quit"]
     with pytest.raises(DeviceFault, match="unexpected contact"):
-        lab.calibrate()
+        lab.take_poses()
     (refused,) = [event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
     assert "unexpected contact" in refused.words
     assert len(lab.arm.moves) == 3
@@ -284,7 +284,7 @@ def test_a_sensor_that_was_switched_off_may_have_another_zero(lab: Lab) -> None:
     lab.arm.at_move[2] = fail
     lab.operator.on_event = on_event
     lab.operator.answers["resume:"] = ["resume"]
-    lab.calibrate()
+    lab.take_poses()
     assert not [event for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
 
 
@@ -296,7 +296,7 @@ def test_a_sensor_that_comes_back_while_the_arm_stands_needs_no_operator(lab: La
             raise lab.sensor.failure
 
     lab.sensor.collecting = fail
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     assert State.HOLD not in lab.operator.states()
     assert any("restarts" in event.words for event in lab.operator.of(Noted))
@@ -314,7 +314,7 @@ def test_a_sensor_that_fails_twice_at_a_pose_needs_a_person(lab: Lab) -> None:
     lab.sensor.heals = True
     lab.operator.on_event = on_event
     with pytest.raises(StreamBroken, match="a cable came off"):
-        lab.calibrate()
+        lab.take_poses()
     assert samplings == [3, 3]
     assert len([event for event in lab.operator.of(Noted) if "restarts" in event.words]) == 1
     assert lab.stops() == [1, 2]
@@ -323,15 +323,15 @@ def test_a_sensor_that_fails_twice_at_a_pose_needs_a_person(lab: Lab) -> None:
 def test_a_full_disk_holds_before_the_arm_moves_on(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     commit, failed = Run.commit, list[int]()
 
-    def full(run: Run, record: PoseRecord) -> None:
+    def full(run: Run, record: PoseRecord) -> PoseRecord:
         if record.stop == 3 and not failed:
             failed.append(len(lab.arm.moves))
             raise OSError(28, "No space left on device")
-        commit(run, record)
+        return commit(run, record)
 
     monkeypatch.setattr(Run, "commit", full)
     lab.operator.answers["resume:"] = ["resume"]
-    lab.calibrate()
+    lab.take_poses()
     assert lab.operator.of(GuardTripped)[0].hazard == 26
     assert failed == [3]
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
@@ -344,7 +344,7 @@ def test_an_arm_that_was_moved_between_two_poses_is_noticed(lab: Lab) -> None:
 
     lab.operator.on_event = on_event
     with pytest.raises(DeviceFault, match=r"joint 6 is 2\.0° from"):
-        lab.calibrate()
+        lab.take_poses()
     assert lab.operator.of(GuardTripped)[0].hazard == 21
 
 
@@ -361,7 +361,7 @@ def test_an_arm_that_was_moved_while_a_way_waits_for_its_word_does_not_begin_it(
     lab.operator.answers["resume:"] = answers
     lab.operator.at_question.append((f"The arm goes the {way}", move))
     with pytest.raises(DeviceFault, match=r"joint 1 is 25\.0° from"):
-        lab.calibrate()
+        lab.take_poses()
     assert lab.operator.of(GuardTripped)[-1].hazard == 21
     assert len(lab.arm.moves) == moves
 
@@ -383,7 +383,7 @@ def test_each_part_of_a_way_begins_where_the_one_before_should_have_ended(
     monkeypatch.setattr(tour, "plan_approach", in_two)
     monkeypatch.setattr(lab.arm, "move_to", past_it)
     with pytest.raises(DeviceFault, match=r"joint 5 is 1\.0° from"):
-        lab.calibrate()
+        lab.take_poses()
     assert len(lab.arm.moves) == 1
 
 
@@ -397,7 +397,7 @@ def test_the_controller_is_asked_for_the_way_on_itself(lab: Lab) -> None:
     moves: list[int] = []
     lab.operator.at_question.append(("resume:", lambda: moves.append(len(lab.arm.moves))))
     lab.operator.answers["resume:"] = ["resume", "resume"]
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert moves == [4, 4]
     words = [event.words for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
     assert words[1].startswith("the controller's safety limits forbid")
@@ -415,7 +415,7 @@ def test_saturation_that_only_the_samples_of_a_pose_show_discards_it(lab: Lab, m
     monkeypatch.setattr(Before, "sensor_range", np.array([40.0, 40, 40, 4, 4, 4]))
     monkeypatch.setattr(lab.sensor, "collect", one_high)
     with pytest.raises(DeviceFault, match="95 % of its range"):
-        lab.calibrate()
+        lab.take_poses()
     assert lab.operator.of(GuardTripped)[0].hazard == 13
     assert lab.stops() == [1, 2, 3]
 
@@ -424,7 +424,7 @@ def test_saturated_samples_discard_the_pose(lab: Lab, monkeypatch: pytest.Monkey
     monkeypatch.setattr(Before, "sensor_range", np.array([40.0, 40, 40, 4, 4, 4]))
     lab.arm.at_move[4] = lambda: setattr(lab.sensor, "push", np.array([0, 0, 0, 0, 0, 3.8]))
     with pytest.raises(DeviceFault, match="of its range"):
-        lab.calibrate()
+        lab.take_poses()
     assert lab.operator.of(GuardTripped)[0].hazard == 13
     assert lab.stops() == [1, 2, 3]
 
@@ -445,7 +445,7 @@ def hold_and_resume(lab: Lab, fault: Callable[[], None], repair: Callable[[], No
     lab.arm.at_move[4] = fault
     lab.operator.on_event = on_event
     lab.operator.answers.setdefault("resume:", ["resume"])
-    lab.calibrate()
+    lab.take_poses()
 
 
 @pytest.mark.parametrize("mode", ["robot emergency stop", "safeguard stop", "protective stop"])
@@ -474,7 +474,7 @@ def test_the_controller_is_asked_for_every_pose_once_more_but_not_for_the_ways_b
     lab.operator.on_event = on_event
     lab.arm.at_move[4] = lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode="protective stop")
     lab.operator.answers["resume:"] = ["resume"]
-    lab.calibrate()
+    lab.take_poses()
     first, again = asked
     assert first > 50
     assert again == 7
@@ -498,7 +498,7 @@ def test_what_became_wrong_while_the_arm_stood_is_found_before_it_goes_on(lab: L
             repair()
 
     lab.operator.on_event = on_event
-    lab.calibrate()
+    lab.take_poses()
     (refused,) = [event.words for event in lab.operator.of(Noted) if event.words.startswith("not yet")]
     assert "remote: local control" in refused
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
@@ -538,5 +538,5 @@ def test_reduced_mode_that_comes_a_second_time_is_confirmed_again(lab: Lab) -> N
     lab.operator.answers["resume:"] = ["resume"] * 3
     asked: list[int] = []
     lab.operator.at_question.append(("in reduced mode", lambda: asked.append(len(lab.arm.moves))))
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert asked == [3, 7]

@@ -35,7 +35,7 @@ def resumes(lab: Lab, poses: int) -> None:
     kept = lab.stops()
     assert kept == list(range(1, poses + 1))
     lab.operator = Scripted()
-    assert lab.calibrate(resume=lab.run().folder) is not None
+    assert lab.take_poses(resume=lab.run().folder) is not None
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
 
 
@@ -57,7 +57,7 @@ def test_the_arm_stops_in_mid_move_before_anything_else(shown: bool, lab: Lab) -
     lab.arm.at_move[4] = gone
     lab.operator.on_event = on_event
     with pytest.raises(SupervisorGone, match=f"{WHY}.*--resume") as error:
-        lab.calibrate()
+        lab.take_poses()
     assert exit_code(error.value) == 9
     assert lab.arm.stops
     assert len(lab.arm.moves) == 4
@@ -74,7 +74,7 @@ def test_a_pose_in_progress_is_given_up(lab: Lab) -> None:
 
     lab.operator.on_event = on_event
     with pytest.raises(SupervisorGone):
-        lab.calibrate()
+        lab.take_poses()
     assert len(lab.arm.moves) == 3
     assert len(recorded(lab)) == 1
     resumes(lab, 2)
@@ -83,14 +83,14 @@ def test_a_pose_in_progress_is_given_up(lab: Lab) -> None:
 def test_no_question_is_answered_for_an_absent_operator(lab: Lab) -> None:
     lab.operator.gone = WHY
     with pytest.raises(SupervisorGone):
-        lab.calibrate(yes=True, real=False)
+        lab.take_poses(yes=True, real=False)
     assert not lab.arm.moves
 
 
 def test_an_operator_who_leaves_at_a_question_moves_nothing(lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: leave(lab)
     with pytest.raises(SupervisorGone):
-        lab.calibrate()
+        lab.take_poses()
     lab.operator = Scripted()
 
     def refuse() -> None:
@@ -99,7 +99,7 @@ def test_an_operator_who_leaves_at_a_question_moves_nothing(lab: Lab) -> None:
 
     lab.operator.at_question = [("emergency stop", refuse)]
     with pytest.raises(SupervisorGone):
-        lab.calibrate(resume=lab.run().folder)
+        lab.take_poses(resume=lab.run().folder)
     assert len(lab.arm.moves) == 4
     assert len(recorded(lab)) == 2
     resumes(lab, 3)
@@ -113,7 +113,7 @@ def test_a_hold_without_an_operator_ends_with_its_first_cause(lab: Lab) -> None:
     lab.operator.at_question = [("resume:", gone)]
     lab.push_on_the_way(4)
     with pytest.raises(DeviceFault, match="contact"):
-        lab.calibrate()
+        lab.take_poses()
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [Hazard.CONTACT, Hazard.SUPERVISOR_GONE]
     assert len(recorded(lab)) == 1
 
@@ -126,5 +126,5 @@ def test_a_pause_without_an_operator_ends_with_their_absence(lab: Lab) -> None:
     lab.operator.at_question = [("resume:", gone)]
     lab.press((Key.PAUSE, StateChanged, 3))
     with pytest.raises(SupervisorGone):
-        lab.calibrate()
+        lab.take_poses()
     assert len(recorded(lab)) == 1

@@ -57,7 +57,7 @@ def test_the_states_follow_one_another_and_all_is_written_down(lab: Lab) -> None
 
 
 def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> None:
-    lab.calibrate()
+    lab.take_poses()
     texts = [question.text for question in lab.operator.asked]
     order = ["tool free", "ball of 0.3", "emergency stop in reach", "Type MOVE", "Begin"]
     assert [next(word for word in order if word in text) for text in texts] == order
@@ -66,13 +66,14 @@ def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> 
 
 
 def test_the_journal_records_unanswered_questions(lab: Lab) -> None:
-    lab.calibrate(yes=True)  # a first run: --yes answers nothing
+    beside = lab.arm.q
+    lab.take_poses(yes=True)  # a first run: --yes answers nothing
     assert {event.by for event in lab.operator.of(Asked)} == {"person"}
     lab.operator.shown.clear()
     lab.operator.asked.clear()
     lab.operator.answers["tool free"] = ["no"]
-    lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 5.0])
-    lab.calibrate(yes=True)
+    lab.arm.q = beside
+    lab.take_poses(yes=True)
     assert lab.operator.asked == []
     answered = [(event.answer, event.by) for event in lab.operator.of(Asked)]
     assert answered == [(answer, "--yes") for answer in ("yes", "yes", "yes", "MOVE", "yes")]
@@ -80,16 +81,16 @@ def test_the_journal_records_unanswered_questions(lab: Lab) -> None:
 
 
 def test_the_first_run_is_slow_whatever_was_asked_and_the_second_may_be_fast(lab: Lab) -> None:
-    lab.calibrate(fast=True)
+    lab.take_poses(fast=True)
     assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
     assert max(acceleration for *_, acceleration in lab.arm.moves) <= np.radians(40) + 1e-9
     lab.arm.moves.clear()
     lab.operator.asked.clear()
-    lab.calibrate(fast=True)
+    lab.take_poses(fast=True)
     assert max(speed for _, speed, _ in lab.arm.moves) > np.radians(31)
     assert all(question.assumed is not None for question in lab.operator.asked)
     lab.arm.moves.clear()
-    lab.calibrate()
+    lab.take_poses()
     assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
 
 
@@ -98,10 +99,8 @@ def test_a_plan_for_any_speed_is_driven_at_no_more_than_is_allowed(lab: Lab) -> 
     speeds = Speeds(float(np.radians(180)), float(np.radians(80)), None)
     path = lab.folder / "plan.json"
     plan_tour(certifier, USUAL_POSTURE_RAD, 6, speeds=speeds, guess=guess_of(certifier)).save(path)
-    lab.calibrate(plan=path)
-    assert has_completed("A1", str(Plan.load(path).to_dict()["sha256"]))
-    lab.arm.moves.clear()
-    lab.calibrate(plan=path, fast=True)
+    remember_completed("A1", Plan.load(path).sha256)
+    lab.take_poses(plan=path, fast=True)
     fastest = 0.0
     for (start, *_), (goal, speed, _) in pairwise(lab.arm.moves):
         assert speed <= np.radians(60) + 1e-9
@@ -111,7 +110,7 @@ def test_a_plan_for_any_speed_is_driven_at_no_more_than_is_allowed(lab: Lab) -> 
     assert fastest == pytest.approx(0.25, rel=0.01)
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, speed_deg_s=20.0, acceleration_deg_s2=30.0))
     lab.arm.moves.clear()
-    lab.calibrate(plan=path, fast=True)
+    lab.take_poses(plan=path, fast=True)
     assert max(speed for _, speed, _ in lab.arm.moves[1:]) <= np.radians(20) + 1e-9
     assert max(acceleration for *_, acceleration in lab.arm.moves[1:]) <= np.radians(30) + 1e-9
 
@@ -119,12 +118,12 @@ def test_a_plan_for_any_speed_is_driven_at_no_more_than_is_allowed(lab: Lab) -> 
 @pytest.mark.slow
 def test_how_long_to_average_is_chosen_from_the_noise_of_the_sensor(lab: Lab) -> None:
     lab.cell = replace(lab.cell, sampling=Sampling())
-    lab.calibrate()
+    lab.take_poses()
     assert {pose.average_s for pose in lab.operator.of(PoseTaken)} == {1.0}
     lab.operator.shown.clear()
     lab.sensor.rng = np.random.default_rng(0)
     lab.sensor.noise = np.repeat([0.8, 0.001], 3)  # of 100 samples a second: 2 s give 0.057 N
-    lab.calibrate()
+    lab.take_poses()
     (average_s,) = {pose.average_s for pose in lab.operator.of(PoseTaken)}
     assert 1.5 <= average_s <= 4.0
     assert f"average {average_s:.1f} s at each pose" in " ".join(note.words for note in lab.operator.of(Noted))
@@ -148,7 +147,7 @@ def test_the_first_limit_of_contact_names_the_mass_it_assumes(lab: Lab) -> None:
     lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=1.2))
     lab.arm.at_move[4] = lambda: setattr(lab.sensor, "push", np.array([60.0, 0, 0, 0, 0, 0]))
     with pytest.raises(DeviceFault, match=r"a tool of 1.2 kg"):
-        lab.calibrate()
+        lab.take_poses()
 
 
 def has_run(lab: Lab) -> bool:
@@ -158,32 +157,32 @@ def has_run(lab: Lab) -> bool:
 
 @pytest.mark.parametrize("mode", ["auto", "step"])
 def test_a_run_without_interruption_counts_as_complete_and_nothing_is_said_of_it(mode: str, lab: Lab) -> None:
-    lab.calibrate(mode=mode)
+    lab.take_poses(mode=mode)
     assert has_run(lab)
     assert "slow again" not in lab.said()
 
 
 def test_a_skipped_pose_counts_against_the_plan_though_resume_takes_it(lab: Lab) -> None:
     lab.operator.answers["Pose 3 of 7"] = ["s"]
-    lab.calibrate(mode="step")
+    lab.take_poses(mode="step")
     assert "slow again" in lab.said()
     assert "from poses 2 and 3 on" in lab.said()
     lab.operator.shown.clear()
-    lab.calibrate(resume=lab.run().folder, mode="auto")
+    lab.take_poses(resume=lab.run().folder, mode="auto")
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     assert not has_run(lab)
     assert "slow again" in lab.said()
     lab.operator.shown.clear()
-    lab.calibrate(resume=lab.run().folder)  # nothing is left to take: nothing to be said of moves
+    lab.take_poses(resume=lab.run().folder)  # nothing is left to take: nothing to be said of moves
     assert "slow again" not in lab.said()
-    lab.calibrate(resume=lab.run().folder, redo=(1, 2, 3, 4, 5, 6, 7), fast=True)
+    lab.take_poses(resume=lab.run().folder, redo=(1, 2, 3, 4, 5, 6, 7), fast=True)
     assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
     assert has_run(lab)
 
 
 def test_a_pose_that_is_skipped_where_the_arm_stands_counts_against_the_plan(lab: Lab) -> None:
     lab.sensor.collecting = lambda: lab.operator.keys.append(Key.SKIP) if len(lab.arm.moves) == 4 else None
-    lab.calibrate()
+    lab.take_poses()
     assert lab.taken() == [1, 2, 3, 5, 6, 7]
     assert not has_run(lab)
     assert "poses are missing" in lab.said()
@@ -195,10 +194,10 @@ def test_a_move_that_was_broken_off_counts_against_the_plan(key: Key, answer: st
     lab.operator.answers["poses are saved"] = [answer, "resume"]
     if key is Key.STOP:
         with pytest.raises(Declined):
-            lab.calibrate()
-        lab.calibrate(resume=lab.run().folder)
+            lab.take_poses()
+        lab.take_poses(resume=lab.run().folder)
     else:
-        lab.calibrate()
+        lab.take_poses()
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     assert not has_run(lab)
     assert "moves replaced: from pose" in lab.said()
@@ -214,7 +213,7 @@ def test_poses_taken_again_and_a_pause_while_one_is_measured_do_not_count_agains
     lab.sensor.collecting = pause
     lab.press((Key.REDO, PoseTaken, 1), (Key.REDO, StateChanged, 4))
     lab.operator.answers["poses are saved"] = ["resume"]
-    lab.calibrate()
+    lab.take_poses()
     assert lab.taken() == [1, 1, 2, 3, 3, 4, 5, 6, 7]
     assert len(lab.holds()) == 1
     assert has_run(lab)
@@ -226,7 +225,7 @@ def test_an_arm_that_reports_no_serial_number_runs_slowly_each_time_and_the_reas
         lab.arm.moves.clear()
         lab.operator.shown.clear()
         lab.operator.asked.clear()
-        lab.calibrate(fast=True, yes=True)
+        lab.take_poses(fast=True, yes=True)
         assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
         assert len([question for question in lab.operator.asked if "Type MOVE" in question.text]) == 1
         assert lab.said().count("reports no serial number") == 2
@@ -238,7 +237,7 @@ def test_an_arm_that_reports_no_serial_number_runs_slowly_each_time_and_the_reas
 def test_a_run_in_which_nothing_moved_does_not_count_as_complete(lab: Lab) -> None:
     lab.operator.answers["Pose "] = ["s"] * 6
     with pytest.raises(Declined, match="ended before the first pose"):
-        lab.calibrate(mode="step")
+        lab.take_poses(mode="step")
     assert lab.arm.moves == []
     assert not has_completed("A1", str(Plan.load(lab.run().plan_path).to_dict()["sha256"]))
 
@@ -255,7 +254,7 @@ def test_the_plan_is_shown_before_the_checks_and_kept_where_asked(lab: Lab) -> N
     lab.cell = replace(lab.cell, workcell=WorkcellConfig(measured=False))
     path = lab.folder / "plan.json"
     with pytest.raises(NotAccepted):
-        lab.calibrate(dry_run=True, output=path)
+        lab.take_poses(dry_run=True, output=path)
     (shown,) = lab.operator.of(Planned)
     assert lab.operator.shown.index(shown) < lab.operator.shown.index(lab.operator.of(Checked)[0])
     words = in_words(shown)
@@ -269,16 +268,16 @@ def test_the_plan_is_shown_before_the_checks_and_kept_where_asked(lab: Lab) -> N
     assert not Plan.load(path).measured
     lab.cell = replace(lab.cell, workcell=WorkcellConfig(measured=True))
     with pytest.raises(FileExistsError):
-        lab.calibrate(dry_run=True, output=path)
-    assert lab.calibrate(dry_run=True, output=lab.folder / "measured.json") is None
+        lab.take_poses(dry_run=True, output=path)
+    assert lab.take_poses(dry_run=True, output=lab.folder / "measured.json") is None
     assert Plan.load(lab.folder / "measured.json").measured
 
 
 def test_a_way_that_moves_the_whole_arm_asks_for_its_room(lab: Lab) -> None:
     path = lab.folder / "plan.json"
-    lab.calibrate(dry_run=True, output=path)
+    lab.take_poses(dry_run=True, output=path)
     lab.arm.q = lab.arm.q + np.radians([20.0, 0, 0, 0, 0, 0])
-    lab.calibrate(plan=path)
+    lab.take_poses(plan=path)
     texts = [question.text for question in lab.operator.asked]
     assert all(
         any(word in text and "base 20°" in text and "whole arm" in text for text in texts)
@@ -290,12 +289,10 @@ def test_a_way_that_moves_the_whole_arm_asks_for_its_room(lab: Lab) -> None:
 def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_known(
     away_deg: tuple[float, float], assumed: bool, lab: Lab
 ) -> None:
-    lab.calibrate()
-    plan = lab.run().plan_path
-    lab.operator.asked.clear()
+    plan = lab.trust()
     elbow, wrist = away_deg
     lab.arm.q = lab.arm.q + np.radians([0, 0, elbow, 0, 0, wrist])
-    lab.calibrate(plan=plan, fast=True)
+    lab.take_poses(plan=plan, fast=True)
     texts = {question.text: question.assumed is not None for question in lab.operator.asked}
     assert [texts[text] for text in texts if text.startswith("Is the")] == [assumed] * 3
     (way,) = [texts[text] for text in texts if "Type MOVE" in text]
@@ -303,17 +300,17 @@ def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_know
 
 
 def test_a_run_that_goes_on_from_elsewhere_is_confirmed_by_a_person(lab: Lab) -> None:
-    lab.calibrate()  # trusted from here on
+    lab.trust()
     for joint, assumed in ((5, True), (0, False)):
         lab.operator.asked.clear()
         lab.operator.shown.clear()
         lab.arm.moves.clear()
         lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
         with pytest.raises(Declined):
-            lab.calibrate()
+            lab.take_poses()
         lab.arm.q = lab.arm.q + np.radians(9.0) * (np.arange(6) == joint)
         lab.operator.asked.clear()
-        lab.calibrate(resume=Path(lab.operator.of(RunOpened)[-1].folder))
+        lab.take_poses(resume=Path(lab.operator.of(RunOpened)[-1].folder))
         assert [question.assumed is not None for question in lab.operator.asked] == [assumed] * 4
 
 
@@ -332,18 +329,18 @@ def test_the_browser_is_waited_for(lab: Lab, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(view, "shown", shown)
     monkeypatch.setattr(view, "open_in_browser", served.append)
     lab.operator.answers["http://here"] = ["yes", "no"]
-    assert lab.calibrate(dry_run=True, view=True) is None
+    assert lab.take_poses(dry_run=True, view=True) is None
     assert served == ["open", "http://here", "closed"]
     assert [question.assumed for question in lab.operator.asked] == [None]
     with pytest.raises(Declined):
-        lab.calibrate(view=True)
+        lab.take_poses(view=True)
     assert lab.arm.moves == []
 
 
 def test_step_mode_waits_for_enter_before_each_move(lab: Lab) -> None:
     lab.operator.answers["Pose 3 of 7"] = ["s"]
     lab.operator.answers["Pose 5 of 7"] = ["r", ""]
-    lab.calibrate(mode="step")
+    lab.take_poses(mode="step")
     third = np.array(Plan.load(lab.run().plan_path).steps[2].q_rad)
     assert min(np.abs(goal - third).max() for goal, *_ in lab.arm.moves) > np.radians(5)  # never sent there
     (way,) = [question for question in lab.operator.asked if "the way to pose 4" in question.text]
@@ -357,7 +354,7 @@ def test_step_mode_waits_for_enter_before_each_move(lab: Lab) -> None:
 
 def test_a_first_pose_that_is_skipped_is_not_returned_to(lab: Lab) -> None:
     lab.operator.answers["Pose 1 of 7"] = ["s"]
-    lab.calibrate(mode="step")
+    lab.take_poses(mode="step")
     assert lab.stops() == [2, 3, 4, 5, 6]
     first = np.array(Plan.load(lab.run().plan_path).steps[0].q_rad)
     assert min(np.abs(goal - first).max() for goal, *_ in lab.arm.moves) > np.radians(5)
@@ -366,7 +363,7 @@ def test_a_first_pose_that_is_skipped_is_not_returned_to(lab: Lab) -> None:
 
 def test_step_mode_says_what_enter_does(lab: Lab) -> None:
     lab.operator.answers["Pose 3 of 7"] = ["r", ""]
-    lab.calibrate(mode="step")
+    lab.take_poses(mode="step")
     steps = Plan.load(lab.run().plan_path).steps
     asked = [question.text for question in lab.operator.asked if question.text.startswith("Pose")]
     assert "Enter plans the way" in asked[0]
@@ -380,21 +377,22 @@ def test_step_mode_says_what_enter_does(lab: Lab) -> None:
 
 
 def test_step_mode_says_whether_enter_may_move_the_arm_to_the_first_pose(lab: Lab) -> None:
+    beside = lab.arm.q
     for yes, words in (
         (True, "shows it, joint"),
         (True, "shows it, and drives it where --yes may confirm it"),
         (False, "shows it, joint"),
     ):
         lab.operator.asked.clear()
-        lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 5.0])
-        lab.calibrate(mode="step", yes=yes)
+        lab.arm.q = beside
+        lab.take_poses(mode="step", yes=yes)
         first = next(question.text for question in lab.operator.asked if question.text.startswith("Pose 1"))
         assert words in first
 
 
 def test_the_plan_shows_how_the_arm_stops(lab: Lab) -> None:
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, stop_deceleration_deg_s2=150.0))
-    lab.calibrate(dry_run=True)
+    lab.take_poses(dry_run=True)
     (planned,) = lab.operator.of(Planned)
     assert "150 °/s²" in planned.stop_words
     assert planned.stop_words in in_words(planned)

@@ -92,7 +92,7 @@ def test_what_is_wrong_already_is_seen_before_the_arm_moves(lab: Lab) -> None:
 
     lab.operator.on_event = on_event
     with pytest.raises(DeviceFault, match="paused"):
-        lab.calibrate()
+        lab.take_poses()
     assert len(lab.arm.moves) == 2
 
 
@@ -173,7 +173,7 @@ def test_a_stop_that_cannot_be_reported_ends_no_guard_and_is_shown_in_the_hold(l
     lab.push_on_the_way(3, 6)
     lab.operator.on_event = on_event
     lab.operator.answers["resume:"] = ["resume", "resume"]
-    assert lab.calibrate() is not None
+    assert lab.take_poses() is not None
     assert failed == [True]
     diary = (lab.run().folder / "events.ndjson").read_text()
     assert diary.count('"guard-tripped"') == 2  # one for each of the two pushes
@@ -250,7 +250,7 @@ def test_guards_that_ended_on_the_way_are_missed_at_once(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: end(lab)
     lab.operator.answers["resume:"] = ["resume", "quit"]
     with pytest.raises(DeviceFault, match="thread has ended"):
-        lab.calibrate()
+        lab.take_poses()
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [18]
     assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet: the guards'")]) == 1
     assert len(lab.arm.moves) == 3
@@ -267,7 +267,7 @@ def test_nothing_moves_without_a_watchdog(stop: int, lab: Lab) -> None:
         lab.operator.at_question.append(("Is the tool free", lambda: setattr(lab.watchers[-1], "ended", True)))
     lab.operator.on_event = on_event
     with pytest.raises(DeviceFault, match="nothing is watched"):
-        lab.calibrate()
+        lab.take_poses()
     assert len(lab.arm.moves) == stop
 
 

@@ -25,7 +25,7 @@ START = 12
 class Watched:
     """A robot at work: what the world felt in each cycle, and the lines of the file."""
 
-    def __init__(self, path: Path, seconds: float = 6.0, *, scale: float = 5.0, **how: Any) -> None:
+    def __init__(self, path: Path, seconds: float = 5.0, *, scale: float = 5.0, **how: Any) -> None:
         world = World(Truth.drawn(2), MODELS["UR5e"], HOME, 2, CellClock(RealTime()))
         self.robot = Robot(world, RobotSettings(time_scale=scale))
         program = Production(self.robot, Job(str(path), **{"seed": 4, **how}))

@@ -16,8 +16,9 @@ HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 STEP_S = 0.004
 
 
-@pytest.mark.parametrize("model", ["UR3e", "UR5e", "UR20"])
-@pytest.mark.parametrize("limits", [(1.0, 2.0, 2.0), (0.5, 1.5, 0.7), (1.5, 4.0, 3.0)])
+@pytest.mark.parametrize(
+    ("model", "limits"), [("UR3e", (1.0, 2.0, 2.0)), ("UR5e", (0.5, 1.5, 0.7)), ("UR20", (1.5, 4.0, 3.0))]
+)
 def test_the_flange_reaches_the_speed_and_the_accelerations_of_the_request(
     model: str, limits: tuple[float, float, float]
 ) -> None:

@@ -28,7 +28,7 @@ def certifier_of(model: str = "UR5e", tool: tuple[Cylinder, ...] = TOOL, scene: 
 
 def sampled_clear(certifier: Certifier, plan: Plan) -> bool:
     q = np.array([step.q_rad for step in plan.steps])
-    share = np.linspace(0, 1, 361)[:, None, None]
+    share = np.linspace(0, 1, 91)[:, None, None]
     return bool(certifier.free(((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6)).all())
 
 
@@ -105,7 +105,7 @@ def test_cone_tour_stays_in_its_cone_clear_and_says_what_the_cone_allows(
 @pytest.mark.parametrize("lean_rad", [np.pi / 2, pytest.param(np.radians(26.6), marks=pytest.mark.slow)])
 def test_the_cone_is_about_straight_down_however_the_arm_is_mounted(lean_rad: float) -> None:
     certifier = certifier_of(scene=Scene(lean_rad=lean_rad))
-    plan = plan_cone(certifier, poses=8, half_angle_rad=np.radians(40), speeds=Speeds(), guess=guess_of(certifier))
+    plan = plan_cone(certifier, poses=6, half_angle_rad=np.radians(40), speeds=Speeds(), guess=guess_of(certifier))
     tool_axis = np.array([step.R_base_flange for step in plan.steps])[:, :, 2]
     assert (tool_axis @ certifier.scene.down_base).min() >= np.cos(np.radians(40)) - 1e-9
 

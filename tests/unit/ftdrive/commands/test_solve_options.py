@@ -1,0 +1,40 @@
+"""`ftdrive solve` before it reads anything: which options go together."""
+
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from ftdrive.cli import cli
+from ftdrive.errors import ConfigError
+
+PAIR = ("--wrench", "a.csv", "--orientation-file", "b.csv")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ((), "no data"),
+        (PAIR[:2], "give both"),
+        (PAIR[2:], "give both"),
+        (("a.csv", *PAIR), "and no DATASET"),
+        (("a.csv", "--together"), "two runs or more"),
+        (("a.csv", "b.csv", "--together", *PAIR[:2]), "give both"),
+        ((*PAIR, "--together"), "poses at rest"),
+        (("a.csv", "--from", "old.json", "--method", "srom"), "for --method ml"),
+        (("a.csv", "b.csv", "--together", "--method", "lrom"), "for --method ml"),
+        (("a.csv", "b.csv", "--together", "--from", "old.json"), "one of the two"),
+        (("a.csv", "b.csv", "-o", "new.json"), "one dataset and one method"),
+        (("a.csv", "--method", "all", "-o", "new.json"), "one dataset and one method"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(
+    arguments: tuple[str, ...], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a.csv", "b.csv", "old.json"):
+        Path(name).touch()
+    error = CliRunner().invoke(cli, ["solve", *arguments]).exception
+    assert isinstance(error, ConfigError)
+    assert words in str(error)
+    assert not Path("new.json").exists()
