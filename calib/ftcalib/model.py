@@ -8,7 +8,7 @@ Source: Yu, Shi, Lou 2021, eqs 12-13, with e_bR = R_base_flange.T and s_eR = R_f
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TypeAlias, cast
 
 import numpy as np
@@ -25,15 +25,13 @@ Rotations: TypeAlias = "Rotation | Sequence[Rotation] | ArrayLike"
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 ROUNDING = 2e-3  # rounding to three decimals moves an entry of R^T R by at most 1.8e-3
+_IDENTITY = np.eye(3)
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 UP_IN_BASE = np.array([0.0, 0.0, 1.0])
 """For a robot on a table."""
 
-PARAMETER_NAMES = tuple(
-    f"{name}.{axis}"
-    for name in ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
-    for axis in "xyz"
-)
+_QUANTITIES = ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
+PARAMETER_NAMES = tuple(f"{name}.{axis}" for name in _QUANTITIES for axis in "xyz")
 """The 15 error coordinates, in the order of the Jacobian and of every covariance."""
 BIASES = np.r_[6:9, 12:15]
 """Where force and torque bias stand in `PARAMETER_NAMES`."""
@@ -63,12 +61,12 @@ class Parameters:
     """(3,) in the sensor frame, about its origin."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            shape = (3, 3) if field.name == "R_flange_sensor" else (3,)
-            value = read_only(getattr(self, field.name))
+        for name in _QUANTITIES:
+            shape = (3, 3) if name == "R_flange_sensor" else (3,)
+            value = read_only(getattr(self, name))
             if value.shape != shape:
-                raise ValueError(f"{field.name} has shape {value.shape}, expected {shape}")
-            object.__setattr__(self, field.name, value)
+                raise ValueError(f"{name} has shape {value.shape}, expected {shape}")
+            object.__setattr__(self, name, value)
 
     @property
     def bias(self) -> Array:
@@ -218,8 +216,8 @@ def rotation_of(vector: Array) -> Array:
     angle = math.sqrt(float(vector @ vector))
     K = skew(vector)
     if angle < 1e-4:  # series: both coefficients lose their digits
-        return np.asarray(np.eye(3) + (1 - angle**2 / 6) * K + (0.5 - angle**2 / 24) * (K @ K))
-    return np.asarray(np.eye(3) + math.sin(angle) / angle * K + (1 - math.cos(angle)) / angle**2 * (K @ K))
+        return np.asarray(_IDENTITY + (1 - angle**2 / 6) * K + (0.5 - angle**2 / 24) * (K @ K))
+    return np.asarray(_IDENTITY + math.sin(angle) / angle * K + (1 - math.cos(angle)) / angle**2 * (K @ K))
 
 
 def angle_between(R1: Array, R2: Array) -> Array:

@@ -91,17 +91,11 @@ def assess(
     advise : bool
         Whether to look for poses to add.
     """
-    information = scaled_information(R_base_flange, parameters, wrench_cov)
-    eigenvalues, V = np.linalg.eigh(information)
-    free = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
-    rank = 15 - int(free.sum())
-    condition = float(eigenvalues[-1] / eigenvalues[0]) if rank == 15 else float("inf")
-    gap = second_minimum(R_base_flange, parameters)[0]
-    found = Observability(different_orientations(R_base_flange), rank, condition, (), (), np.zeros((0, 3, 3)), gap)
+    found, information, weak = _nearby(R_base_flange, parameters, wrench_cov)
+    found = replace(found, second_gap=second_minimum(R_base_flange, parameters)[0])
     if found.sound:
         return found
-    weak = V[:, free] if rank < 15 else V[:, :1]
-    ambiguities = _ambiguities(R_base_flange, parameters, information / eigenvalues[-1], weak, found)
+    ambiguities = _ambiguities(R_base_flange, parameters, information, weak, found)
     words, poses = _advice(R_base_flange, parameters) if advise else ((), found.advised_R_base_flange)
     return replace(found, ambiguities=ambiguities, advice=words, advised_R_base_flange=poses)
 
@@ -147,7 +141,7 @@ def require_observable(R_base_flange: Array, parameters: Parameters, wrench_cov:
     require_orientations(R_base_flange)
     found = assess(R_base_flange, parameters, wrench_cov, advise=False)
     if found.rank < 15 or found.second_gap < AMBIGUOUS_GAP:
-        raise NotObservable(assess(R_base_flange, parameters, wrench_cov).sentence())
+        raise NotObservable(replace(found, advice=_advice(R_base_flange, parameters)[0]).sentence())
 
 
 def scaled_information(
@@ -206,6 +200,28 @@ def different_orientations(R_base_flange: Array) -> int:
             if len(kept) == 24:
                 break
     return len(kept)
+
+
+def _nearby(
+    R_base_flange: Array, parameters: Parameters, wrench_cov: Array | None = None
+) -> tuple[Observability, Array, Array]:
+    """Assess the neighbourhood of one solution, as if there were no second one.
+
+    Also the information (15, 15) in units of its largest eigenvalue, and its weak directions (15, k).
+    """
+    information = scaled_information(R_base_flange, parameters, wrench_cov)
+    eigenvalues, V = np.linalg.eigh(information)
+    free = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
+    rank = 15 - int(free.sum())
+    condition = float(eigenvalues[-1] / eigenvalues[0]) if rank == 15 else float("inf")
+    different, none = different_orientations(R_base_flange), np.zeros((0, 3, 3))
+    found = Observability(different, rank, condition, (), (), none, float("inf"))
+    return found, information / eigenvalues[-1], V[:, free] if rank < 15 else V[:, :1]
+
+
+def _is_sound(R_base_flange: Array, parameters: Parameters) -> bool:
+    """Give the `sound` of `assess`, and look for the second solution, which takes the longest, only if need be."""
+    return _nearby(R_base_flange, parameters)[0].sound and second_minimum(R_base_flange, parameters)[0] >= WEAK_GAP
 
 
 def _ambiguities(
@@ -330,7 +346,7 @@ def _advice(R_base_flange: Array, parameters: Parameters) -> tuple[tuple[str, ..
     poses, words, motions = R_base_flange, list[str](), _motions()
     while len(words) < MOST_ADVISED:
         trials = [np.concatenate([poses, [R_base_flange[-1] @ turn]]) for _, turn in motions]
-        enough = (k for k, trial in enumerate(trials) if assess(trial, parameters, advise=False).sound)
+        enough = (k for k, trial in enumerate(trials) if _is_sound(trial, parameters))
         best = next(enough, None)
         chosen = int(np.argmax([_worth(trial, parameters) for trial in trials])) if best is None else best
         poses = trials[chosen]

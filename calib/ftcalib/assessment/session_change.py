@@ -113,10 +113,11 @@ def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma
 
 
 def _is_likelier(change: Change, R: Array, wrench: Array, cov: Array | None, t_s: Array | None) -> bool:
-    as_read, without = (fit(R, y, cov, t_s=t_s) for y in (wrench, change.corrected))
+    without = fit(R, change.corrected, cov, t_s=t_s)
     weight_N = _length(without.parameters.gravity_force_base_N)
     if np.sqrt(np.mean(np.sum(without.residuals[without.weights > 0.5, :3] ** 2, axis=1))) > CORRECTED * weight_N:
         return False
+    as_read = fit(R, wrench, cov, t_s=t_s)
     costs = len(KINDS[change.code]) * np.log(wrench.size) + 2 * np.log(len(wrench)) + MARGIN
     return bool(minus_two_log_likelihood(without) + costs < minus_two_log_likelihood(as_read))
 

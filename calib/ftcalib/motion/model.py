@@ -18,7 +18,7 @@ from typing import Self
 import numpy as np
 
 from ftcalib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN
-from ftcalib.model import Array, Parameters, skew
+from ftcalib.model import Array, Parameters, cross, skew
 from ftcalib.motion.samples import Motion
 
 INERTIA_NAMES = ("xx", "yy", "zz", "xy", "xz", "yz")
@@ -34,6 +34,8 @@ for _k, (_i, _j) in enumerate(_PLACES):
     _BASIS[_k, _i, _j] = _BASIS[_k, _j, _i] = 1.0
 _SECOND_MOMENTS = np.trace(_BASIS, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - _BASIS
 _TURNS = skew(np.eye(3))
+_UNITS = np.eye(9).reshape(9, 3, 3)
+"""Each entry of Omega as 1: what is linear in it is a product with what these give, instead of one for each row."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,8 +93,8 @@ def wrench_of(load: Load, motion: Motion, *, bias: bool = True) -> Array:
     """
     static, Q = load.static, load.static.R_flange_sensor
     u = _force(load, motion) @ Q
-    torque = np.cross(static.p_sensor_com_m, u)
-    torque -= _vee(Q.T @ motion.Omega_rad2_s2 @ Q @ np.tensordot(load.inertia, _SECOND_MOMENTS, 1))
+    second = np.tensordot(load.inertia, _SECOND_MOMENTS, 1)
+    torque = cross(static.p_sensor_com_m, u) - motion.Omega_rad2_s2.reshape(-1, 9) @ _vee(Q.T @ _UNITS @ Q @ second)
     K, X = np.tensordot(load.response[:5], GAIN, 1), np.tensordot(load.response[5:], CROSS_TALK_M, 1)
     wrench = np.hstack([u + u @ K, torque + u @ X])
     return wrench + static.bias if bias else wrench
@@ -107,21 +109,21 @@ def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:
     force = _force(load, motion)
     R, Omega = motion.R_base_flange, motion.Omega_rad2_s2
     accelerated = motion.acceleration_m_s2 + Omega @ lever
-    u, Omega_S = force @ Q, Qt @ Omega @ Q
+    u = force @ Q
     direction = F_b / max(float(np.linalg.norm(F_b)), 1e-12) / load.g_m_s2
 
     J = np.zeros((len(R), 6, SIZE))
     dU, dT = J[:, :3], J[:, 3:]
     dU[:, :, 0:3] = -Qt @ skew(force) - m * Qt @ Omega @ skew(Q @ c)
     dU[:, :, 3:6] = Qt @ np.swapaxes(R, 1, 2) - (accelerated @ Q)[:, :, None] * direction
-    dU[:, :, 9:12] = -m * Omega_S
+    dU[:, :, 9:12] = -m * Qt @ Omega @ Q
     dU[:, :, HEIGHT] = -m * Omega[:, :, 2] @ Q
     dT[:] = skew(c) @ dU
     for k, turn in enumerate(_TURNS):
-        dT[:, :, k] -= _vee(Qt @ (turn @ Omega - Omega @ turn) @ Q @ second)
+        dT[:, :, k] -= Omega.reshape(-1, 9) @ _vee(Qt @ (turn @ _UNITS - _UNITS @ turn) @ Q @ second)
     dT[:, :, 9:12] -= skew(u)
     for k, basis in enumerate(_SECOND_MOMENTS):
-        dT[:, :, 15 + k] = -_vee(Omega_S @ basis)
+        dT[:, :, 15 + k] = -Omega.reshape(-1, 9) @ _vee(Qt @ _UNITS @ Q @ basis)
     K, X = np.tensordot(load.response[:5], GAIN, 1), np.tensordot(load.response[5:], CROSS_TALK_M, 1)
     dT += X @ dU
     dU += K @ dU

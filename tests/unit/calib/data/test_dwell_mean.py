@@ -85,8 +85,8 @@ def test_a_channel_that_never_moves_or_copies_another_leaves_a_usable_covariance
 @pytest.mark.parametrize(("N", "rho"), [(400, 0.0), (400, 0.5), (1500, 0.9)])
 def test_quiet_dwells_pass(N: int, rho: float) -> None:
     rng = np.random.default_rng(N)
-    failures = sum(not is_stationary(noise(rng, N, np.full(6, rho))) for _ in range(300))
-    assert failures / 300 < 0.01  # with 3 standard errors 4 % and more would fail
+    failures = sum(not is_stationary(noise(rng, N, np.full(6, rho))) for _ in range(200))
+    assert failures / 200 < 0.01  # with 3 standard errors 4 % and more would fail
 
 
 @pytest.mark.parametrize("N", [400, 7000])
@@ -120,7 +120,7 @@ def filtered(rng: np.random.Generator, seconds: float, corner_Hz: float) -> Arra
 def test_a_sensor_left_alone_is_quiet(corner_Hz: float) -> None:
     rng = np.random.default_rng(17)
     level = noise_level(filtered(rng, 20, corner_Hz), 1000)
-    alarms = np.mean([not is_quiet(filtered(rng, 2, corner_Hz), level) for _ in range(300)])
+    alarms = np.mean([not is_quiet(filtered(rng, 2, corner_Hz), level) for _ in range(200)])
     assert alarms < 0.015  # with a threshold of 3 standard errors 4 % and 13 %
 
 

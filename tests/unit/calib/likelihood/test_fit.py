@@ -151,7 +151,7 @@ def test_errors_are_at_the_cramer_rao_bound(kind: str, runs: int) -> None:
 )
 def test_no_start_reaches_a_lower_minimum(n: int, degrees: float, weight_in_sigma: float) -> None:
     sigma = SIGMA * 100 / weight_in_sigma
-    for seed in range(8):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         p, R = truth(rng), haar(rng, n) if degrees == 180 else cone(rng, n, degrees)
         wrench = predict(p, R) + noise(rng, n, sigma)
@@ -188,25 +188,18 @@ def test_the_odds_of_the_second_basin_are_those_of_being_wrong() -> None:
 @pytest.mark.parametrize(("n", "bumped"), [pytest.param(24, 6, marks=pytest.mark.slow), (12, 3)])
 @pytest.mark.parametrize("measured", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_bumped_poses_are_rejected_and_no_others(n: int, bumped: int, measured: bool) -> None:
-    error, least, missed, false = np.zeros(5), np.zeros(5), 0, 0
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        p, R = truth(rng), haar(rng, n)
-        push = rng.normal(size=(bumped, 3))
-        push *= (WEIGHT_N * rng.uniform(0.2, 1, bumped) / np.linalg.norm(push, axis=1))[:, None]
-        wrench = predict(p, R) + noise(rng, n)
-        wrench[:bumped] += np.concatenate([push, np.cross(0.1 * rng.normal(size=(bumped, 3)), push)], axis=1)
-        best = fit(R, wrench, WHITE if measured else None)
-        missed += int(best.weights[:bumped].sum())
-        false += int((best.weights[bumped:] == 0).sum())
-        error += squared(best, p)
-        least += bound(p, R[bumped:], np.linalg.inv(WHITE))
-        assert best.dof == 6 * int(best.weights.sum()) - 15
-        distances = squared_length(best.left_out_residuals, best.left_out_cov)
-        assert (distances[best.weights == 0] > 22).all()
-    assert missed <= 1
-    assert false <= 2
-    assert (error / least < 4).all()
+    rng = np.random.default_rng(0)
+    p, R = truth(rng), haar(rng, n)
+    push = rng.normal(size=(bumped, 3))
+    push *= (WEIGHT_N * rng.uniform(0.2, 1, bumped) / np.linalg.norm(push, axis=1))[:, None]
+    wrench = predict(p, R) + noise(rng, n)
+    wrench[:bumped] += np.concatenate([push, np.cross(0.1 * rng.normal(size=(bumped, 3)), push)], axis=1)
+    best = fit(R, wrench, WHITE if measured else None)
+    assert np.flatnonzero(best.weights == 0).tolist() == list(range(bumped))
+    assert best.dof == 6 * (n - bumped) - 15
+    distances = squared_length(best.left_out_residuals, best.left_out_cov)
+    assert (distances[:bumped] > 22).all()
+    assert (squared(best, p) / bound(p, R[bumped:], np.linalg.inv(WHITE)) < 4).all()
 
 
 @pytest.mark.parametrize(("seed", "bumped"), [(3, 6), (1002, 2)])
@@ -262,7 +255,7 @@ def drifting(rng: np.random.Generator, n: int, kind: str) -> tuple[Parameters, A
 
 def test_a_drifting_bias_is_followed() -> None:
     turned, covered, changes = [], [], []
-    for seed in range(5):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         p, R, wrench, bias = drifting(rng, 60, "walk")
         best = fit(R, wrench, np.diag((SIGMA / 10) ** 2))
@@ -400,7 +393,7 @@ def random_known(name: str, p: Parameters, rng: np.random.Generator) -> Known:
     ],
 )
 def test_knowledge_is_used_for_what_it_is_worth(name: str, unknowns: int) -> None:
-    runs = 4
+    runs = 2
     distance, chi2 = [], []
     for seed in range(runs):
         rng = np.random.default_rng(seed)
@@ -542,10 +535,10 @@ def test_the_blocks_of_the_inverse_are_those_of_the_dense_one(n: int) -> None:
 @pytest.mark.parametrize("bumped", [pytest.param(0, marks=pytest.mark.slow), 12])
 def test_among_many_poses_larger_noise_rejects_none_and_bumped_poses_are_rejected(bumped: int) -> None:
     rng = np.random.default_rng(4)
-    p, R = truth(rng), haar(rng, 600)
-    wrench = predict(p, R) + noise(rng, 600, 1.5 * SIGMA)
+    p, R = truth(rng), haar(rng, 510)
+    wrench = predict(p, R) + noise(rng, 510, 1.5 * SIGMA)
     wrench[:bumped] += 12 * SIGMA * rng.choice([-1, 1], size=(bumped, 6))
-    found = fit(R, wrench, np.broadcast_to(WHITE, (600, 6, 6)))
+    found = fit(R, wrench, np.broadcast_to(WHITE, (510, 6, 6)))
     rejected = np.flatnonzero(found.weights == 0)
     assert rejected[:bumped].tolist() == list(range(bumped))
     assert len(rejected) <= bumped + bool(bumped)  # among so many, one that is not bumped
@@ -553,7 +546,7 @@ def test_among_many_poses_larger_noise_rejects_none_and_bumped_poses_are_rejecte
 
 def test_a_bias_is_uncertain_where_a_drift_leaves_no_noise() -> None:
     z = []
-    for seed in range(6):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         p, R = truth(rng), haar(rng, 12)
         warming = (1 - np.exp(-np.arange(12) / 4))[:, None] * np.repeat([2.0, 0.05], 3)

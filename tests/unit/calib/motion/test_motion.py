@@ -15,7 +15,7 @@ from tests.moving_load import Recorded, Truth, means_of, programme, record, swee
 
 TRUTH = Truth()
 QUIET = Truth(noise=(0, 0), vibration=(0, 0), joint_noise_rad=0)
-SWEEP_S = 12.0
+SWEEP_S = 9.0
 
 
 @pytest.fixture(scope="module")
@@ -87,14 +87,14 @@ def test_gain_and_cross_talk_are_found() -> None:
 
 
 def test_contact_is_left_out_and_listed() -> None:
-    joints, stops = programme(4, 30.0)
+    joints, stops = programme(4, 20.0)
     touched = {(start + 0.1, end): np.r_[0, 0, -6.0, 0.1, 0, 0] for start, end in stops[1::2]}
-    result = solve_motion(*means_of(record(TRUTH, joints, 30.0, 4, contacts=touched)))
+    result = solve_motion(*means_of(record(TRUTH, joints, 20.0, 4, contacts=touched)))
     motion = result.motion
     assert motion is not None
     assert result.verdict == "good"
     assert abs(result.mass_kg - TRUTH.mass_kg) < 5e-4
-    starts = [start for start, _ in touched if start < 29]
+    starts = [start for start, _ in touched if start < 19]
     assert [one["t_s"] for one in motion.contacts] == pytest.approx(starts, abs=0.2)
     assert all(4 < one["force_N"] < 8 for one in motion.contacts)
     assert "contacts_left_out" in {one.code for one in result.findings}
@@ -141,8 +141,8 @@ def test_known_values_determine_what_the_motion_does_not() -> None:
 
 
 def test_without_positions_slow_parts_count() -> None:
-    joints, _ = programme(3, 40.0)
-    found = solve_motion(*means_of(record(TRUTH, joints, 40.0, 3), positions=False))
+    joints, _ = programme(3, 25.0)
+    found = solve_motion(*means_of(record(TRUTH, joints, 25.0, 3), positions=False))
     assert found.verdict == "usable"
     assert abs(found.mass_kg - TRUTH.mass_kg) < 5e-3
     assert "positions_missing" in {one.code for one in found.findings}

@@ -14,7 +14,7 @@ from ftcalib.model import Parameters, predict
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Truth, means_of, record, sweep
 
-SECONDS = 8.0
+SECONDS = 6.0
 OLD = Truth()
 NEW = replace(OLD, mass_kg=0.7, p_sensor_com_m=np.array([-0.02, 0.01, 0.11]), bias=OLD.bias + 0.4)
 
@@ -29,12 +29,16 @@ def earlier_of(truth: Truth) -> CalibrationResult:
     return solve(CalibrationDataset(R, wrench, covariance, np.zeros(24, np.int64), np.full(24, np.nan)))
 
 
+@pytest.fixture(scope="module")
+def earlier() -> CalibrationResult:
+    return earlier_of(OLD)
+
+
 def swept(truth: Truth, earlier: CalibrationResult | None) -> CalibrationResult:
     return solve_motion(*means_of(record(truth, sweep(SECONDS), SECONDS, 5, rates_Hz=(250.0, 250.0))), earlier=earlier)
 
 
-def test_an_earlier_result_adds_what_it_knows() -> None:
-    earlier = earlier_of(OLD)
+def test_an_earlier_result_adds_what_it_knows(earlier: CalibrationResult) -> None:
     alone, joined = swept(NEW, None), swept(NEW, earlier)
     e = Parameters(**NEW.to_dict()).difference(joined.parameters)
     assert np.abs(e / np.sqrt(np.diag(joined.covariance))).max() < 4
@@ -69,6 +73,6 @@ def test_gain_and_cross_talk_are_kept() -> None:
     ],
     ids=["mounting", "base"],
 )
-def test_what_holds_no_more_is_named(changed: dict[str, Any], named: str) -> None:
+def test_what_holds_no_more_is_named(changed: dict[str, Any], named: str, earlier: CalibrationResult) -> None:
     with pytest.raises(NotObservable, match=named):
-        swept(replace(NEW, **changed), earlier_of(OLD))
+        swept(replace(NEW, **changed), earlier)
