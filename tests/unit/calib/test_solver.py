@@ -137,8 +137,9 @@ def test_the_covariance_is_honest(orientations: str, seed: int, runs: int) -> No
     J = np.linalg.inv(np.linalg.cholesky(cov)) @ jacobian(TRUTH, R)
     bound = np.diag(np.linalg.inv(np.einsum("nki,nkj->ij", J, J))).reshape(5, 3).sum(axis=1)
     np.testing.assert_allclose(squared.reshape(5, 3).sum(axis=1) / bound, 1, atol=3 * np.sqrt(2 / 3 / runs))
-    # Seven poses now and then seem to show more than the measured noise; that can only widen what is stated.
-    widened = 0.05 if orientations == "24" else 0.1
+    # One of 14 sets of seven poses seems to show more than the measured noise, which widens what is stated: over four
+    # sets of orientations by 6 to 9 % in the mean, with a standard error of 4 % here.
+    widened = 0.05 if orientations == "24" else 0.15
     np.testing.assert_allclose(stated.reshape(5, 3).sum(axis=1) / bound, 1, atol=widened)
 
 
