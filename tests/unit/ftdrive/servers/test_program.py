@@ -1,5 +1,6 @@
 """The service for a program: which registers it writes, and how it answers."""
 
+from collections.abc import Callable
 from typing import Any, cast
 
 import numpy as np
@@ -9,6 +10,7 @@ from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import WrenchFrame
 from ftdrive.servers.program import CODES, INTEGERS, ProgramService, doubles_of
 from ftdrivers.errors import StreamBroken
+from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.live.simulated import calibrated, info
 from tests.unit.ftdrive.live.test_weighing import NOTHING, POSE, part, rests
 
@@ -196,10 +198,15 @@ def test_a_program_sees_that_the_service_has_ended() -> None:
 def test_a_wrench_without_new_samples_is_stale_and_a_lost_controller_is_called_again() -> None:
     cell = Cell((POSE, NOTHING))
     cell.run(0.1)
-    service, clock = cell.service, cell.stream.clock
-    service._newest_ns = clock.now_ns() - 10**8
-    service._ends = cast("Any", Turns(service, cell.registers))
+    service, clock = cell.service, FakeClock()
+    cell.stream.clock = clock
     written = len(cell.registers.written)
+
+    def no_sample_for(seconds: float) -> None:
+        assert len(cell.registers.written) == written, "before"
+        service._newest_ns = clock.now_ns() - round(seconds * 1e9)
+
+    service._ends = cast("Any", Turns(service, no_sample_for))
     service._watch()
     assert [one["condition"] for one in cell.registers.written[written:]] == [3], "once"
     assert cell.said == ["The controller answers again."]
@@ -212,15 +219,17 @@ def test_a_wrench_without_new_samples_is_stale_and_a_lost_controller_is_called_a
 
 
 class Turns:
-    """Lets `_watch` look five times; before the third the controller is lost, before the fourth samples are new."""
+    """Lets `_watch` look five times: at a new sample, at an old one twice, and then the controller is lost."""
 
-    def __init__(self, service: Any, registers: FakeRegisters) -> None:
-        self.service, self.registers, self.turn = service, registers, 0
+    def __init__(self, service: Any, no_sample_for: Callable[[float], None]) -> None:
+        self.service, self.no_sample_for, self.turn = service, no_sample_for, 0
 
     def wait(self, seconds: float) -> bool:
         if seconds == 0.02:
             self.turn += 1
-        if self.turn == 3:
+        if self.turn <= 2:
+            self.no_sample_for({1: 0.04, 2: 0.06}[self.turn])
+        if self.turn == 4:
             self.service._registers = None
         return self.turn > 5
 

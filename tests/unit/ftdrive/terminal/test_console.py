@@ -4,6 +4,7 @@ import io
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
 from errno import ENOSPC, EPIPE
@@ -17,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 from syrupy.assertion import SnapshotAssertion
 
+import ftdrive.cli as cli_module
 from ftdrive.checks.check import Check
 from ftdrive.cli import cli, in_a_sentence
 from ftdrive.cli import run as cli_run
@@ -206,6 +208,20 @@ def ended(code: str, *arguments: str) -> tuple[int, str]:
 
 
 MAIN = "import sys; from ftdrive.cli import main; sys.exit(main())"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no terminal closes by a signal there")
+@pytest.mark.parametrize("ignored", [False, True], ids=["", "nohup"])
+def test_a_terminal_that_closes_ends_a_command_unless_it_may(ignored: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    handlers: dict[int, object] = {signal.SIGHUP: signal.SIG_IGN if ignored else signal.SIG_DFL}
+    monkeypatch.setattr(signal, "getsignal", handlers.__getitem__)
+    monkeypatch.setattr(signal, "signal", handlers.__setitem__)
+    for name in ("_open_closed_streams", "_leave_dead_streams"):
+        monkeypatch.setattr(cli_module, name, lambda: False)
+    monkeypatch.setattr(cli_module, "run", lambda _: 3)
+    assert cli_module.main() == 3
+    assert (handlers.pop(signal.SIGHUP) == signal.SIG_IGN) == ignored
+    assert handlers == dict.fromkeys((signal.SIGINT, signal.SIGTERM), signal.default_int_handler)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes end otherwise there")
