@@ -1,11 +1,14 @@
 """Where the frames of a wrench are drawn."""
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from ftdrive.live.frames import frames_in_flange
-from ftdrive.live.samples import WrenchFrame
+from ftdrive.live.samples import WrenchFrame, sensor_origin_m
 from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, P_FLANGE_TCP_M, R_FLANGE_TCP, calibrated, info
 
 INFO = info(calibrated())
@@ -27,3 +30,13 @@ def test_sensor_and_tcp_stand_still_in_the_flange() -> None:
     (name,) = found.keys() - {"sensor", "tcp"}
     assert np.allclose(found[name][0], np.eye(3))
     assert found[name][1] == pytest.approx([0.01, 0.02, 0.03])
+
+
+@pytest.mark.parametrize(
+    ("height_mm", "sigma_m", "z_m"), [(None, 0.002, 0.042), (None, 0.004, np.nan), (30.0, 0.002, 0.03)]
+)
+def test_a_height_that_motion_showed_well_stands_in_for_one_that_is_not_configured(
+    height_mm: float | None, sigma_m: float, z_m: float
+) -> None:
+    calibration = SimpleNamespace(motion=SimpleNamespace(height_m=0.042, covariance=np.eye(34) * sigma_m**2))
+    assert sensor_origin_m(height_mm, cast("Any", calibration))[2] == pytest.approx(z_m, nan_ok=True)
