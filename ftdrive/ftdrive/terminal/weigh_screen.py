@@ -90,6 +90,8 @@ class WeighApp(App[None]):
 
     def draw(self) -> None:
         """Show the present state."""
+        if not self.is_running:  # it closes: the widgets go before the timer
+            return
         if self.reader.failure is not None:
             self.exit()
             return

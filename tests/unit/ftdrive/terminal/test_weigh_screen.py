@@ -91,6 +91,10 @@ class Scale:
         self.title, self.sigma, self.line, self.note, self.keys = (str(one.content) for one in self.app.query(Static))
 
 
+def test_a_screen_that_closes_is_not_drawn_any_more() -> None:
+    Scale(FakeWeighing(Shown(PART, None))).app.draw()
+
+
 def test_the_number_ends_where_its_sigma_does() -> None:
     scale = Scale(FakeWeighing(Shown(PART, None, 3)))
     assert scale.title == "ftdrive weigh   tool gripper_a   EMULATED"
