@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtri
 
@@ -410,13 +410,6 @@ class _Joined:
         return self.prior.contradiction(
             cost - alone, self.prior.count(WHOLE), refit, "the rows of the recording", words
         )
-
-
-def block_diag(A: Array, B: Array) -> Array:
-    """Give what `scipy.linalg.block_diag` does, which takes ten times as long."""
-    M = np.zeros((A.shape[0] + B.shape[0], A.shape[1] + B.shape[1]))
-    M[: A.shape[0], : A.shape[1]], M[A.shape[0] :, A.shape[1] :] = A, B
-    return M
 
 
 def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
