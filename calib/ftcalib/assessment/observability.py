@@ -92,7 +92,7 @@ def assess(
         Whether to look for poses to add.
     """
     found, information, weak = _nearby(R_base_flange, parameters, wrench_cov)
-    found = replace(found, second_gap=second_minimum(R_base_flange, parameters)[0])
+    found = _with_second_gap(found, R_base_flange, parameters)
     if found.sound:
         return found
     ambiguities = _ambiguities(R_base_flange, parameters, information, weak, found)
@@ -221,7 +221,12 @@ def _nearby(
 
 def _is_sound(R_base_flange: Array, parameters: Parameters) -> bool:
     """Give the `sound` of `assess`, and look for the second solution, which takes the longest, only if need be."""
-    return _nearby(R_base_flange, parameters)[0].sound and second_minimum(R_base_flange, parameters)[0] >= WEAK_GAP
+    found = _nearby(R_base_flange, parameters)[0]
+    return found.sound and _with_second_gap(found, R_base_flange, parameters).sound
+
+
+def _with_second_gap(found: Observability, R_base_flange: Array, parameters: Parameters) -> Observability:
+    return replace(found, second_gap=second_minimum(R_base_flange, parameters)[0])
 
 
 def _ambiguities(

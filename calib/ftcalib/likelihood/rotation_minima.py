@@ -296,12 +296,14 @@ def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
         step *= np.minimum(1, reach / np.maximum(length, arrived))[:, None]
         ahead = q + (basis @ (axes @ step[:, :, None]))[:, :, 0]
         ahead /= np.linalg.norm(ahead, axis=1)[:, None]
-        there = (ahead, *_local(quartic, ahead))
+        there: tuple[Array, ...] = (ahead, *_local(quartic, ahead))
         down = there[1] <= cost + 1e-14
         reach = np.where(down, np.minimum(2 * reach, longest), reach / 4)
         done = (length < arrived) | (reach < arrived)
-        both = zip(here, there, strict=True)
-        here = there if down.all() else tuple(np.where(down.reshape(-1, *[1] * (y.ndim - 1)), y, x) for x, y in both)
+        if not down.all():
+            both = zip(here, there, strict=True)
+            there = tuple(np.where(down.reshape(-1, *[1] * (y.ndim - 1)), y, x) for x, y in both)
+        here = there
         near = np.abs(here[0] @ here[0].T) > 1 - 1e-6
         same = (near.argmax(axis=1) < np.arange(len(near))) & (curvature[:, 0] > 0)  # goes where another start goes
         if done.any():
