@@ -8,6 +8,7 @@ and the test that injects it.
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Final, Self
 
 import numpy as np
@@ -94,7 +95,7 @@ class Limits:
         return cls(link_usual_s=usual.link_usual_s + clock.lead_s, stalled_s=clock.patience_s(usual.stalled_s))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ExpectedMotion:
     """The expected motion: a straight move in joint space, along a curve, or standing."""
 
@@ -103,13 +104,13 @@ class ExpectedMotion:
     moving: bool
     curve_rad: Array | None = None
     """(n, 6) dense points of a curve from start to goal."""
-    turns_rad: Array = field(init=False)
-    """How far each joint turns (6,)."""
 
-    def __post_init__(self) -> None:
-        curve = self.curve_rad
-        turns = np.abs(self.goal_rad - self.start_rad) if curve is None else np.ptp(curve, axis=0)
-        object.__setattr__(self, "turns_rad", turns)
+    @cached_property
+    def turns_rad(self) -> Array:
+        """How far each joint turns (6,)."""
+        if self.curve_rad is None:
+            return np.abs(self.goal_rad - self.start_rad)
+        return np.asarray(np.ptp(self.curve_rad, axis=0))
 
     def nearest_rad(self, q_rad: Array) -> Array:
         """Return the point (6,) of the motion that is nearest to a posture (6,)."""

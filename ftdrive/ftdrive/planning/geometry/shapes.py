@@ -44,10 +44,9 @@ class Bodies:
 
     def at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> "Bodies":
         """Take some of the bodies of (n, k), one a pair of indices."""
-        place = row * len(self.half_length_m) + column
         return Bodies(
-            self.centre_m.reshape(-1, 3).take(place, axis=0),
-            self.axis.reshape(-1, 3).take(place, axis=0),
+            self.centre_at(row, column),
+            self.axis.reshape(-1, 3).take(row * len(self.half_length_m) + column, axis=0),
             self.half_length_m.take(column),
             self.radius_m.take(column),
             self.rounding_m.take(column),
