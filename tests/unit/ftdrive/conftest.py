@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from socketserver import BaseServer
 
 import pytest
 
@@ -20,3 +21,9 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     return Lab(tmp_path, monkeypatch)
+
+
+@pytest.fixture
+def quick_shutdown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Servers of the standard library look for the end every 10 ms instead of twice a second."""
+    monkeypatch.setattr(BaseServer.serve_forever, "__defaults__", (0.01,))

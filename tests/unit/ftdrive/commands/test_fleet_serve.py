@@ -4,7 +4,6 @@ import urllib.request
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
-from socketserver import BaseServer
 
 import pytest
 
@@ -14,12 +13,9 @@ from ftdrive.store.store import Store
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fleet.fleets import cell, fleet
 
+pytestmark = pytest.mark.usefixtures("quick_shutdown")
+
 Ran = tuple[int, str]
-
-
-@pytest.fixture(autouse=True)
-def _quick_shutdown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(BaseServer.serve_forever, "__defaults__", (0.01,))  # else half a second
 
 
 @pytest.fixture

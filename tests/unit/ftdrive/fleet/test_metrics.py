@@ -7,7 +7,6 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
 from datetime import timedelta
-from socketserver import BaseServer
 
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
@@ -17,12 +16,9 @@ from ftdrive.fleet.metrics import NAMES, MetricsServer
 from ftdrive.fleet.state import FleetFinding, Weighings
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
 
+pytestmark = pytest.mark.usefixtures("quick_shutdown")
+
 Samples = dict[tuple[str, str], float]
-
-
-@pytest.fixture(autouse=True)
-def _quick_shutdown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(BaseServer.serve_forever, "__defaults__", (0.01,))  # else half a second
 
 
 @pytest.fixture
