@@ -7,6 +7,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ftcalib.assessment import units
@@ -43,9 +44,17 @@ STEADY = 0.05
 """A force that varies by less than this share of it is constant."""
 FEWEST_SATURATED = 3
 """Poses with the same extreme reading of a channel."""
+FEWEST_TO_PREDICT = 4
+"""Degrees of freedom of a regression that predicts readings with a noise of its own."""
+UNEQUAL = 0.05
+"""With fewer poses, readings whose fit differs by more than this share of the spread should not be equal."""
+BY_CHANCE = 1e-6
+"""Probability, per reading, of one that is farther from its prediction."""
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
 FOR_STEPS = 1000
 """Poses that show steps of the readings."""
+FEWEST_STEPS = 4
+"""Different readings of a channel that show steps: a weight along each axis reads as -weight, 0 and +weight."""
 COARSE = 0.005
 """Rounding matters if its standard deviation exceeds this share of the spread."""
 
@@ -242,7 +251,10 @@ def _torque_rms(weight_sensor_N: Array, torque_Nm: Array, P: Array, T0: Array) -
 
 
 def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
-    """Find channels that do not move, that are coarse or that stop at a limit, and rows that were copied."""
+    """Find channels that do not move, that are coarse or that stop at a limit, and rows that were copied.
+
+    Equal readings count only where the orientations predict different ones.
+    """
     spread = np.ptp(wrench, axis=0)
     group = np.repeat([spread[:3].max(), spread[3:].max()], 3)
     stuck = [name for name, own, all_ in zip(CHANNELS, spread, group, strict=True) if own == 0 < all_]
@@ -250,24 +262,64 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
     coarse = [_coarse_step(part[:FOR_STEPS]) for part in np.hsplit(wrench, 2)]
     if any(coarse):
         return [*found, Finding.of("quantised", step_N=coarse[0], step_Nm=coarse[1])]
-    copied = _copies(wrench) if len(np.unique(wrench[:, np.argmax(spread)])) < len(wrench) else []
+    distinct = len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench)
+    copied = [] if distinct else _copies(wrench)
+    ties = [(k, tied) for k in range(len(CHANNELS)) if spread[k] for tied in _tied(wrench[:, k])]
+    repeated: list[NDArray[np.intp]] = []
     for rows in copied:
         same = bool(np.ptp(R_base_flange[rows], axis=0).max() == 0)
-        found.append(Finding.of("repeated_poses" if same else "repeated_wrenches", poses=rows + 1))
-    single = ~np.isin(np.arange(len(wrench)), [row for rows in copied for row in rows[1:]])
-    for k in np.flatnonzero(spread):
-        for limit in (wrench[:, k].min(), wrench[:, k].max()):
-            rows = np.flatnonzero((wrench[:, k] == limit) & single)
-            if len(rows) >= FEWEST_SATURATED:
-                found.append(Finding.of("saturated", channel=CHANNELS[k], poses=rows + 1))
+        if same or _unexpected(R_base_flange, wrench, rows, np.flatnonzero(spread)):
+            repeated.append(rows)
+            found.append(Finding.of("repeated_poses" if same else "repeated_wrenches", poses=rows + 1))
+    again = [row for rows in repeated for row in rows[1:]]
+    for k, tied in ties:
+        once = tied[~np.isin(tied, again)]
+        if len(once) >= FEWEST_SATURATED and _unexpected(R_base_flange, wrench, once, np.array([k])):
+            found.append(Finding.of("saturated", channel=CHANNELS[k], poses=once + 1))
     return found
+
+
+def _tied(readings: Array) -> list[NDArray[np.intp]]:
+    """Return the rows that share the smallest reading, and those that share the largest, where they are enough."""
+    limits = [np.flatnonzero(readings == limit) for limit in (readings.min(), readings.max())]
+    return [rows for rows in limits if len(rows) >= FEWEST_SATURATED]
+
+
+def _unexpected(R_base_flange: Array, wrench: Array, rows: NDArray[np.intp], channels: NDArray[np.intp]) -> bool:
+    """Whether the orientations predict other readings of the channels in `rows` than the equal ones that were read.
+
+    The other poses predict them: each channel is linear in the direction of gravity in flange axes. Rounded readings of
+    poses that share this direction are equal by right: four of the 24 orientations do so on a level base.
+    """
+    others = np.setdiff1d(np.arange(len(wrench)), rows)
+    dof = len(others) - 4
+    if dof < FEWEST_TO_PREDICT:
+        expected = predict(rough_fit(R_base_flange, wrench), R_base_flange[rows])
+        return bool((np.ptp(expected, axis=0) > UNEQUAL * np.ptp(wrench, axis=0))[channels].any())
+    F_b = rough_fit(R_base_flange[others], wrench[others]).gravity_force_base_N
+    design = np.column_stack([F_b @ R_base_flange / (_length(F_b) or 1.0), np.ones(len(wrench))])
+    X = design[others]
+    slope = np.linalg.lstsq(X, wrench[others])[0]
+    squares = np.sum((wrench[others] - X @ slope) ** 2, axis=0).reshape(2, 3).sum(axis=1)
+    noise = np.repeat(np.sqrt(squares / (3 * dof)), 3)  # of force and of torque
+    leverage = np.einsum("ni,ij,nj->n", design[rows], np.linalg.pinv(X.T @ X), design[rows])
+    limit = stats.t.isf(BY_CHANCE, 3 * dof) * noise * np.sqrt(1 + leverage)[:, None] + _resolution(wrench)
+    return bool((np.abs(design[rows] @ slope - wrench[rows]) > limit)[:, channels].any())
+
+
+def _resolution(wrench: Array) -> Array:
+    """Return the smallest difference of two readings of each channel (6,), as far as it may be that of rounding."""
+    gaps = [np.diff(np.unique(channel)).min(initial=np.inf) for channel in wrench.T]
+    finest, coarsest = ROUNDING * np.abs(wrench).max(axis=0), np.sqrt(12) * COARSE * np.ptp(wrench, axis=0)
+    return np.asarray(np.maximum(np.minimum(gaps, coarsest), finest))
 
 
 def _coarse_step(readings: Array) -> float:
     """Return the step of which all differences of readings (n, 3) are multiples; 0 without one that matters."""
-    gaps = np.concatenate([np.diff(np.unique(channel)) for channel in readings.T])
-    if not gaps.size:
+    distinct = [np.unique(channel) for channel in readings.T]
+    if max(map(len, distinct)) < FEWEST_STEPS:
         return 0.0
+    gaps = np.concatenate([np.diff(values) for values in distinct])
     step, spread = float(gaps.min()), float(np.linalg.norm(readings.std(axis=0)))
     even = np.abs(gaps / step - np.round(gaps / step)).max() < 1e-6
     return step if even and step > np.sqrt(12) * COARSE * spread else 0.0

@@ -18,9 +18,10 @@ from ftcalib import (
     read_csv,
     solve,
 )
-from ftcalib.assessment.faults import _Rough, broken_channels, constant_weight, least_rms, rough_fit
+from ftcalib.assessment.faults import CHANNELS, _Rough, broken_channels, constant_weight, least_rms, rough_fit
 from ftcalib.known import Known
 from ftcalib.model import Array, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
 
 Sequence = Literal["xyz", "XYZ"]
 SIGMA = np.repeat([0.05, 0.00125], 3)
@@ -380,3 +381,62 @@ def test_a_limit_is_one_that_three_poses_read(side: int) -> None:
     (finding,) = broken_channels(wrench, R)
     assert (finding.code, finding.values["channel"]) == ("saturated", "ty")
     assert finding.values["poses"] == sorted((order[:3] + 1).tolist())
+
+
+def of_a_level_base(seed: int, decimals: int, steps: float, off_deg: float) -> tuple[Array, Array]:
+    """The 24 orientations and rounded readings, in which poses with the same direction of gravity often tie."""
+    rng = np.random.default_rng(seed)
+    mount = np.eye(3) if seed % 2 else Rotation.random(rng=rng).as_matrix()
+    down = Rotation.from_euler("xy", off_deg * np.array([0.5, 0.8]), degrees=True).apply([0.0, 0.0, -1.0])
+    bias, com = rng.normal(size=(2, 3)) * [[15.0], [1.0]], rng.uniform(0.02, 0.1) * rng.normal(size=3)
+    p = Parameters(mount, rng.uniform(5, 25) * down, bias[0], com, bias[1])
+    R = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+    wrench = predict(p, R) + steps * 10.0**-decimals * rng.normal(size=(24, 6))
+    return R, np.round(wrench, decimals)
+
+
+@pytest.mark.parametrize("decimals", [2, 4])
+def test_readings_that_tie_because_they_are_rounded_are_neither_saturated_nor_copied(decimals: int) -> None:
+    """None of 45 sets; noise of 0.3 to 3 steps, base 0 to 1 degree off."""
+    wrong = []
+    for seed in range(45):
+        R, wrench = of_a_level_base(seed, decimals, (0.3, 1.0, 3.0)[seed % 3], (0.0, 0.05, 0.1, 0.3, 1.0)[seed % 5])
+        wrong += [(seed, one.code) for one in broken_channels(wrench, R) if one.code != "quantised"]
+    assert wrong == []
+
+
+@pytest.mark.parametrize("method", ["ml", "srom", "lrom"])
+def test_readings_without_noise_are_not_saturated(method: str) -> None:
+    R, wrench = of_a_level_base(3, 15, 0.0, 0.0)
+    result = solve(CalibrationDataset(R, wrench, None, np.zeros(24, np.int64), np.arange(24.0)), method=method)
+    assert result.verdict != "rejected"
+    assert not {one.code for one in result.findings} & {"saturated", "repeated_wrenches"}
+
+
+def test_readings_that_are_cut_off_are_saturated() -> None:
+    """Of 6 to 24 poses that lose 10 sigma or more."""
+    rng, missed, all_ = np.random.default_rng(4), [], 0
+    while all_ < 50:
+        seed, n, channel = int(rng.integers(10**6)), int(rng.choice([6, 12, 24])), int(rng.integers(6))
+        _, R, wrench = session(seed, n)
+        readings = np.sort(wrench[:, channel])
+        cut = int(rng.integers(3, max(4, n // 4) + 1))
+        limit = rng.uniform(readings[-cut - 1], readings[-cut])
+        if readings[-1] - limit < 10 * SIGMA[channel]:
+            continue
+        all_ += 1
+        wrench[:, channel] = np.minimum(wrench[:, channel], limit)
+        found = [(one.code, one.values["channel"]) for one in broken_channels(wrench, R)]
+        if found != [("saturated", CHANNELS[channel])]:
+            missed.append((seed, n, channel, found))
+    assert len(missed) <= 1, missed
+
+
+def test_copied_rows_are_named_beside_rows_that_are_equal_by_right() -> None:
+    R, wrench = of_a_level_base(1, 2, 0.0, 0.0)
+    equal = [i for i in range(1, 24) if (wrench[i] == wrench[0]).all()]
+    assert equal
+    other = next(i for i in range(1, 24) if i not in equal)
+    wrench[other] = wrench[0]
+    found = [one for one in broken_channels(wrench, R) if one.code == "repeated_wrenches"]
+    assert [one.values["poses"] for one in found] == [sorted([1, *(i + 1 for i in equal), other + 1])]
