@@ -1,10 +1,9 @@
-"""A recording of a free tool in motion, raw: every sample of sensor and arm, in one file of a run."""
+"""A recording of a free tool in motion, raw: every sample of sensor and arm, in one file of a run or in parts of it."""
 
 import hashlib
 import io
 import math
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -17,6 +16,7 @@ from ftcalib.files import write_new
 from ftcalib.model import Array
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
+from ftdrive.runs.run import DAMAGE, arrays_of
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 FORMAT: Final = "ftdrive.motion/1"
@@ -46,45 +46,74 @@ class MotionRecording:
 
     @classmethod
     def load(cls, path: Path) -> "MotionRecording":
-        """Read a file; raises `BadDataset`."""
-        try:
-            with zipfile.ZipFile(path) as file:  # which checks the CRC-32 of each array
-                data = {
-                    name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
-                    for name in file.namelist()
-                }
-            return cls._of(data)
-        except (KeyError, OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
-            raise BadDataset(f"{path} is not a recording in motion ({error}): take it from a copy") from error
+        """Read a file, or the files of a folder; raises `BadDataset`."""
+        parts = list(cls.parts(path))
+        samples = FtSamples.concatenate([one.samples for one in parts])
+        return cls(samples, ArmStates.concatenate([one.states for one in parts]), parts[0].nominal_rate_Hz)
 
     @classmethod
-    def _of(cls, data: Mapping[str, Any]) -> "MotionRecording":
-        if str(data.get("format")) != FORMAT:
-            raise ValueError(f"its format is {data.get('format')}, this version reads {FORMAT}")
-        return cls(
-            FtSamples(*(data[f"wrench_{name}"] for name in _WRENCH)),
-            ArmStates(*(data[f"pose_{name}"] for name in _POSES)),
-            float(data["nominal_rate_Hz"]),
-        )
+    def parts(cls, path: Path) -> "Iterator[MotionRecording]":
+        """Read one file after the other; raises `BadDataset`."""
+        return map(cls._load, _files(path))
 
-    def means(self) -> tuple[Means, Means]:
-        """Return both streams as the estimator takes them, on the host's clock in s since the first sample."""
-        start_ns = int(min(self.samples.t_host_ns[0], self.states.t_host_ns[0]))
-        wrench, poses = Means(), Means()
-        wrench.add(self._wrench_s(start_ns), self.samples.wrench)
-        rotations = self.states.R_base_flange.reshape(-1, 9)
-        t_s = measured_s(self.states.t_device_s, self.states.t_host_ns, start_ns)
-        poses.add(t_s, np.hstack([rotations, self.states.p_base_flange_m]))
-        return wrench, poses
+    @classmethod
+    def _load(cls, path: Path) -> "MotionRecording":
+        try:
+            data = arrays_of(path)
+            if str(data.get("format")) != FORMAT:
+                raise ValueError(f"its format is {data.get('format')}, this version reads {FORMAT}")
+            return cls(
+                FtSamples(*(data[f"wrench_{name}"] for name in _WRENCH)),
+                ArmStates(*(data[f"pose_{name}"] for name in _POSES)),
+                float(data["nominal_rate_Hz"]),
+            )
+        except DAMAGE as error:
+            raise BadDataset(f"{path} is not a recording in motion ({error}): take it from a copy") from error
 
-    def _wrench_s(self, start_ns: int) -> Array:
-        """Return the times of the wrenches by the sensor's clock, or its count; a polled one has neither."""
-        samples = self.samples
-        if np.isfinite(samples.t_device_s).all():
-            return measured_s(samples.t_device_s, samples.t_host_ns, start_ns)
-        if math.isfinite(self.nominal_rate_Hz):
-            return measured_s(samples.seq, samples.t_host_ns, start_ns)
-        return np.asarray((samples.t_host_ns - start_ns) * 1e-9)
+    @property
+    def count(self) -> Array:
+        """The sensor's clock, else its count; NaN of a polled sensor, which has neither."""
+        if np.isfinite(self.samples.t_device_s).all():
+            return self.samples.t_device_s
+        even = math.isfinite(self.nominal_rate_Hz)
+        return np.asarray(self.samples.seq, np.float64) if even else np.full(len(self.samples), np.nan)
+
+
+def means_of(path: Path) -> tuple[Means, Means]:
+    """Return both streams as the estimator takes them, on the host's clock in s since the first sample.
+
+    The files of a recording in parts are read twice, so that only one of them is in memory; raises `BadDataset`.
+    """
+    times = [
+        (one.samples.t_host_ns, one.count, one.states.t_host_ns, one.states.t_device_s)
+        for one in MotionRecording.parts(path)
+    ]
+    wrench_ns, counts, poses_ns, poses_s = (list(column) for column in zip(*times, strict=True))
+    received = [np.concatenate(each) for each in (wrench_ns, poses_ns)]
+    if not all(map(len, received)):
+        raise BadDataset(f"{path} has samples of one device only: record again")
+    start_ns = int(min(each[0] for each in received))
+    clocks = (received[0], np.concatenate(counts)), (received[1], np.concatenate(poses_s))
+    wrench_s, pose_s = (
+        measured_s(count, t_ns, start_ns) if np.isfinite(count).all() else (t_ns - start_ns) * 1e-9
+        for t_ns, count in clocks
+    )
+    wrench, poses = Means(), Means()
+    ends = np.cumsum([[len(one), len(other)] for one, other in zip(wrench_ns, poses_ns, strict=True)], axis=0)
+    for one, t_w, t_p in zip(
+        MotionRecording.parts(path), np.split(wrench_s, ends[:-1, 0]), np.split(pose_s, ends[:-1, 1]), strict=True
+    ):
+        wrench.add(t_w, one.samples.wrench)
+        poses.add(t_p, np.hstack([one.states.R_base_flange.reshape(-1, 9), one.states.p_base_flange_m]))
+    return wrench, poses
+
+
+def _files(path: Path) -> list[Path]:
+    """Return the files of a recording: itself, or those of a folder in the order of their numbers."""
+    files = sorted(path.glob("*.npz"), key=lambda file: file.stem.zfill(9)) if path.is_dir() else [path]
+    if not files:
+        raise BadDataset(f"{path} has no samples yet: record for some seconds")
+    return files
 
 
 def measured_s(count: Any, t_host_ns: Any, start_ns: int) -> Array:
@@ -111,8 +140,11 @@ def solve_motion_file(
     path: Path, *, height_m: float | None, known: Known | None, provenance: Mapping[str, Any], **circumstances: Any
 ) -> CalibrationResult:
     """Calibrate from the recording of a run; circumstances as for `ftcalib.motion.solve.solve_motion`."""
-    wrench, poses = MotionRecording.load(path).means()
-    source = {"recording": path.name, "recording_sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+    wrench, poses = means_of(path)
+    digest = hashlib.sha256()
+    for file in _files(path):
+        digest.update(file.read_bytes())
+    source = {"recording": path.name, "recording_sha256": digest.hexdigest()}
     return solve_motion(
         wrench,
         poses,

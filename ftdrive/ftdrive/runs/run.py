@@ -4,6 +4,7 @@ run.json          ftdrive.run/1: when, with what, command line, versions, config
 plan.json         ftdrive.plan/1: the plan the arm followed; not where a person moved it
 events.ndjson     what happened, one object a line, as `ftdrive.session.events` has it
 motion.npz        ftdrive.motion/1: every sample of sensor and arm while the tool moved; motion-2.npz likewise
+motion/1.npz ...  the same in parts, each on disk within seconds, of a recording that may end at any time
 poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on; 01-2.npz took its place
 dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after poses were added or taken again
 calibration.json  ftdrive.calibration/1: the result; calibration-2.json likewise. Of a verification: the accepted update
@@ -63,8 +64,8 @@ ZIP_DAMAGE: Final = (
     *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
 """Errors of `zipfile` for a damaged file: RuntimeError for an apparent password or unknown compression. OSError too."""
-_DAMAGE: Final = (*ZIP_DAMAGE, KeyError, OSError, TypeError, tokenize.TokenError)
-"""Errors for the file of a pose; numpy raises TokenError."""
+DAMAGE: Final = (*ZIP_DAMAGE, KeyError, OSError, TypeError, tokenize.TokenError)
+"""Errors for a file of arrays; numpy raises TokenError."""
 LOCK: Final = "lock"
 CRC: Final = "crc32"
 """Field of an event with the CRC-32 of the others, as JSON with sorted keys."""
@@ -175,13 +176,14 @@ class Run:
 
     @property
     def motion_path(self) -> Path:
-        """Where the newest recording in motion is kept."""
-        return _newest(self.folder / "motion.npz")
+        """Where the newest recording in motion is kept: a file, or a folder of parts."""
+        folder = self.folder / "motion"
+        return folder if folder.is_dir() else _newest(self.folder / "motion.npz")
 
     @property
     def in_motion(self) -> bool:
         """Whether it holds a recording in motion instead of poses."""
-        return self.motion_path.is_file()
+        return self.motion_path.is_file() or any(self.motion_path.glob("*.npz"))
 
     @property
     def plan_path(self) -> Path:
@@ -415,19 +417,24 @@ def _newest(path: Path) -> Path:
     return found
 
 
+def arrays_of(path: Path) -> dict[str, Any]:
+    """Read a file of arrays; raises one of `DAMAGE`."""
+    with zipfile.ZipFile(path) as file:
+        # `ZipFile.read` reads to the end of each array, where its CRC-32 is checked; `numpy.load` need not.
+        return {
+            name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
+            for name in file.namelist()
+        }
+
+
 def _read_record(path: Path) -> PoseRecord:
     try:
-        with zipfile.ZipFile(path) as file:
-            # `ZipFile.read` reads to the end of each array, where its CRC-32 is checked; `numpy.load` need not.
-            data = {
-                name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
-                for name in file.namelist()
-            }
+        data = arrays_of(path)
         found = str(data.get("format"))
         if found != RECORDING_FORMAT:
             raise BadDataset(f"{path} has format {found!r}: this version reads {RECORDING_FORMAT}")
         return _record(data)
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise BadDataset(
             f"{path} is not a recording of a pose ({error}): {_RESTORE}, or move it away and --resume the run"
         ) from error

@@ -105,5 +105,5 @@ class Journal:
 
 
 def _to_continue(run: Run) -> str:
-    """Return the command that continues a run; a sweep starts again."""
-    return "" if run.header().get("mode") == "sweep" else run.resume_command
+    """Return the command that continues a run; a recording in motion starts again."""
+    return "" if run.header().get("mode") in ("sweep", "passive") else run.resume_command

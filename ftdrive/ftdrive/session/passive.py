@@ -1,5 +1,7 @@
 """A calibration beside a program or a hand that moves the arm: both devices are only read, until the result is good."""
 
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Final
 
 from ftcalib import Setup
@@ -8,9 +10,9 @@ from ftcalib.motion.solve import solve_motion
 from ftcalib.result import CalibrationResult
 from ftcalib.rounding import with_sigma
 from ftdrive.errors import Declined
-from ftdrive.runs.motion import MotionRecording
+from ftdrive.runs.motion import MotionRecording, means_of
 from ftdrive.runs.run import Run
-from ftdrive.session.events import MotionRecorded
+from ftdrive.session.events import MotionRecorded, Noted
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
@@ -20,6 +22,8 @@ FIRST_S: Final = 10.0
 """Until the first fit; each later one has a quarter more."""
 LONGER: Final = 1.25
 LEAST_S: Final = 5.0
+PART_S: Final = 1.0
+"""Between two files: what a power failure can lose, and all that is in memory."""
 _READ_S: Final = 0.2
 _SILENT_S: Final = 10.0
 """A shorter silence of a device is a gap in the recording, not its end."""
@@ -27,71 +31,114 @@ GOOD: Final = 2
 """So many good fits in a row end it."""
 
 
-def record_passively(cell: OpenCell, run: Run, seconds: float, setup: Setup, g_m_s2: float) -> None:
+def record_passively(
+    cell: OpenCell, run: Run, seconds: float, setup: Setup, g_m_s2: float, fits: Executor | None = None
+) -> None:
     """Record the free tool in motion until two fits in a row are good, the operator presses q, or the time is over.
 
-    Each fit is shown with its sigmas and with the motion that is missing.
+    Each second is on disk before the next. Each fit is shown with its sigmas and with the motion that is missing. It
+    runs in a thread of `fits`, so that a lost device is reported at once.
 
     Raises
     ------
     Declined
         The operator ended it in the first seconds.
     DeviceError
-        A device has failed.
+        A device has failed; what was recorded is in the run.
     """
     cell.note(f"Recording for {seconds:.0f} s at most; nothing is commanded. Keep the tool free for part of the time.")
-    samples, states = list[FtSamples](), list[ArmStates]()
-    begin_s, next_s, good = cell.clock.now_s(), FIRST_S, 0
-    heard_s = begin_s
-    with cell.sensor.follow() as wrench, cell.arm.follow() as poses:
-        for _ in cell.clock.looks(seconds):
-            try:
-                samples.append(wrench.read(_READ_S))
-                states.append(poses.read(0.0))
-                heard_s = cell.clock.now_s()
-            except (DeviceTimeout, StreamBroken, ConnectError):  # a sensor with `recover` reconnects
-                if cell.clock.now_s() - heard_s > _SILENT_S:
-                    raise
-                cell.clock.sleep(_READ_S)
-            elapsed_s = cell.clock.now_s() - begin_s
-            if cell.journal.pressed() is Key.STOP:
-                break
-            if elapsed_s >= next_s:
-                next_s = LONGER * elapsed_s
-                good = good + 1 if _is_good(cell, _joined(cell, samples, states), elapsed_s, setup, g_m_s2) else 0
-                if good == GOOD:
-                    break
-    recording = _joined(cell, samples, states)
-    duration_s = cell.clock.now_s() - begin_s
-    if duration_s < LEAST_S:
-        raise Declined(f"ended after {duration_s:.1f} s: record {FIRST_S:.0f} s or more")
-    path = run.new_path("motion", ".npz")
-    recording.save(path)
+    cell.journal.keep_in(run)
+    executor = fits or ThreadPoolExecutor(1)
+    try:
+        recorder = _Recorder(cell, run)
+        recorder.record(seconds, lambda at_s: executor.submit(_fitted, run, at_s, setup, g_m_s2))
+    except BaseException:
+        kept = f"the recording so far is kept; solve it with {run.solve_command}"
+        cell.journal.show(Noted(words=kept if run.in_motion else f"nothing was recorded in {run.folder}"), sync=True)
+        raise
+    finally:
+        executor.shutdown(wait=False, cancel_futures=True)
+    if recorder.duration_s < LEAST_S:
+        raise Declined(f"ended after {recorder.duration_s:.1f} s: record {FIRST_S:.0f} s or more")
     event = MotionRecorded(
-        file=path.name,
-        duration_s=duration_s,
-        samples=len(recording.samples),
-        states=len(recording.states),
+        file=run.motion_path.name,
+        duration_s=recorder.duration_s,
+        samples=recorder.samples,
+        states=recorder.states,
         temperature_C=cell.sensor.temperature_C(),
     )
     cell.journal.show(event, sync=True)
 
 
-def _joined(cell: OpenCell, samples: list[FtSamples], states: list[ArmStates]) -> MotionRecording:
-    samples[:], states[:] = [FtSamples.concatenate(samples)], [ArmStates.concatenate(states)]
-    return MotionRecording(samples[0], states[0], cell.sensor.health().nominal_rate_Hz)
+class _Recorder:
+    """Writes both streams of a cell into a run, part by part."""
+
+    def __init__(self, cell: OpenCell, run: Run) -> None:
+        self._cell, self._run = cell, run
+        self._unsaved: tuple[list[FtSamples], list[ArmStates]] = [], []
+        self._parts = self.samples = self.states = 0
+        self.duration_s = 0.0
+
+    def record(self, seconds: float, fit: Callable[[float], "Future[tuple[str, bool]]"]) -> None:
+        """Record, and show a fit from time to time, until it is over."""
+        cell, clock = self._cell, self._cell.clock
+        (self._run.folder / "motion").mkdir()
+        begin_s = heard_s = saved_s = clock.now_s()
+        next_s, good, running = FIRST_S, 0, None
+        is_silent = False
+        with cell.sensor.follow() as wrench, cell.arm.follow() as poses:
+            try:
+                for _ in clock.looks(seconds):
+                    try:
+                        samples, states = self._unsaved
+                        samples.append(wrench.read(_READ_S))
+                        states.append(poses.read(0.0))
+                        heard_s, is_silent = clock.now_s(), False
+                    except (DeviceTimeout, StreamBroken, ConnectError) as error:  # one with `recover` reconnects
+                        if clock.now_s() - heard_s > _SILENT_S:
+                            raise
+                        if not is_silent:
+                            cell.note(f"{error}. Waiting {_SILENT_S:.0f} s for it.", warning=True)
+                        is_silent = True
+                        clock.sleep(_READ_S)
+                    self.duration_s = clock.now_s() - begin_s
+                    if clock.now_s() - saved_s >= PART_S:
+                        self._save()
+                        saved_s = clock.now_s()
+                    if cell.journal.pressed() is Key.STOP:
+                        break
+                    if running is not None and running.done() and not is_silent:
+                        words, is_good = running.result()
+                        cell.note(words)
+                        running, good = None, good + 1 if is_good else 0
+                        if good == GOOD:
+                            break
+                    if running is None and self.duration_s >= next_s and not is_silent:
+                        next_s, running = LONGER * self.duration_s, fit(self.duration_s)
+            finally:
+                self._save()
+
+    def _save(self) -> None:
+        """Write what is not on disk yet as one more part."""
+        samples, states = self._unsaved
+        if samples and states:
+            joined = FtSamples.concatenate(samples), ArmStates.concatenate(states)
+            self._unsaved = [], []
+            if any(map(len, joined)):
+                part = MotionRecording(*joined, self._cell.sensor.health().nominal_rate_Hz)
+                self._parts += 1
+                part.save(self._run.folder / "motion" / f"{self._parts}.npz")
+                self.samples, self.states = self.samples + len(joined[0]), self.states + len(joined[1])
 
 
-def _is_good(cell: OpenCell, recording: MotionRecording, elapsed_s: float, setup: Setup, g_m_s2: float) -> bool:
-    """Fit what was recorded so far and show it."""
+def _fitted(run: Run, at_s: float, setup: Setup, g_m_s2: float) -> tuple[str, bool]:
+    """Fit what is on disk; return how good it is in words, and whether it is good."""
     try:
-        wrench, poses = recording.means()
+        wrench, poses = means_of(run.motion_path)
         result = solve_motion(wrench, poses, setup=setup, height_m=setup.sensor_height_m, g_m_s2=g_m_s2)
     except (AcceptanceError, DataError) as error:
-        cell.note(f"{elapsed_s:.0f} s: {error}")
-        return False
-    cell.note(f"{elapsed_s:.0f} s: {in_words(result)}")
-    return result.verdict == "good"
+        return f"{at_s:.0f} s: {error}", False
+    return f"{at_s:.0f} s: {in_words(result)}", result.verdict == "good"
 
 
 def in_words(result: CalibrationResult) -> str:

@@ -1,12 +1,14 @@
 """A recording in motion: its file, and the times of measurement."""
 
+import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ftcalib.errors import BadDataset
-from ftdrive.runs.motion import MotionRecording, measured_s
+from ftdrive.runs.motion import MotionRecording, means_of, measured_s
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 
@@ -26,7 +28,7 @@ def test_it_reads_back_what_was_saved(tmp_path: Path) -> None:
     assert np.array_equal(again.samples.wrench, one.samples.wrench)
     assert np.array_equal(again.states.R_base_flange, one.states.R_base_flange)
     assert again.nominal_rate_Hz == one.nominal_rate_Hz
-    wrench, poses = again.means()
+    wrench, poses = means_of(tmp_path / "motion.npz")
     assert (wrench.samples, poses.samples) == (500, 500)
 
 
@@ -38,6 +40,47 @@ def test_a_damaged_file_is_refused(tmp_path: Path) -> None:
     path.write_bytes(bytes(content))
     with pytest.raises(BadDataset, match="not a recording in motion"):
         MotionRecording.load(path)
+
+
+def test_no_single_bit_of_its_headers_can_end_in_another_error(tmp_path: Path) -> None:
+    """A flipped bit is refused, or changes nothing that is read."""
+    path = tmp_path / "motion.npz"
+    recording(20).save(path)
+    content = path.read_bytes()
+    directory = content.index(b"PK\x01\x02")
+    for byte in [*range(0, 120, 2), *range(directory, len(content), 5)]:  # all bits of a header, in different arrays
+        damaged = bytearray(content)
+        damaged[byte] ^= 1 << (byte % 8)
+        path.write_bytes(bytes(damaged))
+        with suppress(BadDataset):
+            MotionRecording.load(path)
+
+
+def test_a_file_that_claims_to_be_larger_than_memory_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "motion.npz"
+    recording(20).save(path)
+    with zipfile.ZipFile(path) as file:
+        arrays = {name: file.read(name) for name in file.namelist()}
+    arrays["wrench_wrench.npy"] = arrays["wrench_wrench.npy"].replace(b"(20, 6), }", b"(%d, 6), }" % 10**13)
+    with zipfile.ZipFile(path, "w") as file:
+        for name, content in arrays.items():
+            file.writestr(name, content)
+    with pytest.raises(BadDataset, match="not a recording in motion"):
+        MotionRecording.load(path)
+
+
+def test_parts_are_read_like_one_file_and_an_incomplete_one_is_ignored(tmp_path: Path) -> None:
+    whole, folder = recording(), tmp_path / "motion"
+    folder.mkdir()
+    whole.save(tmp_path / "motion.npz")
+    for number, start in enumerate(range(0, 500, 45), 1):  # more than 9, so that names do not sort by text
+        rows = slice(start, start + 45)
+        MotionRecording(whole.samples.rows(rows), whole.states.rows(rows), 100.0).save(folder / f"{number}.npz")
+    (folder / "13.npz.partial").write_bytes(b"PK")
+    assert np.array_equal(MotionRecording.load(folder).samples.seq, whole.samples.seq)
+    for one, other in zip(means_of(folder), means_of(tmp_path / "motion.npz"), strict=True):
+        for found, expected in zip(one.result(), other.result(), strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_samples_that_are_received_late_do_not_move_the_others() -> None:

@@ -1,10 +1,11 @@
 """A passive calibration: it ends by itself, by a key, or after its time, and its run solves again."""
 
 from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -14,8 +15,10 @@ from ftdrive.errors import Declined
 from ftdrive.runs import outcome
 from ftdrive.runs.motion import MotionRecording
 from ftdrive.runs.run import Run
+from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key
-from ftdrive.session.passive import record_passively
+from ftdrive.session.passive import PART_S, record_passively
+from ftdrivers.errors import StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.fake_clock import FakeClock
 from tests.moving_load import Recorded, Truth, programme, record
@@ -36,8 +39,8 @@ def free() -> Recorded:
 class FakeCell:
     """Sensor, arm and journal of a free tool that a program moves."""
 
-    def __init__(self, recorded: Recorded, *, stop_s: float = np.inf) -> None:
-        self.clock, self.shown, self._stop_s = FakeClock(), list[Any](), stop_s
+    def __init__(self, recorded: Recorded, *, stop_s: float = np.inf, lost_s: float = np.inf) -> None:
+        self.clock, self.shown, self._stop_s, self._lost_s = FakeClock(), list[Any](), stop_s, lost_s
         nothing = np.zeros((len(recorded.t_pose_s), 6))
         start_ns = self._start_ns = self.clock.now_ns()
         self._samples = FtSamples.of(
@@ -52,7 +55,9 @@ class FakeCell:
             follow=lambda: self._follow(self._samples, STEP_S), health=lambda: health, temperature_C=lambda: None
         )
         self.arm = SimpleNamespace(follow=lambda: self._follow(self._states, 0.0))
-        self.journal = SimpleNamespace(pressed=self._pressed, show=lambda event, **_: self.shown.append(event))
+        self.journal = SimpleNamespace(
+            pressed=self._pressed, show=lambda event, **_: self.shown.append(event), keep_in=lambda _: None
+        )
 
     @contextmanager
     def _follow(self, rows: Any, step_s: float) -> Iterator[Any]:
@@ -60,6 +65,8 @@ class FakeCell:
 
         def read(_: float) -> Any:
             self.clock.sleep(step_s)
+            if (self.clock.now_ns() - self._start_ns) * 1e-9 > self._lost_s:
+                raise StreamBroken("sensor: it was unplugged", "check its plug")
             now_ns = self.clock.now_ns()
             since, until = np.searchsorted(rows.t_host_ns, [before[0], now_ns])
             before[0] = now_ns
@@ -70,13 +77,23 @@ class FakeCell:
     def _pressed(self) -> Key | None:
         return Key.STOP if (self.clock.now_ns() - self._start_ns) * 1e-9 >= self._stop_s else None
 
-    def note(self, words: str) -> None:
+    def note(self, words: str, *, warning: bool = False) -> None:
+        del warning
         self.shown.append(words)
+
+
+class AtOnce(Executor):
+    """Fits in the thread that asks, because a fake clock waits for no other."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
 
 
 def passively(cell: Any, folder: Path, seconds: float) -> Run:
     run = Run.create(folder, "passive", {"mode": "passive"})
-    record_passively(cell, run, seconds, Setup(), 9.80665)
+    record_passively(cell, run, seconds, Setup(), 9.80665, AtOnce())
     return run
 
 
@@ -91,12 +108,34 @@ def test_it_ends_by_itself_when_the_result_is_good(free: Recorded, tmp_path: Pat
 
 def test_q_and_the_time_end_it_and_too_little_is_not_kept(free: Recorded, tmp_path: Path) -> None:
     by_key, by_time = FakeCell(free, stop_s=6.0), FakeCell(free)
-    assert passively(by_key, tmp_path, SECONDS).motion_path.is_file()
+    assert passively(by_key, tmp_path, SECONDS).in_motion
     assert by_key.shown[-1].duration_s == pytest.approx(6.0, abs=STEP_S)
     passively(by_time, tmp_path, 6.0)
     assert by_time.shown[-1].duration_s == pytest.approx(6.0, abs=STEP_S)
     with pytest.raises(Declined, match="record 10 s"):
         passively(FakeCell(free, stop_s=2.0), tmp_path, SECONDS)
+
+
+def test_what_was_recorded_before_a_failure_is_kept_and_solved(
+    free: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A device that is lost is named at its first silence; after the longest one the recording ends."""
+    cell = FakeCell(free, lost_s=13.0)
+    run = Run.create(tmp_path, "passive", {"mode": "passive"})
+    with pytest.raises(StreamBroken, match="unplugged"):
+        record_passively(cast(OpenCell, cell), run, 60.0, Setup(), 9.80665, AtOnce())
+    *_, fit, lost, kept = [getattr(one, "words", one) for one in cell.shown]
+    assert fit.startswith("10 s")  # and no fit after the loss
+    assert "unplugged" in lost
+    assert run.solve_command in kept
+    assert MotionRecording.load(run.motion_path).samples.seq[-1] >= 500 * (13.0 - STEP_S) - 1
+    monkeypatch.setattr(outcome, "circumstances_of", lambda _: ({"setup": Setup()}, {}))
+    assert outcome.solve_in_motion(run).verdict in {"good", "usable"}
+
+
+def test_memory_holds_one_part_at_a_time(free: Recorded, tmp_path: Path) -> None:
+    run = passively(FakeCell(free), tmp_path, 8.0)
+    assert max(len(one.samples) for one in MotionRecording.parts(run.motion_path)) <= 500 * (PART_S + STEP_S)
 
 
 @pytest.mark.slow
