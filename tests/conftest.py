@@ -26,6 +26,19 @@ os.environ["XDG_STATE_HOME"] = _state.name
 os.environ["XDG_DATA_HOME"] = _state.name + "/data"
 for _name in [name for name in os.environ if name.startswith("FTDRIVE_") and name != "FTDRIVE_REAL_DATA"]:
     del os.environ[_name]
+# Nor do colours and width depend on the terminal in which the tests run.
+for _name in (
+    "COLORTERM",
+    "COLUMNS",
+    "FORCE_COLOR",
+    "LINES",
+    "NO_COLOR",
+    "PY_COLORS",
+    "TTY_COMPATIBLE",
+    "TTY_INTERACTIVE",
+):
+    os.environ.pop(_name, None)
+os.environ["TERM"] = "xterm-256color"
 os.environ.pop("UV_RUN_RECURSION_DEPTH", None)  # or every command in a message would begin with `uv run`
 
 
