@@ -57,7 +57,7 @@ def test_a_payload_is_pushed_read_back_and_restored(station: Station, run: Path,
 
     pushed = ftdrive.run("push", run, "--config", "cell.toml", typed="push\nPUSH\n")
     assert pushed.returncode == 0, pushed.stderr
-    assert "'push' is none of the answers" in pushed.stderr
+    assert "'push' is not PUSH: type it in capital letters" in pushed.stderr
     assert "zeroes the arm's own force sensor" in pushed.stderr
     assert f"undo: ftdrive push --restore {run / 'push.json'}" in pushed.stdout
     truth_kg = station.truth["mass_kg"]

@@ -15,6 +15,8 @@ class Key(Enum):
     SKIP = "s"
     PAUSE = "p"
     STOP = "q"
+    OTHER = ""
+    """Any other key: Space, Enter, an arrow, Ctrl-D, Ctrl-Z. It stops an arm in motion."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,7 +53,7 @@ def record_passively(
         recorder = _Recorder(cell, run)
         recorder.record(seconds, lambda at_s: executor.submit(_fitted, run, at_s, setup, g_m_s2))
     except BaseException:
-        kept = f"the recording so far is kept; solve it with {run.solve_command}"
+        kept = f"the recording so far is kept; solve it with\n{run.solve_command}"
         cell.journal.show(Noted(words=kept if run.in_motion else f"nothing was recorded in {run.folder}"), sync=True)
         raise
     finally:

@@ -35,8 +35,9 @@ class PoseBook:
                 words = f"the sweep was not completed: {run.folder} has its events, and no recording"
                 self.cell.journal.show(Noted(words=words), sync=True)
                 raise
-            words = f"{len(run.stops())} poses saved in {run.folder}; continue with {run.resume_command}"
-            words += f", or solve them with {run.solve_command}" if run.stops() and run.command == "calibrate" else ""
+            words = f"{len(run.stops())} poses saved in {run.folder}; continue with\n{run.resume_command}"
+            if run.stops() and run.command == "calibrate":
+                words += f"\nor solve them with\n{run.solve_command}"
             self.cell.journal.show(Noted(words=words), sync=True)
             raise
 

@@ -25,8 +25,6 @@ class Progress:
     """Whether the operator has typed the word for the first motion."""
     taken_last: int | None = None
     """Stop of the newest pose."""
-    again: bool = False
-    """Whether the newest pose is to be taken again."""
     skipped: set[int] = field(default_factory=set)
     """Indices of postures that the arm should avoid."""
     reopened: set[int] = field(default_factory=set)
@@ -78,7 +76,6 @@ class Progress:
 
     def redo(self, stop: int) -> None:
         """Put a stop that was taken in front of the others."""
-        self.again = False
         self.todo.insert(0, stop)
         self.skipped.discard(self.index(stop))
 

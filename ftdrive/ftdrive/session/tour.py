@@ -171,7 +171,7 @@ class Tour:
             raise Declined("ended by the operator between two poses")
         if answer == "s":
             self._skip()
-        elif answer == "r" and self._redoable() is not None:
+        elif answer == "r" and self._redoable():
             self._redo()
         return answer == ""
 
@@ -192,46 +192,39 @@ class Tour:
     def _obey_keys(self) -> None:
         """Obey the keys pressed: r refers to the last pose taken, s to the one under way, as on the screen.
 
-        Called between two looks, so before another pose is shown.
+        Every key stops an arm in motion; what it means is done after the stop. Called between two looks, so before
+        another pose is shown.
         """
-        moving = self._now.moving
-        if self._now.again and not moving:
-            raise Turned(Key.REDO)
         while (key := self._journal.pressed()) is not None:
-            if key is Key.PAUSE:
-                raise OperatorStop("paused by the operator")
             if key is Key.STOP:
                 raise OperatorStop("stopped by the operator", for_good=True)
+            if key is Key.SKIP and self._now.under_way is not None:
+                raise Turned(key)
+            if key is Key.REDO and self._redoable():
+                raise Turned(key)
+            if key is Key.PAUSE or self._now.moving:
+                raise OperatorStop("paused by the operator" if key is Key.PAUSE else "stopped by a key")
             if key is Key.KEEP:
                 self._note("every pose is saved without a key; press r to take it again")
             if key is Key.SKIP:
-                if self._now.under_way is not None:
-                    raise Turned(key)
-                self._note("s skips the pose that is under way: none is under way")
-            if key is Key.REDO and (last := self._redoable()) is not None:
-                self._now.again = True
-                if not moving:
-                    raise Turned(key)
-                self._note(f"the arm completes its move, then goes back to pose {last}")
+                self._note("no pose in progress: nothing to skip")
 
     def _turn(self, key: Key) -> None:
-        if key is Key.REDO:
-            self._redo()
-            return
         if not self._now.standing:
             self._arm.stop()
-        self._skip()
+        if key is Key.REDO:
+            self._redo()
+        else:
+            self._skip()
 
-    def _redoable(self) -> int | None:
-        """Return the stop that r takes again; None, with a note why, if there is none."""
+    def _redoable(self) -> bool:
+        """Whether r can take the last pose again; a note says why it cannot."""
         last = self._now.taken_last
         if last is None:
             self._note("r takes the last pose again: there is no pose yet")
         elif self._now.todo[0] == last:
             self._note(f"pose {last} is being taken again already")
-        else:
-            return last
-        return None
+        return last is not None and self._now.todo[0] != last
 
     def _redo(self) -> None:
         stop = self._now.taken_last

@@ -40,3 +40,8 @@ _COMMAND = re.compile(rf"(?<![\w./-])(?<!uv run )ftdrive (?=(?:{'|'.join(COMMAND
 def as_typed(text: str) -> str:
     """Return a message whose commands begin with `uv run` if this program was started so: nothing else would work."""
     return _COMMAND.sub("uv run ftdrive ", text) if "UV_RUN_RECURSION_DEPTH" in os.environ else text  # uv run sets it
+
+
+def is_command(line: str) -> bool:
+    """Whether a line is a command and nothing else; it is never broken, so that it can be copied."""
+    return line.startswith(("ftdrive ", "uv run ftdrive "))

@@ -10,7 +10,7 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 
-from ftdrive.terminal.command_names import as_typed
+from ftdrive.terminal.command_names import as_typed, is_command
 from ftdrive.terminal.text import NARROWEST, visible
 
 
@@ -68,13 +68,18 @@ def print_address(words: str, address: str) -> None:
 
 
 def hanging(head: str | Text, words: str, console: Console = messages) -> Text:
-    """Put words behind a head; on a terminal too narrow for them the next lines begin under the first word."""
+    """Put words behind a head; on a terminal too narrow for them the next lines begin under the first word.
+
+    Print it with `soft_wrap`: a line that is a command stays whole.
+    """
     first = Text.assemble(head)
     text = Text(as_typed(words))
     width = console.width - first.cell_len
     if console.soft_wrap or width < NARROWEST:
         return first + text
-    lines = text.wrap(console, width)
+    lines = [
+        line for part in text.split() for line in ([part] if is_command(part.plain) else part.wrap(console, width))
+    ]
     for line in lines:
         line.rstrip()
     return first + Text("\n" + " " * first.cell_len).join(lines)

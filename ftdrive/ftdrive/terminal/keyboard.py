@@ -1,4 +1,4 @@
-"""Single keys from a terminal, without Enter. Ctrl-C still interrupts."""
+"""Single keys from a terminal, without Enter. Ctrl-C still interrupts; all other keys only reach the session."""
 
 import atexit
 import os
@@ -19,7 +19,7 @@ _KEYS = {key.value: key for key in Key}
 _WORD_S = 0.3
 """A letter within this time of another belongs to a word, such as an answer typed too late."""
 _ALWAYS = {Key.PAUSE, Key.STOP}
-"""Read within a word too: an unnecessary stop does no harm."""
+"""Read within a word too: an unnecessary stop does no harm. What else a word contains is another key."""
 
 
 class Keyboard:
@@ -86,6 +86,11 @@ class Keyboard:
             return
         atexit.register(self._restore)
         tty.setcbreak(self._fd, termios.TCSANOW)
+        mode = termios.tcgetattr(self._fd)
+        mode[0] &= ~termios.IXON  # Ctrl-S would freeze the screen beside a moving arm
+        for name in (termios.VSUSP, termios.VQUIT):  # Ctrl-Z would suspend the guards, and Ctrl-\ end them
+            mode[6][name] = b"\0"
+        termios.tcsetattr(self._fd, termios.TCSANOW, mode)
         wake, self._wake = os.pipe()
         self._thread = Thread(target=self._read, args=(wake,), name="keyboard", daemon=True)
         self._thread.start()
@@ -124,11 +129,11 @@ class Keyboard:
                 now_s = time.monotonic()
                 word, typed_s = (word if now_s - typed_s < _WORD_S else ""), now_s
                 alone = not word and len(set(letters)) == 1
-                for letter in dict.fromkeys(letters):
-                    key = _KEYS.get(letter)
-                    if key is not None and letter not in word and (alone or key in _ALWAYS):
-                        self._keys.append(key)
-                word += letters
+                found = [_KEYS[letter] for letter in dict.fromkeys(letters) if letter in _KEYS and letter not in word]
+                found = [key for key in found if alone or key in _ALWAYS]
+                held_down = word and len(set(word + letters)) == 1
+                self._keys += found or ([] if held_down else [Key.OTHER])
+                word += letters or "\x1b"
         except OSError:
             return  # the terminal is gone: the supervisor reports it
         finally:

@@ -41,6 +41,18 @@ def prompt(question: Question) -> str:
     return f"{question.text} [{'/'.join(answer or 'Enter' for answer in question.answers)}] "
 
 
+def not_an_answer(question: Question, typed: str) -> str:
+    """Return why a line is no answer, and what to type; a key of the screen stands for no word that moves an arm."""
+    word = typed.strip()
+    named = [answer for answer in question.answers if answer]
+    if len(question.answers) == 1 and word.lower() == named[0].lower():
+        return f"'{word}' is not {named[0]}: type it in capital letters, or no."
+    other = [f"'{answer}'" for answer in named] + ["Enter"] * ("" in question.answers)
+    choice = " or ".join(filter(None, [", ".join(other[:-1]), other[-1]]))
+    full = [answer for answer in named if word and len(word) < len(answer) and answer.startswith(word.lower())]
+    return f"'{word}' is no answer here: type {full[0] + ' in full' if len(full) == 1 else choice}."
+
+
 def read_line(supervisor: Supervisor, question: Question) -> str:
     """Read one line; raises as `Supervisor.read_line`."""
     return supervisor.read_line(
@@ -96,7 +108,7 @@ class JsonOperator(_Keyless):
             typed = read_line(self.supervisor, question)
             if (answer := match(question, typed)) is not None:
                 return answer
-            error = f"'{typed.strip()}' is none of the answers"
+            error = not_an_answer(question, typed)
 
     def _write(self, value: Mapping[str, Any]) -> None:
         line = json.dumps(value, allow_nan=False) + "\n"
@@ -156,7 +168,7 @@ class PlainOperator(_Keyless):
                 self._write(typed)
             if (answer := match(question, typed)) is not None:
                 return answer
-            self._write(f"'{typed.strip()}' is none of the answers.\n")
+            self._write(not_an_answer(question, typed) + "\n")
 
     def finish(self) -> None:
         """Write the checks that wait for others on their line."""

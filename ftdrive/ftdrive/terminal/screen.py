@@ -40,7 +40,7 @@ from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.terminal.command_names import as_typed
 from ftdrive.terminal.console import hanging, messages
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, prompt, read_line
+from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
 from ftdrive.terminal.session_text import SessionText, TextLine, in_words, rms_sigma, sigmas_of
 from ftdrive.terminal.supervisor import Supervisor
@@ -469,7 +469,7 @@ class Screen:
     def _print(self, lines: Sequence[TextLine]) -> None:
         for line in lines:
             head, words = self._view.shown(line.head), self._view.shown(line.words)
-            self._console.print(hanging(head, words, self._console), style=line.style)
+            self._console.print(hanging(head, words, self._console), style=line.style, soft_wrap=True)
 
     def _new_live(self) -> Live:
         return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
@@ -491,7 +491,7 @@ class Screen:
             used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
             if (answer := match(question, typed)) is not None:
                 break
-            other = Text(self._view.shown(f"'{typed.strip()}' is none of the answers."))
+            other = Text(self._view.shown(not_an_answer(question, typed)))
             self._console.print(other, crop=True, no_wrap=True)
             used += 1
         self._console.file.write(f"\x1b[{used}F\x1b[J")

@@ -142,7 +142,7 @@ def head_and_words(event: Event) -> tuple[str, str]:
     match event:
         case RunOpened():
             return "", f"kept in {event.folder}" + (
-                f"; to continue after a stop: {event.resume}" if event.resume else ""
+                f"; after a stop, continue with\n{event.resume}" * bool(event.resume)
             )
         case StateChanged(state=State.HOLD):  # repeats the words of STOP
             return "", f"{event.state.upper()}: {event.words}"

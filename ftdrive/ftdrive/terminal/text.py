@@ -8,7 +8,7 @@ from typing import IO, Final
 
 import click
 
-from ftdrive.terminal.command_names import as_typed
+from ftdrive.terminal.command_names import as_typed, is_command
 
 _CONTROL = re.compile(
     "[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]|\r(?!\n)"
@@ -52,7 +52,7 @@ def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
         replace_whitespace=False,
     )
     return "\n".join(
-        fold.fill(line) + line[len(line.rstrip()) :]
+        line if is_command(line.strip()) else fold.fill(line) + line[len(line.rstrip()) :]
         for line in text.split("\n")  # a prompt ends with a space
     )
 

@@ -27,9 +27,8 @@ def test_the_arm_stands_until_it_leaves_and_may_return_to_where_it_came_from() -
 def test_a_skipped_first_pose_takes_its_return_along_and_a_redo_brings_it_back() -> None:
     now = begun()
     assert (now.skip(), now.todo, now.skipped) == ([1, 7], [2, 3, 4, 5, 6], {0})
-    now.again = True
     now.redo(1)
-    assert (now.todo[0], now.skipped, now.again) == (1, set(), False)
+    assert (now.todo[0], now.skipped) == (1, set())
 
 
 def test_a_move_counts_as_driven_only_along_the_plan() -> None:

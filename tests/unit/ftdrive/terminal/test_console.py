@@ -75,6 +75,14 @@ def test_what_is_longer_than_the_terminal_goes_on_under_its_first_word(width: in
     assert hanging("head: ", words, Console(width=width, soft_wrap=True)).plain == f"head: {words}"  # a file
 
 
+def test_a_line_that_is_a_command_is_never_broken() -> None:
+    console = Console(width=40, file=io.StringIO(), color_system=None)
+    command = "ftdrive calibrate --resume /home/operator/cells/left/runs/2026-11-28T040528Z-calibrate"
+    console.print(hanging("   ", f"kept in a folder; after a stop, continue with\n{command}", console), soft_wrap=True)
+    assert isinstance(console.file, io.StringIO)
+    assert command in console.file.getvalue()
+
+
 def test_findings_of_doctor_and_their_cures_are_indented(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

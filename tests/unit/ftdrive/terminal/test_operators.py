@@ -29,7 +29,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.operator import Operator, Question
-from ftdrive.terminal.operators import JsonOperator, PlainOperator, match
+from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer
 from ftdrive.terminal.text import in_whole_words
 
 FREE = Question("Is the tool free?", assumed="yes")
@@ -272,3 +272,18 @@ def test_a_terminal_that_cannot_discard_early_answers_gives_none(monkeypatch: py
         PlainOperator(stdin=typed, stderr=io.StringIO()).ask(Question("Type MOVE", ("MOVE",)))
     assert typed.tell() == 0
     assert exit_code(error.value) == 2
+
+
+@pytest.mark.parametrize(
+    ("answers", "typed", "advice"),
+    [
+        (("resume", "skip", "back", "quit"), "s", "type skip in full"),
+        (("resume", "skip", "back", "quit"), "r", "type resume in full"),
+        (("resume", "skip", "back", "quit"), "go", "type 'resume', 'skip', 'back' or 'quit'"),
+        (("MOVE",), "move", "type it in capital letters"),
+        (("MOVE",), "yes", "type 'MOVE'"),
+        (("", "s", "r", "q"), "x", "type 's', 'r', 'q' or Enter"),
+    ],
+)
+def test_what_is_no_answer_is_said_with_what_would_be(answers: tuple[str, ...], typed: str, advice: str) -> None:
+    assert advice in not_an_answer(Question("?", answers), typed)

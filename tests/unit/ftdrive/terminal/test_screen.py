@@ -296,7 +296,7 @@ class Shown:
             pass  # the terminal was closed
 
 
-def test_keys_arrive_without_enter_and_escapes_and_letters_without_meaning_do_not(
+def test_keys_arrive_without_enter_and_all_others_as_another_key(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("ftdrive.terminal.keyboard._WORD_S", 0.0)
@@ -305,8 +305,18 @@ def test_keys_arrive_without_enter_and_escapes_and_letters_without_meaning_do_no
             os.write(person, bytes([letter]))
             eventually(lambda: keyboard.waiting)
             assert keyboard.pressed() is key
-        for noise in (b"\x1bOS", b"\x1bOq", b"\x1b[15;2~", b"\x1b[A", b"xyz1 "):  # F4, keypad 1, shift-F5, up
-            os.write(person, noise)
+        # F4, keypad 1, shift-F5, up, escape; Space, Enter, Ctrl-D, Ctrl-Z, Ctrl-\, Ctrl-S, Ctrl-Q; letters
+        for other in (
+            b"\x1bOS",
+            b"\x1bOq",
+            b"\x1b[15;2~",
+            b"\x1b[A",
+            b"\x1b",
+            *(b" \n\x04\x1a\x1c\x13\x11x1"[i : i + 1] for i in range(9)),
+        ):
+            os.write(person, other)
+            eventually(lambda: keyboard.waiting)
+            assert keyboard.pressed() is Key.OTHER
         os.write(person, b"Q")
         eventually(lambda: keyboard.waiting)
         assert keyboard.waiting == (Key.STOP,)
@@ -315,14 +325,15 @@ def test_keys_arrive_without_enter_and_escapes_and_letters_without_meaning_do_no
 @pytest.mark.parametrize(
     ("strokes", "heard"),
     [
-        (("y", "e", "s"), []),
-        (("yes\n",), []),
-        (("s\n",), []),
-        (("\n", "s"), []),
-        (("rs",), []),
+        (("y", "e", "s"), [Key.OTHER] * 3),
+        (("yes\n",), [Key.OTHER]),
+        (("s\n",), [Key.OTHER]),
+        (("\n", "s"), [Key.OTHER] * 2),
+        (("rs",), [Key.OTHER]),
         (("s", "s", "s"), [Key.SKIP]),  # held down
+        ((" ", " "), [Key.OTHER]),
         (("p", "p"), [Key.PAUSE]),
-        (("s", "k", "i", "p"), [Key.SKIP, Key.PAUSE]),  # the first came alone
+        (("s", "k", "i", "p"), [Key.SKIP, Key.OTHER, Key.OTHER, Key.PAUSE]),  # the first came alone
         (("resume, please\n",), [Key.PAUSE]),
     ],
 )
@@ -411,7 +422,7 @@ def test_the_screen_draws_asks_and_goes_on() -> None:
             eventually(lambda: "Go? Type MOVE: " in shown.text)
             assert termios.tcgetattr(program)[3] & termios.ECHO
             os.write(person, b"move\n")
-            eventually(lambda: "'move' is none of the answers" in shown.text)
+            eventually(lambda: "'move' is not MOVE: type it in capital letters" in shown.text)
             os.write(person, b"MOVE\n")
             asking.join(10)
             assert answers == ["MOVE"]
