@@ -88,7 +88,7 @@ def history(
     _print_table([_row(one, last.get(one.id), now) for one in results])
     trend_lines = (f"trend: {drift}" for drift in found)
     warmth_lines = (line for one in warmth for line in one.lines())
-    weighing_lines = (f"last weighing: {_weighing_in_words(one)}" for one in weighed)
+    weighing_lines = (f"last weighing: {_weighing_in_words(one)}" for one in weighed if one.mass_kg is not None)
     for line in (*trend_lines, *warmth_lines, *weighing_lines):
         echo(line)
     if advice:

@@ -316,11 +316,13 @@ class StreamInfo:
     """Id, verdict, marks, age and last verification of the calibration, when the stream was opened; for people."""
     emulated: bool = False
     """Whether arm and sensor are emulated."""
+    foreign: bool = False
+    """Whether the calibration is of another arm, sensor or mount, and was applied all the same."""
 
     @property
     def marks(self) -> tuple[str, ...]:
         """What every output says of the cell and the calibration, see `ftdrive.runs.verification.MARKS`."""
-        return marks_of(self.calibration, emulated=self.emulated)
+        return marks_of(self.calibration, emulated=self.emulated, foreign=self.foreign)
 
 
 @dataclass(frozen=True, slots=True)

@@ -105,6 +105,7 @@ class CompensatedStream(ProcessedStream):
         self._name = name
         self._force = force
         self._begin = frame, stages, false_alarm_rate
+        self._foreign = False
         self.block_s = 0.003
         """A block has the samples of so long, because it costs about the same with one sample as with many. May be set
         at any time: longer blocks arrive later and take less of the processor."""
@@ -185,6 +186,7 @@ class CompensatedStream(ProcessedStream):
         belongs = belonging(calibration, {"arm": arm, "sensor": sensor}, mount)
         if belongs.others and not self._force:
             raise ConfigError(f"{belongs.others[0]}: calibrate this cell, or apply it all the same with --force")
+        self._foreign = bool(belongs.others)
         return calibration, name, (*warnings, *belongs.others, *belongs.unknown), temperature
 
     def _described(
@@ -208,6 +210,7 @@ class CompensatedStream(ProcessedStream):
             verification=verification,
             calibration_state=state,
             emulated=self.cell.is_emulated,
+            foreign=self._foreign,
         )
 
     def _trusted(self) -> tuple[VerificationRecord | None, str]:
@@ -215,7 +218,7 @@ class CompensatedStream(ProcessedStream):
         path = Path(self._name)
         known = path.name and path.exists()
         verification = verification_near(path, self._calibration.id) if known else None
-        marks = marks_of(self._calibration, emulated=self.cell.is_emulated)
+        marks = marks_of(self._calibration, emulated=self.cell.is_emulated, foreign=self._foreign)
         return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC), marks)
 
     def use_tool(self, name: str) -> StreamEvent:

@@ -138,7 +138,8 @@ class Header:
         """Build from the content of a file; unknown fields are ignored. Raises `BadRecording`."""
         check_format(document, FORMAT, BadRecording)
         try:
-            values = {item.name: document[item.name] for item in fields(StreamInfo)}
+            newer = {"foreign": False}  # fields that files of earlier versions lack
+            values = {item.name: {**newer, **document}[item.name] for item in fields(StreamInfo)}
             values |= {name: np.array(values[name], np.float64) for name in _ARRAYS}
             values |= {"arm": _device(values["arm"]), "sensor": _device(values["sensor"])}
             values["calibration"] = CalibrationResult.from_dict(values["calibration"])

@@ -21,9 +21,11 @@ FORMAT: Final = "ftdrive.verification/1"
 
 EMULATED: Final = "EMULATED"
 EDITED: Final = "EDITED BY HAND"
+FOREIGN: Final = "OF ANOTHER CELL"
 MARKS: Final[Mapping[str, str]] = {
     EMULATED: "The cell was EMULATED: these are not the values of a real tool.",
     EDITED: "The file was EDITED BY HAND after it was solved: its verdict and its sigmas are not those of its numbers.",
+    FOREIGN: "The calibration is OF ANOTHER CELL: arm, sensor or mounting differ, and --force applies it all the same.",
 }
 """What every output says of some calibrations: a mark, and its meaning in a sentence."""
 
@@ -155,11 +157,12 @@ def age_of(calibration: "CalibrationResult", now: datetime) -> list[str]:
     return [f"{age_in_words(now - datetime.fromisoformat(created))} old"] if isinstance(created, str) else []
 
 
-def marks_of(calibration: "CalibrationResult", *, emulated: bool = False) -> tuple[str, ...]:
-    """Return the `MARKS` of a calibration; `emulated` says that what it is applied to is emulated anyhow."""
+def marks_of(calibration: "CalibrationResult", *, emulated: bool = False, foreign: bool = False) -> tuple[str, ...]:
+    """Return the `MARKS` of a calibration; `emulated` and `foreign` say so of what it is applied to."""
     found = {
         EMULATED: emulated or calibration.provenance.get("station") is not None,
         EDITED: calibration.is_edited,
+        FOREIGN: foreign,
     }
     return tuple(mark for mark, applies in found.items() if applies)
 

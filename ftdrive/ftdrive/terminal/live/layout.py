@@ -54,8 +54,9 @@ def _narrow(view: View, width: int, rows: int) -> list[Line]:
     if rows - len(body) >= 3 * _LEAST_PLOT_ROWS + 10:
         plot_rows = min(7, (rows - len(body) - 10) // 3)
         body += _plots(view, width, 3 * plot_rows, across=2)
-    if rows - len(body) >= 8:
-        body += [separator, *panels.links(view, width)]
+    links = [separator, *panels.links(view, width)]
+    if rows - len(body) - len(links) - 1 >= max(1, panels.newest_rows(view, width)):  # a refusal is read to its end
+        body += links
     if rows - len(body) >= 20:
         body += [separator, *panels.identity(view, width)]
     left = rows - len(body) - 1

@@ -16,7 +16,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.following import in_words
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
-from ftdrive.runs.verification_record import age_in_words
+from ftdrive.runs.verification_record import EMULATED, age_in_words
 from ftdrive.terminal.live import braille
 from ftdrive.terminal.live.braille import Codes
 from ftdrive.terminal.live.history import Columns
@@ -29,6 +29,7 @@ from ftdrive.terminal.live.view import (
     TRACE,
     WARNING,
     Line,
+    Note,
     Part,
     Reading,
     Replay,
@@ -125,7 +126,8 @@ def state(view: View, width: int) -> Line:
     calibration, status = view.info.calibration, view.status
     line = Line(" cal ")
     line.add(calibration.id[:6]).add(" ")
-    line.add(calibration.verdict.upper(), GOOD if calibration.verdict == "good" else WARNING)
+    trusted = calibration.verdict == "good" and not set(view.info.marks) - {EMULATED}
+    line.add(calibration.verdict.upper(), GOOD if trusted else WARNING)
     line.add(_age(view)).add(", ").add(*_verified(view))
     if status.tare is not None and status.tare_t_host_ns is not None:
         force_N = float(np.linalg.norm(status.tare[:3]))
@@ -509,16 +511,25 @@ def events(view: View, width: int, rows: int) -> list[Line]:
     for note in view.notes:
         if len(lines) > rows:
             break
-        head = Line(" ")
-        if note.t_host_ns is not None:
-            head.add(f"{_time_of_day(view.info, note.t_host_ns)} ", FAINT)
-        text = note.text if note.times == 1 else f"{note.text} ({note.times} times)"
-        item = _hanging(head, [Part(text, note.style)], width)
+        item = _event(view, note, width)
         if rows <= 3 and lines and lines[-1].width + item[0].width + 3 <= width and len(item) == 1:
             lines[-1].add("   ").join(item[0])
         else:
             lines += item
     return [line.fit(width) for line in [*lines, *[Line()] * rows][:rows]]
+
+
+def newest_rows(view: View, width: int) -> int:
+    """Return how many lines the newest event takes."""
+    return next((len(_event(view, note, width)) for note in view.notes), 0)
+
+
+def _event(view: View, note: Note, width: int) -> list[Line]:
+    head = Line(" ")
+    if note.t_host_ns is not None:
+        head.add(f"{_time_of_day(view.info, note.t_host_ns)} ", FAINT)
+    text = note.text if note.times == 1 else f"{note.text} ({note.times} times)"
+    return _hanging(head, [Part(text, note.style)], width)
 
 
 def _hanging(head: Line, words: Sequence[Part], width: int) -> list[Line]:
