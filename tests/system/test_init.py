@@ -2,10 +2,13 @@
 
 import json
 import re
+import shlex
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
@@ -71,6 +74,31 @@ def test_a_script_needs_no_questions(station: Station) -> None:
     assert (cell.tool.name, cell.tool.mass_kg, cell.workcell.mounting) == ("gripper", 1.2, "12.5")
     assert cell.workcell.planes_mm == ((-1, 0, 0, -900),)
     assert cell.workcell.boxes_mm == ((500, 500, 0, 900, 900, 90),)
+
+
+@pytest.mark.parametrize("signal", ["end of input", "Ctrl-C"])
+def test_answers_are_kept_in_a_command_that_goes_on(
+    station: Station, monkeypatch: pytest.MonkeyPatch, signal: str
+) -> None:
+    """After Ctrl-D or Ctrl-C nothing has to be typed twice."""
+    if signal == "Ctrl-C":
+        prompt = click.prompt
+
+        def until_the_tool(text: str, **options: Any) -> Any:
+            if text.startswith("First cylinder"):
+                raise click.Abort
+            return prompt(text, **options)
+
+        monkeypatch.setattr(click, "prompt", until_the_tool)
+    typed = f"{station.cell.robot.host}\n{serial_port(station)}\n33\n\ngripper left\n"
+    outcome = run("-o", "left.toml", typed=typed)
+    assert isinstance(outcome.exception, ConfigError if signal == "end of input" else SystemExit)
+    text = str(outcome.exception) if signal == "end of input" else outcome.output
+    command = next(line.strip() for line in text.splitlines() if "ftdrive init" in line)
+    assert shlex.split(command) == [
+        *("ftdrive", "init", "-o", "left.toml", "--robot", station.cell.robot.host),
+        *("--sensor", f"ati-serial://{serial_port(station)}", "--height", "33", "--tool-name", "gripper left"),
+    ]
 
 
 def test_an_arm_without_a_measured_shape_is_reported(addresses: list[str], monkeypatch: pytest.MonkeyPatch) -> None:

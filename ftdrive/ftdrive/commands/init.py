@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from typing import Any, TypeVar
 
 import click
@@ -18,6 +19,8 @@ T = TypeVar("T")
 Judge = Callable[[Any], None]
 """Raises `ConfigError` for rows of an answer."""
 
+_ROWS = ("--tool", "--plane", "--box")
+"""Options that may be repeated."""
 _SILENT = "did not answer when this was written"
 
 
@@ -112,6 +115,8 @@ def init(
             station = stack.enter_context(Station(emulated, ["--time-scale", "1"]))
             robot, sensor, clock = station.cell.robot.host, station.cell.sensor.url, station.clock
         ask = Questions(yes, defaults)
+        ask.command += "" if str(output) == "ftdrive.toml" else f" -o {quote(str(output))}"
+        ask.command += " --simulate" * simulate
         host, model, robot_words = _robot(ask, robot, model, clock)
         if model is not None and model_named(model, controller_major=0) not in SHAPES:
             _say(f"the {model} has no measured shape, so no motion can be planned: use calibrate --manual", "  ! ")
@@ -188,6 +193,14 @@ class Questions:
 
     def __init__(self, yes: bool, defaults: Mapping[str, Any]) -> None:
         self.interactive, self.defaults = not yes, defaults
+        self.command = "ftdrive init"
+        self.answers: dict[str, list[str]] = {}
+        """By option, so that a command can repeat them."""
+
+    def to_continue(self) -> str:
+        """Return the command that goes on after these answers."""
+        given = (f"{option} {quote(one)}" for option, answers in self.answers.items() for one in answers)
+        return " ".join([self.command, *given])
 
     def ask(self, words: str, key: str, given: str | None, usual: str | None, read: Callable[[str], T]) -> T:
         """Return the option or the answer; `usual` is the answer of Enter and --yes, None where there is none."""
@@ -201,7 +214,9 @@ class Questions:
                 raise ConfigError(f"{option} is missing and has no default: {words[0].lower()}{words[1:]}")
             given = usual
         if given is not None:
-            return read(given)
+            value = read(given)
+            self._keep(option, given)
+            return value
         while True:
             shown = in_whole_words(f"{words} [{usual}]: " if usual else f"{words}: ", sys.stderr)
             try:
@@ -209,12 +224,23 @@ class Questions:
             except click.Abort as abort:
                 echo(err=True)  # the next message begins a line
                 if isinstance(abort.__context__, EOFError):
-                    raise ConfigError(f"the input ended before an answer: give {option}, or use a terminal") from abort
+                    raise ConfigError(
+                        f"the input ended before {option} was given; the answers so far are kept in this command:\n"
+                        f"{self.to_continue()}"
+                    ) from abort
+                _say(f"The answers so far are kept in this command:\n{self.to_continue()}", "  ! ")
                 raise
             try:
-                return read(answer)
+                value = read(answer)
             except ConfigError as error:
                 _say(str(error), "  ✘ ")
+                continue
+            self._keep(option, answer)
+            return value
+
+    def _keep(self, option: str, answer: str) -> None:
+        if answer:
+            self.answers[option] = [*self.answers.get(option, []), answer] if option in _ROWS else [answer]
 
     def text(self, words: str, key: str, given: str | None, usual: str | None = None) -> str:
         """Ask for a text; Enter takes `usual`, else the value in force."""
@@ -260,6 +286,7 @@ class Questions:
         if given:
             found += map(read, given)
             whole(tuple(found))
+            self.answers[RULES[key].option] = list(given)
             return tuple(found)
         if not (self.interactive or needed):
             return ()
@@ -337,10 +364,11 @@ def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
             text = ask.text(f"Another address{keep}", "sensor.url", None, failed)
             continue
         _say(f"{url}: {report}", "  ✔ ")
+        ask.answers["--sensor"] = [url]  # not the number of a place in a list
         return url, report
 
 
 def _say(words: str, head: str = "") -> None:
     from ftdrive.terminal.console import hanging, messages
 
-    messages.print(hanging(head, words))
+    messages.print(hanging(head, words), soft_wrap=True)
