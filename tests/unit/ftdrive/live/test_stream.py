@@ -20,6 +20,7 @@ from ftdrive.live.contact import Contact
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.source import read_calibration
+from ftdrive.runs.verification_record import FOREIGN
 from ftdrive.store import tools as named_tools
 from ftdrive.store.tools import Tool
 from ftdrivers.errors import DeviceError, DeviceTimeout
@@ -214,6 +215,7 @@ def test_a_calibration_of_another_sensor_or_mount_is_applied_if_forced(cell: Cel
     with cell.stream(force=True) as stream:
         assert len(stream.read())
     assert "the sensor S2" in stream.warnings[0]
+    assert FOREIGN in stream.info.marks
     assert "[sensor] mount = 'adapter-a', but no [sensor] mount is configured" in stream.warnings[1]
     cell.calibration = replace(cell.calibration, provenance={"setup": {"mount": "adapter-a"}})
     with pytest.raises(ConfigError, match=r"adapter-a.*--force"), cell.stream():

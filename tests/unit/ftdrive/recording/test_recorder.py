@@ -197,6 +197,11 @@ def test_a_file_of_another_kind_is_named_with_its_fault(content: str, words: str
         read_recording(path)
 
 
+def test_a_header_of_an_earlier_version_has_no_mark_of_another_cell() -> None:
+    document = {name: value for name, value in Header(info(), BASE_TCP, USUAL).to_dict().items() if name != "foreign"}
+    assert Header.from_dict(document).info.foreign is False
+
+
 def test_a_newer_version_is_refused() -> None:
     document = Header(info(), BASE_TCP, USUAL).to_dict() | {"format": "ftdrive.recording/2"}
     with pytest.raises(BadRecording, match="use a newer program"):

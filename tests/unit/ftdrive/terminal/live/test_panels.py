@@ -7,9 +7,11 @@ import pytest
 
 from ftcalib.model import Array
 from ftdrive.live.samples import Stages, WrenchFrame
+from ftdrive.runs.verification_record import FOREIGN
 from ftdrive.terminal.live import panels
+from ftdrive.terminal.live.layout import frame
 from ftdrive.terminal.live.panels import line_of_force, others, sphere
-from ftdrive.terminal.live.view import Line, View
+from ftdrive.terminal.live.view import BAD, GOOD, WARNING, Line, Note, View
 from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, SIGMA, TARE, FakeStream
 from tests.unit.ftdrive.terminal.live.test_summary import Rig, reading_of
 
@@ -106,3 +108,20 @@ def test_what_is_left_in_the_wrench_is_named(stages: Stages, words: str, view: V
     reading = replace(reading_of(view), stages=stages, frame=WrenchFrame("flange", (0.0, 0.01, -0.15)))
     line = text(panels.provenance(replace(view, reading=reading), 120))
     assert line.rstrip().endswith(f"{words}, flange @ (0,10,-150) mm")
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_calibration_of_another_cell_is_marked_in_the_header_and_not_green(view: View, width: int) -> None:
+    foreign = replace(view, info=replace(view.info, foreign=True, emulated=True))
+    assert FOREIGN in text(panels.title(foreign, width))
+    styles = {part.text: part.style for part in panels.state(foreign, width).parts}
+    assert styles["GOOD"] == WARNING
+    assert {part.text: part.style for part in panels.state(view, width).parts}["GOOD"] == GOOD
+
+
+def test_a_refusal_is_read_to_its_end_on_a_low_screen(view: View) -> None:
+    words = "tare refused: the reading differs from a free tool by 1.52 N, more than noise, calibration and a usual "
+    words += "drift explain (test value 31, limit 22.5); take hand or contact away, or calibrate again"
+    refused = replace(view, notes=[Note(None, words, BAD), *view.notes])
+    shown = " ".join(text(line).strip() for line in frame(refused, 80, 24))
+    assert words in " ".join(shown.split())
