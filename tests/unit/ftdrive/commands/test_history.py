@@ -102,9 +102,6 @@ def test_the_last_weighing_of_each_tool_is_a_line_and_days_are_a_table(run: Call
         file = WeighingsFile.of(user_folder() / FOLDER, {"tool": "gripper", "arm_serial": "arm-1"}, day)
         part = {"t_utc": f"{day}T10:15:00+00:00", "is_something": True, "mass_sigma_kg": 1e-3, "mass_kg": 0.2 + n / 1e3}
         file.append([part, {"refused": "cable"}, {"refused": "cable"}])
-    WeighingsFile.of(user_folder() / FOLDER, {"tool": "welder", "arm_serial": "arm-1"}, days[-1]).append(
-        [{"refused": "cable"}]
-    )
     run("history", "--index", user_folder() / FOLDER)
     (line,) = [one for one in run("history")[1].splitlines() if one.startswith("last weighing: ")]
     assert line == f"last weighing: gripper, {days[-1]} 10:15: 0.2270 ± 0.0010 kg; 1 part, 2 refused on this day"
@@ -117,6 +114,15 @@ def test_the_last_weighing_of_each_tool_is_a_line_and_days_are_a_table(run: Call
     assert found[-1]["refusals"]["cable"] == 2
     assert json.loads(run("history", "--json")[1])["last_weighings"][0]["mass_kg"] == 0.227
     assert run("history", runs, "--weighings")[0] == 2
+
+
+def test_a_day_without_a_weighing_has_no_line(run: Callable[..., Ran], runs: Path) -> None:
+    run("history", "--index", runs)
+    day = datetime.now(UTC).date().isoformat()
+    WeighingsFile.of(user_folder() / FOLDER, {"tool": "welder", "arm_serial": "1"}, day).append([{"refused": "cable"}])
+    run("history", "--index", user_folder() / FOLDER)
+    assert len(json.loads(run("history", "--json")[1])["last_weighings"]) == 1
+    assert "last weighing" not in run("history")[1]
 
 
 def test_rebuilt_a_deleted_run_is_gone_and_a_damaged_one_is_named(run: Callable[..., Ran], runs: Path) -> None:
