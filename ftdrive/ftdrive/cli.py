@@ -10,13 +10,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from errno import ENOSPC
 from io import StringIO
+from types import FrameType
 from typing import Any
 
 import click
 
 from ftcalib.errors import DeviceError
 from ftdrive import __version__
-from ftdrive.errors import exit_code
+from ftdrive.errors import SupervisorGone, exit_code
 from ftdrive.terminal.command_names import COMMANDS
 from ftdrive.terminal.text import echo
 
@@ -29,6 +30,8 @@ Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device
 
 _CLOSED_PIPE = 128 + 13
 """As a shell reports a program that SIGPIPE ended."""
+_closed_terminals: list[int] = []
+"""Signals of a terminal that was closed; whatever fails after one is its consequence."""
 
 
 @contextmanager
@@ -115,13 +118,19 @@ def main() -> int:
     """Run the command line; return the exit code."""
     # Ctrl-C, `kill` and a terminal that closes all end a command the same way: the arm is stopped first. Set even where
     # they are inherited as ignored, as in a job in the background; but `nohup` means that the terminal may close.
-    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-        if hasattr(signal, name) and not (name == "SIGHUP" and signal.getsignal(signal.SIGHUP) == signal.SIG_IGN):
-            signal.signal(getattr(signal, name), signal.default_int_handler)
+    for name in ("SIGINT", "SIGTERM"):
+        signal.signal(getattr(signal, name), signal.default_int_handler)
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, _hang_up)
     _open_closed_streams()
     code = run(sys.argv[1:])
     is_dead = _leave_dead_streams()
     return _CLOSED_PIPE if is_dead and code == 0 else code
+
+
+def _hang_up(number: int, frame: FrameType | None) -> None:
+    _closed_terminals.append(number)
+    signal.default_int_handler(number, frame)
 
 
 def _leave_dead_streams() -> bool:
@@ -150,6 +159,19 @@ def _open_closed_streams() -> None:
 def run(arguments: Sequence[str]) -> int:
     """Run one command line without the program's name; errors are printed, the exit code is returned."""
     try:
+        code = _run(arguments)
+    except Exception:
+        if not _closed_terminals:
+            raise
+        code = 1
+    if _closed_terminals:  # which is the cause of any other error
+        _say("error: the terminal was closed")
+        return exit_code(SupervisorGone("")) or code
+    return code
+
+
+def _run(arguments: Sequence[str]) -> int:
+    try:
         return int(cli.main(list(arguments), prog_name="ftdrive", standalone_mode=False) or 0)
     except click.ClickException as error:
         error.show(message := StringIO())
@@ -160,7 +182,7 @@ def run(arguments: Sequence[str]) -> int:
         return 130
     except Exception as error:
         code = exit_code(error)
-        if code is None:
+        if code is None or _closed_terminals:
             raise
         _say(f"error: {in_a_sentence(error)}")
         return code

@@ -5,15 +5,17 @@ lines, and only the lines that changed are sent to the terminal.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import ClassVar, TypeVar, get_args
+from typing import Any, ClassVar, TypeVar, cast, get_args
 
 from rich.segment import Segment
 from rich.style import Style
 from textual import events
 from textual.app import App, ComposeResult
+from textual.drivers.linux_driver import LinuxDriver
 from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
@@ -106,6 +108,31 @@ def run_live(
         raise feed.failure
 
 
+class ClosableDriver(LinuxDriver):
+    """Draws on a terminal that may be closed: the thread of Textual that writes would end, and its queue then block."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._file = cast("Any", _UntilClosed(self._file))
+
+
+class _UntilClosed:
+    """A file that ignores errors of writing."""
+
+    def __init__(self, file: Any) -> None:
+        self.file, self.fileno = file, file.fileno
+
+    def write(self, text: str) -> None:
+        """Write."""
+        with suppress(OSError):
+            self.file.write(text)
+
+    def flush(self) -> None:
+        """Flush."""
+        with suppress(OSError):
+            self.file.flush()
+
+
 class Canvas(Widget):
     """Shows lines; only those that changed are drawn again."""
 
@@ -146,7 +173,7 @@ class LiveApp(App[None]):
     TITLE = "ftdrive live"
 
     def __init__(self, feed: Feed, summary: Summary) -> None:
-        super().__init__(ansi_color=True)  # the terminal's own colours, light or dark
+        super().__init__(ClosableDriver, ansi_color=True)  # the terminal's own colours, light or dark
         self.theme = "ansi-dark"
         self._feed, self._summary = feed, summary
         self._canvas = Canvas()

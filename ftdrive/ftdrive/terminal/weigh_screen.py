@@ -9,6 +9,7 @@ from textual.widgets import Digits, Static
 from ftcalib.extras.weighing import Weight
 from ftcalib.rounding import counted, to_place_of
 from ftdrive.errors import NotAccepted
+from ftdrive.terminal.live_screen import ClosableDriver
 from ftdrive.terminal.weighing import Shown, Weighing, line_of
 
 _REFRESH_S = 0.1
@@ -68,7 +69,7 @@ class WeighApp(App[None]):
     ]
 
     def __init__(self, weighing: Weighing) -> None:
-        super().__init__()
+        super().__init__(ClosableDriver)
         self._weighing = weighing
         self.reader = _Reader(weighing)
 

@@ -1,9 +1,21 @@
 """Commands whose caller has closed a standard stream, as some supervisors do."""
 
+import errno
+import os
+import pty
+import select
+import shutil
+import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
+
+from ftdrive import cli
+from ftdrive.recording.files import read_recording
+from tests.unit.ftdrive.recorded import calibration
 
 
 @pytest.mark.slow
@@ -17,3 +29,62 @@ def test_a_closed_stream_is_no_traceback_and_no_file_gets_its_number(closed: str
         )
         assert ended.returncode == code
         assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize(
+    "left", [None, KeyboardInterrupt(), OSError(errno.EIO, "Input/output error"), RuntimeError("of a screen")]
+)
+def test_whatever_a_closed_terminal_leaves_behind_is_exit_code_9(
+    left: BaseException | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A command that ends well, one that is interrupted, one that cannot write, and a screen that breaks."""
+
+    def command(*_: object, **__: object) -> int:
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGHUP)
+        if left is not None:
+            raise left
+        return 0
+
+    monkeypatch.setattr(cli, "_closed_terminals", [])
+    monkeypatch.setattr(cli.cli, "main", command)
+    monkeypatch.setattr(sys, "argv", ["ftdrive", "live"])
+    before = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        assert cli.main() == 9
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
+    assert capsys.readouterr().err.removeprefix("interrupted\n") == "error: the terminal was closed\n"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("setsid") is None, reason="setsid of util-linux gives a process its terminal")
+@pytest.mark.parametrize(
+    "command", ["record -o a.mcap", "stream --port 0", "serve-load", "live", "live --plain", "weigh"]
+)
+def test_a_closed_terminal_ends_each_command_of_the_stream_well(command: str, tmp_path: Path) -> None:
+    calibration().save(tmp_path / "calibration.json")
+    options = ["--simulate", "--force", "--calibration", "calibration.json"]
+    terminal, slave = pty.openpty()
+    process = subprocess.Popen(
+        ["setsid", "--ctty", sys.executable, "-m", "ftdrive", *command.split(), *options],
+        **dict.fromkeys(("stdin", "stdout", "stderr"), slave),
+        cwd=tmp_path,
+    )
+    os.close(slave)
+    shown, ready = "", {"record": " s, ", "serve-load": "registers", "stream": "Ctrl-C"}
+    deadline_s = time.monotonic() + 60
+    try:
+        while ready.get(command.split(maxsplit=1)[0], "\x1b[") not in shown:
+            assert time.monotonic() < deadline_s, shown
+            if select.select([terminal], [], [], 0.1)[0]:
+                shown += os.read(terminal, 4096).decode(errors="replace")
+        os.close(terminal)
+        assert process.wait(timeout=60) == 9
+    finally:
+        process.kill()
+        process.wait()
+    assert "Traceback" not in shown
+    if command.startswith("record"):
+        assert read_recording(tmp_path / "a.mcap")
