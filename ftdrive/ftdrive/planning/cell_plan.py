@@ -137,7 +137,7 @@ class _Shoulder:
     """The ball that the shoulder of an arm fills in every posture."""
 
     def __init__(self, name: str) -> None:
-        self._centre_m = np.array([0.0, 0.0, MODELS[name].d1_m])
+        self._centre_m = np.array([0.0, 0.0, MODELS[name].d_m[0]])
         self._radius_m, self._margin_m = SHAPES[name].shoulder_radius_m, Margins().scene_m
 
     def against_plane(self, row: Sequence[float]) -> str:

@@ -111,7 +111,7 @@ class AlongPlan:
         if self.options.mode == "sweep":
             return self.task.plan(certifier, q, self.options.poses)
         with suppress(ConfigError):  # the planner reports it, with what to do
-            q[3:5] = constant_tour(q)[0, 3:5]  # joint 6 keeps its turn: it shows how the cable is wound
+            q[3:5] = constant_tour(q, certifier.arm.kinematics)[0, 3:5]  # joint 6 keeps its turn: it shows how the cable is wound
         return self.task.plan(certifier, q, self.options.poses)
 
     def _kept(self) -> list[PoseRecord]:

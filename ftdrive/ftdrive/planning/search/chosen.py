@@ -180,6 +180,6 @@ def _others(certifier: Certifier, q_now: Array, candidates: Array) -> Array:
     """Postures (k, 3) of joints 1 to 3 that reach the most tool directions."""
     postures = grid(certifier, q_now, POSTURE_STEP_DEG)
     looks = candidates[np.linspace(0, len(candidates) - 1, LOOKS).astype(int)]
-    q = np.array([wrist_inverse(posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)
+    q = np.array([wrist_inverse(certifier.arm.kinematics, posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)
     free = certifier.free(q.reshape(-1, 6)).reshape(q.shape[:3]).any(axis=2)
     return np.asarray(postures[np.argsort(-free.sum(axis=1), kind="stable")][:OTHER_POSTURES])
