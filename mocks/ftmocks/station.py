@@ -13,15 +13,17 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ftmocks import factory_kinematics
 from ftmocks.arrays import Array
 from ftmocks.clock import CellClock
 from ftmocks.imperfections import Imperfections
 from ftmocks.inertia import inertia_tensor
-from ftmocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
+from ftmocks.kinematics import MODELS, Dh, Vector6, rotation, vector3, vector6
 from ftmocks.recording import RecordedArm, RecordedWorld, Recording
 from ftmocks.sensors.catalogue import WRIST, Sensor
 from ftmocks.ur.operator import Operator
@@ -116,6 +118,19 @@ def _recording(options: Namespace) -> Recording | None:
         raise ValueError(f"cannot read the recording: {error}") from None
 
 
+def kinematics_from(options: Namespace) -> Dh:
+    """Return the real arm: drawn from the seed, nominal or from a file, as --kinematics says."""
+    model = options.model or ("UR5" if options.polyscope[0] <= 3 else "UR5e")
+    if options.kinematics == "drawn":
+        return factory_kinematics.drawn(model, options.seed)
+    if options.kinematics == "ideal":
+        return MODELS[model]
+    dh = factory_kinematics.read(Path(options.kinematics))
+    if options.model not in (None, dh.model):
+        raise ValueError(f"--model {options.model}: the arm in {options.kinematics} is a {dh.model}")
+    return dh
+
+
 def start_posture(options: Namespace) -> Vector6:
     """Return joint angles (rad) at power-up: as given, or near the tour's first pose with the wrist off by chance."""
     if options.start_q_deg is not None:
@@ -147,9 +162,8 @@ class Station:
     def __init__(self, options: Namespace, clock: CellClock | None = None) -> None:
         self._options = options
         self._clock = clock or CellClock()
-        options.model = options.model or ("UR5" if options.polyscope[0] <= 3 else "UR5e")
-        nominal = MODELS[options.model]
-        dh = nominal.disturbed(options.seed, 1e-3 * options.dh_noise, 3e-4 * options.dh_noise)
+        dh = kinematics_from(options)
+        options.model = dh.model
         truth = truth_from(options)
         self._recording = recording = _recording(options)
         if recording is None:
@@ -174,6 +188,9 @@ class Station:
             ),
             None if recording is None else RecordedArm(dh, recording),
         )
+        if options.kinematics_message != "true":
+            other = factory_kinematics.drawn(dh.model, options.seed + 1)
+            self.robot.reported_dh = {"none": None, "wrong": other}[options.kinematics_message]
         self._selector = selectors.SelectSelector()  # the only one that waits for less than a millisecond
         self.server = self._listen()
         self._sensors: dict[str, Sensor] = {}
@@ -244,6 +261,7 @@ class Station:
                 **({"api_port": API_PORT} if API_PORT in self.server.ports else {}),
                 "model": self._options.model,
                 "serial_number": self._options.serial_number,
+                "kinematics": {name: getattr(self.world.dh, name) for name in ("theta", "a", "d", "alpha")},
             },
             "sensors": sensors,
             **self._content(),
