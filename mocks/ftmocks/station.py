@@ -21,7 +21,7 @@ import numpy as np
 from ftmocks import factory_kinematics
 from ftmocks.arrays import Array
 from ftmocks.clock import CellClock
-from ftmocks.imperfections import Imperfections
+from ftmocks.imperfections import WRIST_DRIFT_N, Imperfections
 from ftmocks.inertia import inertia_tensor
 from ftmocks.kinematics import MODELS, Dh, Vector6, rotation, vector3, vector6
 from ftmocks.recording import RecordedArm, RecordedWorld, Recording
@@ -61,6 +61,8 @@ VECTORS = {
 def truth_from(options: Namespace) -> Truth:
     """Draw the truth from the seed, then replace every quantity given on the command line."""
     truth = Truth.drawn(options.seed, options.mount)
+    if options.sensor == WRIST:
+        truth = truth.with_wrist_sensor(options.seed)
     if options.recording is not None:  # has its own bias and noise
         nothing = np.zeros(3)
         truth = replace(truth, force_bias_N=nothing, torque_bias_Nm=nothing, noise_force_N=0.0, noise_torque_Nm=0.0)
@@ -79,10 +81,8 @@ def truth_from(options: Namespace) -> Truth:
     changes["sensor_mass_kg"] = _sensor_mass_kg(options)
     if options.noise is not None:
         changes["noise_force_N"], changes["noise_torque_Nm"] = options.noise
-    if options.sensor == WRIST:
-        if options.sensor_rotvec_deg is not None:
-            raise ValueError(f"the axes of {WRIST} are those of the flange: leave --sensor-rotvec-deg out")
-        changes["R_flange_sensor"] = np.eye(3)
+    if options.sensor == WRIST and options.sensor_rotvec_deg is not None:
+        raise ValueError(f"the axes of {WRIST} are those of the flange: leave --sensor-rotvec-deg out")
     return replace(truth, **changes)
 
 
@@ -167,7 +167,8 @@ class Station:
         truth = truth_from(options)
         self._recording = recording = _recording(options)
         if recording is None:
-            imperfections = Imperfections().changed(options.imperfections)
+            usual = Imperfections(wrist_drift_N=WRIST_DRIFT_N) if options.sensor == WRIST else Imperfections()
+            imperfections = usual.changed(options.imperfections)
             self.world = World(truth, dh, start_posture(options), options.seed, self._clock, imperfections)
         else:
             self.world = RecordedWorld(recording, truth, dh, options.seed, self._clock)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ftmocks.arrays import Array
-from ftmocks.imperfections import FRICTION_RAD_S, Ringing, wrist_drift
+from ftmocks.imperfections import FRICTION_RAD_S, Ringing, WarmUp
 from ftmocks.kinematics import (
     ZERO6,
     Dh,
@@ -130,7 +130,7 @@ class Robot:
         self.arm = arm or Arm(world.dh, world.q, imperfections.servo_lag_s)
         self._ringing = Ringing.at_rest(imperfections, world.seed)
         self._joint_noise = np.random.default_rng([world.seed, 9])
-        self._wrist_drift = wrist_drift(imperfections, world.seed, world.now_s)
+        self._wrist_drift = WarmUp(imperfections.wrist_drift_N, world.now_s)
         self.reported_dh: Dh | None = world.dh
         """The kinematics that the primary interface sends; None for none."""
         self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
