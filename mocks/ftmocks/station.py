@@ -356,7 +356,10 @@ class Station:
             "speed_scaling": arm.pace,
             **({} if self._recording is None else {"recording_s": self._recording.at_s(self._clock.now_s())}),
             "true_wrench": self.world.true_wrench().tolist(),
-            "bad_inputs": self.server.rtde.bad_inputs,
+            "bad_inputs": [
+                *self.server.rtde.bad_inputs,
+                *(doubt for event in robot.events for doubt in event.detail.get("doubts", ())),
+            ],
             "t_host_ns": self._clock.now_ns(),
             "events": [event.to_json() for event in robot.events[int(request.get("since", 0)) :]],
         }
