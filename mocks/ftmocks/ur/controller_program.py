@@ -22,6 +22,8 @@ class ControllerProgram:
 
     def __init__(self, name: str) -> None:
         self.name = name
+        self.doubts: list[str] = []
+        """What a controller is reported to reject in its text."""
 
     @property
     def place(self) -> Place:

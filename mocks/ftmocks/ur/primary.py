@@ -27,7 +27,7 @@ import struct
 import zlib
 from collections.abc import Callable, Sequence
 
-from ftmocks.kinematics import MODELS
+from ftmocks.kinematics import MODELS, Dh
 from ftmocks.ur import dashboard
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import JOINT_MODES, JOINT_POWER_OFF, POWERED, SAFETY_BITS, Runtime, SafetyMode
@@ -125,7 +125,9 @@ def state_package(robot: Robot, *, complete: bool = False) -> bytes:
     """Return the robot state; a complete one has kinematics and configuration."""
     parts = {MODE_DATA: _mode_data(robot), JOINT_DATA: _joint_data(robot), CARTESIAN_INFO: _cartesian_info(robot)}
     if complete:
-        parts |= {KINEMATICS_INFO: _kinematics_info(robot), CONFIGURATION_DATA: _configuration_data(robot)}
+        if robot.reported_dh is not None:
+            parts[KINEMATICS_INFO] = _kinematics_info(robot.reported_dh)
+        parts[CONFIGURATION_DATA] = _configuration_data(robot)
     body = b"".join(struct.pack(">IB", 5 + len(part), kind) + part for kind, part in parts.items())
     return struct.pack(">iB", 5 + len(body), ROBOT_STATE) + body
 
@@ -158,10 +160,9 @@ def _cartesian_info(robot: Robot) -> bytes:
     return struct.pack(">12d", *robot.tcp_pose("actual"), *robot.tcp_offset)
 
 
-def _kinematics_info(robot: Robot) -> bytes:
-    dh = robot.arm.dh
+def _kinematics_info(dh: Dh) -> bytes:
     parameters = (dh.theta, dh.a, dh.d, dh.alpha)
-    nominal = dh == MODELS[robot.settings.model]
+    nominal = dh == MODELS[dh.model]
     checksums = [0xFFFFFFFF if nominal else zlib.crc32(_doubles(joint)) for joint in zip(*parameters, strict=True)]
     return struct.pack(">6I", *checksums) + b"".join(map(_doubles, parameters)) + struct.pack(">I", 0)
 

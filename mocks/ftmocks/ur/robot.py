@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ftmocks.arrays import Array
-from ftmocks.imperfections import FRICTION_RAD_S, Ringing, wrist_drift
+from ftmocks.imperfections import FRICTION_RAD_S, Ringing, WarmUp
 from ftmocks.kinematics import (
     ZERO6,
     Dh,
@@ -21,6 +21,7 @@ from ftmocks.kinematics import (
     Vector3,
     Vector6,
     cross,
+    elbow,
     forward,
     jacobian,
     matrix_of,
@@ -73,8 +74,8 @@ class Limits:
             return True
         normal, distance = np.array(self.plane[:3]), self.plane[3]
         flange = forward(self.dh, q)
-        points = (forward(self.dh, q, joints=2), flange, flange @ X_flange_tcp)
-        return all(float(normal @ X[:3, 3]) >= distance for X in points)
+        points = (elbow(self.dh, q), flange[:3, 3], (flange @ X_flange_tcp)[:3, 3])
+        return all(float(normal @ p) >= distance for p in points)
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,9 @@ class Robot:
         self.arm = arm or Arm(world.dh, world.q, imperfections.servo_lag_s)
         self._ringing = Ringing.at_rest(imperfections, world.seed)
         self._joint_noise = np.random.default_rng([world.seed, 9])
-        self._wrist_drift = wrist_drift(imperfections, world.seed, world.now_s)
+        self._wrist_drift = WarmUp(imperfections.wrist_drift_N, world.now_s)
+        self.reported_dh: Dh | None = world.dh
+        """The kinematics that the primary interface sends; None for none."""
         self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
         self.frequency_hz = 125 if settings.polyscope[0] <= 3 else 500
         self.period_s = 1.0 / self.frequency_hz
@@ -162,11 +165,9 @@ class Robot:
         """Text of the popup that a program shows, until the operator closes it."""
         self.wrist_sensor: Callable[[int], Array] | None = None
         """Readings (n, 6) of a wrist sensor with bias and noise; without one `ft_raw_wrench` is exact."""
-        self._physical_s = 0.0
-        self._stopped_at_s = 0.0
+        self._physical_s = self._stopped_at_s = self._watchdog_age_s = 0.0
         self._later: list[tuple[float, Callable[[], object]]] = []
         self._watchdog: tuple[str, float] | None = None
-        self._watchdog_age_s = 0.0
         self._ft_zero = np.zeros(6)
         self._measured: tuple[int, Vector6] | None = None
         self._reading: tuple[int, Vector6] | None = None

@@ -2,6 +2,7 @@
 
 import pytest
 
+from ftmocks.factory_kinematics import drawn
 from ftmocks.kinematics import MODELS
 from ftmocks.ur import primary
 from ftmocks.ur.events import Event
@@ -89,12 +90,21 @@ def test_the_state_of_a_nominal_arm() -> None:
 
 
 def test_a_calibrated_arm_has_its_own_checksums() -> None:
-    dh = MODELS["UR3"].disturbed(1)
+    dh = drawn("UR3", 1)
     settings = RobotSettings(model="UR3", polyscope=(3, 15, 0))
     state = decoded(primary.state_package(Robot(World(Truth.drawn(0), dh, HOME, 0), settings), complete=True))
     assert len(set(state["kinematics"]["checksum"])) == 6
     assert state["kinematics"]["a"] == list(dh.a)
     assert (state["configuration"]["robot_type"], state["configuration"]["sub_type"]) == (3, 1)
+
+
+@pytest.mark.parametrize("what", ["none", "wrong"])
+def test_kinematics_can_be_missing_or_those_of_another_arm(what: str) -> None:
+    robot, other = new_robot(), drawn("UR5e", 2)
+    robot.reported_dh = None if what == "none" else other
+    state = decoded(primary.state_package(robot, complete=True))
+    assert state.get("kinematics", {}).get("d") == (None if what == "none" else list(other.d))
+    assert state["configuration"]["d"] == list(MODELS["UR5e"].d)
 
 
 def test_modes_of_a_held_and_of_a_powerless_arm() -> None:
