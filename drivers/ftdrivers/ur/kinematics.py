@@ -14,9 +14,13 @@ from math import asin, cos, pi, sin, sqrt
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ftdrivers.interfaces import Array
+from ftdrivers.interfaces import Array, DeviceInfo
 
-__all__ = ["MODELS", "Array", "Kinematics", "Pose", "flange_poses", "forward", "model_named"]
+__all__ = ["MODELS", "Array", "Kinematics", "Pose", "flange_poses", "forward", "kinematics_of", "model_named"]
+
+
+_ROUNDED = 1e-9
+_ALPHA_RAD = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,9 +38,19 @@ class Kinematics:
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> "Kinematics":
-        """Build from theta, a, d and alpha of all joints, (24,), in the order of `numbers`."""
-        theta, a, d, alpha = np.asarray(numbers, np.float64).reshape(4, 6).tolist()
-        return cls(tuple(theta), tuple(a), tuple(d), tuple(alpha))
+        """Build from theta, a, d and alpha of all joints, (24,), in the order of `numbers`.
+
+        Raises `ValueError` unless all are finite and the last axis is that of the flange.
+        """
+        theta, a, d, alpha = np.array(numbers, np.float64).reshape(4, 6)
+        if not np.isfinite([theta, a, d, alpha]).all() or max(abs(a[5]), abs(alpha[5])) > _ROUNDED:
+            raise ValueError(f"theta, a, d and alpha are {[*numbers]}: give finite ones, a6 and alpha6 zero.")
+        a[5] = alpha[5] = 0.0
+        for joint, right in enumerate(_ALPHA_RAD):
+            if alpha[joint] * right < 0:  # the same arm, with the x axis of this frame reversed
+                theta[joint : joint + 2] += pi, -pi
+                a[joint], alpha[joint] = -a[joint], -alpha[joint]
+        return cls(*(tuple(values.tolist()) for values in (theta, a, d, alpha)))
 
     @property
     def numbers(self) -> tuple[float, ...]:
@@ -63,7 +77,7 @@ class Kinematics:
 
 def _nominal(d1_m: float, a2_m: float, a3_m: float, d4_m: float, d5_m: float, d6_m: float) -> Kinematics:
     a_m, d_m = (0.0, a2_m, a3_m, 0.0, 0.0, 0.0), (d1_m, 0.0, 0.0, d4_m, d5_m, d6_m)
-    return Kinematics((0.0,) * 6, a_m, d_m, (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0))
+    return Kinematics((0.0,) * 6, a_m, d_m, _ALPHA_RAD)
 
 
 MODELS = {
@@ -123,6 +137,12 @@ def forward(kinematics: Kinematics, q_rad: Sequence[float] | Array) -> Pose:
         R_next = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
         flange = flange @ Pose(R_joint @ R_next, R_joint @ link_m)
     return flange
+
+
+def kinematics_of(info: DeviceInfo) -> Kinematics | None:
+    """Return the kinematics that an arm reports among its facts, or None."""
+    fact = info.facts.get("kinematics")
+    return Kinematics.of(fact.value) if fact is not None and isinstance(fact.value, tuple) else None
 
 
 def model_named(name: str, controller_major: int) -> str | None:

@@ -195,7 +195,7 @@ class ArmModel:
         upper_arm, forearm = s.upper_arm_offset_m * at.lift, s.forearm_offset_m * at.lift_3
         wrist_hub, base = (s.wrist_radius_m - HUB_ROUNDING_M, HUB_ROUNDING_M), np.zeros(at.lift.shape)
         parts = [
-            (base, base + [0.0, 0.0, d1_m], 0.0, s.base_radius_m),
+            (base, base + d1_m * np.eye(3)[2], 0.0, s.base_radius_m),
             (at.shoulder_m, shoulder_end, 0.0, s.shoulder_radius_m),
             _hub(at.lift, shoulder_side),
             (at.shoulder_m + upper_arm, at.elbow_m + upper_arm, 0.0, s.upper_arm_radius_m),

@@ -174,7 +174,7 @@ def _parallel(kinematics: Kinematics) -> tuple[tuple[float, ...], Array]:
     limbs = np.hypot(links[1:3, 0], links[1:3, 1])
     turned = np.arctan2(-links[1:3, 1], -links[1:3, 0])  # a2 and a3 are negative
     lengths = (links[0, 2], -limbs[0], -limbs[1], *links[3:, 2])
-    return lengths, _wrapped(theta + [0.0, turned[0], turned[1] - turned[0], -turned[1], 0.0, 0.0])
+    return lengths, _wrapped(theta + np.array([0.0, turned[0], turned[1] - turned[0], -turned[1], 0.0, 0.0]))
 
 
 def deviation(kinematics: Kinematics) -> tuple[Array, Array]:
@@ -207,8 +207,8 @@ def _refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array, p_base_
             J = np.concatenate([np.stack(levers, axis=2), J], axis=1)
             off = np.concatenate([p_base_flange_m - points[6], off], axis=1)
         JT = np.swapaxes(J, 1, 2)
-        damping = np.square(off).sum(axis=1)[:, None, None] * np.eye(J.shape[1])  # near a singular posture, below half a radian
-        step = JT @ np.linalg.solve(J @ JT + damping + _TINY * np.eye(J.shape[1]), off[:, :, None])
+        damping = np.square(off).sum(axis=1)[:, None, None] + _TINY  # no step is above half a radian
+        step = JT @ np.linalg.solve(J @ JT + damping * np.eye(J.shape[1]), off[:, :, None])
         q[:, first:] += step[:, :, 0]
     return q
 
