@@ -27,13 +27,13 @@ def guarded():
   end
   thr = run mover()
   beat = read_input_integer_register(24)
-  missed_s = 0
+  missed_s = 0.0
   while missed_s < 0.2:
     sync()
     missed_s = missed_s + get_steptime()
     if read_input_integer_register(24) != beat:
       beat = read_input_integer_register(24)
-      missed_s = 0
+      missed_s = 0.0
     end
   end
   kill thr

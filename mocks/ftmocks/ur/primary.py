@@ -45,8 +45,8 @@ READ_ONLY_CODE = 210
 WARNING = 2
 
 ROBOT_TYPES = {"UR5": 1, "UR10": 2, "UR3": 3, "UR16": 4, "UR20": 7, "UR30": 8}
-SUB_TYPES = {False: 1, True: 3}
-"""Of a CB-Series arm and of a later one."""
+SUB_TYPES = {False: 2, True: 3}
+"""Of a CB3 arm and of an e-Series one."""
 JOINT_ACCELERATION_RAD_S2 = 40.0
 DEFAULTS = (1.0471975511965976, 1.3962634015954636, 0.25, 1.2, 0.25)
 """Joint speed and acceleration, tool speed and acceleration, radius of a joint: rad and m."""

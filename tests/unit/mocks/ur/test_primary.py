@@ -95,7 +95,7 @@ def test_a_calibrated_arm_has_its_own_checksums() -> None:
     state = decoded(primary.state_package(Robot(World(Truth.drawn(0), dh, HOME, 0), settings), complete=True))
     assert len(set(state["kinematics"]["checksum"])) == 6
     assert state["kinematics"]["a"] == list(dh.a)
-    assert (state["configuration"]["robot_type"], state["configuration"]["sub_type"]) == (3, 1)
+    assert (state["configuration"]["robot_type"], state["configuration"]["sub_type"]) == (3, 2)
 
 
 @pytest.mark.parametrize("what", ["none", "wrong"])
