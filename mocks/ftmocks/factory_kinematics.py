@@ -112,4 +112,5 @@ def read(path: Path) -> Dh:
         theta, a, d, alpha = (vector6(arm[name]) for name in ("theta", "a", "d", "alpha"))
         return Dh(model, theta, a, d, alpha, MODELS[model].max_speed)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"cannot read kinematics from {path}: {error!r}") from None
+        wanted = "give a JSON object with model, theta, a, d and alpha"
+        raise ValueError(f"cannot read kinematics from {path}: {error!r}; {wanted}") from None

@@ -246,7 +246,8 @@ class Station:
         wanted = {"both": ("can", "serial"), "none": ()}.get(self._options.sensor, (self._options.sensor,))
         if WRIST in wanted:
             robot = self.robot
-            robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, robot.cycle_s)) + robot.wrist_error()
+            self.world.sensor_error = robot.wrist_error
+            robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, robot.cycle_s))
         for name in wanted:
             self._sensors[name] = Sensor(
                 name, self.world.measure_at, seed=self._options.seed, host=self.server.host, clock=self._clock

@@ -223,6 +223,8 @@ class World:
         """What touches the tool, by name."""
         self.drifts: tuple[SensorDrift, ...] = ()
         """Drifts of the zero besides the drift of the truth."""
+        self.sensor_error: Callable[[], Array] | None = None
+        """What a sensor adds to each reading besides bias and noise, (6,)."""
         self._t0_s = self.now_s
         self._lock = threading.Lock()
         self._ripple = Ripple(imperfections, seed)
@@ -385,7 +387,7 @@ class World:
         with self._lock:
             noise = self._noise.standard_normal((len(t_s), 6))
             readings: Array = self._true_wrenches(t_s) + noise * self._noise_sd
-        return readings
+        return readings if self.sensor_error is None else readings + self.sensor_error()
 
     def _true_wrenches(self, t_s: Array) -> Array:
         """Return the wrench on the sensor at these times, (n, 6), or (6,) where it is the same."""

@@ -15,7 +15,7 @@ class ScriptError(Exception):
 
 
 class ControllerProgram:
-    """A program as the controller runs it. This one, which was loaded at the pendant, ends in its first cycle."""
+    """A program as the controller runs it. This one was loaded at the pendant, and loops there until it is stopped."""
 
     reads_registers = False
     """Whether it obeys the commands that a client writes into `COMMAND_REGISTERS`."""
@@ -32,7 +32,7 @@ class ControllerProgram:
 
     def step(self) -> bool:
         """Run one control cycle; return False when the program has ended."""
-        return False
+        return True
 
     def close(self) -> None:
         """End the program; a moving arm comes to rest."""

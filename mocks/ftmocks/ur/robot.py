@@ -8,6 +8,7 @@ keeps the cell's time, and so does the controller's clock when the arm's own sen
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -144,7 +145,7 @@ class Robot:
         self.safety_mode = SafetyMode.NORMAL
         self.remote_switches = 0
         """How often the pendant changed between local and remote control."""
-        self.loaded_program: str | None = None
+        self.loaded_program: str | None = None  # its path
         self.payload_kg = settings.payload_kg
         self.payload_cog_m = settings.payload_cog_m
         self.payload_inertia: Vector6 = ZERO6
@@ -260,7 +261,7 @@ class Robot:
     @property
     def program_name(self) -> str:
         """Name of the program, as the dashboard shows it."""
-        return self._program.name if self._program is not None else self.loaded_program or "unnamed"
+        return self._program.name if self._program is not None else PurePosixPath(self.loaded_program or "unnamed").name
 
     @property
     def remote_control(self) -> bool:
@@ -338,7 +339,7 @@ class Robot:
             return True
         if self.loaded_program is None or self.runtime == Runtime.PLAYING:
             return False
-        self._start(ControllerProgram(self.loaded_program))
+        self._start(ControllerProgram(self.program_name))
         return True
 
     @property
