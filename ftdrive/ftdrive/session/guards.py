@@ -507,7 +507,7 @@ def by_safety(status: ArmStatus, words: str) -> Tripped:
         payload = "" if status.payload_kg is None else f" (payload set: {status.payload_kg:.2f} kg)"
         words += f"; usual causes are contact, and a controller with a wrong payload or centre of mass{payload}"
         return fault(Hazard.PROTECTIVE_STOP, words)
-    stopped = "emergency" in mode or "safeguard" in mode
+    stopped = any(word in mode for word in ("emergency", "safeguard", "enabling"))
     return Tripped(Hazard.EMERGENCY_STOP if stopped else Hazard.SAFETY_MODE, DeviceFault(words))
 
 

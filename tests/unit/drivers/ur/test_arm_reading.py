@@ -263,6 +263,33 @@ def test_an_old_controller_is_asked_for_its_tcp_before_and_after(controller: Con
         reader.state(lambda: [float(next(changing))] * 6)
 
 
+@pytest.mark.parametrize(
+    ("mode", "name", "fix"),
+    [
+        (12, "automatic mode safeguard stop", "close the safeguard of automatic mode"),
+        (13, "three-position enabling stop", "hold the enabling device"),
+        (14, "three-position enabling stop of the pendant", "hold the enabling device"),
+        (15, "IMMI emergency stop", "moulding machine"),
+        (16, "IMMI safeguard stop", "moulding machine"),
+        (17, "PROFIsafe waiting for parameters", "start the safety PLC"),
+        (18, "PROFIsafe automatic mode safeguard stop", "safety PLC"),
+        (19, "PROFIsafe safeguard stop", "safety PLC"),
+        (20, "PROFIsafe emergency stop", "safety PLC"),
+        (22, "safety API safeguard stop", "safety API"),
+    ],
+)
+@pytest.mark.parametrize("bits", [0x410, 0x401])
+def test_a_stop_whose_source_only_the_safety_mode_names(
+    controller: Controller, reader: Reader, mode: int, name: str, fix: str, bits: int
+) -> None:
+    controller.safety_mode, controller.safety_bits = mode, bits
+    reader.look()
+    status = reader.status()
+    assert status.safety_mode == name
+    assert status.fault is not None
+    assert (f"{name} (safety mode {mode})", fix in status.fault.fix) == (status.fault.found, True)
+
+
 @pytest.mark.parametrize("mode", [3, 4])
 def test_joints_without_power_are_not_measured(controller: Controller, reader: Reader, mode: int) -> None:
     controller.robot_mode = mode
@@ -522,7 +549,7 @@ ROBOT_MODES = """
 7 running, 8 updating firmware, 9 unknown"""
 SAFETY_MODES = """
 1 normal, 2 reduced, 3 protective stop, 4 recovery, 5 safeguard stop, 6 system emergency stop, 7 robot emergency stop,
-8 violation, 9 fault, 10 joint identification, 11 undefined, 12 unknown"""
+8 violation, 9 fault, 10 joint identification, 11 undefined, 21 unknown, 23 unknown"""
 PROGRAM_STATES = "0 stopping, 1 stopped, 2 playing, 3 pausing, 4 paused, 5 resuming, 6 unknown"
 SAFETY_BITS = """
 2 protective stop, 3 recovery mode, 4 safeguard stop, 5 emergency stop, 6 emergency stop, 7 emergency stop,
