@@ -113,7 +113,8 @@ def wrist_inverse(kinematics: Kinematics, q_arm_rad: ArrayLike, R_base_flange: A
     wrist = np.stack([psi - (q_arm + offset[:3])[1:].sum(), q5, q6], axis=2) - offset[3:]
     q = np.concatenate([np.broadcast_to(q_arm, wrist.shape), wrist], axis=2)
     q = _refined(kinematics, q.reshape(-1, 6), np.repeat(R_base_flange, 2, axis=0)).reshape(q.shape)
-    return np.concatenate([q[:, :, :3], _wrapped(q[:, :, 3:])], axis=2)
+    q[:, :, [3, 5]] = _wrapped(q[:, :, [3, 5]])
+    return q
 
 
 def wrist_refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array) -> Array:
