@@ -2,10 +2,11 @@
 
     FTDRIVE_REAL_DATA=… python -m tests.benchmarks.real_arms [--arms 01,13] [--paths script] [--plans FOLDER]
 
-Each arm of `ur_calibrations/arms.csv` is a station with these kinematics. `doctor`, `plan`, `calibrate` along that plan,
-`verify`, and `solve --method srom` have to find it good, as they would with a configuration file and typed answers. An
-arm whose shape is not measured (UR3, UR5 and UR10 of the CB3 generation) cannot be planned: `doctor` has to accept it,
-`calibrate` to refuse it in a sentence, and `calibrate --manual` to start. The exit code is the number of rows that failed.
+Each arm of `ur_calibrations/arms.csv` is a station with these kinematics. `doctor`, `plan`, `calibrate` along that
+plan, `verify`, and `solve --method srom` have to find it good, as they would with a configuration file and typed
+answers. An arm whose shape is not measured (UR3, UR5 and UR10 of the CB3 generation) cannot be planned: `doctor` has to
+accept it, `calibrate` to refuse it in a sentence, `calibrate --manual` to take poses by hand. The exit code is the
+number of rows that failed.
 
 `--plans` keeps the plan of each run for `tests.benchmarks.mesh_check --arm NUMBER --plan FILE`.
 """
