@@ -9,6 +9,7 @@ that it reports is the source of flange poses; kinematics check it, and plan.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import asin, cos, pi, sin, sqrt
 
 import numpy as np
@@ -23,7 +24,7 @@ _ROUNDED = 1e-9
 _ALPHA_RAD = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Kinematics:
     """Standard Denavit-Hartenberg parameters of one arm, six each; those of `MODELS` are nominal.
 
@@ -57,7 +58,7 @@ class Kinematics:
         """(24,) theta, a, d and alpha of all joints."""
         return (*self.theta_rad, *self.a_m, *self.d_m, *self.alpha_rad)
 
-    @property
+    @cached_property
     def links_m(self) -> Array:
         """(6, 3) from a point on the axis of each joint to one on the next axis, in axes that turn with the joint.
 

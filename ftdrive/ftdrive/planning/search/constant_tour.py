@@ -78,4 +78,6 @@ def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
     inside = q4[(np.abs(q4) <= 2 * np.pi - room).all(axis=1)]
     nearest = inside[np.abs(inside[:, 0] - q[3]).argmin()]
     tour = np.column_stack([np.tile(q[:3], (len(psi), 1)), nearest, q5, q6])
+    if kinematics is _NOMINAL:
+        return tour
     return wrist_refined(kinematics, tour, frames(_NOMINAL, tour).R_base_flange)
