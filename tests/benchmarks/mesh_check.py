@@ -43,6 +43,8 @@ coal: Any = importlib.import_module("coal")
 TARGET_M = 0.015
 SHAPES_M = 0.001
 """So far the meshes stand out of our shapes at most."""
+FOREARM_WRIST_2, BUILD_M = (3, 5), 0.030
+"""The planner leaves out the part of wrist 2 along axis 5: so far the build keeps it from the forearm."""
 STEP_RAD = np.radians(1.0)
 RANDOM = 3000
 PARTS = ("base", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3", "tool")
@@ -146,23 +148,22 @@ def main() -> None:
 
 
 def stated(arm: Arm, path: Path) -> None:
-    """Check every distance that a plan states, which is to itself, to the scene, or both."""
-    plan, excess_m = Plan.load(path), []
+    """Check every distance that a plan states along its move, against hulls, and where these are nearer, meshes."""
+    plan, over_m = Plan.load(path), []
     q_rad = np.array([step.q_rad for step in plan.steps])
     for step, start, end in zip(plan.steps, q_rad, np.roll(q_rad, -1, axis=0), strict=True):
+        claim_m = np.full(len(PAIRS), step.clearance_m)
+        claim_m[PAIRS.index(FOREARM_WRIST_2)] = min(step.clearance_m, BUILD_M)
         places = np.linspace(start, end, int(np.ceil(np.abs(end - start).max() / STEP_RAD)) + 1)
-        hulls_m = np.array([arm.distances_m(arm.hulls, q, PAIRS) for q in places])
-        place, pair = np.unravel_index(hulls_m.argmin(), hulls_m.shape)
-        least_m = hulls_m[place, pair]
-        if least_m < step.clearance_m:  # a hull fills what is hollow
-            near = np.argwhere(hulls_m < step.clearance_m)
-            least_m = min(arm.distances_m(arm.meshes, places[i], [PAIRS[j]])[0] for i, j in near)
-        excess_m.append(step.clearance_m - least_m)
-    worst = int(np.argmax(excess_m))
-    verdict = "pass" if excess_m[worst] <= SHAPES_M else "FAIL"
+        over = claim_m - [arm.distances_m(arm.hulls, q, PAIRS) for q in places]
+        for place, pair in np.argwhere(over > 0):  # a hull fills what is hollow
+            over[place, pair] = claim_m[pair] - arm.distances_m(arm.meshes, places[place], [PAIRS[pair]])[0]
+        over_m.append(float(over.max()))
+    least_mm = 1e3 * min(step.clearance_m for step in plan.steps)
+    farther_mm, verdict = -1e3 * max(over_m), "pass" if max(over_m) <= SHAPES_M else "FAIL"
     show(
-        f"  {path.name}: {plan.kind}, {len(plan.steps)} distances of {1e3 * plan.steps[worst].clearance_m:.1f} mm or "
-        f"more are true, the tightest by {-1e3 * excess_m[worst]:.1f} mm: {verdict}"
+        f"  {path.name}: {plan.kind}, {len(plan.steps)} distances of {least_mm:.1f} mm or more, meshes at least "
+        f"{farther_mm:.1f} mm farther apart: {verdict}"
     )
 
 
