@@ -14,7 +14,9 @@ Nodes = NDArray[np.intp]
 
 SHOULDER_RAD = float(np.radians(110))
 WRIST_6_RAD = float(np.radians(200))
-WINDOW_RAD = np.array([np.pi, SHOULDER_RAD, np.inf, np.pi, np.pi, WRIST_6_RAD])
+HALF_TURN_RAD = float(np.radians(183))
+"""So that a real arm, which is up to 3 degrees from the table, has both ways to an angle half a turn away."""
+WINDOW_RAD = np.array([np.pi, SHOULDER_RAD, np.inf, HALF_TURN_RAD, HALF_TURN_RAD, WRIST_6_RAD])
 """To both sides of where the joints stand. Joint 6 is what winds the cable."""
 ELBOW_RAD = float(np.radians(165))
 """From stretched. The elbow cannot fold further, and the shapes do not know it."""

@@ -226,6 +226,12 @@ def test_a_plan_that_only_another_arm_has_room_for_is_refused() -> None:
         plan.of_arm(behind_wall(other, wall_m))
 
 
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
+def test_a_real_arm_has_the_wrist_tours_of_a_nominal_one(seed: int) -> None:
+    """Its wrist 2 is half a turn away at some poses, and a little more on a real arm."""
+    assert planned(certifier_of(kinematics=drawn("UR5e", seed)), poses=12).kind == usual(12).kind == "wrist"
+
+
 def test_a_sweep_of_another_arm_is_refused() -> None:
     plan = replace(
         usual(), sweep=Sweep(USUAL_POSTURE_RAD.tolist(), np.zeros((3, 2)), np.ones((3, 2)), np.zeros((3, 2)), 20, 3)
