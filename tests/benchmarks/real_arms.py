@@ -12,6 +12,7 @@ number of rows that failed.
 """
 
 import argparse
+import re
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -34,12 +35,22 @@ Row = tuple[str, str, bool]
 """Name, figures and whether it passed."""
 
 
+def connected(ftdrive: CommandLine, station: Station) -> Path:
+    """Write the configuration file of a station, with poses as long as those of an emulated cell."""
+    config = ftdrive.connect(station)
+    text = config.read_text(encoding="utf-8")
+    config.write_text(
+        re.sub(r"average_s = .*", f"average_s = {station.cell.sampling.average_s}", text), encoding="utf-8"
+    )
+    return config
+
+
 def calibrated(arm: RealArm, path: ControlPath, folder: Path, plans: Path | None) -> Iterator[Row]:
     """Run the commands on one arm, which may move."""
     options = ("--seed", arm.number, "--kinematics", str(arm.save(folder)))
     with Station("can", options, control_path=path) as station:
         ftdrive = CommandLine(folder)
-        config = ftdrive.connect(station)
+        config = connected(ftdrive, station)
         name = f"{arm.number} {arm.model:6s} {path:8s}"
         doctor = ftdrive.json("doctor", "--config", config)
         (kinematics,) = (check["found"] for check in doctor["checks"] if check["name"] == "robot.kinematics")
@@ -82,7 +93,7 @@ def read_only(arm: RealArm, folder: Path) -> Iterator[Row]:
     options = ("--polyscope", "3.15.8", "--seed", arm.number, "--kinematics", str(arm.save(folder)))
     with Station("can", options) as station:
         ftdrive = CommandLine(folder)
-        config = ftdrive.connect(station)
+        config = connected(ftdrive, station)
         name = f"{arm.number} {arm.model:6s} read    "
         doctor = ftdrive.json("doctor", "--config", config)
         (kinematics,) = (check["found"] for check in doctor["checks"] if check["name"] == "robot.kinematics")
