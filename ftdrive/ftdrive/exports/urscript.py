@@ -100,7 +100,7 @@ def _warnings(model: str, *, is_nominal: bool) -> Iterator[str]:
     yield "This is no safety function. Real cables, fixtures and people are not in the plan."
     yield f"Run it on a {model} with exactly this tool and mounting; in another cell the moves are not proven clear."
     if not is_nominal:
-        yield "It is proven with the measured kinematics of one arm: on another one distances are up to 12 mm smaller."
+        yield "It is proven with the measured kinematics of one arm: on another one distances are up to 20 mm smaller."
     yield "The tool turns every way, upside down too: nothing loose, no fluid, nothing in the gripper."
     yield (
         f"The approach to the first pose is not in the plan: the program stops unless each joint is within "
