@@ -57,7 +57,7 @@ class DeviceInfo:
     facts: dict[str, Fact] = field(default_factory=dict)
     """Of a sensor, as far as known: `serial`; `counts_per_N` and `counts_per_Nm`, the scale of the device's numbers;
     `range`, (6,) the largest force in N and torque in N·m on each axis, in both directions; `sign`, 1 or -1. Of an arm:
-    `control`, by what it is moved and why."""
+    `control`, by what it is moved and why; `kinematics`, theta, a, d and alpha (24,) of its joints, as measured."""
 
 
 class Columns:

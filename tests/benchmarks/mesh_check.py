@@ -8,7 +8,10 @@ Install: uv pip install coal airo-models; uv pip install --no-deps compas-fab
   airo-models 0.0.12 (MIT): UR3e and UR5e, airo_models/arms/ur5e/ur5e.urdf.
   compas-fab 2.0.1 (MIT): UR10e, compas_fab/data/robot_library/ur10e_robot/urdf/robot_description.urdf.
 
-Run: python -m tests.benchmarks.mesh_check --urdf .../ur5e.urdf [--tool 0:200:100]
+Run: python -m tests.benchmarks.mesh_check --urdf .../ur5e.urdf [--tool 0:200:100] [--arm 01] [--plan FILE]
+
+`--arm` places the links as a real arm of that number does, by the file of FTDRIVE_REAL_DATA, and gives the planner its
+kinematics. `--plan` checks a plan instead: every distance that it states against the meshes along its move.
 """
 
 import argparse
@@ -28,13 +31,20 @@ from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds
+from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
 from ftdrive.planning.search.constant_tour import constant_tour
-from ftdrivers.ur.kinematics import MODELS, Array, forward
+from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, forward
 from tests.benchmarks.planning import FIXED_POINTS_M
+from tests.own_kinematics import of_dh
+from tests.real_arms import RealArm, real_arms
 
 coal: Any = importlib.import_module("coal")
 TARGET_M = 0.015
+SHAPES_M = 0.001
+"""So far the meshes stand out of our shapes at most."""
+FOREARM_WRIST_2, BUILD_M = (3, 5), 0.030
+"""The planner leaves out the part of wrist 2 along axis 5: so far the build keeps it from the forearm."""
 STEP_RAD = np.radians(1.0)
 RANDOM = 3000
 PARTS = ("base", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3", "tool")
@@ -115,25 +125,55 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--urdf", type=Path, required=True)
     parser.add_argument("--tool", default="0:200:100", help="from:to:diameter in mm from the flange")
+    parser.add_argument("--arm", help="number of a real arm")
+    parser.add_argument("--plan", type=Path, nargs="+", default=[])
     arguments = parser.parse_args()
     tool = Cylinder(*(float(value) / 1e3 for value in arguments.tool.split(":")))
-    arm = read(arguments.urdf, tool)
-    show(f"{arm.model}, meshes of {arguments.urdf}")
-    placing(arm)
-    tour(arm, "constant tour", constant_tour(USUAL_POSTURE_RAD))
-    certifier = Certifier(ArmModel(arm.model, [tool]), Scene())
+    real = next((arm for arm in real_arms() if arm.number == arguments.arm), None)
+    if arguments.arm and real is None:
+        parser.error(f"there is no arm {arguments.arm}: set FTDRIVE_REAL_DATA")
+    arm = read(arguments.urdf, tool, real)
+    own = None if real is None else of_dh(real.dh())
+    show(f"{arm.model}, meshes of {arguments.urdf}{f', arm {real.number}' if real else ''}")
+    placing(arm, own or MODELS[arm.model])
+    for path in arguments.plan:
+        stated(arm, path)
+    if arguments.plan:
+        return
+    tour(arm, "constant tour", constant_tour(USUAL_POSTURE_RAD, own or MODELS["UR5e"]))
+    certifier = Certifier(ArmModel(arm.model, [tool], own), Scene())
     planned(arm, certifier)
     compare(arm, certifier)
     cover(arm, certifier.arm)
 
 
-def placing(arm: Arm) -> None:
+def stated(arm: Arm, path: Path) -> None:
+    """Check every distance that a plan states along its move, against hulls, and where these are nearer, meshes."""
+    plan, over_m = Plan.load(path), []
+    q_rad = np.array([step.q_rad for step in plan.steps])
+    for step, start, end in zip(plan.steps, q_rad, np.roll(q_rad, -1, axis=0), strict=True):
+        claim_m = np.full(len(PAIRS), step.clearance_m)
+        claim_m[PAIRS.index(FOREARM_WRIST_2)] = min(step.clearance_m, BUILD_M)
+        places = np.linspace(start, end, int(np.ceil(np.abs(end - start).max() / STEP_RAD)) + 1)
+        over = claim_m - [arm.distances_m(arm.hulls, q, PAIRS) for q in places]
+        for place, pair in np.argwhere(over > 0):  # a hull fills what is hollow
+            over[place, pair] = claim_m[pair] - arm.distances_m(arm.meshes, places[place], [PAIRS[pair]])[0]
+        over_m.append(float(over.max()))
+    least_mm = 1e3 * min(step.clearance_m for step in plan.steps)
+    farther_mm, verdict = -1e3 * max(over_m), "pass" if max(over_m) <= SHAPES_M else "FAIL"
+    show(
+        f"  {path.name}: {plan.kind}, {len(plan.steps)} distances of {least_mm:.1f} mm or more, meshes at least "
+        f"{farther_mm:.1f} mm farther apart: {verdict}"
+    )
+
+
+def placing(arm: Arm, kinematics: Kinematics) -> None:
     """Show how far the flange is from ours, and how far neighbours are apart."""
     apart_m = turned_rad = gap_m = 0.0
     # The axes of a URDF's base are turned by 180 degrees about z.
     half_turn = np.diag([-1.0, -1.0, 1.0])
     for q in sampled(constant_tour(USUAL_POSTURE_RAD))[::10]:
-        ours, theirs = forward(MODELS[arm.model], q), arm.place(q)[TOOL]
+        ours, theirs = forward(kinematics, q), arm.place(q)[TOOL]
         apart_m = max(apart_m, float(np.linalg.norm(theirs[:3, 3] - half_turn @ ours.p_m)))
         turned_rad = max(turned_rad, float(Rotation.from_matrix(theirs[:3, :3].T @ half_turn @ ours.R).magnitude()))
         gap_m = max(gap_m, arm.distances_m(arm.meshes, q, [(i, i + 1) for i in range(TOOL)]).max())
@@ -209,8 +249,8 @@ def sampled(q_rad: Array) -> Array:
     return np.concatenate(parts)
 
 
-def read(urdf: Path, tool: Cylinder) -> Arm:
-    """Read the chain from the root to the flange, and the meshes on it."""
+def read(urdf: Path, tool: Cylinder, real: RealArm | None = None) -> Arm:
+    """Read the chain from the root to the flange, and the meshes on it; the links of a real arm are in its places."""
     # airo-models uses the prefix drake: without declaring it.
     root: Any = ET.fromstring(urdf.read_text().replace("drake:", "drake_"))
     links = {link.get("name"): link for link in root.findall("link")}
@@ -222,8 +262,9 @@ def read(urdf: Path, tool: Cylinder) -> Arm:
     joints: Joints = []
     found, pose = [meshes_of(urdf, links[name])], np.eye(4)
     for joint, child in reversed(chain):
-        pose = pose @ transform(joint.find("origin"))
-        if joint.get("type") != "fixed":
+        turns = joint.get("type") != "fixed"
+        pose = pose @ (transform(joint.find("origin")) if real is None or not turns else real.links[len(joints)])
+        if turns:
             joints.append((pose, np.array([float(value) for value in joint.find("axis").get("xyz").split()])))
             found.append([])
             pose = np.eye(4)

@@ -146,7 +146,7 @@ def naive() -> None:
     for model, point in FIXED_POINTS_M.items():
         certifier = certifier_of(model)
         guess = guess_of(certifier)
-        branches = inverse(certifier.arm.geometry, special(range(1, 25)), np.tile(point, (24, 1)))
+        branches = inverse(certifier.arm.kinematics, special(range(1, 25)), np.tile(point, (24, 1)))
         q = [USUAL_POSTURE_RAD]
         for options in branches:
             reached = options[~np.isnan(options[:, 0])]

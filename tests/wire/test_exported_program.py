@@ -15,6 +15,7 @@ from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
+from ftdrivers.ur.control_program import without_comments
 from tests.wire.conftest import Station
 
 pytestmark = pytest.mark.slow  # every test needs a process of its own
@@ -38,7 +39,7 @@ def start(plan: Plan, start_station: Callable[..., Station]) -> Callable[[float]
         q_deg[5] += away_deg
         station = start_station("--time-scale", "20", "--start-q-deg", ",".join(f"{angle:.3f}" for angle in q_deg))
         with station.connect(SCRIPT_PORT) as sock:
-            sock.sendall(program(plan, dwell_s=DWELL_S).encode("ascii"))
+            sock.sendall(without_comments(program(plan, dwell_s=DWELL_S)).encode("ascii"))
         station.wait_for(lambda state: state["popup"] is not None)
         return station
 

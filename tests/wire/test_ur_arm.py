@@ -23,7 +23,7 @@ from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBro
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import Control
 from ftdrivers.ur.control_process import ControlProcess
-from ftdrivers.ur.kinematics import MODELS, forward
+from ftdrivers.ur.kinematics import forward, kinematics_of
 from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station, on_ur_rtde, one_path
 from tests.wire.moves import away, no_guard
@@ -54,12 +54,14 @@ class Trigger:
 
 def assert_flange_is_right(arm: UrArm) -> None:
     state = arm.state()
-    nominal = forward(MODELS["UR5e"], state.q_rad)  # an emulated arm is exactly nominal
-    assert np.allclose(state.R_base_flange, nominal.R, atol=1e-6)
-    assert np.allclose(state.p_base_flange_m, nominal.p_m, atol=1e-6)
+    own = kinematics_of(arm.identify())
+    assert own is not None
+    flange = forward(own, state.q_rad)
+    assert np.allclose(state.R_base_flange, flange.R, atol=1e-6)
+    assert np.allclose(state.p_base_flange_m, flange.p_m, atol=1e-6)
     assert arm._reader is not None
     tcp = Rotation.from_rotvec(arm._reader.look().tcp_pose[3:])
-    assert (tcp.inv() * Rotation.from_matrix(nominal.R)).magnitude() > 0.5  # there is something to take off
+    assert (tcp.inv() * Rotation.from_matrix(flange.R)).magnitude() > 0.5  # there is something to take off
 
 
 @one_path

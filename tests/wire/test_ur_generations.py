@@ -8,10 +8,10 @@ from math import radians
 import numpy as np
 import pytest
 
-from ftdrivers.errors import DeviceFault, ModelUnknown
+from ftdrivers.errors import ConnectError, DeviceFault, ModelUnknown
 from ftdrivers.interfaces import NOT_REPORTED
 from ftdrivers.ur.arm import UrArm
-from ftdrivers.ur.kinematics import MODELS, forward
+from ftdrivers.ur.kinematics import forward, kinematics_of
 from tests.wire.conftest import TIME_SCALE, Station
 from tests.wire.moves import no_guard
 
@@ -58,6 +58,30 @@ def test_open_state_move_stop_limits_close(start_station: Callable[..., Station]
     station.kill()
 
 
+@pytest.mark.parametrize(
+    ("options", "model", "refused"),
+    [
+        (("--kinematics-message", "none"), None, None),
+        (("--kinematics-message", "wrong"), None, "kinematics that the controller sends .* contradict each other"),
+        (("--model", "UR10e", "--polyscope", "5.4.0"), "UR5e", "the arm is another model, probably a UR10e"),
+        (("--model", "UR10e"), "UR5e", "is a UR10e, not a UR5e"),
+    ],
+)
+def test_an_arm_without_kinematics_is_read_and_another_one_is_refused(
+    start_station: Callable[..., Station], options: tuple[str, ...], model: str | None, refused: str | None
+) -> None:
+    station = start_station(*options)
+    with closing(station.arm(model=model)) as arm:
+        if refused is None:
+            arm.open()
+            assert kinematics_of(arm.identify()) is None
+            arm.state()
+        else:
+            with pytest.raises(ConnectError, match=refused):
+                arm.open()
+    station.kill()
+
+
 def use(arm: UrArm, station: Station, polyscope: str, model: str, tcp: str) -> None:
     old = polyscope == "5.4.0"
     arm.open(control=True)
@@ -84,9 +108,11 @@ def use(arm: UrArm, station: Station, polyscope: str, model: str, tcp: str) -> N
     arm.wait_until_still(timeout_s=30, guard=no_guard)
     state = arm.state()
     assert np.allclose(state.q_rad, q, atol=1e-4)
-    nominal = forward(MODELS[model], q)
-    assert np.allclose(state.R_base_flange, nominal.R, atol=1e-4)
-    assert np.allclose(state.p_base_flange_m, nominal.p_m, atol=1e-4)
+    own = kinematics_of(arm.identify())
+    assert own is not None
+    flange = forward(own, q)
+    assert np.allclose(state.R_base_flange, flange.R, atol=1e-4)
+    assert np.allclose(state.p_base_flange_m, flange.p_m, atol=1e-4)
 
     q[5] += 1.5 if q[5] < 0.5 else -1.5
 

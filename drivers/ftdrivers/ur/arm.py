@@ -59,7 +59,7 @@ class UrArm(RobotArm):
     host
         Address of the controller.
     model
-        Such as "UR5e", to compare poses with nominal kinematics; None takes the model that the controller reports.
+        Such as "UR5e", to compare poses with; None takes the model that the controller reports.
     speed_rad_s, acceleration_rad_s2
         Defaults of the leading joint in `move_to`. The speed slider of the pendant scales them down further.
     stop_rad_s2
@@ -200,7 +200,7 @@ class UrArm(RobotArm):
         reader = self._reading()
         path, why = path_for(self._setting, reader.version)
         source: Literal["configured", "assumed"] = "assumed" if self._setting == "auto" else "configured"
-        return replace(reader.info, facts={"control": Fact(f"{path}: {why}", source)})
+        return replace(reader.info, facts={**reader.info.facts, "control": Fact(f"{path}: {why}", source)})
 
     def state(self) -> ArmState:
         """Read a new, consistent state; the pose is that of the mechanical flange, whatever TCP is active.

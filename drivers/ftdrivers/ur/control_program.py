@@ -1,6 +1,7 @@
 """Our program on the controller, as the driver sees it: its text, its registers, its commands and what it reports.
 
-`program.script` describes the registers; tests compare both.
+`program.script` describes the registers; tests compare both. Its constructs are those of programs that are known to run
+on controllers: docs/reference/urscript-constructs.md.
 
 Ref: Universal Robots, URScript manual, "Real-Time Data Exchange (RTDE) Guide".
 Checked on hardware: no.
@@ -79,13 +80,18 @@ class Report:
         return self.state == _NO_HEARTBEAT
 
 
+def without_comments(text: str) -> str:
+    """Return a program without its lines of comment and empty lines, as UR's client library sends it too."""
+    return "".join(f"{line}\n" for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
+
+
 def program_text(token: int, version: Sequence[int], stop_rad_s2: float) -> str:
     """Return the program for one session on a controller of this version, with the deceleration of its stops."""
     com, inertia = (", ".join(f"ft_number({k})" for k in numbers) for numbers in (range(1, 4), range(4, 10)))
     payload = f"set_payload(ft_number(0), [{com}])"
     if tuple(version[:2]) >= (5, 10):
         payload = f"set_target_payload(ft_number(0), [{com}], [{inertia}])"
-    text = files("ftdrivers.ur").joinpath("program.script").read_text("ascii")
+    text = without_comments(files("ftdrivers.ur").joinpath("program.script").read_text("ascii"))
     fields = {"$TOKEN": str(token), "$DECELERATION": f"{stop_rad_s2:.4f}", "$SET_PAYLOAD": payload}
     for field, value in fields.items():
         text = text.replace(field, value)

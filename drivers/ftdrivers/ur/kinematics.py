@@ -1,53 +1,101 @@
-"""Nominal forward kinematics of Universal Robots arms, and the algebra of their poses.
+"""Forward kinematics of Universal Robots arms, and the algebra of their poses.
 
 Ref: Universal Robots, "DH parameters for calculations of kinematics and dynamics"; ROS 2 description of the arms,
 `default_kinematics.yaml` of each model, version 2.4.5.
 
-The calibrated pose of a real arm differs from the nominal one by 1 to 2 mm. So this checks the model and the active
-TCP, and is never a source of flange poses.
+A real arm is up to 7.5 mm and 1.3 degrees from the nominal one, so its controller uses measured parameters. The flange
+that it reports is the source of flange poses; kinematics check it, and plan.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import asin, cos, pi, sin, sqrt
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ftdrivers.interfaces import Array
+from ftdrivers.interfaces import Array, DeviceInfo
 
-__all__ = ["MODELS", "Array", "Geometry", "Pose", "flange_poses", "forward", "model_named"]
+__all__ = ["MODELS", "Array", "Kinematics", "Pose", "flange_poses", "forward", "kinematics_of", "model_named"]
 
+
+_ROUNDED = 1e-9
 _ALPHA_RAD = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Geometry:
-    """Standard Denavit-Hartenberg lengths of one model; those not named are zero."""
+@dataclass(frozen=True)
+class Kinematics:
+    """Standard Denavit-Hartenberg parameters of one arm, six each; those of `MODELS` are nominal.
 
-    d1_m: float
-    a2_m: float
-    a3_m: float
-    d4_m: float
-    d5_m: float
-    d6_m: float
+    The axes of joints 2, 3 and 4 are nearly parallel. So measured `d_m` of these joints are up to hundreds of metres,
+    which cancel: `links_m` has lengths that can be seen on the arm.
+    """
+
+    theta_rad: tuple[float, ...]
+    a_m: tuple[float, ...]
+    d_m: tuple[float, ...]
+    alpha_rad: tuple[float, ...]
+
+    @classmethod
+    def of(cls, numbers: Sequence[float]) -> "Kinematics":
+        """Build from theta, a, d and alpha of all joints, (24,), in the order of `numbers`.
+
+        Raises `ValueError` unless all are finite and the last axis is that of the flange.
+        """
+        theta, a, d, alpha = np.array(numbers, np.float64).reshape(4, 6)
+        if not np.isfinite([theta, a, d, alpha]).all() or max(abs(a[5]), abs(alpha[5])) > _ROUNDED:
+            raise ValueError(f"theta, a, d and alpha are {[*numbers]}: give finite ones, a6 and alpha6 zero.")
+        a[5] = alpha[5] = 0.0
+        for joint, right in enumerate(_ALPHA_RAD):
+            if alpha[joint] * right < 0:  # the same arm, with the x axis of this frame reversed
+                theta[joint : joint + 2] += pi, -pi
+                a[joint], alpha[joint] = -a[joint], -alpha[joint]
+        return cls(*(tuple(values.tolist()) for values in (theta, a, d, alpha)))
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """(24,) theta, a, d and alpha of all joints."""
+        return (*self.theta_rad, *self.a_m, *self.d_m, *self.alpha_rad)
+
+    @cached_property
+    def links_m(self) -> Array:
+        """(6, 3) from a point on the axis of each joint to one on the next axis, in axes that turn with the joint.
+
+        Points on axes 3 and 4 are level with the shoulder along the lift axis, as those of the nominal arm. The next
+        axis is turned by alpha about x.
+        """
+        a, d, alpha = np.array([self.a_m, self.d_m, self.alpha_rad])
+        along = np.zeros(7)
+        """From the origin of each frame of Denavit and Hartenberg to the chosen point, along the axis of its joint."""
+        for joint in (1, 2):
+            along[joint + 1] = (along[joint] - d[joint]) / np.cos(alpha[joint])
+        sideways = -along[1:] * np.sin(alpha)
+        level = d - along[:-1] + along[1:] * np.cos(alpha)
+        level[1:3] = 0.0  # by choice of the points; the sum of large numbers leaves a rest
+        return np.stack([a, sideways, level], axis=1)
+
+
+def _nominal(d1_m: float, a2_m: float, a3_m: float, d4_m: float, d5_m: float, d6_m: float) -> Kinematics:
+    a_m, d_m = (0.0, a2_m, a3_m, 0.0, 0.0, 0.0), (d1_m, 0.0, 0.0, d4_m, d5_m, d6_m)
+    return Kinematics((0.0,) * 6, a_m, d_m, _ALPHA_RAD)
 
 
 MODELS = {
-    "UR3": Geometry(0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819),
-    "UR5": Geometry(0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823),
-    "UR10": Geometry(0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922),
-    "UR3e": Geometry(0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921),
-    "UR5e": Geometry(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
-    "UR7e": Geometry(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
-    "UR10e": Geometry(0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
-    "UR12e": Geometry(0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
-    "UR16e": Geometry(0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655),
-    "UR8long": Geometry(0.2186, -0.8989, -0.7149, 0.1824, 0.1361, 0.1434),
-    "UR15": Geometry(0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434),
-    "UR18": Geometry(0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434),
-    "UR20": Geometry(0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543),
-    "UR30": Geometry(0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543),
+    "UR3": _nominal(0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819),
+    "UR5": _nominal(0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823),
+    "UR10": _nominal(0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922),
+    "UR3e": _nominal(0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921),
+    "UR5e": _nominal(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
+    "UR7e": _nominal(0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
+    "UR10e": _nominal(0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
+    "UR12e": _nominal(0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
+    "UR16e": _nominal(0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655),
+    "UR8long": _nominal(0.2186, -0.8989, -0.7149, 0.1824, 0.1361, 0.1434),
+    "UR15": _nominal(0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434),
+    "UR18": _nominal(0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434),
+    "UR20": _nominal(0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543),
+    "UR30": _nominal(0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543),
 }
 
 
@@ -80,21 +128,22 @@ def flange_poses(tcp_poses: Array, tcp_offsets: Array) -> tuple[Array, Array]:
     return R_base_flange, tcp_poses[:, :3] - np.einsum("nij,nj->ni", R_base_flange, tcp_offsets[:, :3])
 
 
-def forward(geometry: Geometry, q_rad: Sequence[float] | Array) -> Pose:
-    """Return the flange in base for the joint angles `q_rad` (6,), by the nominal lengths."""
-    d_m = (geometry.d1_m, 0.0, 0.0, geometry.d4_m, geometry.d5_m, geometry.d6_m)
-    a_m = (0.0, geometry.a2_m, geometry.a3_m, 0.0, 0.0, 0.0)
+def forward(kinematics: Kinematics, q_rad: Sequence[float] | Array) -> Pose:
+    """Return the flange in base for the joint angles `q_rad` (6,)."""
     flange = Pose(np.eye(3), np.zeros(3))
-    for q, alpha, d, a in zip(q_rad, _ALPHA_RAD, d_m, a_m, strict=True):
-        link = np.array(
-            [
-                [cos(q), -sin(q) * cos(alpha), sin(q) * sin(alpha)],
-                [sin(q), cos(q) * cos(alpha), -cos(q) * sin(alpha)],
-                [0.0, sin(alpha), cos(alpha)],
-            ]
-        )
-        flange = flange @ Pose(link, np.array([a * cos(q), a * sin(q), d]))
+    turned = zip(q_rad, kinematics.theta_rad, kinematics.alpha_rad, kinematics.links_m, strict=True)
+    for q, theta, alpha, link_m in turned:
+        c, s, ca, sa = cos(q + theta), sin(q + theta), cos(alpha), sin(alpha)
+        R_joint = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        R_next = np.array([[1.0, 0.0, 0.0], [0.0, ca, -sa], [0.0, sa, ca]])
+        flange = flange @ Pose(R_joint @ R_next, R_joint @ link_m)
     return flange
+
+
+def kinematics_of(info: DeviceInfo) -> Kinematics | None:
+    """Return the kinematics that an arm reports among its facts, or None."""
+    fact = info.facts.get("kinematics")
+    return Kinematics.of(fact.value) if fact is not None and isinstance(fact.value, tuple) else None
 
 
 def model_named(name: str, controller_major: int) -> str | None:

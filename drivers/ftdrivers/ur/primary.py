@@ -12,7 +12,7 @@ Checked on hardware: no.
 import logging
 import socket
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -20,6 +20,7 @@ from typing import Final
 
 from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, ProtocolError
+from ftdrivers.ur.kinematics import Kinematics
 
 log = logging.getLogger(__name__)
 
@@ -33,7 +34,9 @@ _KEY_HEAD: Final = struct.Struct(">iiB")  # code, argument, length of the title
 _EXCEPTION_HEAD: Final = struct.Struct(">ii")  # line, column
 _CODE_HEAD: Final = struct.Struct(">iiiBI")  # code, argument, level, type of the data (4 bytes in old documents), data
 _READ_ONLY_CODE: Final = 210
-_CONFIGURATION: Final = 6
+_KINEMATICS, _CONFIGURATION = 5, 6
+_KINEMATIC_DATA: Final = struct.Struct(">24x24d")
+"""Behind six checksums: theta, a, d and alpha of all joints."""
 _ROBOT_TYPE: Final = struct.Struct(">432xi")
 """In the configuration data, behind limits, defaults and lengths of the arm."""
 _ROBOT_TYPES: Final = MappingProxyType(
@@ -94,7 +97,14 @@ class RobotType:
     model: str | None
 
 
-Message = Started | Stopped | Failed | Code | Note | RobotType
+@dataclass(frozen=True, slots=True)
+class FactoryKinematics:
+    """The measured parameters of the arm; None if the controller sends what no arm has."""
+
+    kinematics: Kinematics | None
+
+
+Message = Started | Stopped | Failed | Code | Note | RobotType | FactoryKinematics
 
 
 def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
@@ -129,8 +139,18 @@ def _decode_state(payload: bytes) -> Iterator[Message]:
     with suppress(ProtocolError):
         while (part := take_package(rest)) is not None:
             kind, content = part
-            if kind == _CONFIGURATION:
+            if kind == _KINEMATICS:
+                yield FactoryKinematics(_kinematics(_KINEMATIC_DATA.unpack_from(content)))
+            elif kind == _CONFIGURATION:
                 yield RobotType(_ROBOT_TYPES.get(_ROBOT_TYPE.unpack_from(content)[0]))
+
+
+def _kinematics(numbers: Sequence[float]) -> Kinematics | None:
+    try:
+        return Kinematics.of(numbers)
+    except ValueError as error:
+        log.warning("the kinematics of the arm cannot be used: %s", error)
+        return None
 
 
 def _decode_message(kind: int, content: bytes) -> Iterator[Message]:
@@ -206,23 +226,30 @@ class Primary:
         self._socket.close()
 
 
-def read_model(host: str, *, timeout_s: float, clock: Clock) -> str | None:
-    """Return the model that the controller reports, without its generation; None where it reports none."""
+def read_arm(host: str, *, timeout_s: float, clock: Clock) -> tuple[str | None, Kinematics | None]:
+    """Return the model that the controller reports, without its generation, and the arm's measured kinematics.
+
+    Both come in the first robot state of a connection. None for what does not come.
+    """
+    model, kinematics = None, None
     try:
         primary = Primary(host, timeout_s=timeout_s)
     except ConnectError as error:
         log.info("%s", error)
-        return None
+        return None, None
     try:
         for left_s in clock.looks(timeout_s):
-            for message in primary.read(max(min(left_s, clock.poll_s), 1e-3)):
+            messages = primary.read(max(min(left_s, clock.poll_s), 1e-3))
+            for message in messages:
                 if isinstance(message, RobotType):
-                    return message.model
-            if primary.closed:
+                    model = message.model
+                elif isinstance(message, FactoryKinematics):
+                    kinematics = message.kinematics
+            if primary.closed or any(isinstance(message, RobotType) for message in messages):
                 break
     finally:
         primary.close()
-    return None
+    return model, kinematics
 
 
 def find_program_port(host: str, port: int, *, timeout_s: float) -> None:

@@ -1,6 +1,7 @@
 """One sample of a Universal Robots controller, and the meaning of its numbers.
 
-Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide" (outputs, modes, states and safety status bits).
+Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide" (outputs, modes, states and safety status bits);
+`ur/datatypes.h` of Universal Robots' client library (safety modes 12 to 22).
 Checked on hardware: no.
 """
 
@@ -70,7 +71,31 @@ _SAFETY_MODES: Final = {
     9: "fault",
     10: "joint identification",
     11: "undefined",
+    12: "automatic mode safeguard stop",
+    13: "three-position enabling stop",
+    14: "three-position enabling stop of the pendant",
+    15: "IMMI emergency stop",
+    16: "IMMI safeguard stop",
+    17: "PROFIsafe waiting for parameters",
+    18: "PROFIsafe automatic mode safeguard stop",
+    19: "PROFIsafe safeguard stop",
+    20: "PROFIsafe emergency stop",
+    22: "safety API safeguard stop",
 }
+_ENABLING: Final = "hold the enabling device in its middle position, or switch to automatic mode at the pendant"
+_MODE_FIXES: Final = {
+    12: "close the safeguard of automatic mode and reset it",
+    13: _ENABLING,
+    14: _ENABLING,
+    15: "release the emergency stop of the moulding machine, then power the arm on at the pendant",
+    16: "close the safeguard of the moulding machine and reset it",
+    17: "start the safety PLC, and check its PROFIsafe connection",
+    18: "clear the safeguard stop of automatic mode in the safety PLC",
+    19: "clear the safeguard stop in the safety PLC",
+    20: "clear the emergency stop in the safety PLC, then power the arm on at the pendant",
+    22: "clear the stop in the program that uses the safety API",
+}
+"""Of modes whose source the status bits do not name."""
 _SAFETY: Final = (  # the first that applies is the most specific
     (0b0_1110_0000, "emergency stop", "make the cell safe, release the button, power the arm on at the pendant"),
     (0b0_0000_0100, "protective stop", "find and remove its cause, then clear it at the pendant"),
@@ -136,6 +161,8 @@ class Sample:
 
     def safety_fault(self) -> DeviceFault | None:
         """Return why safety system or robot mode forbid motion."""
+        if fix := _MODE_FIXES.get(self.safety_mode):
+            return DeviceFault(f"{_SAFETY_MODES[self.safety_mode]} (safety mode {self.safety_mode})", fix)
         for bits, meaning, fix in _SAFETY:
             if self.safety_bits & bits:
                 return DeviceFault(f"{meaning} (safety status bits 0x{self.safety_bits:x})", fix)

@@ -17,6 +17,7 @@ from ftcalib.poses.information import Guess, predicted_sigma, special
 from ftdrive.cell.config import CellConfig, RobotConfig, ToolConfig
 from ftdrive.checks.check import Check, State
 from ftdrive.checks.computer import SensorAddress, latency_command
+from ftdrive.planning.geometry.kinematics import frames
 from ftdrivers.clock import Clock
 from ftdrivers.errors import (
     ConnectError,
@@ -39,7 +40,7 @@ from ftdrivers.interfaces import (
     Health,
     RobotArm,
 )
-from ftdrivers.ur.kinematics import MODELS
+from ftdrivers.ur.kinematics import MODELS, kinematics_of
 
 _PUSH_N = 2.0
 _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs on this computer"
@@ -52,6 +53,8 @@ _PAYLOAD_MM: Final = 100.0
 """The centre of the payload may be this far outside the described tool."""
 _LINK_S: Final = 0.5
 _LINK_TRIES: Final = 3
+_POSTURES: Final = 200
+"""Random ones, in which an arm is compared with its model."""
 SLOWEST_SLIDER = 0.05
 """The time-outs of moves allow for this one."""
 AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
@@ -315,6 +318,23 @@ def check_arm(info: DeviceInfo, robot: RobotConfig) -> Check:
             return Check(name, "failed", f"{found}: they cannot be compared", "remove [robot] serial")
         return Check(name, "failed", found, "correct one of the two")
     return Check(name, "ok", who(info))
+
+
+def check_kinematics(info: DeviceInfo) -> Check:
+    """Check that an arm reports its own kinematics, and how far they are from those of its model."""
+    name, own = "robot.kinematics", kinematics_of(info)
+    if info.model not in MODELS:
+        return Check(name, "skipped", f"the kinematics of a {info.model} are not known here")
+    if own is None:
+        found = f"none reported: plans use those of a nominal {info.model}, with wider margins"
+        return Check(name, "warning", found, "enable the primary client interface under Settings, Security, Services")
+    q_rad = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSTURES, 6))
+    real, nominal = frames(own, q_rad), frames(MODELS[info.model], q_rad)
+    off_mm = 1e3 * np.linalg.norm(real.flange_m - nominal.flange_m, axis=1).max()
+    chord = np.linalg.norm(real.R_base_flange - nominal.R_base_flange, axis=(1, 2)).max() / np.sqrt(8.0)
+    off_deg = np.degrees(2 * np.arcsin(chord))
+    found = f"own, up to {off_mm:.1f} mm and {off_deg:.2f}° from a nominal {info.model}"
+    return Check(name, "ok", f"{found}; plans use them")
 
 
 def check_diagnosis(diagnosis: Diagnosis, device: str = "robot") -> Check:

@@ -79,7 +79,8 @@ def _draw(cell: CellConfig, run: Run) -> None:
 
     path = run.folder / "sweep.png"
     try:
-        draw(Plan.load(run.plan_path), certifier_for(cell, cell.robot.model), path)
+        plan = Plan.load(run.plan_path)
+        draw(plan, certifier_for(cell, cell.robot.model, plan.kinematics), path)
         messages.print(f"The sweep is drawn in {path}.")
     except ConfigError as error:
         messages.print(f"The sweep is not drawn: {error}.")

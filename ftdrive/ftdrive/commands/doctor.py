@@ -136,6 +136,7 @@ def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], Rob
     return [
         Check("robot.reachable", "ok", f"{host} answers"),
         devices.check_arm(info, cell.robot),
+        devices.check_kinematics(info),
         devices.check_remote(arm),
         *map(devices.check_diagnosis, arm.diagnose()),
         devices.check_safety(status),

@@ -144,6 +144,10 @@ def plan(
             f"Placeholders in {', '.join(sorted(described))} (measured = false): this plan is for the eye only."
         )
     certifier = certifier_for(cell, cell.robot.model)
+    messages.print(
+        f"Made for a nominal {certifier.arm.name}, with wider margins: calibrate proves it again with the arm's own "
+        "kinematics."
+    )
     q_rad = np.array([*np.radians(numbers("--posture", posture, ",", (3,))), *USUAL_POSTURE_RAD[3:]])
     with working("Planning"):
         made = plan_for(

@@ -99,9 +99,9 @@ def ftd_request(command):
   local last = <live>
   local still = 0.0
   local waited = 0.0
+  local step = get_steptime()
   while waited < <LIMIT_S>:
     sync()
-    local step = get_steptime()
     waited = waited + step
     still = still + step
     if <live> != last:

@@ -56,7 +56,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield "# In PolyScope: a Script node of type File with this file, then one of type Line with ftdrive_tour()"
     yield "#"
     yield "# WARNINGS"
-    for warning in _warnings(model):
+    for warning in _warnings(model, is_nominal=plan.kinematics is None):
         yield f"# - {warning}"
     yield ""
     yield f'textmsg("{name}: {len(steps)} poses")'
@@ -96,9 +96,11 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield 'popup("The tour is complete.", title="ftdrive", blocking=False)'
 
 
-def _warnings(model: str) -> Iterator[str]:
+def _warnings(model: str, *, is_nominal: bool) -> Iterator[str]:
     yield "This is no safety function. Real cables, fixtures and people are not in the plan."
     yield f"Run it on a {model} with exactly this tool and mounting; in another cell the moves are not proven clear."
+    if not is_nominal:
+        yield "It is proven with the measured kinematics of one arm: on another one distances are up to 20 mm smaller."
     yield "The tool turns every way, upside down too: nothing loose, no fluid, nothing in the gripper."
     yield (
         f"The approach to the first pose is not in the plan: the program stops unless each joint is within "

@@ -15,7 +15,7 @@ from ftdrive.planning.motion import Speeds, slower
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import TOOL_POSES, guess_of, plan_box, plan_cone, plan_tool, plan_tour
 from ftdrive.planning.sweep_planner import plan_sweep
-from ftdrivers.ur.kinematics import MODELS, model_named
+from ftdrivers.ur.kinematics import MODELS, Kinematics, model_named
 
 FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
 """No move is faster, whatever a plan or an old configuration contains."""
@@ -72,7 +72,7 @@ def sweep_for(cell: CellConfig, certifier: Certifier, q_rad: ArrayLike, seconds:
     return made.marked(measured=cell.workcell.measured, emulated=cell.is_emulated)
 
 
-def certifier_for(cell: CellConfig, model: str | None) -> Certifier:
+def certifier_for(cell: CellConfig, model: str | None, kinematics: Kinematics | None = None) -> Certifier:
     """Describe arm, tool and surroundings of a cell to the certifier.
 
     Parameters
@@ -80,6 +80,8 @@ def certifier_for(cell: CellConfig, model: str | None) -> Certifier:
     cell : CellConfig
     model : str or None
         Model of the arm, as reported by the controller or configured.
+    kinematics : Kinematics, optional
+        The arm's own; without them nominal ones, and more distance is kept.
 
     Raises
     ------
@@ -92,7 +94,8 @@ def certifier_for(cell: CellConfig, model: str | None) -> Certifier:
         raise ConfigError("what is mounted? Give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml")
     planes = (BASE_PLANE, *map(plane_from_mm, cell.workcell.planes_mm))
     scene = Scene(planes, tuple(map(box_from_mm, cell.workcell.boxes_mm)), lean_of(cell.workcell.mounting))
-    certifier = Certifier(ArmModel(model, [cylinder_from_mm(values) for values in cell.tool.cylinders_mm]), scene)
+    arm = ArmModel(model, [cylinder_from_mm(values) for values in cell.tool.cylinders_mm], kinematics)
+    certifier = Certifier(arm, scene)
     require_possible(cell, model)
     return certifier
 
@@ -137,7 +140,7 @@ class _Shoulder:
     """The ball that the shoulder of an arm fills in every posture."""
 
     def __init__(self, name: str) -> None:
-        self._centre_m = np.array([0.0, 0.0, MODELS[name].d1_m])
+        self._centre_m = np.array([0.0, 0.0, MODELS[name].d_m[0]])
         self._radius_m, self._margin_m = SHAPES[name].shoulder_radius_m, Margins().scene_m
 
     def against_plane(self, row: Sequence[float]) -> str:

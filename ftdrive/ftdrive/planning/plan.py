@@ -15,9 +15,9 @@ from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
 from ftdrivers.sweep import Sweep
-from ftdrivers.ur.kinematics import Array
+from ftdrivers.ur.kinematics import Array, Kinematics
 
-PLAN_FORMAT = "ftdrive.plan/1"
+PLAN_FORMAT, OLD_FORMAT = "ftdrive.plan/2", "ftdrive.plan/1"
 BALL_SAMPLES = 181
 PROOF_S = 0.1
 """Between two points of a sweep whose straight move is proven clear."""
@@ -51,7 +51,7 @@ class Plan:
     why: tuple[str, ...]
     """What was tried, and the loss of accuracy of this choice."""
     made_for: Mapping[str, str]
-    """SHA-256 of model, tool, scene (with the margins)."""
+    """SHA-256 of model, kinematics, tool, scene (with the margins). Files of version 1 have no kinematics."""
     steps: tuple[Step, ...]
     acceleration_rad_s2: float
     ball_m: float
@@ -60,7 +60,7 @@ class Plan:
     """(3,) in base; where the axes of joints 4 and 5 cross, if base, shoulder and elbow rest."""
     predicted: Mapping[str, Any]
     description: Mapping[str, Any]
-    """Model, tool, scene and speeds; `measured` and `emulated` see `marked`."""
+    """Model, kinematics, tool, scene and speeds; `measured` and `emulated` see `marked`."""
     sweep: Sweep | None = None
     """The curve that the arm follows through the steps, which are points of it."""
     off_curve_m: float = 0.0
@@ -97,6 +97,14 @@ class Plan:
         return replace(
             self, why=(words, *self.why), description={**self.description, "measured": measured, "emulated": True}
         )
+
+    @property
+    def kinematics(self) -> Kinematics | None:
+        """Those of the arm that it was made on; None if it was made with nominal ones."""
+        found = self.description.get("kinematics", {"source": "nominal"})
+        if found["source"] == "nominal":
+            return None
+        return Kinematics.of([*found["theta_rad"], *found["a_m"], *found["d_m"], *found["alpha_rad"]])
 
     @property
     def R_base_flange(self) -> Array:
@@ -166,7 +174,8 @@ class Plan:
         """Read a file; raises `BadPlan` if it is not a plan, `PlanRefused` if it was changed."""
         try:
             document = read_object(path, BadPlan)
-            check_format(document, PLAN_FORMAT, BadPlan)
+            if document.get("format") != OLD_FORMAT:
+                check_format(document, PLAN_FORMAT, BadPlan)
         except BadPlan as error:
             raise BadPlan(f"{path}: {error}") from error
         document.pop("schema_version", None)  # that of `ftdrive plan --json`, which is a plan too
@@ -194,7 +203,7 @@ class Plan:
     def require(self, certifier: Certifier) -> None:
         """Raise `PlanRefused` unless the plan was made for this model, tool and scene, and is still proven clear."""
         now = fingerprints(certifier)
-        changed = [name for name in now if self.made_for.get(name) != now[name]]
+        changed = [name for name in now if name != "kinematics" and self.made_for.get(name) != now[name]]
         if changed:
             raise PlanRefused(f"the plan was made for another {' and another '.join(changed)}: make a new one")
         q = np.array([step.q_rad for step in self.steps])
@@ -202,6 +211,46 @@ class Plan:
             q = self.sweep.at(np.arange(0.0, self.sweep.duration_s, PROOF_S))
         if not certifier.keeping(self.off_curve_m).clear_around(q):
             raise PlanRefused("a move of the plan cannot be proven clear: make a new plan")
+
+    def of_arm(self, certifier: Certifier) -> "Plan":
+        """Return the same joint moves, certified with the kinematics of this arm; flange poses and distances are its.
+
+        A plan for another model, tool or scene is returned as it is: `require` refuses it. Raises `PlanRefused` if a
+        move cannot be proven clear with these kinematics.
+        """
+        now = fingerprints(certifier)
+        if {**self.made_for, "kinematics": now["kinematics"]} != now or self.made_for == now:
+            return self
+        if self.sweep is not None:
+            raise PlanRefused("the sweep was planned with other kinematics: make a new plan on this arm")
+        q = np.array([step.q_rad for step in self.steps])
+        following = np.roll(q, -1, axis=0)
+        certificate, R = certifier.certify(q, following), certifier.arm.frames(q).R_base_flange
+        if not certificate.clear.all():
+            whose = "nominal" if certifier.arm.is_nominal else "this arm's own"
+            raise PlanRefused(
+                f"the plan was made with other kinematics, and with {whose} a move cannot be proven clear: make a new "
+                "plan on this arm"
+            )
+        centre_m, ball_m = ball_of(certifier, q, following)
+        steps = tuple(
+            replace(
+                step,
+                R_base_flange=tuple(tuple(row) for row in R[i].tolist()),
+                certified=bool(certificate.clear[i]),
+                clearance_m=float(certificate.clearance_m[i]),
+                limited_by=certificate.limited_by[i],
+            )
+            for i, step in enumerate(self.steps)
+        )
+        return replace(
+            self,
+            made_for=now,
+            steps=steps,
+            ball_m=ball_m,
+            ball_centre_m=tuple(centre_m.tolist()),
+            description={**self.description, "kinematics": kinematics_of(certifier)},
+        )
 
 
 def make_plan(
@@ -267,6 +316,7 @@ def description_of(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[s
     """Return the description of a plan."""
     return {
         "model": certifier.arm.name,
+        "kinematics": kinematics_of(certifier),
         "tool": [asdict(part) for part in certifier.arm.tool],
         "scene": certifier.scene.describe(),
         "margins": asdict(certifier.margins),
@@ -277,6 +327,12 @@ def description_of(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[s
             "sigma_torque_Nm": guess.sigma_torque_Nm,
         },
     }
+
+
+def kinematics_of(certifier: Certifier) -> dict[str, Any]:
+    """Return the kinematics of a description: their source, theta, a, d and alpha of all joints."""
+    source = "nominal" if certifier.arm.is_nominal else "controller"
+    return {"source": source, **asdict(certifier.arm.kinematics)}
 
 
 def ball_of(certifier: Certifier, start_rad: Array, end_rad: Array) -> tuple[Array, float]:
@@ -294,6 +350,7 @@ def fingerprints(certifier: Certifier) -> dict[str, str]:
     """SHA-256 of everything that a proof of clearance depends on."""
     return {
         "model": digest(certifier.arm.describe()),
+        "kinematics": digest(kinematics_of(certifier)),
         "tool": digest([asdict(part) for part in certifier.arm.tool]),
         "scene": digest([certifier.scene.describe(), asdict(certifier.margins)]),
     }

@@ -84,7 +84,7 @@ def _attempts(certifier: Certifier, q_now: Array, poses: int, speeds: Speeds, gu
     numbers, reason = NUMBERS[poses], _reason(poses)
     if poses == 24:
         why = "The constant tour is proven clear at the present posture; base, shoulder and elbow stay at rest."
-        q = constant_tour.constant_tour(q_now)
+        q = constant_tour.constant_tour(q_now, certifier.arm.kinematics)
         fits = _winds_little(q, q_now) and certifier.clear_around(q)
         yield "constant", [why], (constant_tour.NUMBERS, q) if fits else None
     why = f"{reason}: the wrist visits them in the fastest order that is clear, base, shoulder and elbow at rest."

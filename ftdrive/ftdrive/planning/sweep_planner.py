@@ -117,7 +117,7 @@ def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
     yield q_now
     for turn in (np.pi / 2, -np.pi / 2):
         yield np.concatenate([q_now[:4], [turn], q_now[5:]])
-    near = constant_tour(q_now)
+    near = constant_tour(q_now, certifier.arm.kinematics)
     yield from near[np.argsort(np.abs(near - q_now).max(axis=1), kind="stable")[:6]]
     for tour in with_room(certifier, q_now):
         yield tour[int(np.abs(tour - q_now).max(axis=1).argmin())]

@@ -1,7 +1,7 @@
 """A run folder: the plan, every pose with its raw samples, and the results.
 
 run.json          ftdrive.run/1: when, with what, command line, versions, configuration, devices
-plan.json         ftdrive.plan/1: the plan the arm followed; not where a person moved it
+plan.json         ftdrive.plan/2: the plan the arm followed; not where a person moved it
 events.ndjson     what happened, one object a line, as `ftdrive.session.events` has it
 motion.npz        ftdrive.motion/1: every sample of sensor and arm while the tool moved; motion-2.npz likewise
 motion/1.npz ...  the same in parts, each on disk within seconds, of a recording that may end at any time

@@ -39,6 +39,7 @@ from ftdrive.session.task import Task
 from ftdrive.session.tour import SLOW, Pace, Tour
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.interfaces import NOT_REPORTED
+from ftdrivers.ur.kinematics import kinematics_of
 
 _GRID_RAD: Final = float(np.radians(0.1))
 """Joints 1 to 3 are rounded to this grid before planning, so that the same posture gives the same plan and hash."""
@@ -73,7 +74,11 @@ class AlongPlan:
         """
         cell, dry_run = self.cell, self.options.dry_run
         certifier = self._certifier()
-        plan = plan or self._plan(certifier)
+        if plan is None:
+            plan = self._plan(certifier)
+        elif plan is not (own := plan.of_arm(certifier)):
+            cell.note("the plan was made with other kinematics: its moves are proven again with those of this arm")
+            plan = own
         kept = self._kept()
         taken = {record.stop for record in kept}
         todo = [stop for stop in plan.stops if stop not in taken]
@@ -104,14 +109,16 @@ class AlongPlan:
         arm = self.cell.arm
         if not self.options.dry_run and arm.status().tcp_offset is None:
             arm.open(control=True)  # an old controller reports no poses before
-        return certifier_for(self.task.cell, arm.identify().model)
+        info = arm.identify()
+        return certifier_for(self.task.cell, info.model, kinematics_of(info))
 
     def _plan(self, certifier: Certifier) -> Plan:
         q = np.round(self.cell.arm.state().q_rad / _GRID_RAD) * _GRID_RAD
         if self.options.mode == "sweep":
             return self.task.plan(certifier, q, self.options.poses)
         with suppress(ConfigError):  # the planner reports it, with what to do
-            q[3:5] = constant_tour(q)[0, 3:5]  # joint 6 keeps its turn: it shows how the cable is wound
+            # Joint 6 keeps its turn, which shows how the cable is wound.
+            q[3:5] = constant_tour(q, certifier.arm.kinematics)[0, 3:5]
         return self.task.plan(certifier, q, self.options.poses)
 
     def _kept(self) -> list[PoseRecord]:

@@ -50,8 +50,14 @@ class Limits:
     """Allowed motion of joints that should rest."""
     tracking_rad: float = float(np.radians(2.0))
     """Allowed distance of a moving joint from the straight line in joint space."""
-    flange_m: float = 0.005
-    flange_rad: float = float(np.radians(0.5))
+    flange_m: float = 0.002
+    flange_rad: float = float(np.radians(0.2))
+    """From the arm's own kinematics: twice what the driver allows at rest, which has looked before."""
+    nominal_m: float = 0.020
+    nominal_rad: float = float(np.radians(3.0))
+    """From nominal kinematics; real arms are up to 7.5 mm and 1.3 degrees from them."""
+    lag_s: float = 0.008
+    """Between joint angles and pose of one state."""
     sensor_age_moving_s: float = 0.1
     sensor_age_holding_s: float = 0.5
     frozen_samples_s: float = 0.2
@@ -264,15 +270,21 @@ class ModelGuard(Guard):
 
     def judge(self, state: ArmState) -> None:
         """Compare the flange with the forward kinematics of the model the plan was certified for."""
-        at = self.certifier.arm.frames(state.q_rad)
+        arm, limits = self.certifier.arm, self.limits
+        at = arm.frames(state.q_rad)
         away_m = float(np.linalg.norm(at.flange_m[0] - state.p_base_flange_m))
         cosine = (np.trace(at.R_base_flange[0].T @ state.R_base_flange) - 1) / 2
         away_rad = float(np.arccos(np.clip(cosine, -1, 1)))
-        if away_m > self.limits.flange_m or away_rad > self.limits.flange_rad:
+        lag_rad = float(np.abs(state.qd_rad_s).sum()) * limits.lag_s
+        allowed_m, allowed_rad = limits.flange_m, limits.flange_rad
+        if arm.is_nominal:
+            allowed_m, allowed_rad = limits.nominal_m, limits.nominal_rad
+        reach_m = float(np.linalg.norm(at.flange_m[0]))
+        if away_m > allowed_m + lag_rad * reach_m or away_rad > allowed_rad + lag_rad:
             raise fault(
                 Hazard.WRONG_TCP,
                 f"the flange is {1e3 * away_m:.1f} mm and {np.degrees(away_rad):.2f}° from where a "
-                f"{self.certifier.arm.name} should have it: check the model and the active TCP",
+                f"{arm.name} should have it: check the model and the active TCP",
             )
 
 
@@ -495,7 +507,7 @@ def by_safety(status: ArmStatus, words: str) -> Tripped:
         payload = "" if status.payload_kg is None else f" (payload set: {status.payload_kg:.2f} kg)"
         words += f"; usual causes are contact, and a controller with a wrong payload or centre of mass{payload}"
         return fault(Hazard.PROTECTIVE_STOP, words)
-    stopped = "emergency" in mode or "safeguard" in mode
+    stopped = any(word in mode for word in ("emergency", "safeguard", "enabling"))
     return Tripped(Hazard.EMERGENCY_STOP if stopped else Hazard.SAFETY_MODE, DeviceFault(words))
 
 

@@ -8,6 +8,7 @@ the UR5e by the length of wrist 2. Models without measured shapes are refused.
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftcalib.model import cross
 from ftdrive.errors import ConfigError
-from ftdrive.planning.geometry.kinematics import Frames, frames
+from ftdrive.planning.geometry.kinematics import Frames, deviation, frames
 from ftdrive.planning.geometry.shapes import Bodies
-from ftdrivers.ur.kinematics import MODELS, Array, Geometry, model_named
+from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, model_named
 
 HUB_ROUNDING_M = 0.020
 """Of the edges of the housings at the joints. On the constant tour a UR3e then comes within 22 mm of itself; the convex
@@ -140,9 +141,17 @@ _Housing = tuple[Array, tuple[float, float], float, float]
 
 
 class ArmModel:
-    """One arm with its tool."""
+    """One arm with its tool.
 
-    def __init__(self, model: str, tool: Sequence[Cylinder]) -> None:
+    Parameters
+    ----------
+    model : str
+    tool : sequence of Cylinder
+    kinematics : Kinematics, optional
+        The arm's own; without them nominal ones, from which a real arm differs: `Certifier` then keeps more distance.
+    """
+
+    def __init__(self, model: str, tool: Sequence[Cylinder], kinematics: Kinematics | None = None) -> None:
         name = model_named(model, controller_major=0)
         if name is None:
             raise ConfigError(
@@ -156,7 +165,8 @@ class ArmModel:
         if not tool:
             raise ConfigError("the tool is empty: describe at least the sensor as a cylinder, from:to:diameter in mm")
         self.name = name
-        self.geometry: Geometry = MODELS[name]
+        self.is_nominal = kinematics is None
+        self.kinematics = kinematics or MODELS[name]
         self.shape = SHAPES[name]
         self.tool = tuple(tool)
         self.names = tuple(name for name, _ in _ARM) + tuple(f"tool {i + 1}" for i in range(len(tool)))
@@ -166,35 +176,36 @@ class ArmModel:
 
     def frames(self, q_rad: ArrayLike) -> Frames:
         """Where the joints are, for joint vectors (n, 6)."""
-        return frames(self.geometry, q_rad)
+        return frames(self.kinematics, q_rad)
 
     def bodies(self, q_rad: ArrayLike) -> Bodies:
         """Bodies (n, k) at joint vectors (n, 6), in the order of `names`."""
-        at, g, s = self.frames(q_rad), self.geometry, self.shape
+        at, s = self.frames(q_rad), self.shape
+        *_, d1_m, d5_m, d6_m = self._lengths_m
         axis_6 = at.R_base_flange[:, :, 2]
-        half_way = (at.wrist_m + at.wrist_2_m) / 2
-        wrist_3 = at.flange_m - g.d6_m / 2 * axis_6
+        half_way = at.wrist_2_m - d5_m / 2 * at.axis_5
+        wrist_3 = at.flange_m - d6_m / 2 * axis_6
         lid = s.wrist_lid_m - HUB_ROUNDING_M
         shoulder_side = at.shoulder_m, s.upper_arm_hub_m, s.upper_arm_radius_m, HUB_ROUNDING_M
         elbow = at.elbow_m, s.elbow_hub_m, s.elbow_radius_m, HUB_ROUNDING_M
         elbow_side = at.elbow_m, s.forearm_hub_m, s.elbow_radius_m, HUB_ROUNDING_M
         wrist_side = at.forearm_end_m, s.forearm_end_hub_m, s.forearm_end_radius_m, FOREARM_END_ROUNDING_M
         shoulder_end = at.shoulder_m + s.upper_arm_hub_m[0] * at.lift
-        forearm_end = at.forearm_end_m + s.forearm_end_hub_m[1] * at.lift
-        upper_arm, forearm = s.upper_arm_offset_m * at.lift, s.forearm_offset_m * at.lift
-        wrist_hub = s.wrist_radius_m - HUB_ROUNDING_M, HUB_ROUNDING_M
+        forearm_end = at.forearm_end_m + s.forearm_end_hub_m[1] * at.lift_4
+        upper_arm, forearm = s.upper_arm_offset_m * at.lift, s.forearm_offset_m * at.lift_3
+        wrist_hub, base = (s.wrist_radius_m - HUB_ROUNDING_M, HUB_ROUNDING_M), np.zeros(at.lift.shape)
         parts = [
-            (np.zeros_like(at.lift), at.shoulder_m, 0.0, s.base_radius_m),
+            (base, base + d1_m * np.eye(3)[2], 0.0, s.base_radius_m),
             (at.shoulder_m, shoulder_end, 0.0, s.shoulder_radius_m),
             _hub(at.lift, shoulder_side),
             (at.shoulder_m + upper_arm, at.elbow_m + upper_arm, 0.0, s.upper_arm_radius_m),
             _hub(at.lift, elbow),
             *_edges(at.lift, 0, shoulder_side, elbow),
             *_edges(at.lift, 1, shoulder_side, elbow),
-            _hub(at.lift, elbow_side),
+            _hub(at.lift_3, elbow_side),
             (at.elbow_m + forearm, at.forearm_end_m + forearm, 0.0, s.forearm_radius_m),
-            _hub(at.lift, wrist_side),
-            *_edges(at.lift, 1, elbow_side, wrist_side),
+            _hub(at.lift_3, wrist_side),
+            *_edges(at.lift_3, 1, elbow_side, wrist_side),
             (forearm_end, at.wrist_m, 0.0, s.wrist_radius_m),
             (at.wrist_m - lid * at.axis_5, half_way, *wrist_hub),
             (half_way, at.wrist_2_m, 0.0, s.wrist_radius_m),
@@ -214,37 +225,59 @@ class ArmModel:
     @property
     def ball_m(self) -> float:
         """Radius about the wrist centre of a ball that holds all that the last three joints move, and 15 mm more."""
-        g, r = self.geometry, self.shape.wrist_radius_m
-        parts = [(r, g.d6_m), *((part.reach_m, g.d6_m + part.to_m) for part in self.tool)]
-        return max(float(np.hypot(g.d5_m + reach, height)) for reach, height in parts) + 0.015
+        (*_, d5_m, d6_m), r = self._lengths_m, self.shape.wrist_radius_m
+        parts = [(r, d6_m), *((part.reach_m, d6_m + part.to_m) for part in self.tool)]
+        ball_m = max(float(np.hypot(d5_m + reach, height)) for reach, height in parts)
+        return ball_m + float(self._off_m[3:].sum()) + 0.015
 
     def describe(self) -> dict[str, Any]:
-        """Everything a plan relies on, for its hash."""
-        return {"model": self.name, "geometry": asdict(self.geometry), "shape": asdict(self.shape)}
+        """Everything a plan relies on, for its hash; kinematics apart."""
+        nominal = MODELS[self.name]
+        lengths = nominal.d_m[0], *nominal.a_m[1:3], *nominal.d_m[3:]
+        names = ("d1_m", "a2_m", "a3_m", "d4_m", "d5_m", "d6_m")
+        return {"model": self.name, "geometry": dict(zip(names, lengths, strict=True)), "shape": asdict(self.shape)}
+
+    @cached_property
+    def _lengths_m(self) -> tuple[float, ...]:
+        """Upper arm, forearm, d4, d1, d5 and d6."""
+        links = self.kinematics.links_m
+        upper, fore = np.hypot(links[1:3, 0], links[1:3, 1]).tolist()
+        d1_m, _, _, d4_m, d5_m, d6_m = links[:, 2].tolist()
+        return upper, fore, d4_m, d1_m, d5_m, d6_m
+
+    @cached_property
+    def _off_m(self) -> Array:
+        """Bound (6,): how far what follows each link is from where an arm with the same lengths, exact axes has it."""
+        shift_m, tilt_rad = deviation(self.kinematics)
+        length_m = np.linalg.norm(self.kinematics.links_m, axis=1)
+        after_m = length_m[::-1].cumsum()[::-1] - length_m
+        beyond_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in self.tool)
+        thick_m = max(self.shape.shoulder_radius_m, *self.shape.upper_arm_hub_m, *self.shape.elbow_hub_m)
+        return np.asarray(shift_m + tilt_rad * (after_m + beyond_m + thick_m))
 
     def _travel(self) -> Array:
         """Bound (k, 6): how far a turn of joint j by one radian can move a point of body i, metres.
 
-        Largest distance of a point of the body from the joint's axis, over all postures. Of a body that is round about
-        the axis of joint 6, that joint moves nothing.
+        Largest distance of a point of the body from the joint's axis, over all postures, as of an arm with exact axes,
+        and how far the links between can be from it. Of a body that is round about the axis of joint 6, that joint
+        moves nothing.
         """
-        g, s = self.geometry, self.shape
+        (upper, fore, d4_m, _, d5_m, d6_m), s = self._lengths_m, self.shape
         # Reach of each body beyond the wrist centre: from axis 4, from axis 5, from axis 6, and along the lift axis.
         # Rounding is left out: where a body's core stays, so does all of it.
         r, lid = s.wrist_radius_m, s.wrist_lid_m - HUB_ROUNDING_M
-        hub, back_4, back_5 = r - HUB_ROUNDING_M, max(lid, g.d5_m / 2), max(lid, g.d6_m / 2)
+        hub, back_4, back_5 = r - HUB_ROUNDING_M, max(lid, d5_m / 2), max(lid, d6_m / 2)
         wrist: list[tuple[float, float, float]] = [
             (0.0, 0.0, 0.0),
             (float(np.hypot(back_4, hub)), hub, 0.0),
-            (g.d5_m, 0.0, 0.0),
-            (float(np.hypot(g.d5_m + hub, back_5)), float(np.hypot(back_5, hub)), 0.0),
-            (float(np.hypot(g.d5_m + r, g.d6_m)), float(np.hypot(g.d6_m, r)), 0.0),
+            (d5_m, 0.0, 0.0),
+            (float(np.hypot(d5_m + hub, back_5)), float(np.hypot(back_5, hub)), 0.0),
+            (float(np.hypot(d5_m + r, d6_m)), float(np.hypot(d6_m, r)), 0.0),
         ]
         for part in self.tool:
-            height, reach = g.d6_m + part.to_m, part.reach_m
+            height, reach = d6_m + part.to_m, part.reach_m
             turned = reach if part.offset_m > 0 else 0.0
-            wrist.append((float(np.hypot(g.d5_m + reach, height)), float(np.hypot(height, reach)), turned))
-        upper, fore = -g.a2_m, -g.a3_m
+            wrist.append((float(np.hypot(d5_m + reach, height)), float(np.hypot(height, reach)), turned))
         rows = np.zeros((len(_ARM) + len(self.tool), 6))
         hubs = s.upper_arm_hub_m, s.elbow_hub_m, s.forearm_hub_m, s.forearm_end_hub_m
         sideways = max(abs(end) for hub in hubs for end in hub)
@@ -256,8 +289,11 @@ class ArmModel:
         rows[_ELBOW_SIDE, :3] = np.hypot(sideways, upper + radius), upper + radius, radius
         for row, (from_4, from_5, from_6) in zip(rows[_WRIST_1[0] :], wrist, strict=True):
             from_2 = upper + fore + from_4
-            row[:] = np.hypot(from_2, g.d4_m + from_5 + radius), from_2, fore + from_4, from_4, from_5, from_6
-        return rows
+            row[:] = np.hypot(from_2, d4_m + from_5 + radius), from_2, fore + from_4, from_4, from_5, from_6
+        between = np.arange(6) < self.moved_by[:, None]
+        # What moves with a joint begins at its own link: the links from the joint to the body's, that one included.
+        off_m = np.where(between, self._off_m, 0.0)
+        return np.asarray(rows + np.where(between, off_m[:, ::-1].cumsum(axis=1)[:, ::-1], 0.0))
 
 
 def _hub(lift: Array, housing: _Housing) -> _Part:

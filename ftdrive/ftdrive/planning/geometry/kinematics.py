@@ -1,8 +1,8 @@
 """Kinematics of Universal Robots arms for many joint vectors at once.
 
-Joints 2, 3 and 4 turn about parallel axes (the lift axis), so the flange orientation in the shoulder frame is
-`Rz(psi) @ Ry(-q5) @ Rz(q6)` with psi = q2 + q3 + q4. Both inverses below read the wrist off this product.
-Lengths are nominal: good for planning, never a source of flange poses for the solver.
+Joints 2, 3 and 4 of a nominal arm turn about parallel axes (the lift axis), so the flange orientation in the shoulder
+frame is `Rz(psi) @ Ry(-q5) @ Rz(q6)` with psi = q2 + q3 + q4. Both inverses below read the wrist off this product. The
+axes of a real arm are up to half a degree from parallel: there, the product is where Newton's method begins.
 """
 
 from dataclasses import dataclass
@@ -10,11 +10,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ftcalib.model import cross
 from ftdrive.errors import ConfigError
-from ftdrivers.ur.kinematics import Array, Geometry
+from ftdrivers.ur.kinematics import Array, Kinematics
 
 ALIGNED = 1e-9
 """Below this sine of q5, joints 4 and 6 turn about one line."""
+_STEPS = 5
+"""Of Newton's method, from an arm with exactly parallel axes: the rest is rounding."""
+_TINY = 1e-14
+_REACHED = 1e-6
+"""Metres and radians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,15 +28,19 @@ class Frames:
     """Where the joints are, for n joint vectors; everything (n, 3) in base, metres."""
 
     lift: Array
-    """Direction of joint axes 2, 3 and 4."""
+    """Direction of joint axis 2."""
+    lift_3: Array
+    lift_4: Array
+    """Of joint axes 3 and 4, parallel to axis 2 on a nominal arm."""
     shoulder_m: Array
     elbow_m: Array
     forearm_end_m: Array
+    """On axis 4, at no distance from the shoulder along the lift axis."""
     wrist_m: Array
-    """Wrist centre, where axes 4 and 5 cross."""
+    """Wrist centre, where axis 4 crosses axis 5, or comes nearest to it."""
     axis_5: Array
     wrist_2_m: Array
-    """Where axes 5 and 6 cross."""
+    """The same on axis 5, for axis 6."""
     R_base_flange: Array
     """(n, 3, 3); its last column is the direction of axis 6."""
     flange_m: Array
@@ -44,66 +54,80 @@ def checked_joints(q_rad: ArrayLike) -> Array:
     return q
 
 
-def frames(geometry: Geometry, q_rad: ArrayLike) -> Frames:
+def frames(kinematics: Kinematics, q_rad: ArrayLike) -> Frames:
     """Forward kinematics of joint vectors (n, 6)."""
-    q = np.asarray(q_rad, dtype=np.float64).reshape(-1, 6)
-    c1, s1 = np.cos(q[:, 0]), np.sin(q[:, 0])
-    zero = np.zeros(len(q))
-    outward, lift = np.stack([c1, s1, zero], axis=1), np.stack([s1, -c1, zero], axis=1)
-    up = np.array([0.0, 0.0, 1.0])
-
-    def in_plane(angle: Array) -> Array:
-        return np.asarray(np.cos(angle)[:, None] * outward + np.sin(angle)[:, None] * up)
-
-    psi = q[:, 1] + q[:, 2] + q[:, 3]
-    shoulder = np.tile(geometry.d1_m * up, (len(q), 1))
-    elbow = shoulder + geometry.a2_m * in_plane(q[:, 1])
-    forearm_end = elbow + geometry.a3_m * in_plane(q[:, 1] + q[:, 2])
-    wrist = forearm_end + geometry.d4_m * lift
-    axis_5 = in_plane(psi - np.pi / 2)
-    wrist_2 = wrist + geometry.d5_m * axis_5
-    R_base_shoulder = np.stack([outward, np.broadcast_to(up, outward.shape), lift], axis=2)
-    R = R_base_shoulder @ wrist_rotation(psi, q[:, 4], q[:, 5])
-    return Frames(lift, shoulder, elbow, forearm_end, wrist, axis_5, wrist_2, R, wrist_2 + geometry.d6_m * R[:, :, 2])
-
-
-def wrist_rotation(psi_rad: Array, q5_rad: Array, q6_rad: Array) -> Array:
-    """Flange orientation (n, 3, 3) in the shoulder frame (x outward, y up, z along the lift axis)."""
-    cp, sp, c5, s5, c6, s6 = (f(a) for a in (psi_rad, q5_rad, q6_rad) for f in (np.cos, np.sin))
-    rows = (
-        (cp * c5 * c6 - sp * s6, -cp * c5 * s6 - sp * c6, -cp * s5),
-        (sp * c5 * c6 + cp * s6, -sp * c5 * s6 + cp * c6, -sp * s5),
-        (s5 * c6, -s5 * s6, c5),
+    axes, points, R = _chain(kinematics, np.asarray(q_rad, dtype=np.float64).reshape(-1, 6))
+    along = kinematics.links_m[:, 2]
+    return Frames(
+        lift=axes[1],
+        lift_3=axes[2],
+        lift_4=axes[3],
+        shoulder_m=points[1],
+        elbow_m=points[2],
+        forearm_end_m=points[3],
+        wrist_m=points[3] + along[3] * axes[3],
+        axis_5=axes[4],
+        wrist_2_m=points[4] + along[4] * axes[4],
+        R_base_flange=R,
+        flange_m=points[6],
     )
-    return np.array(rows).transpose(2, 0, 1)
 
 
-def wrist_inverse(q_arm_rad: ArrayLike, R_base_flange: Array) -> Array:
+def _chain(kinematics: Kinematics, q_rad: Array) -> tuple[list[Array], list[Array], Array]:
+    """Return directions (n, 3) of the six axes, a point (n, 3) on each and the flange, and R_base_flange (n, 3, 3)."""
+    turn = q_rad.T + np.array(kinematics.theta_rad)[:, None]
+    cosine, sine = np.cos(turn), np.sin(turn)
+    x, y, z = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, len(q_rad)))  # each (3, n): numpy is quicker so
+    point = np.zeros((3, len(q_rad)))
+    axes, points = [], []
+    for c, s, alpha, (a, b, d) in zip(cosine, sine, kinematics.alpha_rad, kinematics.links_m.tolist(), strict=True):
+        axes.append(z.T)
+        points.append(point.T)
+        x, y = c * x + s * y, c * y - s * x
+        for length_m, direction in ((a, x), (b, y), (d, z)):
+            if length_m:
+                point = point + length_m * direction
+        ca, sa = np.cos(alpha), np.sin(alpha)
+        y, z = ca * y + sa * z, ca * z - sa * y
+    return axes, [*points, point.T], np.ascontiguousarray(np.transpose([x, y, z], (2, 1, 0)))
+
+
+def wrist_inverse(kinematics: Kinematics, q_arm_rad: ArrayLike, R_base_flange: Array) -> Array:
     """Angles of the wrist that give the flange these orientations while joints 1 to 3 stand still.
 
     Parameters
     ----------
+    kinematics : Kinematics
     q_arm_rad : array_like, shape (3,)
     R_base_flange : array, shape (n, 3, 3)
 
     Returns
     -------
     array, shape (n, 2, 6)
-        Joint vectors with the wrist in (-pi, pi], once with q5 >= 0 and once with q5 <= 0. Where axes 4 and 6 are
-        parallel, q6 is free and taken as zero.
+        Joint vectors with the wrist in (-pi, pi], once with q5 >= 0 and once with q5 <= 0. Where axes 4 and 6 of a
+        nominal arm are parallel, q6 is free and taken as zero; a real arm may there be off by its own deviation.
     """
     q_arm = np.asarray(q_arm_rad, dtype=np.float64)
-    psi, q5, q6 = _wrist_angles(q_arm[0], R_base_flange)
-    q4 = _wrapped(psi - q_arm[1] - q_arm[2])
-    return np.concatenate([np.broadcast_to(q_arm, (*q4.shape, 3)), np.stack([q4, q5, q6], axis=2)], axis=2)
+    _, offset = _parallel(kinematics)
+    psi, q5, q6 = _wrist_angles(q_arm[0] + offset[0], R_base_flange)
+    wrist = np.stack([psi - (q_arm + offset[:3])[1:].sum(), q5, q6], axis=2) - offset[3:]
+    q = np.concatenate([np.broadcast_to(q_arm, wrist.shape), wrist], axis=2)
+    q = _refined(kinematics, q.reshape(-1, 6), np.repeat(R_base_flange, 2, axis=0)).reshape(q.shape)
+    q[:, :, [3, 5]] = _wrapped(q[:, :, [3, 5]])
+    return q
 
 
-def inverse(geometry: Geometry, R_base_flange: Array, p_base_flange_m: Array) -> Array:
+def wrist_refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array) -> Array:
+    """Turn the wrist of joint vectors (n, 6), which nearly have these orientations (n, 3, 3), to have them exactly."""
+    return _refined(kinematics, np.asarray(q_rad), R_base_flange)
+
+
+def inverse(kinematics: Kinematics, R_base_flange: Array, p_base_flange_m: Array) -> Array:
     """All joint vectors that bring the flange to these poses.
 
     Parameters
     ----------
-    geometry : Geometry
+    kinematics : Kinematics
     R_base_flange : array, shape (n, 3, 3)
     p_base_flange_m : array, shape (n, 3)
 
@@ -111,27 +135,82 @@ def inverse(geometry: Geometry, R_base_flange: Array, p_base_flange_m: Array) ->
     -------
     array, shape (n, 8, 6)
         In (-pi, pi]; two shoulders, two wrists, two elbows, in this order of nesting; nan where there is no solution.
+        A real arm may have none where the nominal one is just stretched out, or the other way round: nan too.
     """
     R, p = np.asarray(R_base_flange, dtype=np.float64), np.asarray(p_base_flange_m, dtype=np.float64)
-    crossing = p - geometry.d6_m * R[:, :, 2]
+    (d1, a2, a3, d4, d5, d6), offset = _parallel(kinematics)
+    crossing = p - d6 * R[:, :, 2]
     with np.errstate(invalid="ignore", divide="ignore"):
-        swing = np.arccos(geometry.d4_m / np.hypot(crossing[:, 0], crossing[:, 1]))
+        swing = np.arccos(d4 / np.hypot(crossing[:, 0], crossing[:, 1]))
     heading = np.arctan2(crossing[:, 1], crossing[:, 0]) + np.pi / 2
     q = np.full((len(R), 2, 2, 2, 6), np.nan)
     for shoulder, q1 in enumerate((heading + swing, heading - swing)):
         psi, q5, q6 = _wrist_angles(q1, R)  # (n, 2)
         c1, s1 = np.cos(q1), np.sin(q1)
-        x = (c1 * crossing[:, 0] + s1 * crossing[:, 1])[:, None] - geometry.d5_m * np.sin(psi)
-        y = (crossing[:, 2] - geometry.d1_m)[:, None] + geometry.d5_m * np.cos(psi)
-        a2, a3 = geometry.a2_m, geometry.a3_m
+        x = (c1 * crossing[:, 0] + s1 * crossing[:, 1])[:, None] - d5 * np.sin(psi)
+        y = (crossing[:, 2] - d1)[:, None] + d5 * np.cos(psi)
         with np.errstate(invalid="ignore"):
             bend = np.arccos((x**2 + y**2 - a2**2 - a3**2) / (2 * a2 * a3))
         for elbow, q3 in enumerate((bend, -bend)):
             q2 = np.arctan2(y, x) - np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3))
             joints = np.stack([np.broadcast_to(q1[:, None], q3.shape), q2, q3, psi - q2 - q3, q5, q6], axis=2)
-            q[:, shoulder, :, elbow] = _wrapped(joints)
-    q = q.reshape(len(R), 8, 6)
-    q[np.isnan(q).any(axis=2)] = np.nan
+            q[:, shoulder, :, elbow] = joints - offset
+    q = q.reshape(-1, 6)
+    reached = np.flatnonzero(~np.isnan(q).any(axis=1))
+    pose = reached // 8
+    found = _refined(kinematics, q[reached], R[pose], p[pose])
+    at = frames(kinematics, found)
+    off = np.maximum(np.abs(at.flange_m - p[pose]).max(axis=1), np.abs(at.R_base_flange - R[pose]).max(axis=(1, 2)))
+    q[:] = np.nan
+    q[reached] = np.where((off < _REACHED)[:, None], _wrapped(found), np.nan)
+    return q.reshape(len(R), 8, 6)
+
+
+def _parallel(kinematics: Kinematics) -> tuple[tuple[float, ...], Array]:
+    """Return the arm with the same lengths and axes exactly parallel or at right angles: d1, a2, a3, d4, d5 and d6.
+
+    Its joint angles are those of the given arm plus the offsets (6,), which are zero for a nominal one.
+    """
+    links, theta = kinematics.links_m, np.array(kinematics.theta_rad)
+    limbs = np.hypot(links[1:3, 0], links[1:3, 1])
+    turned = np.arctan2(-links[1:3, 1], -links[1:3, 0])  # a2 and a3 are negative
+    lengths = (links[0, 2], -limbs[0], -limbs[1], *links[3:, 2])
+    return lengths, _wrapped(theta + np.array([0.0, turned[0], turned[1] - turned[0], -turned[1], 0.0, 0.0]))
+
+
+def deviation(kinematics: Kinematics) -> tuple[Array, Array]:
+    """How far each link (6,) is from one of an arm with the same lengths and axes exactly parallel or at right angles.
+
+    Returns
+    -------
+    shift_m, tilt_rad : array, shape (6,)
+        Of the point on the next axis, and of that axis.
+    """
+    links = kinematics.links_m
+    shift_m = np.hypot(links[:, 0], links[:, 1])
+    shift_m[1:3] = 0.0
+    right = np.array([np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0])
+    return shift_m, np.abs(np.array(kinematics.alpha_rad) - right)
+
+
+def _refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array, p_base_flange_m: Array | None = None) -> Array:
+    """Newton's method from joint vectors (n, 6) to the nearest ones with these poses; without points, by the wrist."""
+    if max(map(np.max, deviation(kinematics))) < ALIGNED:
+        return q_rad
+    first = 3 if p_base_flange_m is None else 0
+    q = q_rad.copy()
+    for _ in range(_STEPS):
+        axes, points, R = _chain(kinematics, q)
+        J = np.stack(axes[first:], axis=2)
+        off = cross(np.swapaxes(R, 1, 2), np.swapaxes(R_base_flange, 1, 2)).sum(axis=1) / 2
+        if p_base_flange_m is not None:
+            levers = [cross(axis, points[6] - point) for axis, point in zip(axes, points[:6], strict=True)]
+            J = np.concatenate([np.stack(levers, axis=2), J], axis=1)
+            off = np.concatenate([p_base_flange_m - points[6], off], axis=1)
+        JT = np.swapaxes(J, 1, 2)
+        damping = np.square(off).sum(axis=1)[:, None, None] + _TINY  # no step is above half a radian
+        step = JT @ np.linalg.solve(J @ JT + damping * np.eye(J.shape[1]), off[:, :, None])
+        q[:, first:] += step[:, :, 0]
     return q
 
 

@@ -27,6 +27,8 @@ DIRECTIONS_OF_A_LUMP, SPINS_OF_A_LUMP = 60, 4
 """If joint 6 changes what can collide: each spin is a shape of its own then."""
 MOST_PARTS = 2
 """Number of disconnected parts of free space that are tried."""
+FROM_HERE = 6
+"""Number of joint vectors of each part, the nearest ones, to which a straight move is tried."""
 NEARLY = 1.05
 """No other posture is tried if the predicted error is within this factor of the best poses of the cone."""
 OTHER_POSTURES = 2
@@ -163,7 +165,9 @@ def _tours_at(
         return
     part = connected(certifier, q, group % spins)
     reached = [np.unique(group[part == p]) for p in range(part.max() + 1)]
-    for p in sorted(range(len(reached)), key=lambda p: -len(reached[p]))[:MOST_PARTS]:
+    here = _begins_here(certifier, q_now, q, part)
+    # The same orientations a whole turn of wrist 2 away are another part, with no approach: the arm is in between.
+    for p in sorted(range(len(reached)), key=lambda p: (not here[p], -len(reached[p])))[:MOST_PARTS]:
         if len(reached[p]) < poses:
             break
         chosen = reached[p][choice(candidates[reached[p]])]
@@ -176,10 +180,19 @@ def _tours_at(
             yield tuple((101 + place[group[nodes]]).tolist()), q[nodes]
 
 
+def _begins_here(certifier: Certifier, q_now: Array, q_rad: Array, part: Nodes) -> list[bool]:
+    """Return for each part whether a straight move from the present joint angles leads into it."""
+    near = np.argsort(np.abs(q_rad - q_now).max(axis=1), kind="stable")
+    ends = [near[part[near] == p][:FROM_HERE] for p in range(part.max() + 1)]
+    goals = q_rad[np.concatenate(ends)]
+    clear = certifier.certify(np.tile(q_now, (len(goals), 1)), goals, tight=False).clear
+    return [bool(one.any()) for one in np.split(clear, np.cumsum([len(end) for end in ends])[:-1])]
+
+
 def _others(certifier: Certifier, q_now: Array, candidates: Array) -> Array:
     """Postures (k, 3) of joints 1 to 3 that reach the most tool directions."""
     postures = grid(certifier, q_now, POSTURE_STEP_DEG)
     looks = candidates[np.linspace(0, len(candidates) - 1, LOOKS).astype(int)]
-    q = np.array([wrist_inverse(posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)
+    q = np.array([wrist_inverse(certifier.arm.kinematics, posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)
     free = certifier.free(q.reshape(-1, 6)).reshape(q.shape[:3]).any(axis=2)
     return np.asarray(postures[np.argsort(-free.sum(axis=1), kind="stable")][:OTHER_POSTURES])

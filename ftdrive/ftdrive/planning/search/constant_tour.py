@@ -9,8 +9,8 @@ the speed of the tool's tip is limited: 16 moves turn joint 6 alone. Wrist 1 tur
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftdrive.planning.geometry.kinematics import checked_joints
-from ftdrivers.ur.kinematics import Array
+from ftdrive.planning.geometry.kinematics import checked_joints, frames, wrist_refined
+from ftdrivers.ur.kinematics import MODELS, Array, Kinematics
 
 # Orientation number in the paper, then psi = q2 + q3 + q4, q5 and q6 in degrees.
 _TOUR_DEG = (
@@ -45,16 +45,25 @@ DIFFERENT_SHAPES = tuple(np.unique([row[1:3] for row in _TOUR_DEG], axis=0, retu
 """Stops that differ in more than joint 6."""
 
 
-def constant_tour(q_rad: ArrayLike) -> Array:
+_NOMINAL = MODELS["UR5e"]
+"""The wrist angles of an orientation are the same for every nominal arm."""
+_ROOM_RAD = float(np.radians(3))
+"""Between the table and the wrist angles of a real arm, which is at most 1.3 degrees from the nominal one."""
+
+
+def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
     """Joint vectors (24, 6) of the tour at the present posture of joints 1 to 3.
 
     Joints 1 to 3 keep their angles. The flange orientation at a pose is `Rz(q1 - 45 deg) @ R_i.T` with the paper's
-    matrix R_i, so at other base pans than 45 degrees the whole set is turned about the base's z axis.
+    matrix R_i, so at other base pans than 45 degrees the whole set is turned about the base's z axis. The wrist of an
+    arm with its own kinematics turns up to a few degrees less or more to get there.
 
     Parameters
     ----------
     q_rad : array_like, shape (6,)
         Present joint angles. Joint 4 stays as close to it as whole turns allow.
+    kinematics : Kinematics, optional
+        The arm's own.
 
     Returns
     -------
@@ -65,6 +74,10 @@ def constant_tour(q_rad: ArrayLike) -> Array:
     psi, q5, q6 = np.radians(_TOUR_DEG)[:, 1:].T
     # Whole turns, chosen for the tour as one; as it turns joint 4 by 90 degrees only, some fit always.
     q4 = psi - q[1] - q[2] + 2 * np.pi * np.arange(-3, 4)[:, None]
-    inside = q4[(np.abs(q4) <= 2 * np.pi + 1e-9).all(axis=1)]
+    room = _ROOM_RAD if kinematics is not _NOMINAL else -1e-9
+    inside = q4[(np.abs(q4) <= 2 * np.pi - room).all(axis=1)]
     nearest = inside[np.abs(inside[:, 0] - q[3]).argmin()]
-    return np.column_stack([np.tile(q[:3], (len(psi), 1)), nearest, q5, q6])
+    tour = np.column_stack([np.tile(q[:3], (len(psi), 1)), nearest, q5, q6])
+    if kinematics is _NOMINAL:
+        return tour
+    return wrist_refined(kinematics, tour, frames(_NOMINAL, tour).R_base_flange)

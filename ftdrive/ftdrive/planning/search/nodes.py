@@ -14,7 +14,9 @@ Nodes = NDArray[np.intp]
 
 SHOULDER_RAD = float(np.radians(110))
 WRIST_6_RAD = float(np.radians(200))
-WINDOW_RAD = np.array([np.pi, SHOULDER_RAD, np.inf, np.pi, np.pi, WRIST_6_RAD])
+HALF_TURN_RAD = float(np.radians(183))
+"""So that a real arm, which is up to 3 degrees from the table, has both ways to an angle half a turn away."""
+WINDOW_RAD = np.array([np.pi, SHOULDER_RAD, np.inf, HALF_TURN_RAD, HALF_TURN_RAD, WRIST_6_RAD])
 """To both sides of where the joints stand. Joint 6 is what winds the cable."""
 ELBOW_RAD = float(np.radians(165))
 """From stretched. The elbow cannot fold further, and the shapes do not know it."""
@@ -38,7 +40,7 @@ def wrist_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array) ->
         Index of the orientation.
     """
     q_now = np.asarray(q_rad, dtype=np.float64)
-    solutions = wrist_inverse(q_now[:3], R_base_flange)  # (m, 2, 6)
+    solutions = wrist_inverse(certifier.arm.kinematics, q_now[:3], R_base_flange)  # (m, 2, 6)
     group = np.repeat(np.arange(len(solutions)), 2)
     return _free(certifier, *_within_windows(solutions.reshape(-1, 6), group, q_now, first=3))
 
@@ -66,7 +68,7 @@ def box_nodes(
     """
     places = centre_m + half_size_m * np.stack(np.meshgrid(STEPS, STEPS, STEPS), axis=-1).reshape(-1, 3)
     group, place = (index.ravel() for index in np.indices((len(R_base_flange), len(places))))
-    q = inverse(certifier.arm.geometry, R_base_flange[group], places[place])  # (m * 27, 8, 6)
+    q = inverse(certifier.arm.kinematics, R_base_flange[group], places[place])  # (m * 27, 8, 6)
     group = np.repeat(group, q.shape[1])
     q = q.reshape(-1, 6)
     reached = ~np.isnan(q[:, 0]) & (np.abs(q[:, 2]) <= ELBOW_RAD)

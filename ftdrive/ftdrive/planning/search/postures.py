@@ -38,7 +38,7 @@ def with_room(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
         # Turning joint 6 alone brings a new pose, but hardly a new shape: the rest is for the proof.
         q = tours[:, DIFFERENT_SHAPES]
         for i in np.flatnonzero(certifier.free(q.reshape(-1, 6)).reshape(q.shape[:2]).all(axis=1)):
-            yield tours[i]
+            yield constant_tour(tours[i, 0], certifier.arm.kinematics)
             offered += 1
             if offered == MOST_POSTURES:
                 return

@@ -181,7 +181,7 @@ def _draw_surroundings(scene: Any, plan: Plan, certifier: Certifier, q_rad: Arra
 
 def _size_m(certifier: Certifier) -> float:
     arm = certifier.arm
-    return 2 * (arm.ball_m - arm.geometry.a2_m - arm.geometry.a3_m)
+    return 2 * (arm.ball_m + float(np.linalg.norm(arm.kinematics.links_m[1:3], axis=1).sum()))
 
 
 def _foot(plane: Plane) -> Array:

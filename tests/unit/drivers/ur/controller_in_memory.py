@@ -26,7 +26,7 @@ from ftdrivers.ur import control_child, opening, reading
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import STOP_RAD_S2
 from ftdrivers.ur.control_process import ControlProcess
-from ftdrivers.ur.kinematics import MODELS, Pose, forward
+from ftdrivers.ur.kinematics import MODELS, Kinematics, Pose, forward
 from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.rtde import Recipe
 from ftdrivers.ur.sample import OUTPUTS
@@ -76,6 +76,8 @@ class Controller:
         self.robot_mode, self.safety_mode, self.safety_bits, self.program = 7, 1, 1, 1
         self.unknown: set[str] = set()
         """Outputs it does not know."""
+        self.kinematics: Kinematics | None = MODELS["UR5e"]
+        """What the primary interface sends."""
         self.registers_taken = False
         self.ur_rtde_is_installed = True
         self.silent = False
@@ -409,6 +411,7 @@ def install(controller: Controller, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subprocess, "Popen", ProcessInMemory)
     monkeypatch.setattr(time, "sleep", controller.clock.sleep)  # in `Calls`
     monkeypatch.setattr(reading, "Subscription", lambda *_, **__: controller)
+    monkeypatch.setattr(reading, "read_arm", lambda *_, **__: (None, controller.kinematics))
     monkeypatch.setattr(ServicesOf, "ask", lambda _, question, *, timeout_s, **__: controller.ask(question, timeout_s))
     monkeypatch.setattr(opening, "find_spec", lambda _: controller.ur_rtde_is_installed or None)
     monkeypatch.setattr(opening, "find_program_port", lambda *_, **__: None)

@@ -9,11 +9,12 @@ import pytest
 
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.interfaces import ArmStates
-from ftdrivers.ur.kinematics import MODELS, forward
+from ftdrivers.ur.kinematics import MODELS, Kinematics, forward
 from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.sample import Sample
 from ftdrivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
+from tests.own_kinematics import drawn, real
 from tests.unit.drivers.ur.controller_in_memory import (
     CYCLE_S,
     Controller,
@@ -262,6 +263,33 @@ def test_an_old_controller_is_asked_for_its_tcp_before_and_after(controller: Con
         reader.state(lambda: [float(next(changing))] * 6)
 
 
+@pytest.mark.parametrize(
+    ("mode", "name", "fix"),
+    [
+        (12, "automatic mode safeguard stop", "close the safeguard of automatic mode"),
+        (13, "three-position enabling stop", "hold the enabling device"),
+        (14, "three-position enabling stop of the pendant", "hold the enabling device"),
+        (15, "IMMI emergency stop", "moulding machine"),
+        (16, "IMMI safeguard stop", "moulding machine"),
+        (17, "PROFIsafe waiting for parameters", "start the safety PLC"),
+        (18, "PROFIsafe automatic mode safeguard stop", "safety PLC"),
+        (19, "PROFIsafe safeguard stop", "safety PLC"),
+        (20, "PROFIsafe emergency stop", "safety PLC"),
+        (22, "safety API safeguard stop", "safety API"),
+    ],
+)
+@pytest.mark.parametrize("bits", [0x410, 0x401])
+def test_a_stop_whose_source_only_the_safety_mode_names(
+    controller: Controller, reader: Reader, mode: int, name: str, fix: str, bits: int
+) -> None:
+    controller.safety_mode, controller.safety_bits = mode, bits
+    reader.look()
+    status = reader.status()
+    assert status.safety_mode == name
+    assert status.fault is not None
+    assert (f"{name} (safety mode {mode})", fix in status.fault.fix) == (status.fault.found, True)
+
+
 @pytest.mark.parametrize("mode", [3, 4])
 def test_joints_without_power_are_not_measured(controller: Controller, reader: Reader, mode: int) -> None:
     controller.robot_mode = mode
@@ -271,21 +299,78 @@ def test_joints_without_power_are_not_measured(controller: Controller, reader: R
     reader.state(never)
 
 
+REAL_ARM = [7.4, 1.3]
+"""mm and degrees from the nominal model, as the farthest of 30 real arms."""
+
+
 @pytest.mark.parametrize(
-    ("moved_mm", "turned_deg", "wrong"),
-    [(0, 0, False), (4, 0.4, False), (6, 0, True), (0, 0.6, True)],
+    ("moved_mm", "turned_deg", "sends", "refused"),
+    [
+        (0, 0, None, None),
+        (*REAL_ARM, None, None),
+        (21, 0, None, "21.0 mm and 0.00 degrees .* no known model"),
+        (0, 3.1, None, "3.10 degrees .* no known model"),
+        (0.9, 0.09, MODELS["UR5e"], None),
+        (1.1, 0, MODELS["UR5e"], "1.1 mm .* controller sends .* contradict"),
+        (0, 0.11, MODELS["UR5e"], "0.11 degrees .* controller sends .* contradict"),
+        (0, 0, drawn("UR5e"), "controller sends .* contradict"),
+        (0, 0, MODELS["UR10e"], "controller sends .* contradict"),
+    ],
 )
-def test_a_flange_that_does_not_fit_the_joints_is_refused(
-    reader: Reader, moved_mm: float, turned_deg: float, wrong: bool
+def test_a_real_arm_is_read_and_what_contradicts_its_kinematics_is_refused(
+    controller: Controller, moved_mm: float, turned_deg: float, sends: Kinematics | None, refused: str | None
 ) -> None:
-    nudge = pose_from_ur([1e-3 * moved_mm, 0.0, 0.0, 0.0, math.radians(turned_deg), 0.0])
+    controller.kinematics = sends
+    reader = ReaderInMemory(controller, "UR5e")
     sample = reader.look()
+    nudge = pose_from_ur([1e-3 * moved_mm, 0.0, 0.0, 0.0, math.radians(turned_deg), 0.0])
     flange = forward(MODELS["UR5e"], sample.q_rad) @ nudge
-    if not wrong:
-        reader._check_model(sample.q_rad, flange)
+    if refused is None:
+        reader._check_pose(sample.q_rad, flange, sample.qd_rad_s)
         return
-    with pytest.raises(DeviceFault, match=f"{moved_mm}.0 mm and {turned_deg:.2f} degrees .* UR5e"):
-        reader._check_model(sample.q_rad, flange)
+    with pytest.raises(DeviceFault, match=refused):
+        reader._check_pose(sample.q_rad, flange, sample.qd_rad_s)
+
+
+@pytest.mark.parametrize("is_a", ["UR3e", "UR5", "UR10e", "UR16e", "UR30"])
+@pytest.mark.parametrize("sends", [None, MODELS["UR5e"]])
+def test_an_arm_of_another_model_is_refused(controller: Controller, is_a: str, sends: Kinematics | None) -> None:
+    controller.kinematics = sends
+    reader = ReaderInMemory(controller, "UR5e")
+    rng = np.random.default_rng(1)
+    for q in rng.uniform(-3, 3, (5, 6)):
+        with pytest.raises(DeviceFault, match=f"UR5e: the arm is another model, probably a {is_a}"):
+            reader._check_pose(q, forward(MODELS[is_a], q), np.zeros(6))
+
+
+@pytest.mark.parametrize("sends", [None, MODELS["UR5e"]])
+def test_a_tcp_that_changes_is_named_after_the_arm_has_fitted(controller: Controller, sends: Kinematics | None) -> None:
+    controller.kinematics = sends
+    reader = ReaderInMemory(controller, "UR5e")
+    sample = reader.look()
+    flange = forward(MODELS["UR5e"], sample.q_rad)
+    reader._check_pose(sample.q_rad, flange, sample.qd_rad_s)
+    with pytest.raises(DeviceFault, match="TCP is changing"):
+        reader._check_pose(sample.q_rad, flange @ pose_from_ur([0, 0, 0.03, 0, 0, 0]), sample.qd_rad_s)
+
+
+def test_a_moving_arm_may_be_a_control_cycle_behind(controller: Controller) -> None:
+    reader = ReaderInMemory(controller, "UR5e")
+    q, qd = np.array(controller.q_rad), np.full(6, math.radians(20))
+    reader._check_pose(q, forward(MODELS["UR5e"], q + 0.008 * qd), qd)
+    with pytest.raises(DeviceFault, match="TCP"):
+        reader._check_pose(q, forward(MODELS["UR5e"], q + 0.008 * qd), np.zeros(6))
+
+
+@pytest.mark.parametrize("number", sorted(real()))
+def test_every_real_arm_is_nearest_to_its_own_model(controller: Controller, number: str) -> None:
+    model, own = real()[number]
+    for controller.kinematics in (own, None):
+        reader = ReaderInMemory(controller, None)
+        reader.info = replace(reader.info, model=model)
+        for q in np.random.default_rng(2).uniform(-np.pi, np.pi, (20, 6)):
+            reader._fits = False
+            reader._check_pose(q, forward(own, q), np.zeros(6))
 
 
 # ---------------------------------------------------------------------- following
@@ -464,7 +549,7 @@ ROBOT_MODES = """
 7 running, 8 updating firmware, 9 unknown"""
 SAFETY_MODES = """
 1 normal, 2 reduced, 3 protective stop, 4 recovery, 5 safeguard stop, 6 system emergency stop, 7 robot emergency stop,
-8 violation, 9 fault, 10 joint identification, 11 undefined, 12 unknown"""
+8 violation, 9 fault, 10 joint identification, 11 undefined, 21 unknown, 23 unknown"""
 PROGRAM_STATES = "0 stopping, 1 stopped, 2 playing, 3 pausing, 4 paused, 5 resuming, 6 unknown"
 SAFETY_BITS = """
 2 protective stop, 3 recovery mode, 4 safeguard stop, 5 emergency stop, 6 emergency stop, 7 emergency stop,

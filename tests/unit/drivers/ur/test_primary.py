@@ -1,5 +1,6 @@
 """The primary interface: packages as its document lays them out, and a connection to a server of bytes."""
 
+import math
 import socket
 import struct
 import threading
@@ -13,7 +14,8 @@ from hypothesis import strategies as st
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError, ProtocolError
 from ftdrivers.ur import primary
-from ftdrivers.ur.primary import Code, Failed, Message, Note, RobotType, Started, Stopped
+from ftdrivers.ur.kinematics import MODELS
+from ftdrivers.ur.primary import Code, FactoryKinematics, Failed, Message, Note, RobotType, Started, Stopped
 
 
 def package(kind: int, payload: bytes) -> bytes:
@@ -124,10 +126,42 @@ def test_the_model_is_read_once_it_is_reported(monkeypatch: pytest.MonkeyPatch) 
         client.recv(1)
 
     with served(serve, monkeypatch) as host:
-        assert primary.read_model(host, timeout_s=5, clock=REAL) == "UR30"
+        assert primary.read_arm(host, timeout_s=5, clock=REAL) == ("UR30", None)
     with served(lambda _: None, monkeypatch) as host:
-        assert primary.read_model(host, timeout_s=5, clock=REAL) is None
-    assert primary.read_model("127.0.0.1", timeout_s=1, clock=REAL) is None  # its port is closed now
+        assert primary.read_arm(host, timeout_s=5, clock=REAL) == (None, None)
+    assert primary.read_arm("127.0.0.1", timeout_s=1, clock=REAL) == (None, None)  # its port is closed now
+
+
+KINEMATICS_OF_A_UR5E = bytes.fromhex(
+    "000000e105ffffffffffffffffffffffffffffffffffffffffffffffff"
+    + "00" * 48
+    + "0000000000000000bfdb333333333333bfd919ce075f6fd2"
+    + "00" * 24
+    + "3fc4cccccccccccd000000000000000000000000000000003fc10ff9724745393fb985f06f6944673fb97f62b6ae7d56"
+    + "3ff921fb54524550000000000000000000000000000000003ff921fb54524550bff921fb545245500000000000000000"
+    + "00000000"
+)
+"""Of a simulator, PolyScope 5.8, from the tests of Universal Robots' client library (test_primary_parser.cpp)."""
+
+
+def test_the_kinematics_are_read_with_the_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = package(16, KINEMATICS_OF_A_UR5E + configuration(1)[5:])
+
+    def serve(client: socket.socket) -> None:
+        client.sendall(state)
+        client.recv(1)
+
+    with served(serve, monkeypatch) as host:
+        model, kinematics = primary.read_arm(host, timeout_s=5, clock=REAL)
+    assert model == "UR5"
+    assert kinematics is not None
+    assert kinematics.numbers == pytest.approx(MODELS["UR5e"].numbers, abs=1e-9)
+
+
+@pytest.mark.parametrize("numbers", [[math.nan] * 24, [0.0] * 11 + [0.1] + [0.0] * 12, [0.0] * 23 + [0.1]])
+def test_kinematics_that_no_arm_has_are_left_out(numbers: list[float]) -> None:
+    content = package(5, struct.pack(">6I24dI", *[0] * 6, *numbers, 0))
+    assert list(primary.decode(16, content)) == [FactoryKinematics(None)]
 
 
 def test_each_closed_port_has_its_fix() -> None:

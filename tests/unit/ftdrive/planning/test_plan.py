@@ -5,6 +5,7 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,10 +16,13 @@ from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.scene import Box, Plane, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s, tips
-from ftdrive.planning.plan import Plan
+from ftdrive.planning.plan import Plan, digest, fingerprints
 from ftdrive.planning.planner import NUMBERS, TOOL_POSES, USUAL_POSTURE_RAD, guess_of, plan_tool, plan_tour
 from ftdrive.planning.search.tours import shortest_tour
-from ftdrivers.ur.kinematics import Array
+from ftdrivers.sweep import Sweep
+from ftdrivers.ur.kinematics import MODELS as NOMINAL
+from ftdrivers.ur.kinematics import Array, Kinematics
+from tests.own_kinematics import drawn
 
 MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")
 TOOLS = (
@@ -35,8 +39,9 @@ def certifier_of(
     tool: tuple[Cylinder, ...] = TOOLS[1],
     scene: Scene | None = None,
     margins: Margins | None = None,
+    kinematics: Kinematics | None = None,
 ) -> Certifier:
-    return Certifier(ArmModel(model, tool), scene or Scene(), margins)
+    return Certifier(ArmModel(model, tool, kinematics), scene or Scene(), margins)
 
 
 def planned(certifier: Certifier, q: Array = USUAL_POSTURE_RAD, poses: int = 24, speeds: Speeds | None = None) -> Plan:
@@ -152,6 +157,87 @@ def test_plan_is_deterministic_and_comes_back_from_its_file(tmp_path: Path) -> N
 def test_plan_is_refused_for_anything_else_than_it_was_made_for(other: Certifier, named: str) -> None:
     with pytest.raises(PlanRefused, match=f"another {named}"):
         usual().require(other)
+
+
+def old_file(plan: Plan) -> dict[str, Any]:
+    """Contents of a plan of version 1, which has no kinematics."""
+    document = {**plan.to_dict(), "format": "ftdrive.plan/1"}
+    document["made_for"] = {
+        "model": "2d83d53e55ee9aeaf10c8b48c2b4a7e6389d7d0beffb02b6d4b35ce4b280395a",  # of a UR5e, as then
+        "tool": plan.made_for["tool"],
+        "scene": plan.made_for["scene"],
+    }
+    document["description"] = {key: value for key, value in document["description"].items() if key != "kinematics"}
+    del document["sha256"]
+    return document | {"sha256": digest(document)}
+
+
+@pytest.mark.parametrize("own", [None, drawn("UR5e")])
+def test_a_plan_of_version_1_is_read_and_proven_for_this_arm(tmp_path: Path, own: Kinematics | None) -> None:
+    path = tmp_path / "plan.json"
+    path.write_text(json.dumps(old_file(usual())))
+    old, certifier = Plan.load(path), certifier_of(kinematics=own)
+    assert old.kinematics is None
+    old.require(certifier)
+    plan = old.of_arm(certifier)
+    plan.require(certifier)
+    assert plan.of_arm(certifier) is plan
+    assert plan.kinematics == own
+    assert plan.nodes_rad.tolist() == old.nodes_rad.tolist()
+    again = tmp_path / "again.json"
+    plan.save(again)
+    assert Plan.load(again).of_arm(certifier).sha256 == plan.sha256
+
+
+def test_a_plan_of_another_arm_has_the_distances_and_poses_of_this_one() -> None:
+    ours, certifier = planned(certifier_of(kinematics=drawn("UR5e", 1))), certifier_of(kinematics=drawn("UR5e", 2))
+    plan = ours.of_arm(certifier)
+    q = plan.nodes_rad
+    certificate = certifier.certify(q, np.roll(q, -1, axis=0))
+    assert [step.clearance_m for step in plan.steps] == certificate.clearance_m.tolist()
+    assert np.allclose(plan.R_base_flange, certifier.arm.frames(q).R_base_flange)
+    assert not np.allclose(plan.R_base_flange, ours.R_base_flange, atol=1e-4)
+    assert plan.sha256 != ours.sha256
+
+
+def test_a_plan_that_only_another_arm_has_room_for_is_refused() -> None:
+    """A wall as near as the margin allows to the arm that the plan was made for is too near for another one."""
+    one, other = NOMINAL["UR5e"], drawn("UR5e")
+    plan = planned(certifier_of(kinematics=one))
+    tip = [tips(certifier_of(kinematics=k).arm, plan.nodes_rad)[:, 0] for k in (one, other)]
+    nearer = (tip[1] - tip[0]).mean(axis=0)
+    normal = tuple((-nearer / np.linalg.norm(nearer)).tolist())
+
+    def behind_wall(kinematics: Kinematics, offset_m: float) -> Certifier:
+        return certifier_of(scene=Scene(planes=(Plane(normal, offset_m),)), kinematics=kinematics)
+
+    def nearest_wall_m(kinematics: Kinematics) -> float:
+        clear, blocked = -2.0, 2.0
+        for _ in range(14):
+            middle = (clear + blocked) / 2
+            is_clear = behind_wall(kinematics, middle).clear_around(plan.nodes_rad)
+            clear, blocked = (middle, blocked) if is_clear else (clear, middle)
+        return clear
+
+    wall_m = (nearest_wall_m(one) + nearest_wall_m(other)) / 2
+    plan = replace(plan, made_for=fingerprints(behind_wall(one, wall_m)))
+    plan.require(behind_wall(one, wall_m))
+    with pytest.raises(PlanRefused, match="made with other kinematics, and with this arm's own a move"):
+        plan.of_arm(behind_wall(other, wall_m))
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
+def test_a_real_arm_has_the_wrist_tours_of_a_nominal_one(seed: int) -> None:
+    """Its wrist 2 is half a turn away at some poses, and a little more on a real arm."""
+    assert planned(certifier_of(kinematics=drawn("UR5e", seed)), poses=12).kind == usual(12).kind == "wrist"
+
+
+def test_a_sweep_of_another_arm_is_refused() -> None:
+    plan = replace(
+        usual(), sweep=Sweep(USUAL_POSTURE_RAD.tolist(), np.zeros((3, 2)), np.ones((3, 2)), np.zeros((3, 2)), 20, 3)
+    )
+    with pytest.raises(PlanRefused, match="other kinematics"):
+        plan.of_arm(certifier_of(kinematics=drawn("UR5e")))
 
 
 def test_plan_changed_by_hand_is_refused(tmp_path: Path) -> None:

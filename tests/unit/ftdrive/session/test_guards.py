@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
@@ -28,11 +29,13 @@ from ftdrive.session.guards import (
 )
 from ftdrivers.errors import DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ArmState, ArmStatus
+from ftdrivers.ur.kinematics import MODELS
 
 Array = NDArray[np.float64]
 
 LIMITS = Limits()
 CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene())
+OWN = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)], MODELS["UR5e"]), Scene())
 START = np.radians([45.0, -100, 60, -50, 90, 45])
 GOAL = np.radians([45.0, -100, 60, -140, 45, 90])
 STATUS = ArmStatus(0, 0.0, "running", "normal", "playing", None, 1.0, 1.0, 1.5, (0.0, 0.0, 0.05), (0.0,) * 6)
@@ -113,12 +116,17 @@ def test_only_an_arm_that_comes_no_nearer_has_stalled() -> None:
 
 
 @pytest.mark.parametrize("by", ["place", "angle"])
-def test_a_flange_where_this_model_cannot_have_it_is_seen(by: str) -> None:
-    looks, right = Looks(ModelGuard(LIMITS, CERTIFIER)), state(GOAL)
-    assert looks.trips(state=replace(right, p_base_flange_m=np.add(right.p_base_flange_m, [0, 0, 0.004]))) is None
-    turn = np.array([[np.cos(0.012), -np.sin(0.012), 0], [np.sin(0.012), np.cos(0.012), 0], [0, 0, 1]])
+@pytest.mark.parametrize(("certifier", "right_m", "wrong_m"), [(CERTIFIER, 0.018, 0.022), (OWN, 0.0015, 0.0025)])
+def test_a_flange_where_this_arm_cannot_have_it_is_seen(
+    by: str, certifier: Certifier, right_m: float, wrong_m: float
+) -> None:
+    """Nominal kinematics are farther from a real arm than its own."""
+    looks, right = Looks(ModelGuard(LIMITS, certifier)), state(GOAL)
+    off = {"place": np.array([0, 0, right_m]), "angle": np.zeros(3)}[by]
+    assert looks.trips(state=replace(right, p_base_flange_m=np.add(right.p_base_flange_m, off))) is None
+    turn = Rotation.from_rotvec([0.0, 0.0, 3 * wrong_m]).as_matrix()
     wrong = (
-        replace(right, p_base_flange_m=np.add(right.p_base_flange_m, [0, 0, 0.006]))
+        replace(right, p_base_flange_m=np.add(right.p_base_flange_m, [0, 0, wrong_m]))
         if by == "place"
         else replace(right, R_base_flange=right.R_base_flange @ turn)
     )

@@ -14,7 +14,9 @@ from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.scene import Box, Plane, Scene
 from ftdrive.planning.geometry.shapes import Bodies, height_above, separation, separation_from_box
 from ftdrive.planning.search.constant_tour import constant_tour
-from ftdrivers.ur.kinematics import Array
+from ftdrivers.ur.kinematics import MODELS as NOMINAL
+from ftdrivers.ur.kinematics import Array, Kinematics
+from tests.own_kinematics import drawn, real
 
 MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")
 TOOLS = (
@@ -93,9 +95,26 @@ def test_parallel_capsules_by_hand() -> None:
     assert separation(a, b, np.array([np.inf]))[0] == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize("model", SHAPES)
-def test_no_point_of_arm_or_tool_moves_faster_than_its_bound(model: str) -> None:
-    arm = ArmModel(model, [Cylinder(0, 0.2, 0.1), Cylinder(0.05, 0.1, 0.04, 0.08, -0.03)])
+OWN = [(model, None) for model in SHAPES] + [(model, drawn(model, seed)) for model in SHAPES for seed in (0, 1)]
+OWN += [one for one in real().values() if one[0] in SHAPES]
+LUMPY = [Cylinder(0, 0.2, 0.1), Cylinder(0.05, 0.1, 0.04, 0.08, -0.03)]
+
+
+@pytest.mark.parametrize(("model", "kinematics"), OWN)
+def test_everything_the_wrist_moves_stays_in_the_ball(model: str, kinematics: Kinematics | None) -> None:
+    arm = ArmModel(model, LUMPY, kinematics)
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, 6))
+    bodies, centre_m = arm.bodies(q), arm.frames(q).wrist_m
+    beyond = np.flatnonzero(arm.moved_by > 4)
+    for sign in (-1, 1):
+        end = bodies.centre_m + sign * bodies.half_length_m[:, None] * bodies.axis
+        away = np.linalg.norm(end - centre_m[:, None], axis=2) + bodies.radius_m * 0.5  # of an end, not of its rim
+        assert away[:, beyond].max() < arm.ball_m
+
+
+@pytest.mark.parametrize(("model", "kinematics"), OWN)
+def test_no_point_of_arm_or_tool_moves_faster_than_its_bound(model: str, kinematics: Kinematics | None) -> None:
+    arm = ArmModel(model, LUMPY, kinematics)
     rng = np.random.default_rng(0)
     q, step = rng.uniform(-np.pi, np.pi, (50, 6)), 1e-5
     for joint in range(6):
@@ -197,6 +216,38 @@ def test_certified_moves_are_clear_where_they_are_sampled_and_others_are_not_cal
     assert some_not > 3
 
 
+@pytest.mark.parametrize(("model", "kinematics"), OWN[::5])
+def test_bodies_keep_their_lengths_and_stay_on_their_joints(model: str, kinematics: Kinematics | None) -> None:
+    arm = ArmModel(model, LUMPY, kinematics)
+    rng = np.random.default_rng(0)
+    q = rng.uniform(-np.pi, np.pi, (40, 6))
+    for joint in range(6):
+        turned = q.copy()
+        turned[:, joint] = rng.uniform(-np.pi, np.pi, 40)
+        before, after = arm.bodies(q), arm.bodies(turned)
+        still = np.flatnonzero(arm.moved_by <= joint)
+        assert np.abs(before.centre_m - after.centre_m)[:, still].max() < 1e-12
+        for i in range(len(arm.names)):  # bodies of one link move as one
+            mates = np.flatnonzero(arm.moved_by == arm.moved_by[i])
+            apart = [np.linalg.norm(b.centre_m[:, mates] - b.centre_m[:, [i]], axis=2) for b in (before, after)]
+            assert np.abs(apart[0] - apart[1]).max() < 1e-9
+
+
+@pytest.mark.parametrize(("model", "own"), [one for one in real().values() if one[0] in SHAPES])
+def test_a_nominal_arm_keeps_as_much_more_distance_as_a_real_one_can_be_nearer(model: str, own: Kinematics) -> None:
+    """To the scene all of it; to itself, the margin between its parts is three times that."""
+    real_arm, nominal = (Certifier(ArmModel(model, TOOLS[2], k), Scene()) for k in (own, None))
+    q = np.random.default_rng(3).uniform(-2, 2, (100, 6))
+    row, pair = (index.ravel() for index in np.indices((len(q), len(nominal._margin_m))))
+    far = np.full(len(row), np.inf)
+    nearer = nominal._distance(q, row, pair, far) - real_arm._distance(q, row, pair, far)
+    of_scene = pair >= len(nominal._pairs)
+    more = nominal._margin_m - real_arm._margin_m
+    assert (nearer <= more[pair])[of_scene].all()
+    touching = nominal._distance(q, row, pair, far) <= 0
+    assert nearer[~of_scene & ~touching].max() < 0.01
+
+
 def test_a_thin_post_between_two_poses_is_not_missed() -> None:
     arm = ArmModel("UR5e", TOOLS[1])
     start, end = STANDS.copy(), STANDS.copy()
@@ -215,7 +266,7 @@ def test_a_thin_post_between_two_poses_is_not_missed() -> None:
 @pytest.mark.parametrize(("room_m", "clear"), [(-1e-4, False), (5e-4, True)])
 def test_the_bound_holds_where_a_point_comes_as_fast_as_it_can(room_m: float, clear: bool, tight: bool) -> None:
     """Stretched out level, joint 2 alone turns: the tip comes up to a block at nearly lever times rate."""
-    arm = ArmModel("UR5e", [Cylinder(0, 0.2, 0.01)])
+    arm = ArmModel("UR5e", [Cylinder(0, 0.2, 0.01)], NOMINAL["UR5e"])
 
     def tip(q: Array) -> Array:
         at = arm.frames(q)
@@ -227,7 +278,7 @@ def test_the_bound_holds_where_a_point_comes_as_fast_as_it_can(room_m: float, cl
         return Certifier(arm, Scene(planes=(), boxes=(block,)))
 
     end = np.array([0, 0, 0, np.radians(-18.5), np.pi / 2, 0])
-    end[1] += np.arctan2(tip(end)[2] - arm.geometry.d1_m, -tip(end)[0])
+    end[1] += np.arctan2(tip(end)[2] - arm.kinematics.d_m[0], -tip(end)[0])
     start = end + 0.2 * np.eye(6)[1]  # less than the first interval of the proof
     far, near = (clearances(below(0.05), [q])[1][0] for q in (start, end))
     assert 0.98 < (far - near) / (0.2 * arm.travel_m[-1, 1]) <= 1
@@ -237,7 +288,7 @@ def test_the_bound_holds_where_a_point_comes_as_fast_as_it_can(room_m: float, cl
 
 
 def test_margins_are_kept_exactly() -> None:
-    arm = ArmModel("UR5e", TOOLS[1])
+    arm = ArmModel("UR5e", TOOLS[1], NOMINAL["UR5e"])
     within, outside = clearances(Certifier(arm, Scene()), [STANDS])
     for change, expected in ((-1e-4, True), (1e-4, False)):
         margins = Margins(self_m=float(within[0]) + change, scene_m=0.0)

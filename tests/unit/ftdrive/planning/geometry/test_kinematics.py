@@ -4,7 +4,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ftdrive.planning.geometry.kinematics import frames, inverse, wrist_inverse
-from ftdrivers.ur.kinematics import MODELS, Array, forward
+from ftdrive.planning.planner import USUAL_POSTURE_RAD
+from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, forward
+from tests.own_kinematics import drawn, of_dh, real
+from tests.real_arms import RealArm, real_arms
+
+OWN = [drawn(model) for model in MODELS] + [kinematics for _, kinematics in real().values()]
 
 angles = st.lists(st.floats(-np.pi, np.pi), min_size=6, max_size=6)
 
@@ -61,7 +67,7 @@ def test_inverse_says_nothing_where_the_arm_does_not_reach() -> None:
 @given(angles)
 def test_the_wrist_alone_gives_the_orientation_in_two_ways(q: list[float]) -> None:
     R = frames(MODELS["UR10e"], q).R_base_flange
-    found = wrist_inverse(q[:3], R)[0]
+    found = wrist_inverse(MODELS["UR10e"], q[:3], R)[0]
     assert np.array_equal(found[:, :3], [q[:3], q[:3]])
     assert np.allclose(frames(MODELS["UR10e"], found).R_base_flange, R, atol=1e-7)
     assert found[0, 4] >= 0 >= found[1, 4]
@@ -71,6 +77,68 @@ def test_the_wrist_alone_gives_the_orientation_in_two_ways(q: list[float]) -> No
 def test_where_axes_4_and_6_are_parallel_the_wrist_turns_with_axis_4(q5: float) -> None:
     q = [0.3, -1.2, 0.8, 0.5, q5, 0.9]
     R = frames(MODELS["UR3e"], q).R_base_flange
-    found = wrist_inverse(q[:3], R)[0]
+    found = wrist_inverse(MODELS["UR3e"], q[:3], R)[0]
     assert np.array_equal(found[:, 5], [0, 0])
     assert np.allclose(frames(MODELS["UR3e"], found).R_base_flange, R, atol=1e-12)
+
+
+def test_a_frame_with_its_axis_reversed_is_the_same_arm() -> None:
+    theta, a, d, alpha = np.reshape(drawn("UR5e").numbers, (4, 6))
+    for joint in (0, 3, 4):
+        theta[joint : joint + 2] += np.pi, -np.pi
+        a[joint], alpha[joint] = -a[joint], -alpha[joint]
+    again = Kinematics.of([*theta, *a, *d, *alpha])
+    assert again.alpha_rad == pytest.approx(drawn("UR5e").alpha_rad)
+    for q in random_joints(5):
+        assert np.allclose(forward(again, q).p_m, forward(drawn("UR5e"), q).p_m, atol=1e-12)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_lengths_of_links_are_those_of_the_nominal_arm_whatever_its_parameters(model: str) -> None:
+    own, nominal = drawn(model), MODELS[model]
+    assert max(map(abs, own.d_m)) > 1  # metres that cancel
+    lengths = [np.linalg.norm(kinematics.links_m, axis=1) for kinematics in (own, nominal)]
+    assert np.abs(lengths[0] - lengths[1]).max() < 0.002
+
+
+@pytest.mark.parametrize("kinematics", OWN)
+def test_own_kinematics_agree_with_the_chain_of_links(kinematics: Kinematics) -> None:
+    q = random_joints(20)
+    found = frames(kinematics, q)
+    for i, one in enumerate(q):
+        pose = forward(kinematics, one)
+        assert np.allclose(found.R_base_flange[i], pose.R, atol=1e-12)
+        assert np.allclose(found.flange_m[i], pose.p_m, atol=1e-12)
+
+
+@pytest.mark.parametrize("arm", real_arms(), ids=lambda arm: str(arm.number))
+def test_parameters_of_real_arms_give_the_pose_of_their_links(arm: RealArm) -> None:
+    kinematics = of_dh(arm.dh())
+    for q in random_joints(10):
+        pose, X = forward(kinematics, q), arm.flange(q)
+        assert np.allclose(pose.R, X[:3, :3], atol=1e-11)
+        assert np.allclose(pose.p_m, X[:3, 3], atol=1e-11)
+
+
+@pytest.mark.parametrize("kinematics", OWN)
+def test_newton_reaches_the_poses_of_the_own_chain(kinematics: Kinematics) -> None:
+    q = random_joints(100)
+    at = frames(kinematics, q)
+    branches = inverse(kinematics, at.R_base_flange, at.flange_m)
+    row, branch = np.nonzero(~np.isnan(branches[:, :, 0]))
+    again = frames(kinematics, branches[row, branch])
+    assert np.abs(again.flange_m - at.flange_m[row]).max() < 1e-6
+    assert np.abs(again.R_base_flange - at.R_base_flange[row]).max() < 1e-6
+    starts = np.abs(np.exp(1j * branches) - np.exp(1j * q[:, None])).max(axis=2)
+    assert (np.nan_to_num(starts, nan=9.0).min(axis=1) < 1e-4).mean() > 0.9  # others are nearly stretched out
+    wrist = frames(kinematics, wrist_inverse(kinematics, q[0, :3], at.R_base_flange).reshape(-1, 6)).R_base_flange
+    assert np.abs(wrist - np.repeat(at.R_base_flange, 2, axis=0)).max() < 1e-9
+
+
+@pytest.mark.parametrize("kinematics", OWN)
+def test_the_constant_tour_has_its_orientations_on_every_arm(kinematics: Kinematics) -> None:
+    nominal, own = constant_tour(USUAL_POSTURE_RAD), constant_tour(USUAL_POSTURE_RAD, kinematics)
+    assert np.array_equal(own[:, :3], nominal[:, :3])
+    assert np.degrees(np.abs(own - nominal).max()) < 3
+    wanted = frames(MODELS["UR5e"], nominal).R_base_flange
+    assert np.abs(frames(kinematics, own).R_base_flange - wanted).max() < 1e-9

@@ -7,6 +7,7 @@ import pytest
 
 from ftcalib.poses.information import T12, special
 from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.planning.approach import plan_approach
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import frames
@@ -100,6 +101,17 @@ def test_cone_tour_stays_in_its_cone_clear_and_says_what_the_cone_allows(
     q = np.array([step.q_rad for step in plan.steps])
     assert (np.abs(q - q[0] * [1, 1, 1, 0, 0, 0] - USUAL_POSTURE_RAD * [0, 0, 0, 1, 1, 1]) <= WINDOW_RAD + 1e-6).all()
     assert "times that of all 24" in plan.why[-1]
+
+
+@pytest.mark.parametrize(
+    "half_angle_deg", [30, *(pytest.param(deg, marks=pytest.mark.slow) for deg in (20, 40, 45, 60, 90))]
+)
+def test_a_tour_in_a_cone_has_an_approach(half_angle_deg: float) -> None:
+    """The same orientations with wrist 2 at 270 degrees have none: between, the tool folds against the forearm."""
+    certifier = certifier_of()
+    half_angle_rad = np.radians(half_angle_deg)
+    plan = plan_cone(certifier, half_angle_rad=half_angle_rad, speeds=Speeds(), guess=guess_of(certifier))
+    assert plan_approach(certifier, USUAL_POSTURE_RAD, plan.nodes_rad[0], Speeds()).certified
 
 
 @pytest.mark.parametrize("lean_rad", [np.pi / 2, pytest.param(np.radians(26.6), marks=pytest.mark.slow)])
