@@ -6,12 +6,15 @@ A JSON file also has its `checksum`, which reveals damage and edits.
 import hashlib
 import json
 import os
+import stat
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, BinaryIO, Final, TypeAlias
 
 JSON: TypeAlias = Any
 """What `json` can write: numbers, strings, None, and lists and dicts of them."""
+MOST_BYTES: Final = 200_000_000
+"""Of a text that is read whole: 200,000 poses with their covariances."""
 
 
 def write_new(path: str | Path, content: str | bytes) -> None:
@@ -64,6 +67,33 @@ def _refuse_existing(path: Path) -> None:
         raise FileExistsError(f"{path} exists already and is never overwritten: choose another name")
 
 
+def open_file(path: str | Path) -> BinaryIO:
+    """Open a file for reading; raises `OSError`, also for a pipe or a device, whose reading may never end."""
+    path = Path(path)
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # of a folder `open` has the words
+        raise OSError(f"{path} is a pipe or a device: save its content in a file, and give that")
+    return path.open("rb")
+
+
+def read_file(path: str | Path) -> bytes:
+    """Read a file whole; raises `OSError` as `open_file`, and above 200 MB."""
+    with open_file(path) as file:
+        if (size := os.fstat(file.fileno()).st_size) > MOST_BYTES:
+            raise OSError(
+                f"{path} has {size / 1e6:.0f} MB, more than {MOST_BYTES / 1e6:.0f} MB: check that it is the file"
+            )
+        return file.read(MOST_BYTES)
+
+
+def parsed_json(text: str | bytes) -> JSON:
+    """Parse JSON; raises `ValueError`, also if it is nested too deeply."""
+    try:
+        return json.loads(text)
+    except RecursionError as exc:
+        raise ValueError("its brackets are nested too deeply") from exc
+
+
 def write_object(
     path: str | Path, document: Mapping[str, JSON], *, indent: int | None = 1, allow_nan: bool = False
 ) -> None:
@@ -79,7 +109,7 @@ def object_text(document: Mapping[str, JSON], *, indent: int | None = 1, allow_n
 
 def read_object(path: str | Path, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:
     """Read a JSON file as `object_of` takes its content. Raises `OSError` too."""
-    return object_of(Path(path).read_bytes(), error, accept_changed=accept_changed)
+    return object_of(read_file(path), error, accept_changed=accept_changed)
 
 
 def object_of(content: bytes, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:
@@ -100,8 +130,8 @@ def object_of(content: bytes, error: type[Exception], *, accept_changed: bool = 
     if not text.strip():
         raise error("the file is empty: repeat the run that wrote it.")
     try:
-        document = json.loads(text)
-    except (ValueError, RecursionError) as exc:  # RecursionError from deeply nested brackets
+        document = parsed_json(text)
+    except ValueError as exc:
         raise error(f"this is not valid JSON ({exc}): the file is damaged or of another kind.") from exc
     if not isinstance(document, dict):
         raise error(f"the file contains a JSON {type(document).__name__}, not an object: is it the right file?")

@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import io
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
-from ftcalib.files import JSON, check_format, read_object, write_object
+from ftcalib.files import JSON, check_format, read_file, read_object, write_object
 from ftcalib.model import ROUNDING, Array, Rotations, matrices_of, nearest_rotation, read_only
 
 FORMAT = "ftdrive.dataset/1"
@@ -231,11 +232,11 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
     if missing:
         raise BadDataset(
             f"missing column {', '.join(missing)}: the first row must name {ORIENTATION_FORMS}, and "
-            f"fx, fy, fz, tx, ty, tz; it names {', '.join(names)}."
+            f"fx, fy, fz, tx, ty, tz; it names {listed(names)}."
         )
     repeated = [name for name in wanted if names.count(name) > 1]
     if repeated:
-        raise BadDataset(f"column {', '.join(repeated)} appears more than once: keep one.")
+        raise BadDataset(f"column {listed(repeated)} appears more than once: keep one.")
     if not rows:
         raise BadDataset("the table has a header but no row: add one row per pose.")
 
@@ -266,6 +267,12 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
         t_s=table[:, -1] - table[0, -1] if "t" in names else np.full(len(rows), np.nan),
         meta={"source": path.name, "orientation": orientation},
     )
+
+
+def listed(names: Sequence[str], most: int = 20) -> str:
+    """Return names for a message, and how many more there are."""
+    shown = ", ".join(name if len(name) <= 40 else f"{name[:40]}…" for name in names[:most])
+    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
 def orientation_columns(names: Collection[str]) -> tuple[str, ...]:
@@ -300,8 +307,8 @@ def rotations_of(columns: Sequence[str], table: Array) -> Array:
 
 def _table(path: Path) -> list[list[str]]:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
+        text = io.StringIO(read_file(path).decode("utf-8-sig"), newline="")
+        rows = [row for row in csv.reader(text) if any(cell.strip() for cell in row)]
     except (UnicodeDecodeError, csv.Error) as exc:
         raise BadDataset(f"this is not a text table ({exc}): save it as UTF-8 CSV.") from exc
     if not rows:

@@ -16,12 +16,18 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ftcalib.data.dataset import LARGEST
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array, skew
 
 MEAN_S = 0.01
 GAP_S = 0.06
 """Rows whose filter spans a longer gap, or one of three periods of a slower stream, are left out."""
+
+LONGEST_GAP_S = 86400.0
+"""Longer ones are refused: the times are of two recordings, or wrong."""
+LATEST_S = 1e11
+"""Times count in units of 10 ms, which 64 bits must hold."""
 
 _FIT = np.linalg.pinv(np.vander(MEAN_S * np.arange(-5, 6), 5, increasing=True))[:3].T * [1.0, 1.0, 2.0]
 """(11, 3) value and two derivatives of a quartic through 110 ms: flat over the band."""
@@ -82,7 +88,7 @@ class Means:
         Raises
         ------
         BadDataset
-            The time goes back, or a number is not finite.
+            The time goes back or leaps by more than a day, or a number is not finite or too large for a sensor.
         """
         if not len(t_s):
             return
@@ -90,6 +96,17 @@ class Means:
             raise BadDataset("the time goes back: give the samples in the order of their times")
         if not (np.isfinite(t_s).all() and np.isfinite(values).all()):
             raise BadDataset("a time or a value is not a finite number: remove these samples")
+        if (bad := np.flatnonzero((np.abs(t_s) > LATEST_S) | (np.abs(values) > LARGEST).any(axis=1))).size:
+            raise BadDataset(
+                f"sample {self.samples + bad[0] + 1} at {t_s[bad[0]]:.6g} s has {np.abs(values[bad[0]]).max():.3g}, "
+                "more than any device reports: remove this sample"
+            )
+        steps = np.diff(t_s, prepend=self._last_s if self.samples else t_s[0])
+        if steps[longest := int(steps.argmax())] > LONGEST_GAP_S:
+            raise BadDataset(
+                f"no sample for {steps[longest]:.3g} s before sample {self.samples + longest + 1} at "
+                f"{t_s[longest]:.6g} s: divide the recording there, or correct the times"
+            )
         self._last_s, self.samples = float(t_s[-1]), self.samples + len(t_s)
         before = np.floor(t_s / MEAN_S)
         share = (t_s / MEAN_S - before)[:, None]
@@ -217,9 +234,17 @@ def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: fl
         )
         for start in range(0, count // band.step, _CHUNK)
         for end in [min(start + _CHUNK, count // band.step)]
+        if start == 0
+        or _has_samples(t_w, first + MEAN_S * start * band.step, first + MEAN_S * (end * band.step + 2 * reach))
     ]
     t, y, columns, rates, speed = (np.concatenate(each) for each in zip(*parts, strict=True))
     return Rows(t, y, Motion.of_columns(columns), Motion.of_columns(rates), speed, delay_s, band.row_s)
+
+
+def _has_samples(t_s: Array, start_s: float, end_s: float) -> bool:
+    """Whether a sample lies there: a gap of hours costs no work."""
+    before, after = np.searchsorted(t_s, [start_s, end_s])
+    return bool(after > before)
 
 
 def _chunk(wrench: tuple[Array, Array], poses: tuple[Array, Array], grid: Array, band: Band) -> tuple[Array, ...]:

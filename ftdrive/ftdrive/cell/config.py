@@ -17,6 +17,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+from ftcalib.files import read_file
 from ftcalib.sampling import Sampling
 from ftdrive.cell import rules
 from ftdrive.cell.rules import Rows, Rule, entry, rule_of
@@ -375,10 +376,7 @@ def _from_cell(cell: CellConfig) -> dict[str, Setting]:
 
 
 def _from_file(path: Path) -> dict[str, Setting]:
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not a TOML file: {error}; correct it") from error
+    document = read_toml(path)
     if (found := document.pop("format", None)) != FORMAT:
         instead = "" if found is None else f", found {found!r}"
         raise ConfigError(f'{path}: the first line must be format = "{FORMAT}"{instead}')
@@ -395,6 +393,16 @@ def _from_file(path: Path) -> dict[str, Setting]:
                 raise ConfigError(f"{path}: [{section}] has no key '{key}': {_known(key, 'keys', _names(section))}")
             values[f"{section}.{key}"] = Setting(checked(str(path), f"{section}.{key}", value), str(path))
     return values
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a file; raises `ConfigError` or `OSError`."""
+    try:
+        return tomllib.loads(read_file(path).decode("utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not a TOML file: {error}; correct it") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path} is not a TOML file: its brackets are nested too deeply; correct it") from error
 
 
 def _from_environment() -> dict[str, Setting]:
@@ -419,7 +427,7 @@ def _parsed(name: str, key: str, text: str) -> Any:
         return text
     try:
         document = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         document = {}
     return document["value"] if document.keys() == {"value"} else text
 

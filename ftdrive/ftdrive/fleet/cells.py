@@ -12,12 +12,11 @@ A run belongs to a cell by the serial number of its arm if the cell has one, els
 
 import os
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from ftdrive.cell.config import settings
+from ftdrive.cell.config import read_toml, settings
 from ftdrive.errors import ConfigError
 from ftdrive.store.records import StoredCell, StoredResult, StoredWeighings
 
@@ -40,10 +39,7 @@ def read_cells(path: Path) -> list[StoredCell]:
         The file cannot be read.
     """
     refuse_variables()
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not TOML ({error}): fix it there") from error
+    document = read_toml(path)
     if document.get("format") != FORMAT:
         found = repr(document.get("format")) if "format" in document else "missing"
         raise ConfigError(f'{path}: the format is {found}: write format = "{FORMAT}" into its first line')

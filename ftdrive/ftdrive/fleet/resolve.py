@@ -17,7 +17,7 @@ import numpy as np
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Setup, solve
 from ftcalib.errors import BadCalibration, BadDataset
 from ftcalib.extras.difference import difference
-from ftcalib.files import read_object, write_new
+from ftcalib.files import read_file, read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
 from ftdrive import __version__
 from ftdrive.fleet.workers import OtherVersion, Workers, answers, in_words, require_version
@@ -64,7 +64,7 @@ def task_of(folder: Path) -> tuple[bytes, bytes]:
         "circumstances": {**circumstances, "setup": asdict(circumstances["setup"])},
         "provenance": {"created_utc": own.get("created_utc"), **origin},
     }
-    return run.dataset_path.read_bytes(), json.dumps(given).encode()
+    return read_file(run.dataset_path), json.dumps(given).encode()
 
 
 def solved(dataset: bytes, task: bytes) -> bytes:

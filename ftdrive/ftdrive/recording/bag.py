@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset, UsageError
+from ftcalib.files import open_file
 from ftcalib.motion.samples import Means
 from ftdrive.errors import ConfigError
 from ftdrivers.errors import ProtocolError
@@ -41,7 +42,7 @@ def is_bag(path: Path) -> bool:
         return (path / "metadata.yaml").is_file()
     if path.suffix != ".mcap" or not path.is_file():
         return False
-    with path.open("rb") as file:
+    with open_file(path) as file:
         start = file.read(512)
     try:
         (profile,) = struct.unpack_from("<I", start, 17)

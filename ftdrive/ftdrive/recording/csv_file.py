@@ -26,6 +26,7 @@ from typing import IO
 
 import numpy as np
 
+from ftcalib.files import open_file, parsed_json
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.growing_file import GrowingFile
@@ -96,7 +97,7 @@ class CsvFile(GrowingFile):
 def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str]:
     """Read a recording in pieces; return why it ends early. Raises `BadRecording` or `OSError`."""
     size = path.stat().st_size
-    with path.open("rb") as file:
+    with open_file(path) as file:
         if not file.readline().startswith(f"# {FORMAT.partition('/')[0]}/".encode()):
             raise BadRecording(f"the first line is not '# {FORMAT}'")
         file.seek(0)
@@ -168,6 +169,6 @@ def _crc_line(crc: int) -> bytes:
 
 def _parsed(text: str) -> dict[str, object]:
     try:
-        return dict(json.loads(text))
+        return dict(parsed_json(text))
     except (TypeError, ValueError) as error:
         raise BadRecording(f"the header is not a JSON object ({error}): the file is damaged") from error

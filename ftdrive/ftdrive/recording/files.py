@@ -8,6 +8,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from ftcalib.files import open_file
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.csv_file import CsvFile, read_csv
@@ -30,7 +31,7 @@ def is_recording(path: Path) -> bool:
     """Whether a file is a recording of `ftdrive record`, by its ending; a CSV by its first line."""
     ending = Path(path.name.removesuffix(".partial")).suffix
     if ending == ".csv" and path.is_file():
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return file.readline(100).startswith(f"# {FORMAT.partition('/')[0]}/".encode())
     return ending in ENDINGS and ending != ".csv"
 

@@ -1,10 +1,11 @@
 """A file that grows under its name with `.partial`, and gets its name when it is complete."""
 
 import os
+from contextlib import suppress
 from pathlib import Path
-from typing import Self
+from typing import IO, Self
 
-from ftcalib.files import require_new
+from ftcalib.files import open_file, require_new
 
 
 class GrowingFile:
@@ -24,6 +25,7 @@ class GrowingFile:
         self.path = path
         self.partial = partial_of(path)
         self._file = self.partial.open("xb", buffering=0)
+        _lock(self._file)
 
     @property
     def size(self) -> int:
@@ -46,6 +48,7 @@ class GrowingFile:
 
     def complete(self) -> None:
         """Fsync the file and give it its name. Raises `OSError`."""
+        os.fsync(self._file.fileno())  # while it is locked, because it may take seconds
         self._file.close()
         publish(self.partial, self.path)
 
@@ -73,11 +76,41 @@ def publish(written: Path, path: Path) -> None:
     written.rename(path)
 
 
+def _lock(file: IO[bytes]) -> bool:
+    """Lock a file until it is closed; False if it is locked already."""
+    try:
+        import fcntl
+    except ImportError:  # not on Windows, where no stream is recorded
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # of a network drive without locks
+        return True
+    return True
+
+
+def _holder(file: IO[bytes]) -> str:
+    """Return the process that locked a file, as proc_locks(5) lists it."""
+    with suppress(OSError):
+        for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
+            _, kind, *_, process, place, _, _ = line.split()
+            if kind == "FLOCK" and place.endswith(f":{os.fstat(file.fileno()).st_ino}"):
+                return f"process {process}"
+    return "another process"
+
+
 def partial_of(path: Path) -> Path:
     """Return the name until a file is complete; raises `OSError` if it or the file exists or the folder does not."""
     partial = path.with_name(path.name + ".partial")
     require_new(path)
     if partial.exists():
+        with open_file(partial) as file:
+            if not _lock(file):
+                raise FileExistsError(
+                    f"{_holder(file)} still records to {partial}: choose another name, or end that recording first"
+                )
         raise FileExistsError(
             f"{partial} exists: an earlier recording was interrupted. Save it with "
             f"`ftdrive convert {partial} NEW{path.suffix}`, then delete it"

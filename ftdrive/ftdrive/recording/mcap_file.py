@@ -21,6 +21,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ftcalib.files import open_file, parsed_json
 from ftdrive import __version__
 from ftdrive.errors import BadRecording
 from ftdrive.live import ros2
@@ -302,7 +303,7 @@ def _event(body: bytes, t_host_ns: int) -> StreamEvent:
         texts.append(body[place + 4 : place + 3 + length].decode())
         place += 4 + length + -length % 4
     kind, text, _, values = texts
-    return StreamEvent(t_host_ns, kind, text, json.loads(values))  # type: ignore[arg-type]  # a newer version has more
+    return StreamEvent(t_host_ns, kind, text, parsed_json(values))  # type: ignore[arg-type]  # a newer version has more
 
 
 def _bytes(*records: "McapRecord") -> bytes:
@@ -321,7 +322,7 @@ def read_mcap(path: Path, columns: Collection[str]) -> Generator[Piece, None, st
     documents: dict[str, Any] = {}
     content: _Content | None = None
     size = path.stat().st_size
-    with path.open("rb") as file:
+    with open_file(path) as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise BadRecording("the first bytes are not those of MCAP")
         try:
@@ -360,7 +361,7 @@ def _add_document(data: bytes, documents: dict[str, Any]) -> None:
 
     _require_crc(data[:-4], data[-4:])
     attachment = Attachment.read(ReadDataStream(io.BytesIO(data)))
-    documents[attachment.name] = json.loads(attachment.data)
+    documents[attachment.name] = parsed_json(attachment.data)
 
 
 def _header(documents: Mapping[str, Any]) -> Header:

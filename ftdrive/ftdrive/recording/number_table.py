@@ -8,9 +8,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from ftcalib.data.dataset import ORIENTATION_FORMS, orientation_columns
+from ftcalib.data.dataset import ORIENTATION_FORMS, listed, orientation_columns
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
+from ftcalib.files import open_file
 from ftdrivers.interfaces import Array
 
 _READ_BYTES, _LONGEST_LINE = 1 << 21, 1 << 14
@@ -54,7 +55,7 @@ def read_table(path: Path, wanted: Wanted) -> Iterator[Part]:
     BadDataset
         A column is missing, or a line is not one of numbers; the parts before it are read.
     """
-    with path.open("rb") as file:
+    with open_file(path) as file:
         names, found = _columns(path, file.readline(), wanted)
         use = [names.index(name) for name in ("t", *found)]
         count = 0
@@ -72,7 +73,7 @@ def mean_rate_Hz(path: Path, wanted: Wanted) -> float:
     BadDataset
         A column is missing, or there are fewer than two rows of numbers.
     """
-    with path.open("rb") as file:
+    with open_file(path) as file:
         names, _ = _columns(path, file.readline(), wanted)
         first, lines = file.readline(), 1
         tail = first
@@ -89,10 +90,13 @@ def mean_rate_Hz(path: Path, wanted: Wanted) -> float:
 
 def _columns(path: Path, head: bytes, wanted: Wanted) -> tuple[list[str], Sequence[str]]:
     """Return the names of all columns, and of the wanted ones."""
-    names = [name.strip() for name in next(csv.reader([head.decode("utf-8-sig", "replace")]), [])]
+    try:
+        names = [name.strip() for name in next(csv.reader([head.decode("utf-8-sig", "replace")]), [])]
+    except csv.Error as error:  # such as a field of more than 131,072 characters
+        raise BadDataset(f"{path.name}: the first row is no list of columns ({error}): give a CSV file") from error
     found = wanted.choose(names)
     if not {"t", *found} <= set(names):
-        raise BadDataset(f"{path.name}: the first row must name t and {wanted.words}; it names {', '.join(names)}")
+        raise BadDataset(f"{path.name}: the first row must name t and {wanted.words}; it names {listed(names)}")
     return names, found
 
 

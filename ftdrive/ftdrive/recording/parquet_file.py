@@ -25,6 +25,7 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ftcalib.files import open_file, parsed_json
 from ftdrive import __version__
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import StreamEvent
@@ -207,7 +208,7 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
 
     kind = np.dtype([(name, ROW[name]) for name in ROW.names or () if name in columns])
     size, count = path.stat().st_size, 0
-    with path.open("rb") as file:
+    with open_file(path) as file:
         if file.read(len(_MAGIC)) != _MAGIC:
             raise BadRecording("the first bytes are not those of Parquet")
         try:
@@ -267,4 +268,4 @@ def _read_record(file: IO[bytes]) -> dict[str, Any] | None:
         return None
     if start[:4] != _RECORD or zlib.crc32(text) != crc:
         raise BadRecording("a record differs from its checksum: the file is damaged")
-    return dict(json.loads(text))
+    return dict(parsed_json(text))

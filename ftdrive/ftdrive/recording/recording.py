@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadCalibration
-from ftcalib.files import JSON, check_format
+from ftcalib.files import JSON, check_format, parsed_json
 from ftdrive.errors import BadRecording
 from ftdrive.live.quaternions import matrices, quaternions
 from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame, sensor_origin_m
@@ -183,7 +183,7 @@ def event_text(event: StreamEvent) -> str:
 def event_of(text: str) -> StreamEvent:
     """Build an event from `event_text`. Raises `ValueError`."""
     try:
-        values = json.loads(text)
+        values = parsed_json(text)
         return StreamEvent(values["t_host_ns"], values["kind"], values["text"], values["values"])
     except (KeyError, TypeError) as error:
         raise ValueError(f"an event without {error}") from error

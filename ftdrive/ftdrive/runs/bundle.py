@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from ftcalib.errors import BadDataset, UsageError
-from ftcalib.files import check_format, read_object, write_new
+from ftcalib.files import check_format, read_file, read_object, write_new
 from ftdrive.cell.config import recorded_cell
 from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, check_permissions, check_workcell
 from ftdrive.errors import BadBundle
@@ -64,7 +64,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
     poses: dict[str, bytes] = {}
     for file in sorted(one for one in folder.rglob("*") if (not one.is_dir() or one.is_symlink()) and one.name != LOCK):
         name = file.relative_to(folder.parent).as_posix()
-        content = None if file.is_symlink() else file.read_bytes()
+        content = file.read_bytes() if file.is_file() and not file.is_symlink() else None  # a pipe has no end
         if content is not None and file.suffix == ".npz":
             poses[name] = content
         elif content is not None and (text := _text(content)) is not None:
@@ -72,7 +72,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
         else:
             left_out.append(file.relative_to(folder).as_posix())
     for number, file in enumerate(transcripts, 1):
-        if (text := _text(file.read_bytes())) is None:
+        if (text := _text(read_file(file))) is None:
             raise BadBundle(f"{file} is not a text file: give a file of `ftdrive transcript record`")
         texts[f"transcripts/{number}-{file.name}"] = text
     for text in texts.values():

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult, Known
 from ftcalib.errors import BadDataset
@@ -20,8 +21,16 @@ from ftdrive.runs.run import DAMAGE, arrays_of
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 FORMAT: Final = "ftdrive.motion/1"
-_WRENCH: Final = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
-_POSES: Final = ("t_host_ns", "t_device_s", "q_rad", "qd_rad_s", "R_base_flange", "p_base_flange_m")
+_WRENCH: Final = {"t_host_ns": (), "t_device_s": (), "seq": (), "counts": None, "wrench": (6,), "status": ()}
+"""Arrays and the shape of each sample; a sensor may have any number of counts."""
+_POSES: Final = {
+    "t_host_ns": (),
+    "t_device_s": (),
+    "q_rad": (6,),
+    "qd_rad_s": (6,),
+    "R_base_flange": (3, 3),
+    "p_base_flange_m": (3,),
+}
 _BLOCKS: Final = 200
 """Of samples, from each of which the one counts that is received the soonest."""
 
@@ -63,8 +72,8 @@ class MotionRecording:
             if str(data.get("format")) != FORMAT:
                 raise ValueError(f"its format is {data.get('format')}, this version reads {FORMAT}")
             return cls(
-                FtSamples(*(data[f"wrench_{name}"] for name in _WRENCH)),
-                ArmStates(*(data[f"pose_{name}"] for name in _POSES)),
+                FtSamples(*_columns(data, "wrench", _WRENCH)),
+                ArmStates(*_columns(data, "pose", _POSES)),
                 float(data["nominal_rate_Hz"]),
             )
         except DAMAGE as error:
@@ -106,6 +115,18 @@ def means_of(path: Path) -> tuple[Means, Means]:
         wrench.add(t_w, one.samples.wrench)
         poses.add(t_p, np.hstack([one.states.R_base_flange.reshape(-1, 9), one.states.p_base_flange_m]))
     return wrench, poses
+
+
+def _columns(
+    data: Mapping[str, Any], kind: str, shapes: Mapping[str, tuple[int, ...] | None]
+) -> Iterator[NDArray[Any]]:
+    n = len(data[f"{kind}_t_host_ns"])
+    for name, shape in shapes.items():
+        array = data[f"{kind}_{name}"]
+        expected = (n, *(array.shape[1:] if shape is None else shape))
+        if array.shape != expected or array.dtype.kind not in "iuf":
+            raise ValueError(f"{kind}_{name} is {array.dtype} {array.shape}, expected numbers {expected}")
+        yield array
 
 
 def _files(path: Path) -> list[Path]:

@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ftcalib.files import JSON, is_changed, object_text
+from ftcalib.files import JSON, is_changed, object_text, parsed_json
 from ftdrive.runs.run import CRC, event_of, with_crc32
 
 _HOME = re.compile(r"(?:/home|/Users|[A-Za-z]:\\Users)[/\\]([^/\\\s\"':;,<>]+)")
@@ -158,8 +158,8 @@ def _is_address(text: str) -> bool:
 def _document(text: str) -> JSON | None:
     """Parse an object or a list of JSON; None for anything else."""
     try:
-        document = json.loads(text)
-    except (ValueError, RecursionError):
+        document = parsed_json(text)
+    except ValueError:
         return None
     return document if isinstance(document, (dict, list)) else None
 

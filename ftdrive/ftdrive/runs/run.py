@@ -42,7 +42,7 @@ from typing import Any, Final, Literal, Self, get_args
 import numpy as np
 
 from ftcalib.errors import BadDataset
-from ftcalib.files import check_format, read_object, write_new, write_object
+from ftcalib.files import check_format, open_file, parsed_json, read_file, read_object, write_new, write_object
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord, TourPose
 from ftdrive import __version__
@@ -60,7 +60,7 @@ POSE = "pose-taken"
 
 _RESTORE = "take it from a copy"
 ZIP_DAMAGE: Final = (
-    *(EOFError, MemoryError, RuntimeError, ValueError),
+    *(EOFError, MemoryError, OverflowError, RuntimeError, ValueError),
     *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
 """Errors of `zipfile` for a damaged file: RuntimeError for an apparent password or unknown compression. OSError too."""
@@ -232,7 +232,7 @@ class Run:
             A line is damaged.
         """
         path = self._events_path
-        text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+        text = read_file(path).decode(errors="replace") if path.exists() else ""
         *lines, rest = text.split("\n")
         for number, line in enumerate(lines, 1):
             if (event := event_of(line)) is None:
@@ -326,7 +326,7 @@ def in_motion(place: Path) -> bool:
 def event_of(line: str) -> dict[str, Any] | None:
     """Return the event in a line of events.ndjson; None if it is damaged."""
     try:
-        event = json.loads(line)
+        event = parsed_json(line)
     except ValueError:
         return None
     if not isinstance(event, dict):
@@ -419,7 +419,7 @@ def _newest(path: Path) -> Path:
 
 def arrays_of(path: Path) -> dict[str, Any]:
     """Read a file of arrays; raises one of `DAMAGE`."""
-    with zipfile.ZipFile(path) as file:
+    with open_file(path) as content, zipfile.ZipFile(content) as file:
         # `ZipFile.read` reads to the end of each array, where its CRC-32 is checked; `numpy.load` need not.
         return {
             name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)

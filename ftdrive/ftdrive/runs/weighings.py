@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from ftcalib.errors import BadDataset
-from ftcalib.files import JSON, check_format
+from ftcalib.files import JSON, check_format, open_file
 
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
@@ -98,7 +98,7 @@ class WeighingsFile:
         """
         from ftdrive.runs.run import event_of
 
-        with self.path.open("rb") as file:
+        with open_file(self.path) as file:
             file.seek(self.size)
             *lines, _ = file.read().split(b"\n")
         for line in lines:

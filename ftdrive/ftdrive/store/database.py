@@ -50,7 +50,7 @@ class Database:
                     f"[store] url begins with {self._dialect}: give sqlite:////PATH or postgresql+psycopg://…"
                 )
             self._engine: Engine = create_engine(self._url, poolclass=NullPool, connect_args=self._limits())
-        except (ArgumentError, NoSuchModuleError) as error:
+        except (ArgumentError, NoSuchModuleError, ValueError) as error:  # ValueError of a port that is no number
             raise ConfigError("[store] url is no address of a database: give one such as sqlite:////PATH") from error
         except ImportError as error:
             raise ConfigError(

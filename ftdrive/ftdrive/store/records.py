@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ftcalib.errors import BadDataset, DataError
-from ftcalib.files import JSON, check_format, read_object
+from ftcalib.files import JSON, check_format, read_file, read_object
 from ftdrive.runs.verification_record import EMULATED, FORMAT, marks_of
 from ftdrive.runs.weighings import FILES, FOLDER, WeighingsFile, is_weighings
 
@@ -329,7 +329,7 @@ def _verification(path: Path) -> StoredVerification:
         raise BadDataset(f"{path.name} lacks the id of its calibration or the outcome: the file is damaged")
     bias_change = _object(document.get("bias_change"))
     return StoredVerification(
-        id=hashlib.sha256(path.read_bytes()).hexdigest()[:12],
+        id=hashlib.sha256(read_file(path)).hexdigest()[:12],
         path=str(path),
         run=path.parent.name,
         calibration_id=calibration_id,

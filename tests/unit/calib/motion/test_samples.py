@@ -1,11 +1,14 @@
 """Samples of a moving arm: their means, and rows of wrench and motion, against motions with known derivatives."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array, skew
+from ftcalib.motion import samples
 from ftcalib.motion.samples import MEAN_S, NARROW, WIDE, Band, Means, rows_of
 
 AXIS = np.array([0.36, 0.48, 0.8])
@@ -113,6 +116,16 @@ def test_rows_near_a_gap_are_left_out() -> None:
             assert 0 <= after - 6.0 - gap - reach < WIDE.row_s + MEAN_S / 2
 
 
+def test_a_gap_of_hours_costs_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    (t, values), (_, poses) = streams(24.0)
+    later = np.where(t < 12.0, t, t + 80_000.0)
+    chunk = Mock(side_effect=samples._chunk)
+    monkeypatch.setattr(samples, "_chunk", chunk)
+    rows = rows_of((later, values), (later, poses))
+    assert 100 < len(rows) < 200
+    assert chunk.call_count <= 3
+
+
 def test_a_slow_stream_has_longer_gaps() -> None:
     (t, values), poses = streams(12.0)
     for period in (4, 8):
@@ -175,3 +188,21 @@ def test_samples_that_cannot_be_used_are_refused(wrong: str) -> None:
     (values[1] if wrong == "value" else t)[0 if wrong == "value" else 2] = 0.5 if wrong == "order" else np.nan
     with pytest.raises(BadDataset, match="time goes back" if wrong == "order" else "not a finite number"):
         means.add(t, values)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "words"),
+    [
+        (0.02, 1e308, "sample 3 at 0.02 s has 1e\\+308, more than any device reports"),
+        (1e6, 1.0, "no sample for 1e\\+06 s before sample 3 at 1e\\+06 s: divide the recording there"),
+        (1e300, 1.0, "sample 3 at 1e\\+300 s"),
+    ],
+)
+@pytest.mark.parametrize("pieces", [1, 2])
+def test_times_and_values_that_no_device_has_are_named(at: float, value: float, words: str, pieces: int) -> None:
+    t, values, means = np.array([0.0, 0.01, at]), np.array([[1.0], [1.0], [value]]), Means()
+    *before, last = np.array_split(np.arange(3), pieces)
+    for rows in before:
+        means.add(t[rows], values[rows])
+    with pytest.raises(BadDataset, match=words):
+        means.add(t[last], values[last])

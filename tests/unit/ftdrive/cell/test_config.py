@@ -201,6 +201,7 @@ def test_other_programs_variables_are_left_alone(monkeypatch: pytest.MonkeyPatch
         (GOOD + "height_mm = 0.033\n", "is it mm"),
         (GOOD.replace("10.0.0.2", "http://10.0.0.2/"), "name or IPv4 address alone"),
         (GOOD + "[robot", "TOML"),
+        (GOOD + "[tool]\ncylinders_mm = " + "[" * 50_000, "TOML file: its brackets are nested too deeply"),
         (GOOD + '[site]\ng_m_s2 = "9.8"\n', "g_m_s2"),
         (GOOD + "[site]\ng_m_s2 = -9.8\n", "9.7 to 9.9"),
         (HEAD + '[robot]\nmodel = "ur6"\n', "UR5e"),

@@ -58,7 +58,7 @@ _CELL = '[cells.a]\nconfig = "b.toml"\nverify_every_days = 7\n'
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[cells.a\n", r"cells\.toml is not TOML"),
+        ("[cells.a\n", r"cells\.toml is not a TOML file"),
         ("", "no cell is listed: write a table"),
         ("[cells]\n", "no cell is listed"),
         (f"schedule = 3\n{_CELL}", "the key schedule is unknown"),

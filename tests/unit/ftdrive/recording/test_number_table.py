@@ -79,3 +79,14 @@ def test_a_long_table_is_read_in_parts_up_to_its_fault(tmp_path: Path, monkeypat
             valid.extend(read_table(path, WRENCH))
         assert 0 < len(valid) < len(parts)
         assert f"w.csv, after row {sum(len(part.t_s) for part in valid)}: " in str(error.value)
+
+
+def test_a_first_row_without_end_is_refused_in_a_line(tmp_path: Path) -> None:
+    path = tmp_path / "w.csv"
+    path.write_text("t," + "x" * 140_000 + "\n0,1\n")
+    with pytest.raises(BadDataset, match=r"w\.csv: the first row is no list of columns"):
+        list(read_table(path, WRENCH))
+    path.write_text(",".join(f"x{i}" for i in range(100_000)) + "\n")
+    with pytest.raises(BadDataset, match=r"x0, x1, .* and 99980 more") as raised:
+        list(read_table(path, WRENCH))
+    assert len(str(raised.value)) < 300

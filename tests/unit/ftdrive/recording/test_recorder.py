@@ -1,6 +1,7 @@
 """The recorder: what is in the files when something goes wrong, and what it does not do."""
 
 import errno
+import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording import Recorder, read_recording, write_recording
 from ftdrive.recording.csv_file import CsvFile
+from ftdrive.recording.files import require_new_recordings
 from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.recording.recording import Header
 from tests.unit.ftdrive.recorded import BASE_TCP, USUAL, block, info
@@ -206,3 +208,15 @@ def test_a_newer_version_is_refused() -> None:
     document = Header(info(), BASE_TCP, USUAL).to_dict() | {"format": "ftdrive.recording/2"}
     with pytest.raises(BadRecording, match="use a newer program"):
         Header.from_dict(document)
+
+
+def test_a_file_that_still_grows_is_not_to_be_deleted(tmp_path: Path) -> None:
+    path = tmp_path / "peg.csv"
+    recorder = Recorder([path], info(), {})
+    recorder.write(block(500))
+    with pytest.raises(FileExistsError, match=f"process {os.getpid()} still records to .*: choose another name"):
+        require_new_recordings([path])
+    recorder.close()
+    path.rename(tmp_path / "peg.csv.partial")  # as a process leaves it that ends at once
+    with pytest.raises(FileExistsError, match="an earlier recording was interrupted"):
+        require_new_recordings([path])

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import re
 import shutil
 import zipfile
@@ -198,6 +199,24 @@ def test_arrays_that_unpack_to_too_much_are_refused(tmp_path: Path, monkeypatch:
     files = {"bundle.json": ABOUT, "r/run.json": "{}", "r/poses/01.npz": inner.getvalue()}
     with pytest.raises(BadBundle, match="do not use"), unpacked(zipped(tmp_path / "a.zip", files)):
         pass
+
+
+def test_shapes_larger_than_memory_are_refused_in_a_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    array = io.BytesIO()
+    np.lib.format.write_array_header_1_0(array, {"descr": "<f8", "fortran_order": False, "shape": (10**30, 6)})
+    zipped(tmp_path / "motion.npz", {"format.npy": array.getvalue()})
+    header = Run.create(tmp_path, "r", {"config": CONFIG, "devices": DEVICES}).folder
+    files = {f"{header.name}/run.json": (header / "run.json").read_bytes()}
+    files[f"{header.name}/motion.npz"] = (tmp_path / "motion.npz").read_bytes()
+    path = zipped(tmp_path / "a.zip", {"bundle.json": ABOUT.replace('"r"', f'"{header.name}"'), **files})
+    assert run_command(["solve", str(path)]) == 6
+    assert "is not a recording in motion" in capfd.readouterr().err
+
+
+def test_a_pipe_in_a_run_is_left_out(tmp_path: Path) -> None:
+    folder = Run.create(tmp_path, "r", {"config": CONFIG, "devices": DEVICES}).folder
+    os.mkfifo(folder / "calibration.json")
+    assert write_bundle(folder, tmp_path / "a.zip").left_out == ["calibration.json"]
 
 
 def test_a_cut_off_bundle_and_another_file_are_named(

@@ -56,12 +56,13 @@ def test_no_single_bit_of_its_headers_can_end_in_another_error(tmp_path: Path) -
             MotionRecording.load(path)
 
 
-def test_a_file_that_claims_to_be_larger_than_memory_is_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize("shape", [(10**13, 6), (10**30, 6), (10**13, 0), (20, 5), (0, 6)])
+def test_a_file_whose_shapes_are_wrong_is_refused(shape: tuple[int, int], tmp_path: Path) -> None:
     path = tmp_path / "motion.npz"
     recording(20).save(path)
     with zipfile.ZipFile(path) as file:
         arrays = {name: file.read(name) for name in file.namelist()}
-    arrays["wrench_wrench.npy"] = arrays["wrench_wrench.npy"].replace(b"(20, 6), }", b"(%d, 6), }" % 10**13)
+    arrays["wrench_wrench.npy"] = arrays["wrench_wrench.npy"].replace(b"(20, 6), }", f"{shape}, }}".encode())
     with zipfile.ZipFile(path, "w") as file:
         for name, content in arrays.items():
             file.writestr(name, content)

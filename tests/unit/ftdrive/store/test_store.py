@@ -139,6 +139,7 @@ def test_a_damaged_file_is_named_and_costs_only_itself(runs: Path, store_url: st
     [
         ("store.sqlite", "no address of a database"),
         ("sqlite+none:////data/store", "no address of a database"),
+        ("postgresql+psycopg://lab:secret@host:port/db", "no address of a database"),
         ("mysql://lab:secret@host/db", "begins with mysql: give sqlite"),
         ("postgresql+psycopg://lab:secret@host/db", "needs the package psycopg"),
     ],
