@@ -23,7 +23,7 @@ from ftmocks.imperfections import Imperfections
 from ftmocks.inertia import inertia_tensor
 from ftmocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
 from ftmocks.recording import RecordedArm, RecordedWorld, Recording
-from ftmocks.sensors.catalogue import WRIST, Sensor
+from ftmocks.sensors.catalogue import WRIST, Sensor, parse_settings
 from ftmocks.ur.operator import Operator
 from ftmocks.ur.robot import INSTALLED_G_M_S2, Robot, RobotSettings
 from ftmocks.ur.server import API_PORT, UrServer
@@ -146,6 +146,7 @@ class Station:
 
     def __init__(self, options: Namespace, clock: CellClock | None = None) -> None:
         self._options = options
+        self._sensor_options = parse_settings(options.sensor, options.sensor_setting)
         self._clock = clock or CellClock()
         options.model = options.model or ("UR5" if options.polyscope[0] <= 3 else "UR5e")
         nominal = MODELS[options.model]
@@ -231,7 +232,12 @@ class Station:
             robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, robot.cycle_s)) + robot.wrist_error()
         for name in wanted:
             self._sensors[name] = Sensor(
-                name, self.world.measure_at, seed=self._options.seed, host=self.server.host, clock=self._clock
+                name,
+                self.world.measure_at,
+                seed=self._options.seed,
+                host=self.server.host,
+                clock=self._clock,
+                options=self._sensor_options,
             )
 
     def _hello(self) -> dict[str, Any]:

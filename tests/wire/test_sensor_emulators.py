@@ -96,7 +96,7 @@ def rdt_client(box: NetFtBox) -> Iterator[RdtClient]:
 
 @pytest.fixture
 def net_box() -> Iterator[NetFtBox]:
-    box = NetFtBox(constant(RDT_WRENCH), rdt_port=0, rate_hz=1000)
+    box = NetFtBox(constant(RDT_WRENCH), rdt_port=0, rate_hz=1000, tool_transform=[0.0] * 6)
     yield box
     box.stop()
 

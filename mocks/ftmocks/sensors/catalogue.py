@@ -8,8 +8,11 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
+import numpy as np
+
 from ftmocks.arrays import Array
 from ftmocks.clock import CellClock
+from ftmocks.sensors import robotous
 from ftmocks.wires.device import Device
 
 MeasureAt = Callable[[Array], Array]
@@ -29,6 +32,10 @@ class Kind:
         Settings for a client that does not know such addresses.
     options
         Of the emulator.
+    settings
+        What `--sensor-setting` can change: the option of the emulator, and what makes its value of the text.
+    at_host
+        Whether it listens at the address of the station, not behind a pseudo-terminal.
     floats
         Whether its wire can carry NaN.
     """
@@ -38,11 +45,33 @@ class Kind:
     query: str = ""
     endpoint: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, tuple[str, Callable[[str], Any]]] = field(default_factory=dict)
+    at_host: bool = False
     floats: bool = False
 
 
 def _slcan(bitrate: int, **more: Any) -> dict[str, Any]:
     return {"interface": "slcan", "bitrate": bitrate, **more}
+
+
+def _numbers(text: str) -> list[float]:
+    numbers = [float(part) for part in text.split(",")]
+    if len(numbers) != 6 or not np.isfinite(numbers).all():
+        raise ValueError(f"expected 6 numbers separated by commas, got {text!r}")
+    return numbers
+
+
+def _identifiers(text: str) -> tuple[int, ...]:
+    numbers = tuple(int(part, 0) for part in text.split(","))
+    if len(set(numbers)) != 3 or not all(0 <= number < 0x800 for number in numbers):
+        raise ValueError(f"expected 3 different CAN identifiers from 0 to 0x7FF, got {text!r}")
+    return numbers
+
+
+def _model(name: str) -> robotous.Model:
+    if name not in robotous.MODELS:
+        raise ValueError(f"unknown model {name!r}; known: {', '.join(robotous.MODELS)}")
+    return robotous.MODELS[name]
 
 
 KINDS = {
@@ -55,14 +84,28 @@ KINDS = {
     ),
     "serial": Kind("ftmocks.sensors.ati_serial:AtiSerialBox", "ati-serial"),
     "robotous-can": Kind(
-        "ftmocks.sensors.robotous:RobotousCanNode", "robotous-can", "interface=slcan&rate=1000", _slcan(1_000_000)
+        "ftmocks.sensors.robotous:RobotousCanNode",
+        "robotous-can",
+        "interface=slcan&rate=1000",
+        _slcan(1_000_000),
+        settings={"model": ("model", _model), "ids": ("ids", _identifiers)},
     ),
     "robotous-serial": Kind(
-        "ftmocks.sensors.robotous:RobotousSerialBox", "robotous-serial", "baud=115200&rate=200", {"baud": 115_200}
+        "ftmocks.sensors.robotous:RobotousSerialBox",
+        "robotous-serial",
+        "baud=115200&rate=200",
+        {"baud": 115_200},
+        settings={"model": ("model", _model)},
     ),
     "robotiq": Kind("ftmocks.sensors.robotiq:RobotiqBox", "robotiq-ft300"),
     "bota": Kind("ftmocks.sensors.bota:BotaBox", "bota", floats=True),
-    "netft": Kind("ftmocks.sensors.netft:NetFtBox", "ati-netft", options={"rdt_port": 0, "rate_hz": 1000}),
+    "netft": Kind(
+        "ftmocks.sensors.netft:NetFtBox",
+        "ati-netft",
+        options={"rdt_port": 0, "rate_hz": 1000},
+        settings={"tool-transform": ("tool_transform", _numbers), "bias": ("bias", _numbers)},
+        at_host=True,
+    ),
 }
 """Sensors on a wire of their own."""
 
@@ -71,6 +114,28 @@ WRIST = "ur-ft"
 
 CHOICES = (*KINDS, WRIST, "both", "none")
 """Values of --sensor; "both" is can and serial."""
+
+
+def parse_settings(name: str, settings: list[str]) -> dict[str, Any]:
+    """Return the options of an emulator that settings ``NAME=VALUE`` stand for.
+
+    Raises
+    ------
+    ValueError
+        When the sensor `name` has no such setting, or the value is none.
+    """
+    known = KINDS[name].settings if name in KINDS else {}
+    options: dict[str, Any] = {}
+    for setting in settings:
+        key, sign, value = setting.partition("=")
+        if not known:
+            raise ValueError(f"the sensor {name} has no settings: leave --sensor-setting out")
+        if not sign or key not in known:
+            choices = " or ".join(f"{choice}=VALUE" for choice in known)
+            raise ValueError(f"{setting!r} is no setting of the sensor {name}: give {choices}")
+        option, parse = known[key]
+        options[option] = parse(value)
+    return options
 
 
 class Sensor:
@@ -86,9 +151,20 @@ class Sensor:
         Loopback address of the station.
     clock
         Of the cell.
+    options
+        Of the emulator, see `parse_settings`.
     """
 
-    def __init__(self, name: str, measure_at: MeasureAt, *, seed: int, host: str, clock: CellClock) -> None:
+    def __init__(
+        self,
+        name: str,
+        measure_at: MeasureAt,
+        *,
+        seed: int,
+        host: str,
+        clock: CellClock,
+        options: dict[str, Any] | None = None,
+    ) -> None:
         self.name = name
         self._kind = KINDS.get(name)
         self._emulator: Device[Any] | None = None
@@ -96,10 +172,10 @@ class Sensor:
             self.endpoint = {"url": f"{WRIST}://{host}?counts_per_N=1&counts_per_Nm=1", "host": host}
             return
         module, _, class_name = self._kind.emulator.partition(":")
-        options = self._kind.options | ({"host": host} if name == "netft" else {})
+        given = self._kind.options | (options or {}) | ({"host": host} if self._kind.at_host else {})
         make: Callable[..., Device[Any]] = getattr(import_module(module), class_name)
         emulator: Device[Any] = make(
-            lambda count: measure_at(emulator.sample_times_s(count)), seed=seed, clock=clock, **options
+            lambda count: measure_at(emulator.sample_times_s(count)), seed=seed, clock=clock, **given
         )
         self._emulator = emulator
         self.endpoint = self._endpoint(self._kind, emulator.start())
@@ -107,7 +183,7 @@ class Sensor:
     def _endpoint(self, kind: Kind, where: Any) -> dict[str, Any]:
         """Return what the station reports about it, its address under "url"."""
         if isinstance(where, dict):
-            ports = "&".join(f"{key}={where[key]}" for key in ("rdt_port", "http_port"))
+            ports = "&".join(f"{key}={port}" for key, port in where.items() if key != "host")
             return {"url": f"{kind.scheme}://{where['host']}?{ports}", **where}
         url = f"{kind.scheme}://{where}" + (f"?{kind.query}" if kind.query else "")
         return {"url": url, "channel" if "interface" in kind.endpoint else "port": where, **kind.endpoint}

@@ -148,9 +148,7 @@ def test_commands_without_reply(sensor: RobotousSensor[bytes], request_: str) ->
     assert sensor.execute(command(request_)) == []
 
 
-@pytest.mark.parametrize(
-    ("baud_code", "fastest_hz"), [(0, 333), (1, 1000), (2, 500), (3, 500), (4, 333), (5, 200)]
-)
+@pytest.mark.parametrize(("baud_code", "fastest_hz"), [(0, 333), (1, 1000), (2, 500), (3, 500), (4, 333), (5, 200)])
 def test_the_baud_rate_limits_the_rate(baud_code: int, fastest_hz: int, readings: Readings) -> None:
     sensor = RobotousSerialBox(readings, baud_code=baud_code)
     sensor.boot()
