@@ -12,7 +12,7 @@ import numpy as np
 
 from ftmocks.arrays import Array
 from ftmocks.clock import CellClock
-from ftmocks.sensors import robotous
+from ftmocks.sensors import bota, robotous
 from ftmocks.wires.device import Device
 
 MeasureAt = Callable[[Array], Array]
@@ -68,6 +68,18 @@ def _identifiers(text: str) -> tuple[int, ...]:
     return numbers
 
 
+def _bota_baud_code(text: str) -> int:
+    if not text.isdecimal() or int(text) not in bota.BAUD_RATES:
+        raise ValueError(f"unknown baud rate {text!r}; known: {', '.join(map(str, bota.BAUD_RATES))}")
+    return bota.BAUD_RATES.index(int(text))
+
+
+def _seconds(text: str) -> float:
+    if not 0.0 <= float(text) < np.inf:
+        raise ValueError(f"expected a time in s, got {text!r}")
+    return float(text)
+
+
 def _model(name: str) -> robotous.Model:
     if name not in robotous.MODELS:
         raise ValueError(f"unknown model {name!r}; known: {', '.join(robotous.MODELS)}")
@@ -98,7 +110,12 @@ KINDS = {
         settings={"model": ("model", _model)},
     ),
     "robotiq": Kind("ftmocks.sensors.robotiq:RobotiqBox", "robotiq-ft300"),
-    "bota": Kind("ftmocks.sensors.bota:BotaBox", "bota", floats=True),
+    "bota": Kind(
+        "ftmocks.sensors.bota:BotaBox",
+        "bota",
+        settings={"baud": ("baud_code", _bota_baud_code), "boot-s": ("boot_s", _seconds)},
+        floats=True,
+    ),
     "netft": Kind(
         "ftmocks.sensors.netft:NetFtBox",
         "ati-netft",

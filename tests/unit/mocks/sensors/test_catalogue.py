@@ -18,6 +18,7 @@ from ftmocks.sensors.robotous import MODELS
             ["model=RFT64-6A01", "ids=0xF0,0xF1,242"],
             {"model": MODELS["RFT64-6A01"], "ids": (0xF0, 0xF1, 0xF2)},
         ),
+        ("bota", ["baud=230400", "boot-s=0.5"], {"baud_code": 3, "boot_s": 0.5}),
         (
             "netft",
             ["tool-transform=0,0,0,0,0,90", "bias=0,0,0,0,0,0"],
@@ -37,6 +38,8 @@ def test_settings(name: str, settings: list[str], options: dict[str, Any]) -> No
         ("netft", "bias", "give tool-transform=VALUE or bias=VALUE"),
         ("netft", "bias=1,2", "6 numbers"),
         ("netft", "tool-transform=0,0,inf,0,0,0", "6 numbers"),
+        ("bota", "baud=1000", "unknown baud rate '1000'"),
+        ("bota", "boot-s=-1", "a time in s"),
         ("robotous-can", "ids=1,1,2", "3 different"),
         ("robotous-serial", "model=RFT1", "unknown model 'RFT1'"),
     ],
