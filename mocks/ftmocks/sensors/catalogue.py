@@ -110,6 +110,7 @@ KINDS = {
         settings={"model": ("model", _model)},
     ),
     "robotiq": Kind("ftmocks.sensors.robotiq:RobotiqBox", "robotiq-ft300"),
+    "robotiq-urcap": Kind("ftmocks.sensors.robotiq_urcap:RobotiqUrcap", "robotiq-urcap", at_host=True),
     "bota": Kind(
         "ftmocks.sensors.bota:BotaBox",
         "bota",
