@@ -36,6 +36,8 @@ class Kind:
         What `--sensor-setting` can change: the option of the emulator, and what makes its value of the text.
     at_host
         Whether it listens at the address of the station, not behind a pseudo-terminal.
+    bias_scale
+        Multiples of the forces and torques of the drawn bias, which reach 15 N and 1 N·m.
     floats
         Whether its wire can carry NaN.
     """
@@ -47,6 +49,7 @@ class Kind:
     options: dict[str, Any] = field(default_factory=dict)
     settings: dict[str, tuple[str, Callable[[str], Any]]] = field(default_factory=dict)
     at_host: bool = False
+    bias_scale: tuple[float, float] = (1.0, 1.0)
     floats: bool = False
 
 
@@ -86,6 +89,11 @@ def _model(name: str) -> robotous.Model:
     return robotous.MODELS[name]
 
 
+FT300_BIAS_SCALE = (3.3, 1.2)
+"""One at rest reads (-20.7, 22.0, -48.7) N and (-0.10, 1.17, -0.32) N·m: ros-industrial-attic/robotiq, request 215."""
+NETFT_BIAS_SCALE = (1.1, 2.1)
+"""One has a bias of (15.4, -12.2, -1.7) N and (-1.2, -2.1, 0.05) N·m: philip-long/FoamCutting_kukalwr."""
+
 KINDS = {
     "can": Kind(
         "ftmocks.sensors.ati_can:AtiCanNode",
@@ -109,8 +117,10 @@ KINDS = {
         {"baud": 115_200},
         settings={"model": ("model", _model)},
     ),
-    "robotiq": Kind("ftmocks.sensors.robotiq:RobotiqBox", "robotiq-ft300"),
-    "robotiq-urcap": Kind("ftmocks.sensors.robotiq_urcap:RobotiqUrcap", "robotiq-urcap", at_host=True),
+    "robotiq": Kind("ftmocks.sensors.robotiq:RobotiqBox", "robotiq-ft300", bias_scale=FT300_BIAS_SCALE),
+    "robotiq-urcap": Kind(
+        "ftmocks.sensors.robotiq_urcap:RobotiqUrcap", "robotiq-urcap", at_host=True, bias_scale=FT300_BIAS_SCALE
+    ),
     "bota": Kind(
         "ftmocks.sensors.bota:BotaBox",
         "bota",
@@ -123,6 +133,7 @@ KINDS = {
         options={"rdt_port": 0, "rate_hz": 1000},
         settings={"tool-transform": ("tool_transform", _numbers), "bias": ("bias", _numbers)},
         at_host=True,
+        bias_scale=NETFT_BIAS_SCALE,
     ),
 }
 """Sensors on a wire of their own."""

@@ -4,8 +4,10 @@ from typing import Any
 
 import pytest
 
+from ftmocks.__main__ import _parser
 from ftmocks.sensors.catalogue import parse_settings
 from ftmocks.sensors.robotous import MODELS
+from ftmocks.station import truth_from
 
 
 @pytest.mark.parametrize(
@@ -47,3 +49,18 @@ def test_settings(name: str, settings: list[str], options: dict[str, Any]) -> No
 def test_wrong_settings(name: str, setting: str, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         parse_settings(name, [setting])
+
+
+def test_biases_are_as_large_as_those_of_real_sensors() -> None:
+    def biases(sensor: str, *more: str) -> tuple[list[float], list[float]]:
+        options = _parser().parse_args(["station", "--sensor", sensor, "--seed", "3", *more])
+        truth = truth_from(options)
+        return truth.force_bias_N.tolist(), truth.torque_bias_Nm.tolist()
+
+    force_N, torque_Nm = biases("can")
+    for sensor, force_scale, torque_scale in (("robotiq", 3.3, 1.2), ("robotiq-urcap", 3.3, 1.2), ("netft", 1.1, 2.1)):
+        force, torque = biases(sensor)
+        assert force == pytest.approx([force_scale * value for value in force_N])
+        assert torque == pytest.approx([torque_scale * value for value in torque_Nm])
+    assert biases("robotiq", "--force-bias", "1,2,3")[0] == [1, 2, 3]
+    assert biases("both") == biases("none") == biases("ur-ft") == (force_N, torque_Nm)
