@@ -187,7 +187,16 @@ def test_bota_too_slow_is_a_warning(start: Start, caplog: pytest.LogCaptureFixtu
     [
         ({"calibration": {"counts_per_force": 416_666, "counts_per_torque": 1_000}}, ""),
         ({"calibration": {"force_unit": 1, "torque_unit": 4}}, ""),
-        ({"calibration": {"counts_per_force": 10_000, "counts_per_torque": 100_000, "serial": "X"}}, "onrobot=1"),
+        (
+            {
+                "calibration": {"counts_per_force": 10_000, "counts_per_torque": 100_000, "serial": "X"},
+                "tool_transform": [0.0] * 6,
+            },
+            "onrobot=1",
+        ),
+        ({"tool_transform": [0.0] * 6, "bias": [0] * 6, "gauge_offset": [0] * 6}, ""),
+        ({"tool_transform": [10.0, -20.0, 132.71, 20.0, -30.0, 40.0]}, ""),
+        ({"tool_transform": [1.0, -2.0, 5.0, 0.3, -0.5, 0.7], "distance_unit": 1, "angle_unit": 2}, ""),
         ({"product": "Ethernet Axia"}, ""),
         ({"rate_hz": 7000}, ""),
     ],

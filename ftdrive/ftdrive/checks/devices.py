@@ -85,6 +85,7 @@ def check_identity(info: DeviceInfo) -> list[Check]:
         _check_scale(facts.get("counts_per_N"), facts.get("counts_per_Nm")),
         _check_range(facts.get("range")),
         _check_sign(facts.get("sign")),
+        *_check_settings(facts.get("software_bias"), facts.get("tool_transformation")),
     ]
 
 
@@ -111,6 +112,19 @@ def _check_sign(fact: Fact | None) -> Check:
     if fact is None:
         return Check("sensor.sign", "ok", "the driver does not report its sign")
     return Check("sensor.sign", "ok", f"sign {fact.value}, {_SOURCE[fact.source]}; --push shows whether it is right")
+
+
+def _check_settings(bias: Fact | None, transformation: Fact | None) -> list[Check]:
+    """Report what the sensor itself adds to or changes about its readings; nothing where it does not."""
+    checks = []
+    if bias is not None and isinstance(bias.value, tuple):
+        numbers = ", ".join(f"{value:g}" for value in bias.value)
+        found = f"the sensor subtracts its software bias ({numbers}): a calibration holds only while it stays"
+        checks.append(Check("sensor.bias", "ok", found))
+    if transformation is not None:
+        found = f"the driver undoes the tool transformation of the sensor: {transformation.value}"
+        checks.append(Check("sensor.origin", "ok", found))
+    return checks
 
 
 def check_load(limits: ArrayLike | None, cell: CellConfig) -> Check:

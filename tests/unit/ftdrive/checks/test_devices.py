@@ -38,6 +38,17 @@ FACTS = {
 }
 
 
+def test_what_the_sensor_itself_changes_is_reported() -> None:
+    facts = FACTS | {
+        "software_bias": Fact((745.0, 0.0, 0.0, 0.0, 0.0, -253.0), "device"),
+        "tool_transformation": Fact("0;0;132.71;0;0;0 (mm, degrees)", "device"),
+    }
+    found = {check.name: check for check in diagnosis.check_identity(DeviceInfo("Net F/T", "FT1", "1", facts))}
+    assert "(745, 0, 0, 0, 0, -253)" in found["sensor.bias"].found
+    assert "undoes" in found["sensor.origin"].found
+    assert "132.71" in found["sensor.origin"].found
+
+
 def test_what_is_known_of_a_sensor_is_said_with_its_source() -> None:
     found = {check.name: check for check in diagnosis.check_identity(DeviceInfo("Gamma", "FT1", "3.8", FACTS))}
     assert {check.state for check in found.values()} == {"ok"}
