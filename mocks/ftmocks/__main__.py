@@ -105,11 +105,16 @@ def _parser() -> argparse.ArgumentParser:
     add("--joint-limit-deg", type=_positive, default=360.0)
     add("--plane", type=_plane, metavar="nx,ny,nz,d", help="safety plane in base: n·p >= d (m) is allowed")
     add(
-        "--dh-noise",
-        type=float,
-        default=0.0,
-        metavar="SCALE",
-        help="factory calibration: 1 makes the arm deviate from nominal by 1 mrad and 0.3 mm per parameter",
+        "--kinematics",
+        default="drawn",
+        metavar="drawn|ideal|FILE.json",
+        help="factory calibration: drawn with the spread of real arms (default), none, or model, theta, a, d, alpha",
+    )
+    add(
+        "--kinematics-message",
+        choices=("true", "none", "wrong"),
+        default="true",
+        help="what the primary interface sends of it; wrong: that of another arm of the same model (default true)",
     )
 
     truth = station.add_argument_group("truth (each overrides what the seed draws)")

@@ -6,7 +6,7 @@ Standard DH, one row per joint: ``T_i = Rz(theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i)`
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -43,9 +43,12 @@ class FlangeMotion(NamedTuple):
 class Dh:
     """Denavit-Hartenberg parameters of one arm (m, rad), six values each, and its joint speed limits (rad/s).
 
-    ``theta`` are offsets added to the joint angles: zero on a nominal arm, small on a factory-calibrated one.
+    ``theta`` are offsets added to the joint angles: zero on a nominal arm. A real one, see `factory_kinematics`, has
+    frames far away from its links.
     """
 
+    model: str
+    """Name of its nominal arm in `MODELS`."""
     theta: Vector6
     a: Vector6
     d: Vector6
@@ -57,21 +60,6 @@ class Dh:
         """theta, a, d, and cosine and sine of alpha, link by link."""
         rows = zip(self.theta, self.a, self.d, self.alpha, strict=True)
         return [(theta, a, d, math.cos(alpha), math.sin(alpha)) for theta, a, d, alpha in rows]
-
-    def disturbed(self, seed: int, angle_rad: float = 1e-3, length_m: float = 3e-4) -> "Dh":
-        """The arm as a factory calibration would find it: every parameter off by a seeded normal deviation."""
-        noise = np.random.default_rng([seed, 6]).normal(size=(4, 6))
-
-        def moved(values: Vector6, row: int, scale: float) -> Vector6:
-            return vector6(np.add(values, scale * noise[row]))
-
-        return replace(
-            self,
-            theta=moved(self.theta, 0, angle_rad),
-            a=moved(self.a, 1, length_m),
-            d=moved(self.d, 2, length_m),
-            alpha=moved(self.alpha, 3, angle_rad),
-        )
 
 
 def vector6(values: Sequence[float] | Array) -> Vector6:
@@ -86,9 +74,10 @@ def vector3(values: Sequence[float] | Array) -> Vector3:
     return (x, y, z)
 
 
-def _nominal(lengths: Vector6, speeds_deg_s: Sequence[float]) -> Dh:
+def _nominal(model: str, lengths: Vector6, speeds_deg_s: Sequence[float]) -> Dh:
     d1, a2, a3, d4, d5, d6 = lengths
     return Dh(
+        model,
         theta=ZERO6,
         a=(0.0, a2, a3, 0.0, 0.0, 0.0),
         d=(d1, 0.0, 0.0, d4, d5, d6),
@@ -102,17 +91,19 @@ _MIDDLE = (180, 180, 180, 180, 180, 180)
 _LARGE = (120, 120, 180, 180, 180, 180)
 _HEAVY = (120, 120, 150, 210, 210, 210)
 
-MODELS: dict[str, Dh] = {
-    "UR3": _nominal((0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819), _SMALL),
-    "UR5": _nominal((0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823), _MIDDLE),
-    "UR10": _nominal((0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922), _LARGE),
-    "UR3e": _nominal((0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921), _SMALL),
-    "UR5e": _nominal((0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996), _MIDDLE),
-    "UR10e": _nominal((0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655), _LARGE),
-    "UR16e": _nominal((0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655), _LARGE),
-    "UR20": _nominal((0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543), _HEAVY),
-    "UR30": _nominal((0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543), _HEAVY),
+_ARMS: dict[str, tuple[Vector6, Sequence[float]]] = {
+    "UR3": ((0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819), _SMALL),
+    "UR5": ((0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823), _MIDDLE),
+    "UR10": ((0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922), _LARGE),
+    "UR3e": ((0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921), _SMALL),
+    "UR5e": ((0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996), _MIDDLE),
+    "UR10e": ((0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655), _LARGE),
+    "UR16e": ((0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655), _LARGE),
+    "UR20": ((0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543), _HEAVY),
+    "UR30": ((0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543), _HEAVY),
 }
+
+MODELS = {model: _nominal(model, lengths, speeds) for model, (lengths, speeds) in _ARMS.items()}
 """Nominal arms. Source: Universal Robots ROS 2 description, default_kinematics.yaml and joint_limits.yaml."""
 
 
@@ -146,6 +137,12 @@ def _chain(dh: Dh, q: Sequence[float]) -> list[_Rows]:
 
 def _stack(m: _Rows) -> Array:
     return np.array([m[0:4], m[4:8], m[8:12], (0.0, 0.0, 0.0, 1.0)])
+
+
+def elbow(dh: Dh, q: Sequence[float]) -> Array:
+    """Position of the elbow in base, (3,): the point of the axis of joint 3 in the middle plane of the upper arm."""
+    frame = forward(dh, q, joints=2)
+    return np.asarray(frame[:3, 3] - dh.d[1] * frame[:3, 2])  # back along the axis: d of a real arm is metres
 
 
 def jacobian(dh: Dh, q: Sequence[float]) -> Array:
@@ -255,7 +252,7 @@ def inverse(dh: Dh, target: Array, near: Sequence[float]) -> Vector6 | None:
     def distance(q: Vector6) -> float:
         return sum(abs(v - n) for v, n in zip(q, near, strict=True))
 
-    branches = closed_form(dh, target, near[5])
+    branches = closed_form(MODELS[dh.model], target, near[5])
     seeds = [vector6([_nearest_turn(v, n) for v, n in zip(q, near, strict=True)]) for q in branches]
     seeds.sort(key=distance)
     if not seeds:  # just outside the nominal arm's reach, perhaps not outside this one's

@@ -13,15 +13,17 @@ import sys
 from argparse import Namespace
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ftmocks import factory_kinematics
 from ftmocks.arrays import Array
 from ftmocks.clock import CellClock
-from ftmocks.imperfections import Imperfections
+from ftmocks.imperfections import WRIST_DRIFT_N, Imperfections
 from ftmocks.inertia import inertia_tensor
-from ftmocks.kinematics import MODELS, Vector6, rotation, vector3, vector6
+from ftmocks.kinematics import MODELS, Dh, Vector6, rotation, vector3, vector6
 from ftmocks.recording import RecordedArm, RecordedWorld, Recording
 from ftmocks.sensors.catalogue import KINDS, WRIST, Sensor, parse_settings
 from ftmocks.ur.operator import Operator
@@ -59,7 +61,9 @@ VECTORS = {
 def truth_from(options: Namespace) -> Truth:
     """Draw the truth from the seed, then replace every quantity given on the command line."""
     truth = Truth.drawn(options.seed, options.mount)
-    if options.sensor in KINDS:
+    if options.sensor == WRIST:
+        truth = truth.with_wrist_sensor(options.seed)
+    elif options.sensor in KINDS:
         force_scale, torque_scale = KINDS[options.sensor].bias_scale
         truth = replace(
             truth, force_bias_N=force_scale * truth.force_bias_N, torque_bias_Nm=torque_scale * truth.torque_bias_Nm
@@ -82,10 +86,8 @@ def truth_from(options: Namespace) -> Truth:
     changes["sensor_mass_kg"] = _sensor_mass_kg(options)
     if options.noise is not None:
         changes["noise_force_N"], changes["noise_torque_Nm"] = options.noise
-    if options.sensor == WRIST:
-        if options.sensor_rotvec_deg is not None:
-            raise ValueError(f"the axes of {WRIST} are those of the flange: leave --sensor-rotvec-deg out")
-        changes["R_flange_sensor"] = np.eye(3)
+    if options.sensor == WRIST and options.sensor_rotvec_deg is not None:
+        raise ValueError(f"the axes of {WRIST} are those of the flange: leave --sensor-rotvec-deg out")
     return replace(truth, **changes)
 
 
@@ -121,6 +123,19 @@ def _recording(options: Namespace) -> Recording | None:
         raise ValueError(f"cannot read the recording: {error}") from None
 
 
+def kinematics_from(options: Namespace) -> Dh:
+    """Return the real arm: drawn from the seed, nominal or from a file, as --kinematics says."""
+    model = options.model or ("UR5" if options.polyscope[0] <= 3 else "UR5e")
+    if options.kinematics == "drawn":
+        return factory_kinematics.drawn(model, options.seed)
+    if options.kinematics == "ideal":
+        return MODELS[model]
+    dh = factory_kinematics.read(Path(options.kinematics))
+    if options.model not in (None, dh.model):
+        raise ValueError(f"--model {options.model}: the arm in {options.kinematics} is a {dh.model}")
+    return dh
+
+
 def start_posture(options: Namespace) -> Vector6:
     """Return joint angles (rad) at power-up: as given, or near the tour's first pose with the wrist off by chance."""
     if options.start_q_deg is not None:
@@ -153,13 +168,13 @@ class Station:
         self._options = options
         self._sensor_options = parse_settings(options.sensor, options.sensor_setting)
         self._clock = clock or CellClock()
-        options.model = options.model or ("UR5" if options.polyscope[0] <= 3 else "UR5e")
-        nominal = MODELS[options.model]
-        dh = nominal.disturbed(options.seed, 1e-3 * options.dh_noise, 3e-4 * options.dh_noise)
+        dh = kinematics_from(options)
+        options.model = dh.model
         truth = truth_from(options)
         self._recording = recording = _recording(options)
         if recording is None:
-            imperfections = Imperfections().changed(options.imperfections)
+            usual = Imperfections(wrist_drift_N=WRIST_DRIFT_N) if options.sensor == WRIST else Imperfections()
+            imperfections = usual.changed(options.imperfections)
             self.world = World(truth, dh, start_posture(options), options.seed, self._clock, imperfections)
         else:
             self.world = RecordedWorld(recording, truth, dh, options.seed, self._clock)
@@ -180,6 +195,9 @@ class Station:
             ),
             None if recording is None else RecordedArm(dh, recording),
         )
+        if options.kinematics_message != "true":
+            other = factory_kinematics.drawn(dh.model, options.seed + 1)
+            self.robot.reported_dh = {"none": None, "wrong": other}[options.kinematics_message]
         self._selector = selectors.SelectSelector()  # the only one that waits for less than a millisecond
         self.server = self._listen()
         self._sensors: dict[str, Sensor] = {}
@@ -234,7 +252,8 @@ class Station:
         wanted = {"both": ("can", "serial"), "none": ()}.get(self._options.sensor, (self._options.sensor,))
         if WRIST in wanted:
             robot = self.robot
-            robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, robot.cycle_s)) + robot.wrist_error()
+            self.world.sensor_error = robot.wrist_error
+            robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, robot.cycle_s))
         for name in wanted:
             self._sensors[name] = Sensor(
                 name,
@@ -255,6 +274,7 @@ class Station:
                 **({"api_port": API_PORT} if API_PORT in self.server.ports else {}),
                 "model": self._options.model,
                 "serial_number": self._options.serial_number,
+                "kinematics": {name: getattr(self.world.dh, name) for name in ("theta", "a", "d", "alpha")},
             },
             "sensors": sensors,
             **self._content(),
@@ -348,7 +368,10 @@ class Station:
             "speed_scaling": arm.pace,
             **({} if self._recording is None else {"recording_s": self._recording.at_s(self._clock.now_s())}),
             "true_wrench": self.world.true_wrench().tolist(),
-            "bad_inputs": self.server.rtde.bad_inputs,
+            "bad_inputs": [
+                *self.server.rtde.bad_inputs,
+                *(doubt for event in robot.events for doubt in event.detail.get("doubts", ())),
+            ],
             "t_host_ns": self._clock.now_ns(),
             "events": [event.to_json() for event in robot.events[int(request.get("since", 0)) :]],
         }

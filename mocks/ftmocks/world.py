@@ -29,6 +29,9 @@ BURST_GAP_S = 0.001
 """A burst begins so soon behind the last one, where it is measured from: half the work."""
 REMEMBERED = 16
 """Control cycles whose motion is known: a sensor may be later than the controller."""
+WRIST_BIAS_N, WRIST_BIAS_SPREAD = (1800.0, 400.0, 25400.0), 0.1
+WRIST_BIAS_NM, WRIST_BIAS_SPREAD_NM = (-76.0, 0.0, 0.0), 3.0
+WRIST_NOISE_N = 0.1
 _MINUTE_S = 60.0
 _NOTHING: Array = np.zeros(6)
 
@@ -76,6 +79,18 @@ class Truth:
             force_bias_N=rng.uniform(-15.0, 15.0, 3),
             torque_bias_Nm=rng.uniform(-1.0, 1.0, 3),
             gyration_m2=drawn_gyration(np.random.default_rng([seed, 5]), reach),
+        )
+
+    def with_wrist_sensor(self, seed: int) -> "Truth":
+        """Return the cell with the sensor in the wrist of a UR5e, whose ft_raw_wrench has large zeros."""
+        rng = np.random.default_rng([seed, 10])
+        return replace(
+            self,
+            R_flange_sensor=np.eye(3),
+            sensor_mass_kg=0.0,
+            force_bias_N=np.array(WRIST_BIAS_N) * (1.0 + WRIST_BIAS_SPREAD * rng.standard_normal(3)),
+            torque_bias_Nm=np.array(WRIST_BIAS_NM) + WRIST_BIAS_SPREAD_NM * rng.standard_normal(3),
+            noise_force_N=WRIST_NOISE_N,
         )
 
     @property
@@ -208,6 +223,8 @@ class World:
         """What touches the tool, by name."""
         self.drifts: tuple[SensorDrift, ...] = ()
         """Drifts of the zero besides the drift of the truth."""
+        self.sensor_error: Callable[[], Array] | None = None
+        """What a sensor adds to each reading besides bias and noise, (6,)."""
         self._t0_s = self.now_s
         self._lock = threading.Lock()
         self._ripple = Ripple(imperfections, seed)
@@ -370,7 +387,7 @@ class World:
         with self._lock:
             noise = self._noise.standard_normal((len(t_s), 6))
             readings: Array = self._true_wrenches(t_s) + noise * self._noise_sd
-        return readings
+        return readings if self.sensor_error is None else readings + self.sensor_error()
 
     def _true_wrenches(self, t_s: Array) -> Array:
         """Return the wrench on the sensor at these times, (n, 6), or (6,) where it is the same."""

@@ -324,7 +324,7 @@ def test_dashboard_lines_end_with_a_bare_line_feed(station: StationProcess) -> N
             b"Robotmode: RUNNING\n",
             b"Failed to execute: play\n",
             b"No program loaded\n",
-            b"Loading program: a.urp\n",
+            b"Loading program: /programs/a.urp, /programs/default.installation\n",
             b"could not understand: 'nonsense'\n",
             b"Disconnected\n",
         ]

@@ -27,13 +27,13 @@ def guarded():
   end
   thr = run mover()
   beat = read_input_integer_register(24)
-  missed_s = 0
+  missed_s = 0.0
   while missed_s < 0.2:
     sync()
     missed_s = missed_s + get_steptime()
     if read_input_integer_register(24) != beat:
       beat = read_input_integer_register(24)
-      missed_s = 0
+      missed_s = 0.0
     end
   end
   kill thr
@@ -97,6 +97,14 @@ def test_a_program_from_port_30001_runs_and_is_heard_by_every_client(station: St
             assert client.next("text")["text"] == "hello"
             assert client.next("key")["title"] == "PROGRAM_XXX_STOPPED"
     assert station.wait_for_event("program f")["by"] == "primary port"
+
+
+def test_doubtful_urscript_runs_and_stands_beside_the_bad_inputs(station: StationProcess) -> None:
+    known = station.ask("state")["bad_inputs"]
+    with PrimarySocket(station.host) as client:
+        client.send("def f():\n  # a comment\n  sync()\nend\n")
+        assert client.next("key")["title"] == "PROGRAM_XXX_STARTED"
+    assert station.ask("state")["bad_inputs"] == [*known, "URScript: the program has lines of comment"]
 
 
 def test_local_control_ends_connections_and_lets_new_ones_only_read(station: StationProcess) -> None:

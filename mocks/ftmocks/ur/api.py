@@ -22,7 +22,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from typing import NamedTuple
 
-from ftmocks.ur.modes import RobotMode, Runtime, SafetyMode
+from ftmocks.ur.modes import EMERGENCY, SAFEGUARDED, RobotMode, Runtime, SafetyMode
 from ftmocks.ur.robot import Robot
 
 POLYSCOPE_X = 10
@@ -34,10 +34,9 @@ Document = dict[str, object]
 Answer = tuple[int, Document]
 
 _SAFETY_NAMES = {
-    SafetyMode.SAFEGUARD_STOP: "PROTECTIVE_STOP",
+    **dict.fromkeys(SAFEGUARDED, "PROTECTIVE_STOP"),
+    **dict.fromkeys(EMERGENCY, "EMERGENCY_STOP"),
     SafetyMode.RECOVERY: "REDUCED",
-    SafetyMode.SYSTEM_EMERGENCY_STOP: "EMERGENCY_STOP",
-    SafetyMode.ROBOT_EMERGENCY_STOP: "EMERGENCY_STOP",
     SafetyMode.VIOLATION: "FAULT",
 }
 """Names of the modes that have another one here."""

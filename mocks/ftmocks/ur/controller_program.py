@@ -15,13 +15,15 @@ class ScriptError(Exception):
 
 
 class ControllerProgram:
-    """A program as the controller runs it. This one, which was loaded at the pendant, ends in its first cycle."""
+    """A program as the controller runs it. This one was loaded at the pendant, and loops there until it is stopped."""
 
     reads_registers = False
     """Whether it obeys the commands that a client writes into `COMMAND_REGISTERS`."""
 
     def __init__(self, name: str) -> None:
         self.name = name
+        self.doubts: list[str] = []
+        """What a controller is reported to reject in its text."""
 
     @property
     def place(self) -> Place:
@@ -30,7 +32,7 @@ class ControllerProgram:
 
     def step(self) -> bool:
         """Run one control cycle; return False when the program has ended."""
-        return False
+        return True
 
     def close(self) -> None:
         """End the program; a moving arm comes to rest."""

@@ -1,12 +1,12 @@
 """The dashboard server's answers: one line in, one line out.
 
 Source: Universal Robots, "Dashboard Server e-Series, port 29999" and its CB-Series page. Wording matters: clients
-compare it.
+compare it. `load` and the name in `programState`: issues 89 and 268 of its client library.
 """
 
 from collections.abc import Callable
 
-from ftmocks.ur.modes import Runtime
+from ftmocks.ur.modes import Runtime, SafetyMode
 from ftmocks.ur.robot import Robot
 
 BANNER = "Connected: Universal Robots Dashboard Server"
@@ -20,13 +20,21 @@ LOCAL_CONTROL = (
     "please switch robot to Remote Control mode and reconnect to port 29999"
 )
 
+PROGRAMS, INSTALLATION = "/programs/", "/programs/default.installation"
+
+_SAFETY_MODES = {
+    SafetyMode.AUTOMATIC_MODE_SAFEGUARD_STOP: SafetyMode.SAFEGUARD_STOP,
+    SafetyMode.SYSTEM_THREE_POSITION_ENABLING_STOP: SafetyMode.SAFEGUARD_STOP,
+}
+"""What `safetymode` does not distinguish; `safetystatus` does."""
+
 _QUERIES: dict[str, Callable[[Robot], str]] = {
     "polyscopeversion": lambda r: f"URSoftware {'.'.join(map(str, r.settings.polyscope))}.{BUILD} (Mar 24 2022)",
     "get serial number": lambda r: r.settings.serial_number,
     "get robot model": lambda r: r.settings.model.rstrip("e"),
     "is in remote control": lambda r: str(r.remote_control).lower(),
     "robotmode": lambda r: f"Robotmode: {r.robot_mode.name}",
-    "safetymode": lambda r: f"Safetymode: {r.safety_mode.name}",
+    "safetymode": lambda r: f"Safetymode: {_SAFETY_MODES.get(r.safety_mode, r.safety_mode).name}",
     "safetystatus": lambda r: f"Safetystatus: {r.safety_mode.name}",
     "running": lambda r: f"Program running: {str(r.runtime == Runtime.PLAYING).lower()}",
     "programstate": lambda r: f"{r.runtime.name} {r.program_name}",
@@ -91,6 +99,12 @@ def _restart_safety(robot: Robot) -> str | None:
     return "Restarting safety"
 
 
+def _load(robot: Robot, name: str) -> str:
+    robot.stop_program("another program loaded")
+    robot.loaded_program = name if name.startswith("/") else PROGRAMS + name
+    return f"Loading program: {robot.loaded_program}, {INSTALLATION}"
+
+
 _COMMANDS: dict[str, Callable[[Robot], str | None]] = {
     "play": _play,
     "stop": _stop,
@@ -131,9 +145,7 @@ def answer(robot: Robot, line: str, *, by: str = "dashboard", trusted: bool = Tr
         robot.note(by, verb, accepted=False, why=LOCAL_CONTROL)
         return LOCAL_CONTROL
     if loads:
-        robot.stop_program("another program loaded")
-        robot.loaded_program = command[5:].strip()
-        reply_text: str | None = f"Loading program: {robot.loaded_program}"
+        reply_text: str | None = _load(robot, command[5:].strip())
     else:
         reply_text = _COMMANDS[verb](robot)
     refusal = TOO_EARLY if verb == "unlock protective stop" else f"Failed to execute: {verb}"

@@ -14,7 +14,7 @@ C210 and not executed. Commands that are no programs: the client library's prima
 Chosen here, where the sources are silent:
 
 * Timestamps are microseconds of the controller's clock; version and compile errors have none (all bits set).
-* Kinematics and configuration come in the first state of a connection only.
+* Kinematics and configuration come in the first state of a connection only, the parts that are not modelled in each.
 * C210 has argument 0, level warning and no text, and goes to the client that sent the program.
 * A run-time error is the message of an exception with line, column and text, then ``PROGRAM_XXX_STOPPED``. It has the
   place of the call, else of the statement.
@@ -27,7 +27,7 @@ import struct
 import zlib
 from collections.abc import Callable, Sequence
 
-from ftmocks.kinematics import MODELS
+from ftmocks.kinematics import MODELS, Dh
 from ftmocks.ur import dashboard
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import JOINT_MODES, JOINT_POWER_OFF, POWERED, SAFETY_BITS, Runtime, SafetyMode
@@ -38,6 +38,8 @@ BUILD_DATE = "24-03-2022, 12:00:00"
 
 ROBOT_STATE, ROBOT_MESSAGE = 16, 20
 MODE_DATA, JOINT_DATA, CARTESIAN_INFO, KINEMATICS_INFO, CONFIGURATION_DATA = 0, 1, 4, 5, 6
+NOT_MODELLED = {2: 32, 3: 70, 7: 56, 8: 4, 9: 48, 10: 38, 11: 21, 12: 3}
+"""Other parts of a state, all zeros here: type and size of their content."""
 TEXT, VERSION, SAFETY_MODE, ERROR_CODE, KEY, RUNTIME_EXCEPTION = 0, 3, 5, 6, 7, 10
 FROM_CONTROLLER, FROM_PROGRAM = -2, -3
 NO_TIMESTAMP = 2**64 - 1
@@ -45,8 +47,8 @@ READ_ONLY_CODE = 210
 WARNING = 2
 
 ROBOT_TYPES = {"UR5": 1, "UR10": 2, "UR3": 3, "UR16": 4, "UR20": 7, "UR30": 8}
-SUB_TYPES = {False: 1, True: 3}
-"""Of a CB-Series arm and of a later one."""
+SUB_TYPES = {False: 2, True: 3}
+"""Of a CB3 arm and of an e-Series one."""
 JOINT_ACCELERATION_RAD_S2 = 40.0
 DEFAULTS = (1.0471975511965976, 1.3962634015954636, 0.25, 1.2, 0.25)
 """Joint speed and acceleration, tool speed and acceleration, radius of a joint: rad and m."""
@@ -125,7 +127,10 @@ def state_package(robot: Robot, *, complete: bool = False) -> bytes:
     """Return the robot state; a complete one has kinematics and configuration."""
     parts = {MODE_DATA: _mode_data(robot), JOINT_DATA: _joint_data(robot), CARTESIAN_INFO: _cartesian_info(robot)}
     if complete:
-        parts |= {KINEMATICS_INFO: _kinematics_info(robot), CONFIGURATION_DATA: _configuration_data(robot)}
+        if robot.reported_dh is not None:
+            parts[KINEMATICS_INFO] = _kinematics_info(robot.reported_dh)
+        parts[CONFIGURATION_DATA] = _configuration_data(robot)
+    parts |= {kind: bytes(size) for kind, size in NOT_MODELLED.items()}
     body = b"".join(struct.pack(">IB", 5 + len(part), kind) + part for kind, part in parts.items())
     return struct.pack(">iB", 5 + len(body), ROBOT_STATE) + body
 
@@ -158,10 +163,10 @@ def _cartesian_info(robot: Robot) -> bytes:
     return struct.pack(">12d", *robot.tcp_pose("actual"), *robot.tcp_offset)
 
 
-def _kinematics_info(robot: Robot) -> bytes:
-    dh = robot.arm.dh
-    parameters = (dh.theta, dh.a, dh.d, dh.alpha)
-    nominal = dh == MODELS[robot.settings.model]
+def _kinematics_info(dh: Dh) -> bytes:
+    nominal = dh == MODELS[dh.model]
+    alpha = [round(angle, 9) for angle in dh.alpha] if nominal else dh.alpha  # 1.570796327, as URSim reports it
+    parameters = (dh.theta, dh.a, dh.d, alpha)
     checksums = [0xFFFFFFFF if nominal else zlib.crc32(_doubles(joint)) for joint in zip(*parameters, strict=True)]
     return struct.pack(">6I", *checksums) + b"".join(map(_doubles, parameters)) + struct.pack(">I", 0)
 

@@ -8,12 +8,13 @@ keeps the cell's time, and so does the controller's clock when the arm's own sen
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from ftmocks.arrays import Array
-from ftmocks.imperfections import FRICTION_RAD_S, Ringing, wrist_drift
+from ftmocks.imperfections import FRICTION_RAD_S, Ringing, WarmUp
 from ftmocks.kinematics import (
     ZERO6,
     Dh,
@@ -21,6 +22,7 @@ from ftmocks.kinematics import (
     Vector3,
     Vector6,
     cross,
+    elbow,
     forward,
     jacobian,
     matrix_of,
@@ -73,8 +75,8 @@ class Limits:
             return True
         normal, distance = np.array(self.plane[:3]), self.plane[3]
         flange = forward(self.dh, q)
-        points = (forward(self.dh, q, joints=2), flange, flange @ X_flange_tcp)
-        return all(float(normal @ X[:3, 3]) >= distance for X in points)
+        points = (elbow(self.dh, q), flange[:3, 3], (flange @ X_flange_tcp)[:3, 3])
+        return all(float(normal @ p) >= distance for p in points)
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,9 @@ class Robot:
         self.arm = arm or Arm(world.dh, world.q, imperfections.servo_lag_s)
         self._ringing = Ringing.at_rest(imperfections, world.seed)
         self._joint_noise = np.random.default_rng([world.seed, 9])
-        self._wrist_drift = wrist_drift(imperfections, world.seed, world.now_s)
+        self._wrist_drift = WarmUp(imperfections.wrist_drift_N, world.now_s)
+        self.reported_dh: Dh | None = world.dh
+        """The kinematics that the primary interface sends; None for none."""
         self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
         self.frequency_hz = 125 if settings.polyscope[0] <= 3 else 500
         self.period_s = 1.0 / self.frequency_hz
@@ -141,7 +145,7 @@ class Robot:
         self.safety_mode = SafetyMode.NORMAL
         self.remote_switches = 0
         """How often the pendant changed between local and remote control."""
-        self.loaded_program: str | None = None
+        self.loaded_program: str | None = None  # its path
         self.payload_kg = settings.payload_kg
         self.payload_cog_m = settings.payload_cog_m
         self.payload_inertia: Vector6 = ZERO6
@@ -162,11 +166,9 @@ class Robot:
         """Text of the popup that a program shows, until the operator closes it."""
         self.wrist_sensor: Callable[[int], Array] | None = None
         """Readings (n, 6) of a wrist sensor with bias and noise; without one `ft_raw_wrench` is exact."""
-        self._physical_s = 0.0
-        self._stopped_at_s = 0.0
+        self._physical_s = self._stopped_at_s = self._watchdog_age_s = 0.0
         self._later: list[tuple[float, Callable[[], object]]] = []
         self._watchdog: tuple[str, float] | None = None
-        self._watchdog_age_s = 0.0
         self._ft_zero = np.zeros(6)
         self._measured: tuple[int, Vector6] | None = None
         self._reading: tuple[int, Vector6] | None = None
@@ -259,7 +261,7 @@ class Robot:
     @property
     def program_name(self) -> str:
         """Name of the program, as the dashboard shows it."""
-        return self._program.name if self._program is not None else self.loaded_program or "unnamed"
+        return self._program.name if self._program is not None else PurePosixPath(self.loaded_program or "unnamed").name
 
     @property
     def remote_control(self) -> bool:
@@ -337,7 +339,7 @@ class Robot:
             return True
         if self.loaded_program is None or self.runtime == Runtime.PLAYING:
             return False
-        self._start(ControllerProgram(self.loaded_program))
+        self._start(ControllerProgram(self.program_name))
         return True
 
     @property

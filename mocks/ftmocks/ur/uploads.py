@@ -66,6 +66,8 @@ def start_upload(robot: Robot, upload: Upload, *, by: str = "script port") -> bo
     obstacle = robot.obstacle if robot.remote_control else "local control"
     try:
         program, detail = upload.compiled(robot), dict[str, Any]()
+        if program.doubts:
+            detail = {"doubts": program.doubts}
     except UrscriptSyntaxError as error:
         obstacle = obstacle or f"syntax error: {error}"
         program, detail = ControllerProgram(upload.name), error_at(error.place, error.report)

@@ -108,6 +108,7 @@ def _register_readers() -> None:
 _register_readers()
 
 _SINCE: dict[str, dict[int, tuple[int, int]]] = {
+    "safety_status": {3: (10, 0), 5: (4, 0), 10: (0, 0)},
     "ft_raw_wrench": {5: (9, 0), 10: (0, 0)},
     "payload": {3: (11, 0), 5: (5, 1), 10: (0, 0)},
     "payload_cog": {3: (11, 0), 5: (5, 1), 10: (0, 0)},

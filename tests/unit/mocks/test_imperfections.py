@@ -143,12 +143,27 @@ def test_friction_of_wrist_3_opposes_its_turn_in_the_built_in_sensor(turn: float
     assert not robot.wrist_error().any()
 
 
-def test_the_built_in_sensor_drifts_for_10_minutes_after_a_start() -> None:
-    robot = cell(replace(IDEAL, wrist_drift_N=4.0))
+def test_the_built_in_sensor_drifts_after_a_start_fastest_at_first() -> None:
+    robot = cell(replace(IDEAL, wrist_drift_N=7.0))
     began_s, before = robot.cycle_s, np.array(robot.raw_wrench())
-    for minutes, drift_N in ((5, 2.0), (10, 4.0), (60, 4.0)):
+    drift_N = []
+    for minutes in (1, 2, 5, 10):
         robot.tick(began_s + 60 * minutes)
-        assert np.linalg.norm((robot.raw_wrench() - before)[:3]) == pytest.approx(drift_N, rel=1e-3)
+        change = robot.raw_wrench() - before
+        np.testing.assert_allclose(change[[0, 1, 3, 4, 5]], 0.0, atol=1e-9)
+        drift_N.append(change[2])
+    assert drift_N[3] == pytest.approx(7.0, rel=1e-3)
+    assert drift_N[0] > drift_N[1] - drift_N[0] > (drift_N[3] - drift_N[2]) / 5 > 0
+
+
+def test_the_built_in_sensor_has_the_zeros_and_the_noise_of_a_real_one() -> None:
+    zeros = [TRUTH.with_wrist_sensor(seed) for seed in range(50)]
+    forces, torques = np.array([t.force_bias_N for t in zeros]), np.array([t.torque_bias_Nm for t in zeros])
+    np.testing.assert_allclose(forces.mean(axis=0), [1800, 400, 25400], rtol=0.06)
+    np.testing.assert_allclose(torques.mean(axis=0), [-76, 0, 0], atol=1.5)
+    assert (np.abs(torques[:, 1:]) < 12).all()
+    assert zeros[0].noise_force_N == 0.1
+    assert forces[0].tolist() != forces[1].tolist()
 
 
 @pytest.mark.parametrize(

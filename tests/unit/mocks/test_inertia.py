@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ftmocks.factory_kinematics import drawn
 from ftmocks.inertia import inertia_tensor
-from ftmocks.kinematics import MODELS, JointState, Vector6, flange_motion, forward, jacobian, vector6
+from ftmocks.kinematics import JointState, Vector6, flange_motion, forward, jacobian, vector6
 from ftmocks.world import AHEAD_S, Truth, World
 
 Array = NDArray[np.float64]
 
-DH = MODELS["UR5e"].disturbed(3)
+DH = drawn("UR5e", 3)
 HOME = np.radians([45, -100, 60, -50, 90, 45])
 STEP_S = 1e-4
 MASSES_KG = np.array([0.3, 0.2, 0.4, 0.1, 0.25])

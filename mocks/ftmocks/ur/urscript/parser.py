@@ -6,11 +6,15 @@ library of Universal Robots for line breaks in a statement.
 Chosen here: one statement a line, as the manual shows programs. Operators bind as in Python, ``xor`` between ``or`` and
 ``and``. A name is known when the program assigns it anywhere, or defines a function of that name anywhere.
 
-Does not model: structs, matrices, ``switch``, ``assert``, program labels, ``+=``, remote procedure calls. Such a text
-is rejected as a syntax error.
+The parser rejects what a published report says that a controller rejects. Where another source contradicts the report,
+it accepts the text and records a doubt. The list with its sources: docs/reference/urscript-constructs.md.
+
+Does not model: structs, matrices, ``^``, ``switch``, ``assert``, remote procedure calls. Such a text is rejected as not
+emulated.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
 from typing import NoReturn
 
 from ftmocks.ur.controller_program import Place
@@ -26,6 +30,7 @@ from ftmocks.ur.urscript.syntax import (
     Keyword,
     Literal,
     Name,
+    NotEmulated,
     Operation,
     Statement,
     Token,
@@ -34,18 +39,36 @@ from ftmocks.ur.urscript.syntax import (
     syntax_error,
     tokens_of,
 )
+from ftmocks.ur.urscript.types import check_types
 
 _LEVELS = (("or",), ("xor",), ("and",), ("not",), ("==", "!=", "<", ">", "<=", ">="), ("+", "-"), ("*", "/", "%"))
 """Operators, from the weakest."""
-_COMPARISONS = _LEVELS[4]
+_COMPARISONS, _ARITHMETIC = _LEVELS[4], _LEVELS[5:]
 _ALONE = ("break", "continue", "halt", "pass", "enter_critical", "exit_critical")
 _WITH_VALUE = ("kill", "join")
 _RESERVED = {"def", "thread", "sec", "if", "elif", "else", "while", "end", "return", "run", "local", "global", "and"}
+_NOT_EMULATED = ("switch", "assert")
+LONGEST_NAME = 31
+"""Of a program, as the client library of Universal Robots cuts it for the sake of older controllers."""
 _RESERVED |= {"or", "xor", "not", "True", "False", "switch", "case", "assert", "None", "in", *_ALONE, *_WITH_VALUE}
 
 
-def parse(text: str, name: str, built_in: Collection[str]) -> Function:
+@dataclass
+class _Names:
+    """The variables of one function: its own, those it reads or assigns without a qualifier, and those with a value."""
+
+    own: set[str] = field(default_factory=set)
+    free: list[tuple[str, Place]] = field(default_factory=list)
+    valued: set[str] = field(default_factory=set)
+    loops: int = 0
+    blocks: int = 0
+    """How many loops, and how many blocks of any kind, surround the present statement."""
+
+
+def parse(text: str, name: str, built_in: Collection[str]) -> tuple[Function, list[str]]:
     """Parse one program: a ``def`` without parameters, or bare statements, which become a program called `name`.
+
+    Return it with the doubts about it: what a controller is reported to reject, although other sources contradict.
 
     Parameters
     ----------
@@ -70,6 +93,10 @@ class _Parser:
         self._at = 0
         self._known = set(built_in)
         self._used: list[tuple[str, Place]] = []
+        self._names = self._main = _Names()
+        self._globals: set[str] = set()
+        self._functions: list[_Names] = []
+        self._doubts: list[str] = []
 
     @property
     def _next(self) -> Token:
@@ -118,10 +145,10 @@ class _Parser:
         self._expect(":")
         self._end_line()
 
-    def program(self, name: str) -> Function:
+    def program(self, name: str) -> tuple[Function, list[str]]:
         self._skip_newlines()
         if self._is("def", "sec"):
-            main = self._function()
+            main = self._function(self._main)
         else:
             functions: dict[str, Function] = {}
             main = Function(name, (), self._block(functions, ()), functions=functions)
@@ -133,9 +160,30 @@ class _Parser:
             if used not in self._known:
                 sentence = f"the name {used} does not exist, or is not modelled by this emulator"
                 raise UrscriptSyntaxError(place, sentence, f"compile_error_name_not_found:{used}:")
-        return main
+        check_types(main)
+        return main, [*self._doubts, *self._other_doubts(main.name)]
 
-    def _function(self) -> Function:
+    def _doubt(self, place: Place, sentence: str) -> None:
+        self._doubts.append(f"URScript, line {place.line}: {sentence}")
+
+    def _other_doubts(self, name: str) -> Iterator[str]:
+        """Yield the doubts that need the whole program."""
+        hidden = self._main.own - self._globals
+        for names in self._functions:
+            for used, place in {used: place for used, place in reversed(names.free) if used not in names.own}.items():
+                if used in hidden:
+                    yield f"URScript, line {place.line}: {used} is not declared global in the program"
+        if any(line.lstrip().startswith("#") for line in self._text.split("\n")):
+            yield "URScript: the program has lines of comment"
+        if len(name) > LONGEST_NAME:
+            yield f"URScript: the name {name} has more than {LONGEST_NAME} characters"
+        if underscored := sorted({used for used in (*self._known, name) if used.startswith("_")}):
+            yield f"URScript: the name {underscored[0]} begins with an underscore"
+
+    def _function(self, names: _Names | None = None) -> Function:
+        outer, self._names = self._names, names or _Names()
+        if names is None:
+            self._functions.append(self._names)
         is_thread = self._take().text == "thread"
         name = self._new_name()
         parameters: list[tuple[str, Expression | None]] = []
@@ -143,12 +191,14 @@ class _Parser:
         while not self._accept(")"):
             if parameters:
                 self._expect(",")
-            parameters.append((self._new_name(), self._expression() if self._accept("=") else None))
+            parameters.append((parameter := self._new_name(), self._expression() if self._accept("=") else None))
+            self._names.own.add(parameter)
         self._colon()
         functions: dict[str, Function] = {}
         body = self._block(functions, ("end",))
         self._take()
         self._end_line()
+        self._names = outer
         return Function(name, tuple(parameters), body, is_thread, functions)
 
     def _block(self, functions: dict[str, Function], ends: tuple[str, ...]) -> Block:
@@ -168,12 +218,16 @@ class _Parser:
 
     def _statement(self, functions: dict[str, Function]) -> Statement:
         place = self._next.place
+        if self._is(*_NOT_EMULATED):
+            raise NotEmulated(place, repr(self._next.text))
         if self._accept("if"):
             return self._if(place, functions)
         if self._accept("while"):
             condition = self._expression()
             self._colon()
-            body = self._block(functions, ("end",))
+            self._names.loops += 1
+            body = self._inner_block(functions, ("end",))
+            self._names.loops -= 1
             self._take()
             statement: Statement = While(place, condition, body)
         elif word := self._accept(*_WITH_VALUE):
@@ -189,6 +243,12 @@ class _Parser:
         self._end_line()
         return statement
 
+    def _inner_block(self, functions: dict[str, Function], ends: tuple[str, ...]) -> Block:
+        self._names.blocks += 1
+        block = self._block(functions, ends)
+        self._names.blocks -= 1
+        return block
+
     def _if(self, place: Place, functions: dict[str, Function]) -> If:
         branches: list[tuple[Expression, Block]] = []
         word: str | None = "if"
@@ -196,7 +256,7 @@ class _Parser:
             condition = Literal(True) if word == "else" else self._expression()
             self._colon()
             branches.append(
-                (condition, self._block(functions, ("end",) if word == "else" else ("end", "elif", "else")))
+                (condition, self._inner_block(functions, ("end",) if word == "else" else ("end", "elif", "else")))
             )
             word = self._take().text
         self._end_line()
@@ -204,7 +264,9 @@ class _Parser:
 
     def _assignment_or_call(self, place: Place) -> Statement:
         scope = self._accept("local", "global") or ""
-        used = len(self._used)
+        if scope == "global" and self._names.blocks:
+            raise syntax_error(self._text, place, "'global' inside an if or while: declare the variable before it")
+        used, free = len(self._used), len(self._names.free)
         left = self._expression()
         if not self._accept("="):
             if scope or not isinstance(left, Call):
@@ -212,11 +274,26 @@ class _Parser:
             return left
         if isinstance(left, Name):
             del self._used[used:]
+            del self._names.free[free:]
             self._known.add(left.name)
-            return Assignment(place, scope, left.name, None, self._expression())
+            value = self._expression()
+            self._note_assignment(place, scope, left.name)
+            return Assignment(place, scope, left.name, None, value)
         if isinstance(left, Item) and isinstance(left.whole, Name) and not scope:
             return Assignment(place, scope, left.whole.name, left.index, self._expression())
         self._fail("only a variable or an element of one can be assigned to")
+
+    def _note_assignment(self, place: Place, scope: str, name: str) -> None:
+        names = self._names
+        if names.loops and name not in names.own | names.valued | self._main.valued | self._globals:
+            self._doubt(place, f"{name} gets its first value inside a loop")
+        names.valued.add(name)
+        if scope == "global":
+            self._globals.add(name)
+        elif scope == "local" or names is self._main:
+            names.own.add(name)
+        else:
+            names.free.append((name, place))
 
     def _expression(self, level: int = 0) -> Expression:
         if level == len(_LEVELS):
@@ -226,6 +303,8 @@ class _Parser:
             return Operation("not", (self._expression(level),)) if self._accept("not") else self._expression(level + 1)
         left = self._expression(level + 1)
         while operator := self._accept(*operators):
+            if operators in _ARITHMETIC and self._is("-", "+"):
+                self._fail(f"a number or a bracket expected behind {operator!r}")
             left = Operation(operator, (left, self._expression(level + 1)))
             if operators is _COMPARISONS and self._is(*_COMPARISONS):
                 self._fail("one comparison expected")
@@ -245,9 +324,12 @@ class _Parser:
             inner = self._expression()
             self._expect(")")
             return inner
-        if opened := self._accept("[", "p["):
-            return Items(self._items(), opened == "p[")
         place = self._next.place
+        if opened := self._accept("[", "p["):
+            items = self._items()
+            if any(isinstance(item, Items) and not item.is_pose for item in items):
+                raise NotEmulated(place, "a list of lists (a matrix)")
+            return Items(items, opened == "p[")
         if self._accept("run"):
             return self._call(place, self._name(), runs=True)
         if word := self._accept("True", "False"):
@@ -261,6 +343,7 @@ class _Parser:
         if self._is("("):
             return self._call(place, name, runs=False)
         self._used.append((name, place))
+        self._names.free.append((name, place))
         return Name(name)
 
     def _items(self) -> tuple[Expression, ...]:

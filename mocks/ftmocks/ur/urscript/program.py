@@ -15,7 +15,8 @@ Chosen here, where the manual is silent:
 * A critical section changes nothing, because a thread is never interrupted before it waits. It does not hold others
   while it waits: the external control program of the client library moves the arm in one, and is stopped meanwhile.
 * Everything ends with the main program. ``return`` ends a thread, whatever its value is.
-* A condition must be True or False.
+* A condition must be True or False. A variable keeps its type and a list its length, and so does what a function
+  returns: see docs/reference/urscript-constructs.md for the reports.
 * A thread that computes for ever in one cycle is a run-time error. The manual lets it go on in the next cycle, and
   warns of a lost connection to the controller.
 """
@@ -43,7 +44,7 @@ from ftmocks.ur.urscript.syntax import (
     While,
 )
 from ftmocks.ur.urscript.threads import Halt, Leave, Run, Scope, Thread
-from ftmocks.ur.urscript.values import Pose, Value, combined, element, negative, number, text_of, truth
+from ftmocks.ur.urscript.values import Pose, Value, combined, element, negative, number, single, text_of, truth
 
 STATEMENTS_PER_CYCLE = 2000
 
@@ -71,7 +72,9 @@ class Program(ControllerProgram):
         self.robot = robot
         self._built_in = functions(robot.settings.polyscope)
         self._globals: dict[str, Value] = {}
-        main = parse(text, name, self._built_in)
+        main, self.doubts = parse(text, name, self._built_in)
+        self._returned: dict[int, Value] = {}
+        """A value that each function, by identity, has returned."""
         self._main = Thread("main")
         self._main.steps = self._body(Scope(self._main, main, None, self._globals))
         self._threads = [self._main]
@@ -128,6 +131,9 @@ class Program(ControllerProgram):
         except Leave as leave:
             if leave.word != "return":
                 raise ScriptError(f"{leave.word} outside of a loop") from None
+            if not scope.function.is_thread:
+                before = self._returned.setdefault(id(scope.function), leave.value)
+                _keep_type(f"the value of {scope.function.name}", before, leave.value)
             return leave.value
 
     def _block(self, scope: Scope, statements: Block) -> Run:
@@ -193,12 +199,16 @@ class Program(ControllerProgram):
         if statement.index is not None:
             whole, index = self._variable(scope, name), (yield from self._value(scope, statement.index))
             element(whole, index)  # must exist
-            whole[index] = value
+            whole[index] = single(value)
             return
         is_global = statement.scope == "global" or (
             not statement.scope and name not in scope.variables and name in self._globals
         )
         variables = self._globals if is_global else scope.variables
+        before = variables.get(name, value)
+        _keep_type(f"the variable {name}", before, value)
+        if isinstance(before, list) and len(before) != len(value):
+            raise ScriptError(f"Resizing of 'List' is not supported: {name} has {len(before)} elements")
         variables[name] = type(value)(value) if isinstance(value, list) else value
 
     def _variable(self, scope: Scope, name: str) -> Value:
@@ -215,7 +225,7 @@ class Program(ControllerProgram):
                 return self._variable(scope, expression.name)
             case Items():
                 values = yield from self._values(scope, expression.items)
-                return Pose(values) if expression.is_pose else values
+                return Pose(values) if expression.is_pose else [single(value) for value in values]
             case Item():
                 whole = yield from self._value(scope, expression.whole)
                 return element(whole, (yield from self._value(scope, expression.index)))
@@ -295,3 +305,9 @@ class Program(ControllerProgram):
             self._checked.add(id(call))
         result = function(self, *args, **named)
         return (yield from result) if isgenerator(result) else result
+
+
+def _keep_type(what: str, before: Value, now: Value) -> None:
+    if type(before) is not type(now):
+        one, other = ("nothing" if value is None else type(value).__name__ for value in (before, now))
+        raise ScriptError(f"Type error: {what} changes from {one} to {other}")

@@ -2,6 +2,7 @@
 
 Source: Universal Robots, "The URScript Programming Language", chapter 1. Wording and places of the errors: recorded
 streams of port 30001 of URSim, published by the Pharmaceutical Bioinformatics group of Uppsala (README of robotlab).
+What controllers reject: docs/reference/urscript-constructs.md.
 """
 
 import re
@@ -29,6 +30,14 @@ class UrscriptSyntaxError(Exception):
         super().__init__(f"line {place.line}: {sentence}")
         self.place = place
         self.report = report
+
+
+class NotEmulated(UrscriptSyntaxError):
+    """The text is URScript, which this emulator does not run."""
+
+    def __init__(self, place: Place, what: str) -> None:
+        sentence = f"{what} is valid URScript, not emulated here"
+        super().__init__(place, sentence, f"not_emulated_on_line:{place.line}:{what}:")
 
 
 @dataclass(frozen=True)
@@ -144,8 +153,9 @@ class Token(NamedTuple):
 
 
 _TOKEN = re.compile(
-    r"(?P<blank>[ \t\r]+|#[^\n]*)|(?P<newline>\n)|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
-    r'|"(?P<text>[^"\n]*)"|(?P<pose>p\[)|(?P<name>[A-Za-z_]\w*)|(?P<sign>==|!=|<=|>=|[-+*/%<>=()\[\],:])',
+    r'(?P<blank>[ \t\r]+|#[^\n]*|\$[ \t]*\d+[ \t]*"[^"\n]*")|(?P<newline>\n)'
+    r"|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
+    r'|"(?P<text>[^"\n]*)"|(?P<pose>p\[)|(?P<name>[A-Za-z_]\w*)|(?P<sign>==|!=|<=|>=|[-+*/%<>=()\[\],:^.{}])',
     re.ASCII,
 )
 
@@ -161,14 +171,15 @@ def syntax_error(text: str, place: Place, sentence: str) -> UrscriptSyntaxError:
 
 
 def tokens_of(text: str) -> Iterator[Token]:
-    """Yield the words of a program, without blanks and comments, and ``end`` behind the last.
+    """Yield the words of a program, without blanks, comments and program labels, and ``end`` behind the last.
 
-    A line break inside brackets, or behind an operator, is a blank.
+    A program label is ``$ 2 "text"``: the node of the pendant's program to which the next lines belong. A line
+    break inside brackets, or behind an operator, is a blank.
 
     Raises
     ------
     UrscriptSyntaxError
-        When a character belongs to no word.
+        When a character belongs to no word, or a word is not emulated.
     """
     at, line, line_start, depth = 0, 1, 0, 0
     goes_on = False
@@ -181,6 +192,10 @@ def tokens_of(text: str) -> Iterator[Token]:
         word = found[kind]
         if kind == "newline":
             line, line_start = line + 1, at
+        if kind == "sign" and word in "^.{}":
+            raise NotEmulated(place, repr(word))
+        if kind == "number" and not set(word).isdisjoint("eE"):
+            raise syntax_error(text, place, f"{word} has an exponent, which not every controller reads")
         if kind == "blank" or (kind == "newline" and (depth or goes_on)):
             continue
         yield Token(kind, word, place)

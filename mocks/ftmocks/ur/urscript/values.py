@@ -83,6 +83,13 @@ def element(whole: Value, index: Value) -> Value:
     return whole[index]
 
 
+def single(value: Value) -> Value:
+    """Take an element of a list, which is no list itself; a pose is."""
+    if type(value) is list:
+        raise ScriptError(f"a list of lists is not emulated: {text_of(value)}")
+    return value
+
+
 def truth(value: Value) -> bool:
     """Take a truth value."""
     if not isinstance(value, bool):

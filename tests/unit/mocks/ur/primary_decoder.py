@@ -88,6 +88,9 @@ def _state(reader: Reader) -> dict[str, Any]:
         size, kind = reader.take("IB")
         part = Reader(reader.data[: size - 5])
         reader.data = reader.data[size - 5 :]
+        if kind not in _PARTS:
+            parts.setdefault("others", {})[kind] = len(part.data)
+            continue
         name, decode = _PARTS[kind]
         parts[name] = decode(part)
         assert part.data == b"", name

@@ -114,6 +114,41 @@ def test_a_closed_safeguard_lets_a_held_program_go_on_but_not_a_stopped_one() ->
     assert (robot.runtime, robot.arm.at_rest) == (Runtime.STOPPED, True)
 
 
+def test_a_loaded_program_has_its_base_name_and_loops_until_it_is_stopped() -> None:
+    robot = new_robot()
+    assert answer(robot, "load lines/a.urp") == "Loading program: /programs/lines/a.urp, /programs/default.installation"
+    assert answer(robot, "programState") == "STOPPED a.urp"
+    assert answer(robot, "get loaded program") == "Loaded program: /programs/lines/a.urp"
+    assert answer(robot, "play") == "Starting program"
+    run(robot, 5.0)
+    assert answer(robot, "programState") == "PLAYING a.urp"
+    assert answer(robot, "stop") == "Stopped"
+    assert answer(robot, "programState") == "STOPPED a.urp"
+
+
+@pytest.mark.parametrize(
+    ("number", "name", "by_dashboard", "runtime", "bits"),
+    [
+        (12, "AUTOMATIC_MODE_SAFEGUARD_STOP", "SAFEGUARD_STOP", Runtime.PAUSED, 0x410),
+        (13, "SYSTEM_THREE_POSITION_ENABLING_STOP", "SAFEGUARD_STOP", Runtime.PAUSED, 0x410),
+        (15, "IMMI_EMERGENCY_STOP", "IMMI_EMERGENCY_STOP", Runtime.STOPPED, 0x4A0),
+        (17, "PROFISAFE_WAITING_FOR_PARAMETERS", "PROFISAFE_WAITING_FOR_PARAMETERS", Runtime.STOPPED, 0x400),
+        (22, "SAFETY_API_SAFEGUARD_STOP", "SAFETY_API_SAFEGUARD_STOP", Runtime.PAUSED, 0x410),
+    ],
+)
+def test_newer_safety_modes_hold_the_arm_or_cut_its_power(
+    number: int, name: str, by_dashboard: str, runtime: Runtime, bits: int
+) -> None:
+    robot = moving_robot()
+    robot.set_safety(SafetyMode(number), "asked for")
+    run(robot, 1.0)
+    assert (robot.runtime, robot.arm.at_rest) == (runtime, True)
+    assert answer(robot, "safetystatus") == f"Safetystatus: {name}"
+    assert answer(robot, "safetymode") == f"Safetymode: {by_dashboard}"
+    assert [OUTPUTS[output][1](robot) for output in ("safety_mode", "safety_status_bits")] == [number, bits]
+    assert (robot.robot_mode == RobotMode.RUNNING) == ("EMERGENCY" not in name)
+
+
 def test_reduced_mode_stops_nothing_and_outlives_a_protective_stop() -> None:
     robot = moving_robot()
     robot.reduced_mode(True)

@@ -2,6 +2,7 @@
 
 import pytest
 
+from ftmocks.factory_kinematics import drawn
 from ftmocks.kinematics import MODELS
 from ftmocks.ur import primary
 from ftmocks.ur.events import Event
@@ -80,21 +81,44 @@ def test_the_state_of_a_nominal_arm() -> None:
     assert state["cartesian"][:6] == pytest.approx(robot.tcp_pose("actual"))
     dh = MODELS["UR5e"]
     for part in ("kinematics", "configuration"):
-        assert [state[part][name] for name in ("theta", "a", "d", "alpha")] == [
-            list(row) for row in (dh.theta, dh.a, dh.d, dh.alpha)
-        ]
+        for name in ("theta", "a", "d", "alpha"):
+            assert state[part][name] == pytest.approx(getattr(dh, name), abs=1e-9)
     assert (state["configuration"]["robot_type"], state["configuration"]["sub_type"]) == (1, 3)
     assert state["configuration"]["limits"][:2] == pytest.approx([-6.283, 6.283], abs=1e-3)
-    assert set(decoded(primary.state_package(robot))) == {"type", "mode", "joints", "cartesian"}
+    assert set(decoded(primary.state_package(robot))) == {"type", "mode", "joints", "cartesian", "others"}
+    assert state["others"] == {2: 32, 3: 70, 7: 56, 8: 4, 9: 48, 10: 38, 11: 21, 12: 3}
+
+
+def test_kinematics_of_a_nominal_arm_byte_by_byte() -> None:
+    """Recorded from a UR5e in URSim 5.8: parser test of the client library."""
+    zero, right = "00" * 8, "3ff921fb54524550"  # 1.570796327
+    golden = [
+        "000000e105" + "ff" * 24,
+        zero * 6,
+        zero + "bfdb333333333333" + "bfd919ce075f6fd2" + zero * 3,
+        "3fc4cccccccccccd" + zero * 2 + "3fc10ff972474539" + "3fb985f06f694467" + "3fb97f62b6ae7d56",
+        right + zero * 2 + right + "b" + right[1:] + zero,
+        "00000000",
+    ]
+    assert bytes.fromhex("".join(golden)) in primary.state_package(new_robot(), complete=True)
 
 
 def test_a_calibrated_arm_has_its_own_checksums() -> None:
-    dh = MODELS["UR3"].disturbed(1)
+    dh = drawn("UR3", 1)
     settings = RobotSettings(model="UR3", polyscope=(3, 15, 0))
     state = decoded(primary.state_package(Robot(World(Truth.drawn(0), dh, HOME, 0), settings), complete=True))
     assert len(set(state["kinematics"]["checksum"])) == 6
     assert state["kinematics"]["a"] == list(dh.a)
-    assert (state["configuration"]["robot_type"], state["configuration"]["sub_type"]) == (3, 1)
+    assert (state["configuration"]["robot_type"], state["configuration"]["sub_type"]) == (3, 2)
+
+
+@pytest.mark.parametrize("what", ["none", "wrong"])
+def test_kinematics_can_be_missing_or_those_of_another_arm(what: str) -> None:
+    robot, other = new_robot(), drawn("UR5e", 2)
+    robot.reported_dh = None if what == "none" else other
+    state = decoded(primary.state_package(robot, complete=True))
+    assert state.get("kinematics", {}).get("d") == (None if what == "none" else list(other.d))
+    assert state["configuration"]["d"] == list(MODELS["UR5e"].d)
 
 
 def test_modes_of_a_held_and_of_a_powerless_arm() -> None:

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from ftmocks.factory_kinematics import drawn
 from ftmocks.kinematics import MODELS, forward, rotvec, vector6
 from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot, RobotSettings
@@ -24,7 +25,7 @@ def test_the_flange_reaches_the_speed_and_the_accelerations_of_the_request(
 ) -> None:
     """By differences of its poses along the path."""
     speed, turning, moving = limits
-    dh = MODELS[model].disturbed(1)
+    dh = drawn(model, 1)
     swing = Swing(dh, HOME, 5.0, speed_rad_s=speed, acceleration_rad_s2=turning, acceleration_m_s2=moving)
     times = np.arange(0.0, swing.period_s, STEP_S)
     poses = np.array([forward(dh, swing.at(t).q) for t in times])

@@ -1,5 +1,7 @@
 """URScript on the emulated controller: the language, and which texts are refused or end with an error."""
 
+import re
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,7 +10,7 @@ from ftmocks.ur.dashboard import answer
 from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.ur.urscript.library import functions
 from ftmocks.ur.urscript.parser import parse
-from ftmocks.ur.urscript.syntax import UrscriptSyntaxError
+from ftmocks.ur.urscript.syntax import NotEmulated, UrscriptSyntaxError
 from tests.unit.mocks.ur.urscript_robot import HOME, end_of, failure, logged, new_robot, results, run, start
 
 BUILT_IN = functions((5, 15, 0))
@@ -18,7 +20,7 @@ BUILT_IN = functions((5, 15, 0))
     ("expression", "value"),
     [
         ("1 + 2 * 3 - 4 / 8", "6.5"),
-        ("(1 + 2) * -3", "-9"),
+        ("(1 + 2) * (-3)", "-9"),
         ("7 % 3", "1"),
         ("-7.5 % 2", "-1.5"),
         ("1 + 1 == 2", "True"),
@@ -29,7 +31,7 @@ BUILT_IN = functions((5, 15, 0))
         ("True xor True or False", "False"),
         ("False and undefined_yet", "False"),
         ("[1, 2.5][1]", "2.5"),
-        ("[[1, 2], [3, 4]][1][0]", "3"),
+        ("[p[0, 0, 3, 0, 0, 0], p[0, 0, 1, 0, 0, 0]][1][2]", "1"),
         ("p[0, 0, 1, 0, 0, 0][2]", "1"),
         ("p[0, 0, 1, 0, 0, 0]", "p[0, 0, 1, 0, 0, 0]"),
         ("norm([3,\n  4  # in the next line\n])", "5.0"),
@@ -172,6 +174,11 @@ def test_run_time_errors_say_what_is_wrong_and_where(body: str, place: tuple[int
         ("def f():\n  x = 1 < 2 < 3\nend\n", (2, 13), "one comparison expected"),
         ("def f():\n  x = None\nend\n", (2, 7), "a name expected"),
         ("def f():\n  3 = x\nend\n", (2, 7), "only a variable"),
+        ("def f():\n  while True:\n    global x = 1\n  end\nend\n", (3, 5), "'global' inside an if or while"),
+        ("def f():\n  if True:\n    global x = 1\n  end\nend\n", (3, 5), "'global' inside an if or while"),
+        ("def f():\n  x = 1 + -2\nend\n", (2, 11), "a number or a bracket expected behind '\\+'"),
+        ("def f():\n  x = 2 * -1\nend\n", (2, 11), "a number or a bracket expected"),
+        ("def f():\n  x = 1e-3\nend\n", (2, 7), "1e-3 has an exponent"),
         ("(" * 3000, (1, 1), "nested too deeply"),
     ],
 )
@@ -197,6 +204,92 @@ def test_errors_read_as_on_a_controller(text: str, place: tuple[int, int], repor
     with pytest.raises(UrscriptSyntaxError) as rejected:
         parse(text, "f", BUILT_IN)
     assert (rejected.value.place, rejected.value.report) == (place, report)
+
+
+@pytest.mark.parametrize(
+    ("text", "place", "what"),
+    [
+        ("def f():\n  x = 2 ^ 3\nend\n", (2, 9), "'^'"),
+        ("def f():\n  x = a.b\nend\n", (2, 8), "'.'"),
+        ("def f():\n  x = [[1, 2], [3, 4]]\nend\n", (2, 7), "a list of lists (a matrix)"),
+        ("def f():\n  switch x:\nend\n", (2, 3), "'switch'"),
+    ],
+)
+def test_what_is_urscript_is_not_called_an_error(text: str, place: tuple[int, int], what: str) -> None:
+    with pytest.raises(NotEmulated, match=f"{re.escape(what)} is valid URScript, not emulated here") as rejected:
+        parse(text, "f", BUILT_IN)
+    assert rejected.value.place == place
+
+
+def test_labels_of_the_program_tree_are_accepted() -> None:
+    robot = start('def f():\n  $ 1 "Robot Program"\n  textmsg("a")\n  $ 2 "x = 1"\n  x = 1\n  textmsg(x)\nend\n')
+    assert logged(robot) == ["a", "1"]
+
+
+@pytest.mark.parametrize(
+    ("body", "why"),
+    [
+        ("  h = 0\n  thread t():\n    sync()\n  end\n  h = run t()", "h changes its type from int to Thread"),
+        ("  x = 1\n  if True:\n    x = 1.5\n  end", "x changes its type from int to float"),
+        ("  x = True\n  def g():\n    x = 1\n  end", "x changes its type from bool to int"),
+        ("  def g(a):\n    if a:\n      return 1\n    end\n    return 1.5\n  end", "g returns float and int"),
+        ("  def g(a):\n    if a:\n      return\n    end\n    return True\n  end", "g returns bool and nothing"),
+    ],
+)
+def test_a_type_that_changes_is_rejected_where_the_text_shows_it(body: str, why: str) -> None:
+    with pytest.raises(UrscriptSyntaxError, match=why):
+        parse(f"def f():\n{body}\nend\n", "f", BUILT_IN)
+
+
+@pytest.mark.parametrize(
+    ("body", "why"),
+    [
+        ("  t = 0\n  t = t + get_steptime()", "the variable t changes from int to float"),
+        ("  def g(a):\n    return a\n  end\n  x = g(1)\n  y = g(1.5)", "the value of g changes from int to float"),
+        ("  q = [1, 2]\n  q = [1, 2, 3]", "Resizing of 'List' is not supported: q has 2 elements"),
+        ("  q = [1, 2]\n  q[0] = q", "a list of lists is not emulated"),
+    ],
+)
+def test_a_type_that_changes_while_the_program_runs_ends_it(body: str, why: str) -> None:
+    assert why in failure(body).why
+
+
+def test_a_local_variable_may_have_another_type_than_one_of_its_name() -> None:
+    before = "x = 1\ndef g():\n  local x = 2.5\n  return x\nend\ndef h():\n  local y = True\n  return y\nend\ny = 3"
+    assert results("g()", "x", before=before) == ["2.5", "1"]
+
+
+@pytest.mark.parametrize(
+    ("text", "doubt"),
+    [
+        ("def f():\n  while False:\n    x = 1\n  end\nend\n", "line 3: x gets its first value inside a loop"),
+        (
+            "def f():\n  x = 1\n  def g():\n    return x\n  end\nend\n",
+            "line 4: x is not declared global in the program",
+        ),
+        ("def f():\n  # why\n  sync()\nend\n", "the program has lines of comment"),
+        (f"def {'n' * 32}():\nend\n", "has more than 31 characters"),
+        ("def f():\n  _x = 1\nend\n", "_x begins with an underscore"),
+    ],
+)
+def test_what_reports_contradict_about_runs_and_is_recorded(text: str, doubt: str) -> None:
+    robot = start(text)
+    (found,) = robot.events[0].detail["doubts"]
+    assert doubt in found
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "  global x = 1\n  def g():\n    return x\n  end",
+        "  def g(x):\n    y = x\n    return y\n  end\n  x = 1",
+        "  x = 0\n  while x < 3:\n    x = x + 1  # counts\n  end",
+        "  thread t():\n    n = 0\n    while n < 2:\n      n = n + 1\n    end\n  end\n  h = run t()\n  join h",
+    ],
+)
+def test_a_careful_program_raises_no_doubt(body: str) -> None:
+    robot = start(f"def f():\n{body}\nend\n")
+    assert robot.events[0].detail == {}
 
 
 def test_a_program_that_is_rejected_leaves_the_running_one() -> None:

@@ -19,14 +19,14 @@ def segment():
     return False
   end
   local hb = read_input_integer_register(24)
-  local missed_s = 0
+  local missed_s = 0.0
   thr = run mover()
   while not done:
     local x = read_input_integer_register(24)
     if x == hb:
       missed_s = missed_s + get_steptime()
     else:
-      missed_s = 0
+      missed_s = 0.0
     end
     hb = x
     if (missed_s > 0.2) or (read_input_integer_register(25) != 0):

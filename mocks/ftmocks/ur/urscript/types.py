@@ -1,0 +1,104 @@
+"""Types of URScript that can be read off the text: a variable keeps its type, and so does what a function returns.
+
+What is not known before the program runs is checked when it runs. The same rules, and who reports them:
+docs/reference/urscript-constructs.md.
+"""
+
+from collections.abc import Iterator
+
+from ftmocks.ur.controller_program import Place
+from ftmocks.ur.urscript.syntax import (
+    Assignment,
+    Block,
+    Call,
+    Expression,
+    Function,
+    If,
+    Items,
+    Keyword,
+    Literal,
+    Operation,
+    Statement,
+    UrscriptSyntaxError,
+    While,
+)
+
+_TRUTH = {"not", "and", "or", "xor", "==", "!=", "<", ">", "<=", ">="}
+Types = dict[str, str]
+"""Type of each variable."""
+
+
+def check_types(main: Function) -> None:
+    """Reject a program in which a variable changes its type, or a function returns values of two types.
+
+    Raises
+    ------
+    UrscriptSyntaxError
+        At the second type.
+    """
+    everywhere = {
+        name for function in _functions(main) for _, scope, name, _ in _assignments(function) if scope == "global"
+    }
+    program = everywhere | {name for _, _, name, _ in _assignments(main)}
+    shared: Types = {}
+    for function in _functions(main):
+        _check(function, shared, program, is_main=function is main)
+
+
+def _functions(function: Function) -> Iterator[Function]:
+    yield function
+    for inner in function.functions.values():
+        yield from _functions(inner)
+
+
+def _check(function: Function, shared: Types, program: set[str], *, is_main: bool) -> None:
+    local: Types = {}
+    for place, scope, name, kind in _assignments(function):
+        types = shared if is_main or scope == "global" or (not scope and name in program) else local
+        if kind and types.setdefault(name, kind) != kind:
+            raise _error(place, f"the variable {name} changes its type from {types[name]} to {kind}", name)
+    returned: set[str] = set()
+    for statement in _statements(function.body):
+        if isinstance(statement, Keyword) and statement.word == "return" and not function.is_thread:
+            kind = "nothing" if statement.value is None else type_of(statement.value)
+            returned |= {kind} if kind else set()
+            if len(returned) > 1:
+                kinds = " and ".join(sorted(returned))
+                raise _error(statement.place, f"{function.name} returns {kinds}", function.name)
+
+
+def _error(place: Place, sentence: str, name: str) -> UrscriptSyntaxError:
+    return UrscriptSyntaxError(place, sentence, f"compile_error_type:{name}:")
+
+
+def _assignments(function: Function) -> Iterator[tuple[Place, str, str, str | None]]:
+    """Yield place, qualifier, name and type of the values that variables of a function get."""
+    for statement in _statements(function.body):
+        if isinstance(statement, Assignment) and statement.index is None:
+            yield statement.place, statement.scope, statement.name, type_of(statement.value)
+
+
+def _statements(block: Block) -> Iterator[Statement]:
+    for statement in block:
+        yield statement
+        if isinstance(statement, While):
+            yield from _statements(statement.body)
+        if isinstance(statement, If):
+            for _, inner in statement.branches:
+                yield from _statements(inner)
+
+
+def type_of(expression: Expression) -> str | None:
+    """Return the type of the value where the text shows it, in the words of Python."""
+    match expression:
+        case Literal():
+            return type(expression.value).__name__
+        case Items():
+            return "Pose" if expression.is_pose else "list"
+        case Call(runs=True):
+            return "Thread"
+        case Operation(operator=word) if word in _TRUTH:
+            return "bool"
+        case Operation(operator="-x" | "+x", operands=(value,)):
+            return type_of(value)
+    return None

@@ -1,0 +1,103 @@
+"""Arms as factories make them: spread, conversion to Denavit-Hartenberg parameters, and what uses them."""
+
+import json
+import math
+from argparse import Namespace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ftmocks.factory_kinematics import drawn, read
+from ftmocks.kinematics import MODELS, elbow, forward, inverse, jacobian, rotvec
+from ftmocks.station import kinematics_from
+from ftmocks.ur import primary
+from ftmocks.ur.robot import Limits, Robot, RobotSettings
+from ftmocks.world import Truth, World
+from tests.real_arms import RealArm, real_arms
+from tests.unit.mocks.ur.primary_decoder import decoded
+from tests.unit.mocks.ur.urscript_robot import HOME
+
+ARMS = real_arms()
+a_real_arm = pytest.mark.parametrize(
+    "arm",
+    ARMS or [pytest.param(None, marks=pytest.mark.skip(reason="FTDRIVE_REAL_DATA is not set"))],
+    ids=[f"{arm.number}-{arm.model}" for arm in ARMS] or ["none"],
+)
+
+
+def test_arms_spread_as_real_ones_do() -> None:
+    """20 real arms: medians .13 to 1.04° and .7 to 3.2 mm, no posture beyond 1.32° and 7.5 mm."""
+    nominal, postures = MODELS["UR5e"], np.random.default_rng(0).uniform(-math.pi, math.pi, (20, 6)).tolist()
+    off = []
+    for seed in range(50):
+        pairs = [(forward(drawn("UR5e", seed), q), forward(nominal, q)) for q in postures]
+        turns_deg = [math.degrees(math.hypot(*rotvec(X[:3, :3] @ Y[:3, :3].T))) for X, Y in pairs]
+        off.append([(deg, 1e3 * math.dist(X[:3, 3], Y[:3, 3])) for deg, (X, Y) in zip(turns_deg, pairs, strict=True)])
+    medians = np.median(off, axis=1)
+    assert (medians > [0.1, 0.5]).all()
+    assert (medians < [1.04, 3.2]).all()
+    assert (np.max(off, axis=(0, 1)) < [1.32, 7.5]).all()
+    assert (medians.max(axis=0) > [0.6, 2.4]).all()
+    assert (medians.min(axis=0) < [0.2, 0.9]).all()
+
+
+def test_nearly_parallel_axes_have_offsets_of_metres_that_cancel() -> None:
+    dh = drawn("UR5e", 0)
+    assert min(map(abs, dh.d[1:4])) > 1.0
+    assert sum(dh.d[1:4]) == pytest.approx(MODELS["UR5e"].d[3], abs=5e-3)
+    assert dh == drawn("UR5e", 0) != drawn("UR5e", 1)
+
+
+def test_inverse_kinematics_finds_the_postures_of_a_drawn_arm() -> None:
+    dh, rng = drawn("UR10e", 4), np.random.default_rng(2)
+    for _ in range(20):
+        q = np.radians([45, -100, 60, -50, 90, 45]) + rng.uniform(-0.5, 0.5, 6)
+        solution = inverse(dh, forward(dh, q.tolist()), (q + rng.uniform(-0.05, 0.05, 6)).tolist())
+        assert solution == pytest.approx(q, abs=1e-8)
+
+
+def test_jacobian_of_far_frames_is_the_derivative() -> None:
+    dh, h = drawn("UR5e", 0), 1e-6
+    q = np.radians([45, -100, 60, -50, 90, 45])
+    for i, step in enumerate(h * np.eye(6)):
+        A, B = forward(dh, (q + step).tolist()), forward(dh, (q - step).tolist())
+        twist = np.concatenate((A[:3, 3] - B[:3, 3], rotvec(A[:3, :3] @ B[:3, :3].T))) / (2 * h)
+        np.testing.assert_allclose(jacobian(dh, q.tolist())[:, i], twist, atol=1e-6)
+
+
+def test_the_elbow_stays_at_the_arm_where_its_frame_is_far_away() -> None:
+    dh, q = drawn("UR5e", 0), HOME
+    assert np.linalg.norm(forward(dh, q, joints=2)[:3, 3]) > 1.0
+    np.testing.assert_allclose(elbow(dh, q), forward(MODELS["UR5e"], q, joints=2)[:3, 3], atol=3e-3)
+    assert Limits(dh, plane=(0.0, 0.0, 1.0, 0.0)).allow(q, np.eye(4))
+
+
+@a_real_arm
+def test_parameters_of_a_real_arm_are_exact(arm: RealArm, tmp_path: Path) -> None:
+    dh = read(arm.save(tmp_path))
+    for q in np.random.default_rng(0).uniform(-math.pi, math.pi, (50, 6)):
+        np.testing.assert_allclose(forward(dh, q.tolist()), arm.flange(q), atol=1e-9)
+
+
+@a_real_arm
+def test_an_emulated_arm_has_the_kinematics_of_a_real_one(arm: RealArm, tmp_path: Path) -> None:
+    path = arm.save(tmp_path)
+    dh = kinematics_from(Namespace(kinematics=str(path), model=None, polyscope=(5, 15, 0), seed=0))
+    robot = Robot(World(Truth.drawn(0), dh, HOME, 0), RobotSettings(model=dh.model))
+    np.testing.assert_allclose(robot.tcp_pose("target")[:3], arm.flange(np.array(HOME))[:3, 3], atol=1e-9)
+    reported = decoded(primary.state_package(robot, complete=True))["kinematics"]
+    given = json.loads(path.read_text(encoding="utf-8"))
+    assert {name: reported[name] for name in arm.dh()} == {name: given[name] for name in arm.dh()}
+    near = [0.01 + v for v in HOME]
+    assert inverse(dh, arm.flange(np.array(HOME)), near) == pytest.approx(HOME, abs=1e-8)
+
+
+def test_a_file_of_another_model_than_the_option_is_rejected(tmp_path: Path) -> None:
+    path = tmp_path / "arm.json"
+    path.write_text(json.dumps({"model": "UR3e", **dict.fromkeys(("theta", "a", "d", "alpha"), [0.1] * 6)}))
+    with pytest.raises(ValueError, match="UR3e"):
+        kinematics_from(Namespace(kinematics=str(path), model="UR5e", polyscope=(5, 15, 0), seed=0))
+    path.write_text('{"model": "UR3e", "theta": [1]}')
+    with pytest.raises(ValueError, match="cannot read kinematics"):
+        read(path)
