@@ -255,7 +255,7 @@ class NetFtSensor(StreamingSensor):
         if len(rating) == 6 and min(rating) > 0:
             per_unit = np.repeat([FORCE_UNITS_N[scale.force_unit.value], TORQUE_UNITS_NM[scale.torque_unit.value]], 3)
             facts["range"] = Fact(tuple((per_unit * rating).tolist()), "device")
-        if any(bias := numbers_in(page, "setbias")):
+        if bias := numbers_in(page, "setbias"):
             facts["software_bias"] = Fact(tuple(bias), "device")
         if not np.array_equal(undo, np.eye(6)):
             units = f"{text_in(page, 'scfgtdu')}, {text_in(page, 'scfgtau')}"

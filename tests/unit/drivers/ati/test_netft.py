@@ -265,7 +265,9 @@ def test_rate_range_and_bias_are_the_devices() -> None:
         )
     without = more.replace(b"990;", b"").replace(b"745;17;447;184;-596;-253", b"0;0;0;0;0;0").replace(b"500", b"0")
     with Box(page=PAGE.replace(b"</netft>", without + b"</netft>")) as box, box.sensor() as sensor:
-        assert not {"range", "software_bias"} & sensor.identify().facts.keys()
+        facts = sensor.identify().facts
+        assert "range" not in facts
+        assert facts["software_bias"] == Fact((0.0,) * 6, "device")
         assert math.isnan(sensor.health().nominal_rate_Hz)
 
 
