@@ -150,7 +150,7 @@ KINDS = {
         Kind("robotous-can", "interface=slcan", (0.02, 0.0005), 200, 6, "A60HA00123"),
         Kind("robotous-serial", "", (0.02, 0.0005), 200, 6, "A60HA00123"),
         Kind("robotiq-ft300", "", (0.01, 0.001), 100, 6, "FTS-1234"),
-        Kind("bota", "", (1e-5, 1e-6), 100, 0, "not reported"),
+        Kind("bota", "", (1e-5, 1e-6), 100, 0, "1", {"boot_s": 0.05}),
         Kind("ati-netft", "", (1e-6, 1e-6), 1000, 6, "FT12345", {"rdt_port": 0, "rate_hz": 1000}),
     )
 }

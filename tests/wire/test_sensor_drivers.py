@@ -185,6 +185,28 @@ def test_bota_too_slow_is_a_warning(start: Start, caplog: pytest.LogCaptureFixtu
 @pytest.mark.parametrize(
     ("options", "query"),
     [
+        ({"baud_code": 3}, ""),
+        ({"baud_code": 1}, "baud=57600"),
+        pytest.param({"boot_s": 3}, "", marks=pytest.mark.slow),
+        pytest.param({"baud_code": 3, "boot_s": 3}, "", marks=pytest.mark.slow),
+        pytest.param({"baud_code": 3, "boot_s": 3}, "sinc=256", marks=pytest.mark.slow),
+    ],
+)
+def test_bota_is_found_at_its_baud_rate_while_it_boots(start: Start, options: dict[str, Any], query: str) -> None:
+    with start("bota", **options).sensor(query) as sensor:
+        np.testing.assert_allclose(sensor.collect(0.2).wrench.mean(axis=0), WRENCH, atol=0.1)
+        assert sensor.identify().serial == "12345"
+        assert sensor.health().nominal_rate_Hz == pytest.approx(200 if query == "sinc=256" else 100)
+
+
+def test_bota_at_another_baud_rate_is_refused(start: Start) -> None:
+    with pytest.raises(ConnectError, match=r"at 460800 baud.*at 230400 baud.*baud="):
+        start("bota", baud_code=2).sensor().open()
+
+
+@pytest.mark.parametrize(
+    ("options", "query"),
+    [
         ({"calibration": {"counts_per_force": 416_666, "counts_per_torque": 1_000}}, ""),
         ({"calibration": {"force_unit": 1, "torque_unit": 4}}, ""),
         (

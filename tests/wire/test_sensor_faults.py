@@ -43,7 +43,7 @@ KINDS = {
         Kind("robotous-can", "interface=slcan"),
         Kind("robotous-serial", "baud=921600&rate=1000", {"baud_code": 1}),
         Kind("robotiq-ft300", ""),
-        Kind("bota", "sinc=64", numbered=True),
+        Kind("bota", "baud=460800&sinc=64", {"boot_s": 0.05}, numbered=True),
         Kind("ati-netft", "", {"rdt_port": 0, "rate_hz": 1000}, numbered=True),
         Kind("ur-ft", "counts_per_N=1&counts_per_Nm=1", numbered=True),
     )
