@@ -141,6 +141,8 @@ class BotaSensor(StreamingSensor):
         for baud, port in tuple(self._ports):
             self._port, self._text, self._frames = port, b"", codec.deframer()
             self._ports.sort(key=lambda one: one[0] != baud)  # a driver that reconnects tries the last one first
+            if found:
+                self._clock.sleep(_CLOSED_S)
             port.open()
             try:
                 if self._sinc is not None:
@@ -149,7 +151,6 @@ class BotaSensor(StreamingSensor):
             except DeviceTimeout as exc:
                 found.append(f"{exc.found} at {baud} baud")
                 port.close()
-                self._clock.sleep(_CLOSED_S)
         raise ConnectError(
             f"{self.name}: {', '.join(found)}",
             "check supply and wiring; add baud=… to its address, or sinc=512 for a sensor in set-up or text mode",
