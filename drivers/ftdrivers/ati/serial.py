@@ -4,8 +4,8 @@ Ref: ATI "Digital F/T" Modbus interface (sections 8.1, 8.3, 8.4 of 9620-05-Digit
 Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_modbus.py and the emulator (tests/wire).
 
 Modbus RTU for set-up, then a bare stream of 13-byte records at 7 kHz. Only a jamming sequence stops the stream, which
-outlives the program that started it. Gauge gains and offsets are volatile: at power-up the sensor has those of its lowest
-calibration in force. So the driver reads them, and writes them only where they differ from the calibration in use.
+outlives the program that started it. Gauge gains and offsets are volatile: at power-up the sensor has those of its
+lowest calibration in force. The driver reads them, and writes them only where they are not those of its calibration.
 """
 
 import logging

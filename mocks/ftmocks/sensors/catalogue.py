@@ -119,7 +119,7 @@ KINDS = {
     ),
     "robotiq": Kind("ftmocks.sensors.robotiq:RobotiqBox", "robotiq-ft300", bias_scale=FT300_BIAS_SCALE),
     "robotiq-urcap": Kind(
-        "ftmocks.sensors.robotiq_urcap:RobotiqUrcap", "robotiq-urcap", at_host=True, bias_scale=FT300_BIAS_SCALE
+        "ftmocks.sensors.robotiq_urcap:RobotiqUrcap", "robotiq-ft300", at_host=True, bias_scale=FT300_BIAS_SCALE
     ),
     "bota": Kind(
         "ftmocks.sensors.bota:BotaBox",
