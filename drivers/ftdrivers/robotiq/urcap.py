@@ -14,7 +14,7 @@ import socket
 import numpy as np
 
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import StreamBroken, Unreachable
+from ftdrivers.errors import DeviceFault, StreamBroken, Unreachable
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 from ftdrivers.robotiq import codec
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
@@ -22,6 +22,8 @@ from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 PORT = 63351
 _CONNECT_S = 2.0
 _RECEIVE_BYTES = 65536
+_END = 32_767 / np.array(codec.COUNTS_PER_UNIT)
+"""(6,) N and N·m: the end of the sensor's 16 bits. The URCap's zero may hide it."""
 _MOST_BYTES = 512
 """No reading is longer."""
 
@@ -109,7 +111,10 @@ class RobotiqUrcap(StreamingSensor):
         self._lost = self._malformed = self._readings.damaged
         if not readings:
             return NOTHING
-        return FtSamples.of(t_host_ns, [number for number, _ in readings], np.array([values for _, values in readings]))
+        wrench = np.array([values for _, values in readings])
+        if (np.abs(wrench) >= _END).any():
+            raise DeviceFault(f"{self.name}: a value is at the end of its range", "take the load off, check the cable")
+        return FtSamples.of(t_host_ns, [number for number, _ in readings], wrench)
 
     def _disconnect(self) -> None:
         connection, self._socket = self._socket, None

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
+from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import Fact
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.robotiq.sensor import RobotiqFt300
@@ -102,10 +102,11 @@ def silence(wire: Socket) -> bytes:
         (lambda _: b"", StreamBroken),
         (lambda _: (_ for _ in ()).throw(ConnectionResetError()), StreamBroken),
         (silence, DeviceTimeout),
+        (lambda _: TEXT.replace(b"30.0", b"-327.68"), DeviceFault),
     ],
-    ids=["closed", "reset", "silent"],
+    ids=["closed", "reset", "silent", "saturated"],
 )
-def test_lost_connection_and_silence_are_errors(wire: Socket, end: Any, error: type[Exception]) -> None:
+def test_lost_connection_silence_and_saturation_are_errors(wire: Socket, end: Any, error: type[Exception]) -> None:
     with Sensor(wire.clock) as sensor:
         wire.end = lambda: end(wire)
         with pytest.raises(error):
