@@ -56,8 +56,15 @@ class DeviceInfo:
     firmware: str
     facts: dict[str, Fact] = field(default_factory=dict)
     """Of a sensor, as far as known: `serial`; `counts_per_N` and `counts_per_Nm`, the scale of the device's numbers;
-    `range`, (6,) the largest force in N and torque in N·m on each axis, in both directions; `sign`, 1 or -1. Of an arm:
-    `control`, by what it is moved and why; `kinematics`, theta, a, d and alpha (24,) of its joints, as measured."""
+    `range`, (6,) the largest force in N and torque in N·m on each axis, in both directions; `sign`, 1 or -1;
+    `software_bias`, which the device subtracts, in its own unit; `tool_transformation` of the device, which the driver
+    undoes; `zero`, "arbitrary" where it is. Of an arm: `control`, by what it is moved and why; `kinematics`, theta, a,
+    d and alpha (24,) of its joints, as measured."""
+
+    @property
+    def has_arbitrary_zero(self) -> bool:
+        """Whether a sensor without load may read anything, so that its range holds for changes of the reading."""
+        return "zero" in self.facts
 
 
 class Columns:

@@ -82,6 +82,18 @@ class Options:
             raise BadUrl(f"{self._url}: option '{key}' is {text}; allowed are {lowest} to {highest}")
         return value
 
+    def counts(self) -> tuple[int, int] | None:
+        """Return the option `counts`, per unit of force and per unit of torque; None where it is not given."""
+        if (text := self.optional("counts")) is None:
+            return None
+        force, _, torque = text.partition(",")
+        if not (force.isdecimal() and torque.isdecimal() and int(force) and int(torque)):
+            raise BadUrl(
+                f"{self._url}: option 'counts' is '{text}'; give two whole numbers, per unit of force and of torque, "
+                "such as 1000000,1000000"
+            )
+        return int(force), int(torque)
+
     def positive(self, key: str, why: str) -> float:
         """Return a required option as a positive number; the error ends with `why`, its source."""
         if key not in self._given:

@@ -10,7 +10,7 @@ from pathlib import Path
 from ftmocks.arrays import Array
 from ftmocks.imperfections import Imperfections
 from ftmocks.kinematics import MODELS
-from ftmocks.sensors.catalogue import CHOICES
+from ftmocks.sensors.catalogue import CHOICES, KINDS
 from ftmocks.station import Station, parse_vector
 from ftmocks.world import MOUNTS_RAD
 
@@ -66,6 +66,13 @@ def _parser() -> argparse.ArgumentParser:
     add("--host", help="loopback address to listen on (default: a free 127.x.y.z)")
     add("--time-scale", type=_positive, default=1.0, metavar="K", help="the arm moves K times faster than real")
     add("--sensor", choices=CHOICES, default="can", metavar="NAME", help=f"{', '.join(CHOICES)} (default can)")
+    add(
+        "--sensor-setting",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="; ".join(f"{name}: {', '.join(kind.settings)}" for name, kind in KINDS.items() if kind.settings),
+    )
     add(
         "--imperfections",
         default="",

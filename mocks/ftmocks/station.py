@@ -25,7 +25,7 @@ from ftmocks.imperfections import WRIST_DRIFT_N, Imperfections
 from ftmocks.inertia import inertia_tensor
 from ftmocks.kinematics import MODELS, Dh, Vector6, rotation, vector3, vector6
 from ftmocks.recording import RecordedArm, RecordedWorld, Recording
-from ftmocks.sensors.catalogue import WRIST, Sensor
+from ftmocks.sensors.catalogue import KINDS, WRIST, Sensor, parse_settings
 from ftmocks.ur.operator import Operator
 from ftmocks.ur.robot import INSTALLED_G_M_S2, Robot, RobotSettings
 from ftmocks.ur.server import API_PORT, UrServer
@@ -63,6 +63,11 @@ def truth_from(options: Namespace) -> Truth:
     truth = Truth.drawn(options.seed, options.mount)
     if options.sensor == WRIST:
         truth = truth.with_wrist_sensor(options.seed)
+    elif options.sensor in KINDS:
+        force_scale, torque_scale = KINDS[options.sensor].bias_scale
+        truth = replace(
+            truth, force_bias_N=force_scale * truth.force_bias_N, torque_bias_Nm=torque_scale * truth.torque_bias_Nm
+        )
     if options.recording is not None:  # has its own bias and noise
         nothing = np.zeros(3)
         truth = replace(truth, force_bias_N=nothing, torque_bias_Nm=nothing, noise_force_N=0.0, noise_torque_Nm=0.0)
@@ -161,6 +166,7 @@ class Station:
 
     def __init__(self, options: Namespace, clock: CellClock | None = None) -> None:
         self._options = options
+        self._sensor_options = parse_settings(options.sensor, options.sensor_setting)
         self._clock = clock or CellClock()
         dh = kinematics_from(options)
         options.model = dh.model
@@ -250,7 +256,12 @@ class Station:
             robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, robot.cycle_s))
         for name in wanted:
             self._sensors[name] = Sensor(
-                name, self.world.measure_at, seed=self._options.seed, host=self.server.host, clock=self._clock
+                name,
+                self.world.measure_at,
+                seed=self._options.seed,
+                host=self.server.host,
+                clock=self._clock,
+                options=self._sensor_options,
             )
 
     def _hello(self) -> dict[str, Any]:

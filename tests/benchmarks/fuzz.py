@@ -26,7 +26,7 @@ from typing import cast
 from ftdrive.checks.computer import SensorAddress
 from ftdrivers.ati import codec as ati
 from ftdrivers.ati import modbus
-from ftdrivers.ati.netft import range_in
+from ftdrivers.ati.netft import transformation_in
 from ftdrivers.bota import codec as bota
 from ftdrivers.errors import BadTranscript, BadUrl, ProtocolError
 from ftdrivers.registry import SENSORS, sensor_from_url
@@ -191,7 +191,11 @@ def targets() -> list[Target]:
         ),
         Target("bota.codec.decode_frame", bota.decode_frame, bota_frame),
         Target("bota frames", bota_stream.feed, bota_frame),
-        Target("netft.range_in", range_in, b"<calfu>2</calfu><caltu>3</caltu><calmr>130;130;400;10;10;10</calmr>"),
+        Target(
+            "netft.transformation_in",
+            transformation_in,
+            b"<cfgtfx>0;0;132.71;0;0;9</cfgtfx><scfgtdu>mm</scfgtdu><scfgtau>degrees</scfgtau>",
+        ),
         Target("ur.rtde.take_package", rtde_packages, rtde.encode(rtde.DATA, bytes(57)) * 2),
         Target("ur.rtde.decode_version", rtde.decode_version, struct.pack(">4I", 5, 15, 0, 1)),
         Target("ur.rtde.Recipe.decode", rtde.Recipe.decode, recipe),

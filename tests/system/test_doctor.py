@@ -27,7 +27,16 @@ NAMED = {
         "robot.programs",
         "robot.version",
     ),
-    *("robot.version", "robot.link", "sensor.load", "noise.level", "noise.accuracy", "disk.runs", "workcell.measured"),
+    *(
+        "robot.version",
+        "robot.link",
+        "sensor.load",
+        "sensor.rest",
+        "noise.level",
+        "noise.accuracy",
+        "disk.runs",
+        "workcell.measured",
+    ),
     *("permissions.port", "permissions.by-id", "permissions.latency_timer"),
 }
 

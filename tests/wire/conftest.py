@@ -140,17 +140,20 @@ class Kind:
     counts: int
     serial: str
     options: dict[str, Any] = field(default_factory=dict)
+    name: str = ""
+    """Of the emulator, where it is not the scheme."""
 
 
 KINDS = {
-    kind.scheme: kind
+    kind.name or kind.scheme: kind
     for kind in (
         Kind("ati-can", "interface=slcan", (0.02, 0.001), 1000, 6, "FT"),
         Kind("ati-serial", "", (0.02, 0.001), 7000, 6, "FT"),
         Kind("robotous-can", "interface=slcan", (0.02, 0.0005), 200, 6, "A60HA00123"),
         Kind("robotous-serial", "", (0.02, 0.0005), 200, 6, "A60HA00123"),
         Kind("robotiq-ft300", "", (0.01, 0.001), 100, 6, "FTS-1234"),
-        Kind("bota", "", (1e-5, 1e-6), 100, 0, "not reported"),
+        Kind("robotiq-ft300", "", (0.01, 0.001), 100, 0, "not reported", {"port": 0}, name="robotiq-urcap"),
+        Kind("bota", "", (1e-5, 1e-6), 100, 0, "1", {"boot_s": 0.05}),
         Kind("ati-netft", "", (1e-6, 1e-6), 1000, 6, "FT12345", {"rdt_port": 0, "rate_hz": 1000}),
     )
 }
@@ -177,7 +180,7 @@ class Emulator:
         """Make a driver of it, in the cell's time unless another clock is given; it is closed with the emulator."""
         where, ports = self.endpoint, []
         if isinstance(where, dict):
-            ports = [f"{key}={where[key]}" for key in ("rdt_port", "http_port")]
+            ports = [f"{key}={port}" for key, port in where.items() if key != "host"]
             where = where["host"]
         query = "&".join(filter(None, [self.kind.query, *ports, options]))
         url = f"{self.kind.scheme}://{where}?{query}".rstrip("?")

@@ -22,6 +22,7 @@ from ftmocks.sensors.ati_serial import AtiSerialBox
 from ftmocks.sensors.bota import BotaBox
 from ftmocks.sensors.netft import Calibration, NetFtBox
 from ftmocks.sensors.robotiq import RobotiqBox
+from ftmocks.sensors.robotiq_urcap import RobotiqUrcap
 from ftmocks.sensors.robotous import Model, RobotousCanNode, RobotousSerialBox
 from ftmocks.wires.faults import Faults
 
@@ -92,7 +93,7 @@ def serve(*measured: Array) -> None:
     kinds: dict[str, Any] = {
         "ati-can": AtiCanNode, "ati-serial": AtiSerialBox, "robotous-can": RobotousCanNode, "bota": BotaBox,
         "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox, "ati-netft": NetFtBox,
-        "ur-ft": EmulatedWrist,
+        "robotiq-urcap": RobotiqUrcap, "ur-ft": EmulatedWrist,
     }  # fmt: skip
     parts = {"faults": Faults, "model": Model, "calibration": Calibration}
     devices, counters, clock = list[Any](), list[Any](), CellClock()

@@ -80,7 +80,7 @@ def test_can_host_that_never_reads_costs_frames_not_memory() -> None:
 
 def test_serial_host_that_does_not_read_loses_whole_records() -> None:
     rng = np.random.default_rng(3)
-    box = AtiSerialBox(lambda n: WRENCH + rng.normal(scale=[0.05] * 3 + [0.002] * 3, size=(n, 6)), needs_gains=False)
+    box = AtiSerialBox(lambda n: WRENCH + rng.normal(scale=[0.05] * 3 + [0.002] * 3, size=(n, 6)))
     with ExitStack() as stack:
         stack.callback(box.stop)
         port = stack.enter_context(serial.Serial(box.start(), 1_250_000, timeout=LIMIT_S))

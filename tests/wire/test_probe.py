@@ -31,7 +31,9 @@ def measure(n: int) -> Any:
         (RobotiqBox, {"streaming_at_start": True}, "robotiq-ft300", "streams"),
         (RobotousSerialBox, {}, "robotous-serial", "Robotous RFT"),
         (RobotousSerialBox, {"streaming_at_start": True}, "robotous-serial", "streams"),
-        (BotaBox, {}, "bota", "streams"),
+        (BotaBox, {"boot_s": 0.5}, "bota", "boots"),
+        (BotaBox, {"streaming_at_start": True}, "bota", "streams"),
+        (BotaBox, {"streaming_at_start": True, "baud_code": 3}, "bota", "streams"),
         (AtiCanNode, {}, None, None),  # behind an slcan adapter: not a question for a serial port
     ],
 )
@@ -55,7 +57,7 @@ def test_a_sensor_shows_itself(
 
 def test_the_address_of_a_port_with_a_strange_name_works(tmp_path: Path, cell_time: Any) -> None:
     port, rng = tmp_path / "my port #1?50%20", np.random.default_rng(1)
-    box = BotaBox(lambda n: rng.normal(size=(n, 6)), seed=1, clock=cell_time.of_devices)
+    box = BotaBox(lambda n: rng.normal(size=(n, 6)), seed=1, clock=cell_time.of_devices, boot_s=0.5)
     try:
         port.symlink_to(box.start())
         answer = probe(str(port), cell_time.of_drivers)

@@ -1,4 +1,4 @@
-"""All sensor drivers against their emulators, which run in a process of their own: one suite, seven wires."""
+"""All sensor drivers against their emulators, which run in a process of their own: one suite, eight wires."""
 
 import gc
 import math
@@ -17,7 +17,16 @@ from ftdrivers.streaming.sensor import StreamingSensor
 WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])  # what the emulators of conftest.py measure, with
 NOISE = np.array([0.03] * 3 + [0.001] * 3)
 
-SCHEMES = ("ati-can", "ati-serial", "robotous-can", "robotous-serial", "robotiq-ft300", "bota", "ati-netft")
+SCHEMES = (
+    "ati-can",
+    "ati-serial",
+    "robotous-can",
+    "robotous-serial",
+    "robotiq-ft300",
+    "robotiq-urcap",
+    "bota",
+    "ati-netft",
+)
 
 
 class Emulator(Protocol):
@@ -82,9 +91,9 @@ def test_open_close_reopen_and_nothing_stays(shared: Emulator) -> None:
     assert (descriptors(), threading.active_count()) == (before, threads)
 
 
-@pytest.mark.parametrize("scheme", [scheme for scheme in SCHEMES if scheme != "ati-can"])  # it is polled
+@pytest.mark.parametrize("scheme", [scheme for scheme in SCHEMES if scheme not in {"ati-can", "robotiq-urcap"}])
 def test_already_streaming_when_opened(start: Start, scheme: str) -> None:
-    """A client died, or the sensor streams from power-up on."""
+    """A client died, or the sensor streams from power-up on. Nothing arrives unasked on CAN or from a URCap."""
     with start(scheme, streaming_at_start=("127.0.0.1", 9) if scheme == "ati-netft" else True).sensor() as sensor:
         np.testing.assert_allclose(sensor.collect(0.1).wrench.mean(axis=0), WRENCH, atol=0.1)
 
@@ -121,8 +130,8 @@ def test_silence_is_an_error(start: Start, scheme: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "scheme", one_fast(scheme for scheme in SCHEMES if scheme != "bota")
-)  # it is given 3 s to boot
+    "scheme", one_fast(scheme for scheme in SCHEMES if scheme not in {"bota", "robotiq-urcap"})
+)  # the first may boot, the second is connected
 def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
     emulator = start(scheme)
     emulator.faults(stall=True)
@@ -138,13 +147,17 @@ def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
         for scheme in SCHEMES
         if scheme != "ati-serial"  # its records have no header and a short sum: see `test_serial_driver.py`
         for fault in ("drop", "corrupt", "byte_slip")
-        # CAN controllers and UDP drop damaged frames themselves
-        if fault == "drop" or scheme not in {"ati-can", "robotous-can", "ati-netft"}
+        # CAN controllers and UDP drop damaged frames themselves, TCP repeats them
+        if fault == "drop" or scheme not in {"ati-can", "robotous-can", "ati-netft", "robotiq-urcap"}
     ],
 )
 def test_damage_is_dropped_and_counted(start: Start, scheme: str, fault: str) -> None:
     emulator = start(scheme)
-    has_no_number = fault == "drop" and scheme in {"robotous-serial", "robotiq-ft300"}  # its frames: documented
+    has_no_number = fault == "drop" and scheme in {
+        "robotous-serial",
+        "robotiq-ft300",
+        "robotiq-urcap",
+    }  # its frames: documented
     with emulator.sensor() as sensor:
         # a sample is two frames on CAN
         emulator.faults(**{fault: {"robotous-can": 0.05, "ati-can": 0.1}.get(scheme, 0.2)})
@@ -185,9 +198,40 @@ def test_bota_too_slow_is_a_warning(start: Start, caplog: pytest.LogCaptureFixtu
 @pytest.mark.parametrize(
     ("options", "query"),
     [
+        ({"baud_code": 3}, ""),
+        ({"baud_code": 1}, "baud=57600"),
+        pytest.param({"boot_s": 3}, "", marks=pytest.mark.slow),
+        pytest.param({"baud_code": 3, "boot_s": 3}, "", marks=pytest.mark.slow),
+        pytest.param({"baud_code": 3, "boot_s": 3}, "sinc=256", marks=pytest.mark.slow),
+    ],
+)
+def test_bota_is_found_at_its_baud_rate_while_it_boots(start: Start, options: dict[str, Any], query: str) -> None:
+    with start("bota", **options).sensor(query) as sensor:
+        np.testing.assert_allclose(sensor.collect(0.2).wrench.mean(axis=0), WRENCH, atol=0.1)
+        assert sensor.identify().serial == "12345"
+        assert sensor.health().nominal_rate_Hz == pytest.approx(200 if query == "sinc=256" else 100)
+
+
+def test_bota_at_another_baud_rate_is_refused(start: Start) -> None:
+    with pytest.raises(ConnectError, match=r"at 460800 baud.*at 230400 baud.*baud="):
+        start("bota", baud_code=2).sensor().open()
+
+
+@pytest.mark.parametrize(
+    ("options", "query"),
+    [
         ({"calibration": {"counts_per_force": 416_666, "counts_per_torque": 1_000}}, ""),
         ({"calibration": {"force_unit": 1, "torque_unit": 4}}, ""),
-        ({"calibration": {"counts_per_force": 10_000, "counts_per_torque": 100_000, "serial": "X"}}, "onrobot=1"),
+        (
+            {
+                "calibration": {"counts_per_force": 10_000, "counts_per_torque": 100_000, "serial": "X"},
+                "tool_transform": [0.0] * 6,
+            },
+            "onrobot=1",
+        ),
+        ({"tool_transform": [0.0] * 6, "bias": [0] * 6, "gauge_offset": [0] * 6}, ""),
+        ({"tool_transform": [10.0, -20.0, 132.71, 20.0, -30.0, 40.0]}, ""),
+        ({"tool_transform": [1.0, -2.0, 5.0, 0.3, -0.5, 0.7], "distance_unit": 1, "angle_unit": 2}, ""),
         ({"product": "Ethernet Axia"}, ""),
         ({"rate_hz": 7000}, ""),
     ],

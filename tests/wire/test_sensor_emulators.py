@@ -10,7 +10,7 @@ import pytest
 import serial
 from numpy.typing import NDArray
 
-from ftmocks.sensors.bota import BotaBox
+from ftmocks.sensors.bota import BotaBox, banner, stream_frame
 from ftmocks.sensors.netft import RECORD, NetFtBox
 from tests.wire.waiting import LIMIT_S, read_to, wait_until
 
@@ -27,7 +27,7 @@ def constant(wrench: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]
 @contextmanager
 def serial_client(device: BotaBox) -> Iterator[serial.Serial]:
     try:
-        with serial.Serial(device.start(), timeout=LIMIT_S) as port:
+        with serial.Serial(device.start(), 460_800, timeout=LIMIT_S) as port:
             yield port
     finally:
         device.stop()
@@ -48,7 +48,7 @@ def serial_client(device: BotaBox) -> Iterator[serial.Serial]:
     ],
 )
 def test_bota_configuration_answers(written: bytes, answers: bytes) -> None:
-    box = BotaBox(constant(BOTA_WRENCH))
+    box = BotaBox(constant(BOTA_WRENCH), streaming_at_start=True)
     with serial_client(box) as port:
         port.write(b"garbage C")
         read_to(port, b"r,0,C,0\r\n")
@@ -56,6 +56,30 @@ def test_bota_configuration_answers(written: bytes, answers: bytes) -> None:
         assert port.read(len(answers)) == answers
         port.write(b"C")
         assert read_to(port, b"r,0,C,0\r\n") == b"", "and nothing else"
+
+
+def test_bota_restarts_when_its_port_is_opened_and_is_heard_at_its_own_speed_only() -> None:
+    box = BotaBox(constant(BOTA_WRENCH), boot_s=0.1)
+    frame = stream_frame(0, BOTA_WRENCH.tolist(), 0, 25.5)[3:27]
+    path = box.start()
+    try:
+        for _ in range(2):
+            with serial.Serial(path, 460_800, timeout=LIMIT_S) as port:
+                before = read_to(port, banner(12345))
+                assert b"c,0,1,0,4" not in before, "printed at 230400 baud"
+                assert frame in port.read(37)
+                port.write(b"C")
+                read_to(port, b"r,0,C,0\r\n")
+            wait_until(lambda: not box._was_open)
+        with serial.Serial(path, 230_400, timeout=LIMIT_S) as port:
+            assert read_to(port, b"c,0,1,0,4\r\n") == b""
+            received = port.read(1000)
+            assert b"App Init" not in received
+            assert frame not in received
+            port.write(b"C")
+            assert b"r,0,C,0" not in port.read(200), "it does not hear this"
+    finally:
+        box.stop()
 
 
 # ---------------------------------------------------------------- Net F/T
@@ -96,7 +120,7 @@ def rdt_client(box: NetFtBox) -> Iterator[RdtClient]:
 
 @pytest.fixture
 def net_box() -> Iterator[NetFtBox]:
-    box = NetFtBox(constant(RDT_WRENCH), rdt_port=0, rate_hz=1000)
+    box = NetFtBox(constant(RDT_WRENCH), rdt_port=0, rate_hz=1000, tool_transform=[0.0] * 6)
     yield box
     box.stop()
 

@@ -61,16 +61,6 @@ def parse_units(text: str) -> tuple[int, int]:
     return _FORCES.index(force) + 1, _TORQUES.index(torque) + 1
 
 
-def parse_counts(text: str) -> tuple[int, int]:
-    """Find the counts per unit of force and of torque in an option such as ``1000000,1000000``. Raises `ValueError`."""
-    force, _, torque = text.partition(",")
-    if not (force.isdecimal() and torque.isdecimal() and int(force) and int(torque)):
-        raise ValueError(
-            f"counts are '{text}'; give two whole numbers, per unit of force and of torque, such as 1000000,1000000"
-        )
-    return int(force), int(torque)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
     """One calibration of one transducer."""

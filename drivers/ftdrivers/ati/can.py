@@ -18,7 +18,6 @@ from ftdrivers.ati.calibration import (
     NEWTON,
     NEWTON_METRE,
     Calibration,
-    parse_counts,
     parse_units,
     refuse_saturated,
     unit_names,
@@ -103,7 +102,7 @@ class AtiCanSensor(StreamingSensor):
 
         Firmware before 3.7 needs ``units=lbf,lbf-in``, and ``counts=1000000,1000000`` if the certificate differs.
         """
-        units, counts = options.optional("units"), options.optional("counts")
+        units = options.optional("units")
         return cls(
             address,
             interface=options.text("interface", "socketcan"),
@@ -111,7 +110,7 @@ class AtiCanSensor(StreamingSensor):
             base=options.integer("base", 0x20, 0, 0x7F),
             slot=options.integer("slot", 0, 0, 15),
             unit_codes=parse_units(units) if units else None,
-            counts_per_unit=parse_counts(counts) if counts else None,
+            counts_per_unit=options.counts(),
             sign=sign,
             clock=clock,
         )

@@ -1,7 +1,8 @@
 """ATI Net F/T, Ethernet Axia and OnRobot HEX force/torque sensors over Ethernet (RDT), through pynetft.
 
-Ref: ATI, "Net F/T User Manual" 9620-05-Net FT, and "Ethernet Axia" 9610-05-Ethernet Axia: RDT, netftapi2.xml and
-netftcalapi.xml, as in public drivers; OptoForce, "Ethernet Converter" manual, version 2.0.
+Ref: ATI, "Net F/T User Manual" 9620-05-Net FT, and "Ethernet Axia" 9610-05-Ethernet Axia: RDT and netftapi2.xml, as in
+public drivers and a public page of a live box; tool transformation as in ATI's DAQ F/T C library (ftconfig.c, TTM);
+OptoForce, "Ethernet Converter" manual, version 2.0.
 Checked on hardware: no. Verified against: tests/unit/drivers/test_netft.py and the emulator (tests/wire).
 
 pynetft reads the scale, drains the socket and reports why a stream has ended. Its bias command is never used here.
@@ -17,11 +18,12 @@ from typing import Self
 
 import numpy as np
 import pynetft
+from scipy.spatial.transform import Rotation
 
-from ftdrivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM, units
+from ftdrivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import UNUSABLE, ConnectError, DeviceFault, ProtocolError, StreamBroken
-from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples, Health
+from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, FtSamples, Health
 from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits, scale_facts
 from ftdrivers.wires.status_word import describe_status
@@ -40,6 +42,7 @@ _QUEUE = 16_384
 """More than 2 s at 7 kHz. A full queue drops the oldest sample, whose number is then missing."""
 _ONROBOT_COUNTS = (10_000, 100_000)
 """Per N and per N·m, fixed by the manual: an OnRobot converter does not report them."""
+_DISTANCES_M = {"in": 0.0254, "ft": 0.3048, "mm": 0.001, "cm": 0.01, "m": 1.0}
 
 MONITOR_LATCHED = 0x80010000
 """A monitored threshold was crossed earlier; the data is valid."""
@@ -109,36 +112,58 @@ ONROBOT_BITS = {
 
 def text_in(page: bytes, element: str) -> str:
     """Find the text of an element in a page of a sensor; empty where it is missing."""
-    match = re.search(rf"<{element}>\s*([\x20-\x3b\x3d-\x7e]{{1,64}}?)\s*</{element}>".encode(), page)
+    match = re.search(rf"<{element}>\s*([\x20-\x3b\x3d-\x7e]{{1,200}}?)\s*</{element}>".encode(), page)
     return match[1].decode("ascii") if match else ""
 
 
 def numbers_in(page: bytes, element: str) -> list[float]:
-    """Find the positive numbers of an element, such as ``130;130;400;10;10;10``; empty where it holds other text."""
+    """Find the numbers of an element, such as ``130;130;400;10;10;10``; empty where it holds other text."""
     try:
         numbers = [float(number) for number in text_in(page, element).split(";")]
     except ValueError:
         return []
-    return numbers if all(math.isfinite(number) and number > 0 for number in numbers) else []
+    return numbers if all(map(math.isfinite, numbers)) else []
 
 
-def range_in(page: bytes) -> tuple[float, ...] | None:
-    """Find the maximum ratings (6,) in N and N·m in ``netftcalapi.xml``."""
-    rating, codes = numbers_in(page, "calmr"), numbers_in(page, "calfu") + numbers_in(page, "caltu")
-    if len(rating) != 6 or len(codes) != 2:
-        return None
-    try:
-        unit_N, unit_Nm = units((int(codes[0]), int(codes[1])))
-    except ProtocolError:
-        return None
-    return (*(unit_N * force for force in rating[:3]), *(unit_Nm * torque for torque in rating[3:]))
+def transformation_in(page: bytes) -> Array:
+    """Find the tool transformation of the box in ``netftapi2.xml``, and return what undoes it.
+
+    The box sends the wrench in the axes of its tool frame, about the origin of that frame. The frame is displaced from
+    that of the transducer, then turned about x, y and z.
+
+    Returns
+    -------
+    array, shape (6, 6)
+        Maps such a wrench to the axes and the origin of the transducer; the identity where the page has no frame.
+
+    Raises
+    ------
+    ProtocolError
+        The page has another number of values, or an unknown unit.
+    """
+    undo = np.eye(6)
+    values, distance, angle = numbers_in(page, "cfgtfx"), text_in(page, "scfgtdu"), text_in(page, "scfgtau")
+    if b"<cfgtfx>" not in page or values == [0.0] * 6:
+        return undo
+    if len(values) != 6 or distance not in _DISTANCES_M or angle not in {"degrees", "radians"}:
+        raise ProtocolError(
+            f"the tool transformation '{text_in(page, 'cfgtfx')}' in '{distance}' and '{angle}' cannot be undone",
+            "set it to zero on the configurations page of the sensor",
+        )
+    x, y, z = _DISTANCES_M[distance] * np.array(values[:3])
+    R = Rotation.from_euler("XYZ", values[3:], degrees=angle == "degrees").as_matrix()
+    undo[:3, :3] = undo[3:, 3:] = R
+    undo[3:, :3] = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
+    return undo
 
 
 class NetFtSensor(StreamingSensor):
     """A sensor with ATI's RDT protocol.
 
     `counts` are the six values as sent, `seq` is the RDT sequence number, `t_device_s` is NaN: records carry no time.
-    Nominal rate and range are known where the pages of the sensor contain them. Every status but a latched monitor
+    `wrench` is in the axes and about the origin of the transducer, without the tool transformation of the box. The box
+    subtracts its software bias before it sends. Both are facts, so a driver that reconnects rejects a changed one.
+    Nominal rate and range are known where the page of the sensor contains them. Every status but a latched monitor
     condition is a `DeviceFault`.
 
     Parameters
@@ -188,9 +213,9 @@ class NetFtSensor(StreamingSensor):
     def _connect(self) -> DeviceInfo:
         # an OnRobot converter serves no pages
         page = b"" if self._onrobot else self._read_page("/netftapi2.xml")
-        self._nominal_Hz, *_ = numbers_in(page, "comm?rdtrate") or [math.nan]  # both spellings exist
-        index = text_in(page, "cfgcalsel")
-        rating = range_in(self._read_page(f"/netftcalapi.xml?index={index}")) if index.isdecimal() else None
+        rate_Hz, *_ = numbers_in(page, "comm?rdtrate") or [math.nan]  # both spellings exist
+        self._nominal_Hz = rate_Hz if rate_Hz > 0 else math.nan
+        undo = transformation_in(page)
         override = None
         if self._onrobot:
             override = pynetft.Calibration(*_ONROBOT_COUNTS, pynetft.ForceUnit.NEWTON, pynetft.TorqueUnit.NEWTON_METER)
@@ -223,11 +248,18 @@ class NetFtSensor(StreamingSensor):
             )
         counts_per_N = scale.counts_per_force_unit / FORCE_UNITS_N[scale.force_unit.value]
         counts_per_Nm = scale.counts_per_torque_unit / TORQUE_UNITS_NM[scale.torque_unit.value]
-        self._counts_per_unit = np.repeat([counts_per_N, counts_per_Nm], 3)
+        self._wrench_per_count = undo / np.repeat([counts_per_N, counts_per_Nm], 3)
         model = "OnRobot HEX (Ethernet)" if self._onrobot else configuration.product_name or "ATI Net F/T"
         facts = scale_facts(counts_per_N, counts_per_Nm, "documented" if self._onrobot else "device")
-        if rating:
-            facts["range"] = Fact(rating, "device")
+        rating = numbers_in(page, "cfgmr")
+        if len(rating) == 6 and min(rating) > 0:
+            per_unit = np.repeat([FORCE_UNITS_N[scale.force_unit.value], TORQUE_UNITS_NM[scale.torque_unit.value]], 3)
+            facts["range"] = Fact(tuple((per_unit * rating).tolist()), "device")
+        if bias := numbers_in(page, "setbias"):
+            facts["software_bias"] = Fact(tuple(bias), "device")
+        if not np.array_equal(undo, np.eye(6)):
+            units = f"{text_in(page, 'scfgtdu')}, {text_in(page, 'scfgtau')}"
+            facts["tool_transformation"] = Fact(f"{text_in(page, 'cfgtfx')} ({units})", "device")
         return DeviceInfo(
             model=model, serial=text_in(page, "cfgcalsn") or NOT_REPORTED, firmware=NOT_REPORTED, facts=facts
         )
@@ -245,7 +277,7 @@ class NetFtSensor(StreamingSensor):
         status = np.array([sample.status for sample in samples], np.uint32)
         self._judge(int(np.bitwise_or.reduce(status)))
         counts = np.array([sample.raw_wrench for sample in samples], np.int32)
-        return FtSamples.of(t_host_ns, numbers, counts / self._counts_per_unit, counts=counts, status=status)
+        return FtSamples.of(t_host_ns, numbers, counts @ self._wrench_per_count.T, counts=counts, status=status)
 
     def _disconnect(self) -> None:
         with self._news:
@@ -332,7 +364,7 @@ class NetFtSensor(StreamingSensor):
             self._warned = True
 
     def _read_page(self, path: str) -> bytes:
-        """Read a page that pynetft does not: serial number of the calibration in use, rate, range."""
+        """Read what pynetft does not: serial number of the calibration in use, rate, range, tool transformation."""
         try:
             page = http.client.HTTPConnection(self._host, self._http_port, timeout=self._http_s)
             with self._clock.away(), closing(page) as connection:

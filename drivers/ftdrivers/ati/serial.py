@@ -4,11 +4,13 @@ Ref: ATI "Digital F/T" Modbus interface (sections 8.1, 8.3, 8.4 of 9620-05-Digit
 Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_modbus.py and the emulator (tests/wire).
 
 Modbus RTU for set-up, then a bare stream of 13-byte records at 7 kHz. Only a jamming sequence stops the stream, which
-outlives the program that started it. Gauge gains and offsets are volatile, so every start writes them.
+outlives the program that started it. Gauge gains and offsets are volatile: at power-up the sensor has those of its
+lowest calibration in force. The driver reads them, and writes them only where they are not those of its calibration.
 """
 
 import logging
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Sequence
 from typing import Self
 
 import numpy as np
@@ -90,12 +92,7 @@ class AtiSerialSensor(StreamingSensor):
                 f"{self.name}: calibration slot {self._calibration_index}: {exc.found}",
                 "choose another slot, calibration=1 to 16 in its address",
             ) from exc
-        self._ask(modbus.UNLOCK)
-        try:
-            self._ask(modbus.write_registers(modbus.GAINS, block.gains))
-            self._ask(modbus.write_registers(modbus.OFFSETS, block.offsets))
-        finally:
-            self._ask(modbus.LOCK)
+        self._set_gauges(block.gains, block.offsets)
         self._start_stream()
         facts = scale_facts(self._calibration.counts_per_N, self._calibration.counts_per_Nm, "device")
         rating = np.array(block.max_rating) * np.repeat(units(block.unit_codes), 3)
@@ -107,6 +104,18 @@ class AtiSerialSensor(StreamingSensor):
             firmware=NOT_REPORTED,
             facts=facts,
         )
+
+    def _set_gauges(self, gains: Sequence[int], offsets: Sequence[int]) -> None:
+        """Write the active gains and offsets where they are not those of the calibration in use."""
+        active = self._ask(modbus.read_registers(modbus.GAINS, len(gains) + len(offsets)))
+        if active == struct.pack(f">{len(gains) + len(offsets)}H", *gains, *offsets):
+            return
+        self._ask(modbus.UNLOCK)
+        try:
+            self._ask(modbus.write_registers(modbus.GAINS, gains))
+            self._ask(modbus.write_registers(modbus.OFFSETS, offsets))
+        finally:
+            self._ask(modbus.LOCK)
 
     def _read_block(self) -> FtSamples:
         if self._slipped:

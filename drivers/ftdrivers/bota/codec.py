@@ -1,12 +1,13 @@
 """Bota SensONE and Rokubi: the 37-byte stream frame and the set-up commands, as pure functions on bytes.
 
-Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs.
+Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs and ROS drivers.
 Checked on hardware: no. Verified against: tests/unit/drivers/bota/test_codec.py.
 
 A decoder returns a value or raises `ProtocolError`, never anything else. All numbers are little-endian.
 """
 
 import math
+import re
 import struct
 from typing import NamedTuple
 
@@ -21,9 +22,22 @@ FRAME_SIZE = 1 + _PAYLOAD.size + 2
 STATUS_BITS = {0: "application too slow", 1: "overrange", 2: "invalid measurement", 3: "raw measurement"}
 OVERRANGE, INVALID, RAW = 2, 4, 8
 
-ENTER_SETUP, ENTER_RUN = b"C", b"R"
-BINARY_AND_CALIBRATED = b"c,0,1,0,4"
-"""No temperature compensation (the vendor's advice), calibrated, binary, 460800 baud."""
+BAUDS = (9600, 57_600, 115_200, 230_400, 460_800)
+"""In the order of their codes 0 to 4."""
+
+ENTER_SETUP, ENTER_RUN, ASK_SERIAL = b"C", b"R", b"p?"
+
+_CONFIGURATION = re.compile(rb"c(?:,\d){3},([0-4])")
+_NAME, _SERIAL, _FIRMWARE = (re.compile(word + rb":\s*([ -~]+)\r") for word in (rb"name", rb"S/N", rb"FW version"))
+_SERIAL_REPLY = re.compile(rb"p,\d,(\d+),[^,\r\n]*,[^,\r\n]*,([ -~]*)")
+
+
+class Identity(NamedTuple):
+    """What a sensor reports about itself; empty where it does not."""
+
+    name: str
+    serial: str
+    firmware: str
 
 
 class Frame(NamedTuple):
@@ -57,6 +71,25 @@ def decode_frame(data: bytes) -> Frame:
     if not all(map(math.isfinite, wrench)):
         raise ProtocolError(f"the sensor sends the wrench {wrench}, which is not finite", "power it off and on")
     return Frame(status, tuple(wrench), t_us, temperature_C)
+
+
+def find_identity(text: bytes) -> Identity:
+    """Find what a sensor has printed while it booted, or replied to `ASK_SERIAL`; other bytes may surround it."""
+    if reply := _SERIAL_REPLY.search(text):
+        return Identity(reply[2].decode("ascii").strip(), reply[1].decode("ascii"), "")
+    found = (pattern.search(text) for pattern in (_NAME, _SERIAL, _FIRMWARE))
+    return Identity(*("" if match is None else match[1].decode("ascii").strip() for match in found))
+
+
+def find_baud(text: bytes) -> int | None:
+    """Find the baud rate of a sensor in its configuration, which it prints at 230400 baud while it boots."""
+    match = _CONFIGURATION.search(text)
+    return None if match is None else BAUDS[int(match[1])]
+
+
+def configuration_command(baud: int) -> bytes:
+    """Build the command that selects calibrated binary frames, without temperature compensation (vendor's advice)."""
+    return f"c,0,1,0,{BAUDS.index(baud)}".encode("ascii")
 
 
 def filter_command(sinc: int) -> bytes:

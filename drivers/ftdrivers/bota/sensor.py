@@ -1,12 +1,14 @@
 """Bota SensONE or Rokubi force/torque sensor on a serial port.
 
-Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs.
+Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs and ROS drivers.
 Checked on hardware: no. Verified against: tests/unit/drivers/bota/test_codec.py and the emulator (tests/wire).
 
-The sensor streams from power-up on. The driver only reads, unless the address configures the filter; `close` leaves the
-stream running. The driver does not wait for the boot text, which may have been sent hours ago.
+The sensor streams from power-up on. Opening its port restarts it, unless it has its own supply; the maker's driver
+waits 3 s for it. This driver only reads, unless the address configures the filter; `close` leaves the stream running.
+It does not require the boot text, which may have been sent hours ago.
 """
 
+import contextlib
 import logging
 import math
 from itertools import pairwise
@@ -26,13 +28,19 @@ from ftdrivers.wires.status_word import describe_status
 
 log = logging.getLogger(__name__)
 
-_BAUD = 460_800
+_USUAL_BAUDS = (460_800, 230_400)
+"""Of the maker's examples, and the default of its ROS 2 driver."""
 _FIRST_FRAMES = 8
 """The median of their spacing is the sample period."""
-_FIRST_FRAMES_S = 3.0
-"""Enough for a sensor that is still booting."""
+_BOOT_S = 5.0
+"""The longest wait for a sensor that boots."""
+_NOISE_BYTES = 40 * codec.FRAME_SIZE
+"""More than the boot text: so many without an intact frame are of another baud rate or format."""
+_CLOSED_S = 0.1
+"""A port that is closed for less may not restart the sensor, which then prints no boot text."""
 _REPLY_S = 1.0
-_ATTEMPTS = 3
+_ATTEMPTS = 5
+"""The first ones are not heard while the sensor boots."""
 _CLOCK = 1 << 32
 
 
@@ -46,37 +54,50 @@ class BotaSensor(StreamingSensor):
     ----------
     port : str
         The serial port; ``/dev/serial/by-id/…`` survives replugging.
+    baud : int, optional
+        One of `codec.BAUDS`; without it, the driver tries 460800, then 230400.
     sinc : int, optional
-        Filter length, such as 512; the sample period is 19.53125 µs times this. With it, the driver configures the
-        sensor to stream calibrated binary frames; without it, the driver never sends anything.
+        Filter length, 64 to 2048, such as 512; the sample period is 19.53125 µs times this. With it, the driver
+        configures the sensor to stream calibrated binary frames; without it, the driver never sends anything.
     sign : int
         -1 for a sensor mounted or wired to report the reaction.
     """
 
-    def __init__(self, port: str, *, sinc: int | None = None, sign: int = 1, clock: Clock = REAL) -> None:
+    def __init__(
+        self, port: str, *, baud: int | None = None, sinc: int | None = None, sign: int = 1, clock: Clock = REAL
+    ) -> None:
         super().__init__(f"Bota sensor on {port}", sign=sign, clock=clock)
-        self._port = SerialPort(self.name, port, _BAUD, clock=clock)
+        if baud is not None and baud not in codec.BAUDS:
+            raise ValueError(f"baud is {baud}; choose one of {', '.join(map(str, codec.BAUDS))}")
+        if sinc is not None and not 64 <= sinc <= 2048:
+            raise ValueError(f"sinc is {sinc}; choose 64 to 2048")
+        bauds = _USUAL_BAUDS if baud is None else (baud,)
+        self._ports = [(baud, SerialPort(self.name, port, baud, clock=clock)) for baud in bauds]
+        """The one that was opened last comes first."""
+        self._port = self._ports[0][1]
         self._sinc = sinc
+        self._text = b""
+        """What has arrived since the port was opened, before the first frames."""
         self._temperature_C = math.nan
 
     @classmethod
     def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
-        """Build from ``bota:///dev/serial/by-id/…?sinc=512``."""
-        return cls(address, sinc=options.integer("sinc", 0, 0, 512) or None, sign=sign, clock=clock)
+        """Build from ``bota:///dev/serial/by-id/…?baud=460800&sinc=512``."""
+        return cls(
+            address,
+            baud=options.integer("baud", 0, 0, 460_800) or None,
+            sinc=options.integer("sinc", 0, 0, 2048) or None,
+            sign=sign,
+            clock=clock,
+        )
 
     def temperature_C(self) -> float | None:
         """Return the temperature of the newest frame."""
         return self._temperature_C if math.isfinite(self._temperature_C) else None
 
     def _connect(self) -> DeviceInfo:
-        self._port.open()
         self._seen_status = 0
-        if self._sinc is not None:
-            setup = codec.BINARY_AND_CALIBRATED, codec.filter_command(self._sinc)
-            for command in (codec.ENTER_SETUP, *setup, codec.ENTER_RUN):
-                self._command(command)
-        self._frames = codec.deframer()
-        first = self._first_frames()
+        first = self._find()
         times = [frame.t_us for frame in first]
         self._period_us = median((b - a) % _CLOCK for a, b in pairwise(times))
         if not self._period_us:
@@ -84,10 +105,11 @@ class BotaSensor(StreamingSensor):
         self._nominal_Hz = 1e6 / self._period_us
         self._t_us = times[-1]
         self._seq = 0
+        identity = codec.find_identity(self._text)
         return DeviceInfo(
-            model="Bota force/torque sensor",
-            serial=NOT_REPORTED,
-            firmware=NOT_REPORTED,
+            model=f"Bota {identity.name or 'force/torque sensor'}",
+            serial=identity.serial or NOT_REPORTED,
+            firmware=identity.firmware or NOT_REPORTED,
             facts=scale_facts(1.0, 1.0, "documented"),
         )
 
@@ -113,29 +135,58 @@ class BotaSensor(StreamingSensor):
     def _disconnect(self) -> None:
         self._port.close()
 
-    def _command(self, command: bytes) -> None:
-        for _ in range(_ATTEMPTS):
-            self._port.write(command)
-            answer = b""  # its reply comes after frames that were already on the way
-            for _ in self._clock.looks(_REPLY_S):
-                answer = answer[-len(codec.success(command)) :] + self._port.read_all(1)
-                if codec.success(command) in answer:
-                    return
-        raise DeviceTimeout(
-            f"{self.name}: '{command.decode()}' was not confirmed within {_ATTEMPTS} times {_REPLY_S} s",
-            "check supply and wiring, power it off and on",
+    def _find(self) -> list[codec.Frame]:
+        """Open the port at the baud rate of the sensor, configure it if requested, and return its first frames."""
+        found: list[str] = []
+        for baud, port in tuple(self._ports):
+            self._port, self._text, self._frames = port, b"", codec.deframer()
+            self._ports.sort(key=lambda one: one[0] != baud)  # a driver that reconnects tries the last one first
+            if found:
+                self._clock.sleep(_CLOSED_S)
+            port.open()
+            try:
+                if self._sinc is not None:
+                    self._configure(baud, self._sinc)
+                return self._first_frames()
+            except DeviceTimeout as exc:
+                found.append(f"{exc.found} at {baud} baud")
+                port.close()
+        raise ConnectError(
+            f"{self.name}: {', '.join(found)}",
+            "check supply and wiring; add baud=… to its address, or sinc=512 for a sensor in set-up or text mode",
         )
+
+    def _configure(self, baud: int, sinc: int) -> None:
+        self._command(codec.ENTER_SETUP)
+        if not codec.find_identity(self._text).serial:  # it has not just booted
+            with contextlib.suppress(DeviceTimeout):
+                self._command(codec.ASK_SERIAL, attempts=1)
+        for command in (codec.configuration_command(baud), codec.filter_command(sinc), codec.ENTER_RUN):
+            self._command(command)
+
+    def _command(self, command: bytes, attempts: int = _ATTEMPTS) -> None:
+        """Send a command until it is confirmed; its reply comes after frames that were already sent."""
+        for _ in range(attempts):
+            begin = len(self._text)
+            self._port.write(command)
+            for _ in self._clock.looks(_REPLY_S):
+                self._text += self._port.read_all(1)
+                if codec.success(command) in self._text[begin:]:
+                    return
+        raise DeviceTimeout(f"'{command.decode()}' was not confirmed within {attempts} times {_REPLY_S:g} s")
 
     def _first_frames(self) -> list[codec.Frame]:
         frames: list[codec.Frame] = []
-        for _ in self._clock.looks(_FIRST_FRAMES_S):
-            frames += [codec.decode_frame(frame) for _, frame in self._frames.feed(self._port.read_all(1))]
+        begin = len(self._text)
+        for _ in self._clock.looks(_BOOT_S):
+            data = self._port.read_all(1)
+            self._text += data
+            frames += [codec.decode_frame(frame) for _, frame in self._frames.feed(data)]
             if len(frames) >= _FIRST_FRAMES:
                 return frames
-        raise ConnectError(
-            f"{self.name}: {len(frames)} intact frames within {_FIRST_FRAMES_S} s, {_FIRST_FRAMES} are needed",
-            "check supply and wiring; add ?sinc=512 for a sensor in set-up, in text mode or at another rate",
-        )
+            if not frames and len(self._text) - begin > _NOISE_BYTES:
+                break
+        raise DeviceTimeout(f"{len(frames)} intact frames within {_BOOT_S:g} s, {_FIRST_FRAMES} are needed")
 
     def _elapse(self, t_us: int) -> tuple[int, int]:
         """Unwrap the sensor's clock; return (time in µs, sequence number)."""

@@ -4,7 +4,7 @@ Three frames may be sent, all read requests: serial number and firmware of an AT
 sensor is asked only if its identifiers are silent, because they may be commands to other devices. For motor drives,
 0x201 to 0x20F are set values.
 
-Ref: ATI 9610-05-1030-04, command list; Robotous RFT manual 1.7, communication protocol; CiA 301, predefined connection
+Ref: ATI 9610-05-1030-04, command list; Robotous RFT manual 1.8, communication protocol; CiA 301, predefined connection
 set.
 """
 
@@ -132,7 +132,8 @@ def _ati(channel: str, interface: str, bitrate: int | None, base: int) -> _Known
 
 
 def _robotous(channel: str, interface: str) -> _Known:
-    reply = dict.fromkeys((robotous_can.FIRST_HALF, robotous_can.SECOND_HALF), 8)
+    command, *answers = robotous_can.IDS
+    reply = dict.fromkeys(answers, 8)
 
     def streams(heard: Sequence[Frame]) -> str | None:
         fields = _messages([frame for frame in heard if frame[0] in reply], reply)
@@ -144,7 +145,7 @@ def _robotous(channel: str, interface: str) -> _Known:
         return "it streams" if plausible and len(samples) >= _ENOUGH_SAMPLES else None
 
     def ask(bus: CanBus, clock: Clock) -> str | None:
-        field = _ask(bus, clock, robotous_can.COMMAND, robotous.encode(robotous.Command.MODEL), reply)
+        field = _ask(bus, clock, command, robotous.encode(robotous.Command.MODEL), reply)
         try:
             model = field and field[0] == robotous.Command.MODEL and robotous.decode_text(field)
         except ProtocolError:
@@ -154,7 +155,7 @@ def _robotous(channel: str, interface: str) -> _Known:
     return _Known(
         "a Robotous",
         _url("robotous-can", channel, [f"interface={interface}" if interface != "socketcan" else ""]),
-        reply.keys() | {robotous_can.COMMAND},
+        reply.keys() | {command},
         streams,
         ask,
     )

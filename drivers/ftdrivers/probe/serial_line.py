@@ -1,6 +1,7 @@
 """Probe a serial port for known sensors: listen first, then request their names. Only for ports that the user names.
 
 Only read requests are sent, with the protocols of ATI, Robotiq and Robotous. Their effect on other devices is unknown.
+A Bota that restarts when its port is opened prints its baud rate at 230400 baud. The maker's driver waits 2 s for it.
 """
 
 from collections.abc import Callable
@@ -19,6 +20,9 @@ from ftdrivers.wires.serial_port import SerialPort
 
 _LISTEN_S = 0.25
 _REPLY_S = 0.25
+_BOOT_S = 2.5
+_CLOSED_S = 0.1
+"""A port that is closed for less may not restart the sensor."""
 _ENOUGH_FRAMES = 5
 """So many with a right checksum identify a stream."""
 
@@ -63,6 +67,9 @@ def probe(port: str, clock: Clock = REAL) -> Answer | None:
                 except ProtocolError:
                     continue
                 return Answer(known.url.format(port=in_url(port)), what)
+        clock.sleep(_CLOSED_S)
+        if baud := bota.find_baud(_hear(port, _BOTA, None, _BOOT_S, clock)):
+            return Answer(f"bota://{in_url(port)}?baud={baud}", "it boots")
     return None
 
 
@@ -124,8 +131,10 @@ def _robotous_reply(data: bytes) -> str:
 
 _robotous_streams = _frames(robotous.deframer)
 
+_BOTA = _Known("bota://{port}?baud=230400", 230_400, False, _frames(bota.deframer))
 _KNOWN = (
-    _Known("bota://{port}", 460_800, False, _frames(bota.deframer)),
+    _Known("bota://{port}?baud=460800", 460_800, False, _BOTA.streams),
+    _BOTA,
     _Known("robotiq-ft300://{port}", 19_200, False, _frames(robotiq.deframer), _ROBOTIQ_REQUEST, _robotiq_reply),
     _Known("robotous-serial://{port}", 115_200, False, _robotous_streams, _ROBOTOUS_REQUEST, _robotous_reply),
     _Known(

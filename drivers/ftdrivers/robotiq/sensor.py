@@ -7,8 +7,6 @@ Modbus RTU for set-up, then a bare stream at 100 Hz, which may run directly afte
 The sensor has no zero command: other programs zero on the host.
 """
 
-from typing import Self
-
 import numpy as np
 
 from ftdrivers.clock import REAL, Clock
@@ -16,6 +14,7 @@ from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 from ftdrivers.registry import Options
 from ftdrivers.robotiq import codec
+from ftdrivers.robotiq.urcap import PORT, RobotiqUrcap
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.wires.modbus import ask
 from ftdrivers.wires.serial_port import SerialPort
@@ -48,8 +47,12 @@ class RobotiqFt300(StreamingSensor):
         self._port = SerialPort(self.name, port, _BAUD, clock=clock)
 
     @classmethod
-    def from_url(cls, address: str, _options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
-        """Build from ``robotiq-ft300:///dev/serial/by-id/…``."""
+    def from_url(
+        cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL
+    ) -> "RobotiqFt300 | RobotiqUrcap":
+        """Build from ``robotiq-ft300:///dev/serial/by-id/…``; from ``robotiq-ft300://HOST?port=…`` a `RobotiqUrcap`."""
+        if not address.startswith("/"):
+            return RobotiqUrcap(address, port=options.integer("port", PORT, 1, 65535), sign=sign, clock=clock)
         return cls(address, sign=sign, clock=clock)
 
     def _connect(self) -> DeviceInfo:

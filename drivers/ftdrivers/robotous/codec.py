@@ -3,13 +3,14 @@
 A command is a field of 8 bytes, a reply or sample one of 16; byte 0 is the command. CAN carries bare fields, the UART
 puts each into a frame. All multi-byte numbers are big-endian.
 
-Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7, communication protocol.
+Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.8, communication protocol, dividers and rates,
+as in the public protocol page of ItsLP18/robotous-ft-pipeline. RFT76-HA01 is missing there; public drivers give it the
+scale of RFT40-SA01.
 Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py.
 
 A decoder returns a value or raises `ProtocolError`, never anything else.
 """
 
-import re
 import struct
 from enum import IntEnum
 from typing import NamedTuple
@@ -27,8 +28,20 @@ AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 RATE_CODES = {10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8}
 """Code of each output rate in Hz. A new sensor reports code 0, which is 200 Hz."""
 
-COUNTS_PER_N = 50
-_COUNTS_PER_NM = {"40": 2000, "44": 2000, "60": 2000, "64": 2000, "76": 2000, "80": 1000, "82": 1000}
+FASTEST_Hz = {57_600: 200, 115_200: 333, 230_400: 500, 460_800: 500, 921_600: 1000}
+"""The highest output rate at each baud rate of a UART."""
+
+_COUNTS_PER_N_NM = {
+    "RFT40-SA01": (50, 2000),
+    "RFT44-SB01": (50, 2000),
+    "RFT60-HA01": (50, 2000),
+    "RFT64-SB01": (50, 2000),
+    "RFT64-6A01": (50, 1000),
+    "RFT76-HA01": (50, 2000),
+    "RFT80-6A01": (50, 1000),
+    "RFT80-6A02": (50, 1000),
+}
+"""By the whole model, because its first number does not determine the scale of torque."""
 _FAILURES = {1: "not supported", 2: "value out of range", 3: "failed to set"}
 
 
@@ -124,13 +137,12 @@ def overloaded_axes(overload: int) -> list[str]:
 
 
 def counts_per_unit(model: str) -> tuple[int, int]:
-    """Return counts per N and per N·m of a model such as ``RFT60-HA01``."""
-    match = re.match(r"RFT-?(\d\d)", model)
-    if match is None or match[1] not in _COUNTS_PER_NM:
-        known = ", ".join(f"RFT{number}" for number in _COUNTS_PER_NM)
-        fix = "add its scale, from its manual, to drivers/ftdrivers/robotous/codec.py"
-        raise ProtocolError(f"the scale of model '{model}' is unknown, known are those of {known}", fix)
-    return COUNTS_PER_N, _COUNTS_PER_NM[match[1]]
+    """Return counts per N and per N·m of a model such as ``RFT60-HA01``; a code of its wire may follow."""
+    counts = _COUNTS_PER_N_NM.get(model[:10])
+    if counts is None:
+        found = f"the scale of model '{model}' is unknown, known are those of {', '.join(_COUNTS_PER_N_NM)}"
+        raise ProtocolError(found, "ask Robotous for its dividers DF and DT, then add counts=DF,DT to its address")
+    return counts
 
 
 def _expect_size(field: bytes) -> None:

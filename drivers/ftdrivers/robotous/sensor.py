@@ -1,6 +1,6 @@
 """Robotous RFT force/torque sensor, on either wire.
 
-Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7.
+Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.8.
 Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py and the emulator (tests/wire).
 
 A streaming sensor accepts only stop and bias, so a reply to any other command proves that it has stopped. This driver
@@ -36,19 +36,30 @@ class RobotousSensor(StreamingSensor):
     fastest_Hz : int
         The highest output rate of the wire.
     rate_Hz : int, optional
-        10, 20, 50, 100, 200, 333, 500 or 1000, which a UART carries at 921600 baud only. Without it, the rate that is
-        set in the sensor.
+        10, 20, 50, 100, 200, 333, 500 or 1000. Without it, the rate that is set in the sensor.
+    counts_per_unit : (int, int), optional
+        Per N and per N·m, for a model whose scale this driver does not know.
     sign : int
         -1 for a sensor mounted or wired to report the reaction.
     """
 
-    def __init__(self, name: str, fastest_Hz: int, *, rate_Hz: int | None, sign: int, clock: Clock) -> None:
+    def __init__(
+        self,
+        name: str,
+        fastest_Hz: int,
+        *,
+        rate_Hz: int | None,
+        counts_per_unit: tuple[int, int] | None,
+        sign: int,
+        clock: Clock,
+    ) -> None:
         super().__init__(name, sign=sign, clock=clock)
         if rate_Hz is not None and rate_Hz not in codec.RATE_CODES:
             raise ValueError(f"rate is {rate_Hz} Hz; choose one of {', '.join(map(str, codec.RATE_CODES))}")
         if rate_Hz is not None and rate_Hz > fastest_Hz:
             raise ValueError(f"rate is {rate_Hz} Hz; choose at most {fastest_Hz} Hz, or a higher baud rate")
         self._rate_Hz = rate_Hz
+        self._configured_counts = counts_per_unit
 
     @abstractmethod
     def _open(self) -> None: ...
@@ -74,7 +85,7 @@ class RobotousSensor(StreamingSensor):
     def _connect(self) -> DeviceInfo:
         self._open()
         model = codec.decode_text(self._ask(Command.MODEL))
-        force, torque = codec.counts_per_unit(model)
+        force, torque = self._configured_counts or codec.counts_per_unit(model)
         self._unit_per_count = 1 / np.array([force] * 3 + [torque] * 3)
         serial = codec.decode_text(self._ask(Command.SERIAL))
         firmware = codec.decode_text(self._ask(Command.FIRMWARE))
@@ -89,7 +100,7 @@ class RobotousSensor(StreamingSensor):
             model=f"Robotous {model}",
             serial=serial,
             firmware=firmware,
-            facts=scale_facts(force, torque, "documented"),
+            facts=scale_facts(force, torque, "configured" if self._configured_counts else "documented"),
         )
 
     def _read_block(self) -> FtSamples:
@@ -130,5 +141,5 @@ class RobotousSensor(StreamingSensor):
                         return field.data
         raise DeviceTimeout(
             f"{self.name}: no reply to {command.name} after {_ATTEMPTS} attempts of {_REPLY_S} s",
-            "check supply, wiring, bit rate and, on CAN, that the sensor has the factory's identifiers",
+            "check supply, wiring, bit rate and, on CAN, the option ids in its address",
         )

@@ -1,6 +1,6 @@
 """Robotous fields over RS-232, RS-422 or USB: each in a frame with a sum.
 
-Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.7: 8N1, 115200 baud from the factory.
+Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.8: 8N1, 115200 baud from the factory.
 """
 
 from typing import Self
@@ -12,20 +12,33 @@ from ftdrivers.robotous.codec import Field
 from ftdrivers.robotous.sensor import RobotousSensor
 from ftdrivers.wires.serial_port import SerialPort
 
-BAUDS = (57_600, 115_200, 230_400, 460_800, 921_600)
-
 
 class RobotousSerial(RobotousSensor):
-    """A Robotous RFT on a serial port, with one of `BAUDS`; the other parameters are those of `RobotousSensor`."""
+    """A Robotous RFT on a serial port.
+
+    `baud` is one of `codec.FASTEST_Hz`; the other parameters are those of `RobotousSensor`.
+    """
 
     def __init__(
-        self, port: str, *, baud: int = 115_200, rate_Hz: int | None = None, sign: int = 1, clock: Clock = REAL
+        self,
+        port: str,
+        *,
+        baud: int = 115_200,
+        rate_Hz: int | None = None,
+        counts_per_unit: tuple[int, int] | None = None,
+        sign: int = 1,
+        clock: Clock = REAL,
     ) -> None:
-        if baud not in BAUDS:
-            raise ValueError(f"baud is {baud}; choose one of {', '.join(map(str, BAUDS))}")
-        # 1 kHz needs 921600 baud (manual); below, a frame of 19 bytes takes 190 bits
-        fastest_Hz = 1000 if baud == 921_600 else min(500, baud // 190)
-        super().__init__(f"Robotous sensor on {port}", fastest_Hz, rate_Hz=rate_Hz, sign=sign, clock=clock)
+        if baud not in codec.FASTEST_Hz:
+            raise ValueError(f"baud is {baud}; choose one of {', '.join(map(str, codec.FASTEST_Hz))}")
+        super().__init__(
+            f"Robotous sensor on {port}",
+            codec.FASTEST_Hz[baud],
+            rate_Hz=rate_Hz,
+            counts_per_unit=counts_per_unit,
+            sign=sign,
+            clock=clock,
+        )
         self._port = SerialPort(self.name, port, baud, clock=clock)
 
     @classmethod
@@ -33,8 +46,9 @@ class RobotousSerial(RobotousSensor):
         """Build from ``robotous-serial:///dev/serial/by-id/…?baud=921600&rate=1000``."""
         return cls(
             address,
-            baud=options.integer("baud", 115_200, BAUDS[0], BAUDS[-1]),
+            baud=options.integer("baud", 115_200, 57_600, 921_600),
             rate_Hz=options.integer("rate", 0, 0, 1000) or None,
+            counts_per_unit=options.counts(),
             sign=sign,
             clock=clock,
         )

@@ -3,8 +3,9 @@
 The controller reports two wrenches. `actual_TCP_force` is in base axes at the active TCP. The controller has already
 subtracted the configured payload and the reading at its last zeroing. This cannot be undone, so a gravity calibration
 has nothing to find in it. `ft_raw_wrench` (PolyScope 5.9 and later) is in flange axes, neither compensated nor zeroed.
-Universal Robots documents neither its unit nor its reference point, and a user has seen values above 20 000. So this
-driver reads only `ft_raw_wrench`, and requires a scale that the user has measured with a known weight.
+Universal Robots documents neither its unit nor its reference point. So this driver reads only `ft_raw_wrench`, and
+requires a scale that the user has measured with a known weight. Recordings have zeros of about 1,800, 400, 25,400 N and
+-76 N·m, and a drift of 7 N in the first ten minutes, so its zero counts as arbitrary.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": `ft_raw_wrench`, `actual_TCP_force`.
 Checked on hardware: no. Verified against: tests/unit/drivers/ur/test_wrist_sensor.py.
@@ -16,7 +17,7 @@ import numpy as np
 
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError, ProtocolError, StreamBroken
-from ftdrivers.interfaces import NOT_REPORTED, WRIST_SENSOR, DeviceInfo, FtSamples
+from ftdrivers.interfaces import NOT_REPORTED, WRIST_SENSOR, DeviceInfo, Fact, FtSamples
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.ur.rtde import Subscription
 from ftdrivers.ur.timing import STRICT
@@ -51,7 +52,7 @@ class UrWristSensor(StreamingSensor):
     ) -> None:
         super().__init__(f"wrist sensor of the arm at {host}", sign=sign, clock=clock)
         self._host = host
-        self._facts = scale_facts(counts_per_N, counts_per_Nm, "configured")
+        self._facts = {**scale_facts(counts_per_N, counts_per_Nm, "configured"), "zero": Fact("arbitrary", "assumed")}
         self._counts_per_unit = np.repeat([counts_per_N, counts_per_Nm], 3)
         self._stream: Subscription | None = None
 

@@ -27,6 +27,7 @@ SENSORS = {
     "robotous-can": "Robotous sensor on CAN",
     "robotous-serial": "Robotous sensor on a serial port",
     "robotiq": "Robotiq sensor",
+    "robotiq-urcap": "Robotiq sensor on the controller",
     "bota": "Bota sensor",
     "netft": "ATI Net F/T",
     "ur-ft": "sensor of its own",

@@ -53,7 +53,7 @@ class SensorAddress:
         if self.scheme.endswith("-can") and self.options.get("interface") == "slcan":
             return Path(self.address.split("@")[0])
         is_path = self.address.startswith("/") and self.scheme != "ros2"
-        return Path(self.address) if self.scheme in _ON_SERIAL or is_path else None
+        return Path(self.address) if (self.scheme in _ON_SERIAL and self.host is None) or is_path else None
 
     @property
     def can_interface(self) -> str | None:
@@ -64,7 +64,8 @@ class SensorAddress:
     @property
     def host(self) -> str | None:
         """The host that sends its samples over Ethernet."""
-        return self.address.partition("/")[0] if self.scheme in _ON_ETHERNET else None
+        of_controller = self.scheme == "robotiq-ft300" and not self.address.startswith("/")
+        return self.address.partition("/")[0] if self.scheme in _ON_ETHERNET or of_controller else None
 
     @property
     def place(self) -> str | None:

@@ -47,6 +47,9 @@ _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs o
 _RATE_TOLERANCE = 0.1
 _MUCH_NOISE: Final = 2.0
 _LOAD: Final = 0.8
+SATURATION: Final = 0.9
+"""Share of the sensor's range at which a session stops the arm."""
+_MUCH_AT_REST: Final = 0.5
 _COMPENSATED: Final = 0.1
 """A smaller share of the weight at rest is likely to be compensated or zeroed."""
 _PAYLOAD_MM: Final = 100.0
@@ -88,6 +91,7 @@ def check_identity(info: DeviceInfo) -> list[Check]:
         _check_scale(facts.get("counts_per_N"), facts.get("counts_per_Nm")),
         _check_range(facts.get("range")),
         _check_sign(facts.get("sign")),
+        *_check_settings(facts.get("software_bias"), facts.get("tool_transformation")),
     ]
 
 
@@ -116,6 +120,19 @@ def _check_sign(fact: Fact | None) -> Check:
     return Check("sensor.sign", "ok", f"sign {fact.value}, {_SOURCE[fact.source]}; --push shows whether it is right")
 
 
+def _check_settings(bias: Fact | None, transformation: Fact | None) -> list[Check]:
+    """Report what the sensor itself adds to or changes about its readings; nothing where it does not."""
+    checks = []
+    if bias is not None and isinstance(bias.value, tuple) and any(bias.value):
+        numbers = ", ".join(f"{value:g}" for value in bias.value)
+        found = f"the sensor subtracts its software bias ({numbers}): a calibration holds only while it stays"
+        checks.append(Check("sensor.bias", "ok", found))
+    if transformation is not None:
+        found = f"the driver undoes the tool transformation of the sensor: {transformation.value}"
+        checks.append(Check("sensor.origin", "ok", found))
+    return checks
+
+
 def check_load(limits: ArrayLike | None, cell: CellConfig) -> Check:
     """Check that twice the tool's weight, also at its end, fits into the sensor's range (6,); None is unknown."""
     name, mass_kg = "sensor.load", cell.tool.mass_kg
@@ -127,6 +144,40 @@ def check_load(limits: ArrayLike | None, cell: CellConfig) -> Check:
     share = max(2 * weight_N / range_N.min(), 2 * weight_N * length_m / range_Nm.min())
     found = f"twice the tool's weight is {100 * share:.0f} % of the sensor's range"
     return Check(name, "ok", found) if share <= _LOAD else Check(name, "failed", found, "take a larger sensor")
+
+
+def check_rest(wrench: Array, limits: ArrayLike | None, cell: CellConfig, *, zero_is_arbitrary: bool) -> Check:
+    """Check that what a sensor reads at rest leaves enough of its range.
+
+    Parameters
+    ----------
+    wrench : array, shape (n, 6)
+        N and N·m.
+    limits : array, shape (6,), optional
+        The range; None is unknown.
+    cell : CellConfig
+        Has the mass of the tool, if that is known.
+    zero_is_arbitrary : bool
+        The range then holds for changes of the reading.
+    """
+    name = "sensor.rest"
+    if zero_is_arbitrary:
+        return Check(
+            name, "skipped", "the zero of this sensor is arbitrary: its range holds for changes of the reading"
+        )
+    if limits is None:
+        return Check(name, "skipped", "not compared with the reading at rest: the sensor's range is unknown")
+    rest, range_ = np.abs(wrench.mean(axis=0)), np.asarray(limits, dtype=np.float64)
+    weight_N = (cell.tool.mass_kg or 0.0) * cell.site.g_m_s2
+    needed = (rest + np.repeat([weight_N, 0.0], 3)) / range_
+    axis = int(np.argmax(needed))
+    share = rest[axis] / range_[axis]
+    unit = "N" if axis < 3 else "N·m"
+    found = f"at rest the sensor reads {rest[axis]:.1f} {unit} in {AXES[axis]}, {100 * share:.0f} % of its range"
+    fix = "take off what presses on the sensor, check its screws and its range, then zero it or take a larger one"
+    if needed[axis] > SATURATION:
+        return Check(name, "failed", found, fix)
+    return Check(name, "ok", found) if share <= _MUCH_AT_REST else Check(name, "warning", found, fix)
 
 
 def check_sensor_error(name: str, error: DeviceError, address: SensorAddress, permissions: Sequence[Check]) -> Check:

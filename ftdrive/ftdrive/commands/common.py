@@ -302,12 +302,24 @@ def store_url(config: Path | None = None) -> str | None:
     return url
 
 
-def read_cell(config: Path | None, robot: str | None, sensor: str | None, *, model: str | None = None) -> "CellConfig":
-    """Read the cell from options, environment and files, in this order of precedence."""
-    from ftdrive.cell.config import load
+def read_cell(
+    config: Path | None,
+    robot: str | None,
+    sensor: str | None,
+    *,
+    model: str | None = None,
+    sensor_alone: bool = False,
+) -> "CellConfig":
+    """Read the cell from options, environment and files, in this order of precedence.
+
+    With `sensor_alone`, a `sensor` needs no robot: the host of the cell is empty where none is set.
+    """
+    from ftdrive.cell.config import cell_of, settings
 
     flags = {"robot.host": ("--robot", robot), "robot.model": ("--model", model), "sensor.url": ("--sensor", sensor)}
-    return load(config, flags)
+    values = settings(config, flags)
+    needs_robot = not sensor_alone or sensor is None or values["robot.host"].value is not None
+    return cell_of(values, devices=needs_robot)
 
 
 def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:

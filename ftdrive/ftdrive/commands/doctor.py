@@ -76,14 +76,15 @@ def doctor(
     """Check robot, sensor, noise, clocks, disk and permissions; print a fix for each finding.
 
     Runs every check except the controller's safety limits, which can only be queried with control. The arm is only
-    read, nothing moves, no program is touched. Exit code 7 if a check fails.
+    read, nothing moves, no program is touched. With --sensor alone, and no robot in the configuration, checks the
+    sensor and skips the robot. Exit code 7 if a check fails.
     """
     check_simulate(simulate, real={"--config": config, "--robot": robot, "--model": model})
     calibration = None if path is None else CalibrationResult.load(path)
     pushed: dict[str, Any] | None = None
     with ExitStack() as stack:
         station = stack.enter_context(Station.of(None, sensor, ["--time-scale", "1"])) if simulate else None
-        cell = read_cell(config, robot, sensor, model=model) if station is None else station.cell
+        cell = read_cell(config, robot, sensor, model=model, sensor_alone=True) if station is None else station.cell
         address = SensorAddress.of(sensor_reached(cell.sensor.url)[0])
         device = build_sensor(cell)
 
@@ -95,7 +96,8 @@ def doctor(
         with working("Reading the sensor"):
             of_sensor, alive = _examine_sensor(device, address, cell, mass_kg, blame, stack)
         model = cell.robot.model if arm is None else arm.identify().model
-        found += [*of_sensor, computer.check_workcell(cell, model), computer.check_disk(runs), *permissions]
+        workcell = [computer.check_workcell(cell, model)] if cell.robot.host else []
+        found += [*of_sensor, *workcell, computer.check_disk(runs), *permissions]
         if calibration is not None:
             connected = {"sensor": device.identify()} if alive else {}
             if arm is not None:
@@ -118,6 +120,8 @@ def doctor(
         again = " --simulate" if simulate else ""
         if failed:
             messages.print_next(f"ftdrive doctor{again}   (when what is marked ✘ is fixed)")
+        elif not cell.robot.host:
+            messages.print_next("ftdrive doctor --robot HOST --sensor URL   (the whole cell)")
         else:
             messages.print_next(f"ftdrive plan{again}   (a tour proven clear)", f"ftdrive calibrate{again}")
     if failed:
@@ -126,6 +130,9 @@ def doctor(
 
 def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], RobotArm | None]:
     """Return the checks of the arm, and the arm where it could be opened."""
+    if not cell.robot.host:
+        found = "the sensor is checked alone, because [robot] host and --robot are not set"
+        return [Check("robot.reachable", "skipped", found)], None
     host, arm = cell.robot.host, build_arm(cell)
     stack.callback(arm.close)
     try:
@@ -196,10 +203,12 @@ def _examine_sensor(
         health = device.health()
     except DeviceError as error:
         return [*found, blame(name, error)], False
-    limits = info.facts.get("range")
+    fact = info.facts.get("range")
+    limits = None if fact is None else np.asarray(fact.value, dtype=np.float64)
     return [
         *found,
-        devices.check_load(None if limits is None else limits.value, cell),
+        devices.check_load(limits, cell),
+        devices.check_rest(samples.wrench, limits, cell, zero_is_arbitrary=info.has_arbitrary_zero),
         *([devices.check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
         *devices.check_stream(samples, health, address, _LOOK_S),
         *devices.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg),

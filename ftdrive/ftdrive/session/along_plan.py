@@ -176,7 +176,7 @@ class AlongPlan:
     def _tour(self, before: Before, pace: Pace, todo: Sequence[int], judge: Judge) -> Run:
         """Ask the safety questions, then visit every pose that is left; each is on disk before the next move."""
         cell, options, way = self.cell, self.options, before.approach.way_rad
-        load = guards.RangeGuard(cell.limits, before.sensor_range)
+        load = guards.RangeGuard(cell.limits, before.sensor_range, before.sensor_zero)
         contact = self._contact_guard(pace, judge)
         rows = (
             guards.SupervisorGuard(cell.journal.absence),

@@ -14,7 +14,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from ftcalib.model import Array
-from ftdrive.checks.devices import AXES
+from ftdrive.checks.devices import AXES, SATURATION
 from ftdrive.errors import SupervisorGone
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.hazards import Hazard
@@ -61,7 +61,7 @@ class Limits:
     sensor_age_moving_s: float = 0.1
     sensor_age_holding_s: float = 0.5
     frozen_samples_s: float = 0.2
-    saturation: float = 0.9
+    saturation: float = SATURATION
     """Share of the sensor's range."""
     contact_N: float = 8.0
     contact_Nm: float = 0.8
@@ -396,6 +396,8 @@ class RangeGuard(Guard):
     limits: Limits
     range: Array | None
     """(6,) N and N·m."""
+    zero: Array = field(default_factory=lambda: np.zeros(6))
+    """(6,) N and N·m: the reading from which the range counts, where the sensor's own zero is arbitrary."""
 
     def look(self, seen: Seen) -> None:
         """Compare the newest sample."""
@@ -405,12 +407,13 @@ class RangeGuard(Guard):
         """Compare any number of samples (..., 6)."""
         if self.range is None:
             return
-        share = (np.abs(wrench) / self.range).reshape(-1, 6).max(axis=0)
+        share = (np.abs(wrench - self.zero) / self.range).reshape(-1, 6).max(axis=0)
         if share.max() > self.limits.saturation:
             axis = int(share.argmax())
+            verb = "has changed by" if self.zero.any() else "reads"
             raise fault(
                 Hazard.OVERLOAD,
-                f"the sensor reads {100 * share[axis]:.0f} % of its range in {AXES[axis]}: "
+                f"the sensor {verb} {100 * share[axis]:.0f} % of its range in {AXES[axis]}: "
                 "take the load off, or use a lighter or shorter tool",
             )
 

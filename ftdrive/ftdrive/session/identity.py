@@ -16,7 +16,7 @@ from ftdrivers.registry import Options, split_url
 
 _CHOOSES_CALIBRATION: Final = {"slot": 0, "calibration": 1}
 """Options of a sensor's address that choose one of its calibrations, with their defaults."""
-_OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range")
+_OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range", "software_bias")
 """Facts that differ for another scale or calibration."""
 
 

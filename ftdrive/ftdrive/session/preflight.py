@@ -58,6 +58,12 @@ class Before:
         fact = self.cell.sensor.identify().facts.get("range")
         return None if fact is None else np.asarray(fact.value, dtype=np.float64)
 
+    @property
+    def sensor_zero(self) -> Array:
+        """Reading (6,) from which its range counts: at rest, where its own zero is arbitrary."""
+        is_arbitrary = self.cell.sensor.identify().has_arbitrary_zero
+        return np.asarray(self.quiet.wrench.mean(axis=0) if is_arbitrary else np.zeros(6))
+
 
 @dataclass(frozen=True, slots=True)
 class Row:
@@ -108,6 +114,14 @@ def check_sensor(before: Before) -> Check:
     wrench = before.quiet.wrench
     rate = devices.check_rate(len(wrench) / LISTEN_S, before.cell.sensor.health().nominal_rate_Hz)
     return merged("sensor", [rate, devices.check_level(wrench)])
+
+
+def check_load(before: Before) -> Check:
+    """Check that the sensor's range is enough for the tool and for what the sensor reads at rest."""
+    limits, config = before.sensor_range, before.config
+    is_arbitrary = before.cell.sensor.identify().has_arbitrary_zero
+    rest = devices.check_rest(before.quiet.wrench, limits, config, zero_is_arbitrary=is_arbitrary)
+    return merged("load", [devices.check_load(limits, config), rest])
 
 
 def check_workcell(before: Before) -> Check:
@@ -201,7 +215,7 @@ CHECKS: Final[Sequence[Row]] = (
     Row("slider", lambda before: devices.check_speed(before.cell.arm.status())),
     Row("link", check_link),
     Row("sensor", check_sensor),
-    Row("load", lambda before: devices.check_load(before.sensor_range, before.config)),
+    Row("load", check_load),
     Row("workcell", check_workcell),
     Row("plan", check_plan),
     _APPROACH,

@@ -2,6 +2,13 @@
 
 Ref: ATI 9620-05-Digital FT, sections 8.1, 8.3, 8.4; ATI 9610-05-1030-04, section 9 (the same port on a NETCANOEM).
 
+Gains and offsets of the gauges in force (registers 0 to 11): four public programs write them from the calibration block
+at every start, and one of them calls them volatile: KITrobotics/ati_force_torque, a Win32 driver for two Gamma Digital
+F/T, one with minimalmodbus, and the header of a Teensy program for a NETCANOEM. The code of that Teensy program, and
+another one for a real device, stream without writing them and receive good readings. Both are right only if the
+registers are loaded at power-up. So the emulator loads those of the lowest calibration. A client that uses another
+calibration reads wrong gauges unless it writes its gains. No source says that a client should not write them.
+
 Does not model: baud mismatch (a pty has no speed), parity of what the client sends, collisions of a half-duplex line,
 writing calibrations to storage, the power-up time.
 
@@ -94,8 +101,8 @@ class AtiSerialBox(ModbusSensor):
     ----------
     calibrations
         What each slot 1 to 16 holds; a slot not named is empty. The lowest one describes the transducer.
-    needs_gains
-        Whether gauges read wrong until gains and offsets of the calibration have been written.
+    loads_gains
+        Whether gains and offsets of the lowest calibration are in force from power-up on; if not, they are 0.
     status
         Status word; its bit 15 is the error bit of every record.
     gauge_offset
@@ -113,7 +120,7 @@ class AtiSerialBox(ModbusSensor):
     has_parity = True
 
     calibrations: Mapping[int, Calibration] = field(default_factory=lambda: {1: REFERENCE})
-    needs_gains: bool = True
+    loads_gains: bool = True
     status: int = 0
     gauge_offset: float | Sequence[float] = 0.0
     streaming_at_start: bool = False
@@ -135,6 +142,9 @@ class AtiSerialBox(ModbusSensor):
             block = calibration_block(calibration) if calibration else bytes(2 * CALIBRATION_REGISTERS)
             words = struct.unpack(f">{CALIBRATION_REGISTERS}H", block)
             self._registers |= dict(enumerate(words, start=CALIBRATION + (slot - 1) * CALIBRATION_STRIDE))
+        if self.loads_gains:
+            gains_offsets = (*self._transducer.gauge_gains, *self._transducer.gauge_offsets)
+            self._registers |= dict(enumerate(gains_offsets, start=GAINS))
         self._unlocked = False
         self._burst.clear()
         self._fall_silent()
@@ -201,15 +211,16 @@ class AtiSerialBox(ModbusSensor):
         size = RECORD_BYTES if self.faults.harm_frames else len(data)
         return [data[i : i + size] for i in range(0, len(data), size)]
 
+    @property
+    def _transducer(self) -> Calibration:
+        return self.calibrations[min(self.calibrations)]
+
     def _gauges(self, count: int) -> NDArray[np.int16]:
         """(count, 6) gauges at the gains and offsets in force, which are right only when they are the calibration's."""
-        calibration = self.calibrations[min(self.calibrations)]
-        gain: Array | float = 1.0
-        shift = np.asarray(self.gauge_offset, dtype=np.float64)
-        if self.needs_gains:
-            active = np.array([self._registers[address] for address in range(GAINS, SESSION)], dtype=np.float64)
-            gain = active[:6] / calibration.gauge_gains
-            shift = gain * shift + (active[6:] - calibration.gauge_offsets) / 4
+        calibration = self._transducer
+        active = np.array([self._registers[address] for address in range(GAINS, SESSION)], dtype=np.float64)
+        gain: Array = active[:6] / calibration.gauge_gains
+        shift = gain * np.asarray(self.gauge_offset) + (active[6:] - calibration.gauge_offsets) / 4
         gauges = calibration.gauges(self.measure(count), gain=gain, shift=shift)
         if self.saturated_axis is not None:
             gauges[:, self.saturated_axis] = GAUGE_MAX

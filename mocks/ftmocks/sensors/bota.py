@@ -1,18 +1,29 @@
 """An emulated Bota Systems SensONE with serial interface: text commands, and a stream of 37-byte frames.
 
-Ref: Bota Systems, SensONE serial user manual and the vendor's Python example (configuration, frame, CRC).
+Ref: Bota Systems, SensONE serial user manual and the vendor's Python example (configuration, frame, CRC), which has the
+serial speed 460800 baud, and opens the port before it waits for ``App Init``. The vendor's driver rokubimini_serial:
 
-Does not model: line speed, the filters' effect on the readings (only the sampling time follows from the sinc length),
-offsets and tare, raw output.
+* Its version for ROS 1 waits for 3 s after it has opened the port, because the sensor boots (init).
+* Its version for ROS 2 has 230400 baud as default and 460800 as maximum (DEFAULT_BAUD_RATE_OPTION). It sends ``#`` for
+  a restart at every speed. Then it finds ``c,D,D,D,D`` at 230400 baud, and at the speed of the sensor ``App Init``,
+  ``name: NAME``, ``S/N: NUMBER`` and ``FW version: VERSION``, each ended by CR. ``s`` stores the configuration.
 
-Chosen here, because the sources leave it open: the text around ``App Init``. Commands need no line ending; CR, LF and
-spaces between them are ignored. While the sensor streams, it ignores everything but ``C``. A configuration command with
-values out of range, or an unknown one, is answered with error 1. Settings survive `reset`. The CSV format is one line
-per sample with the fields of the frame. The sinc length may be 51 to 4096.
+Does not model: the filters' effect on the readings (only the sampling time follows from the sinc length), offsets and
+tare, raw output, and two openings within 5 ms, which count as one.
+
+Chosen here, because the sources leave it open: the sensor restarts whenever a client opens the port, as with an adapter
+that supplies it, and prints its configuration after half of `boot_s`. At another speed, both sides receive noise.
+Commands need no line ending; CR, LF and spaces between them are ignored. While the sensor streams, it ignores
+everything but ``C``, ``I`` and ``#``. A configuration command with values out of range, or an unknown one, is answered
+with error 1. A restart brings back what was stored; a new speed needs one. The CSV format is one line per sample with
+the fields of the frame. The sinc length may be 64 (800 Hz, the fastest of the data sheet) to 2048. ``p?`` is answered
+with ``p,0,NUMBER,1,0,NAME`` and ``r,0,p,0``.
 """
 
+import random
 import re
 import struct
+import termios
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,15 +32,19 @@ import numpy as np
 from ftmocks.wires.stream import SerialSensor
 
 HEADER = b"\xaa"
-LONGEST_COMMAND = len(b"f,4096,0,0,0")
+LONGEST_COMMAND = len(b"f,2048,0,0,0")
 SINC_UNIT_S = 19.53125e-6
-SINC_LENGTHS = range(51, 4097)
-BANNER = b"Bota Systems AG\r\nSensONE\r\nApp Init\r\n"
+SINC_LENGTHS = range(64, 2049)
+BAUD_RATES = (9600, 57_600, 115_200, 230_400, 460_800)
+BOOT_BAUD_CODE = 3
+NAME = b"SensONE"
 OVERRANGE, RAW_OUTPUT = 0x0002, 0x0008
 CAPACITY = (500.0, 500.0, 1200.0, 15.0, 15.0, 12.0)
+_SPEEDS = (termios.B9600, termios.B57600, termios.B115200, termios.B230400, termios.B460800)
 _COMMUNICATION = re.compile(rb"c,([01]),([01]),([01]),([0-4])")
 _FILTER = re.compile(rb"f,(\d{1,4}),([01]),([01]),([01])")
-_COMMAND = re.compile(rb"[CR]|[cf](?:,\d+){3},\d")
+_COMMAND = re.compile(rb"[CRIs#]|p\?|[cf](?:,\d+){3},\d")
+_WHILE_STREAMING = re.compile(rb"[CI#]")
 
 
 def _x25_entry(byte: int) -> int:
@@ -55,6 +70,11 @@ def stream_frame(status: int, wrench: list[float], timestamp_us: int, temperatur
     return HEADER + payload + crc16_x25(payload)
 
 
+def banner(serial: int) -> bytes:
+    """Return what the sensor prints when it has booted."""
+    return b"App Init\r\nname: %b\r\nS/N: %d\r\nFW version: 1.2.0\r\n" % (NAME, serial)
+
+
 @dataclass(eq=False, kw_only=True)
 class BotaBox(SerialSensor):
     """The sensor on its RS-422 or USB line.
@@ -63,6 +83,10 @@ class BotaBox(SerialSensor):
     ----------
     sinc_length
         Of the filter at power-up: a sample takes 19.53125 µs times this.
+    baud_code
+        Of the serial speed in force, the index in `BAUD_RATES`.
+    serial
+        Number of the sensor.
     capacity
         (6,) in N and N·m: readings are clipped there and marked as overrange.
     temperature_C
@@ -70,25 +94,32 @@ class BotaBox(SerialSensor):
     status
         Status bits set besides those that follow from the readings and the configuration.
     streaming_at_start
-        Streams already when the client opens it; else it powers up at `start` and sends its banner first.
+        Has its own supply and streams already: it does not restart when a client opens the port.
     boot_s
-        Silence before the banner.
+        Time from the opening of the port, or a restart, to the end of the banner and the first sample.
     """
 
     sinc_length: int = 512
+    baud_code: int = 4
+    serial: int = 12345
     capacity: Sequence[float] = CAPACITY
     temperature_C: float = 25.5
     status: int = 0
-    streaming_at_start: bool = True
-    boot_s: float = 0.1
+    streaming_at_start: bool = False
+    boot_s: float = 3.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.baud_code = 4
+        self.sees_openings = not self.streaming_at_start
         self.csv = False
         self.calibrated = True
+        self._next_baud_code = self.baud_code
+        self._stored = self._settings
+        self._noise = random.Random(self.seed)
         self._line = b""
-        self._boots_at_s: float | None = None
+        self._was_open = False
+        self._boot_texts: list[tuple[float, bytes, int]] = []
+        """What it prints before it streams: when, the text, and the code of its speed."""
         self._powered_s = self._stream_start_us = 0.0
 
     @property
@@ -96,38 +127,54 @@ class BotaBox(SerialSensor):
         """Sampling period."""
         return SINC_UNIT_S * self.sinc_length
 
+    @property
+    def _settings(self) -> tuple[int, int, bool, bool]:
+        return self.sinc_length, self._next_baud_code, self.csv, self.calibrated
+
     def _power_up(self) -> None:
+        self._was_open = False
         self._restart()
         if self.streaming_at_start:
-            self._boots_at_s = None
+            self._boot_texts.clear()
             self._run()
 
     def _restart(self) -> None:
         self._line = b""
         self._fall_silent()
-        self._powered_s = self.clock.now_s()
-        self._boots_at_s = self.clock.now_s() + self.boot_s
+        self.sinc_length, self._next_baud_code, self.csv, self.calibrated = self._stored
+        self.baud_code = self._next_baud_code
+        self._powered_s = now_s = self.clock.now_s()
+        setup = b"c,0,%d,%d,%d\r\n" % (self.calibrated, self.csv, self.baud_code)
+        self._boot_texts = [
+            (now_s + self.boot_s / 2, setup, BOOT_BAUD_CODE),
+            (now_s + self.boot_s, banner(self.serial), self.baud_code),
+        ]
 
     def _work(self, now_s: float) -> float | None:
-        if self._boots_at_s is None:
+        was_open, self._was_open = self._was_open, self._is_open
+        if not self._was_open:
+            self._fall_silent()
+            self._boot_texts.clear()
             return None
-        if now_s < self._boots_at_s:
-            return self._boots_at_s - now_s
-        self._boots_at_s = None
-        self._wire.put([BANNER])
-        self._run()
-        return None
+        if self.sees_openings and not was_open:
+            self._restart()
+        while self._boot_texts and self._boot_texts[0][0] <= now_s:
+            _, text, baud_code = self._boot_texts.pop(0)
+            self._wire.put(self._as_received([text], baud_code))
+            if not self._boot_texts:
+                self._run()
+        return self._boot_texts[0][0] - now_s if self._boot_texts else None
 
     def _received(self, data: bytes) -> None:
-        if self._boots_at_s is not None:
+        if self._boot_texts or not self._client_has(self.baud_code):
             return
         self._line += data
         while self._line:
             if self.streaming:
-                _, found, self._line = self._line.partition(b"C")
-                if found:
-                    self._pacer.stop()
-                    self._answer(b"C")
+                heard = _WHILE_STREAMING.search(self._line)
+                self._line = self._line[heard.end() :] if heard else b""
+                if heard:
+                    self._execute(heard[0])
                 continue
             self._line = self._line.lstrip(b"\r\n ")
             command = _COMMAND.match(self._line)
@@ -139,7 +186,7 @@ class BotaBox(SerialSensor):
 
     def _refuse_what_is_no_command(self) -> None:
         """Keep the beginning of a command, and answer anything else with an error."""
-        if self._line and (self._line[:1] not in b"cf" or len(self._line) > LONGEST_COMMAND):
+        if self._line and (self._line[:1] not in b"cfp" or len(self._line) > LONGEST_COMMAND):
             self._answer(self._line[:1], error=1)
             self._line = b""
 
@@ -148,26 +195,49 @@ class BotaBox(SerialSensor):
         error = 0
         if communication:
             self.calibrated, self.csv = communication[2] == b"1", communication[3] == b"1"
-            self.baud_code = int(communication[4])
+            self._next_baud_code = int(communication[4])
         elif filters and int(filters[1]) in SINC_LENGTHS:
             self.sinc_length = int(filters[1])
-        elif command not in (b"C", b"R"):
+        elif command == b"#":
+            self._restart()
+            return
+        elif command in (b"C", b"I"):
+            self._pacer.stop()
+        elif command == b"s":
+            self._stored = self._settings
+        elif command == b"p?":
+            self._print(b"p,0,%d,1,0,%b\r\n" % (self.serial, NAME))
+        elif command != b"R":
             error = 1
         self._answer(command[:1], error=error)
         if command == b"R":
             self._run()
 
     def _answer(self, letter: bytes, *, error: int = 0) -> None:
-        self._wire.put([b"r,%d,%b,0\r\n" % (error, letter)])
+        self._print(b"r,%d,%b,0\r\n" % (error, letter))
+
+    def _print(self, text: bytes) -> None:
+        self._wire.put(self._as_received([text], self.baud_code))
+
+    def _client_has(self, baud_code: int) -> bool:
+        """Whether the client's speed is this one; a box without a terminal has a client with any speed."""
+        return self._file < 0 or termios.tcgetattr(self._file)[5] == _SPEEDS[baud_code]
+
+    def _as_received(self, frames: list[bytes], baud_code: int) -> list[bytes]:
+        """Return what the client receives of frames sent at a speed: noise when its own is another."""
+        if self._client_has(baud_code):
+            return frames
+        return [self._noise.randbytes(len(frame) // 2) for frame in frames]
 
     def _samples(self, count: int) -> list[bytes]:
         status = self.status | (0 if self.calibrated else RAW_OUTPUT)
         clipped, overrange = self._readings(count, np.asarray(self.capacity))
         first = self._pacer.made - count
-        return [
+        frames = [
             self._frame(status | (OVERRANGE if over else 0), row.tolist(), first + i)
             for i, (over, row) in enumerate(zip(overrange, clipped, strict=True))
         ]
+        return self._as_received(frames, self.baud_code)
 
     def _frame(self, status: int, wrench: list[float], number: int) -> bytes:
         timestamp_us = int(self._stream_start_us + number * 1e6 * self.sample_s) & 0xFFFFFFFF

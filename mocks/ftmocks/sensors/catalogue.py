@@ -8,8 +8,11 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any
 
+import numpy as np
+
 from ftmocks.arrays import Array
 from ftmocks.clock import CellClock
+from ftmocks.sensors import bota, robotous
 from ftmocks.wires.device import Device
 
 MeasureAt = Callable[[Array], Array]
@@ -29,6 +32,12 @@ class Kind:
         Settings for a client that does not know such addresses.
     options
         Of the emulator.
+    settings
+        What `--sensor-setting` can change: the option of the emulator, and what makes its value of the text.
+    at_host
+        Whether it listens at the address of the station, not behind a pseudo-terminal.
+    bias_scale
+        Multiples of the forces and torques of the drawn bias, which reach 15 N and 1 N·m.
     floats
         Whether its wire can carry NaN.
     """
@@ -38,12 +47,52 @@ class Kind:
     query: str = ""
     endpoint: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
+    settings: dict[str, tuple[str, Callable[[str], Any]]] = field(default_factory=dict)
+    at_host: bool = False
+    bias_scale: tuple[float, float] = (1.0, 1.0)
     floats: bool = False
 
 
 def _slcan(bitrate: int, **more: Any) -> dict[str, Any]:
     return {"interface": "slcan", "bitrate": bitrate, **more}
 
+
+def _numbers(text: str) -> list[float]:
+    numbers = [float(part) for part in text.split(",")]
+    if len(numbers) != 6 or not np.isfinite(numbers).all():
+        raise ValueError(f"expected 6 numbers separated by commas, got {text!r}")
+    return numbers
+
+
+def _identifiers(text: str) -> tuple[int, ...]:
+    numbers = tuple(int(part, 0) for part in text.split(","))
+    if len(set(numbers)) != 3 or not all(0 <= number < 0x800 for number in numbers):
+        raise ValueError(f"expected 3 different CAN identifiers from 0 to 0x7FF, got {text!r}")
+    return numbers
+
+
+def _bota_baud_code(text: str) -> int:
+    if not text.isdecimal() or int(text) not in bota.BAUD_RATES:
+        raise ValueError(f"unknown baud rate {text!r}; known: {', '.join(map(str, bota.BAUD_RATES))}")
+    return bota.BAUD_RATES.index(int(text))
+
+
+def _seconds(text: str) -> float:
+    if not 0.0 <= float(text) < np.inf:
+        raise ValueError(f"expected a time in s, got {text!r}")
+    return float(text)
+
+
+def _model(name: str) -> robotous.Model:
+    if name not in robotous.MODELS:
+        raise ValueError(f"unknown model {name!r}; known: {', '.join(robotous.MODELS)}")
+    return robotous.MODELS[name]
+
+
+FT300_BIAS_SCALE = (3.3, 1.2)
+"""One at rest reads (-20.7, 22.0, -48.7) N and (-0.10, 1.17, -0.32) N·m: ros-industrial-attic/robotiq, request 215."""
+NETFT_BIAS_SCALE = (1.1, 2.1)
+"""One has a bias of (15.4, -12.2, -1.7) N and (-1.2, -2.1, 0.05) N·m: philip-long/FoamCutting_kukalwr."""
 
 KINDS = {
     "can": Kind(
@@ -55,14 +104,37 @@ KINDS = {
     ),
     "serial": Kind("ftmocks.sensors.ati_serial:AtiSerialBox", "ati-serial"),
     "robotous-can": Kind(
-        "ftmocks.sensors.robotous:RobotousCanNode", "robotous-can", "interface=slcan&rate=1000", _slcan(1_000_000)
+        "ftmocks.sensors.robotous:RobotousCanNode",
+        "robotous-can",
+        "interface=slcan&rate=1000",
+        _slcan(1_000_000),
+        settings={"model": ("model", _model), "ids": ("ids", _identifiers)},
     ),
     "robotous-serial": Kind(
-        "ftmocks.sensors.robotous:RobotousSerialBox", "robotous-serial", "baud=115200&rate=200", {"baud": 115_200}
+        "ftmocks.sensors.robotous:RobotousSerialBox",
+        "robotous-serial",
+        "baud=115200&rate=200",
+        {"baud": 115_200},
+        settings={"model": ("model", _model)},
     ),
-    "robotiq": Kind("ftmocks.sensors.robotiq:RobotiqBox", "robotiq-ft300"),
-    "bota": Kind("ftmocks.sensors.bota:BotaBox", "bota", floats=True),
-    "netft": Kind("ftmocks.sensors.netft:NetFtBox", "ati-netft", options={"rdt_port": 0, "rate_hz": 1000}),
+    "robotiq": Kind("ftmocks.sensors.robotiq:RobotiqBox", "robotiq-ft300", bias_scale=FT300_BIAS_SCALE),
+    "robotiq-urcap": Kind(
+        "ftmocks.sensors.robotiq_urcap:RobotiqUrcap", "robotiq-ft300", at_host=True, bias_scale=FT300_BIAS_SCALE
+    ),
+    "bota": Kind(
+        "ftmocks.sensors.bota:BotaBox",
+        "bota",
+        settings={"baud": ("baud_code", _bota_baud_code), "boot-s": ("boot_s", _seconds)},
+        floats=True,
+    ),
+    "netft": Kind(
+        "ftmocks.sensors.netft:NetFtBox",
+        "ati-netft",
+        options={"rdt_port": 0, "rate_hz": 1000},
+        settings={"tool-transform": ("tool_transform", _numbers), "bias": ("bias", _numbers)},
+        at_host=True,
+        bias_scale=NETFT_BIAS_SCALE,
+    ),
 }
 """Sensors on a wire of their own."""
 
@@ -71,6 +143,28 @@ WRIST = "ur-ft"
 
 CHOICES = (*KINDS, WRIST, "both", "none")
 """Values of --sensor; "both" is can and serial."""
+
+
+def parse_settings(name: str, settings: list[str]) -> dict[str, Any]:
+    """Return the options of an emulator that settings ``NAME=VALUE`` stand for.
+
+    Raises
+    ------
+    ValueError
+        When the sensor `name` has no such setting, or the value is none.
+    """
+    known = KINDS[name].settings if name in KINDS else {}
+    options: dict[str, Any] = {}
+    for setting in settings:
+        key, sign, value = setting.partition("=")
+        if not known:
+            raise ValueError(f"the sensor {name} has no settings: leave --sensor-setting out")
+        if not sign or key not in known:
+            choices = " or ".join(f"{choice}=VALUE" for choice in known)
+            raise ValueError(f"{setting!r} is no setting of the sensor {name}: give {choices}")
+        option, parse = known[key]
+        options[option] = parse(value)
+    return options
 
 
 class Sensor:
@@ -86,9 +180,20 @@ class Sensor:
         Loopback address of the station.
     clock
         Of the cell.
+    options
+        Of the emulator, see `parse_settings`.
     """
 
-    def __init__(self, name: str, measure_at: MeasureAt, *, seed: int, host: str, clock: CellClock) -> None:
+    def __init__(
+        self,
+        name: str,
+        measure_at: MeasureAt,
+        *,
+        seed: int,
+        host: str,
+        clock: CellClock,
+        options: dict[str, Any] | None = None,
+    ) -> None:
         self.name = name
         self._kind = KINDS.get(name)
         self._emulator: Device[Any] | None = None
@@ -96,10 +201,10 @@ class Sensor:
             self.endpoint = {"url": f"{WRIST}://{host}?counts_per_N=1&counts_per_Nm=1", "host": host}
             return
         module, _, class_name = self._kind.emulator.partition(":")
-        options = self._kind.options | ({"host": host} if name == "netft" else {})
+        given = self._kind.options | (options or {}) | ({"host": host} if self._kind.at_host else {})
         make: Callable[..., Device[Any]] = getattr(import_module(module), class_name)
         emulator: Device[Any] = make(
-            lambda count: measure_at(emulator.sample_times_s(count)), seed=seed, clock=clock, **options
+            lambda count: measure_at(emulator.sample_times_s(count)), seed=seed, clock=clock, **given
         )
         self._emulator = emulator
         self.endpoint = self._endpoint(self._kind, emulator.start())
@@ -107,7 +212,7 @@ class Sensor:
     def _endpoint(self, kind: Kind, where: Any) -> dict[str, Any]:
         """Return what the station reports about it, its address under "url"."""
         if isinstance(where, dict):
-            ports = "&".join(f"{key}={where[key]}" for key in ("rdt_port", "http_port"))
+            ports = "&".join(f"{key}={port}" for key, port in where.items() if key != "host")
             return {"url": f"{kind.scheme}://{where['host']}?{ports}", **where}
         url = f"{kind.scheme}://{where}" + (f"?{kind.query}" if kind.query else "")
         return {"url": url, "channel" if "interface" in kind.endpoint else "port": where, **kind.endpoint}

@@ -1,13 +1,23 @@
 """An emulated ATI Net F/T box (or Ethernet Axia): samples over UDP (RDT), configuration over HTTP.
 
-Ref: ATI 9620-05-Net FT, sections "UDP Interface Using RDT" and "XML"; 9610-05-Ethernet Axia, sections 9 and 10.
+Ref: ATI 9620-05-Net FT, sections "UDP Interface Using RDT" and "XML"; 9610-05-Ethernet Axia, sections 9 and 10. Names
+and form of the elements are those of a page of a Gamma SI-330-30 (box firmware 2.2.59), as quoted by a public client of
+revision 22 of the manual. It has tool transformation and software bias, as the emulated box has.
 
-Does not model: the TCP interface, multi-unit mode, filters, tool transformation, monitor conditions, more than one
-configuration, the web pages, DHCP, and that a real box answers only a few HTTP requests in a row.
+* The software bias is six strain gauge counts (int16, sections 4.4 and 7.1), which the box subtracts from the gauges
+  before its matrix. The RDT command "bias" makes the present gauges the bias.
+* The tool transformation follows: displacements in the axes of the transducer, then rotations about x, the new y and
+  the new z. The force is ``R.T F``, the torque ``R.T (T - d x F)`` with ``R = Rx Ry Rz``. Order and signs are those of
+  ATI's own library (TTM in ftconfig.c of the DAQ F/T C library, in lagadic/visp).
+* A rate becomes the next higher whole fraction of 7000 Hz (section 4.7).
+
+Does not model: the TCP interface, multi-unit mode, filters, monitor conditions, more than one configuration, the web
+pages, DHCP, rounding to gauge counts, and that a real box answers only a few HTTP requests in a row.
 
 Chosen here, because the sources leave it open: a new request of samples replaces the running one and its address.
-"One-shot" sends its count of samples, one for count 0, at the set rate. A reading at its rating sets the summary and
-saturation bits. A datagram that is no request is ignored.
+"One-shot" sends its count of samples, one for count 0, at the set rate. A reading at its rating in the axes of the
+transducer sets the summary and saturation bits. A datagram that is no request is ignored. A bias set over HTTP survives
+a power failure, one by RDT does not.
 """
 
 import contextlib
@@ -25,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftmocks.arrays import Array
-from ftmocks.sensors.ati_gauges import Scale
+from ftmocks.sensors.ati_gauges import REFERENCE, Scale
 from ftmocks.wires.device import Device
 
 RDT_PORT = 49152
@@ -37,6 +47,9 @@ MAX_BUFFER = 40
 SUMMARY, LATCH, SATURATED = 0x8000_0000, 0x0001_0000, 0x8002_0000
 FORCE_UNITS = {1: "lbf", 2: "N", 3: "klbf", 4: "kN", 5: "kgf", 6: "gf"}
 TORQUE_UNITS = {1: "lbf-in", 2: "lbf-ft", 3: "Nm", 4: "Nmm", 5: "kgf-cm", 6: "kNm"}
+DISTANCE_UNITS = {1: ("in", 0.0254), 2: ("ft", 0.3048), 3: ("mm", 0.001), 4: ("cm", 0.01), 5: ("m", 1.0)}
+ANGLE_UNITS = {1: ("degrees", np.pi / 180), 2: ("radians", 1.0)}
+TRANSFORM_KEYS, BIAS_KEYS = ([f"{name}{i}" for i in range(6)] for name in ("cfgtfx", "setbias"))
 
 
 class Command(IntEnum):
@@ -75,6 +88,31 @@ class Calibration(Scale):
     rating: Sequence[float] = (130.0, 130.0, 400.0, 10.0, 10.0, 10.0)
 
 
+def transform_matrix(displacement_m: Array, angles_rad: Array) -> Array:
+    """Return what turns wrenches about the transducer's origin into those of a tool frame, (6, 6).
+
+    Parameters
+    ----------
+    displacement_m
+        (3,) origin of the tool frame, in the axes of the transducer.
+    angles_rad
+        (3,) rotations about x, the new y and the new z.
+    """
+    turned = np.eye(3)
+    for axis, angle in enumerate(angles_rad):
+        first, second = (axis + 1) % 3, (axis + 2) % 3
+        turn = np.eye(3)
+        turn[[first, second], [first, second]] = np.cos(angle)
+        turn[second, first] = np.sin(angle)
+        turn[first, second] = -np.sin(angle)
+        turned = turned @ turn
+    x, y, z = displacement_m
+    matrix = np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = turned.T
+    matrix[3:, :3] = -turned.T @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return matrix
+
+
 def rdt_records(first: int, ft: NDArray[np.int64], status: NDArray[np.int64], counts: Array) -> bytes:
     """Return consecutive 36-byte records, big-endian.
 
@@ -107,6 +145,14 @@ class NetFtBox(Device[bytes]):
         Scale and identity.
     product
         Name the box gives itself.
+    tool_transform
+        (6,) displacements dx dy dz and rotations rx ry rz, in these units; zeros for none.
+    distance_unit, angle_unit
+        Codes, the keys of `DISTANCE_UNITS` and `ANGLE_UNITS`.
+    bias
+        (6,) software bias in gauge counts at power-up; zeros for none.
+    gauge_offset
+        (6,) or scalar, what the gauges read without load; None for `bias`, which then leaves the readings as measured.
     rate_hz
         Of samples, 1 to 7000.
     buffer_size
@@ -124,6 +170,11 @@ class NetFtBox(Device[bytes]):
     http_port: int = 0
     calibration: Calibration = Calibration()
     product: str = "Net F/T"
+    tool_transform: Sequence[float] = (0.0, 0.0, 132.71, 0.0, 0.0, 0.0)
+    distance_unit: int = 3
+    angle_unit: int = 1
+    bias: Sequence[int] = (745, 17, 447, 184, -596, -253)
+    gauge_offset: float | Sequence[float] | None = None
     rate_hz: int = INTERNAL_HZ
     buffer_size: int = 5
     rdt_enabled: bool = True
@@ -137,6 +188,7 @@ class NetFtBox(Device[bytes]):
         self._buffer = b""
         self._buffered = False
         self._stream_hz = float(self.rate_hz)
+        self._gauge_offset = np.asarray(self.bias if self.gauge_offset is None else self.gauge_offset, dtype=float)
         self._bias = np.zeros(6)
         self._booted_s = 0.0
         self._ft_start = 0
@@ -170,7 +222,7 @@ class NetFtBox(Device[bytes]):
     def _power_up(self) -> None:
         self._wire.clear()
         self._pacer.stop()
-        self._bias = np.zeros(6)
+        self._bias = np.array(self.bias, dtype=float)
         self._booted_s = self.clock.now_s()
         if self.streaming_at_start:
             self._request(Command.REAL_TIME, 0, self.streaming_at_start)
@@ -198,7 +250,8 @@ class NetFtBox(Device[bytes]):
                 self.status &= ~LATCH
                 self.status = 0 if self.status == SUMMARY else self.status
             case Command.BIAS:
-                self._bias = self._counts(1)[0][0]
+                gauges_per_SI = REFERENCE.gauges_per_SI
+                self._bias = gauges_per_SI @ self._measured(1)[0][0] + self._gauge_offset
 
     def _deliver(self, frames: list[bytes]) -> None:
         for datagram in frames:
@@ -212,18 +265,25 @@ class NetFtBox(Device[bytes]):
             count = max(0, min(count, self._left - first))
             self._pacer.made = first + count
         if count:
-            counts, saturated = self._counts(count)
+            measured, saturated = self._measured(count)
             ft = self._ft_start + ((first + np.arange(count)) * (INTERNAL_HZ / self._stream_hz)).astype(np.int64)
             status = np.where(saturated, SATURATED, 0) | self.status
-            records = rdt_records(first + 1, ft, status, counts - self._bias)
+            records = rdt_records(first + 1, ft, status, self._counts(measured))
             self._send(records, last=self._left is not None and first + count >= self._left)
         if self._left is not None and first + count >= self._left:
             self._pacer.stop()
 
-    def _counts(self, count: int) -> tuple[Array, NDArray[np.bool_]]:
-        """(count, 6) counts before bias, and (count,) whether a reading is at its rating."""
-        readings, saturated = self._readings(count, np.asarray(self.calibration.rating))
-        return readings * self.calibration.counts_per_SI, saturated
+    def _measured(self, count: int) -> tuple[Array, NDArray[np.bool_]]:
+        """(count, 6) wrenches on the transducer in N and N·m, and (count,) whether one is at its rating."""
+        return self._readings(count, np.asarray(self.calibration.rating))
+
+    def _counts(self, measured: Array) -> Array:
+        """(n, 6) counts of (n, 6) wrenches on the transducer: without the software bias, in the tool frame."""
+        bias = np.linalg.solve(REFERENCE.gauges_per_SI, self._bias - self._gauge_offset)
+        metres, radians = DISTANCE_UNITS[self.distance_unit][1], ANGLE_UNITS[self.angle_unit][1]
+        displacement, angles = np.reshape(self.tool_transform, (2, 3))
+        matrix = transform_matrix(displacement * metres, angles * radians)
+        return np.asarray((measured - bias) @ matrix.T * self.calibration.counts_per_SI)
 
     def _send(self, records: bytes, *, last: bool) -> None:
         data = self._buffer + records
@@ -243,15 +303,42 @@ class NetFtBox(Device[bytes]):
                 return _xml("netftCalibration", self._calibration())
             case "/comm.cgi" if query.keys() <= {"comrdte", "comrdtrate", "comrdtbsiz"}:
                 return self._communication(query)
+            case "/setting.cgi" if query.keys() <= set(BIAS_KEYS):
+                return self._setting(query)
+            case "/config.cgi" if query.pop("cfgid", "0") == "0":
+                return self._configured(query)
         return None
 
     def _communication(self, query: dict[str, str]) -> bytes | None:
         if not all(value.isdecimal() for value in query.values()):
             return None
         self.rdt_enabled = query.get("comrdte", str(int(self.rdt_enabled))) != "0"
-        self.rate_hz = min(max(int(query.get("comrdtrate", self.rate_hz)), 1), INTERNAL_HZ)
+        rate_hz = min(max(int(query.get("comrdtrate", self.rate_hz)), 1), INTERNAL_HZ)
+        self.rate_hz = INTERNAL_HZ // (INTERNAL_HZ // rate_hz)
         self.buffer_size = min(max(int(query.get("comrdtbsiz", self.buffer_size)), 1), MAX_BUFFER)
         return b"<html><body>Communications</body></html>"
+
+    def _setting(self, query: dict[str, str]) -> bytes | None:
+        with contextlib.suppress(ValueError):
+            bias = [int(query.get(key, round(value))) for key, value in zip(BIAS_KEYS, self._bias, strict=True)]
+            if all(-32768 <= value <= 32767 for value in bias):
+                self.bias, self._bias = bias, np.array(bias, dtype=float)
+                return b"<html><body>Settings</body></html>"
+        return None
+
+    def _configured(self, query: dict[str, str]) -> bytes | None:
+        if not query.keys() <= {*TRANSFORM_KEYS, "cfgtdu", "cfgtau"}:
+            return None
+        with contextlib.suppress(ValueError):
+            transform = [
+                float(query.get(key, old)) for key, old in zip(TRANSFORM_KEYS, self.tool_transform, strict=True)
+            ]
+            distance = int(query.get("cfgtdu", self.distance_unit))
+            angle = int(query.get("cfgtau", self.angle_unit))
+            if np.isfinite(transform).all() and distance in DISTANCE_UNITS and angle in ANGLE_UNITS:
+                self.tool_transform, self.distance_unit, self.angle_unit = transform, distance, angle
+                return b"<html><body>Configurations</body></html>"
+        return None
 
     def _configuration(self) -> dict[str, object]:
         calibration = self.calibration
@@ -265,6 +352,15 @@ class NetFtBox(Device[bytes]):
             "scfgtu": TORQUE_UNITS[calibration.torque_unit],
             "cfgcpf": calibration.counts_per_force,
             "cfgcpt": calibration.counts_per_torque,
+            "cfgtdu": self.distance_unit,
+            "scfgtdu": DISTANCE_UNITS[self.distance_unit][0],
+            "cfgtau": self.angle_unit,
+            "scfgtau": ANGLE_UNITS[self.angle_unit][0],
+            "cfgtfx": ";".join(f"{value:.3f}" if value else "0" for value in self.tool_transform),
+            "cfgmr": ";".join(f"{rating:g}" for rating in calibration.rating / calibration.units_SI),
+            "setcfgsel": 0,
+            "setbias": ";".join(f"{value:.0f}" for value in self._bias.round() + 0.0),
+            "runrate": INTERNAL_HZ,
             "comrdte": "Enabled" if self.rdt_enabled else "Disabled",
             "comrdtrate": self.rate_hz,
             "comrdtbsiz": self.buffer_size,
@@ -281,7 +377,6 @@ class NetFtBox(Device[bytes]):
             "caltu": calibration.torque_unit,
             "calcpf": calibration.counts_per_force,
             "calcpt": calibration.counts_per_torque,
-            "calmr": ";".join(f"{rating:g}" for rating in calibration.rating / calibration.units_SI),
         }
 
 

@@ -1,14 +1,17 @@
 """An emulated Robotous RFT force/torque sensor: one device, on a CAN bus or on a UART.
 
 Ref: Robotous RFT series installation and operation manual, revision 1.7 (commands, data field, CAN and UART packets).
+Revision 1.8 as transcribed in ItsLP18/robotous-ft-pipeline (divisors of each model, rates a baud rate allows, overload
+from 120 % of the rated load). In revision 1.7 the divisors of RFT64-6A01 were (50, 2000).
 
 Does not model: the low-pass filter (its type and code are stored and reported), storage wear, line speed.
 
 Chosen here, because the manual leaves it open: an unknown command or a damaged packet gets no answer. A setting of the
-other wire is answered as unsupported. 1000 Hz on a slower line becomes the rate that the line carries. A reading at the
-end of the int16 range, or beyond the capacity, sets the overload bit of its axis. The overload counters count the
-beginnings of overloads up to 255. CAN identifiers and the baud rate need a reboot; `reset` is one. All other settings
-survive it, except bias and streaming.
+other wire is answered as unsupported, and a rate the line does not allow as out of range. If the line becomes slower
+later, it sends what it carries. A reading at the end of the int16 range also sets the overload bit of its axis. The
+overload counters count the beginnings of overloads up to 255. CAN identifiers and the baud rate need a reboot; `reset`
+is one. All other settings survive it, except bias and streaming. The rated loads are those of the data sheets for
+RFT40-SA01 and RFT60-HA01, and those of RFT60-HA01 for the others.
 """
 
 import random
@@ -31,6 +34,8 @@ COMMAND_BYTES, RESPONSE_BYTES = 8, 16
 START_OF_PACKET, END_OF_PACKET = 0x55, 0xAA
 RATES_HZ = (200, 10, 20, 50, 100, 200, 333, 500, 1000)
 BAUD_RATES = (115_200, 921_600, 460_800, 230_400, 115_200, 57_600)
+FASTEST_HZ = {57_600: 200, 115_200: 333, 230_400: 500, 460_800: 500, 921_600: 1000}
+OVERLOAD = 1.2
 FILTER_TYPES, FILTER_CODES = (0, 1), range(15)
 SUCCESS, FAILURE = 1, 0
 UNSUPPORTED, OUT_OF_RANGE = 1, 2
@@ -66,13 +71,28 @@ class Model:
     force_divisor, torque_divisor
         Counts per newton and per newton metre.
     capacity
-        (6,) in N and N·m; beyond it an axis is overloaded.
+        (6,) rated load in N and N·m; from 120 % of it on an axis is overloaded.
     """
 
     name: str = "RFT60-HA01"
     force_divisor: float = 50.0
     torque_divisor: float = 2000.0
     capacity: Sequence[float] = (200.0, 200.0, 200.0, 8.0, 8.0, 8.0)
+
+
+MODELS = {
+    model.name: model
+    for model in (
+        Model("RFT40-SA01", capacity=(100.0, 100.0, 150.0, 2.5, 2.5, 2.5)),
+        Model("RFT44-SB01"),
+        Model("RFT60-HA01"),
+        Model("RFT64-SB01"),
+        Model("RFT64-6A01", torque_divisor=1000.0),
+        Model("RFT80-6A01", torque_divisor=1000.0),
+        Model("RFT80-6A02", torque_divisor=1000.0),
+    )
+}
+"""By the name that the sensor reports."""
 
 
 def raw_values(wrench: Array, model: Model) -> NDArray[np.int16]:
@@ -124,6 +144,8 @@ class RobotousSensor(PtyDevice[Frame]):
         At most 15 ASCII characters each.
     baud_code
         Of the UART in force, the index in `BAUD_RATES`; a pty does not notice a client at another rate.
+    ids
+        CAN identifiers in force: of commands, and of the first and second frame of a response.
     overload
         Overload bits set besides those of the readings: bit 5 to 0 are Fx to Tz.
     streaming_at_start
@@ -136,6 +158,7 @@ class RobotousSensor(PtyDevice[Frame]):
     serial: str = "A60HA00123"
     firmware: str = "VER 1.7"
     baud_code: int = 0
+    ids: tuple[int, int, int] = (0x64, 0x01, 0x02)
     overload: int = 0
     streaming_at_start: bool = False
 
@@ -143,7 +166,7 @@ class RobotousSensor(PtyDevice[Frame]):
         super().__post_init__()
         self.rate_code = 0
         self.filter = (0, 0)
-        self.ids = self.stored_ids = (0x64, 0x01, 0x02)
+        self.stored_ids = self.ids
         self.stored_baud_code = self.baud_code
         self.overload_counts = [0] * 6
         self._overloaded = 0
@@ -199,7 +222,8 @@ class RobotousSensor(PtyDevice[Frame]):
         raw = raw_values(wrench - self._bias, self.model)
         if self.saturated_axis is not None:
             raw[:, self.saturated_axis] = 32767
-        overloaded = (np.abs(wrench) > self.model.capacity) | (raw == 32767) | (raw == -32768)
+        limit = OVERLOAD * np.asarray(self.model.capacity)
+        overloaded = (np.abs(wrench) >= limit) | (raw == 32767) | (raw == -32768)
         bits = (overloaded @ (1 << np.arange(5, -1, -1))).tolist()
         sent = []
         for values, overload in zip(raw.tolist(), bits, strict=True):
@@ -221,7 +245,7 @@ class RobotousSensor(PtyDevice[Frame]):
         match code:
             case Command.SET_FILTER if first in FILTER_TYPES and second in FILTER_CODES:
                 self.filter = (first, second)
-            case Command.SET_RATE if first < len(RATES_HZ):
+            case Command.SET_RATE if first < len(RATES_HZ) and RATES_HZ[first] <= self._fastest_hz:
                 self.rate_code = first
             case Command.SET_BAUD if first < len(BAUD_RATES):
                 self.stored_baud_code = first
@@ -230,6 +254,11 @@ class RobotousSensor(PtyDevice[Frame]):
             case _:
                 return OUT_OF_RANGE
         return 0
+
+    @property
+    def _fastest_hz(self) -> float:
+        """The highest rate that can be set."""
+        return max(RATES_HZ)
 
     def _response(self, code: int, *values: int) -> bytes:
         return bytes((code, *values)).ljust(RESPONSE_BYTES, b"\0")
@@ -277,6 +306,10 @@ class RobotousSerialBox(RobotousSensor[bytes], SerialSensor):
     def rate_hz(self) -> float:
         """Samples a second of a stream, and no more than the line carries."""
         return min(super().rate_hz, BAUD_RATES[self.baud_code] / (10 * (RESPONSE_BYTES + 3)))
+
+    @property
+    def _fastest_hz(self) -> float:
+        return FASTEST_HZ[BAUD_RATES[self.baud_code]]
 
     def _power_up(self) -> None:
         self._line.clear()

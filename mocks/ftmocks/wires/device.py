@@ -166,6 +166,11 @@ class Device(ABC, Generic[Frame]):
         """Pass on the frames that arrive at the client now."""
 
     @property
+    def _readable(self) -> list[int]:
+        """Files on which something may come from the client."""
+        return [self._file]
+
+    @property
     def _unfinished(self) -> bool:
         """Whether something waits until the client reads."""
         return False
@@ -209,7 +214,7 @@ class Device(ABC, Generic[Frame]):
         """Do what is due, then wait for the client and take what it sent; False when the device was unplugged."""
         wait_s = time_out_s(self._tick(self.clock.follow() * 1e-9))
         writers = [self._file] if self._unfinished else []
-        readable, writable, _ = select.select([self._file, self._wake_read], writers, [], wait_s)
+        readable, writable, _ = select.select([*self._readable, self._wake_read], writers, [], wait_s)
         if self._wake_read in readable:
             if os.read(self._wake_read, 1) == _END:
                 return False

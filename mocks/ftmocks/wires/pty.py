@@ -1,6 +1,7 @@
 """A sensor behind a pseudo-terminal, which answers and streams through a faulty wire.
 
-Ref: pty(7), termios(3). The slave end stays open here, or the master would read EIO when a client closes its end.
+Ref: pty(7), termios(3). The slave end stays open here, or the master would read EIO when a client closes its end. A
+device with `sees_openings` leaves it to the client: while nothing has the port open, the master is hung up.
 
 A pty has no parity. Where the line has, a client requests marks with INPCK and PARMRK, as on a real port. The emulator
 then clears PARMRK, or the kernel would double the marks. While INPCK is set, the emulator does all marking. Bytes in
@@ -10,7 +11,9 @@ Does not model: line speed (a pty has none), INPCK without PARMRK, IGNPAR, parit
 breaks.
 """
 
+import contextlib
 import os
+import select
 import termios
 import tty
 from abc import abstractmethod
@@ -31,6 +34,7 @@ class PtyDevice(Device[Frame]):
     """
 
     has_parity = False  # of the line: whether wrong parity can be marked
+    sees_openings = False  # whether the device can ask `_is_open`, which then is right within 5 ms
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,8 +57,24 @@ class PtyDevice(Device[Frame]):
         os.set_blocking(self._file, False)
         self._unsent = self._begun = b""
         path = os.ttyname(self._slave)
+        if self.sees_openings:
+            os.close(self._slave)
+            self._slave = -1
         self._launch()
         return path
+
+    @property
+    def _is_open(self) -> bool:
+        """Whether a client has the port open; True for a device that cannot see it."""
+        if not self.sees_openings or self._file < 0:
+            return True
+        poll = select.poll()
+        poll.register(self._file, 0)
+        return not poll.poll(0)
+
+    @property
+    def _readable(self) -> list[int]:
+        return [self._file] if self._is_open else []  # a terminal that is hung up is always readable
 
     @abstractmethod
     def _received(self, data: bytes) -> None:
@@ -69,7 +89,10 @@ class PtyDevice(Device[Frame]):
         """Return what the client reads of these frames, and what else the adapter has for it."""
 
     def _receive(self) -> None:
-        self._received(os.read(self._file, 4096))
+        data = b""
+        with contextlib.suppress(OSError):  # the client has closed the port
+            data = os.read(self._file, 4096)
+        self._received(data)
 
     def _sample(self, count: int) -> None:
         self._wire.put(self._samples(count))
@@ -81,7 +104,8 @@ class PtyDevice(Device[Frame]):
 
     def _close(self) -> None:
         os.close(self._file)
-        os.close(self._slave)
+        if self._slave >= 0:
+            os.close(self._slave)
 
     def _send(self, data: bytes, record_bytes: int) -> int:
         """Write without blocking; when the client does not read, drop whole records and keep none.

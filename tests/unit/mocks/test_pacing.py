@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ftmocks.clock import LEAD_NS, CellClock
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.ati_serial import AtiSerialBox
-from ftmocks.sensors.bota import BANNER, BotaBox
+from ftmocks.sensors.bota import BotaBox, banner
 from ftmocks.sensors.netft import RECORD, Command, NetFtBox
 from ftmocks.sensors.robotiq import RobotiqBox
 from ftmocks.sensors.robotous import RobotousCanNode, RobotousSerialBox
@@ -97,8 +97,12 @@ def fast_uart(**options: Any) -> RobotousSerialBox:
 
 STREAMS: dict[str, tuple[Callable[..., Any], int, float]] = {
     "ati-serial": (lambda **options: AtiSerialBox(still, streaming_at_start=True, **options), 13, 7000),
-    "bota": (lambda **options: BotaBox(still, **options), 37, 100),
-    "bota-fast": (lambda **options: BotaBox(still, sinc_length=64, **options), 37, 800),
+    "bota": (lambda **options: BotaBox(still, streaming_at_start=True, **options), 37, 100),
+    "bota-fast": (
+        lambda **options: BotaBox(still, streaming_at_start=True, sinc_length=64, **options),
+        37,
+        800,
+    ),
     "robotiq": (lambda **options: RobotiqBox(still, streaming_at_start=True, **options), 16, 100),
     "robotous-serial": (fast_uart, 19, 1000),
     "robotous-can": (opened_node, 44, 1000),
@@ -163,7 +167,7 @@ def test_a_pause_restarts_the_count_of_a_jam(pause_s: float, streaming: bool) ->
 
 
 def test_delays_are_in_the_time_of_the_cell() -> None:
-    bench = Bench(lambda **options: BotaBox(still, faults=Faults(delay_s=0.15), **options))
+    bench = Bench(lambda **options: BotaBox(still, streaming_at_start=True, faults=Faults(delay_s=0.15), **options))
     bench.run(1.0)
     assert bench.arrivals[0][0] == pytest.approx(0.15, abs=2 * STEP_S)
     assert bench.sent_bytes / 37 == pytest.approx(86, abs=1)
@@ -180,11 +184,12 @@ def test_a_reset_node_is_silent_until_it_has_booted() -> None:
 
 
 def test_a_banner_comes_when_the_sensor_has_booted() -> None:
-    bench = Bench(lambda **options: BotaBox(still, streaming_at_start=False, boot_s=0.1, **options))
+    bench = Bench(lambda **options: BotaBox(still, boot_s=0.1, **options))
     bench.run(0.5)
-    assert bench.arrivals[0][0] == pytest.approx(0.1, abs=2 * STEP_S)
-    assert bench.arrivals[0][1] in (len(BANNER), len(BANNER) + 37)
-    assert bench.sent_bytes - len(BANNER) == pytest.approx(37 * 41, abs=37)
+    (setup_s, setup_bytes), (banner_s, banner_bytes) = bench.arrivals[:2]
+    assert (setup_s, banner_s) == pytest.approx((0.05, 0.1), abs=2 * STEP_S)
+    assert banner_bytes in (len(banner(12345)), len(banner(12345)) + 37)
+    assert bench.sent_bytes - setup_bytes - len(banner(12345)) == pytest.approx(37 * 41, abs=37)
 
 
 def test_a_count_of_samples_is_honoured() -> None:

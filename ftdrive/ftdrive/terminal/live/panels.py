@@ -374,7 +374,10 @@ def _range(view: View) -> Line:
         return line.add("unknown: overload is not monitored")
     if view.reading is None:
         return line
-    shares = np.abs(view.reading.raw) / np.array(fact.value)
+    load = view.reading.raw
+    if view.info.sensor.has_arbitrary_zero:
+        load = load - np.concatenate([view.info.calibration.force_bias_N, view.info.calibration.torque_bias_Nm])
+    shares = np.abs(load) / np.array(fact.value)
     worst = int(np.argmax(shares))
     share = float(shares[worst])
     style = BAD if share > 0.95 else WARNING if share > 0.8 else ""

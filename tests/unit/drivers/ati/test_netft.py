@@ -19,8 +19,8 @@ from ftdrivers.ati.netft import (
     ONROBOT_BITS,
     NetFtSensor,
     numbers_in,
-    range_in,
     text_in,
+    transformation_in,
 )
 from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, StreamBroken
 from ftdrivers.interfaces import Fact, Health
@@ -34,9 +34,8 @@ PAGE = (
     b"<netft><prodname>Ethernet Axia</prodname><cfgcpf>1000000</cfgcpf><cfgcpt>1000000</cfgcpt>"
     b"<scfgfu>N</scfgfu><scfgtu>Nm</scfgtu><cfgcalsn>FT12345</cfgcalsn></netft>"
 )
-CALIBRATION = (
-    b"<netftCalibration><calfu>2</calfu><caltu>4</caltu><calmr>25;25;50;250;250;250</calmr></netftCalibration>"
-)
+FRAME = b"<cfgtfx>0;0;132.710;0;0;0</cfgtfx><scfgtdu>mm</scfgtdu><scfgtau>degrees</scfgtau>"
+"""Of a live box, as are the range and the bias below."""
 
 
 def record(number: int, status: int = 0) -> bytes:
@@ -49,7 +48,7 @@ class Box:
     It and its driver live in the time of an emulated cell, which waits for both.
     """
 
-    def __init__(self, *records: bytes, deaf: int = 0, pages: tuple[bytes, bytes] = (PAGE, b"")) -> None:
+    def __init__(self, *records: bytes, deaf: int = 0, page: bytes = PAGE) -> None:
         self.time = CellTime()
         self._records = list(records)
         self._deaf = deaf
@@ -63,7 +62,6 @@ class Box:
         class Pages(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 asked.append(self.path)
-                page = pages["netftcalapi" in self.path]
                 self.send_response(200)
                 self.send_header("Content-Length", str(len(page)))
                 self.end_headers()
@@ -238,45 +236,84 @@ def test_text_in_a_page() -> None:
 
 
 def test_numbers_in_a_page() -> None:
-    assert numbers_in(b"<calmr>130;130;400.5;10;10;1e1</calmr>", "calmr") == [130, 130, 400.5, 10, 10, 10]
+    assert numbers_in(b"<cfgmr>130;130;400.5;-10;0;1e1</cfgmr>", "cfgmr") == [130, 130, 400.5, -10, 0, 10]
     for element in ("comrdtrate", "commrdtrate"):
         assert numbers_in(f"<{element}>500</{element}>".encode(), "comm?rdtrate") == [500]
-    for text in (b"", b"empty", b"0", b"130;;130", b"-1", b"nan", b"inf", b"1;0"):
-        assert numbers_in(b"<calmr>" + text + b"</calmr>", "calmr") == []
+    for text in (b"", b"empty", b"130;;130", b"nan", b"inf"):
+        assert numbers_in(b"<cfgmr>" + text + b"</cfgmr>", "cfgmr") == []
 
 
-@pytest.mark.parametrize(
-    ("page", "expected"),
-    [
-        (CALIBRATION, (25.0, 25.0, 50.0, 0.25, 0.25, 0.25)),
-        (CALIBRATION.replace(b">2<", b">1<"), (*[4.4482216152605 * 25] * 2, 4.4482216152605 * 50, *[0.25] * 3)),
-        (CALIBRATION.replace(b";250<", b"<"), None),
-        (CALIBRATION.replace(b"50;", b"0;"), None),
-        (CALIBRATION.replace(b">2<", b">7<"), None),
-        (CALIBRATION.replace(b"caltu", b"x"), None),
-        (b"not found", None),
-    ],
-)
-def test_range_in_a_page(page: bytes, expected: tuple[float, ...] | None) -> None:
-    assert range_in(page) == (expected and pytest.approx(expected))
-
-
-def test_rate_and_range_are_the_devices() -> None:
-    pages = PAGE.replace(b"</netft>", b"<cfgcalsel>3</cfgcalsel><comrdtrate>500</comrdtrate></netft>"), CALIBRATION
-    with Box(pages=pages) as box, box.sensor() as sensor:
-        rating = sensor.identify().facts["range"]
-        assert rating.source == "device"
-        assert rating.value == pytest.approx((25, 25, 50, 0.25, 0.25, 0.25))
+def test_rate_range_and_bias_are_the_devices() -> None:
+    more = b"<comrdtrate>500</comrdtrate><cfgmr>330;330;990;30;30;30</cfgmr><setbias>745;17;447;184;-596;-253</setbias>"
+    with Box(page=PAGE.replace(b"</netft>", more + b"</netft>")) as box, box.sensor() as sensor:
+        facts = sensor.identify().facts
+        assert facts["range"] == Fact((330.0, 330.0, 990.0, 30.0, 30.0, 30.0), "device")
+        assert facts["software_bias"] == Fact((745.0, 17.0, 447.0, 184.0, -596.0, -253.0), "device")
+        assert "tool_transformation" not in facts
         assert sensor.health().nominal_rate_Hz == 500
-        assert "/netftcalapi.xml?index=3" in box.asked
+        assert set(box.asked) == {"/netftapi2.xml"}
     other_units = PAGE.replace(b">N<", b">lbf<").replace(b">Nm<", b">lbf-in<")
-    with Box(pages=(other_units, b"")) as box, box.sensor() as sensor:  # a page without either
+    with (
+        Box(page=other_units.replace(b"</netft>", b"<cfgmr>1;1;2;1;1;1</cfgmr></netft>")) as box,
+        box.sensor() as sensor,
+    ):
         facts = sensor.identify().facts
         assert facts["counts_per_N"].value == pytest.approx(1e6 / 4.4482216152605)
         assert facts["counts_per_Nm"].value == pytest.approx(1e6 / 0.1129848290276167)
-        assert "range" not in sensor.identify().facts
+        assert facts["range"].value == pytest.approx(
+            [4.4482216152605] * 2 + [8.896443230521] + [0.1129848290276167] * 3
+        )
+    without = more.replace(b"990;", b"").replace(b"745;17;447;184;-596;-253", b"0;0;0;0;0;0").replace(b"500", b"0")
+    with Box(page=PAGE.replace(b"</netft>", without + b"</netft>")) as box, box.sensor() as sensor:
+        facts = sensor.identify().facts
+        assert "range" not in facts
+        assert facts["software_bias"] == Fact((0.0,) * 6, "device")
         assert math.isnan(sensor.health().nominal_rate_Hz)
-        assert set(box.asked) == {"/netftapi2.xml"}
+
+
+def test_tool_transformation_of_the_box_is_undone() -> None:
+    """The torque about the origin of the transducer is the one sent plus d × F: 0.13271 m × (1.5, -2.25, 10) N."""
+    with Box(RECORD, page=PAGE.replace(b"</netft>", FRAME + b"</netft>")) as box, box.sensor() as sensor:
+        sample = sensor.latest(timeout_s=0.5)
+        wrench = [1.5, -2.25, 10, 0.1 + 0.13271 * 2.25, -0.05 + 0.13271 * 1.5, 0.025]
+        np.testing.assert_allclose(sample.wrench[0], wrench)
+        assert sample.counts[0].tolist() == [1_500_000, -2_250_000, 10_000_000, 100_000, -50_000, 25_000]
+        assert sensor.identify().facts["tool_transformation"].value == "0;0;132.710;0;0;0 (mm, degrees)"
+
+
+@pytest.mark.parametrize(
+    ("distance", "angle", "per_m", "per_degree"),
+    [("in", "degrees", 1 / 0.0254, 1.0), ("ft", "degrees", 1 / 0.3048, 1.0), ("cm", "radians", 100.0, math.pi / 180)],
+)
+def test_tool_transformation_turns_about_x_then_y_then_z(
+    distance: str, angle: str, per_m: float, per_degree: float
+) -> None:
+    """Compare with ATI's own matrix, F' = R F and T' = R (T - d × F) with the rows of R as in ftconfig.c."""
+    d, turns = np.array([0.01, -0.02, 0.1]), np.radians([20.0, -30.0, 40.0])
+    (sx, sy, sz), (cx, cy, cz) = np.sin(turns), np.cos(turns)
+    R = np.array(
+        [
+            [cy * cz, sx * sy * cz + cx * sz, sx * sz - cx * sy * cz],
+            [-cy * sz, -sx * sy * sz + cx * cz, sx * cz + cx * sy * sz],
+            [sy, -sx * cy, cx * cy],
+        ]
+    )
+    force, torque = np.array([1.0, 2.0, 3.0]), np.array([0.4, 0.5, 0.6])
+    sent = np.concatenate([R @ force, R @ (torque - np.cross(d, force))])
+    values = ";".join(f"{value:.15g}" for value in [*(per_m * d), *(per_degree * np.degrees(turns))])
+    page = f"<cfgtfx>{values}</cfgtfx><scfgtdu>{distance}</scfgtdu><scfgtau>{angle}</scfgtau>".encode()
+    np.testing.assert_allclose(transformation_in(page) @ sent, [*force, *torque], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "page", [FRAME.replace(b"mm", b"yd"), FRAME.replace(b"degrees", b""), FRAME.replace(b"0;", b"")]
+)
+def test_tool_transformation_that_cannot_be_undone_is_refused(page: bytes) -> None:
+    with (
+        Box(page=PAGE.replace(b"</netft>", page + b"</netft>")) as box,
+        pytest.raises(ConnectError, match=r"cannot be undone.*set it to zero"),
+    ):
+        box.sensor().open()
 
 
 def test_status_in_words() -> None:

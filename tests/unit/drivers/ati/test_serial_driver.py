@@ -72,6 +72,8 @@ FINE = bytes.fromhex("0A030200001D85")
 START, STARTED = bytes.fromhex("0A4655A39D"), bytes.fromhex("0A4601A262")
 UNLOCK, LOCK, DONE = bytes.fromhex("0A6AAAFF1D"), bytes.fromhex("0A6A187F68"), bytes.fromhex("0A6A01BEA2")
 READS = [bytes.fromhex(text) for text in ("0A0300E30040B4B7", "0A0301230040B577", "0A0301630029748D")]
+ACTIVE = bytes.fromhex("0A030000000C44B4")
+"""Reads the active gains and offsets."""
 BYE = (JAM, b"")
 Turn = tuple[bytes, Any]
 
@@ -83,6 +85,7 @@ def start_up(block: bytes | None = None, status: bytes = FINE, *then: Turn, stre
         (JAM, b""),
         (STATUS, status),
         *zip(READS, (read_reply(block[:128]), read_reply(block[128:256]), read_reply(block[256:])), strict=True),
+        (ACTIVE, read_reply(bytes(24))),
         (UNLOCK, DONE),
         (bytes.fromhex("0A10000000060C021F022B0239024302350237472D"), bytes.fromhex("0A10000000064170")),
         (bytes.fromhex("0A10000600060C" + "8000" * 6 + "7566"), bytes.fromhex("0A1000060006A171")),
@@ -117,6 +120,16 @@ def marked(data: bytes, *damaged: int) -> bytes:
     """What the system makes of bytes that were received, `damaged` ones with wrong parity."""
     doubled = [b"\xff\xff" if byte == 0xFF else bytes([byte]) for byte in data]
     return b"".join(b"\xff\x00" + data[i : i + 1] if i in damaged else one for i, one in enumerate(doubled))
+
+
+def test_gains_that_are_active_already_are_not_written(table: Table) -> None:
+    """Programs written for real sensors stream without writing them."""
+    block = calibration_block()
+    turns = changed(start_up(), ACTIVE, read_reply(block[242:266]))
+    kept = [turn for turn in turns if turn[0] not in {UNLOCK, LOCK} and turn[0][1] != 0x10]
+    with table.serial(kept) as wire, Sensor(wire.clock) as sensor:
+        np.testing.assert_allclose(sensor.collect(0.05).wrench[0], WRENCH)
+    assert len(kept) == len(turns) - 4
 
 
 def test_start_up_and_goodbye_are_golden(table: Table) -> None:

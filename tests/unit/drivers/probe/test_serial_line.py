@@ -83,13 +83,14 @@ def test_a_silent_port_is_listened_to_and_then_asked_by_readings_only(monkeypatc
         (921_600, NONE, ROBOTOUS_MODEL),
         (1_250_000, EVEN, ATI_SERIAL),
     ]
-    assert line.clock.now_s() - 1000 == pytest.approx(9 * 0.27, abs=9 * 0.02)
+    assert line.clock.now_s() - 1000 == pytest.approx(10 * 0.27 + 2.6, abs=11 * 0.02)
 
 
 @pytest.mark.parametrize(
     ("setting", "heard", "url"),
     [
-        ((460_800, NONE), BOTA * 5, "bota:///dev/ttyX"),
+        ((460_800, NONE), BOTA * 5, "bota:///dev/ttyX?baud=460800"),
+        ((230_400, NONE), BOTA * 5, "bota:///dev/ttyX?baud=230400"),
         ((19_200, NONE), ROBOTIQ[5:] + ROBOTIQ * 5, "robotiq-ft300:///dev/ttyX"),
         ((115_200, NONE), ROBOTOUS * 5, "robotous-serial:///dev/ttyX"),
         ((921_600, NONE), ROBOTOUS * 5, "robotous-serial:///dev/ttyX?baud=921600"),
@@ -108,7 +109,7 @@ def test_a_silent_port_is_listened_to_and_then_asked_by_readings_only(monkeypatc
         ((1_250_000, EVEN), np.random.default_rng(0).bytes(4000), None),
         ((19_200, NONE), b"hello\r\n" * 500, None),
     ],
-    ids=range(17),
+    ids=range(18),
 )
 def test_a_stream_is_known_by_enough_whole_frames(
     setting: tuple[int, str], heard: bytes, url: str | None, monkeypatch: pytest.MonkeyPatch
@@ -116,6 +117,14 @@ def test_a_stream_is_known_by_enough_whole_frames(
     line = Line(setting, heard)
     assert probed(line, monkeypatch) == (None if url is None else Answer(url, "it streams"))
     assert bool(line.sent) == (url is None)  # a sensor that streams is not asked
+
+
+@pytest.mark.parametrize(("code", "baud"), [(3, 230_400), (4, 460_800), (2, 115_200), (7, None)])
+def test_a_bota_that_restarts_prints_its_baud_rate(
+    code: int, baud: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    line = Line((230_400, NONE), b"\x00c,0,1,0,%d\r\n" % code)
+    assert probed(line, monkeypatch) == (None if baud is None else Answer(f"bota:///dev/ttyX?baud={baud}", "it boots"))
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,38 @@ def test_can_carries_the_same_commands(table: Table, rate_Hz: int | None, period
     assert len(samples) == pytest.approx(0.15 / period_s, abs=3)
 
 
+def test_other_identifiers_are_an_option_of_the_address(table: Table) -> None:
+    def other(lines: list[str]) -> list[str]:
+        return [line.replace("001 ", "0F1 ").replace("002 ", "0F2 ") for line in lines]
+
+    turns = [
+        (sent.replace("064 ", "0F0 "), Stream.of(other(halves(SAMPLE)), 0.005) if sent[4:] == GO else other(received))
+        for sent, received in on_can(ANSWERS, Stream.of([]))
+    ]
+    with table.can(turns) as wire, Bus("can0", ids=(0xF0, 0xF1, 0xF2), clock=wire.clock) as sensor:
+        np.testing.assert_allclose(sensor.collect(0.1).wrench[0], WRENCH)
+
+
+@pytest.mark.parametrize(("model", "configured", "torque"), [("RFT64-6A01", None, 1000), ("RFT99-XX01", 500, 500)])
+def test_scale_follows_the_model_or_the_address(table: Table, model: str, configured: int | None, torque: int) -> None:
+    answers = ANSWERS | {MODEL: b"\x01" + model.encode().ljust(15, b"\0")}
+    counts_per_unit = None if configured is None else (50, configured)
+    with (
+        table.serial(on_uart(answers, Stream.of(frame(SAMPLE), 0.005))) as wire,
+        Uart("/dev/x", counts_per_unit=counts_per_unit, clock=wire.clock) as sensor,
+    ):
+        expected = np.array(counts(SAMPLE)) / np.repeat([50, torque], 3)
+        np.testing.assert_allclose(sensor.collect(0.1).wrench[0], expected)
+        assert sensor.identify().facts["counts_per_Nm"] == Fact(torque, "configured" if configured else "documented")
+
+
+def test_unknown_model_is_refused_with_the_question_to_the_maker(table: Table) -> None:
+    answers = {MODEL: b"\x01RFT99-XX01".ljust(16, b"\0")}
+    turns = on_uart(answers, Stream.of(b""))
+    with table.serial([*turns[:2], turns[-1]]) as wire, pytest.raises(ConnectError, match=r"RFT99-XX01.*ask Robotous"):
+        uart(wire).open()
+
+
 def test_what_was_damaged_before_the_stream_is_not_lost(table: Table) -> None:
     turns = on_uart(ANSWERS, Stream.of(frame(SAMPLE)))
     turns[1] = turns[1][0], b"\x55" * 40 + turns[1][1]  # in the first answer

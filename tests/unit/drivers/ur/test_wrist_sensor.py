@@ -90,6 +90,7 @@ def test_raw_wrench_is_scaled_as_configured(controller: SubscriptionInMemory, se
     assert "ft_raw_wrench" in info.model
     assert info.facts["counts_per_N"] == Fact(200.0, "configured")
     assert "serial" not in info.facts
+    assert info.has_arbitrary_zero
     assert info.firmware == "5.15.0.1"
     assert controller.asked == [(HOST, {"timestamp": "DOUBLE", "ft_raw_wrench": "VECTOR6D"}, 500.0)]
 

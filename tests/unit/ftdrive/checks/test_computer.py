@@ -131,6 +131,7 @@ def test_the_name_by_id_of_a_port(computer: Path) -> None:
         ("bota:///dev/serial/by-id/my%20port", "/dev/serial/by-id/my port"),
         ("ati-netft://192.168.1.1", None),
         ("ur-ft://192.168.1.10?counts_per_N=1&counts_per_Nm=1", None),
+        ("robotiq-ft300://192.168.1.10", None),
     ],
 )
 def test_an_address_names_the_place_that_can_be_probed(url: str, place: str | None) -> None:
@@ -201,6 +202,8 @@ def test_can_details_are_taken_from_what_ip_says(tmp_path: Path, monkeypatch: py
         ("bota:///dev/ttyUSB1?sinc=512", "/dev/ttyUSB1", None),
         ("ur-ft://10.0.0.1?counts_per_N=1&counts_per_Nm=1", None, None),
         ("ati-netft://192.168.1.1", None, None),
+        ("robotiq-ft300://192.168.1.10", None, None),
+        ("robotiq-ft300:///dev/ttyUSB0", "/dev/ttyUSB0", None),
         ("ati-can://PCAN_USBBUS1?interface=pcan", None, None),
         ("bota://COM3", "COM3", None),
         ("bota:///dev/serial/by-id/my%20port", "/dev/serial/by-id/my port", None),
@@ -210,6 +213,7 @@ def test_what_an_address_says(url: str, port: str | None, interface: str | None)
     address = SensorAddress.of(url)
     assert address.serial_port == (None if port is None else Path(port))
     assert address.can_interface == interface
+    assert (address.host is not None) == (".1" in url or "10.0" in url)
 
 
 def test_what_is_no_address_is_a_mistake_of_the_user() -> None:

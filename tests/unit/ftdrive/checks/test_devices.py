@@ -38,6 +38,17 @@ FACTS = {
 }
 
 
+def test_what_the_sensor_itself_changes_is_reported() -> None:
+    facts = FACTS | {
+        "software_bias": Fact((745.0, 0.0, 0.0, 0.0, 0.0, -253.0), "device"),
+        "tool_transformation": Fact("0;0;132.71;0;0;0 (mm, degrees)", "device"),
+    }
+    found = {check.name: check for check in diagnosis.check_identity(DeviceInfo("Net F/T", "FT1", "1", facts))}
+    assert "(745, 0, 0, 0, 0, -253)" in found["sensor.bias"].found
+    assert "undoes" in found["sensor.origin"].found
+    assert "132.71" in found["sensor.origin"].found
+
+
 def test_what_is_known_of_a_sensor_is_said_with_its_source() -> None:
     found = {check.name: check for check in diagnosis.check_identity(DeviceInfo("Gamma", "FT1", "3.8", FACTS))}
     assert {check.state for check in found.values()} == {"ok"}
@@ -168,6 +179,30 @@ def test_the_tool_must_fit_the_range_of_the_sensor(mass_kg: float | None, state:
     cell = CellConfig(RobotConfig(""), SensorConfig(""), replace(TOOL, mass_kg=mass_kg))
     assert diagnosis.check_load((50.0, 50.0, 50.0, 10.0, 10.0, 10.0), cell).state == state
     assert diagnosis.check_load(None, cell).state == "skipped"
+
+
+@pytest.mark.parametrize(
+    ("rest", "mass_kg", "state", "says"),
+    [
+        ((0, 0, 50, 1, 0, 0), 1.0, "ok", "50.0 N in Fz, 17 % of its range"),
+        ((0, 0, -160, 1, 0, 0), 1.0, "warning", "160.0 N in Fz"),
+        ((0, 0, 260, 0, 0, 0), None, "warning", "260.0 N in Fz, 87 % of its range"),
+        ((0, 0, 260, 0, 0, 0), 2.0, "failed", "260.0 N in Fz, 87 % of its range"),
+        ((1800, 400, 25_400, -76, 0, 0), None, "failed", "25400.0 N in Fz, 8467 % of its range"),
+        ((0, 0, 0, 0, 28, 0), None, "failed", "28.0 N·m in Ty, 93 % of its range"),
+    ],
+)
+def test_what_a_sensor_reads_at_rest_must_leave_enough_of_its_range(
+    rest: tuple[float, ...], mass_kg: float | None, state: str, says: str
+) -> None:
+    cell = CellConfig(RobotConfig(""), SensorConfig(""), replace(TOOL, mass_kg=mass_kg))
+    limits = np.array([300.0] * 3 + [30.0] * 3)
+    wrench = np.array([rest], dtype=float)
+    check = diagnosis.check_rest(wrench, limits, cell, zero_is_arbitrary=False)
+    assert (check.state, says in check.found) == (state, True)
+    assert bool(check.fix) == (state != "ok")
+    assert diagnosis.check_rest(wrench, limits, cell, zero_is_arbitrary=True).state == "skipped"
+    assert diagnosis.check_rest(wrench, None, cell, zero_is_arbitrary=False).state == "skipped"
 
 
 PORT = SensorAddress.of("bota:///dev/ttyUSB7")

@@ -1,18 +1,23 @@
 """How `ftdrive doctor` examines an arm and a push, with devices that answer from a list."""
 
+import json
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
+from ftdrive import cli
 from ftdrive.checks import devices
 from ftdrive.checks.check import Check
 from ftdrive.commands import doctor
 from ftdrive.commands.doctor import _check_clock, _check_poses, _examine_push, _print
 from ftdrivers.errors import DeviceTimeout
+from ftdrivers.interfaces import DeviceInfo, Fact
 from tests.fake_clock import FakeClock
+from tests.unit.ftdrive.fake_cell import Lab
 
 LOST = DeviceTimeout("no state for 0.3 s", "look at the cable")
 TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -133,3 +138,24 @@ def test_each_subject_is_named_once_and_a_fix_follows_what_is_wrong(capsys: pyte
     assert capsys.readouterr().out.endswith(" Usable; see the lines with !\n")
     _print(checks[:1])
     assert capsys.readouterr().out.endswith(" All checks passed.\n")
+
+
+def test_a_sensor_alone_is_checked_without_a_robot(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    facts = {"range": Fact((300.0,) * 3 + (30.0,) * 3, "documented")}
+    monkeypatch.setattr(lab.sensor, "identify", lambda: DeviceInfo("fake", "S1", "1", facts))
+    monkeypatch.setattr(doctor, "build_sensor", lambda _: lab.sensor)
+    monkeypatch.chdir(tmp_path)
+    states = []
+    for force_N in (0.0, 290.0):
+        lab.sensor.push = np.array([force_N, 0, 0, 0, 0, 0])
+        code = cli.run(["doctor", "--sensor", "bota:///dev/x", "--json"])
+        checks = {check["name"]: check for check in json.loads(capsys.readouterr().out)["checks"]}
+        assert checks["robot.reachable"]["state"] == "skipped"
+        assert "workcell.measured" not in checks
+        states.append((code, checks["sensor.rest"]["state"]))
+    assert states[0][1] == "ok"
+    assert states[1] == (7, "failed")
+    assert cli.run(["doctor"]) == 2  # without a sensor there is nothing to check
+    assert "[robot] host is not set" in capsys.readouterr().err

@@ -205,6 +205,14 @@ def test_an_axis_near_the_end_of_its_range_is_seen() -> None:
     assert Looks(RangeGuard(LIMITS, None)).trips(wrench=np.full(6, 1e4)) is None
 
 
+def test_a_range_holds_for_changes_where_the_zero_is_arbitrary() -> None:
+    zero = np.array([1800.0, 400, 25_400, -76, 0, 0])
+    guard = RangeGuard(LIMITS, np.array([50.0, 50, 50, 10, 10, 10]), zero)
+    assert Looks(guard).trips(wrench=zero + np.array([0, 0, 40, 0, 8, 0])) is None
+    trip = Looks(guard).trip(wrench=zero - [0, 0, 46, 0, 0, 0])
+    assert (trip.hazard, "has changed by 92 % of its range in Fz" in str(trip)) == (13, True)
+
+
 def contact(*, known: bool = True, quiet: float = 0.03) -> ContactGuard:
     guard = ContactGuard(LIMITS, 1.5, 0.2, 1.4, np.full(6, quiet))
     if known:

@@ -18,7 +18,7 @@ from ftdrive.errors import NotAccepted
 from ftdrive.session import preflight
 from ftdrive.session.events import Checked, Noted
 from ftdrivers.errors import DeviceFault, StreamBroken
-from ftdrivers.interfaces import ArmState
+from ftdrivers.interfaces import ArmState, DeviceInfo, Fact
 from tests.unit.ftdrive.fake_cell import Lab
 
 
@@ -110,6 +110,24 @@ def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
         assert words in next(event.words for event in lab.operator.of(Checked) if event.name == "load")
     else:
         refuse(lab, f"{words}: take a larger sensor")
+
+
+def test_a_sensor_with_an_arbitrary_zero_is_calibrated_within_its_range(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    facts = {"range": Fact((50.0,) * 3 + (10.0,) * 3, "configured"), "zero": Fact("arbitrary", "assumed")}
+    monkeypatch.setattr(lab.sensor, "identify", lambda: DeviceInfo("wrist", "S1", "1", facts))
+    lab.sensor.push = np.array([1800.0, 400, 25_400, -76, 0, 0])
+    outcome = lab.calibrate()
+    assert outcome is not None
+    assert outcome.result.force_bias_N == pytest.approx([1800, 400, 25_400], abs=5)
+
+
+def test_a_reading_at_rest_beyond_the_range_is_refused(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    facts = {"range": Fact((50.0,) * 3 + (10.0,) * 3, "configured")}
+    monkeypatch.setattr(lab.sensor, "identify", lambda: DeviceInfo("fake", "S1", "1", facts))
+    lab.sensor.push = np.array([0, 0, 25_400.0, 0, 0, 0])
+    refuse(lab, "at rest the sensor reads .* in Fz, 50[78].. % of its range")
 
 
 def test_a_speed_slider_that_doctor_calls_too_low_is_refused(lab: Lab) -> None:

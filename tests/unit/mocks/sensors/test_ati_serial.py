@@ -143,3 +143,41 @@ def test_baud_survives_a_power_cycle_only_when_stored(box: AtiSerialBox) -> None
     write(0x1F, 2)
     box._power_up()
     assert box._reply(read_baud)[3:5] == b"\x00\x02"
+
+
+V1_WRENCH = [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608]
+WRITE_GAINS = "0A 10 00 00 00 06 0C 02 1F 02 2B 02 39 02 43 02 35 02 37 47 2D"
+WRITE_OFFSETS = "0A 10 00 06 00 06 0C 80 00 80 00 80 00 80 00 80 00 80 00 75 66"
+
+
+def made(*, loads_gains: bool = True) -> AtiSerialBox:
+    box = AtiSerialBox(lambda n: np.tile(V1_WRENCH, (n, 1)), loads_gains=loads_gains)
+    box._power_up()
+    return box
+
+
+def test_gauges_are_right_from_power_up_on_and_after_writing_the_same_gains() -> None:
+    box = made()
+    assert box._gauges(1)[0].tolist() == V1
+    gains = with_crc(bytes.fromhex("0A 03 0C 02 1F 02 2B 02 39 02 43 02 35 02 37"))
+    assert box._reply(with_crc(bytes.fromhex("0A 03 00 00 00 06"))) == gains
+    for request in ("0A 6A AA FF 1D", WRITE_GAINS, WRITE_OFFSETS, "0A 6A 18 7F 68"):
+        assert not box._reply(bytes.fromhex(request))[1] & 0x80
+    assert box._gauges(1)[0].tolist() == V1
+
+
+def test_gains_of_another_calibration_scale_the_gauges_until_the_next_power_up() -> None:
+    box = made()
+    box._reply(bytes.fromhex("0A 6A AA FF 1D"))
+    box._reply(with_crc(struct.pack(">BBHHB6H", 0x0A, 0x10, 0, 6, 12, *(2 * g for g in REFERENCE.gauge_gains))))
+    assert box._gauges(1)[0].tolist() == [2 * gauge for gauge in V1]
+    box._power_up()
+    assert box._gauges(1)[0].tolist() == V1
+
+
+def test_a_device_without_gains_reads_wrong_until_they_are_written() -> None:
+    box = made(loads_gains=False)
+    assert box._gauges(1)[0].tolist() == [-8192] * 6
+    for request in ("0A 6A AA FF 1D", WRITE_GAINS, WRITE_OFFSETS):
+        box._reply(bytes.fromhex(request))
+    assert box._gauges(1)[0].tolist() == V1

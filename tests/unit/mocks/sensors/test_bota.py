@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ftmocks.sensors.bota import BotaBox, crc16_x25, stream_frame
+from ftmocks.clock import CellClock
+from ftmocks.sensors.bota import BotaBox, banner, crc16_x25, stream_frame
+from tests.unit.mocks.real_time import RealTime
 
 WRENCH = [1, -2, 9.81, 0.1, -0.2, 0.3]
 FRAME = "AA 0000 0000803F 000000C0 C3F51C41 CDCCCC3D CDCC4CBE 9A99993E 40420F00 0000CC41 3D0D"
@@ -36,9 +38,31 @@ def test_frames_hold_their_values(status: int, wrench: list[float], timestamp_us
 
 @pytest.fixture
 def box() -> BotaBox:
-    box = BotaBox(lambda n: np.tile(WRENCH, (n, 1)))
+    box = BotaBox(lambda n: np.tile(WRENCH, (n, 1)), streaming_at_start=True)
     box._power_up()
     return box
+
+
+def answers(box: BotaBox, written: bytes) -> bytes:
+    box._received(written)
+    return b"".join(box._wire.due(box.clock.now_s()))
+
+
+def test_it_boots_for_three_seconds_then_says_who_it_is_and_streams() -> None:
+    real = RealTime()
+    box = BotaBox(lambda n: np.tile(WRENCH, (n, 1)), serial=471, clock=CellClock(real))
+    box._power_up()
+    printed = b""
+    for _ in range(300):
+        box._work(box.clock.now_s())
+        printed += answers(box, b"C")
+        assert not box.streaming
+        real.pass_s(0.01)
+    assert printed == b"c,0,1,0,4\r\n"
+    box._work(box.clock.now_s())
+    assert answers(box, b"") == banner(471)
+    assert box.streaming
+    assert banner(471) == b"App Init\r\nname: SensONE\r\nS/N: 471\r\nFW version: 1.2.0\r\n"
 
 
 def test_samples_carry_time_status_and_temperature(box: BotaBox) -> None:
@@ -65,11 +89,44 @@ def test_overrange_and_uncalibrated_bits(box: BotaBox) -> None:
 
 
 def test_text_and_uncalibrated_output(box: BotaBox) -> None:
-    box._received(b"C c,0,0,1,4\r\nR")
-    assert b"".join(box._wire.due(box.clock.now_s())) == b"r,0,C,0\r\nr,0,c,0\r\nr,0,R,0\r\n"
+    assert answers(box, b"C c,0,0,1,4\r\nR") == b"r,0,C,0\r\nr,0,c,0\r\nr,0,R,0\r\n"
     assert box._samples(1)[0].decode().split(",")[:7] == ["8", "1", "-2", "9.81", "0.1", "-0.2", "0.3"]
 
 
-@pytest.mark.parametrize(("sinc", "rate_hz"), [(512, 100), (256, 200), (128, 400), (64, 800), (51, 1004)])
+@pytest.mark.parametrize(("sinc", "rate_hz"), [(2048, 25), (512, 100), (256, 200), (128, 400), (64, 800)])
 def test_sampling_time_follows_the_filter(sinc: int, rate_hz: float) -> None:
     assert 1 / BotaBox(lambda n: np.zeros((n, 6)), sinc_length=sinc).sample_s == pytest.approx(rate_hz, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("sinc", "error"), [(1, 1), (51, 1), (63, 1), (64, 0), (512, 0), (2048, 0), (2049, 1), (4096, 1)]
+)
+def test_sinc_lengths(box: BotaBox, sinc: int, error: int) -> None:
+    assert answers(box, b"C") == b"r,0,C,0\r\n"
+    assert answers(box, b"f,%d,0,0,0" % sinc) == b"r,%d,f,0\r\n" % error
+    assert box.sinc_length == (512 if error else sinc)
+
+
+def test_serial_number_in_configuration_mode(box: BotaBox) -> None:
+    assert answers(box, b"p?") == b"", "it streams"
+    assert answers(box, b"C") == b"r,0,C,0\r\n"
+    assert answers(box, b"p") == b""
+    assert answers(box, b"?") == b"p,0,12345,1,0,SensONE\r\nr,0,p,0\r\n"
+
+
+def test_a_restart_forgets_what_was_not_stored(box: BotaBox) -> None:
+    answers(box, b"C c,0,1,0,3 f,64,0,0,0")
+    assert (box.baud_code, box.sinc_length) == (4, 64), "a new speed needs a restart"
+    assert answers(box, b"#") == b""
+    assert (box.baud_code, box.sinc_length) == (4, 512)
+    box._boot_texts.clear()
+    assert answers(box, b"C c,0,1,0,3 f,64,0,0,0 s").endswith(b"r,0,s,0\r\n")
+    answers(box, b"#")
+    assert (box.baud_code, box.sinc_length) == (3, 64)
+
+
+@pytest.mark.parametrize("letter", [b"C", b"I"])
+def test_letters_that_end_the_stream(box: BotaBox, letter: bytes) -> None:
+    assert box.streaming
+    assert answers(box, b"x" + letter) == b"r,0,%b,0\r\n" % letter
+    assert not box.streaming

@@ -5,7 +5,8 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
-from ftmocks.sensors.netft import Calibration, NetFtBox, rdt_records
+from ftmocks.sensors.ati_gauges import REFERENCE
+from ftmocks.sensors.netft import Calibration, Command, NetFtBox, rdt_records, transform_matrix
 
 WRENCH = [1.5, -2.25, 10, 0.1, -0.05, 0.025]
 VECTOR = "00000001 000003E8 00000000 0016E360 FFDDAAF0 00989680 000186A0 FFFF3CB0 000061A8"
@@ -26,7 +27,13 @@ def test_sequence_numbers_wrap_and_counts_are_clipped() -> None:
 
 @pytest.fixture
 def box() -> NetFtBox:
-    return NetFtBox(lambda n: np.tile(WRENCH, (n, 1)))
+    box = NetFtBox(lambda n: np.tile(WRENCH, (n, 1)))
+    box._power_up()
+    return box
+
+
+def sent(box: NetFtBox) -> list[float]:
+    return [float(value) for value in (box._counts(box._measured(1)[0])[0] / 1e6).round(9)]
 
 
 def page(box: NetFtBox, path: str) -> dict[str, str]:
@@ -56,10 +63,97 @@ def test_configuration_page(box: NetFtBox) -> None:
     assert expected.items() <= configuration.items()
 
 
+def test_page_of_a_real_box(box: NetFtBox) -> None:
+    """Elements of a page of a Gamma SI-330-30, firmware 2.2.59."""
+    real = {
+        "runrate": "7000",
+        "scfgfu": "N",
+        "scfgtu": "Nm",
+        "cfgtfx": "0;0;132.710;0;0;0",
+        "scfgtdu": "mm",
+        "scfgtau": "degrees",
+        "cfgcpf": "1000000",
+        "cfgcpt": "1000000",
+        "cfgmr": "330;330;990;30;30;30",
+        "setcfgsel": "0",
+        "setbias": "745;17;447;184;-596;-253",
+    }
+    box.calibration = Calibration(rating=(330.0, 330.0, 990.0, 30.0, 30.0, 30.0))
+    assert real.items() <= page(box, "/netftapi2.xml").items()
+
+
+@pytest.mark.parametrize(
+    ("transform", "wrench"),
+    [
+        ((0, 0, 0, 0, 0, 0), [1, 2, 3, 0.1, 0.2, 0.3]),
+        ((0, 0, 100, 0, 0, 0), [1, 2, 3, 0.1 + 0.2, 0.2 - 0.1, 0.3]),
+        ((10, 0, 0, 0, 0, 0), [1, 2, 3, 0.1, 0.2 + 0.03, 0.3 - 0.02]),
+        ((0, 0, 0, 90, 0, 0), [1, 3, -2, 0.1, 0.3, -0.2]),
+        ((0, 0, 0, 0, 90, 0), [-3, 2, 1, -0.3, 0.2, 0.1]),
+        ((0, 0, 0, 0, 0, 90), [2, -1, 3, 0.2, -0.1, 0.3]),
+        ((0, 0, 0, 90, 90, 0), [2, 3, 1, 0.2, 0.3, 0.1]),
+        ((0, 0, 100, 90, 0, 0), [1, 3, -2, 0.1 + 0.2, 0.3, -0.2 + 0.1]),
+    ],
+)
+def test_tool_transformation_as_in_the_library_of_ati(transform: tuple[float, ...], wrench: list[float]) -> None:
+    box = NetFtBox(lambda n: np.tile([1, 2, 3, 0.1, 0.2, 0.3], (n, 1)), tool_transform=transform)
+    box._power_up()
+    assert sent(box) == pytest.approx(wrench)
+
+
+def test_tool_transformation_in_inches_and_radians() -> None:
+    box = NetFtBox(lambda n: np.tile(WRENCH, (n, 1)), distance_unit=1, angle_unit=2)
+    box.tool_transform = (1.0, 2.0, 3.0, 0.1, 0.2, 0.3)
+    box._power_up()
+    expected = transform_matrix(np.array([0.0254, 0.0508, 0.0762]), np.array([0.1, 0.2, 0.3])) @ WRENCH
+    assert sent(box) == pytest.approx(expected.tolist())
+    assert page(box, "/netftapi2.xml")["cfgtfx"] == "1.000;2.000;3.000;0.100;0.200;0.300"
+    assert page(box, "/netftapi2.xml")["scfgtdu"] == "in"
+    assert page(box, "/netftapi2.xml")["scfgtau"] == "radians"
+
+
+def test_by_default_only_the_torque_of_the_displacement_differs(box: NetFtBox) -> None:
+    fx, fy, *_ = WRENCH
+    moved = [0.1 + 0.13271 * fy, -0.05 - 0.13271 * fx, 0.025]
+    assert sent(box) == pytest.approx([*WRENCH[:3], *moved])
+
+
+def test_the_bias_is_in_gauge_counts_before_the_transformation() -> None:
+    bias = [100, -200, 300, -400, 500, -600]
+    box = NetFtBox(lambda n: np.tile(WRENCH, (n, 1)), bias=bias, gauge_offset=0, tool_transform=(0, 0, 100, 0, 0, 0))
+    box._power_up()
+    fx, fy, fz, tx, ty, tz = np.array(WRENCH) - [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608]
+    assert sent(box) == pytest.approx([fx, fy, fz, tx + 0.1 * fy, ty - 0.1 * fx, tz])
+    np.testing.assert_allclose(REFERENCE.matrix @ bias / 1e6, [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608])
+
+
+def test_bias_command_and_settings_page(box: NetFtBox) -> None:
+    before = sent(box)
+    box._request(Command.BIAS, 0, ("127.0.0.1", 9))
+    assert sent(box) == [0.0] * 6
+    assert page(box, "/netftapi2.xml")["setbias"] != "745;17;447;184;-596;-253"
+    box._power_up()
+    assert sent(box) == before
+    assert box.page("/setting.cgi?" + "&".join(f"setbias{i}=0" for i in range(6))) is not None
+    assert page(box, "/netftapi2.xml")["setbias"] == "0;0;0;0;0;0"
+    cleared = sent(box)
+    assert cleared != before, "the gauges have an offset of their own"
+    box._power_up()
+    assert sent(box) == cleared
+
+
+def test_tool_transformation_is_set_over_http(box: NetFtBox) -> None:
+    assert box.page("/config.cgi?cfgid=0&" + "&".join(f"cfgtfx{i}=0" for i in range(6))) is not None
+    assert page(box, "/netftapi2.xml")["cfgtfx"] == "0;0;0;0;0;0"
+    assert sent(box) == pytest.approx(WRENCH)
+    assert box.page("/config.cgi?cfgid=0&cfgtfx0=2.5&cfgtdu=4&cfgtau=2") is not None
+    assert page(box, "/netftapi2.xml").items() >= {"cfgtfx": "2.500;0;0;0;0;0", "scfgtdu": "cm", "cfgtau": "2"}.items()
+
+
 def test_calibration_page(box: NetFtBox) -> None:
     calibration = page(box, "/netftcalapi.xml?index=0")
     assert calibration["calsn"] == "FT12345"
-    assert calibration["calmr"] == "130;130;400;10;10;10"
+    assert "calmr" not in calibration, "no public page has it"
     assert (calibration["calcpf"], calibration["calfu"], calibration["caltu"]) == ("1000000", "2", "3")
 
 
@@ -67,11 +161,27 @@ def test_rate_is_set_over_http(box: NetFtBox) -> None:
     assert box.page("/comm.cgi?comrdtrate=500&comrdtbsiz=50") is not None
     assert (box.rate_hz, box.buffer_size) == (500, 40)
     assert page(box, "/netftapi2.xml")["comrdtrate"] == "500"
+    for asked, rate_hz in ((99, 100), (150, 152), (700, 700), (1, 1)):
+        box.page(f"/comm.cgi?comrdtrate={asked}")
+        assert box.rate_hz == rate_hz, "the next higher fraction of 7000 Hz"
     assert box.page("/comm.cgi?comrdtrate=9000") is not None
     assert box.rate_hz == 7000
 
 
-@pytest.mark.parametrize("path", ["/", "/comm.cgi?comrdtrate=fast", "/comm.cgi?what=1", "/config.cgi?cfgcalsel=1"])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/",
+        "/comm.cgi?comrdtrate=fast",
+        "/comm.cgi?what=1",
+        "/config.cgi?cfgcalsel=1",
+        "/config.cgi?cfgid=1&cfgtfx0=1",
+        "/config.cgi?cfgtfx0=nan",
+        "/config.cgi?cfgtdu=6",
+        "/setting.cgi?setbias0=40000",
+        "/setting.cgi?setbias0=1.5",
+    ],
+)
 def test_pages_that_are_not_there(box: NetFtBox, path: str) -> None:
     assert box.page(path) is None
 
@@ -79,19 +189,20 @@ def test_pages_that_are_not_there(box: NetFtBox, path: str) -> None:
 def test_counts_in_the_units_of_the_configuration(box: NetFtBox) -> None:
     box.calibration = Calibration(counts_per_force=1000, counts_per_torque=100, force_unit=1, torque_unit=1)
     assert page(box, "/netftapi2.xml")["scfgfu"] == "lbf"
+    box.tool_transform = [0.0] * 6
     box.measure = lambda n: np.tile([4.4482216152605, 0, 0, 0.1129848290276167, 0, 0], (n, 1))
-    counts, saturated = box._counts(2)
-    np.testing.assert_allclose(counts, [[1000, 0, 0, 100, 0, 0]] * 2)
+    measured, saturated = box._measured(2)
+    np.testing.assert_allclose(box._counts(measured), [[1000, 0, 0, 100, 0, 0]] * 2, atol=1e-9)
     assert not saturated.any()
 
 
-def test_saturation_clips_at_the_rating(box: NetFtBox) -> None:
+def test_saturation_clips_at_the_rating_of_the_transducer(box: NetFtBox) -> None:
     box.measure = lambda n: np.tile([0, 0, -500.0, 0, 0, 0], (n, 1))
-    counts, saturated = box._counts(1)
-    assert counts[0, 2] == -400e6
+    measured, saturated = box._measured(1)
+    assert measured[0, 2] == -400
     assert saturated.all()
     box.measure = lambda n: np.tile(WRENCH, (n, 1))
     box.saturated_axis = 3
-    counts, saturated = box._counts(1)
-    assert counts[0, 3] == 10e6
+    measured, saturated = box._measured(1)
+    assert measured[0, 3] == 10
     assert saturated.all()

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ftmocks.sensors.robotous import (
-    Model,
+    MODELS,
     RobotousCanNode,
     RobotousSensor,
     RobotousSerialBox,
@@ -68,9 +68,25 @@ def test_documented_sample(sensor: RobotousSensor[bytes]) -> None:
     assert sensor.execute(command("0A")) == [b"\x0a" + bytes.fromhex(SAMPLE)[1:]]
 
 
-def test_divisors_of_the_large_models(sensor: RobotousSensor[bytes]) -> None:
-    sensor.model = Model("RFT80-6A01", 50, 1000, (500,) * 3 + (20,) * 3)
-    assert sensor.samples(1)[0].hex().upper() == "0B01F4FF0603E803E8FE0C003200" + "0000"
+@pytest.mark.parametrize(
+    ("name", "torque_divisor"),
+    [
+        ("RFT40-SA01", 2000),
+        ("RFT44-SB01", 2000),
+        ("RFT60-HA01", 2000),
+        ("RFT64-SB01", 2000),
+        ("RFT64-6A01", 1000),
+        ("RFT80-6A01", 1000),
+        ("RFT80-6A02", 1000),
+    ],
+)
+def test_every_model_reports_its_name_and_has_its_divisors(
+    sensor: RobotousSensor[bytes], name: str, torque_divisor: int
+) -> None:
+    sensor.model = MODELS[name]
+    assert sensor.execute(command("01")) == [b"\x01" + name.encode().ljust(15, b"\0")]
+    small = "0B01F4FF0603E803E8FE0C003200" + "0000"
+    assert sensor.samples(1)[0].hex().upper() == (small if torque_divisor == 1000 else SAMPLE.replace(" ", ""))
 
 
 @given(st.lists(st.tuples(st.binary(max_size=30), st.binary(min_size=8, max_size=8)), max_size=5), st.data())
@@ -116,7 +132,9 @@ def test_damaged_packets_are_skipped_and_the_next_one_found() -> None:
         ("08 01 0E", bytes.fromhex("08 01 00") + bytes(13)),
         ("08 01 0F", bytes.fromhex("08 00 02") + bytes(13)),
         ("08 02 00", bytes.fromhex("08 00 02") + bytes(13)),
-        ("0F 08", bytes.fromhex("0F 01 00") + bytes(13)),
+        ("0F 06", bytes.fromhex("0F 01 00") + bytes(13)),
+        ("0F 07", bytes.fromhex("0F 00 02") + bytes(13)),
+        ("0F 08", bytes.fromhex("0F 00 02") + bytes(13)),
         ("0F 09", bytes.fromhex("0F 00 02") + bytes(13)),
         ("04 10 11 12", bytes.fromhex("04 00 01") + bytes(13)),
     ],
@@ -130,17 +148,26 @@ def test_commands_without_reply(sensor: RobotousSensor[bytes], request_: str) ->
     assert sensor.execute(command(request_)) == []
 
 
-@pytest.mark.parametrize(("code", "rate_hz"), list(enumerate([200, 10, 20, 50, 100, 200, 333, 500, 1000])))
-def test_rates(code: int, rate_hz: int, sensor: RobotousSensor[bytes]) -> None:
-    sensor.execute(command(f"0F {code:02X}"))
-    assert sensor.execute(command("10"))[0][1] == code
-    if rate_hz < 1000:
-        assert sensor.rate_hz == rate_hz
-        return
-    assert sensor.rate_hz == pytest.approx(115_200 / 190), "no more than the line carries"
-    sensor.execute(command("06 01"))
+@pytest.mark.parametrize(("baud_code", "fastest_hz"), [(0, 333), (1, 1000), (2, 500), (3, 500), (4, 333), (5, 200)])
+def test_the_baud_rate_limits_the_rate(baud_code: int, fastest_hz: int, readings: Readings) -> None:
+    sensor = RobotousSerialBox(readings, baud_code=baud_code)
     sensor.boot()
-    assert sensor.rate_hz == rate_hz
+    for code, rate_hz in enumerate([200, 10, 20, 50, 100, 200, 333, 500, 1000]):
+        before = sensor.rate_hz
+        allowed = rate_hz <= fastest_hz
+        assert sensor.execute(command(f"0F {code:02X}"))[0][1:3] == (b"\1\0" if allowed else b"\0\2")
+        assert sensor.rate_hz == (rate_hz if allowed else before)
+    assert RobotousCanNode(readings).execute(command("0F 08"))[0][1] == 1, "CAN carries every rate"
+
+
+def test_a_line_that_became_slower_sends_what_it_carries(readings: Readings) -> None:
+    sensor = RobotousSerialBox(readings, baud_code=1)
+    sensor.boot()
+    sensor.execute(command("0F 08"))
+    sensor.execute(command("06 00"))
+    assert sensor.rate_hz == 1000
+    sensor.boot()
+    assert sensor.rate_hz == pytest.approx(115_200 / 190)
 
 
 def test_settings_read_back_and_those_of_the_line_wait_for_a_reboot(sensor: RobotousSensor[bytes]) -> None:
@@ -161,6 +188,15 @@ def test_can_node_sets_identifiers_but_no_baud_rate(readings: Readings) -> None:
     assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 64 01 02 10 11 12")
     node.boot()
     assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 10 11 12 10 11 12")
+
+
+def test_can_node_with_identifiers_of_its_own(readings: Readings) -> None:
+    node = RobotousCanNode(readings, ids=(0xF0, 0xF1, 0xF2))
+    node.boot()
+    sample = b"\x0a" + bytes.fromhex(SAMPLE)[1:]
+    assert node._answer(CanFrame(0x64, command("0A"))) == []
+    assert node._answer(CanFrame(0xF0, command("0A"))) == [CanFrame(0xF1, sample[:8]), CanFrame(0xF2, sample[8:])]
+    assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 F0 F1 F2 F0 F1 F2")
 
 
 def test_can_node_answers_at_its_identifiers(readings: Readings) -> None:
@@ -207,9 +243,11 @@ def test_bias_is_taken_lifted_and_lost(sensor: RobotousSensor[bytes], readings: 
 
 @pytest.mark.parametrize("axis", range(6))
 def test_overload_bits_and_counts(sensor: RobotousSensor[bytes], readings: Readings, axis: int) -> None:
-    for wrench in (WRENCH, WRENCH + 210 * np.eye(6)[axis], WRENCH - 400 * np.eye(6)[axis], WRENCH):
-        readings.wrench = wrench
-        loaded = wrench is not WRENCH
+    unloaded = WRENCH * (np.arange(6) != axis)
+    rated = np.array([200, 200, 200, 8, 8, 8]) * np.eye(6)[axis]
+    for times in (0, 1.19, 1.2, -1.5, 0):
+        readings.wrench = unloaded + times * rated
+        loaded = abs(times) >= 1.2
         assert [field[13] for field in sensor.samples(3)] == [loaded * (0x20 >> axis)] * 3
     assert list(sensor.execute(command("12"))[0][1:7]) == [int(i == axis) for i in range(6)]
 

@@ -10,8 +10,9 @@ from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.runs.verification_record import FOREIGN
 from ftdrive.terminal.live import panels
 from ftdrive.terminal.live.layout import frame
-from ftdrive.terminal.live.panels import line_of_force, others, sphere
+from ftdrive.terminal.live.panels import _range, line_of_force, others, sphere
 from ftdrive.terminal.live.view import BAD, GOOD, WARNING, Line, Note, View
+from ftdrivers.interfaces import Fact
 from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, SIGMA, TARE, FakeStream
 from tests.unit.ftdrive.terminal.live.test_summary import Rig, reading_of
 
@@ -45,6 +46,17 @@ def test_the_line_of_force_passes_where_the_torque_says(
     reading = replace(reading_of(view), wrench=wrench, in_contact=True, sigma=SIGMA)
     assert text(line_of_force(reading)) == words
     assert text(line_of_force(replace(reading, in_contact=False))) == ""
+
+
+def test_range_is_used_by_the_load_where_the_zero_is_arbitrary(view: View) -> None:
+    bias = np.concatenate([view.info.calibration.force_bias_N, view.info.calibration.torque_bias_Nm])
+    facts = {"range": Fact((50.0,) * 3 + (10.0,) * 3, "configured")}
+    reading = replace(reading_of(view), raw=bias + np.array([0, 0, 20, 0, 0, 0]))
+    sensor = replace(view.info.sensor, facts=facts | {"zero": Fact("arbitrary", "assumed")})
+    line = text(_range(replace(view, reading=reading, info=replace(view.info, sensor=sensor))))
+    assert line.endswith("40 % used, most by Fz")
+    plain = replace(view.info.sensor, facts=facts)
+    assert text(_range(replace(view, reading=reading, info=replace(view.info, sensor=plain)))) != line
 
 
 def test_the_wrench_is_shown_with_fewer_stages_and_in_other_frames(view: View) -> None:

@@ -1,0 +1,66 @@
+"""The settings of the station's sensors."""
+
+from typing import Any
+
+import pytest
+
+from ftmocks.__main__ import _parser
+from ftmocks.sensors.catalogue import parse_settings
+from ftmocks.sensors.robotous import MODELS
+from ftmocks.station import truth_from
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "options"),
+    [
+        ("can", [], {}),
+        ("none", [], {}),
+        (
+            "robotous-can",
+            ["model=RFT64-6A01", "ids=0xF0,0xF1,242"],
+            {"model": MODELS["RFT64-6A01"], "ids": (0xF0, 0xF1, 0xF2)},
+        ),
+        ("bota", ["baud=230400", "boot-s=0.5"], {"baud_code": 3, "boot_s": 0.5}),
+        (
+            "netft",
+            ["tool-transform=0,0,0,0,0,90", "bias=0,0,0,0,0,0"],
+            {"tool_transform": [0, 0, 0, 0, 0, 90], "bias": [0] * 6},
+        ),
+    ],
+)
+def test_settings(name: str, settings: list[str], options: dict[str, Any]) -> None:
+    assert parse_settings(name, settings) == options
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "says"),
+    [
+        ("can", "model=1", "leave --sensor-setting out"),
+        ("both", "model=1", "leave --sensor-setting out"),
+        ("netft", "bias", "give tool-transform=VALUE or bias=VALUE"),
+        ("netft", "bias=1,2", "6 numbers"),
+        ("netft", "tool-transform=0,0,inf,0,0,0", "6 numbers"),
+        ("bota", "baud=1000", "unknown baud rate '1000'"),
+        ("bota", "boot-s=-1", "a time in s"),
+        ("robotous-can", "ids=1,1,2", "3 different"),
+        ("robotous-serial", "model=RFT1", "unknown model 'RFT1'"),
+    ],
+)
+def test_wrong_settings(name: str, setting: str, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        parse_settings(name, [setting])
+
+
+def test_biases_are_as_large_as_those_of_real_sensors() -> None:
+    def biases(sensor: str, *more: str) -> tuple[list[float], list[float]]:
+        options = _parser().parse_args(["station", "--sensor", sensor, "--seed", "3", *more])
+        truth = truth_from(options)
+        return truth.force_bias_N.tolist(), truth.torque_bias_Nm.tolist()
+
+    force_N, torque_Nm = biases("can")
+    for sensor, force_scale, torque_scale in (("robotiq", 3.3, 1.2), ("robotiq-urcap", 3.3, 1.2), ("netft", 1.1, 2.1)):
+        force, torque = biases(sensor)
+        assert force == pytest.approx([force_scale * value for value in force_N])
+        assert torque == pytest.approx([torque_scale * value for value in torque_Nm])
+    assert biases("robotiq", "--force-bias", "1,2,3")[0] == [1, 2, 3]
+    assert biases("both") == biases("none") == biases("ur-ft") == (force_N, torque_Nm)

@@ -1,0 +1,89 @@
+"""The text stream of the emulated URCap."""
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from ftmocks.sensors.robotiq_urcap import RobotiqUrcap, reading_text
+
+WRENCH = [12.34, -5.67, 100, 0.15, -0.025, 1]
+TEXT = b"( 12.340000 , -5.670000 , 100.000000 , 0.150000 , -0.025000 , 1.000000 )"
+
+
+def test_text_of_a_reading() -> None:
+    assert reading_text(WRENCH) == TEXT
+
+
+@contextmanager
+def connected(box: RobotiqUrcap, count: int) -> Iterator[list[socket.socket]]:
+    where = box.start()
+    clients = [socket.create_connection((where["host"], where["port"]), timeout=30) for _ in range(count)]
+    try:
+        yield clients
+    finally:
+        for client in clients:
+            client.close()
+        box.stop()
+
+
+def received(client: socket.socket, count: int) -> bytes:
+    data = b""
+    while len(data) < count:
+        data += client.recv(count - len(data))
+    return data
+
+
+def test_every_client_receives_readings_in_the_resolution_of_the_sensor() -> None:
+    box = RobotiqUrcap(lambda n: np.tile(np.array(WRENCH) + 0.0004, (n, 1)), port=0)
+    with connected(box, 2) as clients:
+        clients[0].sendall(b"SET ZRO")
+        for client in clients:
+            assert received(client, 3 * len(TEXT)) == 3 * TEXT, "without anything between"
+        clients[0].close()
+        assert received(clients[1], 20 * len(TEXT)) == 20 * TEXT
+
+
+def test_a_saturated_axis_and_the_end_of_the_connection() -> None:
+    box = RobotiqUrcap(lambda n: np.tile(WRENCH, (n, 1)), port=0, saturated_axis=2)
+    with connected(box, 1) as (client,):
+        assert received(client, len(TEXT)) == TEXT.replace(b"100.000000", b"327.670000")
+        box.unplug()
+        while client.recv(4096):
+            pass
+
+
+def test_it_listens_at_the_port_of_the_urcap() -> None:
+    box = RobotiqUrcap(lambda n: np.tile(WRENCH, (n, 1)), host="127.83.91.8")
+    with connected(box, 1) as (client,):
+        assert client.getpeername() == ("127.83.91.8", 63351)
+
+
+class Slow(socket.socket):
+    """A client whose buffer has room for so many bytes."""
+
+    def __init__(self, room: int) -> None:
+        super().__init__()
+        self.room, self.data = room, b""
+
+    def send(self, data: bytes, *_: int) -> int:  # type: ignore[override]
+        if not self.room:
+            raise BlockingIOError
+        sent = data[: self.room]
+        self.room -= len(sent)
+        self.data += sent
+        return len(sent)
+
+
+@pytest.mark.parametrize("room", [0, 1, 30, len(TEXT), len(TEXT) + 5])
+def test_a_client_that_does_not_read_loses_whole_readings(room: int) -> None:
+    box = RobotiqUrcap(lambda n: np.tile(WRENCH, (n, 1)))
+    with Slow(room) as client:
+        box._clients[client] = b""
+        box._deliver([TEXT] * 5)
+        client.room = 1000
+        box._deliver([TEXT] * 2)
+        assert client.data == TEXT * (client.data.count(b"(")), "no reading is broken"
+        assert client.data.endswith(2 * TEXT)
