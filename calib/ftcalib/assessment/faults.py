@@ -7,8 +7,8 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import stdtrit
 from scipy.spatial.transform import Rotation
+from scipy.special import stdtrit
 
 from ftcalib.assessment import units
 from ftcalib.assessment.observability import RECOMMENDED_POSES
