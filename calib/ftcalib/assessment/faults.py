@@ -7,8 +7,8 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
 from scipy.spatial.transform import Rotation
+from scipy.special import stdtrit
 
 from ftcalib.assessment import units
 from ftcalib.assessment.observability import RECOMMENDED_POSES
@@ -303,7 +303,7 @@ def _unexpected(R_base_flange: Array, wrench: Array, rows: NDArray[np.intp], cha
     squares = np.sum((wrench[others] - X @ slope) ** 2, axis=0).reshape(2, 3).sum(axis=1)
     noise = np.repeat(np.sqrt(squares / (3 * dof)), 3)  # of force and of torque
     leverage = np.einsum("ni,ij,nj->n", design[rows], np.linalg.pinv(X.T @ X), design[rows])
-    limit = stats.t.isf(BY_CHANCE, 3 * dof) * noise * np.sqrt(1 + leverage)[:, None] + _resolution(wrench)
+    limit = -stdtrit(3 * dof, BY_CHANCE) * noise * np.sqrt(1 + leverage)[:, None] + _resolution(wrench)
     return bool((np.abs(design[rows] @ slope - wrench[rows]) > limit)[:, channels].any())
 
 

@@ -3,7 +3,7 @@
 import hashlib
 import io
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -56,17 +56,13 @@ class MotionRecording:
     @classmethod
     def load(cls, path: Path) -> "MotionRecording":
         """Read a file, or the files of a folder; raises `BadDataset`."""
-        parts = list(cls.parts(path))
+        parts = list(map(cls.load_one, files_of(path)))
         samples = FtSamples.concatenate([one.samples for one in parts])
         return cls(samples, ArmStates.concatenate([one.states for one in parts]), parts[0].nominal_rate_Hz)
 
     @classmethod
-    def parts(cls, path: Path) -> "Iterator[MotionRecording]":
-        """Read one file after the other; raises `BadDataset`."""
-        return map(cls._load, _files(path))
-
-    @classmethod
-    def _load(cls, path: Path) -> "MotionRecording":
+    def load_one(cls, path: Path) -> "MotionRecording":
+        """Read one file; raises `BadDataset`."""
         try:
             data = arrays_of(path)
             if str(data.get("format")) != FORMAT:
@@ -93,9 +89,10 @@ def means_of(path: Path) -> tuple[Means, Means]:
 
     The files of a recording in parts are read twice, so that only one of them is in memory; raises `BadDataset`.
     """
+    files = files_of(path)  # once, because a recording goes on while it is read
     times = [
         (one.samples.t_host_ns, one.count, one.states.t_host_ns, one.states.t_device_s)
-        for one in MotionRecording.parts(path)
+        for one in map(MotionRecording.load_one, files)
     ]
     wrench_ns, counts, poses_ns, poses_s = (list(column) for column in zip(*times, strict=True))
     received = [np.concatenate(each) for each in (wrench_ns, poses_ns)]
@@ -110,7 +107,10 @@ def means_of(path: Path) -> tuple[Means, Means]:
     wrench, poses = Means(), Means()
     ends = np.cumsum([[len(one), len(other)] for one, other in zip(wrench_ns, poses_ns, strict=True)], axis=0)
     for one, t_w, t_p in zip(
-        MotionRecording.parts(path), np.split(wrench_s, ends[:-1, 0]), np.split(pose_s, ends[:-1, 1]), strict=True
+        map(MotionRecording.load_one, files),
+        np.split(wrench_s, ends[:-1, 0]),
+        np.split(pose_s, ends[:-1, 1]),
+        strict=True,
     ):
         wrench.add(t_w, one.samples.wrench)
         poses.add(t_p, np.hstack([one.states.R_base_flange.reshape(-1, 9), one.states.p_base_flange_m]))
@@ -129,7 +129,7 @@ def _columns(
         yield array
 
 
-def _files(path: Path) -> list[Path]:
+def files_of(path: Path) -> list[Path]:
     """Return the files of a recording: itself, or those of a folder in the order of their numbers."""
     files = sorted(path.glob("*.npz"), key=lambda file: file.stem.zfill(9)) if path.is_dir() else [path]
     if not files:
@@ -163,7 +163,7 @@ def solve_motion_file(
     """Calibrate from the recording of a run; circumstances as for `ftcalib.motion.solve.solve_motion`."""
     wrench, poses = means_of(path)
     digest = hashlib.sha256()
-    for file in _files(path):
+    for file in files_of(path):
         digest.update(file.read_bytes())
     source = {"recording": path.name, "recording_sha256": digest.hexdigest()}
     return solve_motion(

@@ -22,6 +22,7 @@ from ftcalib.assessment.faults import CHANNELS, _Rough, broken_channels, constan
 from ftcalib.known import Known
 from ftcalib.model import Array, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib.result import Method
 
 Sequence = Literal["xyz", "XYZ"]
 SIGMA = np.repeat([0.05, 0.00125], 3)
@@ -406,7 +407,7 @@ def test_readings_that_tie_because_they_are_rounded_are_neither_saturated_nor_co
 
 
 @pytest.mark.parametrize("method", ["ml", "srom", "lrom"])
-def test_readings_without_noise_are_not_saturated(method: str) -> None:
+def test_readings_without_noise_are_not_saturated(method: Method) -> None:
     R, wrench = of_a_level_base(3, 15, 0.0, 0.0)
     result = solve(CalibrationDataset(R, wrench, None, np.zeros(24, np.int64), np.arange(24.0)), method=method)
     assert result.verdict != "rejected"

@@ -69,7 +69,9 @@ def test_a_closed_terminal_ends_each_command_of_the_stream_well(command: str, tm
     terminal, slave = pty.openpty()
     process = subprocess.Popen(
         ["setsid", "--ctty", sys.executable, "-m", "ftdrive", *command.split(), *options],
-        **dict.fromkeys(("stdin", "stdout", "stderr"), slave),
+        stdin=slave,
+        stdout=slave,
+        stderr=slave,
         cwd=tmp_path,
     )
     os.close(slave)

@@ -3,11 +3,13 @@
 import zipfile
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ftcalib.errors import BadDataset
+from ftdrive.runs import motion
 from ftdrive.runs.motion import MotionRecording, means_of, measured_s
 from ftdrivers.interfaces import ArmStates, FtSamples
 
@@ -82,6 +84,22 @@ def test_parts_are_read_like_one_file_and_an_incomplete_one_is_ignored(tmp_path:
     for one, other in zip(means_of(folder), means_of(tmp_path / "motion.npz"), strict=True):
         for found, expected in zip(one.result(), other.result(), strict=True):
             np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_part_that_is_added_while_a_recording_is_read_waits_for_the_next_look(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "motion"
+    folder.mkdir()
+    recording().save(folder / "1.npz")
+
+    def measured_meanwhile(*arguments: Any) -> Any:
+        recording().save(tmp_path / "new.npz")
+        (tmp_path / "new.npz").replace(folder / "2.npz")
+        return measured_s(*arguments)
+
+    monkeypatch.setattr(motion, "measured_s", measured_meanwhile)
+    assert means_of(folder)[0].samples == 500
 
 
 def test_samples_that_are_received_late_do_not_move_the_others() -> None:

@@ -13,7 +13,7 @@ import pytest
 from ftcalib import Setup
 from ftdrive.errors import Declined
 from ftdrive.runs import outcome
-from ftdrive.runs.motion import MotionRecording
+from ftdrive.runs.motion import MotionRecording, files_of
 from ftdrive.runs.run import Run
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key
@@ -135,7 +135,9 @@ def test_what_was_recorded_before_a_failure_is_kept_and_solved(
 
 def test_memory_holds_one_part_at_a_time(free: Recorded, tmp_path: Path) -> None:
     run = passively(FakeCell(free), tmp_path, 8.0)
-    assert max(len(one.samples) for one in MotionRecording.parts(run.motion_path)) <= 500 * (PART_S + STEP_S)
+    assert max(len(one.samples) for one in map(MotionRecording.load_one, files_of(run.motion_path))) <= 500 * (
+        PART_S + STEP_S
+    )
 
 
 @pytest.mark.slow
