@@ -2,11 +2,9 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from ftdrive.cell.emulated import Station
-from ftdrive.terminal.report import compensation_error
 from tests.system.command_line import CommandLine
 
 pytestmark = pytest.mark.slow

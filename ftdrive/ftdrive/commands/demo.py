@@ -17,7 +17,14 @@ from ftdrive.terminal.report import compensation_error, errors_in_sigma, print_r
 
 
 @click.command()
-@click.option("--sensor", type=click.Choice(list(SENSORS)), default="can", show_default=True, help="Emulated sensor.")
+@click.option(
+    "--sensor",
+    type=click.Choice(list(SENSORS)),
+    metavar="NAME",
+    default="can",
+    show_default=True,
+    help=f"Emulated sensor: {', '.join(SENSORS)}.",
+)
 @click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the emulated truth and noise."
 )

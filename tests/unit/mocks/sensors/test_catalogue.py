@@ -63,4 +63,4 @@ def test_biases_are_as_large_as_those_of_real_sensors() -> None:
         assert force == pytest.approx([force_scale * value for value in force_N])
         assert torque == pytest.approx([torque_scale * value for value in torque_Nm])
     assert biases("robotiq", "--force-bias", "1,2,3")[0] == [1, 2, 3]
-    assert biases("both") == biases("none") == biases("ur-ft") == (force_N, torque_Nm)
+    assert biases("both") == biases("none") == (force_N, torque_Nm)
