@@ -43,8 +43,8 @@ coal: Any = importlib.import_module("coal")
 TARGET_M = 0.015
 SHAPES_M = 0.001
 """So far the meshes stand out of our shapes at most."""
-FOREARM_WRIST_2, BUILD_M = (3, 5), 0.030
-"""The planner leaves out the part of wrist 2 along axis 5: so far the build keeps it from the forearm."""
+FOREARM_WRIST_2, BUILD_M = (3, 5), 0.025
+"""The planner leaves out the part of wrist 2 along axis 5: so far the build of a UR3e keeps it from the forearm."""
 STEP_RAD = np.radians(1.0)
 RANDOM = 3000
 PARTS = ("base", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3", "tool")

@@ -103,8 +103,7 @@ def read_only(arm: RealArm, folder: Path) -> Iterator[Row]:
         yield f"{name} calibrate", why[:70], refused.returncode != 0 and "shape" in why
         station.control(do="hand-guide")
         manual = ftdrive.run("calibrate", "--config", config, "--manual", typed=TYPED)
-        (run,) = folder.glob("runs/*-calibrate") or [folder]
-        taken = len(list(run.glob("poses/*.npz")))
+        taken = len(list(folder.glob("runs/*-calibrate/poses/*.npz")))
         yield f"{name} manual", f"{taken} poses, exit code {manual.returncode}", taken >= 6
 
 

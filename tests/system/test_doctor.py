@@ -15,7 +15,15 @@ from ftdrive.commands.emulated_run import rehearse
 from tests.system.command_line import CommandLine, listen_for
 
 NAMED = {
-    *("robot.reachable", "robot.identity", "robot.remote", "robot.safety", "robot.program", "robot.flange"),
+    "robot.kinematics",
+    *(
+        "robot.reachable",
+        "robot.identity",
+        "robot.remote",
+        "robot.safety",
+        "robot.program",
+        "robot.flange",
+    ),
     *("clock.pace", "sensor.identity", "sensor.rate", "sensor.lost", "sensor.age", "sensor.status", "sensor.counts"),
     *(
         "sensor.range",

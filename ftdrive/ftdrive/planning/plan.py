@@ -13,6 +13,7 @@ from ftcalib.files import check_format, read_object, write_new
 from ftcalib.poses.information import Guess, Prediction, predicted_sigma, special
 from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.kinematics import wrist_refined
 from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_joint
 from ftdrivers.sweep import Sweep
 from ftdrivers.ur.kinematics import Array, Kinematics
@@ -213,7 +214,7 @@ class Plan:
             raise PlanRefused("a move of the plan cannot be proven clear: make a new plan")
 
     def of_arm(self, certifier: Certifier) -> "Plan":
-        """Return the same joint moves, certified with the kinematics of this arm; flange poses and distances are its.
+        """Return the plan for the kinematics of this arm: its wrist has the orientations, and the distances are its.
 
         A plan for another model, tool or scene is returned as it is: `require` refuses it. Raises `PlanRefused` if a
         move cannot be proven clear with these kinematics.
@@ -223,7 +224,9 @@ class Plan:
             return self
         if self.sweep is not None:
             raise PlanRefused("the sweep was planned with other kinematics: make a new plan on this arm")
-        q = np.array([step.q_rad for step in self.steps])
+        q = wrist_refined(certifier.arm.kinematics, self.nodes_rad, self.R_base_flange)
+        if np.abs(q).max() > 2 * np.pi:
+            q = self.nodes_rad
         following = np.roll(q, -1, axis=0)
         certificate, R = certifier.certify(q, following), certifier.arm.frames(q).R_base_flange
         if not certificate.clear.all():
@@ -236,6 +239,8 @@ class Plan:
         steps = tuple(
             replace(
                 step,
+                q_rad=tuple(q[i].tolist()),
+                turn_rad=float(np.abs(following[i] - q[i]).max()),
                 R_base_flange=tuple(tuple(row) for row in R[i].tolist()),
                 certified=bool(certificate.clear[i]),
                 clearance_m=float(certificate.clearance_m[i]),

@@ -112,7 +112,8 @@ def wrist_inverse(kinematics: Kinematics, q_arm_rad: ArrayLike, R_base_flange: A
     psi, q5, q6 = _wrist_angles(q_arm[0] + offset[0], R_base_flange)
     wrist = np.stack([psi - (q_arm + offset[:3])[1:].sum(), q5, q6], axis=2) - offset[3:]
     q = np.concatenate([np.broadcast_to(q_arm, wrist.shape), wrist], axis=2)
-    q = _refined(kinematics, q.reshape(-1, 6), np.repeat(R_base_flange, 2, axis=0)).reshape(q.shape)
+    if not is_exact(kinematics):
+        q = wrist_refined(kinematics, q.reshape(-1, 6), np.repeat(R_base_flange, 2, axis=0)).reshape(q.shape)
     q[:, :, [3, 5]] = _wrapped(q[:, :, [3, 5]])
     return q
 
@@ -158,7 +159,7 @@ def inverse(kinematics: Kinematics, R_base_flange: Array, p_base_flange_m: Array
     q = q.reshape(-1, 6)
     reached = np.flatnonzero(~np.isnan(q).any(axis=1))
     pose = reached // 8
-    found = _refined(kinematics, q[reached], R[pose], p[pose])
+    found = q[reached] if is_exact(kinematics) else _refined(kinematics, q[reached], R[pose], p[pose])
     at = frames(kinematics, found)
     off = np.maximum(np.abs(at.flange_m - p[pose]).max(axis=1), np.abs(at.R_base_flange - R[pose]).max(axis=(1, 2)))
     q[:] = np.nan
@@ -178,6 +179,11 @@ def _parallel(kinematics: Kinematics) -> tuple[tuple[float, ...], Array]:
     return lengths, _wrapped(theta + np.array([0.0, turned[0], turned[1] - turned[0], -turned[1], 0.0, 0.0]))
 
 
+def is_exact(kinematics: Kinematics) -> bool:
+    """Return whether the axes are exactly parallel or at right angles, as those of nominal arms."""
+    return all(bool(off.max() < ALIGNED) for off in deviation(kinematics))
+
+
 def deviation(kinematics: Kinematics) -> tuple[Array, Array]:
     """How far each link (6,) is from one of an arm with the same lengths and axes exactly parallel or at right angles.
 
@@ -195,8 +201,6 @@ def deviation(kinematics: Kinematics) -> tuple[Array, Array]:
 
 def _refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array, p_base_flange_m: Array | None = None) -> Array:
     """Newton's method from joint vectors (n, 6) to the nearest ones with these poses; without points, by the wrist."""
-    if max(map(np.max, deviation(kinematics))) < ALIGNED:
-        return q_rad
     first = 3 if p_base_flange_m is None else 0
     q = q_rad.copy()
     for _ in range(_STEPS):

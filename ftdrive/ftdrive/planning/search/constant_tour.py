@@ -9,7 +9,7 @@ the speed of the tool's tip is limited: 16 moves turn joint 6 alone. Wrist 1 tur
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftdrive.planning.geometry.kinematics import checked_joints, frames, wrist_refined
+from ftdrive.planning.geometry.kinematics import checked_joints, frames, is_exact, wrist_refined
 from ftdrivers.ur.kinematics import MODELS, Array, Kinematics
 
 # Orientation number in the paper, then psi = q2 + q3 + q4, q5 and q6 in degrees.
@@ -78,6 +78,6 @@ def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
     inside = q4[(np.abs(q4) <= 2 * np.pi - room).all(axis=1)]
     nearest = inside[np.abs(inside[:, 0] - q[3]).argmin()]
     tour = np.column_stack([np.tile(q[:3], (len(psi), 1)), nearest, q5, q6])
-    if kinematics is _NOMINAL:
+    if is_exact(kinematics):
         return tour
     return wrist_refined(kinematics, tour, frames(_NOMINAL, tour).R_base_flange)

@@ -27,6 +27,8 @@ from ftdrivers.errors import (
     StreamBroken,
 )
 from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
+from ftdrivers.ur.kinematics import MODELS
+from tests.own_kinematics import drawn
 from tests.unit.ftdrive.fake_cell import Lab
 
 FACTS = {
@@ -143,6 +145,24 @@ def test_a_remote_control_that_cannot_be_queried_fails(lab: Lab, monkeypatch: py
     monkeypatch.setattr(lab.arm, "in_remote_control", no_dashboard)
     found = diagnosis.check_remote(lab.arm)
     assert (found.state, found.fix) == ("failed", "enable the dashboard server")
+
+
+@pytest.mark.parametrize(
+    ("info", "state", "words"),
+    [
+        (DeviceInfo("UR5e", "A1", "5.15"), "warning", "none reported: plans use those of a nominal UR5e"),
+        (DeviceInfo("UR5e", "A1", "5.15", {"kinematics": Fact(MODELS["UR5e"].numbers, "device")}), "ok", "0.0 mm"),
+        (
+            DeviceInfo("UR5e", "A1", "5.15", {"kinematics": Fact(drawn("UR5e").numbers, "device")}),
+            "ok",
+            "5.2 mm and",
+        ),
+        (DeviceInfo("Acme", "A1", "5.15"), "skipped", "not known here"),
+    ],
+)
+def test_how_far_an_arm_is_from_its_nominal_model(info: DeviceInfo, state: str, words: str) -> None:
+    found = diagnosis.check_kinematics(info)
+    assert (found.state, words in found.found) == (state, True)
 
 
 def test_the_arm_is_the_configured_one() -> None:
