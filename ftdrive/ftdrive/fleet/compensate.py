@@ -114,13 +114,24 @@ def compensated_bytes(recording: bytes, name: str, task: bytes) -> bytes:
     A pure function of its arguments and the installed versions. Raises as `compensated_file`.
     """
     try:
-        with TemporaryDirectory(prefix="ftdrive-compensate-") as folder:
+        with TemporaryDirectory(prefix="ftdrive-compensate-", dir=_folder_of_worker()) as folder:
             source = Path(folder) / name
             source.write_bytes(recording)
             output, _, line = compensated_file(source, Path(folder), task).rpartition(b"\n")
             return Path(fsdecode(output)).read_bytes() + b"\n" + line
     except OSError as error:
-        raise OSError(f"{gettempdir()} on the worker: {error}: make room there, or set TMPDIR") from error
+        place = _folder_of_worker() or gettempdir()
+        raise OSError(f"{place} on the worker: {error}: make room there, or set TMPDIR") from error
+
+
+def _folder_of_worker() -> str | None:
+    """Return the folder of a Dask worker, which Dask removes also if the worker was killed; None elsewhere."""
+    try:
+        from distributed import get_worker
+
+        return str(get_worker().local_directory)
+    except (ImportError, ValueError):
+        return None
 
 
 def compensate_all(
