@@ -59,6 +59,16 @@ def require_version(version: str) -> None:
         )
 
 
+def folder_of_worker() -> str | None:
+    """Return the folder of a Dask worker, which Dask removes also if the worker was killed; None elsewhere."""
+    try:
+        from distributed import get_worker
+
+        return str(get_worker().local_directory)
+    except (ImportError, ValueError):
+        return None
+
+
 def in_words(error: BaseException) -> str:
     """Return why a call failed."""
     expected = isinstance(error, FtdriveError | OSError)
