@@ -14,7 +14,10 @@ from ftcalib import CalibrationDataset, CalibrationResult, Parameters
 from ftcalib.errors import NotObservable
 from ftcalib.model import predict
 from ftdrive.fleet.resolve import solved, task_of
+from ftdrive.runs.motion import MotionRecording
 from ftdrive.runs.run import RUN_FORMAT
+from ftdrivers.interfaces import ArmStates, FtSamples
+from tests.moving_load import Truth, record, sweep
 
 FIRST = datetime(2026, 8, 1, tzinfo=UTC)
 NOISE = np.repeat([0.005, 0.0002], 3)
@@ -64,6 +67,24 @@ def calibrated_run(
     document["provenance"] |= {"created_utc": created_utc, "run": name}
     if result.verdict != "rejected":
         (folder / "calibration.json").write_text(json.dumps(document))
+    return folder
+
+
+def swept_run(runs: Path, name: str, header: Mapping[str, Any] = {}) -> Path:
+    """Make the folder of a run with a recording in motion of 12 s, and without its result."""
+    folder = runs / name
+    folder.mkdir(parents=True)
+    created = {"format": RUN_FORMAT, "created_utc": FIRST.isoformat(), "command": "calibrate", "mode": "sweep"}
+    config = {"robot": {"host": "192.0.2.1"}, "site": {"g_m_s2": 9.80665}, "tool": {"name": "gripper"}}
+    (folder / "run.json").write_text(json.dumps({**created, "config": config, **header}))
+    recorded = record(Truth(), sweep(12.0), 12.0, 1, rates_Hz=(100.0, 100.0))
+    nothing = np.zeros((len(recorded.t_pose_s), 6))
+    received_ns = ((1e9 * t_s).astype(np.int64) for t_s in (recorded.t_pose_s, recorded.t_s))
+    t_pose_ns, t_ns = received_ns
+    R, p = recorded.R_base_flange, recorded.p_base_flange_m
+    states = ArmStates(t_pose_ns, recorded.t_pose_s, nothing, nothing, R, p)
+    samples = FtSamples.of(t_ns, np.arange(len(t_ns)), recorded.wrench)
+    MotionRecording(samples, states, 100.0).save(folder / "motion.npz")
     return folder
 
 

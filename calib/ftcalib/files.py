@@ -18,7 +18,7 @@ MOST_BYTES: Final = 200_000_000
 
 
 def write_new(path: str | Path, content: str | bytes) -> None:
-    """Write a new file: to `<name>.partial`, fsynced, then renamed.
+    """Write a new file: to `<name>.<process>.partial`, fsynced, then renamed.
 
     Parameters
     ----------
@@ -36,17 +36,15 @@ def write_new(path: str | Path, content: str | bytes) -> None:
     """
     path = Path(path)
     require_new(path)
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # of another process that writes the same name
     try:
         with partial.open("wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
             os.fsync(file.fileno())
-        _refuse_existing(path)
-        partial.rename(path)
-    except BaseException:
+        _give_name(partial, path)
+    finally:
         partial.unlink(missing_ok=True)
-        raise
     if os.name == "posix":  # so that the new name survives a power failure
         folder = os.open(path.parent, os.O_RDONLY)
         try:
@@ -60,6 +58,18 @@ def require_new(path: Path) -> None:
     _refuse_existing(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(f"the folder {path.parent} does not exist: create it first")
+
+
+def _give_name(written: Path, path: Path) -> None:
+    """Give a file its name; of two processes at once only one succeeds, where the disk has links."""
+    try:
+        path.hardlink_to(written)
+    except FileExistsError:
+        _refuse_existing(path)
+        raise
+    except (OSError, NotImplementedError):  # as on FAT
+        _refuse_existing(path)
+        written.rename(path)
 
 
 def _refuse_existing(path: Path) -> None:

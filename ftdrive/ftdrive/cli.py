@@ -19,7 +19,7 @@ from ftcalib.errors import DeviceError
 from ftdrive import __version__
 from ftdrive.errors import SupervisorGone, exit_code
 from ftdrive.terminal.command_names import COMMANDS
-from ftdrive.terminal.text import echo
+from ftdrive.terminal.text import echo, in_one_line
 
 _EPILOG = """\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
@@ -184,7 +184,7 @@ def _run(arguments: Sequence[str]) -> int:
         code = exit_code(error)
         if code is None or _closed_terminals:
             raise
-        _say(f"error: {in_a_sentence(error)}")
+        _say(f"error: {in_one_line(in_a_sentence(error))}")
         return code
 
 

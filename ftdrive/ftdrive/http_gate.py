@@ -8,6 +8,7 @@ import asyncio
 import logging
 import os
 import random
+import re
 import socket
 import sys
 from collections.abc import Callable, Collection, Mapping
@@ -27,10 +28,12 @@ _HEAD_S: Final = 10.0
 _HEAD_BYTES: Final = 1 << 16
 _PIECE: Final = 1 << 16
 
+_HOST: Final = re.compile(r"(\[(?P<v6>[0-9a-fA-F:.]+)\]|(?P<name>[\w.-]+))(:\d{1,5})?", re.ASCII)
+
 _log = logging.getLogger(__name__)
 
 
-def refusal(headers: Mapping[str, str] | HTTPMessage, bound: str, origins: Collection[str] = ()) -> str:
+def refusal(headers: Mapping[str, str] | HTTPMessage, bound: str, origins: Collection[str] | None = None) -> str:
     """Return why a request is refused; empty if it is served.
 
     Parameters
@@ -40,22 +43,23 @@ def refusal(headers: Mapping[str, str] | HTTPMessage, bound: str, origins: Colle
     bound : str
         The address at which the server listens; `0.0.0.0` and `::` are all addresses of this computer.
     origins : collection of str
-        Of foreign pages that are served, such as `https://app.foxglove.dev`. Those of the server itself always are.
+        Of foreign pages that `ftdrive stream` serves, such as `https://app.foxglove.dev`; None of a server that serves
+        only its own pages.
     """
     host = headers.get("Host", "")
     if not _is_bound(host, bound):
         return f"the server is not {host or 'named in the request'}: use its address"
     origin = headers.get("Origin")
-    if origin is None or origin in origins or urlsplit(origin).netloc == host:
+    if origin is None or origin in (origins or ()) or urlsplit(origin).netloc == host:
         return ""
-    return f"pages of {origin} are not served; `stream --allow-origin {origin}` serves them"
+    fix = "open the page of this server" if origins is None else f"`ftdrive stream --allow-origin {origin}` serves them"
+    return f"pages of {origin} are not served; {fix}"
 
 
 def _is_bound(host: str, bound: str) -> bool:
-    try:
-        name = urlsplit(f"//{host}").hostname or ""
-    except ValueError:
+    if (found := _HOST.fullmatch(host)) is None:
         return False
+    name = (found["v6"] or found["name"]).lower()
     is_local = bound in ("localhost", "0.0.0.0", "::")
     with suppress(ValueError):
         is_local |= ip_address(bound).is_loopback
@@ -94,7 +98,7 @@ class Gate:
     """
 
     def __init__(
-        self, bound: Address, behind: Callable[[str | None], Address], *, origins: Collection[str] = ()
+        self, bound: Address, behind: Callable[[str | None], Address], *, origins: Collection[str] | None = None
     ) -> None:
         self._host, self._behind, self._origins = bound[0], behind, origins
         self._clients: dict[str, str] = {}

@@ -112,3 +112,11 @@ def test_without_a_configuration_a_plan_needs_arm_and_tool(arguments: list[str],
 def test_settings_are_all_shown() -> None:
     shown = run("config", "show").stdout
     assert all(f"{key.split('.')[1]} =" in shown for key in settings())
+
+
+def test_a_password_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("FTDRIVE_STORE_URL", "postgresql+psycopg://lab:secret@host/db")
+    for options in ((), ("--origin",), ("--json",)):
+        shown = run("config", "show", *options)
+        assert "postgresql+psycopg://lab@host/db" in shown.output
+        assert "secret" not in shown.output

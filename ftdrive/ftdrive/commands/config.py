@@ -1,6 +1,7 @@
 """`ftdrive config`: the values in force, and the origin of each."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from shutil import get_terminal_size
 from typing import Any
@@ -23,12 +24,12 @@ def config() -> None:
 @EMULATED_SENSOR
 @JSON
 def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as_json: bool) -> None:
-    """Print the configuration in force, as a file that could be used in its place.
+    """Print the configuration in force, as a file that could be used in its place; a password is left out.
 
     An option of a command comes first, then the environment, then ./ftdrive.toml, then the user's file, then the
     default.
     """
-    from ftdrive.cell.config import RULES, settings
+    from ftdrive.cell.config import RULES, settings, without_password
     from ftdrive.cell.template import WIDTH, document
 
     check_simulate(simulate, real={"--config": path}, emulated={"--sensor": sensor})
@@ -39,6 +40,8 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
             found = settings(cell=station.cell)
     else:
         found = settings(path)
+    if (store := found["store.url"]).value is not None:
+        found["store.url"] = replace(store, value=without_password(store.value))
     if as_json:
         values: dict[str, dict[str, Any]] = {}
         origins: dict[str, dict[str, str]] = {}

@@ -2,10 +2,9 @@
 
 import gc
 import shlex
-from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import get_args
 
@@ -101,8 +100,9 @@ def report(
     check_simulate(simulate, real={"SOURCE": source}, emulated={"--sensor": sensor})
     if source is None and not simulate:
         raise ConfigError("nothing to report: give a calibration.json, a run folder or a CSV file, or --simulate")
+    chosen = output
     if output is None and form == "html":
-        output = next(one for one in _numbered(DEFAULT) if not one.exists())
+        output = _unused(DEFAULT)
         try:
             require_new(output)
         except OSError as error:
@@ -126,7 +126,12 @@ def report(
             facts = facts_of(subject)
             text = written(facts, form)
     if output is not None:
-        write_new(output, text)
+        try:
+            write_new(output, text)
+        except FileExistsError:  # another report took the name meanwhile
+            if chosen is not None:
+                raise
+            write_new(output := _unused(DEFAULT), text)
         say = beside(as_json)
         say.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}", say))
         say.print(f" Saved {output}")
@@ -136,10 +141,10 @@ def report(
         echo(text, nl=False, fold=False)
 
 
-def _numbered(path: Path) -> Iterator[Path]:
-    """Yield report.html, report-2.html and so on."""
-    yield path
-    yield from (path.with_stem(f"{path.stem}-{number}") for number in count(2))
+def _unused(path: Path) -> Path:
+    """Return report.html, report-2.html and so on: the first that does not exist."""
+    names = chain([path], (path.with_stem(f"{path.stem}-{number}") for number in count(2)))
+    return next(one for one in names if not one.exists())
 
 
 def _typed(context: click.Context) -> tuple[str, ...]:

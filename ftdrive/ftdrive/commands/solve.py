@@ -46,7 +46,7 @@ from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import read_calibration, read_source
 from ftdrive.terminal.console import beside, working
 from ftdrive.terminal.report import print_comparison, print_result
-from ftdrive.terminal.text import echo
+from ftdrive.terminal.text import echo, in_one_line
 
 _METHODS = (
     *("ml", "srom", "lrom", "carlson-relaxation", "carlson-cayley", "carlson-eigen", "carlson-nullspace"),
@@ -206,7 +206,7 @@ def _solve_each(
             first_failure = first_failure or error
             if as_json and not isinstance(error, NotAccepted):
                 write_json({"schema_version": 1, "source": str(source), "error": str(error)})
-            echo(f"error: {source}: {error}", err=True)
+            echo(in_one_line(f"error: {source}: {error}"), err=True)
     if first_failure is not None:
         raise SystemExit(exit_code(first_failure))
 

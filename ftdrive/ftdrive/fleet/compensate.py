@@ -15,7 +15,7 @@ from ftcalib import CalibrationResult
 from ftcalib.files import write_new
 from ftdrive import __version__
 from ftdrive.errors import BadRecording, ConfigError
-from ftdrive.fleet.workers import OtherVersion, Workers, answers, in_words, require_version
+from ftdrive.fleet.workers import OtherVersion, Workers, answers, folder_of_worker, in_words, require_version
 from ftdrive.live.samples import WrenchFrame
 from ftdrive.recording.compensation import compensated, read_with_calibration
 from ftdrive.recording.files import ENDINGS, format_of
@@ -114,13 +114,14 @@ def compensated_bytes(recording: bytes, name: str, task: bytes) -> bytes:
     A pure function of its arguments and the installed versions. Raises as `compensated_file`.
     """
     try:
-        with TemporaryDirectory(prefix="ftdrive-compensate-") as folder:
+        with TemporaryDirectory(prefix="ftdrive-compensate-", dir=folder_of_worker()) as folder:
             source = Path(folder) / name
             source.write_bytes(recording)
             output, _, line = compensated_file(source, Path(folder), task).rpartition(b"\n")
             return Path(fsdecode(output)).read_bytes() + b"\n" + line
     except OSError as error:
-        raise OSError(f"{gettempdir()} on the worker: {error}: make room there, or set TMPDIR") from error
+        place = folder_of_worker() or gettempdir()
+        raise OSError(f"{place} on the worker: {error}: make room there, or set TMPDIR") from error
 
 
 def compensate_all(

@@ -8,6 +8,7 @@ from ftdrive.errors import BadStore, ConfigError
 from ftdrive.fleet.serve import Reading
 from ftdrive.fleet.state import CellState
 from ftdrive.http_gate import Gate, hidden_host
+from ftdrive.terminal.text import visible
 
 try:
     from prometheus_client import CollectorRegistry, start_http_server
@@ -19,6 +20,11 @@ except ImportError:
 
 def _seconds(time: datetime | None) -> float | None:
     return None if time is None else time.timestamp()
+
+
+def _labels(*texts: str | None) -> list[str]:
+    """Return labels without control characters, which files and devices may contain."""
+    return [visible(text or "") for text in texts]
 
 
 OF_TOOL: Final[Mapping[str, tuple[str, Callable[[CellState], float | None]]]] = {
@@ -151,25 +157,25 @@ class MetricsServer(Collector):
         for one in cells:
             about = (one.arm_serial, one.sensor_serial, one.sensor_model, one.calibration_id, one.verdict)
             marked = "true" if one.emulated else "false"
-            info.add_metric([one.cell, *(text or "" for text in (one.tool, *about)), marked], 1)
+            info.add_metric(_labels(one.cell, one.tool, *about, marked), 1)
         yield info
         for name, (help_text, value_of) in OF_TOOL.items():
             family = GaugeMetricFamily(name, help_text, labels=TOOL)
             for one in cells:
                 value = value_of(one)
                 if value is not None:
-                    family.add_metric([one.cell, one.tool or ""], value)
+                    family.add_metric(_labels(one.cell, one.tool), value)
             yield family
         weighings = CounterMetricFamily(WEIGHINGS, "Parts weighed on the last day.", labels=TOOL)
         refusals = CounterMetricFamily(REFUSALS, "Weighings refused on the last day.", labels=(*TOOL, "code"))
         for one in cells:
             if one.weighings is not None:
-                weighings.add_metric([one.cell, one.tool or ""], one.weighings.number)
+                weighings.add_metric(_labels(one.cell, one.tool), one.weighings.number)
                 for code, number in one.weighings.refused.items():
-                    refusals.add_metric([one.cell, one.tool or "", code], number)
+                    refusals.add_metric(_labels(one.cell, one.tool, code), number)
         yield weighings
         yield refusals
         finding = GaugeMetricFamily(FINDING, "1 for each cell of a finding.", labels=("kind", "cell"))
         for kind, cell in sorted({(one.kind, cell) for one in reading.fleet.findings for cell in one.cells}):
-            finding.add_metric([kind, cell], 1)
+            finding.add_metric(_labels(kind, cell), 1)
         yield finding

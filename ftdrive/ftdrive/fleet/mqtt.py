@@ -27,6 +27,8 @@ RECONNECT_S: Final = 60
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 _REJECTED: Final = {134, 135}
 """Bad user name or password, and not authorized."""
+_NO_TOPIC: Final = re.compile(r"[@+#\x00-\x1f\x7f]|^\$")
+"""Wildcards, control characters and the broker's own topics, and what is left of a password that is not escaped."""
 _GOODBYE_S: Final = 1.0
 """So long a broker may take to receive the last message; then it sends the last will."""
 
@@ -59,7 +61,7 @@ class Broker:
         except ValueError:  # also of a password with characters that must be escaped
             host, port = "", None
         prefix = "" if not host else unquote(parts.path).strip("/")
-        if not host or parts.scheme not in _PORTS or parts.query or parts.fragment or re.search(r"[@+#]", prefix):
+        if not host or parts.scheme not in _PORTS or re.search(r"[?#]", url) or _NO_TOPIC.search(prefix):
             raise ConfigError(
                 "--mqtt is no address of a broker: give mqtt://[USER:PASSWORD@]HOST[:PORT][/PREFIX] or mqtts://…, with "
                 "special characters as %XX"

@@ -5,11 +5,13 @@ solved-<version>.json   ftdrive.calibration/1, in the run folder: the result of 
 """
 
 import json
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -20,11 +22,13 @@ from ftcalib.extras.difference import difference
 from ftcalib.files import read_file, read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
 from ftdrive import __version__
-from ftdrive.fleet.workers import OtherVersion, Workers, answers, in_words, require_version
-from ftdrive.runs.outcome import circumstances_of
-from ftdrive.runs.run import Run
+from ftdrive.fleet.workers import OtherVersion, Workers, answers, folder_of_worker, in_words, require_version
+from ftdrive.runs.outcome import circumstances_of, solve_in_motion
+from ftdrive.runs.run import Run, in_motion
 
 CHANGED_SIGMAS: Final = 3.0
+_IN_MOTION: Final = ("run.json", "events.ndjson", "motion*.npz", "motion/*.npz")
+"""Files of a run in motion from which its result is made."""
 
 
 def solved_path(folder: Path) -> Path:
@@ -78,14 +82,49 @@ def solved(dataset: bytes, task: bytes) -> bytes:
     """
     given: dict[str, Any] = json.loads(task)
     require_version(given["version"])
-    versions = {"ftdrive": __version__, **{name: version(name) for name in ("numpy", "scipy")}}
     try:
         document = json.loads(dataset)
     except ValueError as error:
         raise BadDataset(f"the dataset is not valid JSON ({error}): the file is damaged") from error
-    provenance = {**given["provenance"], "versions": versions}
+    provenance = {**given["provenance"], "versions": _versions()}
     circumstances = given["circumstances"] | {"setup": Setup(**given["circumstances"]["setup"])}
     result = solve(CalibrationDataset.from_dict(document), **circumstances, provenance=provenance)
+    return _content(result)
+
+
+def files_of(folder: Path) -> tuple[str, dict[str, bytes]]:
+    """Return the name of a run in motion and the files of which its result is made, for another computer."""
+    found = {file for pattern in _IN_MOTION for file in folder.glob(pattern)}
+    return folder.name, {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(found)}
+
+
+def solved_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
+    """Return the calibration file of a run in motion: a pure function as `solved`."""
+    with TemporaryDirectory(prefix="ftdrive-solve-", dir=folder_of_worker()) as place:
+        folder = Path(place) / name
+        (folder / "motion").mkdir(parents=True)
+        for path, content in files.items():
+            (folder / path).write_bytes(content)
+        if not any(path.startswith("motion/") for path in files):
+            (folder / "motion").rmdir()
+        return solved_motion(folder, version)
+
+
+def solved_motion(folder: Path, version: str) -> bytes:
+    """Return the calibration file of a run in motion, from its folder; raises as `solved`, and `OSError`."""
+    require_version(version)
+    run = Run(folder)
+    result = solve_in_motion(run)
+    provenance = {name: value for name, value in result.provenance.items() if name != "argv"}
+    provenance |= {"created_utc": run.header().get("created_utc"), "versions": _versions()}
+    return _content(replace(result, provenance=provenance))
+
+
+def _versions() -> dict[str, str]:
+    return {"ftdrive": __version__, **{name: version(name) for name in ("numpy", "scipy")}}
+
+
+def _content(result: CalibrationResult) -> bytes:
     return (json.dumps(result.to_dict(), allow_nan=False, indent=1) + "\n").encode()
 
 
@@ -131,7 +170,11 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
             yield folder, _compared(folder)
         else:
             rest.append(folder)
-    for folder, answer in answers(solved, task_of, rest, workers):
+    moved = dict.fromkeys(folder for folder in rest if in_motion(folder))
+    here = answers(solved_motion, lambda folder: (folder, __version__), moved, workers)
+    there = answers(solved_files, lambda folder: (*files_of(folder), __version__), moved, replace(workers, group=1))
+    at_rest = answers(solved, task_of, (folder for folder in rest if folder not in moved), workers)
+    for folder, answer in chain(at_rest, here if workers.share_files else there):
         if isinstance(answer, OtherVersion):
             raise answer
         yield folder, in_words(answer) if isinstance(answer, BaseException) else _compared(folder, answer)
@@ -147,8 +190,13 @@ def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
     except (BadCalibration, OSError) as error:
         return in_words(error)
     finding = None if new.verdict == "good" else new.findings[0]
-    if old is None or old.provenance.get("dataset_sha256") != new.provenance["dataset_sha256"]:
+    if old is None or _data_of(old) != _data_of(new):
         return Comparison(None, new.verdict, finding, PARAMETER_NAMES[0], 0.0)
     change = difference(old, new).in_sigmas
     most = int(np.argmax(np.abs(change)))
     return Comparison(old.verdict, new.verdict, finding, PARAMETER_NAMES[most], float(change[most]))
+
+
+def _data_of(result: CalibrationResult) -> object:
+    """Return the hash of the poses, or of the recording in motion, from which a result was made."""
+    return result.provenance.get("dataset_sha256") or result.provenance.get("recording_sha256")

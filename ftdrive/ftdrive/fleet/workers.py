@@ -18,6 +18,8 @@ from ftdrivers.errors import StreamBroken, Unreachable
 
 CONNECT_S: Final = 10.0
 """For a scheduler to answer, and for its first worker."""
+CHECK_S: Final = 5.0
+"""Without an answer, before the workers are counted again."""
 SAME: Final = ("ftdrive", "numpy", "scipy")
 """Packages whose versions a cluster must share, because the last digits depend on them."""
 
@@ -57,6 +59,16 @@ def require_version(version: str) -> None:
         )
 
 
+def folder_of_worker() -> str | None:
+    """Return the folder of a Dask worker, which Dask removes also if the worker was killed; None elsewhere."""
+    try:
+        from distributed import get_worker
+
+        return str(get_worker().local_directory)
+    except (ImportError, ValueError):
+        return None
+
+
 def in_words(error: BaseException) -> str:
     """Return why a call failed."""
     expected = isinstance(error, FtdriveError | OSError)
@@ -76,6 +88,8 @@ class Workers:
     """Calls that a worker gets at once."""
     share_files: bool = False
     """Whether a path means the same file to each worker."""
+    require_one: Callable[[], None] = lambda: None
+    """Raises `StreamBroken` if none is left, so that no call would ever be answered."""
 
 
 @contextmanager
@@ -137,17 +151,22 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
             f"no Dask scheduler answers at {address} ({error})", "start it, or correct --cluster"
         ) from error
     with config.set(_LARGE_CALLS), client:
+        start = f"start one: dask worker tcp://{found[1]}:{found[2]} --nthreads 1"
+
+        def require_one() -> None:  # `dask worker` starts another one in place of one that died
+            try:
+                client.wait_for_workers(1, timeout=timeout_s)
+            except OSError as error:
+                raise StreamBroken(f"the cluster {address} has no worker any more", f"{start}, and repeat") from error
+
         try:
-            client.wait_for_workers(1, timeout=timeout_s)
-        except TimeoutError as error:
-            raise Unreachable(
-                f"the cluster {address} has no worker",
-                f"start one: dask worker tcp://{found[1]}:{found[2]} --nthreads 1",
-            ) from error
+            require_one()
+        except StreamBroken as error:
+            raise Unreachable(f"the cluster {address} has no worker", start) from error
         _require_same_versions(client.get_versions(packages=list(SAME)), address)
         try:
             submit = client.get_executor(pure=False).submit
-            yield Workers(sum(client.ncores().values()), submit, dask.KilledWorker, GROUP)
+            yield Workers(sum(client.ncores().values()), submit, dask.KilledWorker, GROUP, require_one=require_one)
         except CancelledError as error:
             raise StreamBroken(f"the cluster {address} was lost", "start it, and repeat the command") from error
 
@@ -208,7 +227,9 @@ def _round(
                 died += calls
         if not running:
             return died
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
+        while not (done := wait(running, CHECK_S, FIRST_COMPLETED).done):
+            workers.require_one()
+        for future in done:
             called, raised = running.pop(future), future.exception()
             if isinstance(raised, workers.death):
                 died += called

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, solve
+from ftcalib.errors import NotObservable
 from ftcalib.extras.new_tool import new_tool
 from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
 from ftdrive.planning.geometry.scene import down_of
@@ -82,6 +83,8 @@ def earlier_of(run: Run) -> CalibrationResult | None:
 
 def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
     """Return a run's records as a dataset, the circumstances as `solve` takes them, and the provenance."""
+    if not records:
+        raise NotObservable(f"{run.folder} has no data to solve: {run.how_to_go_on}")
     circumstances, origin = circumstances_of(run)
     emulated = {"emulated": True} if origin["station"] is not None else {}
     dataset = dataset_from(records, {"run": run.folder.name, "devices": origin["devices"], **emulated})

@@ -201,6 +201,13 @@ class Run:
         return f"ftdrive {self.command} --resume {shlex.quote(str(self.folder))}"
 
     @property
+    def how_to_go_on(self) -> str:
+        """What to do about a run without data for a result. Raises `BadDataset`."""
+        if (mode := self.header().get("mode")) in ("sweep", "passive"):
+            return f"start again with --{mode}, because a recording in motion is not continued"
+        return f"continue it with {self.resume_command}"
+
+    @property
     def solve_command(self) -> str:
         """Command that solves the poses taken."""
         return f"ftdrive solve {shlex.quote(str(self.folder))}"

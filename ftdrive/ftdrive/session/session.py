@@ -106,6 +106,7 @@ def description_of(task: Task, options: SessionOptions, connected: Mapping[str, 
         "config": task.cell.to_dict(),
         "devices": {role: asdict(info) for role, info in connected.items()},
         "mode": options.mode,
+        **({"station": {}} if task.cell.is_emulated else {}),  # of another process: nothing more is known
         **options.description,
     }
 

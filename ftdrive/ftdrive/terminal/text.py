@@ -27,6 +27,19 @@ def visible(text: str) -> str:
     return _CONTROL.sub(lambda found: found[0].encode("unicode_escape", "surrogatepass").decode(), text)
 
 
+def in_one_line(text: str) -> str:
+    r"""Return text with its newlines as `\n`, but for those before a command, so that a name cannot begin a line.
+
+    Examples
+    --------
+    >>> print(in_one_line("there is no a\nerror: b; run\nftdrive devices"))
+    there is no a\nerror: b; run
+    ftdrive devices
+    """
+    first, *others = text.replace("\r", "\\r").split("\n")
+    return first + "".join(("\n" if is_command(line) else "\\n") + line for line in others)
+
+
 NARROWEST: Final = 20
 """Columns behind a head: with fewer, lines begin at the left."""
 

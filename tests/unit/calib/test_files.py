@@ -2,13 +2,14 @@
 
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from ftcalib import CalibrationDataset, files
 from ftcalib.data.dataset import read_csv
 from ftcalib.errors import BadDataset
-from ftcalib.files import object_of, read_file
+from ftcalib.files import object_of, read_file, write_new
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")], ids=["pipe", "endless device"])
@@ -35,3 +36,26 @@ def test_nested_brackets_are_no_defect(depth: int) -> None:
     content = '{"checksum": "x", "a": ' + "[" * depth + "]" * depth + "}"
     with pytest.raises(BadDataset):
         object_of(content.encode(), BadDataset)
+
+
+def test_of_two_writers_of_one_name_each_ends_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, links = tmp_path / "report.html", Path.hardlink_to
+
+    def meanwhile(new: Path, written: Path) -> None:
+        monkeypatch.undo()
+        with monkeypatch.context() as other:
+            other.setattr(os, "getpid", lambda: 1)
+            write_new(path, "first")
+        links(new, written)
+
+    monkeypatch.setattr(Path, "hardlink_to", meanwhile)
+    with pytest.raises(FileExistsError, match="is never overwritten: choose another name"):
+        write_new(path, "second")
+    assert path.read_text() == "first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_disk_without_links_takes_files_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "hardlink_to", Mock(side_effect=PermissionError))
+    write_new(tmp_path / "a", "text")
+    assert [(one.name, one.read_text()) for one in tmp_path.iterdir()] == [("a", "text")]

@@ -1,5 +1,6 @@
 """What the commands of a fleet that compute share: which runs, where, and the progress bar."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from datetime import datetime
@@ -52,26 +53,38 @@ def with_progress(title: str, found: Iterator[T], total: int) -> Iterator[T]:
 def runs_to_solve(folders: Sequence[Path], url: str | None, since: datetime | None = None) -> list[Path]:
     """Return the calibrations in these folders, or of the store; raises `ConfigError` if both are given.
 
-    Those without a dataset are left out, and counted on stderr.
+    Those without a dataset or a recording in motion are left out, and counted on stderr.
     """
     from ftdrive.errors import ConfigError
     from ftdrive.fleet.resolve import is_calibration, run_folders
-    from ftdrive.runs.run import Run
+    from ftdrive.runs.run import Run, in_motion
     from ftdrive.terminal.console import messages
 
     if folders and url:
         raise ConfigError("RUNS and --store exclude one another: leave one out")
     found = run_folders(folders) if folders else sorted({Path(one.path).parent for one in open_store(url).results()})
-    runs, unfinished = list[Path](), 0
+    runs, unfinished = list[Path](), Counter[str]()
     for run in found:
         if is_calibration(run, since):
-            if run.is_dir() and not Run(run).dataset_path.exists():
-                unfinished += 1
+            if run.is_dir() and not (Run(run).dataset_path.exists() or in_motion(run)):
+                unfinished[_how_to_finish(run)] += 1
             else:
                 runs.append(run)
-    if unfinished:
-        words = "`ftdrive calibrate --resume RUN` finishes one"
-        messages.print(f"Left out, because they have no dataset: {unfinished} runs; {words}.")
+    for words, count in unfinished.items():
+        messages.print(f"Left out, because they have no data to solve: {count} runs; {words}.")
     if not found:
         messages.print("No runs: name their folders, or add them to the store with `ftdrive fleet index RUNS`.")
     return runs
+
+
+def _how_to_finish(folder: Path) -> str:
+    from ftcalib.errors import DataError
+    from ftdrive.runs.run import Run
+
+    try:
+        mode = Run(folder).header().get("mode")
+    except (DataError, OSError):
+        mode = None
+    if mode in ("sweep", "passive"):
+        return f"start again with `ftdrive calibrate --{mode}`"
+    return "`ftdrive calibrate --resume RUN` finishes one"

@@ -19,6 +19,7 @@ def index(folders: Sequence[Path], url: str | None) -> None:
     from ftcalib.rounding import counted
     from ftdrive.fleet.cells import Owners
     from ftdrive.fleet.words import listed
+    from ftdrive.store.records import record_paths
     from ftdrive.terminal.console import answer, hanging, messages
 
     found = open_store(url)
@@ -29,6 +30,9 @@ def index(folders: Sequence[Path], url: str | None) -> None:
     if indexed.weighings:
         added += f" and {counted(indexed.weighings, 'day')} of weighings"
     answer.print(f" {added} added to {found.name}")
+    for folder in folders:
+        if not record_paths([folder]):
+            messages.print(f" No results in {folder}: name a run folder, or the folder that contains run folders.")
     if cells := found.cells():
         owners = Owners(cells)
         strange = {one.arm_serial or one.robot_host or "?" for one in found.results() if owners.cell_of(one) is None}

@@ -144,3 +144,10 @@ def test_a_cell_that_is_like_a_stored_one_is_refused(run: Callable[..., Ran], ce
     code, _, err = run("add", other)
     assert (code, "the cells twin and press have the same [robot] host 10.0.0.1" in err) == (2, True)
     assert len(json.loads(run("status", "--json")[1])["cells"]) == 2
+
+
+def test_a_folder_of_folders_of_runs_has_a_hint(run: Callable[..., Ran], tmp_path: Path) -> None:
+    result(0).save(new_run(tmp_path / "cells" / "runs", "one") / "calibration.json")
+    code, out, err = run("index", tmp_path / "cells")
+    assert (code, out.partition(" added")[0]) == (0, " 0 results and 0 verifications")
+    assert "name a run folder, or the folder that contains run folders" in " ".join(err.split())

@@ -65,10 +65,14 @@ def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(
 
 def test_runs_without_a_dataset_and_an_empty_store_are_mentioned(run: Callable[..., Ran], tmp_path: Path) -> None:
     (calibrated_run(tmp_path / "runs", "interrupted") / "dataset.json").unlink()
+    stopped = calibrated_run(tmp_path / "runs", "stopped", header={"mode": "sweep"})
+    (stopped / "dataset.json").unlink()
     code, out, err = run("runs")
     assert code == 0
     assert out.startswith("0 runs")
-    assert "they have no dataset: 1 runs" in err
+    words = " ".join(err.split())
+    assert "they have no data to solve: 1 runs; `ftdrive calibrate --resume RUN` finishes one" in words
+    assert "they have no data to solve: 1 runs; start again with `ftdrive calibrate --sweep`" in words
     assert "No runs: " in run()[2]
 
 

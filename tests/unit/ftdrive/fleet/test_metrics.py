@@ -6,6 +6,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from datetime import timedelta
 
 import pytest
@@ -125,6 +126,13 @@ def test_tools_of_a_cell_are_distinguished_and_any_name_is_escaped(server: Metri
     assert families.keys() == {one.removesuffix("_total") for one in NAMES}, (
         "the parser leaves the end of a counter out"
     )
+
+
+def test_labels_have_no_control_characters(server: MetricsServer) -> None:
+    server.update(reading(replace(cell("a", "grip\x1b[2Jper"), sensor_model="ATI\x07")))
+    text = scraped(server)
+    assert not set(text) & set(map(chr, [*range(10), *range(11, 32), 127]))
+    assert 'tool="grip\\\\x1b[2Jper"' in text
 
 
 def test_names_and_units_are_those_prometheus_asks_for(server: MetricsServer) -> None:

@@ -6,6 +6,7 @@ from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from ftdrive.fleet.resolve import (
     task_of,
 )
 from ftdrive.fleet.workers import Answer, Workers
-from tests.calibrated_runs import FIRST, calibrated_run, dataset
+from tests.calibrated_runs import FIRST, calibrated_run, dataset, swept_run
 
 
 def at_once(function: Callable[..., list[Answer]], *arguments: Any) -> "Future[list[Answer]]":
@@ -58,6 +59,19 @@ def test_the_result_is_that_of_the_run_and_replaces_nothing(tmp_path: Path) -> N
     assert new.provenance["setup"]["tool"] == "gripper"
     assert (folder / "calibration.json").read_bytes() == before
     assert solved_path(folder).read_bytes() == solved(*task_of(folder))
+
+
+def test_a_run_in_motion_is_solved_here_and_from_its_files_to_the_same_bytes(tmp_path: Path) -> None:
+    folder = swept_run(tmp_path, "swept")
+    assert again(folder).keys() == {folder}
+    solved_path(folder).rename(folder / "calibration.json")
+    with_folder = Workers(1, at_once, BrokenExecutor, share_files=True)
+    new = CalibrationResult.load(folder / "calibration.json")
+    expected = Comparison(new.verdict, new.verdict, ANY, "R_flange_sensor.x", 0.0)
+    assert dict(solve_again([folder], with_folder)) == {folder: expected}
+    assert solved_path(folder).read_bytes() == (folder / "calibration.json").read_bytes()
+    assert new.provenance["created_utc"] == FIRST.isoformat()
+    assert [new.provenance[name] for name in ("run", "recording")] == ["swept", "motion.npz"]
 
 
 def test_a_run_that_has_the_result_is_not_solved_again(tmp_path: Path) -> None:

@@ -10,7 +10,9 @@ import pytest
 
 from ftcalib.errors import BadDataset
 from ftdrive.errors import ConfigError
+from ftdrive.fleet import workers
 from ftdrive.fleet.workers import SAME, Answer, WorkerDied, Workers, _require_same_versions, answers, cluster_workers
+from ftdrivers.errors import StreamBroken
 
 ITEMS = [Path(f"run-{number}") for number in range(40)]
 
@@ -80,6 +82,19 @@ def test_workers_that_break_while_a_call_is_submitted_lose_only_time() -> None:
         return future
 
     assert dict(answers(name_of, own, ITEMS, Workers(1, submit, BrokenExecutor))) == {i: name_of(i) for i in ITEMS}
+
+
+def test_a_call_that_no_worker_is_left_for_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "CHECK_S", 0.0)
+    left = iter([True, True])
+
+    def require_one() -> None:
+        if not next(left, False):
+            raise StreamBroken("the cluster has no worker any more", "start one")
+
+    endless = Workers(1, lambda *_: Future[list[Answer]](), BrokenExecutor, require_one=require_one)
+    with pytest.raises(StreamBroken, match="no worker any more"):
+        list(answers(name_of, own, ITEMS, endless))
 
 
 @pytest.mark.parametrize("group", [1, 4])

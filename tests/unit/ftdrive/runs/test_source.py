@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationDataset, Known
-from ftcalib.errors import BadDataset
+from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import read_source
@@ -39,4 +39,14 @@ def test_a_recording_in_motion_has_no_poses(tmp_path: Path) -> None:
     run = Run.create(tmp_path, "gripper", {})
     run.motion_path.touch()
     with pytest.raises(BadDataset, match="in motion"):
+        read_source(run.folder, "R_base_flange")
+
+
+@pytest.mark.parametrize(
+    ("mode", "words"),
+    [("sweep", "start again with --sweep"), ("passive", "start again with --passive"), ("auto", "--resume")],
+)
+def test_a_run_without_data_says_how_to_go_on(mode: str, words: str, tmp_path: Path) -> None:
+    run = Run.create(tmp_path, "stopped", {"mode": mode, "config": {"site": {"g_m_s2": 9.81}}})
+    with pytest.raises(NotObservable, match=f"stopped has no data to solve: .*{words}"):
         read_source(run.folder, "R_base_flange")
