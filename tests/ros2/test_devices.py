@@ -19,6 +19,7 @@ from ftdrive.cell.emulated import REAL_PACE, Station
 from ftdrive.live.samples import Block
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.motion import MotionRecording, measured_s
+from ftdrive.runs.run import Run
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError, DeviceError, DeviceTimeout, NoRos2, StreamBroken
 from ftdrivers.registry import sensor_from_url
@@ -89,7 +90,7 @@ def test_a_passive_calibration_by_topics_gives_the_load_and_the_offset_of_the_cl
     result = CalibrationResult.load(path)
     assert result.motion is not None
     assert max(off_in_sigmas(result).values()) < 3.5  # the largest of ten
-    recording = MotionRecording.load(next(path.parent.glob("motion*.npz")))
+    recording = MotionRecording.load(Run(path.parent).motion_path)
     laid_s = [
         float(np.mean(measured_s(one.t_device_s, one.t_host_ns, 0) - one.t_device_s))
         for one in (recording.samples, recording.states)

@@ -1,6 +1,7 @@
 """What the node publishes, to rclpy and to a second implementation, and how it reports faults."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from threading import Event, Thread
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from scipy.spatial.transform import Rotation
 
@@ -314,3 +316,14 @@ def of_stamps(messages: list[Any], stamps: set[int]) -> Any:
             if one.header.stamp.sec * 10**9 + one.header.stamp.nanosec in stamps
         ]
     )
+
+
+def test_no_port_is_open_to_other_computers() -> None:
+    node = Node("local")
+    base = 7400 + 250 * int(os.environ["ROS_DOMAIN_ID"])  # of RTPS, in each domain
+    try:
+        at = {one.laddr.port: one.laddr.ip for one in psutil.Process().net_connections("udp4") if one.laddr}
+    finally:
+        node.close()
+    found = {ip for port, ip in at.items() if base <= port < base + 250}
+    assert found == {"127.0.0.1"}

@@ -4,8 +4,10 @@ docs/decisions/0179-ros-2-through-rclpy-alone.md gives the reason.
 """
 
 import importlib
+import os
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from threading import Thread
 from typing import Any, Final
 
@@ -16,6 +18,8 @@ WAYS: Final = (
     "Python), or install the extra on Linux x86-64: pip install 'ftdrive[ros2]'"
 )
 """Both ways to rclpy."""
+_PROFILES: Final = {"FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"}
+"""Variables that name the user's profiles of Fast DDS; it also reads DEFAULT_FASTDDS_PROFILES.xml where it starts."""
 
 
 def ros2_module(name: str) -> Any:
@@ -25,6 +29,17 @@ def ros2_module(name: str) -> Any:
     except ImportError as error:
         package = name.partition(".")[0]
         raise NoRos2(f"Python cannot import {package} ({error}): {WAYS}") from error
+
+
+def _stay_on_loopback() -> None:
+    """Have Fast DDS bind its ports to loopback where ROS is configured for this computer alone.
+
+    The range of discovery by itself leaves them open on all interfaces. A profile of the user goes first.
+    """
+    if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") != "LOCALHOST" or _PROFILES & os.environ.keys():
+        return
+    if not Path("DEFAULT_FASTDDS_PROFILES.xml").exists():
+        os.environ["FASTDDS_DEFAULT_PROFILES_FILE"] = str(Path(__file__).with_name("loopback.xml"))
 
 
 class Node:
@@ -46,6 +61,7 @@ class Node:
     def __init__(self, name: str, arguments: Sequence[str] = ()) -> None:
         rclpy = ros2_module("rclpy")
         self._executors = ros2_module("rclpy.executors")
+        _stay_on_loopback()
         self.context = rclpy.Context()
         try:
             rclpy.init(args=["ftdrive", *arguments], context=self.context)  # of a context: no signal handlers

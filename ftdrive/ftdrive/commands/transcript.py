@@ -10,6 +10,7 @@ from typing import Any
 import click
 import numpy as np
 
+from ftcalib.files import open_file
 from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import EMULATED, sensor_name, sensor_reached
 from ftdrive.cell.emulated_clock import LocalClock
@@ -132,6 +133,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
             _record(_emulated(sensor), path, 1.0, kept=False)
             loaded = Transcript.load(path)
     elif file is not None:
+        open_file(file).close()  # raises for what has no end
         loaded = Transcript.load(file)
     else:
         raise ConfigError("no transcript is given: add its FILE, or --simulate")

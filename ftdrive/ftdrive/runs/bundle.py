@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from ftcalib.errors import BadDataset, UsageError
-from ftcalib.files import check_format, read_file, read_object, write_new
+from ftcalib.files import check_format, open_file, read_file, read_object, write_new
 from ftdrive.cell.config import recorded_cell
 from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, check_permissions, check_workcell
 from ftdrive.errors import BadBundle
@@ -115,7 +115,7 @@ def unpacked(source: Path) -> Iterator[Path]:
 
 def _unpack(source: Path, folder: Path) -> Path:
     try:
-        with zipfile.ZipFile(source) as archive:
+        with open_file(source) as file, zipfile.ZipFile(file) as archive:
             members = archive.infolist()
             _require_harmless(members)
             archive.extractall(folder)

@@ -219,6 +219,13 @@ def test_a_pipe_in_a_run_is_left_out(tmp_path: Path) -> None:
     assert write_bundle(folder, tmp_path / "a.zip").left_out == ["calibration.json"]
 
 
+def test_a_bundle_without_end_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.zip").symlink_to("/dev/zero")
+    for command in (["solve"], ["transcript", "play"]):
+        assert run_command([*command, str(tmp_path / "a.zip")]) == 6
+        assert "is a pipe or a device" in capfd.readouterr().err
+
+
 def test_a_cut_off_bundle_and_another_file_are_named(
     bundled: tuple[Path, Bundled], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

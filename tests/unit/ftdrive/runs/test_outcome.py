@@ -18,7 +18,9 @@ from ftdrive.session.options import SessionOptions
 from ftdrive.session.preflight import Before, check_payload
 from ftdrive.session.session import description_of
 from ftdrive.session.task import Calibrating
+from ftdrivers.clock import REAL
 from tests.edited_files import edit
+from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import Lab
 
 MEASURED_KG = 1.2 * 9.81 / 9.80665
@@ -134,3 +136,9 @@ def test_a_mounting_counts_as_declared_only_if_it_was_given(mounting: str | None
     description = description_of(Calibrating(lab.cell), SessionOptions(lab.folder), {})
     found = circumstances_of(Run.create(lab.folder, "r", description))[0]["setup"].up_in_base
     assert found == (None if up is None else pytest.approx(up, abs=1e-12))
+
+
+def test_a_cell_with_a_clock_of_its_own_marks_its_results_as_emulated(lab: Lab) -> None:
+    for clock, station in ((FakeClock(), {}), (REAL, None)):
+        description = description_of(Calibrating(replace(lab.cell, clock=clock)), SessionOptions(lab.folder), {})
+        assert circumstances_of(Run.create(lab.folder, "r", description))[1]["station"] == station
