@@ -4,6 +4,8 @@
 lines, and only the lines that changed are sent to the terminal.
 """
 
+import signal
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -97,7 +99,7 @@ def run_live(
     app = LiveApp(feed, Summary(feed, [devices, *checks], dataset))
     feed.start()
     try:
-        app.run()
+        app.run_on_terminal()
     finally:
         feed.stop()
         for path in feed.recorded:
@@ -108,7 +110,36 @@ def run_live(
         raise feed.failure
 
 
-class ClosableDriver(LinuxDriver):
+class ClosableApp(App[None]):
+    """An app whose terminal may be closed: that ends it as its key to quit does, and then the command."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(_ClosableDriver, **options)
+
+    def run_on_terminal(self) -> None:
+        """Run; after a closed terminal the signal is repeated, for whoever handled it before."""
+        before = signal.getsignal(signal.SIGHUP)
+        closed = threading.Event()
+
+        def close(*_: object) -> None:
+            # In the loop of the app: an exception that a signal raises there can leave it waiting for ever.
+            closed.set()
+            if (loop := self._loop) is None:  # it is just starting
+                threading.Timer(_REFRESH_S, close).start()
+            elif not loop.is_closed():
+                loop.call_soon_threadsafe(self.exit)
+
+        if before not in {signal.SIG_IGN, None}:
+            signal.signal(signal.SIGHUP, close)
+        try:
+            self.run()
+        finally:
+            signal.signal(signal.SIGHUP, before)
+            if closed.is_set():
+                signal.raise_signal(signal.SIGHUP)
+
+
+class _ClosableDriver(LinuxDriver):
     """Draws on a terminal that may be closed: the thread of Textual that writes would end, and its queue then block."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -164,7 +195,7 @@ def _style(name: str, key: str) -> Style:
     return style + Style.from_meta({"@click": f"app.press('{key}')"}) if key else style
 
 
-class LiveApp(App[None]):
+class LiveApp(ClosableApp):
     """Draws what a `Feed` knows."""
 
     ENABLE_COMMAND_PALETTE = False
@@ -173,7 +204,7 @@ class LiveApp(App[None]):
     TITLE = "ftdrive live"
 
     def __init__(self, feed: Feed, summary: Summary) -> None:
-        super().__init__(ClosableDriver, ansi_color=True)  # the terminal's own colours, light or dark
+        super().__init__(ansi_color=True)  # the terminal's own colours, light or dark
         self.theme = "ansi-dark"
         self._feed, self._summary = feed, summary
         self._canvas = Canvas()

@@ -3,13 +3,13 @@
 import threading
 from typing import ClassVar
 
-from textual.app import App, ComposeResult
+from textual.app import ComposeResult
 from textual.widgets import Digits, Static
 
 from ftcalib.extras.weighing import Weight
 from ftcalib.rounding import counted, to_place_of
 from ftdrive.errors import NotAccepted
-from ftdrive.terminal.live_screen import ClosableDriver
+from ftdrive.terminal.live_screen import ClosableApp
 from ftdrive.terminal.weighing import Shown, Weighing, line_of
 
 _REFRESH_S = 0.1
@@ -51,7 +51,7 @@ class _Reader(threading.Thread):
         return "zero: the empty gripper was tared"
 
 
-class WeighApp(App[None]):
+class WeighApp(ClosableApp):
     """The scale.
 
     Parameters
@@ -69,7 +69,7 @@ class WeighApp(App[None]):
     ]
 
     def __init__(self, weighing: Weighing) -> None:
-        super().__init__(ClosableDriver)
+        super().__init__()
         self._weighing = weighing
         self.reader = _Reader(weighing)
 
@@ -133,7 +133,7 @@ def run_weigh(weighing: Weighing) -> None:
     """Show the scale until the user quits. Raises what ends it otherwise: of a device, or of the recording."""
     app = WeighApp(weighing)
     try:
-        app.run()
+        app.run_on_terminal()
     finally:
         app.reader.ends = True
         app.reader.join(2.0)
