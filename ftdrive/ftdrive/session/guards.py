@@ -343,8 +343,8 @@ class SafetyGuard(Guard):
         if status.program != "playing":
             raise fault(
                 Hazard.OTHER_CLIENT,
-                f"the control program is {status.program}: another client ended or paused it; leave the arm to "
-                "this program, then resume",
+                f"the control program is {status.program}: a second Ctrl-C, the pendant or another client ended or "
+                "paused it; leave the arm to this program, then resume",
             )
 
 
