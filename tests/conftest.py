@@ -3,6 +3,9 @@
 import gc
 import os
 import signal
+from contextlib import redirect_stderr, redirect_stdout
+from importlib import import_module
+from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -39,6 +42,8 @@ for _name in (
 ):
     os.environ.pop(_name, None)
 os.environ["TERM"] = "xterm-256color"
+with redirect_stdout(StringIO()), redirect_stderr(StringIO()):
+    import_module("ftdrive.terminal.console")  # its consoles see here whether they print on a terminal
 os.environ.pop("UV_RUN_RECURSION_DEPTH", None)  # or every command in a message would begin with `uv run`
 
 
