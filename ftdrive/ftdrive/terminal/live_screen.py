@@ -17,7 +17,7 @@ from rich.segment import Segment
 from rich.style import Style
 from textual import events
 from textual.app import App, ComposeResult
-from textual.drivers.linux_driver import LinuxDriver
+from textual.driver import Driver
 from textual.geometry import Region
 from textual.strip import Strip
 from textual.widget import Widget
@@ -114,7 +114,7 @@ class ClosableApp(App[None]):
     """An app whose terminal may be closed: that ends it as its key to quit does, and then the command."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__(_ClosableDriver, **options)
+        super().__init__(_closable_driver(), **options)
 
     def run_on_terminal(self) -> None:
         """Run; after a closed terminal the signal is repeated, for whoever handled it before."""
@@ -139,12 +139,16 @@ class ClosableApp(App[None]):
                 signal.raise_signal(signal.SIGHUP)
 
 
-class _ClosableDriver(LinuxDriver):
-    """Draws on a terminal that may be closed: the thread of Textual that writes would end, and its queue then block."""
+def _closable_driver() -> type[Driver]:
+    """Return a driver for a terminal that may be closed: the thread that writes would end, and its queue then block."""
+    from textual.drivers.linux_driver import LinuxDriver  # needs termios, which Windows has not
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self._file = cast("Any", _UntilClosed(self._file))
+    class ClosableDriver(LinuxDriver):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            self._file = cast("Any", _UntilClosed(self._file))
+
+    return ClosableDriver
 
 
 class _UntilClosed:
