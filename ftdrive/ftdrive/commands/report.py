@@ -4,7 +4,6 @@ import gc
 import shlex
 from dataclasses import replace
 from datetime import UTC, datetime
-from itertools import chain, count
 from pathlib import Path
 from typing import get_args
 
@@ -35,6 +34,7 @@ from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject
 from ftdrive.report.trust import trust
 from ftdrive.runs.bundle import unpacked
+from ftdrive.runs.run import unused_path
 from ftdrive.terminal.console import beside, hanging, messages, working
 from ftdrive.terminal.text import echo
 
@@ -102,7 +102,7 @@ def report(
         raise ConfigError("nothing to report: give a calibration.json, a run folder or a CSV file, or --simulate")
     chosen = output
     if output is None and form == "html":
-        output = _unused(DEFAULT)
+        output = unused_path(DEFAULT)
         try:
             require_new(output)
         except OSError as error:
@@ -131,7 +131,7 @@ def report(
         except FileExistsError:  # another report took the name meanwhile
             if chosen is not None:
                 raise
-            write_new(output := _unused(DEFAULT), text)
+            write_new(output := unused_path(DEFAULT), text)
         say = beside(as_json)
         say.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}", say))
         say.print(f" Saved {output}")
@@ -139,12 +139,6 @@ def report(
         write_json({**facts, "file": None if output is None else str(output)})
     elif output is None:
         echo(text, nl=False, fold=False)
-
-
-def _unused(path: Path) -> Path:
-    """Return report.html, report-2.html and so on: the first that does not exist."""
-    names = chain([path], (path.with_stem(f"{path.stem}-{number}") for number in count(2)))
-    return next(one for one in names if not one.exists())
 
 
 def _typed(context: click.Context) -> tuple[str, ...]:

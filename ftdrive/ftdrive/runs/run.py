@@ -214,7 +214,7 @@ class Run:
 
     def new_path(self, name: str, ending: str = ".json") -> Path:
         """Give the next free path for a file that may be written again: name.json, name-2.json and so on."""
-        return _next(self.folder / f"{name}{ending}")
+        return unused_path(self.folder / f"{name}{ending}")
 
     def append_event(self, event: Mapping[str, Any], *, sync: bool = False) -> None:
         """Add a line to events.ndjson, or nothing; with `sync` return when it is on disk. Any thread."""
@@ -312,7 +312,7 @@ class Run:
             **readings,
             **{name: getattr(record.samples, name) for name in _SAMPLE_COLUMNS},
         )
-        write_new(_next(self.folder / "poses" / f"{record.stop:02d}.npz"), buffer.getvalue())
+        write_new(unused_path(self.folder / "poses" / f"{record.stop:02d}.npz"), buffer.getvalue())
         return record
 
     def records(self) -> list[PoseRecord]:
@@ -413,7 +413,8 @@ def _numbered(path: Path) -> Iterator[Path]:
     yield from (path.with_stem(f"{path.stem}-{number}") for number in count(2))
 
 
-def _next(path: Path) -> Path:
+def unused_path(path: Path) -> Path:
+    """Return the first of name, name-2 and so on that does not exist."""
     return next(one for one in _numbered(path) if not one.exists())
 
 

@@ -117,7 +117,7 @@ class ClosableApp(App[None]):
         super().__init__(_closable_driver(), **options)
 
     def run_on_terminal(self) -> None:
-        """Run; after a closed terminal the signal is repeated, for whoever handled it before."""
+        """Run; after a closed terminal the signal is repeated, for its handler before."""
         before = signal.getsignal(signal.SIGHUP)
         closed = threading.Event()
 
