@@ -1,7 +1,7 @@
-"""Comparison of all methods on the same data."""
+"""Comparison of all methods on the same data, and of the cases of Yu's Table III."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
@@ -12,8 +12,9 @@ from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.files import JSON
 from ftcalib.known import Known
 from ftcalib.likelihood.session import Drift
-from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, angle_between, predict
-from ftcalib.published.methods import PUBLISHED
+from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, predict
+from ftcalib.poses.paper_sets import EVERY_SET, numbers_of
+from ftcalib.published.methods import PUBLISHED, published
 from ftcalib.result import CalibrationResult, Method
 from ftcalib.setup import NOTHING, Setup
 from ftcalib.solver import estimator_of, solve
@@ -37,6 +38,12 @@ class Compared:
     cv_force_rms_N: float = np.nan
     """Cross-validated: each pose predicted from all others; NaN if the method needs every pose."""
     cv_torque_rms_Nm: float = np.nan
+    largest_errors: Array | None = None
+    """(8,) on the test set, in the axes of the sensor: Fx, Fy, Fz and norm of F in N, the same of T in N·m."""
+    mass_error: float = np.nan
+    """Relative, of the reference."""
+    centre_error: float = np.nan
+    """Distance of the centre of mass from that of the reference, as a share of its distance from the sensor."""
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the JSON object that `ftdrive solve --method all --json` prints for a method."""
@@ -44,6 +51,11 @@ class Compared:
             return {"method": self.method, "reason": self.reason}
         cross_validated = (self.cv_force_rms_N, self.cv_torque_rms_Nm)
         force, torque = (None if np.isnan(rms) else rms for rms in cross_validated)
+        test: dict[str, JSON] = {}
+        if self.largest_errors is not None:
+            names = ("fx_N", "fy_N", "fz_N", "force_N", "tx_Nm", "ty_Nm", "tz_Nm", "torque_Nm")
+            largest = dict(zip(names, self.largest_errors.tolist(), strict=True))
+            test["test"] = {"largest": largest, "mass_error": self.mass_error, "centre_error": self.centre_error}
         return {
             "method": self.method,
             "mass_kg": self.mass_kg,
@@ -55,6 +67,7 @@ class Compared:
             "rotation_difference_rad": self.rotation_difference_rad,
             "residual": {"force_rms_N": self.force_rms_N, "torque_rms_Nm": self.torque_rms_Nm},
             "cross_validated": {"force_rms_N": force, "torque_rms_Nm": torque},
+            **test,
         }
 
 
@@ -66,6 +79,8 @@ def compare(
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
     setup: Setup = NOTHING,
     default: CalibrationResult | None = None,
+    test: CalibrationDataset | None = None,
+    truth: Parameters | None = None,
 ) -> list[Compared]:
     """Run all methods; a method that cannot use these data gives a reason instead.
 
@@ -76,6 +91,10 @@ def compare(
         As for `solve`. The published methods that need gravity take it from `known`, or assume a level base.
     default : CalibrationResult, optional
         What the default method has found with all of these, if that is known already.
+    test : CalibrationDataset, optional
+        Poses of the free tool that no method has seen, for the columns of Yu's Table III.
+    truth : Parameters, optional
+        Reference of mass and centre of mass in these columns, where known; else what the default method finds.
 
     Raises
     ------
@@ -107,8 +126,78 @@ def compare(
         force, torque = _rms(dataset.wrench - predict(parameters, dataset.R_base_flange))
         angle_rad = float(angle_between(parameters.R_flange_sensor, default.R_flange_sensor))
         mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
-        compared.append(Compared(method, None, parameters, mass_kg, angle_rad, force, torque, cv_force, cv_torque))
+        one = Compared(method, None, parameters, mass_kg, angle_rad, force, torque, cv_force, cv_torque)
+        compared.append(one if test is None else _tested(one, test, truth or default.parameters))
     return compared
+
+
+CASES: tuple[tuple[int, Method, str, str], ...] = (
+    *((1, "srom", "A", "D"), (2, "lrom", "A", "D"), (3, "lrom", "B", "D"), (4, "lrom", "B+C", "D")),
+    *((5, "lrom", "H", "D"), (6, "lrom", "E", "D"), (7, "lrom", "E+F", "D"), (8, "mixed", "A+E", "D")),
+    *((9, "lrom", "A+E", "D"), (10, "lrom", "A+B+C+E+F+G", "D"), (11, "lrom", "E", "G")),
+)
+"""Yu, Table III: number, method, sets of the estimate, set of the test (`ftcalib.poses.paper_sets`)."""
+
+
+def table_iii(
+    dataset: CalibrationDataset, numbers: Sequence[int], truth: Parameters | None = None
+) -> list[tuple[int, str, str, Compared]]:
+    """Repeat the eleven cases of Yu's Table III.
+
+    Parameters
+    ----------
+    dataset : CalibrationDataset
+        The sets A to G in any order, in one session.
+    numbers : sequence of int
+        Of each pose, as `ftcalib.poses.paper_sets.numbers_of` gives them.
+    truth : Parameters, optional
+        Reference of mass and centre of mass; default: the maximum likelihood estimate of all poses but those of D.
+
+    Returns
+    -------
+    list of (int, str, str, Compared)
+        Number of the case, sets of the estimate, set of the test, and the result with the columns of the table.
+
+    Raises
+    ------
+    NotObservable
+        A pose of a set is missing.
+    """
+    row_of = {int(number): row for row, number in enumerate(numbers)}
+
+    def part(sets: str) -> CalibrationDataset:
+        wanted = np.concatenate([numbers_of(name) for name in sets.split("+")]).tolist()
+        if missing := [number for number in wanted if number not in row_of]:
+            raise NotObservable(
+                f"{len(missing)} poses of the sets {sets} are missing: take {EVERY_SET}, without leaving out a pose"
+            )
+        rows = [row_of[number] for number in wanted]
+        return CalibrationDataset.of(dataset.R_base_flange[rows], dataset.wrench[rows], t_s=dataset.t_s[rows])
+
+    truth = truth or solve(part(CASES[9][2])).parameters
+    rows = []
+    for number, method, data, test in CASES:
+        found = part(data)
+        parameters = published(method, found.R_base_flange, gravity_direction_base=-UP_IN_BASE)(found.wrench)
+        rows.append((number, data, test, _tested(Compared(method, None, parameters), part(test), truth)))
+    return rows
+
+
+def _tested(compared: Compared, test: CalibrationDataset, truth: Parameters) -> Compared:
+    """Add the columns of Table III."""
+    parameters = compared.parameters
+    if parameters is None:
+        return compared
+    force, torque = np.split(test.wrench - predict(parameters, test.R_base_flange), 2, axis=1)
+    largest = [np.abs(np.column_stack([part, np.linalg.norm(part, axis=1)])).max(axis=0) for part in (force, torque)]
+    weight_N, true_N = (float(np.linalg.norm(p.gravity_force_base_N)) for p in (parameters, truth))
+    off_m = float(np.linalg.norm(parameters.p_sensor_com_m - truth.p_sensor_com_m))
+    return replace(
+        compared,
+        largest_errors=np.concatenate(largest),
+        mass_error=abs(weight_N / true_N - 1),
+        centre_error=off_m / max(float(np.linalg.norm(truth.p_sensor_com_m)), 1e-300),
+    )
 
 
 def _fitted(result: CalibrationResult) -> tuple[Parameters, float, float]:

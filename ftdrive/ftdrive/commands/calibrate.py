@@ -13,6 +13,8 @@ from ftdrive.commands.common import (
     CONTROL,
     FILE,
     FOLDER,
+    METHOD,
+    SETS,
     YES,
     NewFile,
     Number,
@@ -32,10 +34,12 @@ if TYPE_CHECKING:
     from ftdrive.runs.run import Mode
 
 _LONGEST_SWEEP_S = 120
-_OF_A_PLAN = ("--quick", "--minimal", "--output", "--png", "--view")
+_OF_A_PLAN = ("--quick", "--minimal", "--set", "--output", "--png", "--view")
 _EXCLUDE_ONE_ANOTHER = (
     ("--step", "--manual", "--listen", "--sweep", "--passive"),
-    ("--quick", "--minimal", "--plan", "--resume", "--sweep", "--passive"),
+    ("--quick", "--minimal", "--set", "--plan", "--resume", "--sweep", "--passive"),
+    ("--from", "--set"),
+    *(("--method", other) for other in ("--from", "--resume", "--sweep", "--passive")),
     ("--fast", "--sweep", "--passive"),
     ("--from", "--resume", "--passive"),
     *((hand, option) for hand in ("--manual", "--listen", "--passive") for option in _OF_A_PLAN),
@@ -55,6 +59,8 @@ _EXCLUDE_ONE_ANOTHER = (
 @simulate()
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
+@SETS
+@METHOD
 @click.option(
     "--from",
     "earlier",
@@ -108,6 +114,7 @@ def calibrate(
     manual: bool,
     listen: bool,
     resume: Path | None,
+    method: str,
     runs: Path,
     as_json: bool,
     **as_session: Any,
@@ -121,7 +128,7 @@ def calibrate(
     from ftdrive.cell.emulated import REAL_PACE, Station
     from ftdrive.commands.emulated_run import start_mover
     from ftdrive.runs.run import Run
-    from ftdrive.session.options import SessionOptions
+    from ftdrive.session.options import SessionOptions, method_of_poses
     from ftdrive.session.rehearsal import described
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import beside, messages
@@ -153,6 +160,7 @@ def calibrate(
         options = SessionOptions(
             runs,
             poses=poses,
+            method=method_of_poses(method),
             mode=mode,
             seconds=seconds or (600.0 if passive else 20.0),
             resume=resume,
@@ -183,7 +191,10 @@ def calibrate(
 def _refuse_contradictions(context: click.Context) -> None:
     from ftdrive.errors import ConfigError
 
-    params = {"from" if name == "earlier" else name: value for name, value in context.params.items()}
+    named = {"earlier": "from", "sets": "set"}
+    params = {named.get(name, name): value for name, value in context.params.items()}
+    if params["method"] == "ml":
+        params["method"] = None
     given = [f"--{name.replace('_', '-')}" for name, value in params.items() if value]
     for group in _EXCLUDE_ONE_ANOTHER:
         both = [option for option in group if option in given]

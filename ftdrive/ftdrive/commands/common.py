@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from functools import wraps
 from os import fsdecode
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast, get_args
 
 import click
@@ -41,6 +42,20 @@ def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F
     folder = click.Path(file_okay=False, path_type=Path)
     return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
 
+
+SETS = click.option(
+    "--set",
+    "sets",
+    metavar="A+E",
+    help="Sets A to H of orientations of Yu's Fig. 6, such as A+E, instead of 24 poses.",
+)
+METHOD = click.option(
+    "--method",
+    metavar="METHOD",
+    default="ml",
+    show_default=True,
+    help="Method of the result, as of `ftdrive solve`; srom takes the 24 poses of its paper.",
+)
 
 YES = click.option(
     "--yes",
@@ -221,6 +236,12 @@ def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> li
         wanted = " or ".join(map(str, counts))
         raise ConfigError(f"{option} is '{text}': give {wanted} numbers separated by '{separator}'")
     return values
+
+
+def method_names(methods: Sequence[str]) -> str:
+    """Return the lines below the options of a command that name its methods."""
+    names = fill(", ".join(methods), 76, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False)
+    return f"\b\nMETHOD is one of\n{names}"
 
 
 def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[float]] | None:

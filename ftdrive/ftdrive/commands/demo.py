@@ -8,10 +8,11 @@ import numpy as np
 
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import REAL_PACE, SENSORS, Station
-from ftdrive.commands.common import CONTROL, JSON, runs, stop_unless_accepted, write_json
+from ftdrive.commands.common import CONTROL, JSON, METHOD, SETS, runs, stop_unless_accepted, write_json
 from ftdrive.commands.emulated_run import rehearse
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
+from ftdrive.session.options import method_of_poses
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.report import compensation_error, errors_in_sigma, print_result
 
@@ -34,6 +35,8 @@ from ftdrive.terminal.report import compensation_error, errors_in_sigma, print_r
     metavar="VERSION",
     help="Version of the emulated controller, such as 10.11.0, which has no dashboard server.",
 )
+@SETS
+@METHOD
 @click.option("--sweep", is_flag=True, help="Calibrate in one smooth motion, and draw it (needs ftdrive[viz]).")
 @click.option(
     "--simulate", is_flag=True, expose_value=False, help="Emulate the cell: always on here, accepted by every command."
@@ -41,18 +44,29 @@ from ftdrive.terminal.report import compensation_error, errors_in_sigma, print_r
 @runs()
 @JSON
 def demo(
-    sensor: str, seed: int, control: str | None, polyscope: str | None, sweep: bool, runs: Path, as_json: bool
+    sensor: str,
+    seed: int,
+    control: str | None,
+    polyscope: str | None,
+    sets: str | None,
+    method: str,
+    sweep: bool,
+    runs: Path,
+    as_json: bool,
 ) -> None:
     """Calibrate an emulated cell: no real device is connected or moved. Takes about 25 s, a sweep 40 s.
 
     A UR5e and a sensor are emulated in another process, down to the bytes on their wires. The arm moves 20 times faster
     than a real one. The drivers, the session and the solver are those of a real cell.
     """
+    if sweep and (sets is not None or method != "ml"):
+        raise ConfigError("--sweep has no poses: leave out --set and --method")
     options = ["--seed", str(seed), *(["--polyscope", polyscope] if polyscope else []), *(REAL_PACE if sweep else ())]
     with Station(sensor, options, control_path=control or "auto") as station:
         truth = station.truth
         messages.print(f"Emulated UR5e, {SENSORS[sensor]}, tool of {truth['mass_kg']:.3f} kg. No real device is used.")
-        outcome = rehearse(station, runs, "demo", mode="sweep" if sweep else "auto")
+        mode = "sweep" if sweep else "auto"
+        outcome = rehearse(station, runs, "demo", mode=mode, sets=sets, method=method_of_poses(method))
         if sweep:
             _draw(station.cell, outcome.run)
     if as_json:
@@ -72,7 +86,7 @@ def demo(
         print_result(outcome.result, truth=truth, drift=outcome.drift, records=outcome.run.records(), hinted=False)
         messages.print_next(
             f"ftdrive live --calibration {quote(str(outcome.run.folder))} --simulate",
-            outcome.run.solve_command + ("" if sweep else " --method all"),
+            f"ftdrive solve {quote(str(outcome.run.folder))}" + ("" if sweep else " --method all"),
             "ftdrive init   (describe your own cell)",
         )
     stop_unless_accepted(outcome.result, to_be_saved=True)

@@ -4,24 +4,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ftdrive.cell.emulated import Station
     from ftdrive.runs.outcome import Outcome
-    from ftdrive.runs.run import Mode
     from ftdrive.session.options import SessionOptions
 
 
-def rehearse(
-    station: "Station", runs: Path, name: str, *, poses: int = 24, kept: bool = True, mode: "Mode" = "auto"
-) -> "Outcome":
+def rehearse(station: "Station", runs: Path, name: str, *, kept: bool = True, **options: Any) -> "Outcome":
     """Calibrate an emulated cell as `ftdrive.session.rehearsal.rehearse` does, and show it."""
     from ftdrive.session import rehearsal
     from ftdrive.terminal.screen import open_operator
 
     with open_operator() as operator:
-        return rehearsal.rehearse(station, runs, name, operator, poses=poses, kept=kept, mode=mode)
+        return rehearsal.rehearse(station, runs, name, operator, kept=kept, **options)
 
 
 def start_mover(station: "Station", options: "SessionOptions") -> None:
@@ -37,17 +34,19 @@ def start_mover(station: "Station", options: "SessionOptions") -> None:
 
 
 @contextmanager
-def rehearsed_run(sensor: str | None) -> Iterator[Path]:
+def rehearsed_run(sensor: str | None, **options: Any) -> Iterator[Path]:
     """Make a short run of an emulated cell; yields its folder, which is deleted afterwards.
 
     Parameters
     ----------
     sensor : str, optional
         As `sensor_name` takes it.
+    options
+        As of `SessionOptions`.
     """
     from ftdrive.cell.emulated import Station
 
     with TemporaryDirectory(prefix="ftdrive-") as runs:
         with Station.of(None, sensor) as station:
-            outcome = rehearse(station, Path(runs), "simulated", poses=6, kept=False)
+            outcome = rehearse(station, Path(runs), "simulated", kept=False, **options)
         yield outcome.run.folder

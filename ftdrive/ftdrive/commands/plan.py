@@ -9,6 +9,7 @@ import click
 from ftdrive.commands.common import (
     CONFIG,
     JSON,
+    SETS,
     NewFile,
     check_simulate,
     numbers,
@@ -37,6 +38,7 @@ USUAL_POSTURE_DEG = (45, -100, 60)
 )
 @click.option("--quick", is_flag=True, help="12 poses instead of 24.")
 @click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
+@SETS
 @click.option(
     "--cone", "cone_deg", type=float, metavar="DEG", help="Only poses with the tool within DEG of straight down."
 )
@@ -82,6 +84,7 @@ def plan(
     tool: tuple[str, ...],
     quick: bool,
     minimal: bool,
+    sets: str | None,
     cone_deg: float | None,
     box_mm: float | None,
     posture: str,
@@ -113,6 +116,8 @@ def plan(
     for one, other in ((quick, minimal), (cone_deg, box_mm)):
         if one and other:
             raise ConfigError("give --quick or --minimal, and --cone or --free-box, not both")
+    if sets is not None and (quick or minimal or cone_deg or box_mm):
+        raise ConfigError("--set names the poses: leave out --quick, --minimal, --cone and --free-box")
     check_simulate(simulate, real={"--config": config})
     require_viz(png, view=view)
     emulated = None
@@ -155,6 +160,7 @@ def plan(
             certifier,
             q_rad,
             6 if minimal else 12 if quick else 24,
+            sets=sets,
             cone_deg=cone_deg,
             box_mm=box_mm,
             tip_unlimited=_unlimited(tip_speed_limit),

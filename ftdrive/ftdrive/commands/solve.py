@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
-from textwrap import fill
-from typing import Any
+from typing import Any, get_args
 
 import click
 import numpy as np
@@ -12,12 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known
 from ftcalib import solve as solve_dataset
-from ftcalib.compare import compare
+from ftcalib.compare import compare, table_iii
 from ftcalib.data.dataset import Orientation
 from ftcalib.errors import AcceptanceError, DataError
 from ftcalib.extras.new_tool import new_tool, together
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import UP_IN_BASE
+from ftcalib.poses.paper_sets import EVERY_SET
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord, drift_check
 from ftdrive.commands.common import (
@@ -29,6 +29,7 @@ from ftdrive.commands.common import (
     Number,
     check_simulate,
     index_run,
+    method_names,
     numbers,
     simulate,
     stop_unless_accepted,
@@ -41,23 +42,19 @@ from ftdrive.recording.files import is_recording
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.new_tool import require_same_cell
 from ftdrive.runs.outcome import solve_in_motion
-from ftdrive.runs.pose_hints import hints
+from ftdrive.runs.pose_hints import hints, numbers_in_dataset
 from ftdrive.runs.run import Run, in_motion
-from ftdrive.runs.source import read_calibration, read_source
+from ftdrive.runs.source import Source, read_calibration, read_dataset, read_source
+from ftdrive.session.task import NEED_SPECIAL
 from ftdrive.terminal.console import beside, working
-from ftdrive.terminal.report import print_comparison, print_result
+from ftdrive.terminal.report import print_cases, print_comparison, print_result, print_tests
 from ftdrive.terminal.text import echo, in_one_line
 
-_METHODS = (
-    *("ml", "srom", "lrom", "carlson-relaxation", "carlson-cayley", "carlson-eigen", "carlson-nullspace"),
-    *("carlson-iterative", "carlson-polynomial", "known-rotation", "yaw-only", "all"),
-)
-_NAMES = "\b\nMETHOD is one of\n" + fill(
-    ", ".join(_METHODS), 76, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
-)
+_METHODS = (*get_args(Method), "all")
+_EPILOG = method_names(_METHODS)
 
 
-@click.command(epilog=_NAMES)
+@click.command(epilog=_EPILOG)
 @click.argument("sources", metavar="DATASET...", nargs=-1, type=click.Path(exists=True, path_type=Path))
 @click.option(
     "--method",
@@ -98,6 +95,15 @@ _NAMES = "\b\nMETHOD is one of\n" + fill(
     type=click.Path(exists=True, path_type=Path),
     help="A new tool: take mounting, base and gain from this result of the same sensor. 4 poses or 10 s of motion do.",
 )
+@click.option(
+    "--test",
+    metavar="RUN",
+    type=click.Path(exists=True, path_type=Path),
+    help="With --method all: largest errors on these poses of the free tool, as in Yu's Table III.",
+)
+@click.option(
+    "--table-iii", "cases", is_flag=True, help=f"The 11 cases of Yu's Table III, from a run with --set {EVERY_SET}."
+)
 @click.option("--together", "joined", is_flag=True, help="Join runs of one tool, each with a bias of its own.")
 @BAG_TOPICS
 @click.option("--point-mass", is_flag=True, help="In motion: the load is known to have no inertia of its own.")
@@ -118,6 +124,8 @@ def solve(
     wrench: Path | None,
     orientation_file: Path | None,
     earlier: Path | None,
+    test: Path | None,
+    cases: bool,
     joined: bool,
     wrench_topic: str | None,
     pose_topic: str | None,
@@ -144,27 +152,32 @@ def solve(
     sources = sources if pair is None else pair[:1]
     if not (sources or simulate):
         raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
+    if (test is not None or cases) and (method != ("ml" if cases else "all") or (test is not None and cases)):
+        raise ConfigError("--test goes with --method all, and --table-iii without either: leave one of them out")
     if (earlier is not None or joined) and (method != "ml" or (earlier is not None and joined)):
         raise ConfigError("--from and --together are for --method ml, one of the two at a time")
     if joined and pair is not None:
         raise ConfigError("--together joins poses at rest: leave out --wrench and --orientation-file")
     if joined and len(sources) < 2:
         raise ConfigError("--together joins two runs or more: name them, the oldest first")
-    if output is not None and ((len(sources) > 1 and not joined) or method == "all"):
+    if output is not None and ((len(sources) > 1 and not joined) or method == "all" or cases):
         raise ConfigError("--output takes one result: give one dataset and one method")
     read: dict[str, Any] = {
         "orientation": orientation,
         "known": known_values(mass_kg, level_deg, mounting_deg),
         "up_in_base": upward(up),
     }
+    tested = {"test": test, "cases": cases}
     motion = {"pair": pair, "point_mass": point_mass, "topics": (wrench_topic, pose_topic)}
     if joined:
         _solve_together(sources, drift, read, output, force, as_json)
         return
     if earlier is not None:
         read["earlier"] = read_calibration(earlier)
-    with rehearsed_run(sensor) if simulate else nullcontext() as run:
-        _solve_each(sources if run is None else [run], method, drift, read, motion, output, force, as_json)
+    poses = 24 if method in (*NEED_SPECIAL, "all") else 6
+    options = {"sets": EVERY_SET} if cases else {"poses": poses, "method": "ml" if method == "all" else method}
+    with rehearsed_run(sensor, **options) if simulate else nullcontext() as run:
+        _solve_each(sources if run is None else [run], method, drift, read, motion, tested, output, force, as_json)
     if output is not None and sources and sources[0].is_dir():
         index_run(sources[0])  # the result, if it was saved in the run
 
@@ -175,6 +188,7 @@ def _solve_each(
     drift: Drift,
     read: dict[str, Any],
     motion: dict[str, Any],
+    tested: dict[str, Any],
     output: Path | None,
     force: bool,
     as_json: bool,
@@ -186,8 +200,10 @@ def _solve_each(
                 options = {key: value for key, value in read.items() if key != "earlier"}
                 is_motion = is_recording(place) or is_bag(place) or in_motion(place)
                 if method == "all" and motion["pair"] is None and not is_motion:
-                    data = read_source(place, **options)
-                    _show_all(source, data.dataset, {"drift": drift, **data.circumstances}, as_json)
+                    _show_all(source, read_source(place, **options), drift, tested["test"], as_json)
+                    continue
+                if tested["cases"]:
+                    _show_cases(source, read_source(place, **options), as_json)
                     continue
                 result, records = _result_of(place, method, drift, read, motion)
                 if as_json:
@@ -280,13 +296,31 @@ def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) ->
         raise ConfigError(str(error)) from error
 
 
-def _show_all(source: Path, dataset: CalibrationDataset, options: dict[str, Any], as_json: bool) -> None:
+def _show_all(source: Path, data: Source, drift: Drift, test: Path | None, as_json: bool) -> None:
+    tests = None if test is None else read_dataset(test)
+    truth = data.truth
     with working("Solving with all methods"):
-        compared = compare(dataset, **options)
+        compared = compare(data.dataset, drift=drift, **data.circumstances, test=tests, truth=truth)
     if as_json:
         write_json({"schema_version": 1, "source": str(source), "methods": [one.to_dict() for one in compared]})
+        return
+    print_comparison(compared)
+    if tests is not None:
+        reference = "the truth of the emulated cell" if truth is not None else "ml"
+        title = f"Largest errors on the {len(tests)} poses of {test}; mg and centre against {reference}:"
+        print_tests([((one.method,), one) for one in compared], title)
+
+
+def _show_cases(source: Path, data: Source, as_json: bool) -> None:
+    if not data.records:
+        raise ConfigError(f"--table-iii needs the folder of a run with --set {EVERY_SET}, and {source} is none")
+    with working("Solving the cases of Table III"):
+        cases = table_iii(data.dataset, numbers_in_dataset(data.records), data.truth)
+    if as_json:
+        rows = [{"case": number, "data": sets, "test_set": on, **one.to_dict()} for number, sets, on, one in cases]
+        write_json({"schema_version": 1, "source": str(source), "cases": rows})
     else:
-        print_comparison(compared)
+        print_cases(cases, known=data.truth is not None)
 
 
 def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: str | None) -> Known | None:

@@ -42,7 +42,7 @@ Answer = Literal["ask", "no", "yes"]
     "Use the emulated cell of the calibration, or calibrate one first; --sensor emulated://NAME chooses its sensor."
 )
 @click.option("--quick", is_flag=True, help="2 poses instead of 6, at the plan's speeds after one complete slow run.")
-@click.option("--poses", type=click.IntRange(2, 24), help="Number of poses.")
+@click.option("--poses", type=click.IntRange(2, 500), help="Number of poses.")
 @click.option(
     "--max-force",
     "force_N",

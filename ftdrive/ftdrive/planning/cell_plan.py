@@ -13,7 +13,7 @@ from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene, lean_of
 from ftdrive.planning.motion import Speeds, slower
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import TOOL_POSES, guess_of, plan_box, plan_cone, plan_tool, plan_tour
+from ftdrive.planning.planner import TOOL_POSES, guess_of, plan_box, plan_cone, plan_sets, plan_tool, plan_tour
 from ftdrive.planning.sweep_planner import plan_sweep
 from ftdrivers.ur.kinematics import MODELS, Kinematics, model_named
 
@@ -36,11 +36,13 @@ def plan_for(
     *,
     cone_deg: float | None = None,
     box_mm: float | None = None,
+    sets: str | None = None,
     tip_unlimited: bool = False,
 ) -> Plan:
     """Plan a tour for a cell, with its certifier, from joint angles `q_rad` (6,).
 
-    Raises as `plan_cone` with `cone_deg`, `plan_box` with `box_mm`, `plan_tool` for four poses, else `plan_tour`.
+    Raises as `plan_cone` with `cone_deg`, `plan_box` with `box_mm`, `plan_sets` with `sets`, `plan_tool` for four
+    poses, else `plan_tour`.
     """
     speeds, guess = speeds_of(cell), guess_of(certifier, cell.tool.mass_kg)
     if tip_unlimited:
@@ -50,6 +52,8 @@ def plan_for(
         made = plan_cone(certifier, q_rad, poses, half_angle_rad=half_angle_rad, speeds=speeds, guess=guess)
     elif box_mm is not None:
         made = plan_box(certifier, q_rad, poses, half_size_m=box_mm / 1e3, speeds=speeds, guess=guess)
+    elif sets is not None:
+        made = plan_sets(certifier, q_rad, sets, speeds=speeds, guess=guess)
     elif poses == TOOL_POSES:
         made = plan_tool(certifier, q_rad, speeds=speeds, guess=guess)
     else:

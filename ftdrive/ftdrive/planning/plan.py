@@ -29,7 +29,7 @@ class Step:
     """One pose, and the move from it to the next one; the last move leads back to the first pose."""
 
     number: int
-    """Number of the orientation in the paper, 1 to 24; from 101 on for chosen poses."""
+    """Number of the orientation in the paper, 1 to 24; from 101 on for chosen poses, from 1001 on for sets."""
     q_rad: tuple[float, ...]
     R_base_flange: tuple[tuple[float, ...], ...]
     turn_rad: float
@@ -48,7 +48,7 @@ class Plan:
     """A closed tour of poses; `to_dict` defines the file."""
 
     kind: str
-    """constant, wrist, posture, box, cone, reachable, verification or sweep."""
+    """constant, wrist, posture, box, cone, reachable, tool, sets, verification or sweep."""
     why: tuple[str, ...]
     """What was tried, and the loss of accuracy of this choice."""
     made_for: Mapping[str, str]

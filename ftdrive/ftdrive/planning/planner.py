@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ftcalib.poses.information import SUBSET_6, T12, Guess, special
+from ftcalib.poses.paper_sets import COUNTS, names_of, numbers_of, paper_set
 from ftcalib.poses.verification_poses import FEWEST
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.errors import ConfigError, PlanRefused
@@ -20,7 +21,7 @@ from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.search import constant_tour
-from ftdrive.planning.search.chosen import Chosen, chosen_tour, verification_tour
+from ftdrive.planning.search.chosen import Chosen, chosen_tour, tour_of_sets, verification_tour
 from ftdrive.planning.search.nodes import WRIST_6_RAD, box_nodes, wrist_nodes
 from ftdrive.planning.search.postures import with_room
 from ftdrive.planning.search.tours import clear_tour
@@ -33,6 +34,8 @@ TOOL_POSES = 4
 """Of a new tool on a calibrated cell."""
 BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6
+SPARE = 100
+"""Orientations of a random set beyond those wanted: most of them are reachable."""
 
 Found = tuple[Sequence[int], Array]
 """Numbers of the orientations and joint vectors (n, 6), in the order of travel."""
@@ -215,6 +218,46 @@ def plan_box(
         "reach, or no tour of them is proven clear: give a larger box, or another centre"
     )
     return _first_found([("box", [_box_words(centre, half_size_m)], found)], refusal, certifier, speeds, guess)
+
+
+def plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Speeds, guess: Guess) -> Plan:
+    """Plan one tour through sets of orientations of Yu's Fig. 6.
+
+    Parameters
+    ----------
+    q_rad, guess
+        As of `plan_tour`.
+    sets : str
+        One of `ftcalib.poses.paper_sets.COUNTS`, or several, as A+E. Random orientations that are out of reach are
+        replaced by others of the same kind.
+
+    Raises
+    ------
+    ConfigError
+        There is no such set.
+    PlanRefused
+        Too few poses are reachable by moves that are proven clear.
+    """
+    q_now = checked_joints(q_rad)
+    try:
+        names = names_of(sets)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    down = certifier.scene.down_base
+    kinds = [
+        (_at_pan(q_now, NUMBERS[24]) if name == "A" else paper_set(name, spare=SPARE, down_base=down), COUNTS[name])
+        for name in names
+    ]
+    found = tour_of_sets(certifier, q_now, kinds, speeds)
+    if found is None:
+        raise PlanRefused(
+            f"no tour of the sets {sets} is reachable and proven clear: jog the arm to another posture, clear the "
+            "surroundings, or choose other sets"
+        )
+    numbers = np.concatenate([numbers_of(name) for name in names])[found[0]]
+    why = [f"{len(numbers)} poses: {', '.join(f'{name} {COUNTS[name]}' for name in names)} (Yu et al. 2021, Fig. 6)."]
+    why += [] if np.array_equal(found[1][0, :3], q_now[:3]) else [_elsewhere_words(found[1][0])]
+    return make_plan("sets", why, certifier, numbers.tolist(), found[1], speeds, guess)
 
 
 def plan_verification(

@@ -68,7 +68,7 @@ def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     dataset, circumstances, provenance = dataset_of(run, records)
     earlier = earlier_of(run)
     if earlier is None:
-        result = solve(dataset, **circumstances, provenance=provenance)
+        result = solve(dataset, run.method, **circumstances, provenance=provenance)
     else:
         require_same_cell(earlier, provenance)
         result = new_tool(earlier, dataset, provenance)

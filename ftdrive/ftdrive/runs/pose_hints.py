@@ -16,7 +16,12 @@ _CHANGES = {"com_shifted", "load_changed", "bias_stepped", "sensor_turned", "sen
 
 def names_of(records: Sequence[PoseRecord]) -> tuple[str, ...]:
     """Name the rows of a run's dataset: R and the number of the orientation."""
-    return tuple(f"R{record.pose.number:02d}" for record in _in_dataset(records))
+    return tuple(f"R{number:02d}" for number in numbers_in_dataset(records))
+
+
+def numbers_in_dataset(records: Sequence[PoseRecord]) -> tuple[int, ...]:
+    """Return the number of the orientation of each row of a run's dataset."""
+    return tuple(record.pose.number for record in _in_dataset(records))
 
 
 def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Finding, ...]:

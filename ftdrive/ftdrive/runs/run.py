@@ -44,6 +44,7 @@ import numpy as np
 from ftcalib.errors import BadDataset
 from ftcalib.files import check_format, open_file, parsed_json, read_file, read_object, write_new, write_object
 from ftcalib.model import Array
+from ftcalib.result import Method
 from ftcalib.routine import PoseRecord, TourPose
 from ftdrive import __version__
 from ftdrive.cell.config import recorded, without_password
@@ -208,9 +209,16 @@ class Run:
         return f"continue it with {self.resume_command}"
 
     @property
+    def method(self) -> Method:
+        """Method by which the poses are solved."""
+        method: Method = self.header().get("method", "ml")
+        return method
+
+    @property
     def solve_command(self) -> str:
         """Command that solves the poses taken."""
-        return f"ftdrive solve {shlex.quote(str(self.folder))}"
+        with_it = "" if self.method == "ml" else f" --method {self.method}"
+        return f"ftdrive solve {shlex.quote(str(self.folder))}{with_it}"
 
     def new_path(self, name: str, ending: str = ".json") -> Path:
         """Give the next free path for a file that may be written again: name.json, name-2.json and so on."""

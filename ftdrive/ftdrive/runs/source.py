@@ -1,14 +1,16 @@
 """Datasets and calibrations from any place that commands accept: run folders and single files."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, read_csv
 from ftcalib.data.dataset import Orientation
 from ftcalib.errors import BadDataset
-from ftcalib.model import STANDARD_GRAVITY_M_S2
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Parameters
 from ftcalib.routine import PoseRecord
 from ftdrive.runs.outcome import dataset_of, earlier_of
 from ftdrive.runs.run import Run, versions
@@ -26,6 +28,12 @@ class Source:
     """Only of a run."""
     earlier: CalibrationResult | None = None
     """Of a run of a new tool: the result that gives mounting, base and gain."""
+
+    @property
+    def truth(self) -> Parameters | None:
+        """What a perfect calibration finds, of an emulated cell that is described in the run."""
+        truth = (self.provenance.get("station") or {}).get("truth")
+        return None if truth is None else Parameters(*(np.array(truth[one.name]) for one in fields(Parameters)))
 
 
 def read_source(

@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_args
 
+from ftcalib.result import Method
 from ftdrive.errors import ConfigError
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Mode, Run
@@ -19,6 +20,10 @@ class SessionOptions:
     runs: Path
     name: str = "calibrate"
     poses: int = 24
+    sets: str | None = None
+    """Sets of Yu's Fig. 6 instead of that many poses, such as A+E."""
+    method: Method = "ml"
+    """By which a calibration is solved."""
     mode: Mode = "auto"
     """With `resume`, "auto" means the mode of that run."""
     dry_run: bool = False
@@ -47,6 +52,19 @@ class SessionOptions:
     def by_hand(self) -> bool:
         """Whether the operator or a program on the pendant moves the arm."""
         return self.mode in _BY_HAND
+
+
+def method_of_poses(name: str) -> Method:
+    """Return a method by its name, if poses suffice for it. Raises `ConfigError`."""
+    methods: tuple[Method, ...] = get_args(Method)
+    if name not in methods:
+        raise ConfigError(f"there is no method '{name}': choose one of {', '.join(methods)}")
+    if name == "carlson-cayley":
+        raise ConfigError(
+            "carlson-cayley needs the mass on the sensor: take the poses without --method, then "
+            "`ftdrive solve RUN --method carlson-cayley --mass-kg KG`"
+        )
+    return next(method for method in methods if method == name)
 
 
 def with_recorded_mode(options: SessionOptions) -> SessionOptions:

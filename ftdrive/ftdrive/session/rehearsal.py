@@ -8,7 +8,6 @@ from ftcalib import CalibrationResult
 from ftdrive.cell.emulated import Station
 from ftdrive.errors import Declined, NotAccepted
 from ftdrive.runs.outcome import Outcome
-from ftdrive.runs.run import Mode
 from ftdrive.session.events import Event
 from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.session.options import SessionOptions
@@ -72,15 +71,15 @@ def rehearse(
     name: str,
     operator: Operator,
     *,
-    poses: int = 24,
     kept: bool = True,
-    mode: Mode = "auto",
+    **options: Any,
 ) -> Outcome:
-    """Calibrate an emulated cell; `kept` says whether the folder `runs` outlives the calibration."""
-    options = SessionOptions(
-        runs, name, poses=poses, mode=mode, real=False, questions=False, description=described(station)
-    )
-    outcome = calibrate(station.cell, operator if kept else _Unkept(operator, runs), options)
+    """Calibrate an emulated cell.
+
+    `kept` says whether the folder `runs` outlives the calibration; the other keywords are those of `SessionOptions`.
+    """
+    chosen = SessionOptions(runs, name, real=False, questions=False, description=described(station), **options)
+    outcome = calibrate(station.cell, operator if kept else _Unkept(operator, runs), chosen)
     if outcome is None:
         raise RuntimeError("a rehearsal is never a dry run")
     return outcome

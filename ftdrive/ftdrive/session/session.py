@@ -30,9 +30,9 @@ from ftdrivers.interfaces import DeviceInfo
 
 def calibrate(cell: CellConfig, operator: Operator, options: SessionOptions) -> Outcome | None:
     """Guide the operator through a calibration; None after a dry run. Raises as `take_poses`."""
-    task = Calibrating(cell, options.real)
+    task = Calibrating(cell, options.real, options.sets, options.method)
     if options.mode == "sweep":
-        task = Sweeping(on_script_path(cell), options.real, options.seconds)
+        task = Sweeping(on_script_path(cell), options.real, seconds=options.seconds)
     run = take_poses(task, operator, options)
     return None if run is None else solve_and_save(run)
 
@@ -106,6 +106,7 @@ def description_of(task: Task, options: SessionOptions, connected: Mapping[str, 
         "config": task.cell.to_dict(),
         "devices": {role: asdict(info) for role, info in connected.items()},
         "mode": options.mode,
+        **({} if options.method == "ml" else {"method": options.method}),
         **({"station": {}} if task.cell.is_emulated else {}),  # of another process: nothing more is known
         **options.description,
     }

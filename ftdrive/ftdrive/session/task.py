@@ -1,17 +1,23 @@
 """What a session takes its poses for: a calibration, or a verification (`verifying.py`)."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar, Final, Protocol
 
 from ftcalib import CalibrationResult
 from ftcalib.model import Array
+from ftcalib.result import Method
 from ftdrive.cell.config import CellConfig
+from ftdrive.errors import PlanRefused
 from ftdrive.planning.cell_plan import plan_for
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import NUMBERS
 from ftdrive.session.forecast import Averages, prediction
 from ftdrive.session.live_fit import Judge, RunningFit
+
+NEED_SPECIAL: Final = ("srom", "mixed")
+"""Methods that need all 24 special orientations."""
 
 
 class Task(Protocol):
@@ -58,10 +64,22 @@ class Calibrating:
     cell: CellConfig
     real: bool = True
     """Whether a real arm moves."""
+    sets: str | None = None
+    """Sets of Yu's Fig. 6 instead of a number of poses."""
+    method: Method = "ml"
+    """By which the poses are to be solved."""
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
-        """Return a tour."""
-        return plan_for(self.cell, certifier, q_rad, poses)
+        """Return a tour. Raises `PlanRefused` if it lacks orientations that the method needs."""
+        plan = plan_for(self.cell, certifier, q_rad, poses, sets=self.sets)
+        special = sum(step.number <= len(NUMBERS[24]) for step in plan.steps)
+        if self.method in NEED_SPECIAL and (special < 24 or (self.method == "srom" and len(plan.steps) > 24)):
+            more = f"{len(plan.steps) - special} other poses" if special == 24 else f"{special} of them"
+            raise PlanRefused(
+                f"{self.method} needs the 24 special orientations, and the tour has {more}: "
+                + ("choose --method mixed" if special == 24 else "choose --method lrom, or jog the arm to more room")
+            )
+        return plan
 
     def judge(self, *, by_hand: bool) -> Judge:
         """Return the running fit."""

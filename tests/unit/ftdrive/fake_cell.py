@@ -475,7 +475,7 @@ class Lab:
 
     def sweep(self, **options: Any) -> Run | None:
         chosen = SessionOptions(self.folder / "runs", mode="sweep", **options)
-        return session.take_poses(Sweeping(self.cell, chosen.real, 10.0), self.operator, chosen)
+        return session.take_poses(Sweeping(self.cell, chosen.real, seconds=10.0), self.operator, chosen)
 
     def run(self) -> Run:
         (folder,) = (self.folder / "runs").iterdir()

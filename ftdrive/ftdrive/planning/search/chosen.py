@@ -4,9 +4,8 @@ Informative poses follow the design of `ftcalib.poses.selection`, which keeps th
 directions out of one plane.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +32,8 @@ NEARLY = 1.05
 """No other posture is tried if the predicted error is within this factor of the best poses of the cone."""
 OTHER_POSTURES = 2
 POSTURE_STEP_DEG = 20
+FIRST_NUMBER = 101
+"""Of a chosen pose: 1 to 24 are those of the paper."""
 LOOKS = 24
 """Number of tool directions that compare postures."""
 
@@ -102,7 +103,10 @@ def _at(
     ideal: float,
 ) -> Chosen | None:
     """Choose the most informative of the poses that are reachable at this posture."""
-    choice = partial(choose, n=poses, guess=guess)
+
+    def choice(reached: Nodes) -> Nodes:
+        return reached[choose(candidates[reached], poses, guess)]
+
     for numbers, q in _tours_at(certifier, q_now, candidates, spins, poses, choice, speeds):
         rms = predicted_sigma(certifier.arm.frames(q).R_base_flange, guess).force_rms_N
         if np.isfinite(rms):  # else these poses leave a parameter unobservable
@@ -132,13 +136,62 @@ def verification_tour(
         In the order of travel. None instead of both if too few poses are reachable.
     """
     q_now = np.asarray(q_rad, dtype=np.float64)
-    candidates = cone_candidates(np.pi, SPINS_OF_A_LUMP, DIRECTIONS_OF_A_LUMP, certifier.scene.down_base)
+    directions = max(DIRECTIONS_OF_A_LUMP, poses // 2)
+    candidates = cone_candidates(np.pi, SPINS_OF_A_LUMP, directions, certifier.scene.down_base)
 
-    def far_from_fitted(reached: Array) -> Nodes:
-        return choose_verification_poses(reached, R_fitted, poses, gravity_direction_base=certifier.scene.down_base)
+    def far_from_fitted(reached: Nodes) -> Nodes:
+        down_base = certifier.scene.down_base
+        return reached[
+            choose_verification_poses(candidates[reached], R_fitted, poses, gravity_direction_base=down_base)
+        ]
+
+    return _first_tour(certifier, q_now, candidates, SPINS_OF_A_LUMP, poses, far_from_fitted, speeds)
+
+
+def tour_of_sets(
+    certifier: Certifier, q_rad: ArrayLike, kinds: Sequence[tuple[Array, int]], speeds: Speeds
+) -> tuple[Nodes, Array] | None:
+    """Find a short closed tour through a number of orientations of each of several kinds.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        As of `verification_tour`.
+    kinds : sequence of (array of shape (m, 3, 3), int)
+        Orientations R_base_flange, and how many of them are wanted: the first ones that are reachable.
+
+    Returns
+    -------
+    index : int array, shape (n,)
+        In the order of travel: the place among the wanted orientations, counted through all kinds.
+    q_rad : array, shape (n, 6)
+        None instead of both if too few poses of a kind are reachable.
+    """
+    kind = np.repeat(np.arange(len(kinds)), [len(R) for R, _ in kinds])
+    wanted = [count for _, count in kinds]
+
+    def first_of_each(reached: Nodes) -> Nodes:
+        return np.concatenate([reached[kind[reached] == k][:count] for k, count in enumerate(wanted)])
+
+    candidates = np.concatenate([R for R, _ in kinds])
+    q_now = np.asarray(q_rad, dtype=np.float64)
+    found = _first_tour(certifier, q_now, candidates, 1, sum(wanted), first_of_each, speeds)
+    return None if found is None else (np.array(found[0]) - FIRST_NUMBER, found[1])
+
+
+def _first_tour(
+    certifier: Certifier,
+    q_now: Array,
+    candidates: Array,
+    spins: int,
+    poses: int,
+    choice: Callable[[Nodes], Nodes],
+    speeds: Speeds,
+) -> tuple[tuple[int, ...], Array] | None:
+    """Return the first tour of `_tours_at`, with joints 1 to 3 as they stand or at a posture with more room."""
 
     def tours(q: Array) -> Iterator[tuple[tuple[int, ...], Array]]:
-        return _tours_at(certifier, q, candidates, SPINS_OF_A_LUMP, poses, far_from_fitted, speeds)
+        return _tours_at(certifier, q, candidates, spins, poses, choice, speeds)
 
     if (here := next(tours(q_now), None)) is not None:
         return here
@@ -152,13 +205,13 @@ def _tours_at(
     candidates: Array,
     spins: int,
     poses: int,
-    choice: Callable[[Array], Nodes],
+    choice: Callable[[Nodes], Nodes],
     speeds: Speeds,
 ) -> Iterator[tuple[tuple[int, ...], Array]]:
     """Yield tours of chosen candidates that are reachable at this posture and connected by clear moves.
 
     Each is given as numbers from 101 on, in the order of choice, and joint vectors (n, 6) in the order of travel.
-    `choice` gets the reachable orientations (m, 3, 3) and returns indices of `poses` of them.
+    `choice` gets the indices of the reachable candidates and returns `poses` of them.
     """
     q, group = wrist_nodes(certifier, q_now, candidates)
     if not len(q):
@@ -170,14 +223,16 @@ def _tours_at(
     for p in sorted(range(len(reached)), key=lambda p: (not here[p], -len(reached[p])))[:MOST_PARTS]:
         if len(reached[p]) < poses:
             break
-        chosen = reached[p][choice(candidates[reached[p]])]
+        chosen = choice(reached[p])
+        if len(chosen) < poses:
+            continue
         nodes = np.flatnonzero((part == p) & np.isin(group, chosen))
         place = np.full(len(candidates), -1)
         place[chosen] = np.arange(poses)
         order = clear_tour(certifier, q[nodes], place[group[nodes]], speeds)
         if order is not None:
             nodes = nodes[order]
-            yield tuple((101 + place[group[nodes]]).tolist()), q[nodes]
+            yield tuple((FIRST_NUMBER + place[group[nodes]]).tolist()), q[nodes]
 
 
 def _begins_here(certifier: Certifier, q_now: Array, q_rad: Array, part: Nodes) -> list[bool]:

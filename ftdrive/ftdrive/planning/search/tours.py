@@ -26,6 +26,8 @@ ROUNDS = 60
 FEW = 120
 """Of this many joint vectors every move is looked at; of more, those to the nearest ones of each group."""
 NEAREST_OF_EACH = 2
+MANY_GROUPS, NEAREST_OF_ALL = 60, 40
+"""From here on only the nearest of all groups are looked at: moves to each group are as many as their square."""
 NEIGHBOURS = 10
 """In all layers together, about."""
 MOST_NODES = (25, 60)
@@ -84,7 +86,8 @@ def _tour_of(
 ) -> Nodes | None:
     """Find a clear tour through some of the nodes of a proof."""
     count = len(q_rad) if len(q_rad) <= FEW else NEAREST_OF_EACH
-    part = proof.parts(known_as, *_to_every_group(proof.shapes[proof.of[known_as]], group, count))
+    near, count = (group, count) if group.max() < MANY_GROUPS else (np.zeros_like(group), NEAREST_OF_ALL)
+    part = proof.parts(known_as, *_to_every_group(proof.shapes[proof.of[known_as]], near, count))
     covering = [p for p in range(part.max() + 1) if len(np.unique(group[part == p])) == group.max() + 1]
     if not covering:
         return None
