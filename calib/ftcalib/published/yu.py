@@ -1,12 +1,17 @@
-"""The closed-form methods of Yu, Shi, Lou 2021: SROM (24 special orientations) and LROM (any orientations).
+"""The closed-form methods of Yu, Shi, Lou 2021: SROM (24 special orientations), LROM (any), and both mixed.
 
 Source: "Bias Estimation and Gravity Compensation for Wrist-Mounted Force/Torque Sensor", eqs 14-48. In this module
 A (n, 3, 3) is the paper's e_bR, base to flange, which is `R_base_flange` transposed, and the estimated R is s_eR,
 flange to sensor. Docstrings name the misprints of the paper.
 """
 
+from collections.abc import Iterator
+from itertools import chain, combinations_with_replacement
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import NotObservable
 from ftcalib.model import Array, Parameters, nearest_rotation
@@ -25,8 +30,13 @@ _AXES = dict(zip("xyz", np.eye(3), strict=True))
 SPECIAL_R_flange_base = np.array([[float(row[0] + "1") * _AXES[row[1]] for row in rows.split()] for rows in _ROWS])
 """(24, 3, 3) the paper's e_bR_1 … e_bR_24 (Fig. 3, Table of special orientations): the rotation group of the cube."""
 
-TOLERANCE_RAD = np.deg2rad(0.1)
-"""Largest deviation of an orientation from one of the 24."""
+TOLERANCE_RAD = np.deg2rad(1.0)
+"""Largest deviation of an orientation from one of the 24: more than an arm with calibrated kinematics misses by."""
+ROUNDING_RAD = np.deg2rad(0.05)
+"""Deviation that rounded poses have. Beyond it, it is worth a note."""
+
+_RECOGNISED_RAD = 1.3 * TOLERANCE_RAD  # the mean turn of the base is itself uncertain if all poses deviate
+_NEIGHBOURS = 0.065  # distance of the sums of `_likely_members` of poses 2° apart
 
 # Numbers of the orientations whose forces are added and subtracted: p_kj for k, j = 1, 2, 3 (eqs 17-23).
 _SUMS = (
@@ -38,6 +48,9 @@ _SUMS = (
 
 def srom(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | None = None) -> Parameters:
     """Calibrate from the 24 special orientations, in any order, possibly all turned by one common rotation.
+
+    The gravity force is that of the 24 as printed (eqs 14-23). Rotation, biases and centre of mass follow from the
+    orientations as they are (eqs 36-45).
 
     Parameters
     ----------
@@ -52,9 +65,35 @@ def srom(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | 
     NotObservable
         As of `special_numbers`.
     """
-    number, Y = numbered or special_numbers(R_base_flange)
-    force_N = np.empty((24, 3))
-    force_N[number] = wrench[:, :3]
+    return _from_special(R_base_flange, wrench, *(numbered or special_numbers(R_base_flange)))
+
+
+def mixed(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | None = None) -> Parameters:
+    """Calibrate with the gravity force of the 24 special orientations, and all else from all poses: case 8, Table III.
+
+    The 24 are found among the poses. The forces of an orientation that occurs several times are averaged.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    wrench : array, shape (n, 6)
+        N and N·m, in the sensor frame.
+    numbered : tuple, optional
+        What `special_numbers` returns for these orientations, with `others`.
+
+    Raises
+    ------
+    NotObservable
+        As of `special_numbers` with `others`.
+    """
+    return _from_special(R_base_flange, wrench, *(numbered or special_numbers(R_base_flange, others=True)))
+
+
+def _from_special(R_base_flange: Array, wrench: Array, number: Indices, Y: Array) -> Parameters:
+    special = number >= 0
+    force_N = np.zeros((24, 3))
+    np.add.at(force_N, number[special], wrench[special, :3])
+    force_N /= np.bincount(number[special], minlength=24)[:, None]
     # With A_i = R_i Y.T the published formulas see the gravity force in the turned base, Y.T F_b.
     return _remaining_steps(R_base_flange, wrench, Y @ srom_gravity_force(force_N))
 
@@ -62,8 +101,9 @@ def srom(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | 
 def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
     """Calibrate from at least five orientations: eqs 24-34.
 
-    The sign rule of eq 34 contradicts itself (its alpha is not that of eqs 46-48). det R > 0 replaces it and needs no
-    knowledge of the mounting of the robot.
+    Eq 34 chooses the sign by the mounting of the robot. Lines 1 and 2 of the rule are right for the alpha of eq 48 as
+    printed. With eq 48 corrected (`weight_and_tilt`) alpha is another angle, by which an upright robot would get the
+    wrong sign. det R > 0 replaces the rule and needs no knowledge of the mounting.
 
     Parameters
     ----------
@@ -94,7 +134,10 @@ def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
 
 
 def _remaining_steps(R_base_flange: Array, wrench: Array, gravity_force_base_N: Array) -> Parameters:
-    """Rotation and force bias for a known gravity force (Wahba's problem, eqs 36-42 and 39), and eqs 43-45."""
+    """Rotation and force bias for a known gravity force (Wahba's problem, eqs 36-42 and 39), and eqs 43-45.
+
+    The text after eq 42 names a case "rank D = 1, det D < 0", which cannot exist: det D is 0 below rank 3.
+    """
     force_N, gravity_flange_N = wrench[:, :3], gravity_force_base_N @ R_base_flange
     D = (force_N - force_N.mean(axis=0)).T @ (gravity_flange_N - gravity_flange_N.mean(axis=0))
     R = nearest_rotation(D)
@@ -103,46 +146,54 @@ def _remaining_steps(R_base_flange: Array, wrench: Array, gravity_force_base_N: 
     return Parameters(R.T, gravity_force_base_N, force_bias_N, p_sensor_com_m, torque_bias_Nm)
 
 
-def special_numbers(R_base_flange: Array) -> tuple[Indices, Array]:
+def special_numbers(R_base_flange: Array, *, others: bool = False) -> tuple[Indices, Array]:
     """Recognise the 24 special orientations.
 
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
+    others : bool
+        Whether further poses are accepted, such as other orientations or repetitions of the 24.
 
     Returns
     -------
-    number : int array, shape (24,)
-        Row i is orientation number[i] + 1 of the paper.
+    number : int array, shape (n,)
+        Row i is orientation number[i] + 1 of the paper, or another one if number[i] is -1.
     Y : array, shape (3, 3)
-        R_base_flange[i] = Y @ SPECIAL_R_flange_base[number[i]].T; the identity where that fits, else the smallest
-        rotation that does.
+        R_base_flange[i] = Y @ SPECIAL_R_flange_base[number[i]].T, about: the identity where that fits as well as
+        rounded poses do, else the smallest rotation that fits best.
 
     Raises
     ------
     NotObservable
-        An orientation is missing, repeated or more than 0.1° off; the message gives the numbers.
+        An orientation is missing or more than 1° off, or without `others` repeated; the message gives the numbers.
     """
-    best = _Match(R_base_flange, np.eye(3))
-    if not best.complete:
-        turned = [_Match(R_base_flange, _common_rotation(R_base_flange, seed)) for seed in R_base_flange[:24]]
-        best = max([best, *turned], key=lambda match: match.found)
-    if not best.complete:
-        raise NotObservable(best.refusal())
-    return best.number, best.Y
+    match = _Match(R_base_flange, np.eye(3))
+    if match.found < 24 or match.angle_rad[match.number >= 0].max() > ROUNDING_RAD:
+        match = _best_match(R_base_flange)
+    if match.found < 24 or not (others or len(R_base_flange) == 24):
+        raise NotObservable(match.refusal_of_mixed() if others else match.refusal())
+    return match.number, match.Y
+
+
+def special_deviation_rad(R_base_flange: Array, number: Indices, Y: Array) -> float:
+    """Largest angle between a pose (n, 3, 3) and the special orientation that `special_numbers` found for it."""
+    special = number >= 0
+    nominal = Y @ np.swapaxes(SPECIAL_R_flange_base[number[special]], 1, 2)
+    return float(Rotation.from_matrix(np.swapaxes(nominal, 1, 2) @ R_base_flange[special]).magnitude().max())
 
 
 class _Match:
     """The special orientation nearest to each pose, when the base is turned by Y."""
 
-    def __init__(self, R_base_flange: Array, Y: Array) -> None:
-        trace = np.einsum("nij,kji->nk", Y.T @ R_base_flange, SPECIAL_R_flange_base)
+    def __init__(self, R_base_flange: Array, Y: Array, tolerance_rad: float = _RECOGNISED_RAD) -> None:
+        trace = (Y.T @ R_base_flange).reshape(-1, 9) @ np.swapaxes(SPECIAL_R_flange_base, 1, 2).reshape(24, 9).T
         self.Y = Y
-        self.number: Indices = trace.argmax(axis=1)
+        self.nearest: Indices = trace.argmax(axis=1)
         self.angle_rad = np.arccos(np.clip((trace.max(axis=1) - 1) / 2, -1, 1))
-        self.times_seen = np.bincount(self.number[self.angle_rad <= TOLERANCE_RAD], minlength=24)
+        self.number: Indices = np.where(self.angle_rad <= tolerance_rad, self.nearest, -1)
+        self.times_seen = np.bincount(self.number[self.number >= 0], minlength=24)
         self.found = int(np.count_nonzero(self.times_seen))
-        self.complete = len(R_base_flange) == self.found == 24
 
     def refusal(self) -> str:
         if not self.found:
@@ -152,22 +203,65 @@ class _Match:
             problems.append(f"missing {_listed(np.flatnonzero(self.times_seen == 0))}")
         if self.times_seen.max() > 1:
             problems.append(f"repeated {_listed(np.flatnonzero(self.times_seen > 1))}")
-        strays = np.flatnonzero(self.angle_rad > TOLERANCE_RAD)
+        strays = np.flatnonzero(self.number < 0)
         if strays.size:
-            worst = strays[self.angle_rad[strays].argmax()]
-            problems.append(
-                f"row {_listed(strays)} not among them (row {worst + 1} is {np.rad2deg(self.angle_rad[worst]):.2f}° "
-                f"from orientation {self.number[worst] + 1}, 0.1° is allowed)"
-            )
-        return f"SROM needs its 24 orientations once each: {'; '.join(problems)}. Use LROM or ML instead."
+            problems.append(f"row {_listed(strays)} not among them ({self._worst(strays)})")
+        advice = "Use LROM or ML" if self.found < 24 else "Use mixed, which takes further poses, LROM or ML"
+        return f"SROM needs its 24 orientations once each: {'; '.join(problems)}. {advice} instead."
+
+    def refusal_of_mixed(self) -> str:
+        missing = np.flatnonzero(self.times_seen == 0)
+        near = np.flatnonzero((self.number < 0) & np.isin(self.nearest, missing) & (self.angle_rad < np.deg2rad(10)))
+        off = f" ({self._worst(near)})" if near.size else ""
+        return (
+            f"mixed needs each of the 24 orientations of SROM at least once: missing {_listed(missing)}{off}. "
+            "Record these orientations, or use LROM or ML."
+        )
+
+    def _worst(self, rows: Indices) -> str:
+        row = rows[self.angle_rad[rows].argmax()]
+        angle_deg, number = np.rad2deg(self.angle_rad[row]), self.nearest[row] + 1
+        return f"row {row + 1} is {angle_deg:.2f}° from orientation {number}, 1° is allowed"
+
+
+def _best_match(R_base_flange: Array) -> _Match:
+    """Match all poses for the common rotation that finds most of the 24."""
+    matches = list[_Match]()
+    for seed in chain([np.eye(3)], _likely_members(R_base_flange)):
+        matches.append(_Match(R_base_flange, _common_rotation(R_base_flange, seed)))
+        if matches[-1].found == 24:
+            break
+    return max(matches, key=lambda match: match.found)
+
+
+def _likely_members(R_base_flange: Array, most: int = 12) -> Iterator[Array]:
+    """Yield a pose (3, 3) of each of the fullest groups of poses that are equal but for a rotation of the cube.
+
+    Trying each pose as a member of the 24 costs O(n^2). Sums of fourth powers over the columns of a rotation do not
+    change with a rotation of the cube on its right, so poses of one group are neighbours in the space of these sums.
+    """
+    i, j, k, m = np.array(list(combinations_with_replacement(range(3), 4))).T
+    R = R_base_flange
+    invariant = np.sum(R[:, i] * R[:, j] * R[:, k] * R[:, m], axis=2)
+    neighbours = KDTree(invariant).query_ball_point(invariant, _NEIGHBOURS)
+    size = np.array([len(rows) for rows in neighbours])
+    for _ in range(most):
+        if not size.any():
+            return
+        fullest = size.argmax()
+        size[neighbours[fullest]] = 0
+        yield R[fullest]
 
 
 def _common_rotation(R_base_flange: Array, seed: Array) -> Array:
     """Estimate Y from all poses in the group of `seed`, and return the smallest of its 24 equivalents."""
-    match = _Match(R_base_flange, seed)
-    near = match.angle_rad < 3 * TOLERANCE_RAD
-    pairs = R_base_flange[near], SPECIAL_R_flange_base[match.number[near]]
-    equivalents = nearest_rotation(np.einsum("nij,njk->ik", *pairs)) @ SPECIAL_R_flange_base
+    Y = seed
+    for tolerance_rad in (4 * TOLERANCE_RAD, 2 * TOLERANCE_RAD, _RECOGNISED_RAD):  # `seed` itself is off at first
+        number = _Match(R_base_flange, Y, tolerance_rad).number
+        near = number >= 0
+        if near.any():
+            Y = nearest_rotation(np.einsum("nij,njk->ik", R_base_flange[near], SPECIAL_R_flange_base[number[near]]))
+    equivalents = Y @ SPECIAL_R_flange_base
     rounded = equivalents.round(4)  # so that a tie, as at 45°, has the same result in every order of rows
     smallest = min(range(24), key=lambda i: (-np.trace(rounded[i]), *rounded[i].ravel()))
     return np.asarray(equivalents[smallest])

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib import NotObservable, Parameters
@@ -12,6 +13,8 @@ from ftcalib.published.yu import (
     _SUMS,
     SPECIAL_R_flange_base,
     lrom,
+    mixed,
+    special_deviation_rad,
     special_numbers,
     srom,
     srom_gravity_force,
@@ -85,6 +88,87 @@ def test_srom_tolerates_what_an_arm_misses_by() -> None:
         assert Rotation.from_matrix(found @ R24[number] @ np.swapaxes(R, 1, 2)).magnitude().max() < np.deg2rad(0.1)
 
 
+def deviating(rng: np.random.Generator, n: int, most_deg: float) -> Array:
+    """(n, 3, 3) small turns about random axes, by up to an angle."""
+    axis = rng.normal(size=(n, 3))
+    angle = np.deg2rad(most_deg) * rng.uniform(size=(n, 1))
+    return np.asarray(Rotation.from_rotvec(angle * axis / np.linalg.norm(axis, axis=1, keepdims=True)).as_matrix())
+
+
+def is_numbered(R: Array, number: NDArray[np.intp], Y: Array, expected: NDArray[np.intp]) -> bool:
+    """Whether the numbers are the expected ones, up to a rotation of the cube that Y takes up."""
+    special = expected >= 0
+    nominal = Y @ R24[number[special]]
+    fits = Rotation.from_matrix(nominal @ np.swapaxes(R[special], 1, 2)).magnitude().max() < np.deg2rad(1.5)
+    return bool(fits) and ((number >= 0) == special).all()
+
+
+@pytest.mark.parametrize("turns", [50, pytest.param(1000, marks=pytest.mark.slow)])
+def test_deviations_up_to_1_degree_are_recognised_for_any_turn_of_the_base(turns: int) -> None:
+    rng = np.random.default_rng(3)
+    for Y in Rotation.random(turns, rng=rng).as_matrix():
+        order = rng.permutation(24)
+        R = (deviating(rng, 24, 1.0) @ Y @ R24)[order]
+        number, found = special_numbers(R)
+        assert is_numbered(R, number, found, order)
+        assert np.unique(number).size == 24
+        R[3] = turned("y", 1.5) @ Y @ R24[order[3]]
+        others = np.arange(24) != 3
+        R[others] = (Y @ R24)[order[others]]
+        with pytest.raises(NotObservable, match=r"row 4 is 1\.50° from"):
+            special_numbers(R)
+
+
+def test_small_turns_of_the_base_are_no_deviation() -> None:
+    R = turned("z", 0.8) @ R24
+    number, Y = special_numbers(R)
+    np.testing.assert_allclose(Y, turned("z", 0.8), atol=1e-12)
+    assert special_deviation_rad(R, number, Y) < 1e-7
+    assert error(srom(R, predict(TRUTH, R))) < 1e-12
+    R[4] = turned("x", 0.5) @ R[4]
+    assert special_deviation_rad(R, *special_numbers(R)) == pytest.approx(np.deg2rad(0.5), rel=0.05)
+
+
+@pytest.mark.parametrize("Y", [np.eye(3), turned("ZYX", [10, 20, 30])])
+def test_mixed_finds_its_24_among_other_poses(Y: Array) -> None:
+    rng = np.random.default_rng(5)
+    for numbers in (np.r_[:24, [-1] * 24], np.r_[:24, :24], np.r_[:24, 3, 3, [-1] * 100]):
+        expected = rng.permutation(numbers)
+        any_pose = Rotation.random(len(expected), rng=rng).as_matrix()
+        R = np.where((expected >= 0)[:, None, None], Y @ R24[expected], any_pose)
+        number, found = special_numbers(R, others=True)
+        assert is_numbered(R, number, found, expected)
+        assert error(mixed(R, predict(TRUTH, R))) < 1e-12
+
+
+def test_mixed_takes_the_gravity_force_from_the_24_and_the_rest_from_all_poses() -> None:
+    rng = np.random.default_rng(6)
+    R = np.concatenate([R24, Rotation.random(24, rng=rng).as_matrix()])
+    wrench = predict(TRUTH, R) + 0.1 * rng.normal(size=(48, 6))
+    alone, together = srom(R24, wrench[:24]), mixed(R, wrench)
+    np.testing.assert_allclose(together.gravity_force_base_N, alone.gravity_force_base_N, atol=1e-12)
+    assert np.abs(together.difference(alone))[[0, 6, 9, 12]].min() > 1e-6
+    twice = np.concatenate([wrench[:24], wrench[:24] + np.array([0.2, 0, 0, 0, 0, 0])])
+    averaged = mixed(np.tile(R24, (2, 1, 1)), twice)
+    np.testing.assert_allclose(averaged.gravity_force_base_N, alone.gravity_force_base_N, atol=1e-12)
+    np.testing.assert_allclose(averaged.force_bias_N, alone.force_bias_N + np.array([0.1, 0, 0]), atol=1e-12)
+
+
+def test_mixed_names_what_is_missing() -> None:
+    R = np.concatenate([np.delete(R24, [2, 16], axis=0), R24[:5:3], turned("x", 3) @ R24[16:17]])
+    with pytest.raises(NotObservable, match=r"missing 3, 17 \(row 25 is 3\.00° from orientation 17.*Record these"):
+        mixed(R, np.zeros((len(R), 6)))
+    with pytest.raises(NotObservable, match="missing 1, 2, 3"):
+        mixed(R[:0], np.zeros((0, 6)))
+
+
+def test_mixed_finds_its_24_in_thousands_of_poses() -> None:
+    rng = np.random.default_rng(7)
+    repeated = np.tile(Rotation.random(rng=rng).as_matrix(), (500, 1, 1))  # a group that is larger than the 24
+    R = np.concatenate([Rotation.random(3000, rng=rng).as_matrix(), repeated, turned("ZYX", [10, 20, 30]) @ R24])
+    assert np.unique(special_numbers(R, others=True)[0]).size == 25
+
+
 def test_srom_names_what_is_missing_repeated_or_off() -> None:
     def refusal(R: Array) -> str:
         with pytest.raises(NotObservable) as caught:
@@ -93,7 +177,9 @@ def test_srom_names_what_is_missing_repeated_or_off() -> None:
 
     assert "missing 3, 17. Use LROM or ML" in refusal(np.delete(R24, [2, 16], axis=0))
     assert "missing 5; repeated 9." in refusal(np.concatenate([np.delete(R24, 4, axis=0), R24[8:9]]))
-    assert "each: repeated 1." in refusal(np.concatenate([R24, R24[:1]]))
+    assert "each: repeated 1. Use mixed" in refusal(np.concatenate([R24, R24[:1]]))
+    assert "25 not among them" in (extra := refusal(np.concatenate([R24, turned("ZYX", [10, 20, 30])[None]])))
+    assert "Use mixed, which takes further poses" in extra
     bent = R24.copy()
     bent[6] = turned("y", 2.0) @ bent[6]
     assert re.search(r"missing 7; .*row 7 is 2\.00° from orientation 7", refusal(bent))
