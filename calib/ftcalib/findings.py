@@ -382,6 +382,9 @@ CODES: Final[Mapping[str, Code]] = {
         "compared with the declared mounting", "level the base, or set its mounting in the controller"),
     "noise_unknown": Code(_NOTE, "the noise was estimated from the residuals, so chi2 does not test the fit",
         "state the noise of each pose to test it"),
+    "orientations_deviate": Code(_NOTE, "the poses deviate by up to {off_deg:.2f} from the 24 orientations of the "
+        "method, which puts an error of {force_N:.2g} into the gravity force",
+        "use lrom or ml, which take the orientations as they are"),
     "earlier_cell": Code(_NOTE, "mounting, base and gain of {parent} count as known, within their sigmas"),
     "together": Code(_NOTE, "{n_runs} runs as one fit, each with a bias of its own; the bias is that of the last"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),

@@ -14,13 +14,14 @@ from ftcalib.assessment.verdict import SIGNIFICANT_SIGMAS, judge
 from ftcalib.data.dataset import CalibrationDataset
 from ftcalib.data.pooling import pooled_covariance
 from ftcalib.errors import NotObservable
-from ftcalib.findings import Finding
+from ftcalib.findings import Finding, ordered
 from ftcalib.known import Known
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters, predict
-from ftcalib.published.methods import PUBLISHED, Estimator, published
+from ftcalib.published.methods import BASELINES, PUBLISHED, Estimator, published, require_printed_form
+from ftcalib.published.yu import ROUNDING_RAD, special_deviation_rad, special_numbers
 from ftcalib.result import CalibrationResult, DriftResult, Method, require_positive_definite
 from ftcalib.setup import NOTHING, Setup
 
@@ -41,6 +42,7 @@ def solve(
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
     setup: Setup = NOTHING,
     provenance: Mapping[str, Any] | None = None,
+    as_published: bool = False,
 ) -> CalibrationResult:
     """Calibrate from a dataset.
 
@@ -55,7 +57,9 @@ def solve(
         Model of the bias during the tour: chosen from the data, constant, or as given. Poses without time count as
         equally spaced in their order.
     known : Known, optional
-        Known mounting, direction of gravity and mass. Of the published methods, only those that need gravity use it.
+        Known mounting, direction of gravity and mass. Published methods use what they need, as exactly known: Carlson's
+        gravity, "vougioukas" the mounting (default: axes of sensor and flange agree) and the direction of gravity
+        (default: the up direction of `setup`), "wang" the mounting, "yang" the mounting up to a turn about flange z.
     g_m_s2 : float
         Gravity; mass is weight divided by it.
     setup : Setup
@@ -63,11 +67,16 @@ def solve(
         direction of gravity declares one too.
     provenance : mapping, optional
         Stored with the result, beside the hash of the dataset. Must be valid JSON.
+    as_published : bool
+        Run one of Carlson's methods as printed: without biases (`ftcalib.published.methods.published`). `provenance`
+        then has `as_published`.
 
     Raises
     ------
     NotObservable
         The poses do not determine the parameters; the message names what is missing and what to add.
+    ValueError
+        An unknown method, known values that the method cannot use, or `as_published` for another method.
 
     Examples
     --------
@@ -85,16 +94,18 @@ def solve(
             raise ValueError(f"{name} is '{value}', expected one of {', '.join(choices)}")
     if not (np.isfinite(g_m_s2) and g_m_s2 > 0):
         raise ValueError(f"g_m_s2 is {g_m_s2}, expected about 9.8")
-    if method in PUBLISHED and method not in _NEED_GRAVITY and known is not None:
-        raise ValueError(f"{method} cannot use known values: use 'ml'")
-    known = _constrained(method, known)
+    _require_usable(method, known, as_published)
     if setup.up_in_base is None and known is not None and known.gravity_direction_base is not None:
         setup = replace(setup, up_in_base=(-np.asarray(known.gravity_direction_base)).tolist())
+    known = _constrained(method, known, setup)
     require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
     if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNRESOLVED_N:
         raise NotObservable("the force is the same in all poses: check that the sensor works and carries a load.")
 
-    estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, setup) if method in PUBLISHED else None
+    estimator = None
+    if method in PUBLISHED:
+        estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, setup, as_published=as_published)
+    assumed = known if estimator is None or method in BASELINES else None
     wrench_cov = dataset.wrench_cov
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
@@ -107,7 +118,7 @@ def solve(
             wrench_cov,
             t_s=dataset.t_s,
             drift=drift,
-            known=None if estimator else known,
+            known=assumed,
             g_m_s2=g_m_s2,
         )
         _require_determined(dataset.R_base_flange, best, known)
@@ -115,31 +126,16 @@ def solve(
         if named := _mistakes(dataset, wrench_cov, drift, known, g_m_s2, setup):
             raise NotObservable(f"{named[0].words}.", named[0]) from exc
         raise
-    assessed: AssessedFit = best
-    if estimator:
-        parameters = estimator(dataset.wrench)
-        noise = wrench_cov
-        if noise is None:  # take the residuals of the method as its noise
-            residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
-            square = (residuals**2).reshape(-1, 2, 3).mean(axis=(0, 2)) * 6 * len(dataset) / best.dof
-            noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))
-        assessed = IndependentFit(
-            parameters,
-            _simulated_covariance(estimator, parameters, dataset.R_base_flange, noise),
-            dataset.R_base_flange,
-            dataset.wrench,
-            noise,
-            wrench_cov is not None,
-            np.ones(len(dataset)),
-            best.second_basin_chi2,
-        )
+    assessed: AssessedFit = _assessed(estimator, dataset, wrench_cov, best) if estimator else best
     try:
         require_positive_definite(assessed.covariance)
         require_positive_definite(assessed.covariance if assessed.response is None else assessed.response.covariance)
     except ValueError as exc:
         raise NotObservable(f"{exc}. Add poses with other orientations.") from exc
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
-    unconstrained = best if estimator else None if known is None else _unconstrained(dataset, wrench_cov, drift)
+    unconstrained: Fit | None = best if estimator else None
+    if assumed is not None:
+        unconstrained = _unconstrained(dataset, wrench_cov, drift)
     quality = judge(
         assessed,
         t_s=dataset.t_s,
@@ -151,6 +147,8 @@ def solve(
     )
     chi2 = assessed.chi2 if wrench_cov is None else assessed.measured_chi2
     drifted = best.drift if estimator is None else None
+    deviation = _deviation(method, estimator, assessed.parameters, dataset.R_base_flange) if estimator else []
+    printed = {"as_published": True} if as_published else {}
     return CalibrationResult(
         parameters=assessed.parameters,
         covariance=assessed.covariance,
@@ -160,8 +158,8 @@ def solve(
         noise_source="residuals" if wrench_cov is None else "measured",
         g_m_s2=g_m_s2,
         method=method,
-        findings=quality.findings,
-        provenance={**(provenance or {}), "dataset_sha256": dataset.sha256()},
+        findings=ordered([*quality.findings, *deviation]),
+        provenance={**(provenance or {}), **printed, "dataset_sha256": dataset.sha256()},
         p_value=quality.chi2_p,
         measured_sigma=measured_sigma,
         weights=assessed.weights,
@@ -186,11 +184,55 @@ def solve(
     )
 
 
-def _constrained(method: Method, known: Known | None) -> Known | None:
-    if method == "known-rotation" and (known is None or known.R_flange_sensor is None):
-        return replace(known or Known(), R_flange_sensor=np.eye(3))
-    if method == "yaw-only":
-        return replace(known or Known(), yaw_only=True)
+def _require_usable(method: Method, known: Known | None, as_published: bool) -> None:
+    """Raise `ValueError` for known values that a published method cannot use, and for a form that it does not have."""
+    if as_published:
+        require_printed_form(method)
+    if known is None or method not in PUBLISHED or method in _NEED_GRAVITY:
+        return
+    if method not in BASELINES:
+        raise ValueError(f"{method} cannot use known values: use 'ml'")
+    unused = ["mass"] if known.mass_kg is not None else []
+    unused += ["direction of gravity"] if method != "vougioukas" and known.gravity_direction_base is not None else []
+    if unused:
+        raise ValueError(f"{method} cannot use a known {' or '.join(unused)}: leave it out, or use 'ml'")
+
+
+def _assessed(estimator: Estimator, dataset: CalibrationDataset, wrench_cov: Array | None, best: Fit) -> IndependentFit:
+    """Apply a published method; `best` gives the degrees of freedom and the second solution."""
+    parameters = estimator(dataset.wrench)
+    noise = wrench_cov
+    if noise is None:  # take the residuals of the method as its noise
+        residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
+        square = (residuals**2).reshape(-1, 2, 3).mean(axis=(0, 2)) * 6 * len(dataset) / best.dof
+        noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))
+    return IndependentFit(
+        parameters,
+        _simulated_covariance(estimator, parameters, dataset.R_base_flange, noise),
+        dataset.R_base_flange,
+        dataset.wrench,
+        noise,
+        wrench_cov is not None,
+        np.ones(len(dataset)),
+        best.second_basin_chi2,
+    )
+
+
+def _constrained(method: Method, known: Known | None, setup: Setup) -> Known | None:
+    """Known values with those that the method assumes."""
+    if method in ("known-rotation", "vougioukas", "wang") and (known is None or known.R_flange_sensor is None):
+        known = replace(known or Known(), R_flange_sensor=np.eye(3))
+    if method in ("yaw-only", "yang"):
+        known = replace(known or Known(), yaw_only=True)
+    if known is not None and method in BASELINES:
+        direction = -setup.up if known.gravity_direction_base is None else known.gravity_direction_base
+        known = replace(
+            known,
+            yaw_only=method == "yang",
+            gravity_direction_base=direction if method == "vougioukas" else None,
+            R_tolerance_rad=0.0,
+            direction_tolerance_rad=0.0,
+        )
     return known
 
 
@@ -221,11 +263,38 @@ def _mistakes(
     return found
 
 
-def estimator_of(method: Method, R_base_flange: Array, known: Known | None, g_m_s2: float, setup: Setup) -> Estimator:
-    """Prepare a published method, with gravity from `known` if the method needs it. Raises `NotObservable`."""
-    direction = -setup.up if known is None or known.gravity_direction_base is None else known.gravity_direction_base
-    weight_N = None if known is None or known.mass_kg is None else known.mass_kg * g_m_s2
-    return published(method, R_base_flange, gravity_direction_base=np.asarray(direction), weight_N=weight_N)
+def estimator_of(
+    method: Method,
+    R_base_flange: Array,
+    known: Known | None,
+    g_m_s2: float,
+    setup: Setup,
+    *,
+    as_published: bool = False,
+) -> Estimator:
+    """Prepare a published method, with mounting and gravity from `known` if it needs them. Raises `NotObservable`."""
+    known = known or Known()
+    direction = -setup.up if known.gravity_direction_base is None else known.gravity_direction_base
+    return published(
+        method,
+        R_base_flange,
+        gravity_direction_base=np.asarray(direction),
+        weight_N=None if known.mass_kg is None else known.mass_kg * g_m_s2,
+        R_flange_sensor=None if known.R_flange_sensor is None else np.asarray(known.R_flange_sensor),
+        as_published=as_published,
+    )
+
+
+def _deviation(method: Method, estimator: Estimator, parameters: Parameters, R_base_flange: Array) -> list[Finding]:
+    """Name poses that deviate from the special orientations of the method, and the error that this causes."""
+    if method not in ("srom", "mixed"):
+        return []
+    deviation_rad = special_deviation_rad(R_base_flange, *special_numbers(R_base_flange, others=method == "mixed"))
+    if deviation_rad <= ROUNDING_RAD:
+        return []
+    without_noise = estimator(predict(parameters, R_base_flange))
+    off_N = np.linalg.norm(without_noise.gravity_force_base_N - parameters.gravity_force_base_N)
+    return [Finding.of("orientations_deviate", off_deg=np.degrees(deviation_rad), force_N=off_N)]
 
 
 def _require_determined(R_base_flange: Array, best: Fit, known: Known | None) -> None:

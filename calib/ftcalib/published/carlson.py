@@ -230,7 +230,7 @@ def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
         the forces nearly as well (costs less than 12 noise variances apart, estimated from the residuals).
     """
     eq = force_equations(R_base_flange, force_N, bias=bias, method="polynomial optimisation", min_poses=3)
-    _require_turns_and_weight(eq)
+    require_turns_and_weight(eq)
     Q = rotation_minima.force_cost(R_base_flange, force_N, np.ones(len(force_N)), with_bias=bias)
     best, *others = rotation_minima.minima(Q)
     X = best.R.T
@@ -255,7 +255,7 @@ def kron_identity(f: Array) -> Array:
 def _linear_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str) -> ForceEquations:
     """Form the equations of a method that is linear in all nine entries of the rotation, if the poses suffice."""
     eq = force_equations(R_base_flange, force_N, bias=bias, method=method, min_poses=4)
-    _require_turns_and_weight(eq)
+    require_turns_and_weight(eq)
     _require_varied_forces(eq.f, 0)
     return eq
 
@@ -306,7 +306,13 @@ def require_weight(eq: ForceEquations) -> None:
         raise NotObservable("the forces show no weight: attach a tool or a mass to the sensor")
 
 
-def _require_turns_and_weight(eq: ForceEquations) -> None:
+def require_turns_and_weight(eq: ForceEquations) -> None:
+    """Reject poses that leave the gravity force of a known rotation open, and forces as in `require_weight`.
+
+    Raises
+    ------
+    NotObservable
+    """
     if spanned_dimensions(eq.D, len(eq.A) ** 0.5) < 3:
         raise NotObservable(
             "all poses turn about one base axis, and a weight along it resembles a bias: add poses turned about "

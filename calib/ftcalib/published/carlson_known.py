@@ -46,13 +46,14 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     return eq.fit(R_sensor_flange.T, _weight(eq.f, a, R_sensor_flange) * down)
 
 
-def cayley(R_base_flange: Array, force_N: Array, gravity_force_base_N: Array, *, bias: bool) -> ForceFit:
+def cayley(
+    R_base_flange: Array, force_N: Array, gravity_force_base_N: Array, *, bias: bool, as_published: bool = False
+) -> ForceFit:
     """Rotation by the Cayley transform, gravity known with the weight (eqs. 6-11).
 
     The transform fails for rotations by 180 deg and is poor near them, so it is applied after each of four turns of
-    the flange axes (by 0, and by 180 deg about x, y and z) and the best fit is kept; `cayley_rotation` is the published
-    one. An error of the weight goes into the rotation: 10 % leave |dR|_F^2 at 1e-5 however small the noise.
-    `relaxation` needs no weight.
+    the flange axes (by 0, and by 180 deg about x, y and z) and the best fit is kept. An error of the weight goes into
+    the rotation: 10 % leave |dR|_F^2 at 1e-5 however small the noise. `relaxation` needs no weight.
 
     Parameters
     ----------
@@ -63,6 +64,8 @@ def cayley(R_base_flange: Array, force_N: Array, gravity_force_base_N: Array, *,
         Weight of the load on the sensor, in base axes; returned unchanged.
     bias : bool
         Whether to estimate the force bias, or to assume zero like the paper (see the module).
+    as_published : bool
+        Whether to apply the transform once, without turns.
 
     Raises
     ------
@@ -75,7 +78,7 @@ def cayley(R_base_flange: Array, force_N: Array, gravity_force_base_N: Array, *,
     eq, _ = _equations(R_base_flange, force_N, gravity, 2, bias=bias, method="the Cayley transform")
     a = eq.A @ gravity
     turns = [np.diag(signs) for signs in ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))]
-    candidates = [cayley_rotation(eq.f, a @ turn) @ turn for turn in turns]
+    candidates = [cayley_rotation(eq.f, a @ turn) @ turn for turn in turns[: 1 if as_published else 4]]
     R_sensor_flange = min(candidates, key=lambda R: float(np.sum((eq.f - a @ R.T) ** 2)))
     return eq.fit(R_sensor_flange.T, gravity)
 
@@ -100,6 +103,29 @@ def cayley_rotation(f: Array, a: Array) -> Array:
     regressor = skew(f + a).reshape(-1, 3)
     s = np.linalg.svd(np.column_stack([regressor, (a - f).ravel()]), full_matrices=False)[2][-1]
     return Rotation.from_quat([*-s[:3], s[3]]).as_matrix()
+
+
+def centre_of_mass(R_base_flange: Array, torque_Nm: Array, fit: ForceFit) -> Array:
+    """Centre of mass of a known rotation and gravity force, without torque bias (eqs. 4-5).
+
+    `R_TF^S tau_i = r x A_i g` is linear in r. (The matrix of eq. 5 is -<A_i g>, because `<a> b = -<b> a`, as in eq. 11;
+    as printed it gives -r.) The paper's r is in the flange frame; the result is in the sensor frame.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+    torque_Nm : array, shape (n, 3)
+        Sensor axes.
+    fit : ForceFit
+
+    Returns
+    -------
+    array, shape (3,)
+    """
+    weight_flange_N = fit.gravity_force_base_N @ R_base_flange
+    torque_flange_Nm = torque_Nm @ fit.R_flange_sensor.T
+    r = np.linalg.lstsq(-skew(weight_flange_N).reshape(-1, 3), torque_flange_Nm.ravel())[0]
+    return np.asarray(r @ fit.R_flange_sensor, dtype=np.float64)
 
 
 def _equations(

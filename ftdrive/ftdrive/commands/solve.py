@@ -71,6 +71,7 @@ _EPILOG = method_names(_METHODS)
     show_default=True,
     help="Rotation in a CSV: flange to base coordinates, or the inverse (as in the papers).",
 )
+@click.option("--as-published", is_flag=True, help="Carlson's methods as they are printed, without biases.")
 @click.option(
     "--drift",
     type=click.Choice(["auto", "none", "linear", "random-walk"]),
@@ -116,6 +117,7 @@ def solve(
     sources: Sequence[Path],
     method: str,
     orientation: Orientation,
+    as_published: bool,
     drift: Drift,
     mass_kg: float | None,
     level_deg: float | None,
