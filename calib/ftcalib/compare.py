@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import get_args
 
 import numpy as np
@@ -14,7 +15,7 @@ from ftcalib.known import Known
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, predict
 from ftcalib.poses.paper_sets import EVERY_SET, numbers_of
-from ftcalib.published.methods import PUBLISHED, published
+from ftcalib.published.methods import CARLSON, PUBLISHED, published
 from ftcalib.result import CalibrationResult, Method
 from ftcalib.setup import NOTHING, Setup
 from ftcalib.solver import estimator_of, solve
@@ -71,7 +72,7 @@ class Compared:
         }
 
 
-def compare(
+def compare(  # noqa: PLR0913 - one for each thing that may be known
     dataset: CalibrationDataset,
     *,
     drift: Drift = "auto",
@@ -79,6 +80,7 @@ def compare(
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
     setup: Setup = NOTHING,
     default: CalibrationResult | None = None,
+    as_published: bool = False,
     test: CalibrationDataset | None = None,
     truth: Parameters | None = None,
 ) -> list[Compared]:
@@ -91,6 +93,8 @@ def compare(
         As for `solve`. The published methods that need gravity take it from `known`, or assume a level base.
     default : CalibrationResult, optional
         What the default method has found with all of these, if that is known already.
+    as_published : bool
+        Run Carlson's methods as printed, without biases.
     test : CalibrationDataset, optional
         Poses of the free tool that no method has seen, for the columns of Yu's Table III.
     truth : Parameters, optional
@@ -116,7 +120,9 @@ def compare(
             if method == "ml":
                 found = _fitted(default)
             elif method in PUBLISHED:
-                found = _published(dataset, method, known, g_m_s2, setup)
+                found = _published(
+                    dataset, method, known, g_m_s2, setup, as_published=as_published and method in CARLSON
+                )
             else:
                 found = _fitted(solve(dataset, method, drift=drift, known=known, g_m_s2=g_m_s2, setup=setup))
         except (NotObservable, BadDataset) as error:
@@ -205,14 +211,15 @@ def _fitted(result: CalibrationResult) -> tuple[Parameters, float, float]:
 
 
 def _published(
-    dataset: CalibrationDataset, method: Method, known: Known | None, g_m_s2: float, setup: Setup
+    dataset: CalibrationDataset, method: Method, known: Known | None, g_m_s2: float, setup: Setup, *, as_published: bool
 ) -> tuple[Parameters, float, float]:
     R_base_flange, wrench = dataset.R_base_flange, dataset.wrench
-    parameters = estimator_of(method, R_base_flange, known, g_m_s2, setup)(wrench)
+    prepared = partial(estimator_of, method, known=known, g_m_s2=g_m_s2, setup=setup, as_published=as_published)
+    parameters = prepared(R_base_flange)(wrench)
     left_out = np.empty_like(wrench)
     try:
         for out in _folds(len(wrench)):
-            without = estimator_of(method, R_base_flange[~out], known, g_m_s2, setup)(wrench[~out])
+            without = prepared(R_base_flange[~out])(wrench[~out])
             left_out[out] = wrench[out] - predict(without, R_base_flange[out])
     except NotObservable:
         return parameters, np.nan, np.nan

@@ -153,7 +153,7 @@ def test_a_command_that_needs_a_run_works_with_simulate_and_json(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     module = importlib.import_module(f"ftdrive.commands.{'emulated_run' if ' ' in command else command}")
-    monkeypatch.setattr(module, "rehearsed_run", lambda _: nullcontext(Path(demo["run"])))
+    monkeypatch.setattr(module, "rehearsed_run", lambda _, **_options: nullcontext(Path(demo["run"])))
     works_with_simulate_and_json(command, ftdrive, capfd)
 
 
@@ -219,7 +219,7 @@ def test_a_file_gets_the_answer_and_a_reader_that_ends_ends_the_command(
 ) -> None:
     if command in REHEARSED:
         module = importlib.import_module(f"ftdrive.commands.{'emulated_run' if ' ' in command else command}")
-        monkeypatch.setattr(module, "rehearsed_run", lambda _: nullcontext(Path(demo["run"])))
+        monkeypatch.setattr(module, "rehearsed_run", lambda _, **_options: nullcontext(Path(demo["run"])))
     recorder = Recorder([csv := ftdrive.folder / "peg.csv"], info(), {})
     recorder.write(block(100))
     recorder.close()

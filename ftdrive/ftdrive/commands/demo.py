@@ -61,12 +61,13 @@ def demo(
     """
     if sweep and (sets is not None or method != "ml"):
         raise ConfigError("--sweep has no poses: leave out --set and --method")
+    solved_by = method_of_poses(method)
     options = ["--seed", str(seed), *(["--polyscope", polyscope] if polyscope else []), *(REAL_PACE if sweep else ())]
     with Station(sensor, options, control_path=control or "auto") as station:
         truth = station.truth
         messages.print(f"Emulated UR5e, {SENSORS[sensor]}, tool of {truth['mass_kg']:.3f} kg. No real device is used.")
         mode = "sweep" if sweep else "auto"
-        outcome = rehearse(station, runs, "demo", mode=mode, sets=sets, method=method_of_poses(method))
+        outcome = rehearse(station, runs, "demo", mode=mode, sets=sets, method=solved_by)
         if sweep:
             _draw(station.cell, outcome.run)
     if as_json:

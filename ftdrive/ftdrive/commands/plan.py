@@ -180,7 +180,8 @@ def plan(
         from ftdrive.planning.show.words import plan_in_words, stop_in_words
 
         answer.print(*filter(None, (plan_in_words(made), stop_in_words(made, cell.robot))), *saved, sep="\n")
-        messages.print_next(f"ftdrive calibrate{' --simulate' if simulate else ''}   (asks before anything moves)")
+        same = f"{' --simulate' if simulate else ''}{f' --set {sets}' if sets else ''}"
+        messages.print_next(f"ftdrive calibrate{same}   (asks before anything moves)")
     if view:
         _look(made, certifier)
 

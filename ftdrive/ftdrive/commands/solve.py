@@ -156,6 +156,8 @@ def solve(
         raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
     if (test is not None or cases) and (method != ("ml" if cases else "all") or (test is not None and cases)):
         raise ConfigError("--test goes with --method all, and --table-iii without either: leave one of them out")
+    if as_published and method != "all" and not method.startswith("carlson-"):
+        raise ConfigError("--as-published is for --method carlson-... and all: every other method has one form")
     if (earlier is not None or joined) and (method != "ml" or (earlier is not None and joined)):
         raise ConfigError("--from and --together are for --method ml, one of the two at a time")
     if joined and pair is not None:
@@ -169,17 +171,18 @@ def solve(
         "known": known_values(mass_kg, level_deg, mounting_deg),
         "up_in_base": upward(up),
     }
-    tested = {"test": test, "cases": cases}
+    how = {"drift": drift, "as_published": as_published}
+    shown = {"test": test, "cases": cases}
     motion = {"pair": pair, "point_mass": point_mass, "topics": (wrench_topic, pose_topic)}
     if joined:
-        _solve_together(sources, drift, read, output, force, as_json)
+        _solve_together(sources, how, read, output, force, as_json)
         return
     if earlier is not None:
         read["earlier"] = read_calibration(earlier)
     poses = 24 if method in (*NEED_SPECIAL, "all") else 6
     options = {"sets": EVERY_SET} if cases else {"poses": poses, "method": "ml" if method == "all" else method}
     with rehearsed_run(sensor, **options) if simulate else nullcontext() as run:
-        _solve_each(sources if run is None else [run], method, drift, read, motion, tested, output, force, as_json)
+        _solve_each(sources if run is None else [run], method, how, read, motion, shown, output, force, as_json)
     if output is not None and sources and sources[0].is_dir():
         index_run(sources[0])  # the result, if it was saved in the run
 
@@ -187,10 +190,10 @@ def solve(
 def _solve_each(
     sources: Sequence[Path],
     method: str,
-    drift: Drift,
+    how: dict[str, Any],
     read: dict[str, Any],
     motion: dict[str, Any],
-    tested: dict[str, Any],
+    shown: dict[str, Any],
     output: Path | None,
     force: bool,
     as_json: bool,
@@ -202,12 +205,12 @@ def _solve_each(
                 options = {key: value for key, value in read.items() if key != "earlier"}
                 is_motion = is_recording(place) or is_bag(place) or in_motion(place)
                 if method == "all" and motion["pair"] is None and not is_motion:
-                    _show_all(source, read_source(place, **options), drift, tested["test"], as_json)
+                    _show_all(source, read_source(place, **options), how, shown["test"], as_json)
                     continue
-                if tested["cases"]:
+                if shown["cases"]:
                     _show_cases(source, read_source(place, **options), as_json)
                     continue
-                result, records = _result_of(place, method, drift, read, motion)
+                result, records = _result_of(place, method, how, read, motion)
                 if as_json:
                     found = [one.to_dict() for one in hints(result, records)]
                     write_json({"source": str(source), "hints": found, **result.to_dict()})
@@ -230,7 +233,7 @@ def _solve_each(
 
 
 def _result_of(
-    place: Path, method: str, drift: Drift, read: dict[str, Any], motion: dict[str, Any]
+    place: Path, method: str, how: dict[str, Any], read: dict[str, Any], motion: dict[str, Any]
 ) -> tuple[CalibrationResult, Sequence[PoseRecord]]:
     """Solve a recording in motion, or poses; also return the records of a run."""
     topics = motion["topics"]
@@ -255,7 +258,7 @@ def _result_of(
     if earlier is not None:
         require_same_cell(earlier, data.provenance)
         return new_tool(earlier, data.dataset, data.provenance), data.records
-    options = {"drift": drift, **data.circumstances, "provenance": data.provenance}
+    options = {**how, **data.circumstances, "provenance": data.provenance}
     with working("Solving"):
         return _solve(data.dataset, method, options), data.records
 
@@ -265,7 +268,7 @@ _AT_REST = {"pair": None, "point_mass": False, "topics": (None, None)}
 
 def _solve_together(
     sources: Sequence[Path],
-    drift: Drift,
+    how: dict[str, Any],
     read: dict[str, Any],
     output: Path | None,
     force: bool,
@@ -277,7 +280,7 @@ def _solve_together(
         with unpacked(source) as place:
             if is_recording(place) or in_motion(place) or is_bag(place):
                 raise ConfigError(f"--together joins poses at rest, and {source} is in motion")
-            results.append(_result_of(place, "ml", drift, read, _AT_REST)[0])
+            results.append(_result_of(place, "ml", how, read, _AT_REST)[0])
     result = together(results)
     if as_json:
         write_json({"sources": [str(source) for source in sources], **result.to_dict()})
@@ -298,11 +301,11 @@ def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) ->
         raise ConfigError(str(error)) from error
 
 
-def _show_all(source: Path, data: Source, drift: Drift, test: Path | None, as_json: bool) -> None:
+def _show_all(source: Path, data: Source, how: dict[str, Any], test: Path | None, as_json: bool) -> None:
     tests = None if test is None else read_dataset(test)
     truth = data.truth
     with working("Solving with all methods"):
-        compared = compare(data.dataset, drift=drift, **data.circumstances, test=tests, truth=truth)
+        compared = compare(data.dataset, **how, **data.circumstances, test=tests, truth=truth)
     if as_json:
         write_json({"schema_version": 1, "source": str(source), "methods": [one.to_dict() for one in compared]})
         return

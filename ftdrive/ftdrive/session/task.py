@@ -77,7 +77,11 @@ class Calibrating:
             more = f"{len(plan.steps) - special} other poses" if special == 24 else f"{special} of them"
             raise PlanRefused(
                 f"{self.method} needs the 24 special orientations, and the tour has {more}: "
-                + ("choose --method mixed" if special == 24 else "choose --method lrom, or jog the arm to more room")
+                + (
+                    "choose --method mixed"
+                    if special == 24
+                    else "plan all 24, jog the arm to more room, or choose --method lrom"
+                )
             )
         return plan
 

@@ -318,8 +318,8 @@ def print_cases(cases: Sequence[tuple[int, str, str, Compared]], *, known: bool)
 
 
 def to_digits(value: float) -> str:
-    """Write a positive number with three digits, without an exponent."""
-    return f"{value:.0f}" if value >= 100 else f"{value:.3g}" if value >= 0.01 else f"{value:.3f}"
+    """Write a positive number with three digits, at most three of them after the point."""
+    return f"{value:.{0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3}f}"
 
 
 def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:

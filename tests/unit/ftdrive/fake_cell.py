@@ -387,8 +387,10 @@ def _planned(cell: CellConfig, model: str, q_rad: tuple[float, ...], poses: int)
     return plan_for(cell, certifier_for(cell, model), np.array(q_rad), poses)
 
 
-def planned_once(cell: CellConfig, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
+def planned_once(cell: CellConfig, certifier: Certifier, q_rad: Array, poses: int, *, sets: str | None = None) -> Plan:
     """As `plan_for`, but the same question is answered from memory: planning takes most of a test's time."""
+    if sets is not None:
+        return plan_for(cell, certifier, q_rad, poses, sets=sets)
     return _planned(cell, certifier.arm.name, tuple(q_rad.tolist()), poses)
 
 
@@ -464,7 +466,7 @@ class Lab:
     def take_poses(self, **options: Any) -> Run | None:
         """As `calibrate`, for a test that does not ask what the poses give."""
         chosen = self._options(**options)
-        return session.take_poses(Calibrating(self.cell, chosen.real), self.operator, chosen)
+        return session.take_poses(Calibrating(self.cell, chosen.real, chosen.sets), self.operator, chosen)
 
     def trust(self) -> Path:
         """Let the plan of this cell count as completed; return its file."""

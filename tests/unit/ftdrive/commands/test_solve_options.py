@@ -26,6 +26,11 @@ PAIR = ("--wrench", "a.csv", "--orientation-file", "b.csv")
         (("a.csv", "b.csv", "--together", "--from", "old.json"), "one of the two"),
         (("a.csv", "b.csv", "-o", "new.json"), "one dataset and one method"),
         (("a.csv", "--method", "all", "-o", "new.json"), "one dataset and one method"),
+        (("a.csv", "--table-iii", "-o", "new.json"), "one dataset and one method"),
+        (("a.csv", "--test", "b.csv"), "goes with --method all"),
+        (("a.csv", "--method", "all", "--test", "b.csv", "--table-iii"), "--table-iii without either"),
+        (("a.csv", "--method", "srom", "--table-iii"), "--table-iii without either"),
+        (("a.csv", "--method", "srom", "--as-published"), "every other method has one form"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(

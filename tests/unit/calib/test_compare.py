@@ -1,0 +1,100 @@
+"""The columns of Yu's Table III, and its eleven cases."""
+
+import numpy as np
+import pytest
+
+from ftcalib import CalibrationDataset
+from ftcalib.compare import CASES, compare, table_iii
+from ftcalib.errors import NotObservable
+from ftcalib.model import Parameters, predict
+from ftcalib.poses.paper_sets import EVERY_SET, numbers_of, paper_set
+
+TRUTH = Parameters(
+    np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    np.array([0.3, -0.5, -19.7]),
+    np.array([3.0, -5.9, -1.0]),
+    np.array([0.002, -0.004, 0.08]),
+    np.array([-0.07, -0.05, 0.02]),
+)
+NAMES = EVERY_SET.split("+")
+NUMBERS = np.concatenate([numbers_of(name) for name in NAMES])
+POSES = np.concatenate([paper_set(name) for name in NAMES])
+
+
+def measured(sigma_N: float, R: np.ndarray = POSES) -> CalibrationDataset:
+    noise = np.random.default_rng(3).normal(0.0, sigma_N, (len(R), 6)) * [1, 1, 1, 0.025, 0.025, 0.025]
+    return CalibrationDataset.of(R, predict(TRUTH, R) + noise)
+
+
+def test_all_cases_are_exact_without_noise_in_any_order_of_the_poses() -> None:
+    order = np.random.default_rng(0).permutation(len(POSES))
+    cases = table_iii(measured(0.0, POSES[order]), NUMBERS[order].tolist(), TRUTH)
+    assert [(number, one.method, data, test) for number, data, test, one in cases] == list(CASES)
+    for *_, one in cases:
+        assert one.largest_errors is not None
+        assert one.largest_errors.max() < 1e-9
+        assert max(one.mass_error, one.centre_error) < 1e-10
+
+
+def test_the_columns_are_the_largest_of_each_axis_and_of_the_norm() -> None:
+    bumped = measured(0.0, paper_set("D"))
+    wrench = bumped.wrench.copy()
+    wrench[7] += [3.0, 4.0, 0.0, 0.0, 0.0, -0.2]
+    wrench[9] += [0.0, -4.5, 0.0, 0.1, 0.0, 0.0]
+    test = CalibrationDataset.of(bumped.R_base_flange, wrench)
+    (one,) = (one for one in compare(measured(0.0, paper_set("A")), test=test) if one.method == "srom")
+    assert one.largest_errors is not None
+    np.testing.assert_allclose(one.largest_errors, [3.0, 4.5, 0.0, 5.0, 0.1, 0.0, 0.2, 0.2], atol=1e-9)
+    document = one.to_dict()["test"]
+    assert document["largest"]["force_N"] == pytest.approx(5.0)
+    assert document["mass_error"] < 1e-10
+
+
+def test_errors_of_weight_and_centre_are_shares_of_the_truth() -> None:
+    heavier = Parameters(
+        TRUTH.R_flange_sensor,
+        1.02 * TRUTH.gravity_force_base_N,
+        TRUTH.force_bias_N,
+        1.5 * TRUTH.p_sensor_com_m,
+        TRUTH.torque_bias_Nm,
+    )
+    *_, one = table_iii(measured(0.0), NUMBERS.tolist(), heavier)[0]
+    assert one.mass_error == pytest.approx(0.02 / 1.02)
+    assert one.centre_error == pytest.approx(0.5 / 1.5)
+
+
+def test_more_data_are_better_and_the_inside_of_the_data_is_best() -> None:
+    """The rules that the text draws from the table: cases 3 and 4, 5 and 6, 6 and 11."""
+    errors = np.zeros(len(CASES))
+    for seed in range(20):
+        noise = np.random.default_rng(seed).normal(0.0, 0.2, (len(POSES), 6)) * [1, 1, 1, 0.025, 0.025, 0.025]
+        dataset = CalibrationDataset.of(POSES, predict(TRUTH, POSES) + noise)
+        clean = predict(TRUTH, POSES)
+        found = table_iii(dataset, NUMBERS.tolist(), TRUTH)
+        errors += [one.parameters is not None and _far(one.parameters, clean, test) for _, _, test, one in found]
+    assert errors[3] < errors[2]
+    assert errors[5] < errors[4]
+    assert errors[10] < errors[5]
+
+
+def _far(parameters: Parameters, clean: np.ndarray, test: str) -> float:
+    rows = np.isin(NUMBERS, numbers_of(test))
+    return float(np.linalg.norm((predict(parameters, POSES[rows]) - clean[rows])[:, :3], axis=1).max())
+
+
+def test_a_missing_pose_is_named_by_its_set() -> None:
+    with pytest.raises(NotObservable, match="1 poses of the sets A are missing"):
+        table_iii(measured(0.0), [0, *NUMBERS[1:].tolist()], TRUTH)
+
+
+def test_carlson_as_published_has_no_bias() -> None:
+    poses = measured(0.01, paper_set("A"))
+    printed = {one.method: one for one in compare(poses, as_published=True)}
+    extended = {one.method: one for one in compare(poses)}
+    for method in ("carlson-eigen", "carlson-nullspace"):
+        without, with_bias = printed[method].parameters, extended[method].parameters
+        assert without is not None
+        assert with_bias is not None
+        np.testing.assert_array_equal(without.force_bias_N, np.zeros(3))
+        np.testing.assert_allclose(with_bias.force_bias_N, TRUTH.force_bias_N, atol=0.05)
+    assert printed["srom"].to_dict() == extended["srom"].to_dict()

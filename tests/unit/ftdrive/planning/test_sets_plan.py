@@ -1,0 +1,64 @@
+"""Plans through the sets of Yu's Fig. 6, and verifications of many poses."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ftcalib.poses.paper_sets import EVERY_SET, numbers_of, paper_set
+from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_sets, plan_verification
+from ftdrive.planning.show.words import plan_in_words
+
+CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))
+HOW: dict[str, Any] = {"speeds": Speeds(), "guess": guess_of(CERTIFIER)}
+
+
+def test_one_tour_visits_both_sets_with_the_wrist_alone() -> None:
+    made = plan_sets(CERTIFIER, USUAL_POSTURE_RAD, "A+E", **HOW)
+    assert made.certified
+    assert made.arm_rests
+    assert sorted(step.number for step in made.steps) == [*range(1, 25), *numbers_of("E").tolist()]
+    words = plan_in_words(made)
+    assert "48 poses: A 24, E 24" in words
+    assert "48 moves all proven clear" in words
+
+
+def test_each_number_has_an_orientation_of_its_set() -> None:
+    pan = 0.3
+    made = plan_sets(CERTIFIER, [pan, *USUAL_POSTURE_RAD[1:]], "A+H", **HOW)
+    kinds = {
+        "A": Rotation.from_euler("z", pan - np.pi / 4).as_matrix() @ paper_set("A"),
+        "H": paper_set("H", spare=100),
+    }
+    for step in made.steps:
+        wanted = kinds["A" if step.number < 100 else "H"]
+        assert np.abs(wanted - np.array(step.R_base_flange)).max(axis=(1, 2)).min() < 1e-6
+
+
+def test_wrong_sets_are_refused() -> None:
+    with pytest.raises(ConfigError, match="no set 'X'"):
+        plan_sets(CERTIFIER, USUAL_POSTURE_RAD, "X", **HOW)
+    low = Certifier(CERTIFIER.arm, Scene((BASE_PLANE, Plane((0.0, 0.0, -1.0), -0.45))))
+    with pytest.raises(PlanRefused, match="no tour of the sets A"):
+        plan_sets(low, USUAL_POSTURE_RAD, "A", **HOW)
+
+
+@pytest.mark.slow
+def test_the_sets_of_the_table_are_one_tour() -> None:
+    made = plan_sets(CERTIFIER, USUAL_POSTURE_RAD, EVERY_SET, **HOW)
+    assert made.certified
+    assert len(made.steps) == 294
+    assert made.motion_time_s < 400
+
+
+@pytest.mark.slow
+def test_a_verification_of_500_poses_is_planned() -> None:
+    made = plan_verification(CERTIFIER, USUAL_POSTURE_RAD, 500, paper_set("A"), **HOW)
+    assert made.certified
+    assert len({step.number for step in made.steps}) == 500

@@ -1,0 +1,63 @@
+"""A calibration by a published method: its poses, its result, and the commands that continue from its run."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from ftdrive.cli import cli
+from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.runs.run import Run
+from ftdrive.session.options import method_of_poses
+from tests.unit.ftdrive.fake_cell import Lab
+
+
+def test_the_run_keeps_its_method_and_every_solve_uses_it(lab: Lab) -> None:
+    outcome = lab.calibrate(method="lrom")
+    assert outcome is not None
+    assert outcome.result.method == "lrom"
+    assert Run(outcome.run.folder).method == "lrom"
+    assert outcome.run.solve_command.endswith(" --method lrom")
+    usual = lab.calibrate()
+    assert usual is not None
+    assert usual.result.method == "ml"
+
+
+@pytest.mark.parametrize(
+    ("method", "sets", "words"),
+    [
+        ("srom", None, "the tour has 6 of them: plan all 24"),
+        ("srom", "H", "the tour has 0 of them"),
+        ("mixed", "H", "the tour has 0 of them"),
+        ("srom", "A+H", "the tour has 12 other poses: choose --method mixed"),
+    ],
+)
+def test_a_tour_without_the_special_orientations_is_refused_before_it_moves(
+    method: str, sets: str | None, words: str, lab: Lab
+) -> None:
+    with pytest.raises(PlanRefused, match=words):
+        lab.calibrate(method=method, sets=sets)
+    assert lab.arm.moves == []
+
+
+def test_case_8_and_its_table_come_from_one_run(lab: Lab) -> None:
+    outcome = lab.calibrate(method="mixed", sets="A+H")
+    assert outcome is not None
+    assert (outcome.result.method, outcome.result.n_poses) == ("mixed", 36)
+    folder = str(outcome.run.folder)
+    answer = CliRunner().invoke(cli, ["solve", folder, "--method", "all", "--test", folder, "--json"])
+    methods = {one["method"]: one for one in json.loads(answer.stdout)["methods"]}
+    assert methods["mixed"]["test"]["largest"]["force_N"] < 0.1
+    assert "test" not in methods["srom"]
+    shown = CliRunner().invoke(cli, ["solve", folder, "--method", "all", "--test", folder], env={"COLUMNS": "80"})
+    assert "Largest errors on the 36 poses" in shown.stdout
+    incomplete = CliRunner().invoke(cli, ["solve", folder, "--table-iii"]).exception
+    assert "poses of the sets" in str(incomplete)
+
+
+def test_methods_that_poses_alone_do_not_serve_are_refused() -> None:
+    assert method_of_poses("yang") == "yang"
+    with pytest.raises(ConfigError, match="no method 'SROM': choose one of ml, srom"):
+        method_of_poses("SROM")
+    with pytest.raises(ConfigError, match="needs the mass on the sensor"):
+        method_of_poses("carlson-cayley")
