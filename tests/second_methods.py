@@ -53,8 +53,8 @@ def srom_weight(F: Array) -> Array:
     return np.array(F_b)
 
 
-def in_order(A: Array, F: Array, within_rad: float = 0.1) -> Array:
-    """Return the mean force at each special orientation: poses no further than an angle from the nearest of the 24."""
+def in_order(A: Array, F: Array, within_rad: float = 0.0175) -> Array:
+    """Return the mean force at each special orientation: poses within an angle, which no paper names, of the 24."""
     traces = np.einsum("nij,sij->ns", A, special())
     nearest = traces.argmax(axis=1)
     near = traces.max(axis=1) >= 1 + 2 * np.cos(within_rad)
@@ -213,7 +213,7 @@ def nullspace(A: Array, F: Array, T: Array, bias: bool) -> Estimate:
     return _with_weight(A, F, T, to_rotation(_mat(r), flip=True).T, bias)
 
 
-def iterative(A: Array, F: Array, T: Array, bias: bool, tol: float = 1e-14, iterations: int = 20_000) -> Estimate:
+def iterative(A: Array, F: Array, T: Array, bias: bool, tol: float = 1e-14, iterations: int = 2000) -> Estimate:
     """Alternating least squares from R = I, converged; the sign of the matrix is corrected (Carlson, algorithm 1)."""
     D, F9 = D_and_F(A, F, bias)
     K = np.linalg.lstsq(F9, D, rcond=None)[0] @ np.linalg.lstsq(D, F9, rcond=None)[0]
@@ -222,6 +222,8 @@ def iterative(A: Array, F: Array, T: Array, bias: bool, tol: float = 1e-14, iter
         before, R = R, to_rotation(_mat(K @ _vec(R)), flip=True)
         if np.abs(R - before).max() < tol:
             break
+    else:
+        raise ValueError("algorithm 1 does not converge")
     return _with_weight(A, F, T, R.T, bias)
 
 
