@@ -28,6 +28,19 @@ def test_an_example_prints_what_its_page_shows(name: str, tmp_path: Path) -> Non
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
+def test_the_figures_of_the_papers_are_drawn_with_the_numbers_of_their_page(tmp_path: Path) -> None:
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, "-W", "error", str(EXAMPLES / "papers/paper_figures.py"), "--output", str(tmp_path)]
+    outcome = subprocess.run(command, env=environment, capture_output=True, encoding="utf-8", check=False)
+    assert (outcome.returncode, outcome.stderr) == (0, "")
+    assert outcome.stdout == (EXAMPLES / "papers/output.txt").read_text(encoding="utf-8")
+    drawn = {path.name for path in tmp_path.iterdir()}
+    assert drawn == {path.name for path in (EXAMPLES.parent / "docs/pictures/papers").iterdir()}
+    page = (EXAMPLES.parent / "docs/explanation/papers-reproduced.md").read_text(encoding="utf-8")
+    assert {name for name in drawn if f"papers/{name})" in page} == drawn
+
+
 def test_there_are_eight_short_examples_each_with_a_page_that_the_index_names() -> None:
     assert len(NAMES) == 8
     assert [name for name in NAMES if not 10 <= len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= 40] == []
