@@ -20,7 +20,7 @@ from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters, predict
-from ftcalib.published.methods import BASELINES, PUBLISHED, Estimator, published, require_printed_form
+from ftcalib.published.methods import BASELINES, PUBLISHED, SPECIAL, Estimator, published, require_printed_form
 from ftcalib.published.yu import ROUNDING_RAD, special_deviation_rad, special_numbers
 from ftcalib.result import CalibrationResult, DriftResult, Method, require_positive_definite
 from ftcalib.setup import NOTHING, Setup
@@ -126,7 +126,7 @@ def solve(
         if named := _mistakes(dataset, wrench_cov, drift, known, g_m_s2, setup):
             raise NotObservable(f"{named[0].words}.", named[0]) from exc
         raise
-    assessed: AssessedFit = _assessed(estimator, dataset, wrench_cov, best) if estimator else best
+    assessed: AssessedFit = _assessed(method, estimator, dataset, wrench_cov, best) if estimator else best
     try:
         require_positive_definite(assessed.covariance)
         require_positive_definite(assessed.covariance if assessed.response is None else assessed.response.covariance)
@@ -147,7 +147,7 @@ def solve(
     )
     chi2 = assessed.chi2 if wrench_cov is None else assessed.measured_chi2
     drifted = best.drift if estimator is None else None
-    deviation = _deviation(method, estimator, assessed.parameters, dataset.R_base_flange) if estimator else []
+    deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
     printed = {"as_published": True} if as_published else {}
     return CalibrationResult(
         parameters=assessed.parameters,
@@ -198,7 +198,9 @@ def _require_usable(method: Method, known: Known | None, as_published: bool) -> 
         raise ValueError(f"{method} cannot use a known {' or '.join(unused)}: leave it out, or use 'ml'")
 
 
-def _assessed(estimator: Estimator, dataset: CalibrationDataset, wrench_cov: Array | None, best: Fit) -> IndependentFit:
+def _assessed(
+    method: Method, estimator: Estimator, dataset: CalibrationDataset, wrench_cov: Array | None, best: Fit
+) -> IndependentFit:
     """Apply a published method; `best` gives the degrees of freedom and the second solution."""
     parameters = estimator(dataset.wrench)
     noise = wrench_cov
@@ -206,9 +208,11 @@ def _assessed(estimator: Estimator, dataset: CalibrationDataset, wrench_cov: Arr
         residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
         square = (residuals**2).reshape(-1, 2, 3).mean(axis=(0, 2)) * 6 * len(dataset) / best.dof
         noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))
+    # Cube roots err most where a component of the gravity force is zero, which their own estimate hides.
+    truth = best.parameters if method in SPECIAL else parameters
     return IndependentFit(
         parameters,
-        _simulated_covariance(estimator, parameters, dataset.R_base_flange, noise),
+        _simulated_covariance(estimator, truth, dataset.R_base_flange, noise),
         dataset.R_base_flange,
         dataset.wrench,
         noise,
@@ -285,15 +289,15 @@ def estimator_of(
     )
 
 
-def _deviation(method: Method, estimator: Estimator, parameters: Parameters, R_base_flange: Array) -> list[Finding]:
+def _deviation(method: Method, estimator: Estimator, truth: Parameters, R_base_flange: Array) -> list[Finding]:
     """Name poses that deviate from the special orientations of the method, and the error that this causes."""
-    if method not in ("srom", "mixed"):
+    if method not in SPECIAL:
         return []
     deviation_rad = special_deviation_rad(R_base_flange, *special_numbers(R_base_flange, others=method == "mixed"))
     if deviation_rad <= ROUNDING_RAD:
         return []
-    without_noise = estimator(predict(parameters, R_base_flange))
-    off_N = np.linalg.norm(without_noise.gravity_force_base_N - parameters.gravity_force_base_N)
+    without_noise = estimator(predict(truth, R_base_flange))
+    off_N = np.linalg.norm(without_noise.gravity_force_base_N - truth.gravity_force_base_N)
     return [Finding.of("orientations_deviate", off_deg=np.degrees(deviation_rad), force_N=off_N)]
 
 
@@ -317,7 +321,7 @@ def _require_determined(R_base_flange: Array, best: Fit, known: Known | None) ->
 
 
 def _simulated_covariance(estimator: Estimator, truth: Parameters, R_base_flange: Array, wrench_cov: Array) -> Array:
-    """Mean square error of a closed form around its own estimate, from repetitions with simulated noise.
+    """Mean square error of a closed form around `truth`, from repetitions with simulated noise.
 
     Linear propagation fails, because SROM's cube roots have no derivative if a component of the gravity force is zero.
     The seed is fixed, so that the same data give the same numbers.

@@ -22,8 +22,10 @@ _GRAVITY_UNKNOWN: Mapping[str, Callable[..., ForceFit]] = {
 }
 
 CARLSON = ("carlson-relaxation", "carlson-cayley", *_GRAVITY_UNKNOWN)
+SPECIAL = ("srom", "mixed")
+"""Those that take the gravity force from the 24 special orientations."""
 BASELINES = ("vougioukas", "wang", "yang")
-PUBLISHED = ("srom", "lrom", "mixed", *CARLSON, *BASELINES)
+PUBLISHED = (*SPECIAL, "lrom", *CARLSON, *BASELINES)
 
 
 def published(

@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import fields, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ from ftcalib.errors import BadDataset
 from ftcalib.known import Known
 from ftcalib.likelihood.fit import fit
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, jacobian, predict
-from ftcalib.published.methods import published
+from ftcalib.published.methods import BASELINES, CARLSON, PUBLISHED, published
 from ftcalib.published.yu import SPECIAL_R_flange_base, lrom
 from ftcalib.result import Method
+from ftcalib.solver import _simulated_covariance
 
 METHODS: tuple[Method, ...] = ("ml", "srom", "lrom")
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
@@ -278,6 +280,128 @@ def test_known_mountings_are_methods() -> None:
         sigma = result.sigma["R_flange_sensor"]
         assert np.flatnonzero(np.asarray(sigma) > 1e-12).tolist() == ([] if method == "known-rotation" else [2])
         assert CalibrationResult.from_dict(result.to_dict()).to_dict() == result.to_dict()
+
+
+R48 = np.concatenate([R24, Rotation.random(24, rng=1).as_matrix()])
+LEVEL = replace(TRUTH, gravity_force_base_N=np.array([0.0, 0.0, -20.0]))
+NO_BIAS = replace(LEVEL, force_bias_N=np.zeros(3), torque_bias_Nm=np.zeros(3))
+
+
+def given(method: Method) -> Known | None:
+    """What a method needs to know about `LEVEL`."""
+    if method in BASELINES:
+        return Known(R_flange_sensor=LEVEL.R_flange_sensor)
+    return Known(mass_kg=20 / STANDARD_GRAVITY_M_S2) if method == "carlson-cayley" else None
+
+
+@pytest.mark.parametrize("sigma_N", [None, 1e-5])
+@pytest.mark.parametrize(("method", "as_published"), [*product(PUBLISHED, [False]), *product(CARLSON, [True])])
+def test_published_methods_are_good_without_noise(method: Method, as_published: bool, sigma_N: float | None) -> None:
+    R, truth = R24 if method == "srom" else R48, NO_BIAS if as_published else LEVEL
+    cov = None if sigma_N is None else white(len(R), sigma_N * SIGMA / SIGMA[0])
+    wrench = predict(truth, R)
+    if sigma_N is not None:  # residuals that are exactly 0 are tested without a covariance
+        wrench += 1e-9 * np.random.default_rng(0).normal(size=wrench.shape)
+    result = solve(dataset(R, wrench, cov), method, known=given(method), as_published=as_published)
+    assert np.abs(truth.difference(result.parameters)).max() < (1e-9 if sigma_N is None else 1e-7)
+    assert result.verdict == "good"
+    document = result.to_dict()
+    assert document["provenance"].get("as_published", False) is as_published
+    assert CalibrationResult.from_dict(document).to_dict() == document
+
+
+def test_carlsons_printed_form_is_judged_by_the_bias_that_it_leaves_out() -> None:
+    data = dataset(R48, noisy(np.random.default_rng(2), R48, white(48)), white(48))
+    assert solve(data, "carlson-nullspace").verdict == "good"
+    printed = solve(data, "carlson-nullspace", as_published=True)
+    assert printed.verdict == "rejected"
+    np.testing.assert_array_equal(printed.sigma["force_bias_N"], 0)
+    for method, words in (("srom", "srom runs as published already"), ("ml", "ml is no published method")):
+        with pytest.raises(ValueError, match=words):
+            solve(data, method, as_published=True)  # type: ignore[arg-type]  # literals in a loop
+
+
+def test_a_wrong_assumption_of_a_baseline_is_named() -> None:
+    rng = np.random.default_rng(3)
+    cov, mounting = white(48), LEVEL.R_flange_sensor
+    wrench = predict(LEVEL, R48) + rng.normal(size=(48, 6)) * SIGMA
+    yawed = Known(R_flange_sensor=Rotation.from_rotvec([0, 0, 0.1]).as_matrix() @ mounting)
+    rolled = Known(R_flange_sensor=Rotation.from_rotvec([0.05, 0, 0]).as_matrix() @ mounting)
+    leaning = replace(LEVEL, gravity_force_base_N=Rotation.from_rotvec([0.05, 0, 0]).apply([0, 0, -20.0]))
+    leaning_wrench = predict(leaning, R48) + rng.normal(size=(48, 6)) * SIGMA
+    exact = Known(R_flange_sensor=mounting)
+    for method, known, data, code in (
+        ("vougioukas", yawed, wrench, "known_mounting"),
+        ("wang", yawed, wrench, "known_mounting"),
+        ("yang", yawed, wrench, None),
+        ("yang", rolled, wrench, "known_mounting"),
+        ("vougioukas", exact, leaning_wrench, "known_gravity_direction"),
+        ("wang", exact, leaning_wrench, None),
+    ):
+        result = solve(dataset(R48, data, cov), method, known=known)  # type: ignore[arg-type]  # literals in a loop
+        assert (result.verdict == "good") == (code is None)
+        assert code is None or code in {one.code for one in result.findings}
+        assert np.abs(result.covariance[:2, :2]).max() < 1e-30
+    up = (-leaning.gravity_force_base_N).tolist()
+    declared = solve(dataset(R48, leaning_wrench, cov), "vougioukas", known=exact, setup=Setup(up_in_base=up))
+    assert declared.verdict == "good"
+
+
+def test_baselines_take_the_mounting_and_nothing_else() -> None:
+    data = dataset(R48, predict(LEVEL, R48))
+    known = Known(R_flange_sensor=LEVEL.R_flange_sensor, mass_kg=2.0, gravity_direction_base=[0, 0, -1])
+    with pytest.raises(ValueError, match="vougioukas cannot use a known mass: leave it out"):
+        solve(data, "vougioukas", known=known)
+    for method in ("wang", "yang"):
+        with pytest.raises(ValueError, match=f"{method} cannot use a known mass or direction of gravity"):
+            solve(data, method, known=known)
+
+
+@pytest.mark.parametrize("method", BASELINES)
+def test_baselines_solve_three_poses(method: Method) -> None:
+    R = Rotation.random(3, rng=1).as_matrix()
+    result = solve(dataset(R, predict(LEVEL, R)), method, known=given(method))
+    assert np.abs(LEVEL.difference(result.parameters)).max() < 1e-9
+    with pytest.raises(NotObservable, match="2 poses are too few, at least 3"):
+        solve(dataset(R[:2], predict(LEVEL, R[:2])), method, known=given(method))
+
+
+@pytest.mark.parametrize("method", ["srom", "mixed"])
+def test_deviations_from_the_special_orientations_are_named_with_their_error(method: Method) -> None:
+    rng = np.random.default_rng(4)
+    for most_deg, expected in ((0.02, False), (0.3, True)):
+        turns = rng.normal(size=(24, 3))
+        turns *= np.deg2rad(most_deg) / np.linalg.norm(turns, axis=1, keepdims=True)
+        R = Rotation.from_rotvec(turns).as_matrix() @ R24
+        R = R if method == "srom" else np.concatenate([R, R48[24:]])
+        result = solve(dataset(R, noisy(rng, R, white(len(R))), white(len(R))), method)
+        notes = [one for one in result.findings if one.code == "orientations_deviate"]
+        assert bool(notes) is expected
+        for note in notes:
+            assert note.severity == "note"
+            assert note.values["off_deg"] == pytest.approx(0.3, abs=0.15)
+            estimate = published(method, R, gravity_direction_base=-UP_IN_BASE)
+            without_noise = estimate(predict(TRUTH, R)).gravity_force_base_N - TRUTH.gravity_force_base_N
+            assert note.values["force_N"] == pytest.approx(np.linalg.norm(without_noise), rel=0.5)
+
+
+@pytest.mark.parametrize("runs", [20, pytest.param(200, marks=pytest.mark.slow)])
+def test_the_sigma_of_srom_includes_the_deviation_of_its_orientations(
+    runs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ftcalib.solver.SIMULATIONS", 50)
+    rng, cov = np.random.default_rng(5), white(24, SIGMA / 20)  # so that the deviation matters
+    squared = np.zeros(15)
+    for _ in range(runs):
+        R = Rotation.from_rotvec(np.deg2rad(0.3) * rng.normal(size=(24, 3)) / np.sqrt(3)).as_matrix() @ R24
+        wrench = predict(LEVEL, R) + rng.normal(size=(24, 6)) * SIGMA / 20
+        estimate = published("srom", R, gravity_direction_base=-UP_IN_BASE)
+        likeliest = fit(R, wrench, cov, drift="none").parameters
+        sigma = np.sqrt(np.diag(_simulated_covariance(estimate, likeliest, R, cov)))
+        squared += (estimate(wrench).difference(LEVEL) / sigma) ** 2 / runs
+    rms = np.sqrt(squared.reshape(5, 3).mean(axis=1))
+    assert (rms > 0.8).all()
+    assert (rms < 1.25).all()
 
 
 def test_knowledge_makes_poor_poses_enough() -> None:
