@@ -173,7 +173,12 @@ def special_numbers(R_base_flange: Array, *, others: bool = False) -> tuple[Indi
         match = _best_match(R_base_flange)
     if match.found < 24 or not (others or len(R_base_flange) == 24):
         raise NotObservable(match.refusal_of_mixed() if others else match.refusal())
-    return match.number, match.Y
+    kept = match.of_the_24(R_base_flange)
+    if kept.all():
+        return match.number, match.Y
+    number = np.full(len(R_base_flange), -1)
+    number[kept], Y = special_numbers(R_base_flange[kept], others=True)
+    return number, Y
 
 
 def special_deviation_rad(R_base_flange: Array, number: Indices, Y: Array) -> float:
@@ -194,6 +199,17 @@ class _Match:
         self.number: Indices = np.where(self.angle_rad <= tolerance_rad, self.nearest, -1)
         self.times_seen = np.bincount(self.number[self.number >= 0], minlength=24)
         self.found = int(np.count_nonzero(self.times_seen))
+
+    def of_the_24(self, R_base_flange: Array) -> NDArray[np.bool_]:
+        """Find (n,) the poses of the 24 and their repetitions, not one of another set that only lies near one of them.
+
+        True for other poses farther away: they do no harm.
+        """
+        order = np.argsort(self.angle_rad)
+        first = np.zeros(24, dtype=np.intp)
+        first[self.number[order[::-1]]] = order[::-1]  # the nearest of each orientation; -1 is overwritten or unused
+        apart = Rotation.from_matrix(np.swapaxes(R_base_flange, 1, 2) @ R_base_flange[first[self.number]]).magnitude()
+        return np.asarray((self.number < 0) | (apart <= ROUNDING_RAD))
 
     def refusal(self) -> str:
         if not self.found:

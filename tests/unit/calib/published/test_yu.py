@@ -154,6 +154,17 @@ def test_mixed_takes_the_gravity_force_from_the_24_and_the_rest_from_all_poses()
     np.testing.assert_allclose(averaged.force_bias_N, alone.force_bias_N + np.array([0.1, 0, 0]), atol=1e-12)
 
 
+@pytest.mark.parametrize("Y", [np.eye(3), turned("ZYX", [10, 20, 30])])
+def test_mixed_takes_no_other_pose_for_a_repetition_that_only_lies_near(Y: Array) -> None:
+    near = turned("x", 0.6) @ Y @ R24[[3]], turned("y", 1.2) @ Y @ R24[[7]]
+    R = np.concatenate([Y @ R24, *near, turned("z", 0.01) @ Y @ R24[[9]]])
+    number, found = special_numbers(R, others=True)
+    assert number.tolist() == [*range(24), -1, -1, 9]
+    np.testing.assert_allclose(found, Y, atol=1e-5)
+    exact = R[:26]
+    assert error(mixed(exact, predict(TRUTH, exact))) < 1e-12
+
+
 def test_mixed_names_what_is_missing() -> None:
     R = np.concatenate([np.delete(R24, [2, 16], axis=0), R24[:5:3], turned("x", 3) @ R24[16:17]])
     with pytest.raises(NotObservable, match=r"missing 3, 17 \(row 25 is 3\.00° from orientation 17.*Record these"):
