@@ -46,3 +46,20 @@ def test_a_noisy_pose_keeps_its_size() -> None:
     size = np.trace(np.linalg.solve(SHAPE / 50, pooled_covariance(cov, n_samples)), axis1=1, axis2=2) / 6
     assert 15 < size[4] < 40
     assert np.all(np.delete(size, 4) < 2)
+
+
+def test_samples_of_filtered_noise_count_as_few() -> None:
+    rng, n_samples = np.random.default_rng(4), np.full(24, 1000)
+    own = SHAPE * rng.chisquare(4, (24, 1, 6)) / 4  # as of 1000 samples behind a low-pass of 2 Hz
+    pooled = np.diagonal(pooled_covariance(own, n_samples), axis1=1, axis2=2) / np.diag(SHAPE)
+    assert pooled.std() < 0.35  # 0.7 with the weight of 1000 independent samples
+    assert 0.8 < pooled.mean() < 1.2
+
+
+def test_a_pose_of_another_shape_keeps_it_among_many_samples() -> None:
+    n_samples = np.full(24, 1000)
+    own = sampled(np.random.default_rng(5), n_samples, np.ones(24))
+    own[7, 2, 2] *= 50.0
+    pooled = pooled_covariance(own, n_samples)
+    assert 25 < pooled[7, 2, 2] / pooled[8, 2, 2] < 60
+    assert pooled[7, 0, 0] < 3 * pooled[8, 0, 0]
