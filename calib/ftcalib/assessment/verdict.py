@@ -13,9 +13,10 @@ from ftcalib.assessment import described_cell, units
 from ftcalib.assessment.cable import Cable, cable_of
 from ftcalib.assessment.contradictions import contradictions
 from ftcalib.assessment.cross_validation import AssessedFit, DriftAhead, drift_ahead, standardized
-from ftcalib.assessment.faults import COLLAPSE, broken_channels, constant_weight, faults, other_poses
+from ftcalib.assessment.faults import COLLAPSE, ROUNDING, broken_channels, constant_weight, faults, other_poses
 from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
 from ftcalib.assessment.session_change import session_change
+from ftcalib.data.dwell_mean import RESOLUTION
 from ftcalib.findings import Finding, Severity, Verdict, ordered, verdict_of
 from ftcalib.known import Known
 from ftcalib.likelihood.fit import DriftEstimate, Fit
@@ -33,8 +34,6 @@ NOISY_SHARE = 0.01
 """Largest error of a good result whose residuals exceed the measured noise."""
 USUAL_LEVER_M = 0.1
 """Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther."""
-NOISELESS = 1e-6
-"""Below this chi2 per degree of freedom the data are simulated without noise, and equal readings are no copies."""
 CORRELATED = 0.9
 FEW_LEFT_OUT = 0.1
 ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
@@ -114,12 +113,13 @@ def judge(
     parameters, weight_N = fit.parameters, at.weight_N
     few_rejected = at.used.sum() >= (1 - FEW_LEFT_OUT) * len(at.used)
     suspect = at.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
-    broken = broken_channels(fit.wrench, fit.R_base_flange) if fit.chi2 > NOISELESS * fit.dof else []
+    broken = [] if at.is_exact else broken_channels(fit.wrench, fit.R_base_flange)
     mistakes = _mistakes(fit, at.used, t_s, setup) if suspect else []
     changed = [] if mistakes else _change(unconstrained or fit, at, measured_sigma, t_s)
     if suspect and not (mistakes or changed):
         mistakes = _other_poses(fit, at.used, t_s)
-    cable = cable_of(fit) if isinstance(fit, Fit) and not (at.fits_measured_noise or mistakes or changed) else None
+    explained = at.is_exact or at.fits_measured_noise or mistakes or changed
+    cable = cable_of(fit) if isinstance(fit, Fit) and not explained else None
     contradicted: list[Finding] = []
     if known is not None and unconstrained is not None:
         at_its_best = unconstrained.parameters, unconstrained.covariance
@@ -137,7 +137,7 @@ def judge(
         *_noise(fit, at),
         *_poses(fit, at, "note" if few_rejected else "limit"),
         *_drift(fit.drift, at.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
-        *_response(fit.response),
+        *_response(fit.response, weight_N),
         *_cable(cable),
     ]
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
@@ -172,6 +172,8 @@ class _Statistics:
     """The numbers that the findings rest on; those with the names of `Quality` have its meaning."""
 
     used: NDArray[np.bool_]
+    is_exact: bool
+    """Whether less is left than a sensor resolves, as of simulated data: their equal readings are no copies."""
     weight_N: float
     residual_sigma: Array
     worst_pose: int
@@ -209,8 +211,10 @@ def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
     residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
     largest_share, errors, left_out_rms = _errors(fit, used, weight_N)
     measured = bool(np.isfinite(fit.measured_chi2))
+    rest, largest = (np.abs(x[used]).max(axis=0) for x in (fit.residuals, fit.wrench))
     return _Statistics(
         used,
+        bool((rest <= np.maximum(RESOLUTION, ROUNDING * np.repeat(largest.reshape(2, 3).max(axis=1), 3))).all()),
         weight_N,
         residual_sigma,
         int(np.argmax(np.where(used, residual_sigma, -1.0))),
@@ -373,6 +377,8 @@ def _poses(fit: AssessedFit, at: _Statistics, severity_of_rejected: Severity) ->
     rows = np.flatnonzero(uncertain & at.used) + 1
     if 0 < rows.size <= n / 2:
         found.append(Finding.of("poses_unchecked", poses=rows))
+    if at.is_exact:
+        return found
     if at.lag1_p < SURE:
         found.append(Finding.of("residuals_alike", correlation=at.lag1))
     worst, typical = float(at.residual_sigma[at.worst_pose]), float(np.median(at.residual_sigma[at.used] ** 2))
@@ -390,8 +396,7 @@ def _drift(drift: DriftEstimate | None, ahead: DriftAhead, weight_N: float, *, i
         return []
     force_N, torque_Nm = (float(np.linalg.norm(drift.change[part])) for part in (slice(0, 3), slice(3, 6)))
     size_N = max(force_N, torque_Nm / USUAL_LEVER_M)
-    rounding = 1e-9 * size_N  # of a group without drift, whose sigma is as small
-    channels = np.abs(drift.change) > np.maximum(3 * drift.sigma, rounding)
+    channels = np.abs(drift.change) > np.maximum(3 * drift.sigma, RESOLUTION)
     significant = np.array([channels[:3].any(), channels[3:].any()])
     if not significant.any():
         return []
@@ -401,13 +406,13 @@ def _drift(drift: DriftEstimate | None, ahead: DriftAhead, weight_N: float, *, i
     return [Finding.of("drift", "limit" if matters else "note", **values)]
 
 
-def _response(response: Response | None) -> list[Finding]:
+def _response(response: Response | None, weight_N: float) -> list[Finding]:
     """Name the axes along which the sensor reads high or low, and how much force leaks into torque."""
     if response is None:
         return []
     gain, cross_talk, sigma = response.force_gain, response.cross_talk_m, response.sigma
     certain = np.abs(gain) > 3 * sigma["force_gain"]
-    certain &= sigma["force_gain"] > 0
+    certain &= (sigma["force_gain"] > 0) & (np.abs(gain) * weight_N > RESOLUTION[0])
     found = [Finding.of(f"gain_{axis}", gain_percent=100 * gain[k, k]) for k, axis in enumerate("xyz") if certain[k, k]]
     found += [
         Finding.of("axes_mixed", axes=f"{'xyz'[i]} and {'xyz'[j]}", share_percent=100 * abs(gain[i, j]))

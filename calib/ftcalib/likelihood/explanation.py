@@ -82,7 +82,9 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
     if session.lacks_rank(minima[0]):
         return plain, minima, minima[0].chi2
     if session.is_exact(minima[0].parameters):
-        minima = session.descent.minima(inverses(session.cov))
+        if not session.measured:
+            session.cov = session.noise_left(minima[0].parameters)
+            minima = session.descent.minima(inverses(session.cov))
         return plain, minima, minima[0].chi2
     if not session.measured:
         session.cov = session.least_noise(minima[0].parameters)

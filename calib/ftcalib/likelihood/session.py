@@ -5,6 +5,7 @@ from typing import Literal
 
 import numpy as np
 
+from ftcalib.data.dwell_mean import RESOLUTION
 from ftcalib.known import Constraints
 from ftcalib.likelihood.descent import Descent, Minimum, column_scale
 from ftcalib.likelihood.gain_and_cross_talk import LEVER_M as CROSS_TALK_LEVER_M
@@ -34,6 +35,8 @@ FEW_POSES_FOR_RESPONSE = 7  # fewer cannot separate gain and cross-talk from noi
 FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot separate drift from unknown noise
 FEW_POSES_FOR_HYSTERESIS = 12  # fewer cannot separate it from gain and noise
 POSES_FOR_EACH_AXIS = 50  # fewer cannot separate the drifts of the axes of a group
+EXACT = 100  # times the rounding of the data: what a fit to data without noise leaves
+UNEQUAL = 0.01  # residuals of one kind, relative to the other at the usual ratio, are no less
 FLOOR = 1e-3  # of the residuals: the least white noise where it was not measured
 
 
@@ -76,24 +79,33 @@ class Session:
         eigenvalues = np.linalg.eigvalsh(H / np.outer(scale, scale))
         return bool(eigenvalues[0] < RANK_TOLERANCE * eigenvalues[-1]) or self.dof(np.ones(self.n, bool)) <= 0
 
-    def _least(self) -> tuple[float, float]:
-        """Noise of data that have none: their rounding."""
-        least_N = 1e-12 * float(np.abs(self.wrench[:, :3]).max())
-        return least_N, LEVER_M * least_N
+    def _least(self) -> Array:
+        """Noise (2,) of force and torque of data that have none: their rounding."""
+        largest_N, largest_Nm = np.abs(self.wrench).reshape(-1, 2, 3).max(axis=(0, 2))
+        return 1e-12 * np.array([largest_N, max(largest_Nm, LEVER_M * largest_N)])
 
     def is_exact(self, p: Parameters) -> bool:
-        """Whether the parameters fit data of unknown noise to rounding."""
-        if self.measured:
-            return False
-        residuals = self.wrench - predict(p, self.R)
-        return float(np.abs(residuals[:, :3]).max()) < 100 * self._least()[0]
+        """Whether the parameters fit to rounding, or to what no sensor resolves if the noise is unknown."""
+        residuals = np.abs(self.wrench - predict(p, self.R)).max(axis=0).reshape(2, 3).max(axis=1)
+        rounding = EXACT * self._least()
+        return bool((residuals < (rounding if self.measured else np.maximum(rounding, RESOLUTION[::3]))).all())
+
+    def noise_left(self, p: Parameters) -> Array:
+        """Take the residuals as white noise."""
+        return self._white(self._rms(p) * np.sqrt(6 * self.n / self.dof(self.everything)))
 
     def least_noise(self, p: Parameters) -> Array:
         """Give a small share of the residuals, so that a random walk never explains them all."""
-        e = self.wrench - predict(p, self.R)
-        force_N, torque_Nm = (FLOOR * float(np.sqrt(np.mean(e[:, c] ** 2))) for c in (slice(0, 3), slice(3, 6)))
-        least_N, least_Nm = self._least()
-        return np.broadcast_to(white(max(force_N, least_N), max(torque_Nm, least_Nm)), self.cov.shape)
+        return self._white(FLOOR * self._rms(p))
+
+    def _white(self, sigma: Array) -> Array:
+        return np.broadcast_to(white(*np.maximum(sigma, self._least())), self.cov.shape)
+
+    def _rms(self, p: Parameters) -> Array:
+        """Residuals (2,) of force and torque; beside forces that rounding has made exact, torques must have a weight."""
+        e = (self.wrench - predict(p, self.R)).reshape(-1, 2, 3)
+        rms = np.sqrt(np.mean(e**2, axis=(0, 2)))
+        return np.asarray(np.maximum(rms, UNEQUAL * rms[::-1] * [1 / LEVER_M, LEVER_M]))
 
     def start(self, problem: Linearised, components: Sequence[Component]) -> Array:
         """Give variances to start from: the mean square residual of the group, or its noise where that is more."""

@@ -51,19 +51,30 @@ def test_noise_that_was_not_measured_is_at_least_a_thousandth_of_the_residuals_a
     residuals = np.tile([0.3, -0.3, 0.3, -0.01, 0.01, 0.01], (24, 1)) * np.where(np.arange(24) % 2, 1, -1)[:, None]
     own = session(R24, measured=False, residuals=residuals)
     np.testing.assert_allclose(own.least_noise(TOOL)[5], white(0.3e-3, 0.01e-3))
-    largest_N = np.abs(own.wrench[:, :3]).max()
-    np.testing.assert_allclose(own.cov[5], white(1e-12 * largest_N, 0.025e-12 * largest_N))
+    largest_N, largest_Nm = np.abs(own.wrench[:, :3]).max(), np.abs(own.wrench[:, 3:]).max()
+    np.testing.assert_allclose(own.cov[5], white(1e-12 * largest_N, 1e-12 * largest_Nm))
     exact = session(R24, measured=False)
     np.testing.assert_allclose(exact.least_noise(TOOL), np.broadcast_to(exact.cov, (24, 6, 6)))
+    residuals[:, :3] = 0.0
+    exact_forces = session(R24, measured=False, residuals=residuals)
+    np.testing.assert_allclose(
+        exact_forces.noise_left(TOOL)[5], white(4e-3 * np.sqrt(144 / 129), 0.01 * np.sqrt(144 / 129))
+    )
 
 
-@pytest.mark.parametrize(("share", "exact"), [(0.9e-10, True), (1.1e-10, False)])
-def test_data_are_exact_to_their_rounding_only_where_their_noise_is_unknown(share: float, exact: bool) -> None:
-    residuals = np.zeros((24, 6))
-    residuals[7, 1] = -share * np.abs(predict(TOOL, R24)[:, :3]).max()
-    residuals[:, 3:] = 0.1  # the forces decide
-    assert session(R24, measured=False, residuals=residuals).is_exact(TOOL) == exact
-    assert not session(R24, residuals=residuals).is_exact(TOOL)
+@pytest.mark.parametrize(("share", "exact"), [(0.9, True), (1.1, False)])
+@pytest.mark.parametrize(("channel", "resolution"), [(1, 1e-3), (4, 2.5e-5)])
+def test_data_are_exact_to_what_a_sensor_resolves_and_to_rounding(
+    share: float, exact: bool, channel: int, resolution: float
+) -> None:
+    def is_exact(size: float, *, measured: bool) -> bool:
+        residuals = np.zeros((24, 6))
+        residuals[7, channel] = -share * size
+        return session(R24, measured=measured, residuals=residuals).is_exact(TOOL)
+
+    group = slice(0, 3) if channel < 3 else slice(3, 6)
+    assert is_exact(resolution, measured=False) == exact
+    assert is_exact(1e-10 * np.abs(predict(TOOL, R24)[:, group]).max(), measured=True) == exact
 
 
 def test_variances_start_at_the_mean_square_of_the_used_poses_or_at_their_noise() -> None:
