@@ -102,7 +102,7 @@ class Session:
         return np.broadcast_to(white(*np.maximum(sigma, self._least())), self.cov.shape)
 
     def _rms(self, p: Parameters) -> Array:
-        """Residuals (2,) of force and torque; beside forces that rounding has made exact, torques must have a weight."""
+        """Residuals (2,) of force and torque; rounding may hide one kind, which must not outweigh the other."""
         e = (self.wrench - predict(p, self.R)).reshape(-1, 2, 3)
         rms = np.sqrt(np.mean(e**2, axis=(0, 2)))
         return np.asarray(np.maximum(rms, UNEQUAL * rms[::-1] * [1 / LEVER_M, LEVER_M]))
