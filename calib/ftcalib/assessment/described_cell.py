@@ -89,11 +89,16 @@ _OTHER_ORDERS: Final = {
 
 
 def _inside_m(parameters: Parameters, covariance: Array) -> float:
-    """Distance of the centre of mass behind the sensor, towards the robot; 0 if it is not significant."""
+    """Distance of the centre of mass behind the sensor, towards the robot; 0 if it is not significant.
+
+    Reversed torques put the centre of mass of a tool along the flange axis inside the arm, where no tool is. That of a
+    tool to the side lies beside the arm either way, so farther aside than behind shows nothing.
+    """
     outwards = parameters.R_flange_sensor[2]  # flange z in the sensor frame
     inside_m = -float(outwards @ parameters.p_sensor_com_m)
+    aside_m = float(np.linalg.norm(np.cross(outwards, parameters.p_sensor_com_m)))
     sigma_m = float(np.sqrt(outwards @ covariance[9:12, 9:12] @ outwards))
-    return inside_m if inside_m > max(INSIDE_M, 3 * sigma_m) else 0.0
+    return inside_m if inside_m > max(INSIDE_M, 3 * sigma_m, aside_m) else 0.0
 
 
 @dataclass(frozen=True, slots=True)

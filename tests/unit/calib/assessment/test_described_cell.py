@@ -148,22 +148,25 @@ def test_gravity_off_the_mounting_is_named_by_its_angle(
 
 
 @pytest.mark.parametrize(
-    ("inside_m", "sigma_m", "reversed_torques"),
+    ("inside_m", "aside_m", "sigma_m", "reversed_torques"),
     [
-        (-0.3, 1e-6, False),
-        (0.009, 1e-6, False),
-        (0.011, 1e-6, True),
-        (0.029, 0.01, False),
-        (0.031, 0.01, True),
-        (0.49, 1e-6, True),
-        (0.51, 1e-6, False),
+        (-0.3, 0.0, 1e-6, False),
+        (0.009, 0.005, 1e-6, False),
+        (0.011, 0.005, 1e-6, True),
+        (0.029, 0.02, 0.01, False),
+        (0.031, 0.02, 0.01, True),
+        (0.1, 0.099, 1e-6, True),
+        (0.1, 0.101, 1e-6, False),
+        (0.49, 0.2, 1e-6, True),
+        (0.51, 0.2, 1e-6, False),
     ],
 )
-def test_a_centre_of_mass_behind_the_sensor_shows_reversed_torques(
-    inside_m: float, sigma_m: float, reversed_torques: bool
+def test_a_centre_of_mass_behind_the_sensor_but_not_beside_it_shows_reversed_torques(
+    inside_m: float, aside_m: float, sigma_m: float, reversed_torques: bool
 ) -> None:
     mount = Rotation.from_rotvec([0.5, -0.2, 0.4]).as_matrix()
-    behind = replace(NO_LEAN, R_flange_sensor=mount, p_sensor_com_m=mount.T @ [0.2, 0.1, -inside_m])
+    com_flange_m = [0.6 * aside_m, -0.8 * aside_m, -inside_m]
+    behind = replace(NO_LEAN, R_flange_sensor=mount, p_sensor_com_m=mount.T @ com_flange_m)
     covariance = CERTAIN.copy()
     covariance[9:12, 9:12] = mount.T @ np.diag([1.0, 1.0, sigma_m**2]) @ mount
     found = directions(behind, covariance, Setup())
