@@ -294,7 +294,8 @@ CODES: Final[Mapping[str, Code]] = {
     "weight_implausible": Code(_REJECT_OR_LIMIT, "the weight is {weight_N:.5g}{units:units}",
         "check the units of force and torque"),
     "com_too_far": Code(_REJECT_OR_LIMIT, "the centre of mass is {distance_m:.2f} from the sensor, farther than "
-        "{most_m:g}{units:units}", "check the units of force and torque, or describe the tool ([tool] cylinders_mm)"),
+        "{most_m:g}{units:units}", "check the units of force and torque, or describe the tool if it reaches so far "
+        "([tool] cylinders_mm, [workcell] measured = true)"),
     "com_too_near": Code(_LIMIT, "the centre of mass is only {distance_mm:.2g} from the sensor, as if torques were "
         "1000 times too small or forces were in mN", "check the units of force and torque"),
     # Directions and signs

@@ -9,7 +9,7 @@ from ftcalib.model import Parameters
 
 USUAL_COM_M = (0.02, 0.2)
 FAR_COM_M, FARTHEST_COM_M = 0.25, 0.5
-"""A centre of mass farther than the first must be described, farther than the second is wrong."""
+"""A centre of mass farther than the first must be described; farther than the second is wrong otherwise."""
 NEAREST_COM_M = 5e-4
 LIGHTEST_N, HEAVIEST_N, IMPOSSIBLE_N = 0.3, 500.0, 2000.0
 """Weights beyond these look like forces in another unit: 30 g, and more than any UR arm carries."""
@@ -68,7 +68,7 @@ def implausible(found: Parameters, residual_N: float, *, described: bool) -> lis
     residual_N : float
         Root mean square of the forces.
     described : bool
-        Whether the shape of the tool is, which shows how far its centre of mass may be.
+        Whether the shape of the tool is, which alone limits how far its centre of mass may be.
     """
     weight_N, com_m = (float(np.linalg.norm(x)) for x in (found.gravity_force_base_N, found.p_sensor_com_m))
     findings = too_light(weight_N, com_m, residual_N)
@@ -76,7 +76,7 @@ def implausible(found: Parameters, residual_N: float, *, described: bool) -> lis
         severity: Severity = "reject" if weight_N > IMPOSSIBLE_N else "limit"
         names = [unit for unit in ("gf", "mN") if LIGHTEST_N < weight_N * FORCE_UNITS_N[unit] <= HEAVIEST_N]
         findings.append(Finding.of("weight_implausible", severity, weight_N=weight_N, units=suspects(found, names)))
-    if com_m > (FARTHEST_COM_M if described else FAR_COM_M):
+    if com_m > FAR_COM_M and not described:
         values = {"distance_m": com_m, "most_m": FARTHEST_COM_M if com_m > FARTHEST_COM_M else FAR_COM_M}
         severity = "reject" if com_m > FARTHEST_COM_M else "limit"
         findings.append(Finding.of("com_too_far", severity, **values, units=by_com(com_m)))

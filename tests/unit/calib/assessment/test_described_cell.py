@@ -13,6 +13,7 @@ from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, Se
 from ftcalib.assessment.described_cell import _OTHER_ORDERS, LEAN_DEG, directions, lean_from, payload, tool
 from ftcalib.model import predict
 from ftcalib.poses.information import special
+from ftcalib.published.yu import SPECIAL_R_flange_base
 
 Array = NDArray[np.float64]
 
@@ -282,6 +283,22 @@ def test_a_centre_of_mass_far_outside_is_rejected_and_units_are_named() -> None:
     assert ["lbf", "N·m"] in result.findings[0].values["units"]
     undescribed = solve(far)
     assert (undescribed.verdict, undescribed.findings[0].code) == ("usable", "com_too_far")
+
+
+def test_a_description_decides_how_far_the_centre_of_mass_may_be() -> None:
+    """The first setup of Yu et al., Table I, has it at 2 m."""
+    R = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+    mount = Rotation.from_euler("ZYX", [0, 7, 3], degrees=True).as_matrix().T
+    zero = np.zeros(3)
+    readings = predict(Parameters(mount, np.array([0.0, 0, -10]), zero, np.array([0.0, 0, 2]), zero), R)
+    data = CalibrationDataset.of(R, readings)
+    undescribed, short, long = (
+        solve(data, setup=Setup(cylinders_m=rows, sensor_height_m=0.04))
+        for rows in ((), [(0.0, 0.2, 0.1)], [(0.0, 2.1, 0.6)])
+    )
+    assert (undescribed.verdict, codes(undescribed)[0]) == ("rejected", "com_too_far")
+    assert (short.verdict, codes(short)[0]) == ("rejected", "com_outside_tool")
+    assert long.verdict == "good"
 
 
 def test_reversed_torques_come_before_what_they_put_outside() -> None:

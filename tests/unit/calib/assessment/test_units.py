@@ -62,7 +62,8 @@ def test_a_weight_of_no_tool_is_named_with_the_units_that_make_it_one(
         (0.49, False, [("com_too_far", "limit", 0.25)]),
         (0.49, True, []),
         (0.51, False, [("com_too_far", "reject", 0.5)]),
-        (0.51, True, [("com_too_far", "reject", 0.5)]),
+        (0.51, True, []),
+        (2.0, True, []),
     ],
 )
 def test_a_centre_of_mass_of_no_tool_is_named(com_m: float, described: bool, expected: list[object]) -> None:
