@@ -10,6 +10,8 @@ TRUSTED_SAMPLES = 100.0
 """With this many independent samples, the covariance of a pose counts as much as the common shape."""
 MEDIAN_SCATTER = float(chi2_isf(5, 0.5)) / 5
 """Median of the variance of six Gaussian values, relative to its mean."""
+UNLIKE = 3.0
+"""A pose whose variances scatter more than this, relative to their freedom, has a shape of its own: 1 % by chance."""
 
 
 def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
@@ -46,15 +48,18 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
         before, size = size, S @ np.linalg.inv(shape).ravel() / 6
         if np.abs(size - before).max() <= 1e-12 * size.max():
             break
-    freedom *= _independent_share(S, shape, freedom)
+    spread = _spread_within(S, shape)
+    typical = float(np.median(spread * freedom)) / MEDIAN_SCATTER / (1 - 1 / len(S))
+    freedom *= min(1.0, 2 / max(typical, 1e-12))
     # Equal sizes scatter by 2 / (6 freedom) in the logarithm, whose mean is half of that low: remove both.
-    scatter = 2 / (6 * freedom)
-    log_size = np.log(size) + scatter / 2
+    log_size, scatter = np.log(size), 2 / (6 * freedom)
     mean = float(np.average(log_size, weights=freedom))
-    real = max(float(np.average((log_size - mean) ** 2 - scatter, weights=freedom)), 0.0)
-    size = np.exp(mean + (log_size - mean) * real / (real + scatter))
+    found = float(np.average((log_size - mean) ** 2, weights=freedom))
+    real = max(found - float(np.average(scatter, weights=freedom)), 0.0)
+    size = np.exp(mean + (log_size - mean) * real / (real + scatter) + np.minimum(scatter, found) / 2)
     own, common = np.ones(len(known)), np.zeros(len(known))
-    own[known] = freedom / (freedom + TRUSTED_SAMPLES)
+    unlike = 1 - UNLIKE * 2 / freedom / np.maximum(spread, 1e-12)
+    own[known] = np.maximum(freedom / (freedom + TRUSTED_SAMPLES), unlike)
     common[known] = (1 - own[known]) * size
     pooled = own[:, None, None] * wrench_cov
     for i, j in np.ndindex(6, 6):  # without a second array of that size
@@ -62,10 +67,9 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
     return pooled
 
 
-def _independent_share(S: Array, shape: Array, freedom: Array) -> float:
-    """Estimate which share of the freedom covariances (n, 36) have; the median ignores a pose of another shape."""
+def _spread_within(S: Array, shape: Array) -> Array:
+    """Return how the logarithms of the six variances of each covariance (n, 36) scatter, independent ones in shape."""
     white = np.linalg.inv(np.linalg.cholesky(shape))
     log_variances = np.log(S @ np.einsum("ca,cb->abc", white, white).reshape(36, 6))
     log_variances -= np.median(log_variances, axis=0)  # a pose of another shape is a part of the common one
-    scatter = float(np.median(log_variances.var(axis=1, ddof=1) * freedom)) / MEDIAN_SCATTER
-    return min(1.0, 2 * (1 - 1 / len(S)) / max(scatter, 1e-12))
+    return np.asarray(log_variances.var(axis=1, ddof=1))

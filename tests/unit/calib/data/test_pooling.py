@@ -1,6 +1,7 @@
 """Pooled covariances: the common shape, the size of each, and what stays as it is."""
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from ftcalib.data.pooling import pooled_covariance
@@ -56,10 +57,14 @@ def test_samples_of_filtered_noise_count_as_few() -> None:
     assert 0.8 < pooled.mean() < 1.2
 
 
-def test_a_pose_of_another_shape_keeps_it_among_many_samples() -> None:
-    n_samples = np.full(24, 1000)
-    own = sampled(np.random.default_rng(5), n_samples, np.ones(24))
+@pytest.mark.parametrize("freedom", [20, 999])
+def test_a_pose_of_another_shape_keeps_it(freedom: int) -> None:
+    own = SHAPE * np.random.default_rng(5).chisquare(freedom, (24, 1, 6)) / freedom
     own[7, 2, 2] *= 50.0
-    pooled = pooled_covariance(own, n_samples)
-    assert 25 < pooled[7, 2, 2] / pooled[8, 2, 2] < 60
-    assert pooled[7, 0, 0] < 3 * pooled[8, 0, 0]
+    pooled = pooled_covariance(own, np.full(24, 1000))
+    assert 20 < pooled[7, 2, 2] / pooled[8, 2, 2] < 60
+    assert pooled[7, 0, 0] < 3.5 * pooled[8, 0, 0]
+
+
+def test_equal_covariances_are_not_changed() -> None:
+    np.testing.assert_allclose(pooled_covariance(np.tile(SHAPE, (5, 1, 1)), np.full(5, 2)), np.tile(SHAPE, (5, 1, 1)))
