@@ -219,6 +219,7 @@ def _assessed(
         wrench_cov is not None,
         np.ones(len(dataset)),
         best.second_basin_chi2,
+        free=best.free,
     )
 
 

@@ -34,6 +34,8 @@ class IndependentFit:
     response: None = None
     drift: None = None
     gain_sigma: float = 0.0
+    free: Array = field(default_factory=lambda: np.eye(15))
+    """(15, m) error coordinates that the method estimates: fewer where it assumes mounting or gravity."""
 
     @cached_property
     def residuals(self) -> Array:
@@ -54,7 +56,7 @@ class IndependentFit:
     @property
     def dof(self) -> int:
         """Of chi2."""
-        return 6 * int(self.weights.sum()) - 15
+        return 6 * int(self.weights.sum()) - int(self.free.shape[1])
 
     @property
     def left_out_residuals(self) -> Array:
@@ -69,7 +71,10 @@ class IndependentFit:
     @cached_property
     def _left_out(self) -> tuple[Array, Array]:
         """(I - H_kk)^-1 r_k without fitting again, exact for a linear model, and its covariance."""
-        J, noise = jacobian(self.parameters, self.R_base_flange), Noise(self.wrench_cov, kept=self.weights > 0)
+        J, noise = (
+            jacobian(self.parameters, self.R_base_flange) @ self.free,
+            Noise(self.wrench_cov, kept=self.weights > 0),
+        )
         WJ = noise.solve(J)
         information = summed_products(J, WJ)
         scale = column_scale(information)

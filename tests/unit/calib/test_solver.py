@@ -602,3 +602,22 @@ def test_a_real_session_with_drift_is_not_called_good() -> None:
     static = solve(real("foamcutting_2013_06_12"), drift="none")
     assert static.mass_kg == pytest.approx(0.474, abs=0.01)
     assert static.drift is None
+
+
+@pytest.mark.parametrize("method", ["vougioukas", "wang", "yang"])
+def test_a_baseline_counts_only_the_parameters_that_it_estimates(method: Method) -> None:
+    rng = np.random.default_rng(3)
+    R = Rotation.random(5, rng=rng).as_matrix()
+    truth = Parameters(
+        np.eye(3),
+        np.array([0, 0, -20.0]),
+        np.array([1.0, 2, 3]),
+        np.array([0.01, 0.02, 0.08]),
+        np.array([0.1, 0.2, 0.3]),
+    )
+    sigma = np.repeat([0.02, 0.0005], 3)
+    wrench = predict(truth, R) + rng.normal(0.0, sigma, (5, 6))
+    result = solve(CalibrationDataset.of(R, wrench, wrench_cov=np.diag(sigma**2), n_samples=1000), method)
+    assert result.dof == 30 - {"vougioukas": 10, "wang": 12, "yang": 13}[method]
+    assert result.verdict == "usable"
+    assert "there are only 5 poses" in result.reasons[0]
