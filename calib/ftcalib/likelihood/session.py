@@ -40,6 +40,12 @@ UNEQUAL = 0.01  # residuals of one kind, relative to the other at the usual rati
 FLOOR = 1e-3  # of the residuals: the least white noise where it was not measured
 
 
+def _rounding(wrench: Array) -> Array:
+    """Noise (2,) of force and torque of data (n, 6) that have none."""
+    largest_N, largest_Nm = np.abs(wrench).reshape(-1, 2, 3).max(axis=(0, 2))
+    return 1e-12 * np.array([largest_N, max(largest_Nm, LEVER_M * largest_N)])
+
+
 class Session:
     """Arguments as in `ftcalib.likelihood.fit.fit`."""
 
@@ -61,7 +67,7 @@ class Session:
         self.time = time[self.order]
         ordered = bool((self.order[1:] > self.order[:-1]).all())
         self.R, self.wrench = (x if ordered else x[self.order] for x in self.given)
-        cov = white(*self._least()) if wrench_cov is None else np.asarray(wrench_cov, dtype=np.float64)
+        cov = white(*_rounding(self.wrench)) if wrench_cov is None else np.asarray(wrench_cov, dtype=np.float64)
         common = cov.ndim == 2
         self.cov = np.broadcast_to(cov, (self.n, 6, 6)) if common else cov if ordered else cov[self.order]
         self.descent = Descent(self.R, self.wrench, constraints)
@@ -79,15 +85,15 @@ class Session:
         eigenvalues = np.linalg.eigvalsh(H / np.outer(scale, scale))
         return bool(eigenvalues[0] < RANK_TOLERANCE * eigenvalues[-1]) or self.dof(np.ones(self.n, bool)) <= 0
 
-    def _least(self) -> Array:
-        """Noise (2,) of force and torque of data that have none: their rounding."""
-        largest_N, largest_Nm = np.abs(self.wrench).reshape(-1, 2, 3).max(axis=(0, 2))
-        return 1e-12 * np.array([largest_N, max(largest_Nm, LEVER_M * largest_N)])
-
     def is_exact(self, p: Parameters) -> bool:
         """Whether the parameters fit to rounding, or to what no sensor resolves if the noise is unknown."""
-        residuals = np.abs(self.wrench - predict(p, self.R)).max(axis=0).reshape(2, 3).max(axis=1)
-        rounding = EXACT * self._least()
+        first_poses, all_poses = slice(1000), slice(None)  # the first decide nearly always
+        return self._fits_exactly(p, first_poses) and self._fits_exactly(p, all_poses)
+
+    def _fits_exactly(self, p: Parameters, poses: slice) -> bool:
+        wrench = self.wrench[poses]
+        residuals = np.abs(wrench - predict(p, self.R[poses])).max(axis=0).reshape(2, 3).max(axis=1)
+        rounding = EXACT * _rounding(wrench)
         return bool((residuals < (rounding if self.measured else np.maximum(rounding, RESOLUTION[::3]))).all())
 
     def noise_left(self, p: Parameters) -> Array:
@@ -99,7 +105,7 @@ class Session:
         return self._white(FLOOR * self._rms(p))
 
     def _white(self, sigma: Array) -> Array:
-        return np.broadcast_to(white(*np.maximum(sigma, self._least())), self.cov.shape)
+        return np.broadcast_to(white(*np.maximum(sigma, _rounding(self.wrench))), self.cov.shape)
 
     def _rms(self, p: Parameters) -> Array:
         """Residuals (2,) of force and torque; rounding may hide one kind, which must not outweigh the other."""
