@@ -169,9 +169,9 @@ def special_numbers(R_base_flange: Array, *, others: bool = False) -> tuple[Indi
         An orientation is missing or more than 1° off, or without `others` repeated; the message gives the numbers.
     """
     match = _Match(R_base_flange, np.eye(3))
-    if match.found < 24 or match.angle_rad[match.number >= 0].max() > ROUNDING_RAD:
+    if match.seen < 24 or match.angle_rad[match.number >= 0].max() > ROUNDING_RAD:
         match = _best_match(R_base_flange)
-    if match.found < 24 or not (others or len(R_base_flange) == 24):
+    if match.seen < 24 or not (others or len(R_base_flange) == 24):
         raise NotObservable(match.refusal_of_mixed() if others else match.refusal())
     kept = match.of_the_24(R_base_flange)
     if kept.all():
@@ -198,7 +198,7 @@ class _Match:
         self.angle_rad = np.arccos(np.clip((trace.max(axis=1) - 1) / 2, -1, 1))
         self.number: Indices = np.where(self.angle_rad <= tolerance_rad, self.nearest, -1)
         self.times_seen = np.bincount(self.number[self.number >= 0], minlength=24)
-        self.found = int(np.count_nonzero(self.times_seen))
+        self.seen = int(np.count_nonzero(self.times_seen))
 
     def of_the_24(self, R_base_flange: Array) -> NDArray[np.bool_]:
         """Find (n,) the poses of the 24 and their repetitions, not one of another set that only lies near one of them.
@@ -212,17 +212,17 @@ class _Match:
         return np.asarray((self.number < 0) | (apart <= ROUNDING_RAD))
 
     def refusal(self) -> str:
-        if not self.found:
+        if not self.seen:
             return "SROM needs its 24 orientations, and no pose has one of them: use LROM or ML."
         problems = []
-        if self.found < 24:
+        if self.seen < 24:
             problems.append(f"missing {_listed(np.flatnonzero(self.times_seen == 0))}")
         if self.times_seen.max() > 1:
             problems.append(f"repeated {_listed(np.flatnonzero(self.times_seen > 1))}")
         strays = np.flatnonzero(self.number < 0)
         if strays.size:
             problems.append(f"row {_listed(strays)} not among them ({self._worst(strays)})")
-        advice = "Use LROM or ML" if self.found < 24 else "Use mixed, which takes further poses, LROM or ML"
+        advice = "Use LROM or ML" if self.seen < 24 else "Use mixed, which takes further poses, LROM or ML"
         return f"SROM needs its 24 orientations once each: {'; '.join(problems)}. {advice} instead."
 
     def refusal_of_mixed(self) -> str:
@@ -245,9 +245,9 @@ def _best_match(R_base_flange: Array) -> _Match:
     matches = list[_Match]()
     for seed in chain([np.eye(3)], _likely_members(R_base_flange)):
         matches.append(_Match(R_base_flange, _common_rotation(R_base_flange, seed)))
-        if matches[-1].found == 24:
+        if matches[-1].seen == 24:
             break
-    return max(matches, key=lambda match: match.found)
+    return max(matches, key=lambda match: match.seen)
 
 
 def _likely_members(R_base_flange: Array, most: int = 12) -> Iterator[Array]:
