@@ -18,6 +18,7 @@ from ftcalib.extras.new_tool import new_tool, together
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import UP_IN_BASE
 from ftcalib.poses.paper_sets import EVERY_SET
+from ftcalib.published.methods import SPECIAL
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord, drift_check
 from ftdrive.commands.common import (
@@ -45,7 +46,6 @@ from ftdrive.runs.outcome import solve_in_motion
 from ftdrive.runs.pose_hints import hints, numbers_in_dataset
 from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import Source, read_calibration, read_dataset, read_source
-from ftdrive.session.task import NEED_SPECIAL
 from ftdrive.terminal.console import beside, working
 from ftdrive.terminal.report import print_cases, print_comparison, print_result, print_tests
 from ftdrive.terminal.text import echo, in_one_line
@@ -179,7 +179,7 @@ def solve(
         return
     if earlier is not None:
         read["earlier"] = read_calibration(earlier)
-    poses = 24 if method in (*NEED_SPECIAL, "all") else 6
+    poses = 24 if method in (*SPECIAL, "all") else 6
     options = {"sets": EVERY_SET} if cases else {"poses": poses, "method": "ml" if method == "all" else method}
     with rehearsed_run(sensor, **options) if simulate else nullcontext() as run:
         _solve_each(sources if run is None else [run], method, how, read, motion, shown, output, force, as_json)

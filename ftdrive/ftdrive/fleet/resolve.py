@@ -65,7 +65,7 @@ def task_of(folder: Path) -> tuple[bytes, bytes]:
     own = CalibrationResult.load(run.calibration_path).provenance if run.calibration_path.is_file() else run.header()
     given = {
         "version": __version__,
-        "circumstances": {**circumstances, "setup": asdict(circumstances["setup"])},
+        "circumstances": {**circumstances, "method": run.method, "setup": asdict(circumstances["setup"])},
         "provenance": {"created_utc": own.get("created_utc"), **origin},
     }
     return read_file(run.dataset_path), json.dumps(given).encode()

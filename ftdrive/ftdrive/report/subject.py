@@ -117,13 +117,15 @@ def _of_data(source: Path, options: SolveOptions) -> Subject:
     data = read_source(source, options.orientation, options.known, options.up_in_base)
     solved_with = {"drift": options.drift, **data.circumstances}
     run = Run(source) if source.is_dir() else None
-    result = None
+    result, method = None, options.method
+    command = " ".join(["ftdrive solve", shlex.quote(str(source)), *options.words])
+    if run is not None and options == SolveOptions():
+        method, command = run.method, run.solve_command
     if run is not None and options == SolveOptions() and run.calibration_path.is_file():
         result = CalibrationResult.load(run.calibration_path)
     if result is None or result.provenance.get("dataset_sha256") != data.dataset.sha256():
-        result = solve(data.dataset, options.method, **solved_with, provenance=data.provenance)
-        solved_with |= {"default": result} if options.method == "ml" else {}
-    command = " ".join(["ftdrive solve", shlex.quote(str(source)), *options.words])
+        result = solve(data.dataset, method, **solved_with, provenance=data.provenance)
+        solved_with |= {"default": result} if method == "ml" else {}
     return Subject(source, result, command, data.dataset, run, data.records, solved_with)
 
 

@@ -1,10 +1,11 @@
 """What a session takes its poses for: a calibration, or a verification (`verifying.py`)."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Final, Protocol
+from typing import ClassVar, Protocol
 
 from ftcalib import CalibrationResult
 from ftcalib.model import Array
+from ftcalib.published.methods import SPECIAL
 from ftcalib.result import Method
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import PlanRefused
@@ -15,9 +16,6 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import NUMBERS
 from ftdrive.session.forecast import Averages, prediction
 from ftdrive.session.live_fit import Judge, RunningFit
-
-NEED_SPECIAL: Final = ("srom", "mixed")
-"""Methods that need all 24 special orientations."""
 
 
 class Task(Protocol):
@@ -72,16 +70,16 @@ class Calibrating:
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
         """Return a tour. Raises `PlanRefused` if it lacks orientations that the method needs."""
         plan = plan_for(self.cell, certifier, q_rad, poses, sets=self.sets)
-        special = sum(step.number <= len(NUMBERS[24]) for step in plan.steps)
-        if self.method in NEED_SPECIAL and (special < 24 or (self.method == "srom" and len(plan.steps) > 24)):
-            more = f"{len(plan.steps) - special} other poses" if special == 24 else f"{special} of them"
+        special = sum(step.number in NUMBERS[24] for step in plan.steps)
+        if self.method in SPECIAL and special < 24:
             raise PlanRefused(
-                f"{self.method} needs the 24 special orientations, and the tour has {more}: "
-                + (
-                    "choose --method mixed"
-                    if special == 24
-                    else "plan all 24, jog the arm to more room, or choose --method lrom"
-                )
+                f"{self.method} needs the 24 special orientations, and the tour has {special} of them: plan all 24, "
+                "jog the arm to more room, or choose --method lrom"
+            )
+        if self.method == "srom" and len(plan.steps) > 24:
+            raise PlanRefused(
+                f"srom needs the 24 special orientations alone, and the tour has {len(plan.steps) - 24} other poses: "
+                "choose --method mixed"
             )
         return plan
 

@@ -383,15 +383,13 @@ class SteppedWatcher(Watcher):
 
 
 @lru_cache(maxsize=100)
-def _planned(cell: CellConfig, model: str, q_rad: tuple[float, ...], poses: int) -> Plan:
-    return plan_for(cell, certifier_for(cell, model), np.array(q_rad), poses)
+def _planned(cell: CellConfig, model: str, q_rad: tuple[float, ...], poses: int, sets: str | None) -> Plan:
+    return plan_for(cell, certifier_for(cell, model), np.array(q_rad), poses, sets=sets)
 
 
 def planned_once(cell: CellConfig, certifier: Certifier, q_rad: Array, poses: int, *, sets: str | None = None) -> Plan:
     """As `plan_for`, but the same question is answered from memory: planning takes most of a test's time."""
-    if sets is not None:
-        return plan_for(cell, certifier, q_rad, poses, sets=sets)
-    return _planned(cell, certifier.arm.name, tuple(q_rad.tolist()), poses)
+    return _planned(cell, certifier.arm.name, tuple(q_rad.tolist()), poses, sets)
 
 
 _certify, _certificates = Certifier.certify, dict[tuple[object, ...], Certificate]()

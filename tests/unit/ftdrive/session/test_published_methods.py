@@ -7,6 +7,8 @@ from click.testing import CliRunner
 
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError, PlanRefused
+from ftdrive.fleet.resolve import solved, task_of
+from ftdrive.report.subject import SolveOptions, read_subject
 from ftdrive.runs.run import Run
 from ftdrive.session.options import method_of_poses
 from tests.unit.ftdrive.fake_cell import Lab
@@ -49,8 +51,6 @@ def test_case_8_and_its_table_come_from_one_run(lab: Lab) -> None:
     methods = {one["method"]: one for one in json.loads(answer.stdout)["methods"]}
     assert methods["mixed"]["test"]["largest"]["force_N"] < 0.1
     assert "test" not in methods["srom"]
-    shown = CliRunner().invoke(cli, ["solve", folder, "--method", "all", "--test", folder], env={"COLUMNS": "80"})
-    assert "Largest errors on the 36 poses" in shown.stdout
     incomplete = CliRunner().invoke(cli, ["solve", folder, "--table-iii"]).exception
     assert "poses of the sets" in str(incomplete)
 
@@ -61,3 +61,14 @@ def test_methods_that_poses_alone_do_not_serve_are_refused() -> None:
         method_of_poses("SROM")
     with pytest.raises(ConfigError, match="needs the mass on the sensor"):
         method_of_poses("carlson-cayley")
+
+
+def test_a_fleet_and_a_report_solve_the_run_by_its_method(lab: Lab) -> None:
+    outcome = lab.calibrate(method="lrom")
+    assert outcome is not None
+    again = json.loads(solved(*task_of(outcome.run.folder)))
+    assert again["method"] == "lrom"
+    outcome.run.calibration_path.unlink()
+    subject = read_subject(outcome.run.folder, SolveOptions())
+    assert subject.result.method == "lrom"
+    assert subject.reproduce == outcome.run.solve_command
