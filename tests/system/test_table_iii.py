@@ -1,0 +1,18 @@
+"""Yu's procedure on the emulated cell: 294 poses in one tour, and the eleven cases of Table III from them."""
+
+import pytest
+
+from ftcalib.compare import CASES
+from tests.system.command_line import CommandLine
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_eleven_cases_come_from_one_command(ftdrive: CommandLine) -> None:
+    cases = ftdrive.json("solve", "--simulate", "--table-iii")["cases"]
+    assert [(one["case"], one["method"], one["data"], one["test_set"]) for one in cases] == list(CASES)
+    for one in cases:
+        largest = one["test"]["largest"]
+        assert 0 < max(largest[f"f{axis}_N"] for axis in "xyz") <= largest["force_N"] < 0.04
+        assert 0 < max(largest[f"t{axis}_Nm"] for axis in "xyz") <= largest["torque_Nm"] < 0.002
+        assert max(one["test"]["mass_error"], one["test"]["centre_error"]) < 0.002
