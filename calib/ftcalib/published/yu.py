@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import NotObservable
-from ftcalib.model import Array, Parameters, nearest_rotation
+from ftcalib.model import Array, Parameters, nearest_rotation, skew
 
 Indices = NDArray[np.intp]
 
@@ -31,9 +31,9 @@ SPECIAL_R_flange_base = np.array([[float(row[0] + "1") * _AXES[row[1]] for row i
 """(24, 3, 3) the paper's e_bR_1 … e_bR_24 (Fig. 3, Table of special orientations): the rotation group of the cube."""
 
 TOLERANCE_RAD = np.deg2rad(1.0)
-"""Largest deviation of an orientation from one of the 24: more than an arm with calibrated kinematics misses by."""
+"""Deviation from one of the 24 that is always accepted: more than an arm with calibrated kinematics misses by."""
 ROUNDING_RAD = np.deg2rad(0.05)
-"""Deviation that rounded poses have. Beyond it, it is worth a note."""
+"""Deviation that rounded poses have. A larger one is worth a note."""
 
 _RECOGNISED_RAD = 1.3 * TOLERANCE_RAD  # the mean turn of the base is itself uncertain if all poses deviate
 _NEIGHBOURS = 0.065  # distance of the sums of `_likely_members` of poses 2° apart
@@ -63,7 +63,7 @@ def srom(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | 
     Raises
     ------
     NotObservable
-        As of `special_numbers`.
+        As `special_numbers`.
     """
     return _from_special(R_base_flange, wrench, *(numbered or special_numbers(R_base_flange)))
 
@@ -84,7 +84,7 @@ def mixed(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] |
     Raises
     ------
     NotObservable
-        As of `special_numbers` with `others`.
+        As `special_numbers` with `others`.
     """
     return _from_special(R_base_flange, wrench, *(numbered or special_numbers(R_base_flange, others=True)))
 
@@ -166,7 +166,8 @@ def special_numbers(R_base_flange: Array, *, others: bool = False) -> tuple[Indi
     Raises
     ------
     NotObservable
-        An orientation is missing or more than 1° off, or without `others` repeated; the message gives the numbers.
+        An orientation is missing or too far off, or without `others` repeated; the message gives the numbers. Up to 1°
+        is always accepted and more than 1.3° never, because Y is itself uncertain.
     """
     match = _Match(R_base_flange, np.eye(3))
     if match.seen < 24 or match.angle_rad[match.number >= 0].max() > ROUNDING_RAD:
@@ -182,7 +183,7 @@ def special_numbers(R_base_flange: Array, *, others: bool = False) -> tuple[Indi
 
 
 def special_deviation_rad(R_base_flange: Array, number: Indices, Y: Array) -> float:
-    """Largest angle between a pose (n, 3, 3) and the special orientation that `special_numbers` found for it."""
+    """Return the largest angle between a pose (n, 3, 3) and its special orientation, as `special_numbers` found it."""
     special = number >= 0
     nominal = Y @ np.swapaxes(SPECIAL_R_flange_base[number[special]], 1, 2)
     return float(Rotation.from_matrix(np.swapaxes(nominal, 1, 2) @ R_base_flange[special]).magnitude().max())
@@ -206,9 +207,9 @@ class _Match:
         True for other poses farther away: they do no harm.
         """
         order = np.argsort(self.angle_rad)
-        first = np.zeros(24, dtype=np.intp)
-        first[self.number[order[::-1]]] = order[::-1]  # the nearest of each orientation; -1 is overwritten or unused
-        apart = Rotation.from_matrix(np.swapaxes(R_base_flange, 1, 2) @ R_base_flange[first[self.number]]).magnitude()
+        first_of_each = np.unique(self.number[order], return_index=True)[1][-24:]  # number -1, if any, stands before
+        nearest = R_base_flange[order[first_of_each]][self.number]
+        apart = Rotation.from_matrix(np.swapaxes(R_base_flange, 1, 2) @ nearest).magnitude()
         return np.asarray((self.number < 0) | (apart <= ROUNDING_RAD))
 
     def refusal(self) -> str:
@@ -325,11 +326,8 @@ def com_and_torque_bias(weight_N: Array, torque_Nm: Array) -> tuple[Array, Array
     -------
     p_sensor_com_m, torque_bias_Nm : array, shape (3,)
     """
-    C = np.zeros((len(weight_N), 3, 6))
-    fx, fy, fz = weight_N.T
-    C[:, 0, 1], C[:, 0, 2], C[:, 1, 2] = fz, -fy, fx  # P x F = -[F]x P
-    C[:, 1, 0], C[:, 2, 0], C[:, 2, 1] = -fz, fy, -fx
-    C[:, :, 3:] = np.eye(3)
+    P_x_F = -skew(weight_N)
+    C = np.concatenate([P_x_F, np.broadcast_to(np.eye(3), P_x_F.shape)], axis=2)
     solution = np.asarray(np.linalg.lstsq(C.reshape(-1, 6), torque_Nm.ravel())[0], dtype=np.float64)
     return solution[:3], solution[3:]
 
