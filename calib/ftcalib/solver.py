@@ -294,7 +294,7 @@ def _deviation(method: Method, estimator: Estimator, truth: Parameters, R_base_f
     """Name poses that deviate from the special orientations of the method, and the error that this causes."""
     if method not in SPECIAL:
         return []
-    deviation_rad = special_deviation_rad(R_base_flange, *special_numbers(R_base_flange, others=method == "mixed"))
+    deviation_rad = special_deviation_rad(R_base_flange, *special_numbers(R_base_flange, others=True))
     if deviation_rad <= ROUNDING_RAD:
         return []
     without_noise = estimator(predict(truth, R_base_flange))

@@ -79,7 +79,7 @@ def published(
     if method in ("wang", "yang"):
         return _with_torques(partial(getattr(baselines, method), R_flange_sensor=mounting), R_base_flange)
     forces = partial(_carlson(method, gravity_direction_base, weight_N, as_published), bias=not as_published)
-    return (_with_carlsons_torques if as_published else _with_torques)(forces, R_base_flange)
+    return _with_torques(forces, R_base_flange, as_published=as_published)
 
 
 def _carlson(
@@ -103,19 +103,13 @@ def require_printed_form(method: str) -> None:
     raise ValueError(f"{method} {reason}: use as_published with one of {', '.join(CARLSON)}")
 
 
-def _with_torques(method: Callable[..., ForceFit], R_base_flange: Array) -> Estimator:
+def _with_torques(forces: Callable[..., ForceFit], R_base_flange: Array, *, as_published: bool = False) -> Estimator:
     def estimate(wrench: Array) -> Parameters:
-        fit = method(R_base_flange, wrench[:, :3])
-        com_m, torque_bias_Nm = com_and_torque_bias(wrench[:, :3] - fit.force_bias_N, wrench[:, 3:])
+        fit = forces(R_base_flange, wrench[:, :3])
+        if as_published:
+            com_m, torque_bias_Nm = carlson_known.centre_of_mass(R_base_flange, wrench[:, 3:], fit), np.zeros(3)
+        else:
+            com_m, torque_bias_Nm = com_and_torque_bias(wrench[:, :3] - fit.force_bias_N, wrench[:, 3:])
         return Parameters(fit.R_flange_sensor, fit.gravity_force_base_N, fit.force_bias_N, com_m, torque_bias_Nm)
-
-    return estimate
-
-
-def _with_carlsons_torques(method: Callable[..., ForceFit], R_base_flange: Array) -> Estimator:
-    def estimate(wrench: Array) -> Parameters:
-        fit = method(R_base_flange, wrench[:, :3])
-        com_m = carlson_known.centre_of_mass(R_base_flange, wrench[:, 3:], fit)
-        return Parameters(fit.R_flange_sensor, fit.gravity_force_base_N, fit.force_bias_N, com_m, np.zeros(3))
 
     return estimate
