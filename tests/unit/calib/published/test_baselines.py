@@ -142,6 +142,20 @@ def test_poses_that_do_not_suffice_are_refused(method: str, R: Array, words: str
         ESTIMATES[method](R, predict(truth, R))
 
 
+def test_yang_is_refused_where_noise_alone_decides_between_two_yaws() -> None:
+    R, rng = rim(8, 40), np.random.default_rng(2)
+    force_N = predict(Parameters(np.eye(3), 20 * DOWN, *np.ones((3, 3))), R)[:, :3]
+    for _ in range(5):
+        with pytest.raises(NotObservable, match="two yaws of the sensor"):
+            yang(R, force_N + rng.normal(0.0, 0.1, force_N.shape), R_flange_sensor=np.eye(3))
+
+
+def test_yang_is_refused_if_the_forces_show_no_yaw() -> None:
+    along_z = predict(Parameters(np.eye(3), 20 * DOWN, *np.ones((3, 3))), R24)[:, :3] * [0, 0, 1]
+    with pytest.raises(NotObservable, match="leave the yaw of the sensor open"):
+        yang(R24, along_z, R_flange_sensor=np.eye(3))
+
+
 @pytest.mark.parametrize("method", BASELINES)
 def test_a_sensor_that_carries_nothing_is_refused(method: str) -> None:
     with pytest.raises(NotObservable, match="no weight"):
