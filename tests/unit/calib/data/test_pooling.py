@@ -68,3 +68,9 @@ def test_a_pose_of_another_shape_keeps_it(freedom: int) -> None:
 
 def test_equal_covariances_are_not_changed() -> None:
     np.testing.assert_allclose(pooled_covariance(np.tile(SHAPE, (5, 1, 1)), np.full(5, 2)), np.tile(SHAPE, (5, 1, 1)))
+
+
+def test_the_mean_noise_is_kept_where_few_samples_are_independent() -> None:
+    own = SHAPE * np.random.default_rng(6).chisquare(4, (2000, 1, 6)) / 4
+    pooled = np.diagonal(pooled_covariance(own, np.full(2000, 1000)), axis1=1, axis2=2) / np.diag(SHAPE)
+    assert pooled.mean() == pytest.approx(1.0, abs=0.02)  # 0.96 with the mean of the logarithms

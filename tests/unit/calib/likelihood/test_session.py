@@ -77,6 +77,13 @@ def test_data_are_exact_to_what_a_sensor_resolves_and_to_rounding(
     assert is_exact(1e-10 * np.abs(predict(TOOL, R24)[:, group]).max(), measured=True) == exact
 
 
+def test_one_late_pose_makes_data_inexact() -> None:
+    R, residuals = np.tile(R24, (42, 1, 1)), np.zeros((1008, 6))
+    assert session(R, residuals=residuals).is_exact(TOOL)
+    residuals[1005, 1] = 1.0
+    assert not session(R, residuals=residuals).is_exact(TOOL)
+
+
 def test_variances_start_at_the_mean_square_of_the_used_poses_or_at_their_noise() -> None:
     residuals = np.tile([0.3, -0.3, 0.3, 0.0, 0.0, 0.0], (24, 1))
     residuals[0] = 100.0
