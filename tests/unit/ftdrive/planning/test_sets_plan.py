@@ -38,7 +38,23 @@ def test_each_number_has_an_orientation_of_its_set() -> None:
     }
     for step in made.steps:
         wanted = kinds["A" if step.number < 100 else "H"]
-        assert np.abs(wanted - np.array(step.R_base_flange)).max(axis=(1, 2)).min() < 1e-6
+        off = np.abs(wanted - np.array(step.R_base_flange)).max(axis=(1, 2))
+        assert off.min() < 1e-6
+        assert off.argmin() < 24  # the first that are reachable
+
+
+def test_a_set_hangs_with_the_robot_under_a_ceiling() -> None:
+    hanging = Certifier(CERTIFIER.arm, Scene((BASE_PLANE,), lean_rad=np.pi))
+    made = plan_sets(hanging, USUAL_POSTURE_RAD, "H", **HOW)
+    tool_axis = np.array([step.R_base_flange for step in made.steps])[:, :, 2]
+    assert (tool_axis @ [1, 0, 1] / np.sqrt(2)).min() > 0.49
+
+
+def test_another_posture_for_a_set_is_found_and_named() -> None:
+    ceiling = Plane((0.0, 0.0, -1.0), -0.75)
+    made = plan_sets(Certifier(CERTIFIER.arm, Scene((BASE_PLANE, ceiling))), USUAL_POSTURE_RAD, "H", **HOW)
+    assert made.certified
+    assert "A tour exists with joints 1 to 3 at" in made.why[1]
 
 
 def test_wrong_sets_are_refused() -> None:
