@@ -20,9 +20,12 @@ def test_the_run_keeps_its_method_and_every_solve_uses_it(lab: Lab) -> None:
     assert outcome.result.method == "lrom"
     assert Run(outcome.run.folder).method == "lrom"
     assert outcome.run.solve_command.endswith(" --method lrom")
-    usual = lab.calibrate()
-    assert usual is not None
-    assert usual.result.method == "ml"
+    again = json.loads(solved(*task_of(outcome.run.folder)))  # as a fleet does
+    assert again["method"] == "lrom"
+    outcome.run.calibration_path.unlink()
+    subject = read_subject(outcome.run.folder, SolveOptions())  # as a report does
+    assert subject.result.method == "lrom"
+    assert subject.reproduce == outcome.run.solve_command
 
 
 @pytest.mark.parametrize(
@@ -61,14 +64,3 @@ def test_methods_that_poses_alone_do_not_serve_are_refused() -> None:
         method_of_poses("SROM")
     with pytest.raises(ConfigError, match="needs the mass on the sensor"):
         method_of_poses("carlson-cayley")
-
-
-def test_a_fleet_and_a_report_solve_the_run_by_its_method(lab: Lab) -> None:
-    outcome = lab.calibrate(method="lrom")
-    assert outcome is not None
-    again = json.loads(solved(*task_of(outcome.run.folder)))
-    assert again["method"] == "lrom"
-    outcome.run.calibration_path.unlink()
-    subject = read_subject(outcome.run.folder, SolveOptions())
-    assert subject.result.method == "lrom"
-    assert subject.reproduce == outcome.run.solve_command
