@@ -154,10 +154,12 @@ def solve(
     sources = sources if pair is None else pair[:1]
     if not (sources or simulate):
         raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
-    if (test is not None or cases) and (method != ("ml" if cases else "all") or (test is not None and cases)):
+    if (test is not None and (cases or method != "all")) or (cases and method != "ml"):
         raise ConfigError("--test goes with --method all, and --table-iii without either: leave one of them out")
     if as_published and method != "all" and not method.startswith("carlson-"):
         raise ConfigError("--as-published is for --method carlson-... and all: every other method has one form")
+    if cases and (earlier is not None or joined):
+        raise ConfigError("--table-iii solves one run alone: leave out --from and --together")
     if (earlier is not None or joined) and (method != "ml" or (earlier is not None and joined)):
         raise ConfigError("--from and --together are for --method ml, one of the two at a time")
     if joined and pair is not None:
@@ -312,8 +314,8 @@ def _show_all(source: Path, data: Source, how: dict[str, Any], test: Path | None
     print_comparison(compared)
     if tests is not None:
         reference = "the truth of the emulated cell" if truth is not None else "ml"
-        title = f"Largest errors on the {len(tests)} poses of {test}; mg and centre against {reference}:"
-        print_tests([((one.method,), one) for one in compared], title)
+        heading = f"Largest errors on the {len(tests)} poses of {test}; mg and centre against {reference}:"
+        print_tests(("method",), [((one.method,), one) for one in compared], heading)
 
 
 def _show_cases(source: Path, data: Source, as_json: bool) -> None:

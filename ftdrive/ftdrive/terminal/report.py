@@ -284,40 +284,42 @@ def print_comparison(compared: Sequence[Compared]) -> None:
             answer.print(hanging(f" {one.method}: ", one.reason, answer))
 
 
-def print_tests(rows: Sequence[tuple[Sequence[str], Compared]], test: str) -> None:
+def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], Compared]], heading: str) -> None:
     """Print the columns of Yu's Table III: the largest errors on a test set, and those of weight and centre of mass.
 
     Parameters
     ----------
+    titles : sequence of str
+        Of the columns with the names of a row.
     rows : sequence of (names, Compared)
-        The names of a row: the method, or the case and its sets.
-    test : str
-        Heading: what the methods were tested on, and what they are compared with.
+        The names of a row: the method, or the case, its method and its sets.
+    heading : str
+        What the methods were tested on, and what they are compared with.
     """
-    answer.print(hanging(" ", test, answer))
+    answer.print(hanging(" ", heading, answer))
     table = Table(box=None, padding=(0, 0, 0, 1), pad_edge=True)
-    for title in ("case", "method", "data", "test")[-len(rows[0][0]) :] if len(rows[0][0]) > 1 else ("method",):
+    for title in titles:
         table.add_column(title, justify="right" if title == "case" else "left", no_wrap=True)
     for title in ("Fx\nmN", "Fy", "Fz", "F", "Tx\nmN·m", "Ty", "Tz", "T", "mg\n%", "centre\n%"):
         table.add_column(title, justify="right", no_wrap=True)
     for names, one in rows:
         if one.largest_errors is not None:
             shares = 100 * one.mass_error, 100 * one.centre_error
-            largest = (to_digits(1e3 * value) for value in one.largest_errors.tolist())
-            table.add_row(*names, *largest, *map(to_digits, shares))
+            values = *(1e3 * one.largest_errors).tolist(), *shares
+            table.add_row(*names, *map(_to_digits, values))
     answer.print(table, soft_wrap=True)
 
 
 def print_cases(cases: Sequence[tuple[int, str, str, Compared]], *, known: bool) -> None:
     """Print Yu's Table III; `known` says that the errors of weight and centre are those from an emulated truth."""
     reference = "the truth of the emulated cell" if known else "ml with all poses but those of D"
-    title = f"Table III of Yu et al. 2021: largest errors on the test set; mg and centre against {reference}:"
+    heading = f"Table III of Yu et al. 2021: largest errors on the test set; mg and centre against {reference}:"
     every = max((data for _, data, _, _ in cases), key=len)
     rows = [((str(n), one.method, "all" if data == every else data, test), one) for n, data, test, one in cases]
-    print_tests(rows, title)
+    print_tests(("case", "method", "data", "test"), rows, heading)
 
 
-def to_digits(value: float) -> str:
+def _to_digits(value: float) -> str:
     """Write a positive number with three digits, at most three of them after the point."""
     return f"{value:.{0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3}f}"
 

@@ -30,6 +30,8 @@ PAIR = ("--wrench", "a.csv", "--orientation-file", "b.csv")
         (("a.csv", "--test", "b.csv"), "goes with --method all"),
         (("a.csv", "--method", "all", "--test", "b.csv", "--table-iii"), "--table-iii without either"),
         (("a.csv", "--method", "srom", "--table-iii"), "--table-iii without either"),
+        (("a.csv", "--from", "old.json", "--table-iii"), "--table-iii solves one run alone"),
+        (("a.csv", "b.csv", "--together", "--table-iii"), "--table-iii solves one run alone"),
         (("a.csv", "--method", "srom", "--as-published"), "every other method has one form"),
     ],
 )
