@@ -619,6 +619,13 @@ def test_a_drift_of_rounding_size_is_no_drift() -> None:
         assert (finding.severity, finding.values) == (severity, {"force_N": 0.1, "torque_Nm": 0.0})
 
 
+@pytest.mark.parametrize(("share", "codes"), [(1e-3, ["gain_x", "gain_y"]), (1e-6, ["response_small"])])
+def test_a_gain_that_no_sensor_resolves_is_not_named(share: float, codes: list[str]) -> None:
+    covariance = 1e-16 * np.eye(15 + SIZE)
+    found = _response(Response(share * np.eye(SIZE)[0], covariance), 20.0)  # a sensor resolves 1 mN
+    assert [one.code for one in found] == codes
+
+
 @pytest.mark.parametrize("timed", [True, False])
 def test_a_linear_drift_goes_on_for_the_next_minute(timed: bool) -> None:
     ramp = np.linspace(-1, 1, 24)[:, None] * [0.3, 0, 0.4, 0, 0.01, 0]

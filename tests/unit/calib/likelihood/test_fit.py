@@ -554,3 +554,10 @@ def test_a_bias_is_uncertain_where_a_drift_leaves_no_noise() -> None:
         z.append(p.difference(found.parameters)[6:9] / np.sqrt(np.diag(found.covariance)[6:9]))
         assert found.components["white_force_N"] > 0.1 * SIGMA[0]
     assert np.sqrt(np.mean(np.square(z))) < 1.5
+
+
+def test_residuals_below_what_a_sensor_resolves_are_the_noise() -> None:
+    rng = np.random.default_rng(21)
+    tool, R = truth(rng), Rotation.random(24, rng=rng).as_matrix()
+    found = fit(R, predict(tool, R) + rng.normal(size=(24, 6)) * SIGMA / 2000, None)
+    assert found.chi2 == pytest.approx(found.dof, rel=0.01)

@@ -1,11 +1,12 @@
 """What else a place says beside its poses."""
 
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ftcalib import CalibrationDataset, Known
+from ftcalib import CalibrationDataset, Known, Parameters
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftdrive.runs.run import Run
@@ -50,3 +51,13 @@ def test_a_run_without_data_says_how_to_go_on(mode: str, words: str, tmp_path: P
     run = Run.create(tmp_path, "stopped", {"mode": mode, "config": {"site": {"g_m_s2": 9.81}}})
     with pytest.raises(NotObservable, match=f"stopped has no data to solve: .*{words}"):
         read_source(run.folder, "R_base_flange")
+
+
+def test_the_truth_is_that_of_a_described_emulated_cell(dataset: Path) -> None:
+    found = read_source(dataset, "R_base_flange")
+    assert found.truth is None
+    truth = Parameters(np.diag([1.0, -1.0, -1.0]), *np.arange(12.0).reshape(4, 3))
+    described = {one.name: getattr(truth, one.name).tolist() for one in fields(truth)}
+    emulated = replace(found, provenance={"station": {"truth": described, "sensor": "axia80"}}).truth
+    assert emulated is not None
+    np.testing.assert_array_equal(truth.difference(emulated), 0)
