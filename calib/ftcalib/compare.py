@@ -42,7 +42,7 @@ class Compared:
     largest_errors: Array | None = None
     """(8,) on the test set, in the axes of the sensor: Fx, Fy, Fz and norm of F in N, the same of T in N·m."""
     mass_error: float = np.nan
-    """Relative, of the reference."""
+    """Error of the mass as a share of the reference."""
     centre_error: float = np.nan
     """Distance of the centre of mass from that of the reference, as a share of its distance from the sensor."""
 

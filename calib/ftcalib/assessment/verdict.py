@@ -173,7 +173,7 @@ class _Statistics:
 
     used: NDArray[np.bool_]
     is_exact: bool
-    """Whether less is left than a sensor resolves, as of simulated data: their equal readings are no copies."""
+    """Whether no sensor resolves the residuals, as in simulated data. Equal readings are no copies then."""
     weight_N: float
     residual_sigma: Array
     worst_pose: int

@@ -18,7 +18,7 @@ COUNTS: Mapping[str, int] = {"A": 24, "B": 12, "C": 12, "D": 150, "E": 24, "F": 
 """Orientations of each set. H is the first half of E."""
 EVERY_SET = "A+B+C+D+E+F+G"
 """What Table III needs."""
-HALF_ANGLE_RAD = np.pi / 3
+_HALF_ANGLE_RAD = np.pi / 3
 _SIDES = {"E": 1.0, "F": -1.0, "G": 1.0, "H": 1.0}
 
 
@@ -62,7 +62,7 @@ def paper_set(name: str, *, spare: int = 0, down_base: ArrayLike = (0.0, 0.0, -1
     forwards -= forwards @ down * down
     axis = down + _SIDES[name] * forwards / np.linalg.norm(forwards)
     drawn = Rotation.random(8 * count + 100, rng=rng).as_matrix()  # a quarter of all directions is inside
-    inside = drawn[:, :, 2] @ axis / np.linalg.norm(axis) >= np.cos(HALF_ANGLE_RAD)
+    inside = drawn[:, :, 2] @ axis / np.linalg.norm(axis) >= np.cos(_HALF_ANGLE_RAD)
     return np.asarray(drawn[inside][:count])
 
 

@@ -54,7 +54,7 @@ METHOD = click.option(
     metavar="METHOD",
     default="ml",
     show_default=True,
-    help="Method of the result, as of `ftdrive solve`; srom takes the 24 poses of its paper.",
+    help="Method that solves the poses, one of `ftdrive solve`; srom takes the 24 poses of its paper.",
 )
 
 YES = click.option(

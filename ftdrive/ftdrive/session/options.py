@@ -23,7 +23,7 @@ class SessionOptions:
     sets: str | None = None
     """Sets of Yu's Fig. 6 instead of that many poses, such as A+E."""
     method: Method = "ml"
-    """By which a calibration is solved."""
+    """Method that solves the poses of a calibration."""
     mode: Mode = "auto"
     """With `resume`, "auto" means the mode of that run."""
     dry_run: bool = False

@@ -65,7 +65,7 @@ class Calibrating:
     sets: str | None = None
     """Sets of Yu's Fig. 6 instead of a number of poses."""
     method: Method = "ml"
-    """By which the poses are to be solved."""
+    """Method that will solve the poses."""
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
         """Return a tour. Raises `PlanRefused` if it lacks orientations that the method needs."""
@@ -74,7 +74,7 @@ class Calibrating:
         if self.method in SPECIAL and special < 24:
             raise PlanRefused(
                 f"{self.method} needs the 24 special orientations, and the tour has {special} of them: plan all 24, "
-                "jog the arm to more room, or choose --method lrom"
+                "jog the arm to a posture with more room, or choose --method lrom"
             )
         if self.method == "srom" and len(plan.steps) > 24:
             raise PlanRefused(

@@ -33,7 +33,7 @@ NEARLY = 1.05
 OTHER_POSTURES = 2
 POSTURE_STEP_DEG = 20
 FIRST_NUMBER = 101
-"""Of a chosen pose: 1 to 24 are those of the paper."""
+"""Number of the first chosen pose; 1 to 24 are those of the paper."""
 LOOKS = 24
 """Number of tool directions that compare postures."""
 
