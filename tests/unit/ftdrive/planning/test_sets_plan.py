@@ -63,6 +63,8 @@ def test_wrong_sets_are_refused() -> None:
     low = Certifier(CERTIFIER.arm, Scene((BASE_PLANE, Plane((0.0, 0.0, -1.0), -0.45))))
     with pytest.raises(PlanRefused, match="no tour of the sets A"):
         plan_sets(low, USUAL_POSTURE_RAD, "A", **HOW)
+    with pytest.raises(PlanRefused, match=r"no tour of the sets A\+H"):  # enough poses, but too few of A
+        plan_sets(low, USUAL_POSTURE_RAD, "A+H", **HOW)
 
 
 @pytest.mark.slow
