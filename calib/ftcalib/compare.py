@@ -33,7 +33,7 @@ class Compared:
     parameters: Parameters | None = None
     mass_kg: float = np.nan
     rotation_difference_rad: float = np.nan
-    """Angle to the mounting that the default method estimates."""
+    """Angle to the mounting of the default method, or of the truth in Table III."""
     force_rms_N: float = np.nan
     torque_rms_Nm: float = np.nan
     cv_force_rms_N: float = np.nan
@@ -129,11 +129,9 @@ def compare(  # noqa: PLR0913 - one for each thing that may be known
             compared.append(Compared(method, str(error)))
             continue
         parameters, cv_force, cv_torque = found
-        force, torque = _rms(dataset.wrench - predict(parameters, dataset.R_base_flange))
-        angle_rad = float(angle_between(parameters.R_flange_sensor, default.R_flange_sensor))
-        mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
-        one = Compared(method, None, parameters, mass_kg, angle_rad, force, torque, cv_force, cv_torque)
-        compared.append(one if test is None else _tested(one, test, truth or default.parameters))
+        one = _described(method, parameters, dataset, default.parameters, g_m_s2)
+        one = replace(one, cv_force_rms_N=cv_force, cv_torque_rms_Nm=cv_torque)
+        compared.append(one if test is None else _tested(one, parameters, test, truth or default.parameters))
     return compared
 
 
@@ -146,7 +144,11 @@ CASES: tuple[tuple[int, Method, str, str], ...] = (
 
 
 def table_iii(
-    dataset: CalibrationDataset, numbers: Sequence[int], truth: Parameters | None = None
+    dataset: CalibrationDataset,
+    numbers: Sequence[int],
+    truth: Parameters | None = None,
+    *,
+    g_m_s2: float = STANDARD_GRAVITY_M_S2,
 ) -> list[tuple[int, str, str, Compared]]:
     """Repeat the eleven cases of Yu's Table III.
 
@@ -157,7 +159,10 @@ def table_iii(
     numbers : sequence of int
         Of each pose, as `ftcalib.poses.paper_sets.numbers_of` gives them.
     truth : Parameters, optional
-        Reference of mass and centre of mass; default: the maximum likelihood estimate of all poses but those of D.
+        Reference of mass, centre of mass and mounting; default: the maximum likelihood estimate of all poses but
+        those of D.
+    g_m_s2 : float
+        Gravity at the cell.
 
     Returns
     -------
@@ -167,17 +172,17 @@ def table_iii(
     Raises
     ------
     NotObservable
-        A pose of a set is missing.
+        Poses of a set are missing.
     """
     row_of = {int(number): row for row, number in enumerate(numbers)}
+    counts = {name: sum(number not in row_of for number in numbers_of(name).tolist()) for name in EVERY_SET.split("+")}
+    if missing := [f"{count} of {name}" for name, count in counts.items() if count]:
+        raise NotObservable(
+            f"Table III lacks poses of its sets ({', '.join(missing)}): take {EVERY_SET}, without leaving out a pose"
+        )
 
     def part(sets: str) -> CalibrationDataset:
-        wanted = np.concatenate([numbers_of(name) for name in sets.split("+")]).tolist()
-        if missing := [number for number in wanted if number not in row_of]:
-            raise NotObservable(
-                f"{len(missing)} poses of the sets {sets} are missing: take {EVERY_SET}, without leaving out a pose"
-            )
-        rows = [row_of[number] for number in wanted]
+        rows = [row_of[number] for name in sets.split("+") for number in numbers_of(name).tolist()]
         return CalibrationDataset.of(dataset.R_base_flange[rows], dataset.wrench[rows], t_s=dataset.t_s[rows])
 
     truth = truth or solve(part(CASES[9][2])).parameters
@@ -185,15 +190,22 @@ def table_iii(
     for number, method, data, test in CASES:
         found = part(data)
         parameters = published(method, found.R_base_flange, gravity_direction_base=-UP_IN_BASE)(found.wrench)
-        rows.append((number, data, test, _tested(Compared(method, None, parameters), part(test), truth)))
+        one = _described(method, parameters, found, truth, g_m_s2)
+        rows.append((number, data, test, _tested(one, parameters, part(test), truth)))
     return rows
 
 
-def _tested(compared: Compared, test: CalibrationDataset, truth: Parameters) -> Compared:
+def _described(
+    method: Method, parameters: Parameters, dataset: CalibrationDataset, reference: Parameters, g_m_s2: float
+) -> Compared:
+    mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
+    angle_rad = float(angle_between(parameters.R_flange_sensor, reference.R_flange_sensor))
+    residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
+    return Compared(method, None, parameters, mass_kg, angle_rad, *_rms(residuals))
+
+
+def _tested(compared: Compared, parameters: Parameters, test: CalibrationDataset, truth: Parameters) -> Compared:
     """Add the columns of Table III."""
-    parameters = compared.parameters
-    if parameters is None:
-        return compared
     force, torque = np.split(test.wrench - predict(parameters, test.R_base_flange), 2, axis=1)
     largest = [np.abs(np.column_stack([part, np.linalg.norm(part, axis=1)])).max(axis=0) for part in (force, torque)]
     weight_N, true_N = (float(np.linalg.norm(p.gravity_force_base_N)) for p in (parameters, truth))

@@ -320,9 +320,10 @@ def _show_all(source: Path, data: Source, how: dict[str, Any], test: Path | None
 
 def _show_cases(source: Path, data: Source, as_json: bool) -> None:
     if not data.records:
-        raise ConfigError(f"--table-iii needs the folder of a run with --set {EVERY_SET}, and {source} is none")
+        raise ConfigError(f"--table-iii needs the folder of a run, and {source} is a file: calibrate --set {EVERY_SET}")
     with working("Solving the cases of Table III"):
-        cases = table_iii(data.dataset, numbers_in_dataset(data.records), data.truth)
+        numbers = numbers_in_dataset(data.records)
+        cases = table_iii(data.dataset, numbers, data.truth, g_m_s2=data.circumstances["g_m_s2"])
     if as_json:
         rows = [{"case": number, "data": sets, "test_set": on, **one.to_dict()} for number, sets, on, one in cases]
         write_json({"schema_version": 1, "source": str(source), "cases": rows})

@@ -1,5 +1,6 @@
 """The columns of Yu's Table III, and its eleven cases."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -117,9 +118,19 @@ def _far(parameters: Parameters, clean: np.ndarray, test: str) -> float:
     return float(np.linalg.norm((predict(parameters, POSES[rows]) - clean[rows])[:, :3], axis=1).max())
 
 
-def test_a_missing_pose_is_named_by_its_set() -> None:
-    with pytest.raises(NotObservable, match="1 poses of the sets A are missing"):
+def test_missing_poses_are_counted_in_every_set() -> None:
+    with pytest.raises(NotObservable, match=r"\(1 of A\)"):
         table_iii(measured(0.0), [0, *NUMBERS[1:].tolist()], TRUTH)
+    with pytest.raises(NotObservable, match=r"\(12 of C, 150 of D, 24 of E, 24 of F, 48 of G\)"):
+        table_iii(measured(0.0), NUMBERS[:36].tolist(), TRUTH)
+
+
+def test_a_case_has_every_number_that_json_shows() -> None:
+    for *_, one in table_iii(measured(0.01), NUMBERS.tolist(), TRUTH, g_m_s2=9.8):
+        document = json.loads(json.dumps(one.to_dict(), allow_nan=False))
+        assert document["mass_kg"] == pytest.approx(19.7 / 9.8, rel=2e-3)
+        assert 0.0 < document["rotation_difference_rad"] < 0.01
+        assert document["residual"]["force_rms_N"] == pytest.approx(0.017, rel=0.4)
 
 
 def test_carlson_as_published_has_no_bias() -> None:
