@@ -351,10 +351,10 @@ CODES: Final[Mapping[str, Code]] = {
     "torque_error": Code(_REJECT_OR_LIMIT, "judged by the {source}, the torque error is {share_percent:.1f} of the "
         "weight at {lever_m:.2g} ({error_Nm:.2g}), more than {limit_percent:g}",
         "check cables, contact and orientations, and take more poses"),
-    "known_values_misfit_force": Code(_LIMIT, "without known values the forces fit to {free_N:.2g} instead of "
-        "{residual_N:.2g} (method ml)", "check the known mass and the assumption of a level base"),
-    "known_values_misfit_torque": Code(_LIMIT, "without known values the torques fit to {free_Nm:.2g} instead of "
-        "{residual_Nm:.2g} (method ml)", "check the known mass and the assumption of a level base"),
+    "known_values_misfit_force": Code(_LIMIT, "method ml without known values fits the forces to {free_N:.2g} instead "
+        "of {residual_N:.2g}", "check the known values and what the method assumes, or take more poses"),
+    "known_values_misfit_torque": Code(_LIMIT, "method ml without known values fits the torques to {free_Nm:.2g} "
+        "instead of {residual_Nm:.2g}", "check the known values and what the method assumes, or take more poses"),
     "noise_exceeded": Code(_LIMIT_OR_NOTE, "the residuals are {factor:.1f} times the measured noise "
         "({components:?found: |the stated uncertainties do not include this}{components:.2g})",
         "look for drift, cables, contact and inexact orientations"),
