@@ -284,8 +284,9 @@ def _common_rotation(R_base_flange: Array, seed: Array) -> Array:
     return np.asarray(equivalents[smallest])
 
 
-def _listed(indices: Indices) -> str:
-    return ", ".join(str(i + 1) for i in indices.tolist())
+def _listed(indices: Indices, most: int = 6) -> str:
+    shown = ", ".join(str(i + 1) for i in indices[:most].tolist())
+    return shown if len(indices) <= most else f"{shown} and {len(indices) - most} more"
 
 
 def srom_gravity_force(force_N: Array) -> Array:

@@ -190,6 +190,7 @@ def test_srom_names_what_is_missing_repeated_or_off() -> None:
         return str(caught.value)
 
     assert "missing 3, 17. Use LROM or ML" in refusal(np.delete(R24, [2, 16], axis=0))
+    assert "missing 1, 2, 3, 4, 5, 6 and 2 more." in refusal(R24[8:])
     assert "missing 5; repeated 9." in refusal(np.concatenate([np.delete(R24, 4, axis=0), R24[8:9]]))
     assert "each: repeated 1. Use mixed" in refusal(np.concatenate([R24, R24[:1]]))
     assert "25 not among them" in (extra := refusal(np.concatenate([R24, turned("ZYX", [10, 20, 30])[None]])))
