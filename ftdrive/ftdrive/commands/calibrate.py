@@ -189,6 +189,7 @@ def calibrate(
 
 
 def _refuse_contradictions(context: click.Context) -> None:
+    from ftcalib.published.methods import SPECIAL
     from ftdrive.errors import ConfigError
 
     named = {"earlier": "from", "sets": "set"}
@@ -200,6 +201,9 @@ def _refuse_contradictions(context: click.Context) -> None:
         both = [option for option in group if option in given]
         if len(both) > 1:
             raise ConfigError(f"{both[0]} and {both[1]} exclude one another: leave one of them out")
+    if params["manual"] and params["method"] in SPECIAL:
+        words = f"--manual ends before the 24 orientations that {params['method']} needs"
+        raise ConfigError(f"{words}: leave it out, or choose --method lrom")
     seconds, sweep, passive = (context.params[name] for name in ("seconds", "sweep", "passive"))
     if seconds is not None and (seconds > _LONGEST_SWEEP_S if sweep else not passive):
         raise ConfigError(f"--seconds {seconds:g} goes with --passive, or up to {_LONGEST_SWEEP_S} with --sweep")

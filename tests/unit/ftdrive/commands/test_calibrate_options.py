@@ -88,6 +88,14 @@ def test_options_that_exclude_one_another_are_both_named(
     assert cells == []
 
 
+def test_a_tour_by_hand_has_not_the_orientations_of_srom(cells: list[Any]) -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    for method in ("srom", "mixed"):
+        assert f"the 24 orientations that {method} needs" in str(call("--manual", "--method", method))
+    assert cells == []
+    assert isinstance(call("--manual", "--method", "lrom"), Opened)
+
+
 @pytest.mark.parametrize(
     "cell", [CELL.replace("measured = true", "measured = false"), CELL[: CELL.index("[workcell]")]]
 )
