@@ -69,7 +69,7 @@ _EPILOG = method_names(_METHODS)
     type=click.Choice(["R_base_flange", "R_flange_base"]),
     default="R_base_flange",
     show_default=True,
-    help="Rotation in a CSV: flange to base coordinates, or the inverse (as in the papers).",
+    help="Rotation in a CSV, also that of --test: flange to base coordinates, or the inverse (as in the papers).",
 )
 @click.option("--as-published", is_flag=True, help="Carlson's methods as they are printed, without biases.")
 @click.option(
@@ -154,12 +154,12 @@ def solve(
     sources = sources if pair is None else pair[:1]
     if not (sources or simulate):
         raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
-    if (test is not None and (cases or method != "all")) or (cases and method != "ml"):
-        raise ConfigError("--test goes with --method all, and --table-iii without either: leave one of them out")
+    if cases and (method != "ml" or earlier is not None or joined or pair is not None or test is not None):
+        raise ConfigError("--table-iii has methods and test sets of its own: leave out --method, --test and other data")
+    if test is not None and method != "all":
+        raise ConfigError("--test compares methods: add --method all")
     if as_published and method != "all" and not method.startswith("carlson-"):
         raise ConfigError("--as-published is for --method carlson-... and all: every other method has one form")
-    if cases and (earlier is not None or joined):
-        raise ConfigError("--table-iii solves one run alone: leave out --from and --together")
     if (earlier is not None or joined) and (method != "ml" or (earlier is not None and joined)):
         raise ConfigError("--from and --together are for --method ml, one of the two at a time")
     if joined and pair is not None:
@@ -174,7 +174,7 @@ def solve(
         "up_in_base": upward(up),
     }
     how = {"drift": drift, "as_published": as_published}
-    shown = {"test": test, "cases": cases}
+    shown = {"test": test, "tests": _test_set(test, orientation), "cases": cases}
     motion = {"pair": pair, "point_mass": point_mass, "topics": (wrench_topic, pose_topic)}
     if joined:
         _solve_together(sources, how, read, output, force, as_json)
@@ -207,7 +207,7 @@ def _solve_each(
                 options = {key: value for key, value in read.items() if key != "earlier"}
                 is_motion = is_recording(place) or is_bag(place) or in_motion(place)
                 if method == "all" and motion["pair"] is None and not is_motion:
-                    _show_all(source, read_source(place, **options), how, shown["test"], as_json)
+                    _show_all(source, read_source(place, **options), how, shown, as_json)
                     continue
                 if shown["cases"]:
                     _show_cases(source, read_source(place, **options), as_json)
@@ -303,13 +303,21 @@ def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) ->
         raise ConfigError(str(error)) from error
 
 
-def _show_all(source: Path, data: Source, how: dict[str, Any], test: Path | None, as_json: bool) -> None:
-    tests = None if test is None else read_dataset(test)
-    truth = data.truth
+def _test_set(test: Path | None, orientation: Orientation) -> CalibrationDataset | None:
+    if test is None:
+        return None
+    with unpacked(test) as place:
+        return read_dataset(place, orientation)
+
+
+def _show_all(source: Path, data: Source, how: dict[str, Any], shown: dict[str, Any], as_json: bool) -> None:
+    test, tests, truth = shown["test"], shown["tests"], data.truth
     with working("Solving with all methods"):
         compared = compare(data.dataset, **how, **data.circumstances, test=tests, truth=truth)
     if as_json:
-        write_json({"schema_version": 1, "source": str(source), "methods": [one.to_dict() for one in compared]})
+        given = {} if test is None else {"test_set": str(test)}
+        methods = [one.to_dict() for one in compared]
+        write_json({"schema_version": 1, "source": str(source), **given, "methods": methods})
         return
     print_comparison(compared)
     if tests is not None:
