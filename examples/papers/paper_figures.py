@@ -9,15 +9,19 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
 import ftdrive
 from ftcalib.model import Array
 from ftcalib.poses.paper_sets import paper_set
 from ftcalib.published.methods import Estimator, published
+
+try:
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+except ImportError:
+    raise SystemExit("error: the figures need matplotlib: run with `uv run --extra viz python`") from None
 
 Row = tuple[str, str, str]
 """A quantity, the text of the paper, ours."""
@@ -473,12 +477,20 @@ def main() -> None:
     unknown = set(options.figures) - set(FIGURES)
     if unknown:
         parser.error(f"unknown figure {', '.join(sorted(unknown))}: choose from {', '.join(FIGURES)}")
-    options.output.mkdir(parents=True, exist_ok=True)
+    try:
+        draw(options.figures or list(FIGURES), options.output)
+    except OSError as error:
+        parser.error(f"the pictures cannot be written ({error}): choose another folder with --output")
+
+
+def draw(names: Sequence[str], output: Path) -> None:
+    """Save the figures in a folder, and print their numbers."""
+    output.mkdir(parents=True, exist_ok=True)
     mpl.rcParams.update({"svg.fonttype": "none", "svg.hashsalt": "ftdrive", "font.size": 8})
     print(f"{'':52} {'paper':>16}  ours")
-    for name in options.figures or FIGURES:
+    for name in names:
         figure, rows = FIGURES[name](np.random.default_rng(1))
-        figure.savefig(options.output / f"{name}.svg", metadata={"Date": None})
+        figure.savefig(output / f"{name}.svg", metadata={"Date": None})
         print(name)
         for what, paper, ours in rows:
             print(f"  {what:50} {paper:>16}  {ours}")

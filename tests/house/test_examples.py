@@ -2,6 +2,7 @@
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +40,20 @@ def test_the_figures_of_the_papers_are_drawn_with_the_numbers_of_their_page(tmp_
     assert drawn == {path.name for path in (EXAMPLES.parent / "docs/pictures/papers").iterdir()}
     page = (EXAMPLES.parent / "docs/explanation/papers-reproduced.md").read_text(encoding="utf-8")
     assert {name for name in drawn if f"papers/{name})" in page} == drawn
+
+
+def test_the_figures_of_the_papers_say_what_they_need(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = str(EXAMPLES / "papers/paper_figures.py")
+    (file := tmp_path / "file").touch()
+    monkeypatch.setattr(sys, "argv", [script, "yu-fig14", "--output", str(file)])
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_path(script, run_name="__main__")
+    assert "choose another folder with --output" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(SystemExit, match="need matplotlib: run with"):
+        runpy.run_path(script, run_name="__main__")
 
 
 def test_there_are_eight_short_examples_each_with_a_page_that_the_index_names() -> None:
