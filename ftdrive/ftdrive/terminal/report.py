@@ -60,7 +60,8 @@ def print_result(
         The calibration file, printed in the last line.
     """
     amount = f"{result.n_poses} poses" if result.motion is None else f"{100 * result.motion.used_share:.0f} % used"
-    answer.print(Text.assemble(("Result", "bold cyan"), f"  {amount}, method {result.method}"))
+    printed = " as published" if result.provenance.get("as_published") else ""
+    answer.print(Text.assemble(("Result", "bold cyan"), f"  {amount}, method {result.method}{printed}"))
     answer.print(_table(result, truth))
     if result.response is not None:
         answer.print(hanging(" sigma: ", SIGMA_OF_THE_TOOL, answer))

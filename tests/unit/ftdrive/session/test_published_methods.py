@@ -58,6 +58,8 @@ def test_case_8_and_its_table_come_from_one_run(lab: Lab) -> None:
     methods = {one["method"]: one for one in json.loads(answer.stdout)["methods"]}
     assert methods["mixed"]["test"]["largest"]["force_N"] < 0.1
     assert "test" not in methods["srom"]
+    printed = CliRunner().invoke(cli, ["solve", folder, "--method", "carlson-eigen", "--as-published"])
+    assert "method carlson-eigen as published" in printed.stdout
     incomplete = CliRunner().invoke(cli, ["solve", folder, "--table-iii"]).exception
     assert "lacks poses" in str(incomplete)
 
