@@ -43,10 +43,25 @@ def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F
     return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
 
 
+def _known_sets(context: click.Context, parameter: click.Parameter, sets: str | None) -> str | None:
+    """Refuse unknown sets before a device is opened."""
+    del context, parameter
+    if sets is not None:
+        from ftcalib.poses.paper_sets import names_of
+        from ftdrive.errors import ConfigError
+
+        try:
+            names_of(sets)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+    return sets
+
+
 SETS = click.option(
     "--set",
     "sets",
     metavar="A+E",
+    callback=_known_sets,
     help="Sets A to H of orientations of Yu's Fig. 6, such as A+E, instead of 24 poses.",
 )
 METHOD = click.option(

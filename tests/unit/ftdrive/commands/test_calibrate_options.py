@@ -88,6 +88,15 @@ def test_options_that_exclude_one_another_are_both_named(
     assert cells == []
 
 
+@pytest.mark.parametrize("sets", ["", "a", "A+", "A+Z", "A+A", "E+H"])
+def test_unknown_and_repeated_sets_are_refused_before_the_session(sets: str, cells: list[Any]) -> None:
+    Path("ftdrive.toml").write_text(CELL)
+    error = call("--set", sets)
+    assert isinstance(error, ConfigError)
+    assert "choose A, B" in str(error) or "contains a set twice" in str(error)
+    assert cells == []
+
+
 def test_a_tour_by_hand_has_not_the_orientations_of_srom(cells: list[Any]) -> None:
     Path("ftdrive.toml").write_text(CELL)
     for method in ("srom", "mixed"):
