@@ -7,6 +7,7 @@ from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from ftdrive.commands.common import (
     CELL,
@@ -194,7 +195,7 @@ def _refuse_contradictions(context: click.Context) -> None:
 
     named = {"earlier": "from", "sets": "set"}
     params = {named.get(name, name): value for name, value in context.params.items()}
-    if params["method"] == "ml":
+    if context.get_parameter_source("method") is ParameterSource.DEFAULT:
         params["method"] = None
     given = [f"--{name.replace('_', '-')}" for name, value in params.items() if value]
     for group in _EXCLUDE_ONE_ANOTHER:

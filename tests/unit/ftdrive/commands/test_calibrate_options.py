@@ -71,6 +71,7 @@ def call(*arguments: str) -> BaseException:
         (["--manual", "--set", "A"], "--manual and --set"),
         (["--sweep", "--method", "srom"], "--method and --sweep"),
         (["--resume", "run", "--method", "srom"], "--method and --resume"),
+        (["--resume", "run", "--method", "ml"], "--method and --resume"),
         (["--quick", "--resume", "run"], "--quick and --resume"),
         (["--plan", "plan.json", "--resume", "run"], "--plan and --resume"),
         (["--minimal", "--listen"], "--listen and --minimal"),
