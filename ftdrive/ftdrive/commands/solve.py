@@ -315,7 +315,7 @@ def _show_all(source: Path, data: Source, how: dict[str, Any], shown: dict[str, 
     with working("Solving with all methods"):
         compared = compare(data.dataset, **how, **data.circumstances, test=tests, truth=truth)
     if as_json:
-        given = {} if test is None else {"test_set": str(test)}
+        given = {"as_published": how["as_published"], **({} if test is None else {"test_set": str(test)})}
         methods = [one.to_dict() for one in compared]
         write_json({"schema_version": 1, "source": str(source), **given, "methods": methods})
         return
