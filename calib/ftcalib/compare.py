@@ -42,21 +42,26 @@ class Compared:
     largest_errors: Array | None = None
     """(8,) on the test set, in the axes of the sensor: Fx, Fy, Fz and norm of F in N, the same of T in N·m."""
     mass_error: float = np.nan
-    """Error of the mass as a share of the reference."""
+    """Error of the mass as a share of the reference; NaN if that is zero."""
     centre_error: float = np.nan
-    """Distance of the centre of mass from that of the reference, as a share of its distance from the sensor."""
+    """Distance of the centre of mass from that of the reference, as a share of its distance from the sensor; NaN
+    if that is zero."""
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the JSON object that `ftdrive solve --method all --json` prints for a method."""
         if self.parameters is None:
             return {"method": self.method, "reason": self.reason}
         cross_validated = (self.cv_force_rms_N, self.cv_torque_rms_Nm)
-        force, torque = (None if np.isnan(rms) else rms for rms in cross_validated)
+        force, torque = map(_or_none, cross_validated)
         test: dict[str, JSON] = {}
         if self.largest_errors is not None:
             names = ("fx_N", "fy_N", "fz_N", "force_N", "tx_Nm", "ty_Nm", "tz_Nm", "torque_Nm")
             largest = dict(zip(names, self.largest_errors.tolist(), strict=True))
-            test["test"] = {"largest": largest, "mass_error": self.mass_error, "centre_error": self.centre_error}
+            test["test"] = {
+                "largest": largest,
+                "mass_error": _or_none(self.mass_error),
+                "centre_error": _or_none(self.centre_error),
+            }
         return {
             "method": self.method,
             "mass_kg": self.mass_kg,
@@ -213,9 +218,17 @@ def _tested(compared: Compared, parameters: Parameters, test: CalibrationDataset
     return replace(
         compared,
         largest_errors=np.concatenate(largest),
-        mass_error=abs(weight_N / true_N - 1),
-        centre_error=off_m / max(float(np.linalg.norm(truth.p_sensor_com_m)), 1e-300),
+        mass_error=_share(abs(weight_N - true_N), true_N),
+        centre_error=_share(off_m, float(np.linalg.norm(truth.p_sensor_com_m))),
     )
+
+
+def _share(error: float, reference: float) -> float:
+    return error / reference if reference else np.nan
+
+
+def _or_none(value: float) -> float | None:
+    return None if np.isnan(value) else value
 
 
 def _fitted(result: CalibrationResult) -> tuple[Parameters, float, float]:

@@ -321,7 +321,9 @@ def print_cases(cases: Sequence[tuple[int, str, str, Compared]], *, known: bool)
 
 
 def _to_digits(value: float) -> str:
-    """Write a positive number with three digits, at most three of them after the point."""
+    """Write a positive number with three digits, at most three of them after the point; NaN as "-"."""
+    if np.isnan(value):
+        return "-"
     return f"{value:.{0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3}f}"
 
 

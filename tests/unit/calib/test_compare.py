@@ -99,6 +99,14 @@ def test_each_case_uses_the_sets_of_the_printed_table(name: str, cases: set[int]
     assert changed == cases
 
 
+def test_a_reference_of_zero_has_no_relative_errors() -> None:
+    nothing = Parameters(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    *_, one = table_iii(measured(0.0), NUMBERS.tolist(), nothing)[0]
+    assert np.isnan([one.mass_error, one.centre_error]).all()
+    test = json.loads(json.dumps(one.to_dict(), allow_nan=False))["test"]
+    assert test["mass_error"] is test["centre_error"] is None
+
+
 def test_more_data_are_better_and_the_inside_of_the_data_is_best() -> None:
     """The rules that the text draws from the table: cases 3 and 4, 5 and 6, 6 and 11."""
     errors = np.zeros(len(CASES))

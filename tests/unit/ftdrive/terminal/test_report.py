@@ -30,6 +30,7 @@ from ftdrive.terminal.report import (
     print_cases,
     print_comparison,
     print_result,
+    to_digits,
 )
 from tests.unit.ftdrive.exports.calibration.example import calibration as followed
 from tests.unit.ftdrive.fake_cell import Lab
@@ -396,3 +397,7 @@ def test_a_drift_in_the_fit_is_said_with_what_it_means_for_the_next_use(capsys: 
     assert drift_in_use(followed()) is None
     assert (poses_in_words(replace(followed(), quality=quality)) or "").startswith("pose 3, 2.3 sigma; each pose")
     assert poses_in_words(followed()) is None
+
+
+def test_a_share_of_nothing_is_printed_as_a_dash() -> None:
+    assert [to_digits(value) for value in (float("nan"), 0.0, 12.34, 567.8)] == ["-", "0.000", "12.3", "568"]
