@@ -22,6 +22,7 @@ from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.report import (
+    _to_digits,
     drift_in_use,
     drift_in_words,
     error_in_words,
@@ -30,7 +31,6 @@ from ftdrive.terminal.report import (
     print_cases,
     print_comparison,
     print_result,
-    to_digits,
 )
 from tests.unit.ftdrive.exports.calibration.example import calibration as followed
 from tests.unit.ftdrive.fake_cell import Lab
@@ -400,4 +400,4 @@ def test_a_drift_in_the_fit_is_said_with_what_it_means_for_the_next_use(capsys: 
 
 
 def test_a_share_of_nothing_is_printed_as_a_dash() -> None:
-    assert [to_digits(value) for value in (float("nan"), 0.0, 12.34, 567.8)] == ["-", "0.000", "12.3", "568"]
+    assert [_to_digits(value) for value in (float("nan"), 0.0, 12.34, 567.8)] == ["-", "0.000", "12.3", "568"]
