@@ -154,8 +154,12 @@ def solve(
     sources = sources if pair is None else pair[:1]
     if not (sources or simulate):
         raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
-    if cases and (method != "ml" or earlier is not None or joined or pair is not None or test is not None):
-        raise ConfigError("--table-iii has methods and test sets of its own: leave out --method, --test and other data")
+    others = (earlier, pair, test, mass_kg, level_deg, mounting_deg, up)
+    if cases and (method != "ml" or drift != "auto" or joined or any(one is not None for one in others)):
+        raise ConfigError(
+            "--table-iii has methods and test sets of its own: leave out --method, --test and other data, --drift and "
+            "known values"
+        )
     if test is not None and method != "all":
         raise ConfigError("--test compares methods: add --method all")
     if as_published and method != "all" and not method.startswith("carlson-"):

@@ -34,6 +34,8 @@ PAIR = ("--wrench", "a.csv", "--orientation-file", "b.csv")
         (("a.csv", "--from", "old.json", "--table-iii"), "leave out --method, --test"),
         (("a.csv", "b.csv", "--together", "--table-iii"), "leave out --method, --test"),
         ((*PAIR, "--table-iii"), "leave out --method, --test"),
+        (("a.csv", "--mass-kg", "1", "--table-iii"), "and known values"),
+        (("a.csv", "--drift", "none", "--table-iii"), "--drift and known values"),
         (("a.csv", "--method", "srom", "--as-published"), "every other method has one form"),
     ],
 )
