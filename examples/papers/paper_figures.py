@@ -139,7 +139,7 @@ def yu_fig4(rng: np.random.Generator) -> Drawing:
         axes.semilogy(range(1, 7), np.maximum(np.array(errors)[:, k], 1e-17), "osD^v<>"[k], label=label)
     finish(axes, "setup of Table I", "error, SI units", "SROM, no noise")
     axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1))
-    largest = np.max(errors)  # rounding, whose size is another one on each computer
+    largest = float(np.max(errors))  # rounding, whose size is another one on each computer
     return figure, [("largest of 6 x 7 errors", "< 1e-12", "< 1e-12" if largest < 1e-12 else f"{largest:.1e}")]
 
 
