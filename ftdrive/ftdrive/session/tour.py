@@ -407,6 +407,8 @@ class Tour:
         self._show_state(State.HOLD, words=words)
         by_operator = isinstance(error, OperatorStop)
         end = Declined(words) if by_operator else error if trip is None else trip.error
+        if trip is not None and trip.error is not error and trip is not error and trip.error.__cause__ is None:
+            end.__cause__ = error  # which a guard may have overtaken: an arm that fails ends its own program
         question = self._how_to_go_on(back, "" if by_operator else " after fixing the cause")
         while True:
             answer = self._choose(question, end)
@@ -437,7 +439,7 @@ class Tour:
         except SupervisorGone as gone:
             raise (gone if isinstance(end, Declined) else end) from gone
         except Declined:
-            raise end from None
+            raise end from end.__cause__
         if answer == "quit":
             raise end
         return answer

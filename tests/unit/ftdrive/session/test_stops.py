@@ -540,3 +540,17 @@ def test_reduced_mode_that_comes_a_second_time_is_confirmed_again(lab: Lab) -> N
     lab.operator.at_question.append(("in reduced mode", lambda: asked.append(len(lab.arm.moves))))
     assert lab.take_poses() is not None
     assert asked == [3, 7]
+
+
+def test_the_failure_of_an_arm_that_ends_its_own_program_is_kept_as_the_cause(lab: Lab) -> None:
+    late = DeviceTimeout("the move has not ended")
+
+    def fail_and_end_the_program() -> None:
+        lab.arm.set_status(program="stopped")
+        lab.clock.sleep(0.2)  # the guards look meanwhile
+        raise late
+
+    lab.arm.at_move[4] = fail_and_end_the_program
+    with pytest.raises(DeviceFault, match="the control program is stopped") as stopped:
+        lab.calibrate()
+    assert stopped.value.__cause__ is late
