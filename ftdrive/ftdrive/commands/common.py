@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from functools import wraps
 from os import fsdecode
 from pathlib import Path
-from textwrap import fill
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast, get_args
 
 import click
@@ -251,12 +250,6 @@ def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> li
         wanted = " or ".join(map(str, counts))
         raise ConfigError(f"{option} is '{text}': give {wanted} numbers separated by '{separator}'")
     return values
-
-
-def method_names(methods: Sequence[str]) -> str:
-    """Return the lines below the options of a command that name its methods."""
-    names = fill(", ".join(methods), 76, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False)
-    return f"\b\nMETHOD is one of\n{names}"
 
 
 def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[float]] | None:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from contextlib import nullcontext
 from pathlib import Path
+from textwrap import fill
 from typing import Any, get_args
 
 import click
@@ -30,7 +31,6 @@ from ftdrive.commands.common import (
     Number,
     check_simulate,
     index_run,
-    method_names,
     numbers,
     simulate,
     stop_unless_accepted,
@@ -51,7 +51,9 @@ from ftdrive.terminal.report import print_cases, print_comparison, print_result,
 from ftdrive.terminal.text import echo, in_one_line
 
 _METHODS = (*get_args(Method), "all")
-_EPILOG = method_names(_METHODS)
+_EPILOG = "\b\nMETHOD is one of\n" + fill(
+    ", ".join(_METHODS), 76, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
+)
 
 
 @click.command(epilog=_EPILOG)

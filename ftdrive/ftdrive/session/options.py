@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final, cast, get_args
 
 from ftcalib.result import Method
 from ftdrive.errors import ConfigError
@@ -56,15 +56,14 @@ class SessionOptions:
 
 def method_of_poses(name: str) -> Method:
     """Return a method by its name, if poses suffice for it. Raises `ConfigError`."""
-    methods: tuple[Method, ...] = get_args(Method)
-    if name not in methods:
-        raise ConfigError(f"there is no method '{name}': choose one of {', '.join(methods)}")
+    if name not in get_args(Method):
+        raise ConfigError(f"there is no method '{name}': choose one of {', '.join(get_args(Method))}")
     if name == "carlson-cayley":
         raise ConfigError(
             "carlson-cayley needs the mass on the sensor: take the poses without --method, then "
             "`ftdrive solve RUN --method carlson-cayley --mass-kg KG`"
         )
-    return next(method for method in methods if method == name)
+    return cast(Method, name)
 
 
 def with_recorded_mode(options: SessionOptions) -> SessionOptions:
