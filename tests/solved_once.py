@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftcalib.assessment.observability import second_minimum
+from ftcalib.judge.observability import second_minimum
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.rotation_minima import Minimum
 from ftcalib.model import Parameters

@@ -11,10 +11,9 @@ if TYPE_CHECKING:
     from ftcalib.data.dwell_mean import PoseMean, is_stationary, mean_and_covariance
     from ftcalib.errors import BadCalibration, BadDataset, NotObservable
     from ftcalib.findings import Finding
-    from ftcalib.known import Known
+    from ftcalib.known import Known, Setup
     from ftcalib.model import PARAMETER_NAMES, Parameters
     from ftcalib.result import CalibrationResult
-    from ftcalib.setup import Setup
     from ftcalib.solver import solve
 
 __all__ = [
@@ -40,10 +39,9 @@ _MODULES = {
     "ftcalib.data.dwell_mean": ("PoseMean", "is_stationary", "mean_and_covariance"),
     "ftcalib.errors": ("BadCalibration", "BadDataset", "NotObservable"),
     "ftcalib.findings": ("Finding",),
-    "ftcalib.known": ("Known",),
+    "ftcalib.known": ("Known", "Setup"),
     "ftcalib.model": ("PARAMETER_NAMES", "Parameters"),
     "ftcalib.result": ("CalibrationResult",),
-    "ftcalib.setup": ("Setup",),
     "ftcalib.solver": ("solve",),
 }
 

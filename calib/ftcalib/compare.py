@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from ftcalib.data.dataset import CalibrationDataset
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.files import JSON
-from ftcalib.known import Known
+from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, predict
-from ftcalib.poses.paper_sets import EVERY_SET, numbers_of
+from ftcalib.poses.selection import EVERY_SET, numbers_of
 from ftcalib.published.methods import CARLSON, PUBLISHED, published
 from ftcalib.result import CalibrationResult, Method
-from ftcalib.setup import NOTHING, Setup
 from ftcalib.solver import estimator_of, solve
 
 _MOST_FOLDS = 50
@@ -146,7 +145,7 @@ CASES: tuple[tuple[int, Method, str, str], ...] = (
     *((5, "lrom", "H", "D"), (6, "lrom", "E", "D"), (7, "lrom", "E+F", "D"), (8, "mixed", "A+E", "D")),
     *((9, "lrom", "A+E", "D"), (10, "lrom", _ALL, "D"), (11, "lrom", "E", "G")),
 )
-"""Yu, Table III: number, method, sets of the estimate, set of the test (`ftcalib.poses.paper_sets`)."""
+"""Yu, Table III: number, method, sets of the estimate, set of the test (`ftcalib.poses.selection`)."""
 
 
 def table_iii(
@@ -163,7 +162,7 @@ def table_iii(
     dataset : CalibrationDataset
         The sets A to G in any order, in one session.
     numbers : sequence of int
-        Of each pose, as `ftcalib.poses.paper_sets.numbers_of` gives them.
+        Of each pose, as `ftcalib.poses.selection.numbers_of` gives them.
     truth : Parameters, optional
         Reference of mass, centre of mass and mounting; default: the maximum likelihood estimate of all poses but
         those of D.

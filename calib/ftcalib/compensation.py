@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ftcalib.likelihood.gain_and_cross_talk import Response
+from ftcalib.likelihood.response import Response
 from ftcalib.model import Parameters, Rotations, matrices_of, skew
 
 Reals = NDArray[np.floating[Any]]

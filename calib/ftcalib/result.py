@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
-from ftcalib.assessment.verdict import SURE, expected_error
 from ftcalib.compensation import Compensator
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, is_changed, read_object, write_object
 from ftcalib.findings import Finding, Verdict, verdict_of
-from ftcalib.likelihood.gain_and_cross_talk import COMMON_GAIN, Response, hidden_covariance, predicted_covariance
+from ftcalib.judge.verdict import SURE, expected_error
+from ftcalib.likelihood.response import COMMON_GAIN, Response, hidden_covariance, predicted_covariance
 from ftcalib.model import PARAMETER_NAMES, Array, Parameters, Rotations, is_rotation, read_only
 from ftcalib.published.yu import weight_and_tilt
 

@@ -6,16 +6,15 @@ from typing import Any, get_args
 
 import numpy as np
 
-from ftcalib.assessment.contradictions import contradictions
-from ftcalib.assessment.cross_validation import AssessedFit, IndependentFit
-from ftcalib.assessment.faults import faults, no_weight, other_poses
-from ftcalib.assessment.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
-from ftcalib.assessment.verdict import SIGNIFICANT_SIGMAS, judge
-from ftcalib.data.dataset import CalibrationDataset
-from ftcalib.data.pooling import pooled_covariance
+from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.findings import Finding, ordered
-from ftcalib.known import Known
+from ftcalib.judge.cross_validation import AssessedFit, IndependentFit
+from ftcalib.judge.described_cell import contradictions
+from ftcalib.judge.faults import faults, no_weight, other_poses
+from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
+from ftcalib.judge.verdict import SIGNIFICANT_SIGMAS, judge
+from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
@@ -23,7 +22,6 @@ from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Paramet
 from ftcalib.published.methods import BASELINES, PUBLISHED, SPECIAL, Estimator, published, require_printed_form
 from ftcalib.published.yu import ROUNDING_RAD, special_deviation_rad, special_numbers
 from ftcalib.result import CalibrationResult, DriftResult, Method, require_positive_definite
-from ftcalib.setup import NOTHING, Setup
 
 SIMULATIONS = 400
 UNRESOLVED_N = 1e-12

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import ftdrive
 from ftcalib.model import Array
-from ftcalib.poses.paper_sets import paper_set
+from ftcalib.poses.selection import paper_set
 from ftcalib.published.methods import Estimator, published
 
 try:

@@ -21,16 +21,15 @@ from importlib import import_module
 
 TYPE_CHECKING = False  # type checkers take it for that of `typing`, whose import would take most of the time
 if TYPE_CHECKING:
+    from ftcalib.after.weighing import Weight
     from ftcalib.compare import compare
     from ftcalib.compensation import Compensator
     from ftcalib.data.dataset import CalibrationDataset
     from ftcalib.errors import AcceptanceError, DataError, DeviceError, FtdriveError, UsageError
-    from ftcalib.extras.weighing import Weight
     from ftcalib.findings import Finding
-    from ftcalib.known import Known
+    from ftcalib.known import Known, Setup
     from ftcalib.model import Parameters, predict
     from ftcalib.result import CalibrationResult
-    from ftcalib.setup import Setup
     from ftcalib.solver import solve
     from ftdrive.library import open_arm, open_sensor, open_stream, plan_tour
     from ftdrive.live.contact import Contact
@@ -90,12 +89,11 @@ _MODULES = {
     "ftcalib.compensation": ("Compensator",),
     "ftcalib.data.dataset": ("CalibrationDataset",),
     "ftcalib.errors": ("AcceptanceError", "DataError", "DeviceError", "FtdriveError", "UsageError"),
-    "ftcalib.extras.weighing": ("Weight",),
+    "ftcalib.after.weighing": ("Weight",),
     "ftcalib.findings": ("Finding",),
-    "ftcalib.known": ("Known",),
+    "ftcalib.known": ("Known", "Setup"),
     "ftcalib.model": ("Parameters", "predict"),
     "ftcalib.result": ("CalibrationResult",),
-    "ftcalib.setup": ("Setup",),
     "ftcalib.solver": ("solve",),
     "ftdrive.library": ("open_arm", "open_sensor", "open_stream", "plan_tour"),
     "ftdrive.live.contact": ("Contact",),

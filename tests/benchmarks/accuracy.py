@@ -25,15 +25,14 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, NotObservable, Parameters, read_csv, solve
-from ftcalib.assessment.cross_validation import standardized
-from ftcalib.assessment.observability import AMBIGUOUS_GAP, assess
+from ftcalib.judge.cross_validation import standardized
+from ftcalib.judge.observability import AMBIGUOUS_GAP, assess
 from ftcalib.known import Known
 from ftcalib.likelihood import fit as likelihood
 from ftcalib.likelihood import rotation_minima
-from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
+from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import UP_IN_BASE, Array, predict
-from ftcalib.published import carlson_known
-from ftcalib.published.carlson import iterative
+from ftcalib.published.carlson import iterative, relaxation
 from ftcalib.published.methods import published
 from ftcalib.published.yu import SPECIAL_R_flange_base, lrom, srom
 from tests.benchmarks import scenarios as sim
@@ -542,7 +541,7 @@ def carlson_figure_1(trials: int, rng: Rng) -> Array:
         for trial in range(trials):
             X, R = Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), Rotation.random(100, rng=rng).as_matrix()
             force_N = gravity @ R @ X + sigma_N * rng.normal(size=(100, 3))
-            fit = carlson_known.relaxation(R, force_N, gravity, bias=False)
+            fit = relaxation(R, force_N, gravity, bias=False)
             errors[i, trial] = np.sum((fit.R_flange_sensor - X) ** 2)
     return np.asarray(np.median(errors, axis=1))
 

@@ -19,9 +19,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult
-from ftcalib.data.pooling import pooled_covariance
+from ftcalib.data.dataset import pooled_covariance
 from ftcalib.errors import NotObservable
-from ftcalib.likelihood.gain_and_cross_talk import response_columns
+from ftcalib.likelihood.response import response_columns
 from ftcalib.likelihood.session import LEVER_M
 from ftcalib.likelihood.session_noise import centred, pose_times, steps
 from ftcalib.likelihood.variance_components import FORCE, TORQUE, component

@@ -15,7 +15,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from ftcalib.extras.drift_onset import drift_onset
+from ftcalib.after.series import drift_onset
 from ftcalib.model import Array
 from ftdrive.fleet.observed import WINDOW
 

@@ -19,7 +19,7 @@ import click
 import numpy as np
 
 from ftcalib.errors import FtdriveError
-from ftcalib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN
+from ftcalib.likelihood.response import CROSS_TALK_M, GAIN
 from ftcalib.model import Parameters
 from ftcalib.motion.estimate import fit
 from ftcalib.motion.model import DELAY, INERTIA, Load

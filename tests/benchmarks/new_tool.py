@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, solve
+from ftcalib.after.new_tool import new_tool
 from ftcalib.errors import NotObservable
-from ftcalib.extras.new_tool import new_tool
 from ftcalib.model import Array, Parameters, predict
 from ftcalib.motion.solve import solve_motion
 from ftcalib.published.yu import SPECIAL_R_flange_base
@@ -28,7 +28,7 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tool
 from tests import moving_load
-from tests.unit.calib.extras.test_new_tool import OTHER, poses
+from tests.unit.calib.after.test_new_tool import OTHER, poses
 from tests.unit.ftdrive.live.simulated import TRUTH, calibrated, calibrated_from
 
 TOUR = np.swapaxes(SPECIAL_R_flange_base, 1, 2)

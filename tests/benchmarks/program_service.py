@@ -18,7 +18,7 @@ from typing import Any
 import click
 import numpy as np
 
-from ftcalib.extras.weighing import drift_since
+from ftcalib.after.weighing import drift_since
 from ftdrive.errors import ConfigError
 from ftdrive.exports.program_functions import functions
 from ftdrive.live.samples import Block

@@ -18,7 +18,7 @@ from ftcalib import Parameters, read_csv
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood import fit as likelihood
 from ftcalib.likelihood.explanation import Explanation, with_all_minima
-from ftcalib.likelihood.gain_and_cross_talk import COMMON_GAIN, CROSS_TALK_M, GAIN, Response, predicted_covariance
+from ftcalib.likelihood.response import COMMON_GAIN, CROSS_TALK_M, GAIN, Response, predicted_covariance
 from ftcalib.likelihood.session import Session, inverses
 from ftcalib.likelihood.session_noise import centred
 from ftcalib.likelihood.variance_components import FORCE, RESPONSE, ROTATION, TORQUE, Kind, component

@@ -20,14 +20,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, Parameters, solve
+from ftcalib.after.state import BLOCKS
+from ftcalib.after.verification import SINGLE, verify
+from ftcalib.data.dataset import pooled_covariance
 from ftcalib.data.dwell_mean import mean_and_covariance
-from ftcalib.data.pooling import pooled_covariance
-from ftcalib.extras.update import BLOCKS
-from ftcalib.extras.verification import SINGLE, verify
-from ftcalib.likelihood.gain_and_cross_talk import LEVER_M
+from ftcalib.likelihood.response import LEVER_M
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.poses.information import SUBSET_6, T12, special
-from ftcalib.poses.verification_poses import choose_verification_poses
+from ftcalib.poses.selection import choose_verification_poses
 from tests.benchmarks.accuracy import Lab, Row, band, most, run
 from tests.benchmarks.scenarios import Rng, direction
 

@@ -20,7 +20,7 @@ from typing import Any
 import click
 import numpy as np
 
-from ftcalib.extras.weighing import Weight
+from ftcalib.after.weighing import Weight
 from ftcalib.model import Array
 from ftdrive.cell.emulated import Station
 from ftdrive.live.stream import CompensatedStream

@@ -10,10 +10,9 @@ from scipy.linalg import block_diag
 
 from ftcalib.errors import NotObservable
 from ftcalib.known import Constraints, Known
-from ftcalib.likelihood.component_selection import rivals
 from ftcalib.likelihood.descent import MAX_STEPS, Minimum, column_scale
-from ftcalib.likelihood.explanation import Explanation, explain, noise_under
-from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response
+from ftcalib.likelihood.explanation import Explanation, explain, noise_under, rivals
+from ftcalib.likelihood.response import SIZE, Response
 from ftcalib.likelihood.session import Drift, Session
 from ftcalib.likelihood.session_noise import Noise, summed_products
 from ftcalib.likelihood.variance_components import (

@@ -7,13 +7,10 @@ import numpy as np
 
 from ftcalib.data.dwell_mean import RESOLUTION
 from ftcalib.known import Constraints
-from ftcalib.likelihood.descent import Descent, Minimum, column_scale
-from ftcalib.likelihood.gain_and_cross_talk import LEVER_M as CROSS_TALK_LEVER_M
-from ftcalib.likelihood.gain_and_cross_talk import response_columns
-from ftcalib.likelihood.hysteresis import hysteresis_columns
-from ftcalib.likelihood.outliers import Kept
+from ftcalib.likelihood.descent import Descent, Kept, Minimum, Statistics, coefficients, column_scale, features
+from ftcalib.likelihood.response import LEVER_M as CROSS_TALK_LEVER_M
+from ftcalib.likelihood.response import hysteresis_columns, response_columns
 from ftcalib.likelihood.session_noise import Noise, pose_times
-from ftcalib.likelihood.sufficient_statistics import Statistics, coefficients, features
 from ftcalib.likelihood.variance_components import (
     FORCE,
     HYSTERESIS,

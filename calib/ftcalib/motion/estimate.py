@@ -10,12 +10,24 @@ from scipy.linalg import block_diag, cho_factor, cho_solve
 from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtri
 
-from ftcalib.extras.cell_prior import WHOLE, CellPrior
+from ftcalib.after.new_tool import WHOLE, CellPrior
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
 from ftcalib.model import Array, Parameters, angle_between, nearest_rotation
-from ftcalib.motion.model import CROSS_TALK, DELAY, GAINS, HEIGHT, INERTIA, SIZE, Load, jacobian, wrench_of
-from ftcalib.motion.noise import Noise, runs, states
+from ftcalib.motion.model import (
+    CROSS_TALK,
+    DELAY,
+    GAINS,
+    HEIGHT,
+    INERTIA,
+    SIZE,
+    Load,
+    Noise,
+    jacobian,
+    runs,
+    states,
+    wrench_of,
+)
 from ftcalib.motion.samples import Rows
 from ftcalib.published.yu import com_and_torque_bias
 

@@ -8,20 +8,19 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from ftcalib.assessment.cross_validation import IndependentFit
-from ftcalib.assessment.observability import assess
-from ftcalib.assessment.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, expected_error, judge
+from ftcalib.after.new_tool import CellPrior
 from ftcalib.errors import BadDataset, NotObservable
-from ftcalib.extras.cell_prior import CellPrior
 from ftcalib.findings import Finding, Severity, ordered, verdict_of
-from ftcalib.known import Known
-from ftcalib.likelihood.gain_and_cross_talk import Response
+from ftcalib.judge.cross_validation import IndependentFit
+from ftcalib.judge.observability import assess
+from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, expected_error, judge
+from ftcalib.known import NOTHING, Known, Setup
+from ftcalib.likelihood.response import Response
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, rough_delay
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
 from ftcalib.motion.samples import NARROW, WIDE, Means, Rows, rows_of
 from ftcalib.result import CalibrationResult, DriftResult, MotionResult
-from ftcalib.setup import NOTHING, Setup
 
 LEAST_S = 5.0
 FARTHEST_S = 1.5

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftcalib.assessment.observability import second_minimum
+from ftcalib.judge.observability import second_minimum
 from ftcalib.likelihood.rotation_minima import given_rotation
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
 from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias

@@ -1,16 +1,17 @@
-"""Selection of poses from those that the arm can reach: a whole set, or the next pose.
+"""Selection of poses from those that the arm can reach: a whole set, the next pose, a verification, the papers' sets.
 
 Criteria are traces of a covariance C: a pose with whitened Jacobian J lowers trace(M C) by
 trace((1 + J C J^T)^-1 J C M C J^T), so one array operation ranks all candidates. All functions are deterministic.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from ftcalib.model import Array, Parameters, predict
+from ftcalib.model import BIASES, Array, Parameters, predict
 from ftcalib.poses.information import (
     Guess,
     TOOL_DOWN_R_base_flange,
@@ -211,3 +212,139 @@ def _gains(rows: Array, C: Array, M: Array) -> Array:
 
 def _inverse(information: Array) -> Array:
     return np.asarray(np.linalg.inv(information), dtype=np.float64)
+
+
+# Selection of poses that verify a calibration: far from those of the fit, and able to name what has changed.
+
+FEWEST_TO_VERIFY = 2
+FARTHER_SHARE = 0.5
+"""Share of the candidates, the farthest from the fit, among which the poses are chosen."""
+TOOL = Guess(mass_kg=1.0, sigma_force_N=0.02, sigma_torque_Nm=0.001)
+"""The choice hardly depends on the tool."""
+USUAL_CHANGE = np.repeat([np.deg2rad(1.0), TOOL.weight_N * np.deg2rad(0.5), 0.5, 3e-3, 0.02], 3)
+"""(15,) of mounting, gravity force, force bias, centre of mass and torque bias."""
+
+CAUSES = (range(3), range(3, 6), range(9, 12), BIASES)
+"""Error coordinates of mounting, gravity force (base or payload), centre of mass, and bias."""
+
+
+def choose_verification_poses(
+    candidates: Array, fitted: Array, n: int, *, gravity_direction_base: ArrayLike = (0.0, 0.0, -1.0)
+) -> Indices:
+    """Choose poses for a verification: greedily, then exchanging one at a time as long as it helps.
+
+    They are chosen among the half of the candidates in which gravity pulls on the tool from directions farthest from
+    those of the fit. They maximise the determinants of the information about each pair of causes of a change, with a
+    prior of the usual size of a change. Two poses then differ in tilt, and no two causes look alike.
+
+    Parameters
+    ----------
+    candidates : array, shape (m, 3, 3)
+        Orientations R_base_flange that the arm can reach.
+    fitted : array, shape (k, 3, 3)
+        R_base_flange of the calibration.
+    n : int
+        2 or more.
+    gravity_direction_base : array_like, shape (3,)
+        For a robot on a table -z.
+
+    Returns
+    -------
+    int array, shape (n,)
+        Indices of candidates, all different.
+    """
+    candidates, fitted = np.asarray(candidates, dtype=np.float64), np.asarray(fitted, dtype=np.float64)
+    if not FEWEST_TO_VERIFY <= n <= len(candidates):
+        raise ValueError(
+            f"cannot choose {n} poses of {len(candidates)}: {FEWEST_TO_VERIFY} or more, of at least as many"
+        )
+    down = np.asarray(gravity_direction_base, dtype=np.float64)
+    nearest = np.max((down @ candidates) @ (down @ fitted).T, axis=1, initial=-np.inf)  # cosine, in flange axes
+    count = max(n, round(FARTHER_SHARE * len(candidates)))
+    far = np.sort(np.argsort(nearest, kind="stable")[:count])
+    rows = whitened_jacobian(candidates[far], TOOL) / TOOL.scale * USUAL_CHANGE
+    pairs = [rows[..., [*a, *b]] for a, b in combinations(CAUSES, 2)]
+
+    def gains(chosen: list[int]) -> Array:
+        """Increase of log det(1 + sum of J'J), summed over the pairs of causes."""
+        total = np.zeros(len(far))
+        for J in pairs:
+            done = J[chosen].reshape(-1, J.shape[2])
+            covariance = np.linalg.inv(np.eye(J.shape[2]) + done.T @ done)
+            total += np.linalg.slogdet(np.eye(6) + J @ covariance @ np.swapaxes(J, 1, 2))[1]
+        return total
+
+    return np.asarray(far[greedy_and_exchange(gains, n)])
+
+
+# The sets of orientations A to H of Yu, Shi, Lou 2021 (Fig. 6), by which the cases of Table III are named.
+#
+# The figure gives kinds and counts, no numbers. A is the paper's own; the others are drawn here, always alike. The
+# limited workspace of E is that of a tool that points forwards and down: its axis (flange z) within 60° of the
+# direction halfway between straight down and forwards. F is on the opposite side, backwards and down.
+
+COUNTS: Mapping[str, int] = {"A": 24, "B": 12, "C": 12, "D": 150, "E": 24, "F": 24, "G": 48, "H": 12}
+"""Orientations of each set. H is the first half of E."""
+EVERY_SET = "A+B+C+D+E+F+G"
+"""What Table III needs."""
+_HALF_ANGLE_RAD = np.pi / 3
+_SIDES = {"E": 1.0, "F": -1.0, "G": 1.0, "H": 1.0}
+
+
+def paper_set(name: str, *, spare: int = 0, down_base: ArrayLike = (0.0, 0.0, -1.0)) -> Array:
+    """Return the orientations of one set.
+
+    Parameters
+    ----------
+    name : str
+        A to H.
+    spare : int
+        More orientations of the same kind, for an arm that cannot reach each of them; A has none.
+    down_base : array_like, shape (3,)
+        Direction of gravity in base, a unit vector: forwards is base x, or base z where gravity is along x.
+
+    Returns
+    -------
+    array, shape (n, 3, 3)
+        R_base_flange.
+
+    Raises
+    ------
+    ValueError
+        There is no such set.
+
+    Examples
+    --------
+    >>> from ftcalib.poses.selection import paper_set
+    >>> paper_set("E").shape
+    (24, 3, 3)
+    """
+    if name not in COUNTS:
+        raise ValueError(f"there is no set {name}: choose {', '.join(COUNTS)}")
+    if name == "A":
+        return special(range(1, 25))
+    count, rng = COUNTS[name] + spare, np.random.default_rng(ord("E" if name == "H" else name))
+    if name not in _SIDES:
+        return np.asarray(Rotation.random(count, rng=rng).as_matrix())
+    down = np.asarray(down_base, dtype=np.float64)
+    forwards = np.eye(3)[0 if abs(down[0]) < 0.9 else 2]
+    forwards -= forwards @ down * down
+    axis = down + _SIDES[name] * forwards / np.linalg.norm(forwards)
+    drawn = Rotation.random(8 * count + 100, rng=rng).as_matrix()  # a quarter of all directions is inside
+    inside = drawn[:, :, 2] @ axis / np.linalg.norm(axis) >= np.cos(_HALF_ANGLE_RAD)
+    return np.asarray(drawn[inside][:count])
+
+
+def names_of(sets: str) -> Sequence[str]:
+    """Split the names in "A+E". Raises `ValueError` for an unknown set, a repeated one, or E and its half H."""
+    names = sets.split("+")
+    if unknown := [name for name in names if name not in COUNTS]:
+        raise ValueError(f"there is no set '{unknown[0]}': choose {', '.join(COUNTS)}, or several as A+E")
+    if len(set(names)) < len(names) or {"E", "H"} <= set(names):
+        raise ValueError(f"{sets} contains a set twice (H is the half of E): leave one of them out")
+    return names
+
+
+def numbers_of(name: str) -> NDArray[np.intp]:
+    """Return the numbers of the poses of one set: those of the paper for A, 1001 to 1012 for B, from 2001 on for C."""
+    return np.arange(1, COUNTS[name] + 1) + 1000 * "ABCDEFG".index("E" if name == "H" else name)

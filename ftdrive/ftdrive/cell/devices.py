@@ -4,7 +4,7 @@ from collections.abc import Callable
 from math import radians
 from typing import Any, cast
 
-from ftcalib.ports import Arm, Sensor
+from ftcalib.routine import Arm, Sensor
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import sensor_reached
 from ftdrive.errors import ConfigError

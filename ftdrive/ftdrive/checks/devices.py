@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ftcalib import CalibrationDataset, CalibrationResult
-from ftcalib.assessment import described_cell
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
+from ftcalib.judge import described_cell
 from ftcalib.poses.information import Guess, predicted_sigma, special
 from ftdrive.cell.config import CellConfig, RobotConfig, ToolConfig
 from ftdrive.checks.check import Check, State

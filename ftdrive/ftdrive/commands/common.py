@@ -46,7 +46,7 @@ def _known_sets(context: click.Context, parameter: click.Parameter, sets: str | 
     """Refuse unknown sets before a device is opened."""
     del context, parameter
     if sets is not None:
-        from ftcalib.poses.paper_sets import names_of
+        from ftcalib.poses.selection import names_of
         from ftdrive.errors import ConfigError
 
         try:

@@ -11,7 +11,7 @@ from ftdrive.commands.common import JSON, store_url, write_json
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
-    from ftcalib.extras.difference import ChiSquare, Difference, Estimated
+    from ftcalib.after.series import ChiSquare, Difference, Estimated
 
 _SIGNIFICANT = 0.01
 _ROWS = (
@@ -52,7 +52,7 @@ def diff(first: str, second: str, as_json: bool) -> None:
     The differences B minus A are given in sigmas of both together, and tested jointly with both covariances. A rotation
     is compared as one rotation about the flange axes. The exit code is 0 whatever the difference is.
     """
-    from ftcalib.extras.difference import difference
+    from ftcalib.after.series import difference
 
     a, b = _side(first), _side(second)
     found = difference(a.calibrated, b.calibrated)

@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known
 from ftcalib import solve as solve_dataset
+from ftcalib.after.new_tool import new_tool, together
 from ftcalib.compare import compare, table_iii
 from ftcalib.data.dataset import Orientation
 from ftcalib.errors import AcceptanceError, DataError
-from ftcalib.extras.new_tool import new_tool, together
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import UP_IN_BASE
-from ftcalib.poses.paper_sets import EVERY_SET
+from ftcalib.poses.selection import EVERY_SET
 from ftcalib.published.methods import SPECIAL
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord, drift_check

@@ -17,8 +17,8 @@ from typing import Any, Final
 import numpy as np
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Setup, solve
+from ftcalib.after.series import difference
 from ftcalib.errors import BadCalibration, BadDataset
-from ftcalib.extras.difference import difference
 from ftcalib.files import read_file, read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
 from ftdrive import __version__

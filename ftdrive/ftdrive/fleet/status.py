@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from ftcalib.extras.drift_onset import drift_onset
+from ftcalib.after.series import drift_onset
 from ftdrive.fleet.findings import findings
 from ftdrive.fleet.observed import BiasChanges, Observed, when
 from ftdrive.fleet.state import BiasDrift, CellState, Fleet, Weighings

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
-from ftcalib.likelihood.gain_and_cross_talk import Response, predicted_covariance
+from ftcalib.likelihood.response import Response, predicted_covariance
 from ftcalib.model import Array, Parameters
 from ftdrive.live.motion import READING_S, REST, accelerated, samples_in_reading
 from ftdrive.live.noise import Noise, NoiseEstimator

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ftcalib import CalibrationResult
-from ftcalib.extras.inertia import inertial_wrench, motion_of_poses
+from ftcalib.after.inertia import inertial_wrench, motion_of_poses
 from ftcalib.model import jacobian, skew
 from ftdrive.live.samples import Paired
 from ftdrivers.interfaces import Array

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
-from ftcalib.extras.update import Update, with_bias_change
-from ftcalib.extras.weighing import LEAST_SIGMAS, Weight
+from ftcalib.after.state import Update, with_bias_change
+from ftcalib.after.weighing import LEAST_SIGMAS, Weight
 from ftcalib.rounding import with_sigma
 from ftdrive.live.noise import NoiseEstimator
 from ftdrive.live.samples import Paired, StreamEvent, StreamInfo, Tracked

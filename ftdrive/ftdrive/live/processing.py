@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ftcalib.after.inertia import inertial_wrench, motion_of_poses
+from ftcalib.after.series import BiasTemperature
+from ftcalib.after.state import Calibrated, with_bias_change
+from ftcalib.after.weighing import Weight, holding
 from ftcalib.compensation import Compensator
-from ftcalib.extras.inertia import inertial_wrench, motion_of_poses
-from ftcalib.extras.temperature import BiasTemperature
-from ftcalib.extras.update import Calibrated, with_bias_change
-from ftcalib.extras.weighing import Weight, holding
 from ftcalib.files import JSON
 from ftcalib.rounding import with_sigma
 from ftdrive.errors import ConfigError

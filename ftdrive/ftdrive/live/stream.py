@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
-from ftcalib.extras.temperature import BiasTemperature
+from ftcalib.after.series import BiasTemperature
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station

@@ -4,10 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ftcalib.after.state import Calibrated, Update, bias_change, tare
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from ftcalib.errors import BadDataset
-from ftcalib.extras.tare import bias_change, tare
-from ftcalib.extras.update import Calibrated, Update
 from ftcalib.files import JSON
 from ftdrive.live.samples import Paired
 

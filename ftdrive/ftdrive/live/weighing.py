@@ -7,10 +7,10 @@ from typing import Final, get_args
 
 import numpy as np
 
+from ftcalib.after import weighing
+from ftcalib.after.weighing import Fault, Weight, drift_since
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_stationary, mean_and_covariance, restless_channels
 from ftcalib.errors import AcceptanceError
-from ftcalib.extras import weighing
-from ftcalib.extras.weighing import Fault, Weight, drift_since
 from ftcalib.files import JSON
 from ftcalib.model import angle_between
 from ftdrive.errors import ConfigError

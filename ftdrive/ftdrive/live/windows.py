@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ftcalib.after.inertia import inertial_wrench, motion_of_poses
 from ftcalib.compensation import Compensator
-from ftcalib.extras.inertia import inertial_wrench, motion_of_poses
-from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
+from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import BIASES, Array, skew
 from ftdrive.live.contact import GYRATION_M
 from ftdrive.live.frames import near

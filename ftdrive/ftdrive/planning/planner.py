@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ftcalib.poses.information import SUBSET_6, T12, Guess, special
-from ftcalib.poses.paper_sets import COUNTS, names_of, numbers_of, paper_set
-from ftcalib.poses.verification_poses import FEWEST
+from ftcalib.poses.selection import COUNTS, FEWEST_TO_VERIFY, names_of, numbers_of, paper_set
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.certify import Certifier
@@ -228,7 +227,7 @@ def plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Spee
     q_rad, guess
         As of `plan_tour`.
     sets : str
-        One of `ftcalib.poses.paper_sets.COUNTS`, or several, as A+E. Random orientations that are out of reach are
+        One of `ftcalib.poses.selection.COUNTS`, or several, as A+E. Random orientations that are out of reach are
         replaced by others of the same kind.
 
     Raises
@@ -282,8 +281,8 @@ def plan_verification(
         Too few poses are reachable by moves that are proven clear.
     """
     q_now = checked_joints(q_rad)
-    if poses < FEWEST:
-        raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST} or more")
+    if poses < FEWEST_TO_VERIFY:
+        raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST_TO_VERIFY} or more")
     found = verification_tour(certifier, q_now, poses, R_fitted, speeds)
     if found is None:
         raise PlanRefused(

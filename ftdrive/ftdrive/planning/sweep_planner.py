@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftcalib.assessment.verdict import expected_error
+from ftcalib.judge.verdict import expected_error
 from ftcalib.motion.estimate import DELAY_S, GYRATION_M, HEIGHT_M
 from ftcalib.motion.model import DELAY, HEIGHT, INERTIA, Load, jacobian
 from ftcalib.motion.samples import Motion

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ftcalib import CalibrationResult
-from ftcalib.extras.difference import difference
+from ftcalib.after.series import difference
 from ftcalib.model import PARAMETER_NAMES
 
 NAMES = {

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from ftcalib import CalibrationResult
-from ftcalib.assessment.observability import assess
-from ftcalib.assessment.verdict import strong_correlations
 from ftcalib.compare import compare
 from ftcalib.errors import NotObservable
+from ftcalib.judge.observability import assess
+from ftcalib.judge.verdict import strong_correlations
 from ftcalib.model import PARAMETER_NAMES, Array
 from ftcalib.routine import drift_check
 from ftcalib.sphere import largest_gap

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, solve
+from ftcalib.after.new_tool import new_tool
 from ftcalib.errors import NotObservable
-from ftcalib.extras.new_tool import new_tool
 from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.motion import solve_motion_file

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ftcalib import CalibrationResult, Finding
-from ftcalib.assessment.verdict import out_of_line
+from ftcalib.judge.verdict import out_of_line
 from ftcalib.model import Array
 from ftcalib.routine import MOVED_RAD, DriftCheck, PoseRecord, drift_check, is_return, turned_rad
 

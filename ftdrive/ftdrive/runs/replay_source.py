@@ -5,12 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from ftcalib.model import Array
-from ftcalib.ports import ArmReading, WrenchSamples
-from ftcalib.routine import PoseRecord
+from ftcalib.routine import ArmReading, PoseRecord, WrenchSamples
 
 
 class RecordedRun:
-    """Arm and sensor in one, as `ftcalib.ports` wants them; neither moves nor waits."""
+    """Arm and sensor in one, as `ftcalib.routine` wants them; neither moves nor waits."""
 
     def __init__(self, records: Sequence[PoseRecord]) -> None:
         self._records = list(records)

@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 
 from ftcalib import CalibrationDataset, CalibrationResult
-from ftcalib.data.pooling import pooled_covariance
+from ftcalib.after.state import Update, updated
+from ftcalib.after.verification import Verification, verify
+from ftcalib.data.dataset import pooled_covariance
 from ftcalib.errors import BadDataset, NotObservable
-from ftcalib.extras.update import Update, updated
-from ftcalib.extras.verification import Verification, verify
 from ftcalib.files import JSON, write_object
 from ftcalib.model import Array
 from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check, is_return

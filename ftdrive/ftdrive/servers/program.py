@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, Protocol, get_args
 
 import numpy as np
 
-from ftcalib.extras.weighing import Weight
+from ftcalib.after.weighing import Weight
 from ftcalib.model import angle_between_vectors
 from ftdrive.live.samples import Block, StreamInfo, Tracking
 from ftdrive.live.stream import CompensatedStream

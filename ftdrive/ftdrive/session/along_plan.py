@@ -8,8 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from ftcalib.data.averaging_time import averaging_time
-from ftcalib.data.dwell_mean import LEAST_SAMPLES, mean_and_covariance, noise_level
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, averaging_time, mean_and_covariance, noise_level
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord
 from ftcalib.sampling import Sampling

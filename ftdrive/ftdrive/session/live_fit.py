@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, NotObservable, solve
-from ftcalib.assessment.observability import (
+from ftcalib.judge.observability import (
     ACCEPTED_DELTA_CHI2,
     AMBIGUOUS_GAP,
     LEAST_POSES,

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from ftcalib import CalibrationResult
-from ftcalib.assessment.described_cell import Lean, lean_from
+from ftcalib.judge.described_cell import Lean, lean_from
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.checks import computer, devices

@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from ftcalib.assessment import described_cell
 from ftcalib.errors import TooFewSamples
+from ftcalib.judge import described_cell
 from ftcalib.model import Array
 from ftcalib.routine import Stage, TourPose, take_pose
 from ftcalib.sampling import Sampling

@@ -65,7 +65,7 @@ class StoredResult:
 
     @property
     def parameters(self) -> "Parameters":
-        """Estimates; with `covariance` they make a `ftcalib.extras.difference.Estimated`."""
+        """Estimates; with `covariance` they make a `ftcalib.after.series.Estimated`."""
         import numpy as np
 
         from ftcalib.model import Parameters

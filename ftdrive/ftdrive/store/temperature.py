@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ftcalib.extras.temperature import BiasTemperature, bias_temperature
+from ftcalib.after.series import BiasTemperature, bias_temperature
 from ftcalib.model import BIASES, Array
 from ftcalib.rounding import with_sigma
 from ftdrive.store.records import StoredResult, StoredVerification

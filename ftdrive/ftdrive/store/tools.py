@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ftcalib import CalibrationResult
+from ftcalib.after.series import BiasTemperature
 from ftcalib.errors import BadCalibration
-from ftcalib.extras.temperature import BiasTemperature
 from ftdrive.checks.devices import belonging
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.store.records import StoredResult, read_records, record_paths

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ftcalib.extras.trend import FEWEST, Trend, trend
+from ftcalib.after.series import FEWEST_ESTIMATES, Trend, trend
 from ftcalib.model import PARAMETER_NAMES, Array
 from ftcalib.rounding import with_sigma
 from ftdrive.store.records import StoredResult
@@ -69,7 +69,7 @@ def trends_of(series: Sequence[StoredResult]) -> Iterator[QuantityTrend]:
     """Yield the trends of the results of one tool on one arm, sensor and mount, the oldest first."""
     for quantity, unit, rows in _quantities(series):
         days = {row[0] for row in rows}
-        if len(days) < FEWEST or max(days) - min(days) < SHORTEST_DAYS:
+        if len(days) < FEWEST_ESTIMATES or max(days) - min(days) < SHORTEST_DAYS:
             continue
         t, values, covariance = (np.array(column) for column in zip(*rows, strict=True))
         drift = trend(t / _MONTH_DAYS, values, covariance)

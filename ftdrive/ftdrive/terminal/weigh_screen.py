@@ -6,7 +6,7 @@ from typing import ClassVar
 from textual.app import ComposeResult
 from textual.widgets import Digits, Static
 
-from ftcalib.extras.weighing import Weight
+from ftcalib.after.weighing import Weight
 from ftcalib.rounding import counted, to_place_of
 from ftdrive.errors import NotAccepted
 from ftdrive.terminal.live_screen import ClosableApp

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ftcalib.extras.weighing import Weight
+from ftcalib.after.weighing import Weight
 from ftcalib.rounding import counted, with_sigma
 from ftdrive.errors import NotAccepted
 from ftdrive.live.stream import CompensatedStream

@@ -10,7 +10,7 @@ from ftcalib import CalibrationDataset, solve
 from ftcalib.compare import CASES, compare, table_iii
 from ftcalib.errors import NotObservable
 from ftcalib.model import Parameters, predict
-from ftcalib.poses.paper_sets import EVERY_SET, numbers_of, paper_set
+from ftcalib.poses.selection import EVERY_SET, numbers_of, paper_set
 
 TRUTH = Parameters(
     np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import BadCalibration, CalibrationDataset, CalibrationResult, Parameters, solve
-from ftcalib.likelihood.gain_and_cross_talk import COMMON_GAIN, SIZE, Response, hidden_covariance
+from ftcalib.likelihood.response import COMMON_GAIN, SIZE, Response, hidden_covariance
 from ftcalib.model import predict
 from ftcalib.published.yu import weight_and_tilt
 from ftcalib.result import DriftResult, MotionResult, _weight_and_tilt_sigma, require_positive_definite

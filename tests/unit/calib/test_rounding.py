@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ftcalib.assessment.described_cell import Lean
 from ftcalib.findings import Finding
+from ftcalib.judge.described_cell import Lean
 from ftcalib.rounding import to_place_of, with_sigma
 
 

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftcalib.poses.information import Guess, predicted_sigma
-from ftcalib.poses.selection import choose, cone_candidates
-from ftcalib.poses.verification_poses import choose_verification_poses
+from ftcalib.poses.selection import choose, choose_verification_poses, cone_candidates
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import wrist_inverse
 from ftdrive.planning.motion import Speeds

@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from ftcalib import BadDataset
-from ftcalib.data.averaging_time import AveragingTime, allan_deviation, averaging_time
+from ftcalib.data.dwell_mean import AveragingTime, allan_deviation, averaging_time
 from ftcalib.model import Array
 
 RATE_HZ = 200.0

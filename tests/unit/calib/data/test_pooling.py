@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftcalib.data.pooling import pooled_covariance
+from ftcalib.data.dataset import pooled_covariance
 
 Array = NDArray[np.float64]
 SHAPE = np.diag(np.square([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from ftcalib.likelihood.descent import Kept, agreeing_poses, fewest_kept
 from ftcalib.likelihood.explanation import _are_gaussian, _criterion, _limit, _membership, _stand_out
-from ftcalib.likelihood.outliers import Kept, agreeing_poses, fewest_kept
 from ftcalib.likelihood.session import Session, inverses
 from ftcalib.likelihood.variance_components import FORCE, Component, Point, component, point
 from ftcalib.model import Array

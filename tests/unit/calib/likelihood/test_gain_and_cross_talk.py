@@ -10,11 +10,11 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
-from ftcalib.assessment.verdict import _response
+from ftcalib.judge.verdict import _response
 from ftcalib.known import Constraints, Known
-from ftcalib.likelihood.component_selection import with_walks_instead
+from ftcalib.likelihood.explanation import with_walks_instead
 from ftcalib.likelihood.fit import Fit, fit
-from ftcalib.likelihood.gain_and_cross_talk import (
+from ftcalib.likelihood.response import (
     CROSS_TALK_M,
     GAIN,
     LEVER_M,

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from ftcalib.likelihood.component_selection import _pruned, rivals, select, with_slopes_instead
+from ftcalib.likelihood.explanation import _pruned, rivals, select, with_slopes_instead
 from ftcalib.likelihood.session_noise import Noise, centred, walk_times
 from ftcalib.likelihood.variance_components import (
     FORCE,

@@ -23,8 +23,7 @@ from ftcalib.motion.estimate import (
     fit,
     rough_delay,
 )
-from ftcalib.motion.model import CROSS_TALK, DELAY, GAINS, HEIGHT, INERTIA, SIZE, Load, jacobian, wrench_of
-from ftcalib.motion.noise import Noise
+from ftcalib.motion.model import CROSS_TALK, DELAY, GAINS, HEIGHT, INERTIA, SIZE, Load, Noise, jacobian, wrench_of
 from ftcalib.motion.samples import Motion, Rows
 from tests.moving_load import Truth
 from tests.unit.calib.motion.test_motion import load_of

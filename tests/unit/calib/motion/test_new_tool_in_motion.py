@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
 from ftcalib.errors import NotObservable
-from ftcalib.likelihood.gain_and_cross_talk import CROSS_TALK_M, GAIN
+from ftcalib.likelihood.response import CROSS_TALK_M, GAIN
 from ftcalib.model import Parameters, predict
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Truth, means_of, record, sweep

@@ -7,7 +7,7 @@ from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
 from ftcalib.model import Array
-from ftcalib.motion.noise import FEWEST, ORDER, Noise, _filters, _of_equal_order, runs, states
+from ftcalib.motion.model import FEWEST, ORDER, Noise, _filters, _of_equal_order, runs, states
 
 REST, SLOW, QUICK = np.zeros(100), np.linspace(0.1, 0.5, 150), np.linspace(0.6, 2.0, 150)
 

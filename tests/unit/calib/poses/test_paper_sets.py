@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ftcalib.poses.paper_sets import COUNTS, EVERY_SET, names_of, numbers_of, paper_set
+from ftcalib.poses.selection import COUNTS, EVERY_SET, names_of, numbers_of, paper_set
 
 CEILING = np.array([0.0, 0.0, 1.0])
 

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array
 from ftcalib.poses.information import special, whitened_jacobian
-from ftcalib.poses.verification_poses import TOOL, USUAL_CHANGE, choose_verification_poses
+from ftcalib.poses.selection import TOOL, USUAL_CHANGE, choose_verification_poses
 
 DOWN = np.array([0.0, 0.0, -1.0])
 FITTED = special(range(1, 25))

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import NotObservable, Parameters
 from ftcalib.model import Array, predict
-from ftcalib.published.baselines import vougioukas, wang, yang
-from ftcalib.published.methods import BASELINES, published
+from ftcalib.published.methods import BASELINES, published, vougioukas, wang, yang
 from ftcalib.published.yu import SPECIAL_R_flange_base
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)

@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.model import Array
 from ftcalib.published import carlson
-from ftcalib.published.carlson import ForceFit, eigen, iterative, nullspace, polynomial
-from ftcalib.published.carlson_known import cayley, relaxation
+from ftcalib.published.carlson import ForceFit, cayley, eigen, iterative, nullspace, polynomial, relaxation
 
 Method = Callable[[Array, Array, Array, bool], ForceFit]
 

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import NotObservable, Parameters
 from ftcalib.model import UP_IN_BASE, predict
-from ftcalib.published import carlson_known
+from ftcalib.published import carlson
 from ftcalib.published.methods import CARLSON, PUBLISHED, published
 from ftcalib.published.yu import SPECIAL_R_flange_base
 
@@ -68,10 +68,10 @@ def test_the_printed_form_applies_the_cayley_transform_once() -> None:
     force_N = predict(half, R_BASE_FLANGE)[:, :3] + np.random.default_rng(0).normal(size=(len(R_BASE_FLANGE), 3))
     gravity_N = half.gravity_force_base_N
     once, best_of_four = (
-        carlson_known.cayley(R_BASE_FLANGE, force_N, gravity_N, bias=False, as_published=one).R_flange_sensor
+        carlson.cayley(R_BASE_FLANGE, force_N, gravity_N, bias=False, as_published=one).R_flange_sensor
         for one in (True, False)
     )
-    np.testing.assert_allclose(once, carlson_known.cayley_rotation(force_N, gravity_N @ R_BASE_FLANGE).T)
+    np.testing.assert_allclose(once, carlson.cayley_rotation(force_N, gravity_N @ R_BASE_FLANGE).T)
     assert np.abs(once - best_of_four).max() > 1e-3
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ftcalib.extras.bias_change import BiasChange
-from ftcalib.extras.update import reestimate
-from ftcalib.extras.verification import Verification
+from ftcalib.after.expected_readings import BiasChange
+from ftcalib.after.state import reestimate
+from ftcalib.after.verification import Verification
 from ftdrive.commands import verify as command
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run

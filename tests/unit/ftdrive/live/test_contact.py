@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
+from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import Array
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia, _hotelling
 from ftdrive.live.noise import Noise

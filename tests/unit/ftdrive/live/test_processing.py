@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
-from ftcalib.extras.temperature import BiasTemperature
+from ftcalib.after.series import BiasTemperature
 from ftcalib.model import Array, predict
 from ftcalib.result import MotionResult
 from ftdrive.errors import ConfigError

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
-from ftcalib.extras.temperature import BiasTemperature
+from ftcalib.after.series import BiasTemperature
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.errors import ConfigError
 from ftdrive.library import open_stream

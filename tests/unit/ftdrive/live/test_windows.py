@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
+from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import Array, skew
 from ftdrive.live.motion import REST
 from ftdrive.live.noise import Noise

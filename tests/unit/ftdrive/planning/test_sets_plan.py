@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftcalib.poses.paper_sets import EVERY_SET, numbers_of, paper_set
+from ftcalib.poses.selection import EVERY_SET, numbers_of, paper_set
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier

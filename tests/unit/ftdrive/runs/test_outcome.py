@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
-from ftcalib.assessment import described_cell
+from ftcalib.judge import described_cell
 from ftdrive.cell.config import SensorConfig, ToolConfig
 from ftdrive.runs.outcome import circumstances_of, solve_records
 from ftdrive.runs.pose_hints import hints

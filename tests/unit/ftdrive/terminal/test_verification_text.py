@@ -7,8 +7,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ftcalib.extras.bias_change import BiasChange
-from ftcalib.extras.verification import Verification
+from ftcalib.after.expected_readings import BiasChange
+from ftcalib.after.verification import Verification
 from ftdrive.runs.verified import AcceptanceLimits
 from ftdrive.terminal import verification_text
 from ftdrive.terminal.console import messages

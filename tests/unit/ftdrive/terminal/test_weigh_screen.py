@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from textual.widgets import Digits, Static
 
-from ftcalib.extras.weighing import Weight
+from ftcalib.after.weighing import Weight
 from ftdrive.errors import NotAccepted
 from ftdrive.live.weighing import WORDS
 from ftdrive.terminal.weigh_screen import WeighApp, run_weigh

@@ -6,7 +6,7 @@ from math import cos, radians, sin
 import numpy as np
 
 from ftcalib import CalibrationResult, Finding, Parameters
-from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response
+from ftcalib.likelihood.response import SIZE, Response
 from ftcalib.model import Array
 from ftdrive.exports.calibration.settings import Settings
 

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Parameters
-from ftcalib.likelihood.gain_and_cross_talk import SIZE, Response
+from ftcalib.likelihood.response import SIZE, Response
 from ftcalib.model import Array
 from ftdrive.errors import NotAccepted
 from ftdrive.exports.calibration.formats import FORMATS, Property

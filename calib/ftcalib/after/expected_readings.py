@@ -1,0 +1,360 @@
+"""How far readings of an unchanged cell may be from their prediction, under each explanation of the fit's residuals.
+
+What is estimated by a fit of few poses is uncertain, and so is what acts on its readings. Four explanations are kept:
+
+* The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
+* The measured noise, by a factor that only the residuals of the fit show, and inexact orientations, which a fit of few
+  poses does not separate from other noise, or not from none. Known is only the usual accuracy of arms.
+* The measured noise, by such a factor, and hysteresis: each channel is off by a share of the last change of its load.
+  A fit without it takes a part of it for weight, because the load changes most towards the poses that load a channel
+  most.
+* The measured noise, by such a factor, and a bias that walks, where a fit of 24 poses or fewer found a drift, which it
+  may have missed in the other three channels, or noise beyond the measured.
+
+Under the last three, with the ratio of both variances given, the squared distance of new readings from their prediction
+over the mean square of the fit's residuals has exactly an F distribution (predictive test of Chow, Econometrica 28,
+1960). Its probability is averaged over the ratios, each weighted by its restricted likelihood in the fit (posterior
+predictive probability), so an error that the fit cannot find widens the limit as much as the data allow.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import chdtrc as chi2_sf
+from scipy.special import fdtrc as f_sf
+
+from ftcalib.after.state import Update
+from ftcalib.compensation import Compensator
+from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
+from ftcalib.files import JSON
+from ftcalib.likelihood.descent import column_scale
+from ftcalib.likelihood.response import Response, hysteresis_columns, response_columns
+from ftcalib.likelihood.session_noise import pose_times, summed_products
+from ftcalib.model import BIASES, Array, Parameters, jacobian, read_only
+from ftcalib.result import CalibrationResult
+
+USUAL_ERRORS_RAD = np.deg2rad(np.geomspace(0.005, 0.5, 20))
+"""Errors of an arm's orientations over which the average is taken. Before the fit, each is as likely as any other."""
+USUAL_SHARES = np.geomspace(1e-4, 5e-3, 9)
+"""Of the last change of load, over which the average is taken. Before the fit, each is as likely as any other."""
+USUAL_WALKS = np.geomspace(0.3, 30, 5)
+"""Steps of the bias from pose to pose, in sigma of the measured noise, over which the average is taken: of the forces,
+and of the torques. Before the fit, each pair is as likely as any other."""
+MANY_POSES = 1000
+FEW_POSES = 24
+"""From more, the fit finds a walk in all channels that have one."""
+LEAST_FACTOR = 0.1
+"""Of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck."""
+
+NO_WALK = (0.0, 0.0)
+
+_AXES = {name: [k] for k, name in enumerate(("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm"))}
+_CHANNELS = _AXES | {"force_N": [0, 1, 2], "torque_Nm": [3, 4, 5]}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """What unchanged readings scatter by, under one explanation."""
+
+    calibration: Update
+    """The calibration, with the drift of the bias since then in its covariance."""
+    noise: Array
+    """(6n, 6n) of the new readings: measured noise, errors of each pose, drift from the first to each."""
+    freedom: float
+    """Degrees of freedom from which the fit estimated this noise, or its factor; infinite if neither."""
+    factor: float = 1.0
+    """By which all variances are multiplied, noise and calibration; chi2 is without it."""
+    weight: float = 1.0
+    """Probability of the explanation, relative to the others of its kind."""
+
+    def distance(self, R_base_flange: Array, wrench: Array) -> tuple[Array, Array, float]:
+        """Return the residuals (n, 6), their sigma (n, 6), and chi2 of all of them together."""
+        p, response = self.calibration.parameters, self.calibration.response
+        residual = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)
+        S = self.noise + self.common(R_base_flange)
+        chi2 = float(residual.ravel() @ np.linalg.solve(S, residual.ravel()))
+        return residual, np.sqrt(self.factor * np.diag(S)).reshape(residual.shape), chi2
+
+    def common(self, R_base_flange: Array) -> Array:
+        """Return the covariance (6n, 6n) of the predictions: the uncertainty of the calibration, without `factor`."""
+        p, response = self.calibration.parameters, self.calibration.response
+        C = self.calibration.covariance if response is None else response.covariance
+        K = _columns(p, response, R_base_flange).reshape(6 * len(R_base_flange), -1)
+        return np.asarray(K @ C @ K.T)
+
+    def p_value(self, chi2: float, dof: int) -> float:
+        """Probability of a larger chi2."""
+        chi2 /= self.factor
+        return float(chi2_sf(dof, chi2) if np.isinf(self.freedom) else f_sf(dof, self.freedom, chi2 / dof))
+
+    def deviance(self, chi2: float, dof: int) -> float:
+        """-2 log likelihood: chi2, or that of Student's distribution if the noise was estimated."""
+        chi2 /= self.factor
+        return chi2 if np.isinf(self.freedom) else (self.freedom + dof) * float(np.log1p(chi2 / self.freedom))
+
+
+def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wrench_cov: Array) -> Expected:
+    """Add up what the fit found beyond the measured noise, as if the new poses continued the tour.
+
+    A random walk of variance q² a pose moves the bias by q² (N / 3 + 1) from its mean over the N poses of the tour to
+    the first new pose. A linear drift goes on for as long as the tour. If the fit found nothing, the measured noise has
+    the factor chi2 / dof of the fit.
+    """
+    n, later = len(wrench_cov), np.arange(len(wrench_cov), dtype=np.float64)
+    n_used = calibration.n_poses - len(calibration.rejected_poses)
+    measured = np.zeros((n, 6, n, 6))
+    measured[range(n), :, range(n)] = wrench_cov
+    parts, gap = [], np.zeros(6)
+    for name, sigma in _components(calibration).items():
+        kind, _, channels = name.partition("_")
+        part, since = np.zeros((n, 6, n, 6)), np.zeros(6)
+        c = _CHANNELS.get(channels, [])
+        freedom = len(c) * calibration.dof / 6
+        if kind == "walk":
+            part[:, c, :, c], since[c] = sigma**2 * np.minimum.outer(later, later), sigma**2 * (n_used / 3 + 1)
+            freedom = len(c) * (n_used - 1) / 2  # the other half is that of the white noise
+        elif kind == "slope":
+            part[:, c, :, c], since[c] = sigma**2 * np.outer(later, later) / n_used**2, sigma**2
+            freedom = len(c)
+        elif kind == "rotation":  # turns about gravity do not show
+            part[range(n), :, range(n)] = sigma**2 * _turns(calibration.parameters, R_base_flange)
+            freedom = max(2 * n_used - 6, 2)
+        elif kind == "white":  # with unmeasured noise all of it
+            known = np.zeros_like(wrench_cov) if calibration.noise_source == "measured" else wrench_cov
+            for k in c:
+                part[range(n), k, range(n), k] = np.maximum(sigma**2 - known[:, k, k], 0.0)
+        elif kind == "hysteresis":  # six shares, one for each axis
+            T = hysteresis_columns(calibration.parameters, R_base_flange).reshape(6 * n, -1)
+            part, freedom = (sigma**2 * T @ T.T).reshape(n, 6, n, 6), 6
+        else:  # gain and cross-talk act through the response
+            continue
+        gap += since
+        part[:, range(6), :, range(6)] += since[:, None, None]
+        parts.append((part.reshape(6 * n, 6 * n), freedom))
+    total = measured.reshape(6 * n, 6 * n) + sum((part for part, _ in parts), np.zeros((6 * n, 6 * n)))
+    noise = total - np.kron(np.ones((n, n)), np.diag(gap))
+    if not (parts or calibration.components) and calibration.noise_source == "measured":
+        factor = max(calibration.chi2 / calibration.dof, LEAST_FACTOR)
+        return Expected(_drifted(calibration, gap), noise, calibration.dof, factor)
+    # Satterthwaite: the variances of independent estimates add up, each by its share of the noise
+    inverse = np.linalg.inv(total)
+    spread = sum((float(np.vdot(inverse, part)) / (6 * n)) ** 2 / freedom for part, freedom in parts)
+    return Expected(_drifted(calibration, gap), noise, 1 / spread if spread else np.inf)
+
+
+def expected_with_inexact_orientations(
+    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
+) -> list[Expected]:
+    """Explain the fit by scaled measured noise and inexact orientations, for each ratio of both; weights sum to 1.
+
+    Drift is not part of it. Gain, cross-talk and hysteresis have the variance that the fit found. Empty if the noise
+    was not measured, for parameters that were known or not estimated by maximum likelihood, and for so many poses that
+    the fit finds all that matters.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult
+    fitted : CalibrationDataset
+        Poses of the fit, with measured noise.
+    R_base_flange : array, shape (n, 3, 3)
+        New poses, in the order of measuring.
+    wrench_cov : array, shape (n, 6, 6)
+        Of the new readings.
+    """
+    share = calibration.components.get("hysteresis", 0.0)
+    usual = [(error_rad, share, NO_WALK) for error_rad in USUAL_ERRORS_RAD]
+    return _expected(calibration, fitted, R_base_flange, wrench_cov, usual)
+
+
+def expected_with_hysteresis(
+    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
+) -> list[Expected]:
+    """Explain the fit by scaled measured noise and hysteresis; all else as `expected_with_inexact_orientations`."""
+    usual = [(0.0, share, NO_WALK) for share in USUAL_SHARES]
+    return _expected(calibration, fitted, R_base_flange, wrench_cov, usual)
+
+
+def expected_with_walk(
+    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
+) -> list[Expected]:
+    """Explain the fit by scaled measured noise and a bias that walks on; all else as the other two.
+
+    Empty too if the fit found neither drift nor noise beyond the measured, or has more than 24 poses.
+    """
+    looks_so = any(name.startswith(("walk", "slope", "white")) for name in calibration.components)
+    if not looks_so or len(fitted) > FEW_POSES:
+        return []
+    share = calibration.components.get("hysteresis", 0.0)
+    usual = [(0.0, share, walk) for walk in product(USUAL_WALKS, repeat=2)]
+    return _expected(calibration, fitted, R_base_flange, wrench_cov, usual)
+
+
+def _expected(
+    calibration: CalibrationResult,
+    fitted: CalibrationDataset,
+    R_base_flange: Array,
+    wrench_cov: Array,
+    usual: Sequence[tuple[float, float, tuple[float, float]]],
+) -> list[Expected]:
+    """Explain the fit with each error of the orientations (rad), share of the last change of load, and walk."""
+    p, response = calibration.parameters, calibration.response
+    kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
+    dof = 6 * int(kept.sum()) - 15
+    if fitted.wrench_cov is None or calibration.method != "ml" or calibration.dof != dof or len(kept) > MANY_POSES:
+        return []
+    order = np.argsort(pose_times(fitted.t_s), kind="stable")
+    lag, order = hysteresis_columns(p, fitted.R_base_flange[order])[kept[order]], order[kept[order]]
+    R, D = fitted.R_base_flange[order], pooled_covariance(fitted.wrench_cov, fitted.n_samples)[order]
+    e = np.asarray(Compensator(p, response=response).batch(fitted.wrench[order], R), dtype=np.float64)
+    walk = _walk_columns(D) if usual[0][2] != NO_WALK else np.zeros((len(D), 6, 0))
+    J = np.concatenate([_columns(p, response, R), lag, walk], axis=2)
+    known = J.shape[2] - lag.shape[2] - walk.shape[2]
+    sizes, offset = np.full(15, np.inf), np.zeros(J.shape[2])
+    if response is not None:  # found coefficients: measured as zero, with the variance found
+        found = [calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")]
+        sizes, offset[15:known] = np.append(sizes, np.repeat(found, [5, 6])), response.coefficients
+    turn, turn_new = _turns(p, R), _turns(p, R_base_flange)
+    later = np.arange(1.0, len(R_base_flange) + 1)
+    walk_new = np.kron(np.minimum.outer(later, later), np.diag(np.einsum("ncc->c", D) / len(D)))
+    lag_new = hysteresis_columns(p, R_base_flange).reshape(6 * len(R_base_flange), -1)
+
+    explanations, likelihood = [], []
+    for error_rad, share, steps in usual:
+        each = np.repeat(steps, 3)
+        sigma = np.concatenate([sizes, np.full(lag.shape[2], share), np.tile(each, walk.shape[2] // 6)])
+        x, C, chi2, logdet = _posterior(J, D + error_rad**2 * turn, sigma, e, offset)
+        likelihood.append(-0.5 * (logdet + dof * np.log(chi2)))
+        factor = max(chi2 / dof, LEAST_FACTOR)
+        C += np.outer(x, x) / factor  # the calibration as stored is off by what this explanation moves its estimates
+        joint = None if response is None else replace(response, covariance=C[:known, :known])
+        noise = np.asarray(block_diag(*(wrench_cov + error_rad**2 * turn_new)))
+        shares = C[known : known + 6, known : known + 6]  # the swing to the first new pose is unknown too
+        noise += lag_new @ block_diag(shares, np.diag(np.diag(shares))) @ lag_new.T
+        noise += walk_new * np.tile(each, len(later)) ** 2
+        explanations.append(Expected(Update(p, C[:15, :15], 0.0, 0, response=joint), noise, dof, factor))
+    weights = np.exp(np.array(likelihood) - max(likelihood))
+    return [replace(one, weight=weight) for one, weight in zip(explanations, weights / weights.sum(), strict=True)]
+
+
+def _posterior(J: Array, V: Array, sigma: Array, e: Array, offset: Array) -> tuple[Array, Array, float, float]:
+    """Estimate what acts on residuals e (n, 6) through columns J (n, 6, k), under noise V (n, 6, 6).
+
+    Before, each has the mean `-offset` (k,) and the standard deviation `sigma` (k,): infinite if unknown, 0 if absent.
+
+    Returns
+    -------
+    x : array, shape (k,)
+    covariance : array, shape (k, k)
+    chi2 : float
+    logdet : float
+        Logarithm of the determinants that belong to the restricted likelihood.
+    """
+    seen = np.flatnonzero(sigma)
+    before, W = sigma[seen] ** -2, np.linalg.inv(V)
+    WJ = W @ J[..., seen]
+    H = summed_products(J[..., seen], WJ) + np.diag(before)
+    g = np.einsum("nij,ni->j", WJ, e) - before * offset[seen]
+    scale = np.outer(column_scale(H), column_scale(H))
+    x, C = np.zeros(len(sigma)), np.zeros((len(sigma), len(sigma)))
+    C[np.ix_(seen, seen)] = np.linalg.inv(H / scale) / scale
+    x[seen] = C[np.ix_(seen, seen)] @ g
+    chi2 = float(np.einsum("ni,nij,nj->", e, W, e) + before @ offset[seen] ** 2 - g @ x[seen])
+    logdet = np.linalg.slogdet(V)[1].sum() + np.linalg.slogdet(H)[1] - np.log(before[before > 0]).sum()
+    return x, C, chi2, float(logdet)
+
+
+def _walk_columns(D: Array) -> Array:
+    """Give the derivative (n, 6, 6n - 6) of readings by the steps of the bias between them, in sigma of their noise.
+
+    The bias is that of the last pose, which the next readings have, so earlier ones lack the steps after them.
+    """
+    n = len(D)
+    before = np.triu(np.ones((n, n)), 1)[:, 1:]
+    sigma = np.sqrt(np.einsum("ncc->c", D) / n)
+    return np.asarray(-before[:, None, :, None] * np.diag(sigma)[:, None]).reshape(n, 6, 6 * (n - 1))
+
+
+def _columns(p: Parameters, response: Response | None, R_base_flange: Array) -> Array:
+    """Give the derivative (n, 6, k) by the parameters, and by gain and cross-talk if there are any."""
+    J = jacobian(p, R_base_flange)
+    return J if response is None else np.concatenate([J, response_columns(p, R_base_flange)], axis=2)
+
+
+def _turns(p: Parameters, R_base_flange: Array) -> Array:
+    """Give the covariance (n, 6, 6) of the readings for one rad² of variance of each orientation."""
+    turn = jacobian(p, R_base_flange)[..., :3]
+    return np.asarray(turn @ np.swapaxes(turn, 1, 2))
+
+
+def _components(calibration: CalibrationResult) -> Mapping[str, float]:
+    """Components of the noise, and a linear drift that was part of the model."""
+    found = dict(calibration.components)
+    if calibration.drift is not None and not any(name.startswith(("walk", "slope")) for name in found):
+        found |= {f"slope_{name}": float(abs(calibration.drift.change[c[0]])) for name, c in _AXES.items()}
+    return found
+
+
+def _drifted(calibration: CalibrationResult, gap: Array) -> Update:
+    """Add variances (6,) of the bias to the covariance of a calibration."""
+    covariance, response = calibration.covariance.copy(), calibration.response
+    covariance[BIASES, BIASES] += gap
+    if response is not None:
+        joint = response.covariance.copy()
+        joint[BIASES, BIASES] += gap
+        response = replace(response, covariance=joint)
+    return Update(calibration.parameters, covariance, 0.0, 0, response=response)
+
+
+# Change of the six biases since a calibration, from the readings of one verification.
+#
+# The residuals are r = H b + K e + noise, with b the change, H the identity for each pose, and e the errors of the
+# calibration, which all its verifications share. Their mean is that of generalised least squares,
+#
+#     b = G r,    G = (H' S^-1 H)^-1 H' S^-1,    S = noise + K C K',
+#
+# and its covariance has two parts: G noise G' is that of this verification, G K C K' G' that of the calibration.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BiasChange:
+    """New bias minus that of the calibration, in the sensor frame; force first, N and N·m. Arrays are read-only."""
+
+    value: Array
+    """(6,)"""
+    sigma: Array
+    """(6,) one standard deviation from the readings of this verification, independent of any other."""
+    calibration_sigma: Array
+    """(6,) one standard deviation from the calibration: nearly the same error in all its verifications."""
+
+    def __post_init__(self) -> None:
+        for name in ("value", "sigma", "calibration_sigma"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the content as JSON."""
+        return {name: getattr(self, name).tolist() for name in ("value", "sigma", "calibration_sigma")}
+
+
+def bias_change(expected: Expected, R_base_flange: Array, wrench: Array) -> BiasChange:
+    """Estimate the change of the six biases, as if nothing else had changed.
+
+    Parameters
+    ----------
+    expected : Expected
+        What unchanged readings of these poses scatter by.
+    R_base_flange : array, shape (n, 3, 3)
+    wrench : array, shape (n, 6)
+        Mean readings as measured, N and N·m, in the sensor frame.
+    """
+    residual, _, _ = expected.distance(R_base_flange, wrench)
+    common = expected.common(R_base_flange)
+    H = np.tile(np.eye(6), (len(wrench), 1))
+    weighted = np.linalg.solve(expected.noise + common, H).T
+    G = np.linalg.solve(weighted @ H, weighted)
+    noise, calibration = (
+        np.sqrt(expected.factor * np.diag(G @ part @ G.T).clip(0.0)) for part in (expected.noise, common)
+    )
+    return BiasChange(G @ residual.ravel(), noise, calibration)

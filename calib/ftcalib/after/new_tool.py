@@ -1,0 +1,299 @@
+"""A new tool from few poses, and several runs as one fit: mounting, base and gain belong to the cell, not to the tool.
+
+`new_tool` takes mounting, direction of gravity, gain and cross-talk of an earlier result with their covariance as a
+prior. Weight, centre of mass and bias have none. The misfit of poses and prior tests whether they still hold.
+
+`together` joins runs of one tool whose bias has moved between them: each is solved by itself, and what they share is
+the mean weighted by information.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtrc as chi2_sf
+
+from ftcalib.after.state import Update, updated
+from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
+from ftcalib.errors import NotObservable
+from ftcalib.findings import Finding
+from ftcalib.likelihood.response import Response, response_columns
+from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_between_vectors, jacobian, predict, skew
+from ftcalib.result import CalibrationResult
+
+FALSE_ALARMS = 1e-4
+"""Share of good runs that the test of what was kept rejects."""
+WHOLE = (0, 1, 2, 3, 4)
+"""Rows of a prior: three of the mounting, two of the base."""
+_MOUNTING, _BASE = WHOLE[:3], WHOLE[3:]
+
+Refit = Callable[[Sequence[int]], tuple[float, int, Parameters]]
+"""From the rows of the prior that count to the misfit, its degrees of freedom, and the parameters."""
+
+
+class CellPrior:
+    """A Gaussian prior of mounting and direction of gravity, and of gain and cross-talk where the result has them.
+
+    Parameters
+    ----------
+    earlier : CalibrationResult
+        Of the same sensor, mounting and base, with any tool.
+    """
+
+    def __init__(self, earlier: CalibrationResult) -> None:
+        self.earlier, gain = earlier, earlier.response
+        self.coefficients = np.zeros(0) if gain is None else np.array(gain.coefficients)
+        """(11,) of gain and cross-talk, or none."""
+        self._covariance = np.array(earlier.covariance if gain is None else gain.covariance)
+        self._across = np.linalg.svd(skew(earlier.parameters.gravity_force_base_N))[0][:, :2]  # gravity
+
+    @property
+    def has_response(self) -> bool:
+        """Whether gain and cross-talk are known."""
+        return len(self.coefficients) > 0
+
+    def count(self, kept: Sequence[int]) -> int:
+        """Return the number of rows; `kept` as of `rows`."""
+        return len(kept) + len(self.coefficients) * bool(kept)
+
+    def rows(self, p: Parameters, coefficients: Array, kept: Sequence[int] = WHOLE) -> tuple[Array, Array]:
+        """Return the derivative (k, 15 or 26) and the residual (k,), earlier minus present, in standard deviations.
+
+        Parameters
+        ----------
+        p : Parameters
+            The present ones.
+        coefficients : array, shape (11,) or (0,)
+            Of gain and cross-talk.
+        kept : sequence of int
+            Which count: 0 to 2 mounting, 3 and 4 base. Gain and cross-talk do unless it is empty.
+        """
+        rows = [*kept, *range(len(WHOLE), len(WHOLE) + len(self.coefficients))] if kept else []
+        old = self.earlier.parameters
+        before = self._derivative(old)[rows]
+        V = before @ self._covariance @ before.T
+        root = np.linalg.inv(np.linalg.cholesky(V + 1e-12 * np.diag(np.diag(V)) + 1e-24 * np.eye(len(V))))
+        apart = [p.difference(old)[:3], self._across.T @ (down(old) - down(p)), self.coefficients - coefficients]
+        return root @ self._derivative(p)[rows], root @ np.concatenate(apart)[rows]
+
+    def _derivative(self, p: Parameters) -> Array:
+        size = len(self._covariance)
+        F, u = float(np.linalg.norm(p.gravity_force_base_N)), down(p)
+        rows = np.zeros((len(WHOLE) + size - 15, size))
+        rows[:3, :3] = np.eye(3)
+        rows[3:5, 3:6] = self._across.T @ (np.eye(3) - np.outer(u, u)) / F
+        rows[5:, 15:] = np.eye(size - 15)
+        return rows
+
+    def contradiction(self, chi2: float, dof: int, refit: Refit, what: str, alone: str) -> str:
+        """Name what does not hold any more; empty where the prior fits.
+
+        Parameters
+        ----------
+        chi2, dof : float, int
+            Misfit with the whole prior.
+        refit : callable
+            Fits without a part of it. May raise `NotObservable`.
+        what, alone : str
+            Name of the data, and how to calibrate without the earlier result.
+        """
+        if not dof or chi2_sf(dof, chi2) >= FALSE_ALARMS:
+            return ""
+        explained, old = list[tuple[float, str]](), self.earlier.parameters
+        for cause, kept in (("the sensor is mounted otherwise", _BASE), ("the base leans otherwise", _MOUNTING)):
+            try:
+                left, freedom, new = refit(kept)
+            except NotObservable:
+                continue
+            if not freedom or chi2_sf(freedom, left) >= FALSE_ALARMS:
+                turned = float(angle_between(old.R_flange_sensor, new.R_flange_sensor))
+                if kept == _MOUNTING:
+                    turned = angle_between_vectors(down(old), down(new))
+                explained.append((left, f"{cause}, by {np.degrees(turned):.2g}°"))
+        misfit = f"chi2 {chi2:.0f} for {dof} degrees of freedom"
+        if not explained:
+            return (
+                f"{what} do not fit mounting and base of {self.earlier.id} ({misfit}): check for contact, or solve "
+                "alone."
+            )
+        explained.sort()
+        found = " or ".join(text for left, text in explained if left < explained[0][0] + 10)
+        return f"{found} since {self.earlier.id} ({misfit}): {alone}."
+
+
+def down(p: Parameters) -> Array:
+    """Return the direction (3,) of gravity in base."""
+    return np.asarray(p.gravity_force_base_N / np.linalg.norm(p.gravity_force_base_N))
+
+
+_MOST_STEPS = 30
+_SETTLED = 1e-12
+"""Squared step in standard deviations."""
+_SINGULAR = 1e12
+_SIGNIFICANT = 5.0
+_SHARED = np.array([0, 1, 2, 3, 4, 5, 9, 10, 11])
+"""Rows of the error coordinates that runs of one tool share."""
+
+
+def new_tool(
+    earlier: CalibrationResult, dataset: CalibrationDataset, provenance: Mapping[str, Any] | None = None
+) -> CalibrationResult:
+    """Estimate weight, centre of mass and bias of a tool; take the rest from an earlier result with its covariance.
+
+    Parameters
+    ----------
+    earlier : CalibrationResult
+        Accepted, of the same sensor, mounting and base.
+    dataset : CalibrationDataset
+        3 poses or more whose noise was measured; 4 for a test worth its name.
+    provenance : mapping, optional
+        Of the dataset.
+
+    Returns
+    -------
+    CalibrationResult
+        Its `provenance` names the earlier result as `parent`.
+
+    Raises
+    ------
+    NotObservable
+        The poses do not determine the tool, or what was kept holds no more: the message names mounting or base.
+    """
+    if dataset.wrench_cov is None:
+        raise NotObservable(
+            "the noise of the poses was not measured, so nothing tests the earlier result: leave --from out."
+        )
+    cov = pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier))
+    weights: Array = np.linalg.inv(cov).astype(np.float64)
+    poses = dataset.R_base_flange, dataset.wrench, weights
+    prior = CellPrior(earlier)
+    found = _fitted(prior, *poses, WHOLE)
+
+    def refit(kept: Sequence[int]) -> tuple[float, int, Parameters]:
+        again = _fitted(prior, *poses, kept)
+        return again.chi2, again.dof, again.parameters
+
+    alone = "calibrate this tool alone, from 12 poses or more"
+    if changed := prior.contradiction(found.chi2, found.dof, refit, "the poses", alone):
+        raise NotObservable(changed)
+    result = updated(earlier, found, {**(provenance or {}), "dataset_sha256": dataset.sha256()})
+    return replace(result, quality={}, weights=None, components=_kept_noise(earlier))
+
+
+def _fitted(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Array, kept: Sequence[int]) -> Update:
+    """Fit all parameters; `kept` as of `CellPrior.rows`."""
+    n, coefficients = len(wrench), prior.coefficients
+    new = _start(prior.earlier.parameters, R_base_flange, wrench)
+    for _ in range(_MOST_STEPS):
+        left = wrench - predict(new, R_base_flange)
+        J = jacobian(new, R_base_flange)
+        if prior.has_response:
+            T = response_columns(new, R_base_flange)
+            left, J = left - T @ coefficients, np.concatenate([J, T], axis=2)
+        A, r = prior.rows(new, coefficients, kept)
+        WJ = weights @ J
+        H = np.einsum("nij,nik->jk", J, WJ) + A.T @ A
+        scale = np.sqrt(np.diag(H))
+        if not (scale > 0).all() or np.linalg.cond(H / np.outer(scale, scale)) > _SINGULAR:
+            raise NotObservable(f"{n} poses do not determine the tool: add poses with other tilts of the tool.")
+        step = np.linalg.solve(H, np.einsum("nij,ni->j", WJ, left) + A.T @ r)
+        new, coefficients = new.moved(step[:15]), coefficients + step[15:]
+        if float(step @ H @ step) < _SETTLED:
+            break
+    else:
+        raise NotObservable(f"the fit has not settled in {_MOST_STEPS} steps: check the poses, or solve alone.")
+    covariance = np.linalg.inv(H)
+    weight_N = float(np.linalg.norm(new.gravity_force_base_N))
+    sigma_N = float(np.sqrt(down(new) @ covariance[3:6, 3:6] @ down(new)))
+    if weight_N < _SIGNIFICANT * sigma_N:
+        raise NotObservable(f"the weight of the tool is {weight_N:.2g} N, sigma {sigma_N:.2g} N: check the sensor.")
+    chi2 = float(np.einsum("ni,nij,nj->", left, weights, left) + r @ r)
+    dof = 6 * n + len(r) - len(H)
+    response = Response(coefficients, covariance) if prior.has_response else None
+    return Update(new, covariance[:15, :15], chi2, dof, "tool", left, response)
+
+
+def _start(old: Parameters, R_base_flange: Array, wrench: Array) -> Parameters:
+    """Take weight, centre of mass and bias by linear least squares with the earlier mounting and base."""
+    u = down(old) @ (R_base_flange @ old.R_flange_sensor)
+    A = np.zeros((len(u), 6, 10))
+    A[:, :3, 0], A[:, :3, 1:4] = u, np.eye(3)
+    A[:, 3:, 4:7], A[:, 3:, 7:] = -skew(u), np.eye(3)
+    x: Array = np.linalg.lstsq(A.reshape(-1, 10), wrench.ravel(), rcond=None)[0].astype(np.float64)
+    weight_N = max(float(x[0]), 1e-3)
+    return Parameters(old.R_flange_sensor, weight_N * down(old), x[1:4], x[4:7] / weight_N, x[7:])
+
+
+def _kept_noise(earlier: CalibrationResult) -> dict[str, float]:
+    """Return the components that belong to the cell: errors of the arm and of the sensor, not of one session."""
+    return {name: value for name, value in earlier.components.items() if name in ("rotation_rad", "hysteresis")}
+
+
+def _beyond(earlier: CalibrationResult) -> Array:
+    """Variance (6,) of a pose beyond its noise, where noise alone did not explain the residuals of the earlier fit."""
+    if earlier.noise_explains:
+        return np.zeros(6)
+    excess = np.square(earlier.likely_error()) - np.square(earlier.predicted_error())
+    return np.repeat(np.maximum(excess, 0.0) / 3, 3)
+
+
+def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any] | None = None) -> CalibrationResult:
+    """Join results of one tool on one cell; the bias is that of the last run.
+
+    Parameters
+    ----------
+    results : sequence of CalibrationResult
+        Of runs that were solved by themselves, the oldest first.
+    provenance : mapping, optional
+
+    Returns
+    -------
+    CalibrationResult
+        Verdict, findings and residuals are those of the last run.
+
+    Raises
+    ------
+    NotObservable
+        The runs contradict each other in more than the bias, or a run shows gain and cross-talk.
+    """
+    if any(one.response is not None for one in results):
+        raise NotObservable("a run shows gain or cross-talk of the sensor, and these are not joined: use --from.")
+    if any((np.diag(one.covariance)[_SHARED] <= 0).any() for one in results):
+        raise NotObservable("a run takes a value as exactly known: solve its runs without known values.")
+    last = results[-1]
+    difference = np.array([last.parameters.difference(one.parameters)[_SHARED] for one in results])
+    information = np.array([np.linalg.inv(one.covariance[np.ix_(_SHARED, _SHARED)]) for one in results])
+    C = np.linalg.inv(information.sum(axis=0))
+    x = C @ np.einsum("kij,kj->i", information, difference)
+    rest = difference - x
+    chi2, dof = float(np.einsum("ki,kij,kj->", rest, information, rest)), 9 * (len(results) - 1)
+    if dof and chi2_sf(dof, chi2) < FALSE_ALARMS:
+        raise NotObservable(
+            f"the runs contradict each other in more than the bias (chi2 {chi2:.0f} for {dof} degrees of freedom): "
+            "`ftdrive diff` shows in what; tool, sensor or base has changed."
+        )
+    shared, own = np.ix_(_SHARED, _SHARED), np.arange(15)[BIASES]
+    G = last.covariance[np.ix_(own, _SHARED)] @ np.linalg.inv(last.covariance[shared])
+    step = np.zeros(15)
+    step[_SHARED], step[own] = x, G @ x
+    covariance = np.zeros((15, 15))
+    covariance[shared] = C
+    covariance[np.ix_(own, _SHARED)] = G @ C
+    covariance[np.ix_(_SHARED, own)] = (G @ C).T
+    alone = last.covariance[np.ix_(own, own)] - G @ last.covariance[np.ix_(_SHARED, own)]
+    covariance[np.ix_(own, own)] = alone + G @ C @ G.T
+    note = Finding.of("together", n_runs=len(results))
+    return replace(
+        last,
+        parameters=last.parameters.moved(step),
+        covariance=(covariance + covariance.T) / 2,
+        findings=(*last.findings, note),
+        provenance={
+            **last.provenance,
+            **(provenance or {}),
+            "together": [one.id for one in results],
+            "between_chi2": chi2,
+            "between_dof": dof,
+        },
+    )

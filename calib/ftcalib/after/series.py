@@ -1,0 +1,429 @@
+"""Differences between calibrations and their course: step, trend, temperature."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.special import chdtrc as chi2_sf
+from scipy.special import fdtrc as f_sf
+
+from ftcalib.model import Array, Parameters, read_only
+
+# The difference of two calibrations, in standard deviations and tested jointly.
+
+KNOWN = 1e-9
+"""A standard deviation below this share of the largest is one of rounding: the value was taken as known."""
+_SINGULAR = 1e-10
+"""Likewise an eigenvalue of a correlation matrix."""
+_ROUNDING_SIGMAS = 1e-3
+"""A difference in a direction that both calibrations take as known counts from here on."""
+
+
+class Estimated(Protocol):
+    """A calibration, an update of it, or a row of a store."""
+
+    @property
+    def parameters(self) -> Parameters:
+        """Estimates."""
+
+    @property
+    def covariance(self) -> Array:
+        """(15, 15) of the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChiSquare:
+    """Chi-square test of no difference."""
+
+    chi2: float
+    """Squared Mahalanobis distance; infinite if values that both take as known differ."""
+    dof: int
+    p_value: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Difference:
+    """Second calibration minus the first."""
+
+    change: Array
+    """(15,) in the error coordinates `ftcalib.model.PARAMETER_NAMES`; the rotation about the flange axes, rad."""
+    sigma: Array
+    """(15,) one standard deviation of that; 0 where both calibrations share the value or take it as known."""
+    joint: ChiSquare
+    """Of all parameters that the calibrations do not share."""
+    groups: Mapping[str, ChiSquare]
+    """Of each field of `Parameters`."""
+
+    @property
+    def in_sigmas(self) -> Array:
+        """(15,) change divided by sigma; 0 where shared, infinite where two known values differ."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.where(self.change == 0, 0.0, self.change / self.sigma))
+
+
+def difference(first: Estimated, second: Estimated) -> Difference:
+    """Compare two calibrations whose errors are independent.
+
+    A field that is identical in both was copied, as by an update of the bias. It is left out of the joint test, because
+    its error is common to both. Gain and cross-talk of the sensor are not compared.
+
+    Parameters
+    ----------
+    first, second : Estimated
+
+    Returns
+    -------
+    Difference
+        With the covariances of both. The mountings are R1 = exp(-d1) R and R2 = exp(-d2) R, with small errors d about
+        the flange axes, so the error d1 is turned into the axes of the second mounting before it is added.
+    """
+    old, new = first.parameters, second.parameters
+    change = old.difference(new)
+    # The left Jacobian of the rotation drops out of the Mahalanobis distance, because it leaves its own axis in place.
+    turn = block_diag(new.R_flange_sensor @ old.R_flange_sensor.T, np.eye(12))
+    covariance = second.covariance + turn @ first.covariance @ turn.T
+    for i, field in enumerate(fields(Parameters)):
+        if np.array_equal(getattr(old, field.name), getattr(new, field.name)):
+            rows = slice(3 * i, 3 * i + 3)
+            change[rows], covariance[rows, :], covariance[:, rows] = 0.0, 0.0, 0.0
+    everything = np.arange(15)
+    names = [field.name for field in fields(Parameters)]
+    groups = {name: _test(change, covariance, everything[3 * i : 3 * i + 3]) for i, name in enumerate(names)}
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return Difference(read_only(change), read_only(sigma), _test(change, covariance, everything), groups)
+
+
+def _test(change: Array, covariance: Array, rows: NDArray[np.intp]) -> ChiSquare:
+    """Test some rows; directions without variance count only if they differ."""
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    known = sigma[rows] <= KNOWN * sigma.max()
+    if np.any(change[rows[known]] != 0):
+        return ChiSquare(np.inf, len(rows), 0.0)
+    free = rows[~known]
+    if not len(free):
+        return ChiSquare(0.0, 0, 1.0)
+    z = change[free] / sigma[free]
+    eigenvalues, directions = np.linalg.eigh(covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free]))
+    along = directions.T @ z
+    usable = eigenvalues > _SINGULAR * eigenvalues[-1]
+    if np.any(np.abs(along[~usable]) > _ROUNDING_SIGMAS):
+        return ChiSquare(np.inf, len(free), 0.0)
+    chi2, dof = float(np.sum(along[usable] ** 2 / eigenvalues[usable])), int(usable.sum())
+    return ChiSquare(chi2, dof, float(chi2_sf(dof, chi2)))
+
+
+# Whether a bias has begun to drift: the onset of a linear change in a series of verifications of one calibration.
+#
+# A component of the bias, as changes d_i since the calibration at times t_i, is modelled by
+#
+#     d_i = c + s max(0, t_i - t0) + e_i,    e_i ~ N(0, sigma_i^2),    c ~ N(0, sigma_c^2),
+#
+# with the common error c of the calibration. For each onset t0, c and s are estimated by generalised least squares. The
+# t0 with the largest chi2 of s counts (Hinkley, J. Am. Stat. Assoc. 66, 1971). As in `trend`, s must be significant
+# against the stated sigmas and against the scatter about the line (F test).
+#
+# A sudden change, such as a tare, a knock or one bad verification, raises the same statistic. So a step at any t1
+# competes:
+#
+#     d_i = c + b [t_i >= t1] + e_i.
+#
+# Where a step is significant and fits better than any onset, the series begins again at t1 with a free c.
+
+FEWEST = 6
+"""Verifications: fewer do not show their scatter."""
+SIGNIFICANT = 1e-5
+"""Largest p-value of an onset that counts, in one component at one look. It allows for the search over onsets, six
+components and 365 looks a year: false alarms and delays in simulation are in docs/reference/figures/fleet.md."""
+LEAST_DAYS = 7.0
+"""A drift has gone on for so long: a sudden change of the last days is no drift yet."""
+NEAR_DAYS = 14.0
+"""If the series begins later, the error of the calibration limits its level no more, because more may have changed."""
+CLEARLY = 6.0
+"""A step fits better than an onset if its chi2 is larger by this: odds of 20 to 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriftOnset:
+    """Likeliest onset of each of k components; arrays (k,)."""
+
+    found: NDArray[np.bool_]
+    """Whether the component drifts."""
+    t0_days: Array
+    """When it began."""
+    slope: Array
+    """Change a day since then."""
+    sigma: Array
+    """One standard deviation of that, by the stated sigmas or by the scatter if that is larger."""
+    p_value: Array
+    """Of the slope, for one onset and one component."""
+
+    def __post_init__(self) -> None:
+        for name in ("t0_days", "slope", "sigma", "p_value"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+
+def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: Array) -> DriftOnset | None:
+    """Search the onset of a drift in a series of verifications; None if there are too few since the last step.
+
+    Parameters
+    ----------
+    t_days : array, shape (n,)
+        Since the calibration, in ascending order; any spacing.
+    change : array, shape (n, k)
+        Of the bias since the calibration, as `ftcalib.after.expected_readings` estimates it.
+    sigma : array, shape (n, k)
+        Of the readings of each verification, positive.
+    calibration_sigma : array, shape (k,)
+        Of the calibration, common to all.
+    """
+    if len(t_days) < FEWEST:
+        return None
+    weight, known = 1 / np.square(sigma), 1 / np.maximum(np.square(calibration_sigma), 1e-12 * np.square(sigma[0]))
+    near = t_days[0] <= NEAR_DAYS
+    if not near:
+        known = np.zeros_like(known)
+    first = 0
+    while len(t_days) - first >= FEWEST:
+        t, d, w = t_days[first:], change[first:], weight[first:]
+        chi2 = np.sum(w * d * d, axis=0) - np.sum(w * d, axis=0) ** 2 / (np.sum(w, axis=0) + known)
+        ramp, slope, slope_sigma, t0 = _onsets(t, d, w, known, from_calibration=near and first == 0)
+        step, after = _steps(d, w, known)
+        p_ramp, p_step = (_p_value(one, chi2, len(t) - 3) for one in (ramp, step))
+        ahead = np.where(p_step < SIGNIFICANT, step - ramp, -np.inf)
+        if ahead.max() <= CLEARLY:
+            scatter = np.maximum((chi2 - ramp) / (len(t) - 3), 1.0)
+            found = p_ramp < SIGNIFICANT
+            return DriftOnset(found, t0, slope, slope_sigma * np.sqrt(scatter), p_ramp)
+        first += int(after[ahead.argmax()])
+        known = np.zeros_like(known)
+    return None
+
+
+def _onsets(t: Array, d: Array, w: Array, known: Array, *, from_calibration: bool) -> tuple[Array, Array, Array, Array]:
+    """Return chi2, slope, its sigma and onset (k,) of the best onset, at a verification or at the calibration."""
+    t0 = t[t <= t[-1] - LEAST_DAYS]
+    if from_calibration:
+        t0 = np.append(0.0, t0)
+    if not len(t0):
+        t0 = t[:1]
+    later = np.searchsorted(t, t0, side="right")  # the first verification after each onset
+    x = t[:, None]
+    W, Wt, Wtt, Wd, Wtd = (_from_here(part)[later] for part in (w, w * x, w * x * x, w * d, w * x * d))
+    z = t0[:, None]
+    A, B, D = np.sum(w, axis=0) + known, Wt - z * W, Wtt - 2 * z * Wt + z * z * W
+    y = A * (Wtd - z * Wd) - B * np.sum(w * d, axis=0)
+    determinant = A * D - B * B
+    usable = determinant > 1e-9 * A * D
+    determinant = np.where(usable, determinant, 1.0)
+    chi2 = np.where(usable, y * y / (A * determinant), 0.0)
+    best, each = chi2.argmax(axis=0), np.arange(d.shape[1])
+    slope, variance = y / determinant, A / determinant
+    return chi2[best, each], slope[best, each], np.sqrt(variance[best, each]), t0[best]
+
+
+def _steps(d: Array, w: Array, known: Array) -> tuple[Array, Array]:
+    """Return chi2 and row (k,) of the best step, which is the first verification after it."""
+    A, B = np.sum(w, axis=0) + known, _from_here(w)[:-1]
+    y = A * _from_here(w * d)[:-1] - B * np.sum(w * d, axis=0)
+    determinant = B * (A - B)
+    usable = determinant > 1e-9 * A * A
+    chi2 = np.where(usable, y * y / (A * np.where(usable, determinant, 1.0)), 0.0)
+    best = chi2.argmax(axis=0)
+    return chi2[best, np.arange(d.shape[1])], best
+
+
+def _from_here(rows: Array) -> Array:
+    """Return the sums (n + 1, k) of each row and all later ones, the last of which is none."""
+    return np.concatenate([np.cumsum(rows[::-1], axis=0)[::-1], np.zeros((1, rows.shape[1]))])
+
+
+def _p_value(chi2: Array, total: Array, dof: int) -> Array:
+    """Return the larger p-value of one coefficient: against the stated sigmas, and against the scatter."""
+    rest = np.maximum(total - chi2, 1e-12) / dof
+    return np.maximum(chi2_sf(1, chi2), f_sf(1, dof, chi2 / rest))
+
+
+# Linear change of an estimate from calibration to calibration, and whether it is significant.
+
+FEWEST_ESTIMATES = 3
+"""Two points have a line without any scatter about it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trend:
+    """Weighted straight line through n estimates of k numbers."""
+
+    slope: Array
+    """(k,) change per unit of time."""
+    sigma: Array
+    """(k,) one standard deviation of that, from the covariances or from the scatter if that is larger."""
+    p_value: float
+    """Probability of a larger slope, in any direction, if nothing changes linearly."""
+    n: int
+
+
+def trend(t: Array, values: Array, covariance: Array) -> Trend:
+    """Fit a line by generalised least squares, and test its slope against zero.
+
+    The slope must be significant against the stated covariances (chi-square, k degrees of freedom), and against the
+    scatter about the line (F test, k and k (n - 2)). The p-value is the larger of the two, so neither covariances that
+    are too small nor a scatter that happens to be small makes a trend.
+
+    Parameters
+    ----------
+    t : array, shape (n,)
+        n >= 3, not all equal.
+    values : array, shape (n, k)
+    covariance : array, shape (n, k, k)
+        Of each row, positive definite; the rows are independent.
+
+    Raises
+    ------
+    ValueError
+        Too few rows, all at one time, or a covariance that is not positive definite.
+    """
+    t, values = np.asarray(t, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    n, k = values.shape
+    if n < FEWEST_ESTIMATES or np.ptp(t) == 0:
+        raise ValueError(f"{n} estimates at {len(np.unique(t))} times have no trend: give {FEWEST_ESTIMATES} or more")
+    try:
+        whiten = np.linalg.inv(np.linalg.cholesky(covariance))  # (n, k, k)
+    except np.linalg.LinAlgError as error:
+        raise ValueError("a covariance is not positive definite: leave out values taken as known") from error
+    scale = float(np.ptp(t))
+    design = np.concatenate([whiten, whiten * ((t - t.mean()) / scale)[:, None, None]], axis=2).reshape(n * k, 2 * k)
+    readings = (whiten @ (values - values.mean(axis=0))[..., None]).reshape(n * k)
+    inverse = np.linalg.inv(design.T @ design)
+    x = inverse @ design.T @ readings
+    slope, slope_cov = x[k:], inverse[k:, k:]
+    dof = k * (n - 2)
+    scatter = float(np.sum((readings - design @ x) ** 2)) / dof
+    chi2 = float(slope @ np.linalg.solve(slope_cov, slope))
+    special = scipy.special
+    against_scatter = special.fdtrc(k, dof, chi2 / k / scatter) if scatter > 0 else 0.0
+    sigma = np.sqrt(np.diag(slope_cov) * max(scatter, 1.0))
+    return Trend(slope / scale, sigma / scale, float(max(special.chdtrc(k, chi2), against_scatter)), n)
+
+
+"""Runs."""
+# Bias of a sensor against its temperature, over calibrations and verifications, and whether that predicts anything.
+#
+# A component of the bias is y = a + c (T - T0) + s + w(t): s scatters from run to run, w walks with the time. Both are
+# chosen by restricted likelihood, alike for the components of force and for those of torque, so that a walk which looks
+# like a temperature by chance widens the sigma of c. What a fit predicts of a run that it lacks has a closed form. A
+# temperature that does not predict such runs better than the other runs alone is of no use, however steep its slope.
+
+LEAST_K = 3.0
+"""Between the coldest and the warmest run."""
+SURE = 1e-3
+"""Largest p-value of a slope that is used."""
+_MOST = 100
+"""Older runs do not count: their walk says little about today."""
+_SHARES = np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.5])
+"""Tried for scatter and walk, in standard deviations of the runs about their line."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BiasTemperature:
+    """Linear change of the bias with the temperature of a sensor, force first, sensor axes."""
+
+    slope: Array
+    """(6,) N/K and N·m/K."""
+    sigma: Array
+    """(6,) one standard deviation."""
+    n: int
+    """Runs."""
+    coldest_C: float
+    warmest_C: float
+    error: Array
+    """(2,) rms error of the bias of a run that was left out, an axis, predicted with the temperature; N and N·m."""
+    error_without: Array
+    """(2,) the same from the other runs alone."""
+    p_value: Array
+    """(2,) probability of steeper slopes if there is none, of force and torque."""
+
+    @property
+    def predicts(self) -> tuple[bool, bool]:
+        """Whether force and torque of left-out runs are predicted better with the temperature."""
+        force, torque = (self.error < self.error_without) & (self.p_value < SURE)
+        return bool(force), bool(torque)
+
+    def change(self, from_C: float, to_C: float) -> tuple[Array, Array]:
+        """Return the change (6,) of the bias between two temperatures and its sigma; 0 where nothing is predicted.
+
+        Beyond the temperatures of the runs it stays as at the nearest of them.
+        """
+        used = np.repeat(self.predicts, 3)
+        step_K = float(np.diff(np.clip([from_C, to_C], self.coldest_C, self.warmest_C))[0])
+        return np.where(used, self.slope * step_K, 0.0), np.where(used, self.sigma * abs(step_K), 0.0)
+
+
+def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Array) -> BiasTemperature | None:
+    """Fit the bias of one sensor, in one mounting, against its temperature.
+
+    Parameters
+    ----------
+    t_days : array, shape (n,)
+        Ascending.
+    temperature_C : array, shape (n,)
+    bias : array, shape (n, 6)
+        N and N·m, sensor axes.
+    sigma : array, shape (n, 6)
+        One standard deviation of each.
+
+    Returns
+    -------
+    BiasTemperature or None
+        None for fewer than 6 runs, or within 3 K.
+    """
+    t_days, T, y, sigma = (np.asarray(one, dtype=np.float64)[-_MOST:] for one in (t_days, temperature_C, bias, sigma))
+    n = len(T)
+    if n < FEWEST or np.ptp(T) < LEAST_K:
+        return None
+    alone = np.ones((n, 1))
+    line = np.column_stack([alone, T - T.mean()])
+    walk = np.minimum.outer(t_days - t_days[0], t_days - t_days[0]) / max(float(np.ptp(t_days)), 1e-9)
+    slope, error, errors, p_values = np.zeros((2, 6)), np.zeros(2), np.zeros(2), np.ones(2)
+    for k, group in enumerate((slice(0, 3), slice(3, 6))):
+        noise = np.mean(np.square(sigma[:, group]), axis=1)
+        with_T, without = (_fitted(X, walk, y[:, group], noise) for X in (line, alone))
+        slope[0, group], slope[1, group] = with_T.x[1], with_T.sigma
+        error[k], errors[k] = with_T.left_out, without.left_out
+        p_values[k] = f_sf(3, 3 * (n - 2), float(np.mean(np.square(with_T.x[1] / with_T.sigma))))
+    return BiasTemperature(slope[0], slope[1], n, float(T.min()), float(T.max()), error, errors, p_values)
+
+
+class _Fit(NamedTuple):
+    x: Array
+    """(k, 3) coefficients of the columns."""
+    sigma: Array
+    """(3,) of the last coefficient."""
+    left_out: float
+    """Rms of what each run differs from its prediction by the others."""
+
+
+def _fitted(X: Array, walk: Array, y: Array, noise: Array) -> _Fit:
+    """Fit columns X (n, k) to the components y (n, 3); each scatter and walk counts by its likelihood."""
+    spread = float(np.mean(np.square(y - X @ np.linalg.lstsq(X, y, rcond=None)[0])))
+    tried, likelihood = list[tuple[Array, float, Array]](), list[float]()
+    for scatter in _SHARES**2 * spread:
+        for walked in _SHARES**2 * spread:
+            W = np.linalg.inv(np.diag(noise + scatter + 1e-9 * spread + 1e-24) + walked * walk)
+            information = X.T @ W @ X
+            C = np.linalg.inv(information)
+            P = W - W @ X @ C @ X.T @ W  # what the columns leave, weighted
+            left = P @ y
+            tried.append((C @ X.T @ W @ y, float(C[-1, -1]), left / np.diag(P)[:, None]))
+            determinants = 3 * (np.linalg.slogdet(W)[1] - np.linalg.slogdet(information)[1])
+            likelihood.append((determinants - float(np.sum(y * left))) / 2)
+    weights = np.exp(np.array(likelihood) - max(likelihood))
+    weights /= weights.sum()
+    x, variance, left_out = (np.array(one) for one in zip(*tried, strict=True))
+    mean = np.tensordot(weights, x, 1)
+    scattered = np.tensordot(weights, np.square(x[:, -1] - mean[-1]), 1)
+    rms = float(np.sqrt(np.mean(np.square(np.tensordot(weights, left_out, 1)))))
+    return _Fit(mean, np.sqrt(weights @ variance + scattered), rms)

@@ -1,0 +1,387 @@
+"""Update or tare a calibration after a change of bias, payload, mounting or base, from a few new poses.
+
+Parameters that are not estimated keep their values and their uncertainty. The uncertainty counts as an error common to
+all readings, both in the weights (generalised least squares) and in the covariance of the result.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import chdtrc as chi2_sf
+from scipy.special import chdtri as chi2_isf
+
+from ftcalib.after.series import Estimated
+from ftcalib.compensation import Compensator
+from ftcalib.data.dataset import finite
+from ftcalib.data.dwell_mean import is_stationary, mean_and_covariance
+from ftcalib.errors import BadDataset, NotObservable
+from ftcalib.findings import Finding
+from ftcalib.likelihood.response import Response, predicted_covariance, response_columns
+from ftcalib.model import BIASES, Array, Parameters, jacobian, read_only, skew
+from ftcalib.result import CalibrationResult
+
+SIGNIFICANT_SIGMAS = 5.0
+SETTLED = 1e-20  # squared step in standard deviations at which the iteration ends
+MOST_STEPS = 30
+UNDETERMINED = 1e-6  # smallest singular value of the scaled equations over the largest
+
+Block = Literal["weight", "centre of mass", "bias", "gravity direction", "mounting"]
+BLOCKS: Mapping[str, tuple[Block, ...]] = {
+    "bias": ("bias",),
+    "weight": ("weight",),
+    "centre of mass": ("centre of mass",),
+    "payload": ("weight", "centre of mass"),
+    "mounting": ("mounting",),
+    "base": ("gravity direction",),
+    "bias and payload": ("weight", "centre of mass", "bias"),
+    "all": ("weight", "centre of mass", "bias", "gravity direction", "mounting"),
+}
+"""Kinds of update, and what each estimates."""
+
+
+class Calibrated(Estimated, Protocol):
+    """A calibration, or an earlier update of it."""
+
+    @property
+    def response(self) -> Response | None:
+        """Gain and cross-talk of the sensor."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Update:
+    """Parameters after an update, which can be updated again."""
+
+    parameters: Parameters
+    covariance: Array
+    """(15, 15) of the error coordinates `PARAMETER_NAMES`, kept parameters included."""
+    chi2: float
+    """Misfit of the new readings; about `dof` if only noise and the old uncertainty act."""
+    dof: int
+    """0 if no reading is left for a check."""
+    kind: str = ""
+    """One of `BLOCKS`."""
+    residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    """(n, 6) of the new readings, N and N·m, in the sensor frame."""
+    response: Response | None = None
+    """Gain and cross-talk of the sensor are kept; their covariance with the parameters is that after the update."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "covariance", read_only(self.covariance))
+        object.__setattr__(self, "residuals", read_only(self.residuals))
+
+
+def with_bias_change(calibration: Calibrated, change: Array, sigma: Array, *, measured: bool = False) -> Update:
+    """Return a calibration or an update of it whose bias has changed by so much.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult or Update
+    change, sigma : array, shape (6,)
+        N and N·m, sensor axes; one standard deviation.
+    measured : bool
+        Whether sigma is that of the new bias itself, and not of the change alone.
+    """
+
+    def changed(covariance: Array) -> Array:
+        covariance = np.array(covariance)
+        if measured:
+            covariance[BIASES], covariance[:, BIASES] = 0.0, 0.0
+        covariance[BIASES, BIASES] += sigma**2
+        return covariance
+
+    p, response = calibration.parameters, calibration.response
+    new = replace(p, force_bias_N=p.force_bias_N + change[:3], torque_bias_Nm=p.torque_bias_Nm + change[3:])
+    if response is not None:
+        response = replace(response, covariance=changed(response.covariance))
+    return Update(new, changed(calibration.covariance), 0.0, 0, "bias", response=response)
+
+
+def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noise: Array, kind: str) -> Update:
+    """Estimated some of the parameters again by generalised least squares; keep the others.
+
+    With x the parameters of `kind` and e the errors of the old calibration, a reading is h(x) + K e + noise. The
+    weights are the inverse of noise + K C K'. The error of the new parameters is G (noise - K e) + kept e, with G the
+    matrix of the estimate.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult or Update
+    R_base_flange : array, shape (n, 3, 3)
+    wrench : array, shape (n, 6)
+        Mean readings as measured, N and N·m, in the sensor frame.
+    noise : array, shape (6n, 6n)
+        Covariance of all readings, pose by pose.
+    kind : str
+        One of `BLOCKS`.
+
+    Raises
+    ------
+    BadDataset
+        Shapes that do not fit each other.
+    NotObservable
+        The poses do not determine these parameters, or the weight is not significant.
+    """
+    n, old, response = len(wrench), calibration.parameters, calibration.response
+    R_base_flange, wrench = finite("R_base_flange", R_base_flange, (n, 3, 3)), finite("wrench", wrench, (n, 6))
+    C = calibration.covariance if response is None else response.covariance
+    if not old.gravity_force_base_N.any() and kind != "bias":
+        raise NotObservable("the calibration has no weight, so the direction of gravity is unknown: calibrate first.")
+    new = old
+    for _ in range(MOST_STEPS):
+        estimated, kept = _directions(new, BLOCKS[kind]), _kept(old, new, BLOCKS[kind], len(C))
+        J = jacobian(new, R_base_flange)
+        if response is not None:
+            J = np.concatenate([J, response_columns(new, R_base_flange)], axis=2)
+        K = J.reshape(6 * n, -1) @ kept
+        H = J[..., :15].reshape(6 * n, 15) @ estimated
+        S = noise + K @ C @ K.T
+        weighted = np.linalg.solve(S, H).T
+        information = weighted @ H
+        inverse = _inverse(information, kind, n)
+        G = inverse @ weighted
+        left = np.asarray(Compensator(new, response=response).batch(wrench, R_base_flange), dtype=np.float64).ravel()
+        x = G @ left
+        if "weight" in BLOCKS[kind]:
+            weight_N, sigma_N = float(np.linalg.norm(new.gravity_force_base_N) + x[0]), float(np.sqrt(inverse[0, 0]))
+            if not weight_N > SIGNIFICANT_SIGMAS * sigma_N:
+                raise NotObservable(
+                    f"the weight of the payload, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty "
+                    f"of {sigma_N:.2g} N: hang something heavier on the sensor, or check the sign and the tare."
+                )
+        if float(x @ information @ x) < SETTLED * max(1.0, float(left @ np.linalg.solve(S, left))):
+            break
+        new = _moved(new, estimated, x, BLOCKS[kind])
+    else:
+        raise NotObservable(f"the new {kind} has not settled in {MOST_STEPS} steps: calibrate again.")
+    estimated_15 = np.zeros((len(C), len(x)))
+    estimated_15[:15] = estimated
+    gain = estimated_15 @ G
+    mixed = kept - gain @ K
+    covariance = gain @ noise @ gain.T + mixed @ C @ mixed.T
+    covariance = (covariance + covariance.T) / 2
+    return Update(
+        new,
+        covariance[:15, :15],
+        float(left @ np.linalg.solve(S, left)),
+        6 * n - len(x),
+        kind,
+        left.reshape(n, 6),
+        None if response is None else Response(response.coefficients, covariance),
+    )
+
+
+def updated(
+    calibration: CalibrationResult, update: Update, provenance: Mapping[str, Any] | None = None
+) -> CalibrationResult:
+    """Make a new calibration of an update.
+
+    `residuals`, `chi2`, `dof` and `p_value` are those of the new readings. Noise beyond the measured one
+    (`components`) and the verdict are those of the old calibration, because new readings are too few for them.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult
+        That the update was made from.
+    update : Update
+    provenance : mapping, optional
+        Of the new readings. The id of the old calibration is added to its `parent`, and the kind of update as `update`.
+
+    Raises
+    ------
+    NotObservable
+        No reading is left for a check.
+    """
+    if update.dof == 0:
+        raise NotObservable("one pose leaves no reading for a check of the new bias: use 2 poses or more.")
+    given = dict(provenance or {})
+    note = Finding.of("updated", kind=update.kind, n_poses=len(update.residuals), parent=calibration.id)
+    return CalibrationResult(
+        parameters=update.parameters,
+        covariance=update.covariance,
+        residuals=update.residuals,
+        chi2=update.chi2,
+        dof=update.dof,
+        noise_source="measured",
+        g_m_s2=calibration.g_m_s2,
+        method=calibration.method,
+        findings=(*calibration.findings, note),
+        provenance={
+            **given,
+            "parent": {**given.get("parent", {}), "id": calibration.id},
+            "update": update.kind,
+        },
+        p_value=float(chi2_sf(update.dof, update.chi2)),
+        components=calibration.components,
+        response=update.response,
+        gain_sigma=calibration.gain_sigma,
+        cable_shift=calibration.cable_shift,
+        second_basin_chi2=calibration.second_basin_chi2,
+    )
+
+
+def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
+    """Error coordinates (15, k) of what is estimated: weight first, biases force first.
+
+    With a new weight the centre of mass is estimated as their product, in which the readings are linear.
+    """
+    weight_N = float(np.linalg.norm(p.gravity_force_base_N))
+    columns = []
+    if "weight" in blocks:
+        weight = np.zeros((15, 1))
+        weight[3:6, 0] = p.gravity_force_base_N / weight_N
+        if "centre of mass" in blocks:
+            weight[9:12, 0] = -p.p_sensor_com_m / weight_N
+        columns.append(weight)
+    if "centre of mass" in blocks:
+        columns.append(np.eye(15)[:, 9:12] / weight_N)
+    if "bias" in blocks:
+        columns.append(np.eye(15)[:, BIASES])
+    if "gravity direction" in blocks:
+        direction = np.zeros((15, 2))
+        direction[3:6] = weight_N * np.linalg.svd(skew(p.gravity_force_base_N))[0][:, :2]
+        columns.append(direction)
+    if "mounting" in blocks:
+        columns.append(np.eye(15)[:, :3])
+    return np.concatenate(columns, axis=1)
+
+
+def _kept(old: Parameters, new: Parameters, blocks: Sequence[Block], size: int) -> Array:
+    """Derivative (size, size) of the new errors by the old ones, where they are kept."""
+    kept = np.eye(size)
+    if "mounting" in blocks:
+        kept[:3, :3] = 0.0
+    if "bias" in blocks:
+        kept[BIASES, BIASES] = 0.0
+    if "centre of mass" in blocks:
+        kept[9:12, 9:12] = 0.0
+    before, after = old.gravity_force_base_N, new.gravity_force_base_N
+    if "weight" in blocks:
+        across = np.eye(3) - np.outer(after, after) / (after @ after)
+        kept[3:6, 3:6] = np.linalg.norm(after) / np.linalg.norm(before) * across
+    if "gravity direction" in blocks:
+        along = np.outer(after, before) / (before @ before)
+        kept[3:6, 3:6] = 0.0 if "weight" in blocks else along
+    return kept
+
+
+def _moved(p: Parameters, estimated: Array, x: Array, blocks: Sequence[Block]) -> Parameters:
+    step = estimated @ x
+    weight_N = float(np.linalg.norm(p.gravity_force_base_N))
+    if "weight" in blocks:
+        step[9:12] *= weight_N / (weight_N + x[0])
+    elif "gravity direction" in blocks:  # along the sphere
+        moved = p.gravity_force_base_N + step[3:6]
+        step[3:6] = moved * weight_N / np.linalg.norm(moved) - p.gravity_force_base_N
+    return p.moved(step)
+
+
+def _inverse(information: Array, kind: str, n: int) -> Array:
+    """Invert; raise `NotObservable` if the poses leave a parameter free."""
+    scale = np.sqrt(np.diag(information))
+    units = np.outer(scale, scale)
+    try:
+        value = np.linalg.eigvalsh(information / units) if (scale > 0).all() else np.zeros(1)
+        if value[0] > UNDETERMINED**2 * value[-1] and len(scale) <= 6 * n:
+            return np.asarray(np.linalg.inv(information / units) / units)
+    except np.linalg.LinAlgError:  # rounding hides from the eigenvalues that it is singular
+        pass
+    raise NotObservable(
+        f"{n} {'pose does' if n == 1 else 'poses do'} not determine {kind}: add poses with other tilts of the tool."
+    )
+
+
+# Tare: the biases again, from a few seconds of a free tool.
+
+FALSE_ALARMS = 1e-3  # share of good tares that are rejected
+USUAL_DRIFT_N, USUAL_DRIFT_NM = 1.0, 0.03  # a wrist sensor over hours: temperature, mounting, wear
+
+
+def bias_change(
+    calibration: Calibrated, R_base_flange: Array, wrench: Array, wrench_cov: Array, drift_N: float, drift_Nm: float
+) -> tuple[Array, Array]:
+    """Compare readings of a free tool with the prediction.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult or Update
+    R_base_flange : array, shape (n, 3, 3)
+    wrench : array, shape (n, 6)
+        Means, N and N·m, in the sensor frame.
+    wrench_cov : array, shape (n, 6, 6)
+        Of those means.
+    drift_N, drift_Nm : float
+        Expected drift of the biases, one standard deviation an axis.
+
+    Returns
+    -------
+    change : array, shape (n, 6)
+        Measured minus predicted.
+    sigmas : array, shape (n,)
+        Mahalanobis distance, with noise, drift and the uncertainty of the calibration.
+    """
+    p, response = calibration.parameters, calibration.response
+    change = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)
+    drift = np.diag(np.repeat([drift_N**2, drift_Nm**2], 3))
+    S = wrench_cov + drift + predicted_covariance(p, calibration.covariance, response, R_base_flange)
+    return change, np.sqrt(np.einsum("ni,ni->n", change, np.linalg.solve(S, change[..., None])[..., 0]))
+
+
+def tare(
+    calibration: Calibrated,
+    R_base_flange: Array,
+    dwells: Sequence[Array],
+    *,
+    drift_N: float = USUAL_DRIFT_N,
+    drift_Nm: float = USUAL_DRIFT_NM,
+) -> Update:
+    """Estimate the biases again, with the weight of the tool subtracted; reject readings under load.
+
+    The test is the Mahalanobis distance d² of each reading from its prediction. Its covariance holds the noise of the
+    reading, the uncertainty of the calibration, and a bias drift of `drift_N`, `drift_Nm` (one standard deviation an
+    axis). The limit is the 99.9 % quantile of chi-square with 6 degrees of freedom, 22.5. From two poses on, the
+    readings must also agree on one bias, with the same probability.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult or Update
+    R_base_flange : array, shape (n, 3, 3)
+        One pose is enough.
+    dwells : sequence of n arrays, shape (N, 6)
+        Consecutive samples in each pose, N >= 20, as measured, N and N·m, in the sensor frame.
+    drift_N, drift_Nm : float
+        Expected drift of the biases since the calibration. A push of up to about four times this passes for drift,
+        because one pose does not distinguish them.
+
+    Raises
+    ------
+    BadDataset
+        The reading changes during a dwell, is too far from the prediction, or differs between poses: the tool is in
+        contact, or the payload has changed.
+    """
+    if len(dwells) == 0:
+        raise BadDataset("there is no dwell: record at least one pose.")
+    for i, dwell in enumerate(dwells):
+        if not is_stationary(dwell):
+            raise BadDataset(f"pose {i + 1}: the reading changes during the dwell: keep arm and tool still.")
+    means = [mean_and_covariance(dwell) for dwell in dwells]
+    wrench, wrench_cov = np.array([m.mean for m in means]), np.array([m.covariance for m in means])
+    R_base_flange = finite("R_base_flange", R_base_flange, (len(means), 3, 3))
+    change, sigmas = bias_change(calibration, R_base_flange, wrench, wrench_cov, drift_N, drift_Nm)
+    limit = float(chi2_isf(6, FALSE_ALARMS))
+    for i in np.flatnonzero(sigmas**2 > limit).tolist():
+        raise BadDataset(
+            f"pose {i + 1}: the reading is {np.linalg.norm(change[i, :3]):.2g} N and "
+            f"{np.linalg.norm(change[i, 3:]):.2g} N·m from the prediction, more than drift explains "
+            f"(d² {sigmas[i] ** 2:.0f}, limit {limit:.1f}): free the tool, or calibrate again if the payload has "
+            "changed."
+        )
+    update = reestimate(calibration, R_base_flange, wrench, block_diag(*wrench_cov), "bias")
+    if update.dof and update.chi2 > chi2_isf(update.dof, FALSE_ALARMS):
+        raise BadDataset(
+            f"the {len(means)} poses do not agree on one bias (chi2 {update.chi2:.0f} for {update.dof} degrees of "
+            "freedom): free the tool, or calibrate again if the payload has changed."
+        )
+    return update

@@ -1,0 +1,281 @@
+"""Weigh what a gripper holds beyond its calibrated tool: mass and centre of mass from readings at rest.
+
+With u the wrench of 1 kg as the sensor feels it, a held part of mass m and centre of mass p adds
+
+    force_N = m u        torque_Nm = (m p) x u        u = R_base_sensor.T @ g_base
+
+which is linear in m and m p. Both are estimated by generalised least squares. The covariance has the noise of the
+readings, the errors of the calibration, which are common to all of them and grow with the held weight, and the drift of
+the bias. One pose determines m p across gravity only. So a part counts as near a point of the gripper, `REACH_M` is one
+standard deviation, and that alone determines its centre of mass along gravity.
+
+A weight has no force across gravity and no torque about it. What a reading has there is a fault: see `Fault`.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.special import chdtrc as chi2_sf
+
+from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Calibrated
+from ftcalib.compensation import Compensator
+from ftcalib.data.dataset import finite
+from ftcalib.errors import BadDataset
+from ftcalib.likelihood.response import Response, response_columns
+from ftcalib.model import Array, Parameters, jacobian, read_only, skew
+
+REACH_M = 0.1
+"""A part is held so near to the given point, one standard deviation an axis."""
+FALSE_ALARMS = 1e-5
+"""Share of clean weights that a test takes for a fault."""
+LEAST_SIGMAS = 4.0
+"""A mass of so many sigmas differs from zero."""
+DRIFT_PER_H = np.repeat([5.0, 0.15], 3)
+"""Usual drift of a bias, one standard deviation, N/h and N·m/h: warm sensors drift less."""
+USUAL_DRIFT = np.repeat([USUAL_DRIFT_N, USUAL_DRIFT_NM], 3)
+"""Usual change of a bias within days, one standard deviation, N and N·m."""
+_PASSES = 4
+
+Fault = Literal["contact", "cable", "changed", "lifted"]
+"""Why force and torque do not belong to one weight: "contact", a force across gravity; "cable", a torque that no weight
+near the gripper exerts; "changed", each pose has a weight, but not the same; "lifted", less than the tool alone."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weight:
+    """What is held beyond the tool. Arrays are read-only, sensor axes, from the sensor origin.
+
+    Examples
+    --------
+    `weigh` returns it:
+
+    >>> import ftdrive
+    >>> with ftdrive.open_stream(simulate=True) as stream:
+    ...     weight = ftdrive.weigh(stream)
+    >>> weight.is_something, weight.fault is None
+    (False, True)
+    """
+
+    mass_kg: float
+    mass_sigma_kg: float
+    """Noise, calibration and drift; not the scale of the sensor, see `scale_sigma`."""
+    least_kg: float
+    """Smallest mass that this weighing can distinguish from zero."""
+    p_sensor_com_m: Array
+    """(3,) meaningless unless `is_something`."""
+    com_covariance: Array
+    """(3, 3)"""
+    line: Array | None
+    """(3,) unit vector along which the centre of mass is only assumed, because one pose does not show it; else None."""
+    fault: Fault | None
+    chi2: float
+    dof: int
+    poses: int
+    scale_sigma: float = 0.0
+    """Relative error of the scale of the sensor, one standard deviation, if set: common to all weights, tool too."""
+    in_motion: bool = False
+    """Whether it was weighed while the arm carried it; then `poses` is 0."""
+    moment: tuple[Array, Array] = field(default=(np.zeros(4), np.zeros((4, 4))), repr=False)
+    """Mass and mass times centre of mass (4,), and their covariance."""
+
+    def __post_init__(self) -> None:
+        for name in ("p_sensor_com_m", "com_covariance"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    @property
+    def is_something(self) -> bool:
+        """Whether the mass differs from zero."""
+        return self.mass_kg > self.least_kg
+
+    @property
+    def com_sigma_m(self) -> Array:
+        """(3,) one standard deviation along the axes of the sensor."""
+        return np.asarray(np.sqrt(np.diag(self.com_covariance)))
+
+
+def drift_since(seconds: float, per_h: Array = DRIFT_PER_H) -> Array:
+    """Return one standard deviation (6,) of the change of a bias since so long, N and N·m; infinite is never zeroed."""
+    return np.asarray(np.minimum(per_h * max(seconds, 0.0) / 3600, USUAL_DRIFT))
+
+
+def weigh(
+    reference: Calibrated,
+    R_base_flange: Array,
+    wrench: Array,
+    noise: Array,
+    *,
+    drift: Array,
+    g_m_s2: float,
+    p_sensor_near_m: Array,
+    orientation_sigma_rad: float = 0.0,
+) -> Weight:
+    """Weigh what is held in readings of one load.
+
+    Parameters
+    ----------
+    reference : CalibrationResult or Update
+        The empty gripper: a calibration, or its tare.
+    R_base_flange : array, shape (n, 3, 3)
+        One pose is enough for the mass.
+    wrench : array, shape (n, 6)
+        Means as measured, N and N·m, in the sensor frame.
+    noise : array, shape (n, 6, 6)
+        Covariances of these means.
+    drift : array, shape (6,)
+        One standard deviation of the change of the bias since the reference, see `drift_since`.
+    g_m_s2 : float
+        Of the calibration.
+    p_sensor_near_m : array, shape (3,)
+        Where the gripper holds parts, sensor frame.
+    orientation_sigma_rad : float
+        Error of each reported orientation, one standard deviation an axis.
+
+    Raises
+    ------
+    BadDataset
+        Shapes that do not fit each other, or a tool without weight: the direction of gravity is unknown then.
+    """
+    n = len(wrench)
+    R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
+    wrench, noise = finite("wrench", wrench, (n, 6)), finite("noise", noise, (n, 6, 6))
+    tool, response = reference.parameters, reference.response
+    weight_N = float(np.linalg.norm(tool.gravity_force_base_N))
+    if not weight_N > 0:
+        raise BadDataset("the calibrated tool has no weight, so the direction of gravity is unknown: calibrate again.")
+    left = np.asarray(Compensator(tool, response=response).batch(wrench, R_base_flange), dtype=np.float64)
+    u = tool.gravity_force_base_N * (g_m_s2 / weight_N) @ (R_base_flange @ tool.R_flange_sensor)  # (n, 3)
+    A = np.zeros((n, 6, 4))
+    A[:, :3, 0], A[:, 3:, 1:] = u, -skew(u)
+    if response is not None:
+        A[:, :3, 0] += u @ response.force_gain.T
+        A[:, 3:, 0] += u @ response.cross_talk_m.T
+    x = np.zeros(4)
+    for step in range(_PASSES):
+        S = _covariance(reference, x * g_m_s2, R_base_flange, noise, drift, orientation_sigma_rad)
+        if step == 0:  # the force alone, to know how heavy it is
+            rows = np.arange(6 * n).reshape(n, 6)[:, :3].ravel()
+            a, W = A[:, :3, 0].ravel(), np.linalg.inv(S[np.ix_(rows, rows)])
+            x[0] = a @ W @ left[:, :3].ravel() / (a @ W @ a)
+            x[1:], sigma_kg = x[0] * p_sensor_near_m, float(1 / np.sqrt(a @ W @ a))
+            continue
+        W = np.linalg.inv(S)
+        near = np.column_stack([-p_sensor_near_m, np.eye(3)]) / (REACH_M * max(abs(x[0]), sigma_kg))
+        H = A.reshape(6 * n, 4)
+        covariance = np.linalg.inv(H.T @ W @ H + near.T @ near)
+        x = covariance @ H.T @ W @ left.ravel()
+    misfit = left.ravel() - H @ x
+    chi2, dof = float(misfit @ W @ misfit + np.sum((near @ x) ** 2)), 6 * n - 1
+    sigma_kg = float(np.sqrt(covariance[0, 0]))
+    com_m = x[1:] / (x[0] or 1.0)
+    T = np.column_stack([-com_m, np.eye(3)]) / max(abs(x[0]), 1e-9)
+    com_covariance = T @ covariance @ T.T
+    variances, axes = np.linalg.eigh(com_covariance)
+    fault = _fault(left, A, S, float(chi2_sf(dof, chi2)), n)
+    if fault is None and x[0] < -LEAST_SIGMAS * sigma_kg:
+        fault = "lifted"
+    return Weight(
+        mass_kg=float(x[0]),
+        mass_sigma_kg=sigma_kg,
+        least_kg=LEAST_SIGMAS * sigma_kg,
+        p_sensor_com_m=com_m,
+        com_covariance=com_covariance,
+        line=read_only(axes[:, 2]) if variances[2] > (REACH_M / 2) ** 2 else None,
+        fault=fault,
+        chi2=chi2,
+        dof=dof,
+        poses=n,
+        moment=(x, covariance),
+    )
+
+
+def _fault(left: Array, A: Array, S: Array, p_value: float, n: int) -> Fault | None:
+    """Name what does not belong to one weight: first in each pose alone, then between poses."""
+    alone = []
+    for k in range(n):
+        part = S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
+        alone.append(_misfit(left[k, :3], A[k, :3, :1], part[:3, :3]))
+    if min(chi2_sf(2, chi2) for chi2 in alone) < FALSE_ALARMS:
+        return "contact"
+    if p_value >= FALSE_ALARMS:
+        return None
+    for k in range(n):
+        part = S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
+        if n == 1 or chi2_sf(3, _misfit(left[k], A[k], part)) < FALSE_ALARMS:
+            return "cable"
+    return "changed"
+
+
+def _misfit(y: Array, A: Array, S: Array) -> float:
+    """Return chi2 of readings against columns, which may depend on each other."""
+    L = np.linalg.cholesky(S)
+    y, A = np.linalg.solve(L, y), np.linalg.solve(L, A)
+    scale = np.linalg.norm(A, axis=0)
+    rest = y - A @ (np.linalg.pinv(A / scale, rcond=1e-6) @ y / scale)
+    return float(rest @ rest)
+
+
+def _covariance(
+    reference: Calibrated, x_N: Array, R_base_flange: Array, noise: Array, drift: Array, orientation_sigma_rad: float
+) -> Array:
+    """Covariance (6n, 6n) of readings minus prediction: noise, calibration and drift, with a part of weight x_N[0]."""
+    tool, response = reference.parameters, reference.response
+    n, held = len(noise), _part(tool, x_N)
+    J, part = jacobian(tool, R_base_flange), jacobian(held, R_base_flange)
+    across = _across(tool.gravity_force_base_N) * (x_N[0] / np.linalg.norm(tool.gravity_force_base_N))
+    J[..., :3] += part[..., :3]
+    J[..., 3:6] += part[..., 3:6] @ across
+    turn = J[..., :3]
+    single = noise + orientation_sigma_rad**2 * (turn @ np.swapaxes(turn, -1, -2))
+    C = np.array(reference.covariance if response is None else response.covariance)
+    C[range(6, 9), range(6, 9)] += drift[:3] ** 2
+    C[range(12, 15), range(12, 15)] += drift[3:] ** 2
+    if response is not None:
+        columns = response_columns(tool, R_base_flange) + response_columns(held, R_base_flange)
+        J = np.concatenate([J, columns], axis=2)
+    K = J.reshape(6 * n, -1)
+    return np.asarray(block_diag(*single) + K @ C @ K.T)
+
+
+def _part(tool: Parameters, x_N: Array) -> Parameters:
+    """Return weight (N) and moment (N·m) of a part as parameters without bias."""
+    along = tool.gravity_force_base_N / np.linalg.norm(tool.gravity_force_base_N)
+    com_m = x_N[1:] / x_N[0] if x_N[0] else np.zeros(3)
+    return Parameters(tool.R_flange_sensor, x_N[0] * along, np.zeros(3), com_m, np.zeros(3))
+
+
+def _across(v: Array) -> Array:
+    return np.asarray(np.eye(3) - np.outer(v, v) / (v @ v))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Holding:
+    """A tool with a part in its gripper as one load, which compensates and can be tared like a calibration."""
+
+    parameters: Parameters
+    covariance: Array
+    response: Response | None
+
+
+def holding(empty: Calibrated, weight: Weight, g_m_s2: float) -> Holding:
+    """Join the calibrated tool and a part that was weighed.
+
+    The error of the weighing counts as independent of that of the calibration.
+    """
+    tool, response = empty.parameters, empty.response
+    x, cov = weight.moment
+    x_N, cov_N = x * g_m_s2, cov * g_m_s2**2
+    W_N = float(np.linalg.norm(tool.gravity_force_base_N))
+    along, total_N = tool.gravity_force_base_N / W_N, W_N + float(x_N[0])
+    com_m = (W_N * tool.p_sensor_com_m + x_N[1:]) / total_N
+    C = empty.covariance if response is None else response.covariance
+    T, B = np.eye(len(C)), np.zeros((len(C), 4))
+    T[3:6, 3:6] += x_N[0] / W_N * _across(along)
+    T[9:12, 9:12] *= W_N / total_N
+    T[9:12, 3:6] = np.outer(tool.p_sensor_com_m - com_m, along) / total_N
+    B[3:6, 0], B[9:12, 0], B[9:12, 1:] = along, -com_m / total_N, np.eye(3) / total_N
+    covariance = T @ C @ T.T + B @ cov_N @ B.T
+    joined = Parameters(tool.R_flange_sensor, total_N * along, tool.force_bias_N, com_m, tool.torque_bias_Nm)
+    kept = None if response is None else Response(response.coefficients, covariance)
+    return Holding(joined, covariance[:15, :15], kept)

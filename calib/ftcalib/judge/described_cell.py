@@ -1,0 +1,311 @@
+"""What contradicts known values or the described cell: signs, mounting, payload, mass and centre of mass."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from ftcalib.findings import Finding
+from ftcalib.judge import units
+from ftcalib.judge.faults import channels
+from ftcalib.judge.units import FARTHEST_COM_M
+from ftcalib.known import Known, Setup, turn_between, unit_vector
+from ftcalib.model import UP_IN_BASE, Array, Parameters
+from ftcalib.rounding import decimals
+from ftcalib.sphere import axes_along, evenly_spread
+
+INSIDE_M = 0.01
+"""A centre of mass may lie this far on the robot's side of the sensor origin, because adapter plates do."""
+REVERSED_TILT_DEG = 135.0
+HANGING_DEG = 60.0
+"""A robot that leans more hangs on a wall."""
+OTHER_MOUNTING_DEG: Final = 10.0
+"""A larger angle is another mounting, not a lean."""
+LEAN_DEG: Final = 0.2
+"""About the accuracy of an arm's own orientation."""
+COM_MARGIN_M = 0.01
+"""Cables and screws may reach this far out of the described cylinders."""
+SURELY_OUTSIDE_M = 0.1
+"""A centre of mass farther outside than this is wrong; nearer, the description may be."""
+FAR_COM_M = 0.1
+"""Units are suspected where the centre of mass is outside and farther from the sensor than this."""
+NO_TOOL_SHARE = 0.1
+"""Less than this share of the described mass is a remainder, not a tool."""
+TOOL_KG, TOOL_SHARE = 0.1, 0.3
+"""The mass of a tool is known to about the larger of this mass and this share."""
+PAYLOAD_KG, PAYLOAD_SHARE = 0.5, 0.3
+"""A payload may differ by the larger of this mass and this share of the expected one."""
+SENSOR_KG: Final = 0.3
+"""A payload may be larger by this where the mass of sensor and adapter is unknown."""
+UNIT_KG, UNIT_SHARE = 0.8, 0.3
+"""Units are suspected where the payload differs by more than this, and agrees within this share in another unit."""
+_SIGNIFICANT: Final = 4.0
+
+
+def directions(parameters: Parameters, covariance: Array, setup: Setup) -> list[Finding]:
+    """Find signs that look reversed, and gravity that does not agree with the mounting, declared or not.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    covariance : array, shape (15, 15)
+    setup : Setup
+    """
+    lean = lean_from(-setup.up, parameters.gravity_force_base_N, covariance[3:6, 3:6])
+    inside_m = _inside_m(parameters, covariance)
+    if lean.deg >= REVERSED_TILT_DEG:
+        return [Finding.of("forces_reversed" if inside_m else "weight_upwards", off_deg=lean.deg)]
+    found = []
+    if 0 < inside_m <= FARTHEST_COM_M:
+        found.append(Finding.of("torques_reversed", inside_mm=1e3 * inside_m))
+    along = parameters.gravity_force_base_N / np.linalg.norm(parameters.gravity_force_base_N)
+    if setup.up_in_base is None:
+        if lean.is_other_mounting:
+            code = "mounting_undeclared" if lean.deg > HANGING_DEG else "gravity_tilted"
+            values = {"orders": other_orders(along, setup.up)} if code == "mounting_undeclared" else {}
+            found.append(Finding.of(code, off_deg=lean.deg, direction=along, **values))
+    elif lean.is_other_mounting:
+        orders = other_orders(along, setup.up)
+        found.append(Finding.of("gravity_off_mounting", off_deg=lean.deg, direction=along, orders=orders))
+    elif lean.is_significant:
+        found.append(Finding.of("base_leans", lean_deg=lean.deg, sigma_deg=lean.sigma_deg, side=lean.side))
+    return found
+
+
+def other_orders(gravity_direction_base: Array, up: Array) -> list[str]:
+    """Return the orders of quaternions with which gravity points down, had they been read inverted and in another.
+
+    Such orientations are `U R V` of the true ones with fixed rotations U and V, so they fit as well.
+    """
+    along = {order: -float(up @ U @ gravity_direction_base) for order, U in _OTHER_ORDERS.items()}
+    return [order for order, cosine in along.items() if cosine > np.cos(np.radians(OTHER_MOUNTING_DEG))]
+
+
+_OTHER_ORDERS: Final = {
+    "w, x, y, z": np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]),
+    "x, y, z, w": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+}
+"""From base axes as read to those in which the arm stands, for quaternions that are truly in this order."""
+
+
+def _inside_m(parameters: Parameters, covariance: Array) -> float:
+    """Distance of the centre of mass behind the sensor, towards the robot; 0 if it is not significant.
+
+    Reversed torques put the centre of mass of a tool along the flange axis inside the arm, where no tool is. That of a
+    tool to the side lies beside the arm either way, so farther aside than behind shows nothing.
+    """
+    outwards = parameters.R_flange_sensor[2]  # flange z in the sensor frame
+    inside_m = -float(outwards @ parameters.p_sensor_com_m)
+    aside_m = float(np.linalg.norm(np.cross(outwards, parameters.p_sensor_com_m)))
+    sigma_m = float(np.sqrt(outwards @ covariance[9:12, 9:12] @ outwards))
+    return inside_m if inside_m > max(INSIDE_M, 3 * sigma_m, aside_m) else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Lean:
+    """How far the measured direction of gravity in the base is from an expected one."""
+
+    deg: float
+    sigma_deg: float
+    side: str
+    """The low side of the base, such as "+y"."""
+
+    @property
+    def is_other_mounting(self) -> bool:
+        """Whether it is too large for a lean."""
+        return self.deg > OTHER_MOUNTING_DEG
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether it is larger than its uncertainty and than the accuracy of an arm's own orientation."""
+        return self.deg >= max(LEAN_DEG, _SIGNIFICANT * self.sigma_deg)
+
+    def __str__(self) -> str:
+        return "leans {:.{places}f}° (sigma {:.{places}f}°) towards its {}".format(
+            self.deg, self.sigma_deg, self.side, places=decimals(self.sigma_deg)
+        )
+
+
+def lean_from(down: Array, gravity_force_base_N: Array, covariance: Array) -> Lean:
+    """Compare measured gravity (3,), with its covariance (3, 3), with the expected direction `down` (3,), unit length.
+
+    All in base axes. The side is the axis of the base, or the pair of axes, along which gravity differs.
+    """
+    along_N = float(gravity_force_base_N @ down)
+    aside_N = gravity_force_base_N - along_N * down
+    size_N = float(np.linalg.norm(aside_N))
+    low = aside_N / max(size_N, 1e-12)
+    deg = float(np.degrees(np.arctan2(size_N, along_N)))
+    weight_N = float(np.linalg.norm(gravity_force_base_N))
+    sigma_deg = float(np.degrees(np.sqrt(max(float(low @ covariance @ low), 0.0)) / weight_N))
+    return Lean(deg, sigma_deg, " and ".join(axes_along(low)))
+
+
+def payload(
+    payload_kg: float | None, load_kg: float, sensor_kg: float | None, parameters: Parameters | None = None
+) -> list[Finding]:
+    """Compare the controller's payload with the load of the flange.
+
+    Parameters
+    ----------
+    payload_kg : float, optional
+        As set in the controller.
+    load_kg : float
+        Of the sensor, which cannot weigh itself.
+    sensor_kg : float, optional
+        Mass of sensor and adapter. Where it is unknown the payload may be larger by `SENSOR_KG`.
+    parameters : Parameters, optional
+        Estimated; they show units of torque that belong to those of force.
+    """
+    if payload_kg is None:
+        return []
+    expected_kg, set_kg = payload_kg - (sensor_kg or 0.0), load_kg + (sensor_kg or 0.0)
+    if forces := _units(load_kg, expected_kg):
+        suspects = [(force, "N·m") for force in forces] if parameters is None else units.suspects(parameters, forces)
+        return [Finding.of("payload_units", load_kg=load_kg, expected_kg=expected_kg, units=suspects)]
+    margin_kg = max(PAYLOAD_KG, PAYLOAD_SHARE * set_kg)
+    most_kg = set_kg + (SENSOR_KG if sensor_kg is None else 0.0)
+    if set_kg - margin_kg <= payload_kg <= most_kg + margin_kg:
+        return []
+    values = {"payload_kg": payload_kg, "load_kg": load_kg, "sensor_kg": sensor_kg, "set_kg": set_kg}
+    return [Finding.of("payload_mismatch", **values)]
+
+
+def tool(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float) -> list[Finding]:
+    """Compare mass and centre of mass with the described tool."""
+    return [*_mass(parameters, covariance, setup.tool_mass_kg, g_m_s2), *_centre_of_mass(parameters, covariance, setup)]
+
+
+def _mass(parameters: Parameters, covariance: Array, tool_kg: float | None, g_m_s2: float) -> list[Finding]:
+    weight_N = float(np.linalg.norm(parameters.gravity_force_base_N))
+    along, load_kg = parameters.gravity_force_base_N / (weight_N or 1.0), weight_N / g_m_s2
+    sigma_kg = np.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0)) / g_m_s2
+    if tool_kg is None or abs(load_kg - tool_kg) <= max(TOOL_KG, TOOL_SHARE * tool_kg, _SIGNIFICANT * sigma_kg):
+        return []
+    suspects = units.suspects(parameters, units.by_mass(load_kg, tool_kg, UNIT_SHARE))
+    if not suspects and load_kg < NO_TOOL_SHARE * tool_kg:
+        return [Finding.of("weight_compensated", weight_N=weight_N)]
+    return [Finding.of("tool_mass_mismatch", load_kg=load_kg, tool_kg=tool_kg, units=suspects)]
+
+
+def _units(load_kg: float, true_kg: float) -> list[str]:
+    return units.by_mass(load_kg, true_kg, UNIT_SHARE) if abs(true_kg - load_kg) > UNIT_KG else []
+
+
+def _centre_of_mass(parameters: Parameters, covariance: Array, setup: Setup) -> list[Finding]:
+    """Find a centre of mass outside the described tool.
+
+    A body's centre of mass lies in its convex hull. The distance from that of the cylinders is the largest over all
+    directions of the point's reach beyond the hull's, less margin and sigma in that direction. Without the sensor's
+    height its origin may be anywhere between flange face and tip.
+    """
+    if not setup.cylinders_m:
+        return []
+    height_m = setup.sensor_height_m
+    lowest_m, highest_m = (0.0, max(row[1] for row in setup.cylinders_m)) if height_m is None else (height_m,) * 2
+    R = parameters.R_flange_sensor
+    com_m = R @ parameters.p_sensor_com_m
+    along_z = _DIRECTIONS[:, 2]
+    reach_m = _DIRECTIONS @ com_m + np.minimum(along_z * lowest_m, along_z * highest_m)
+    sigma_m = np.sqrt(np.einsum("ni,ij,nj->n", _DIRECTIONS, R @ covariance[9:12, 9:12] @ R.T, _DIRECTIONS))
+    outside_m = float((reach_m - _reach_m(setup.cylinders_m) - _SIGNIFICANT * sigma_m).max())
+    if outside_m <= COM_MARGIN_M:
+        return []
+    distance_m = float(np.linalg.norm(com_m))
+    return [
+        Finding.of(
+            "com_outside_tool",
+            "reject" if outside_m > SURELY_OUTSIDE_M else "limit",
+            com_mm=1e3 * np.add(com_m, (0.0, 0.0, height_m or 0.0)),
+            origin="sensor" if height_m is None else "flange",
+            outside_mm=1e3 * outside_m,
+            units=units.by_com(distance_m) if distance_m > FAR_COM_M else [],
+        )
+    ]
+
+
+_DIRECTIONS = np.vstack([evenly_spread(2000), np.eye(3), -np.eye(3)])
+"""Neighbours are about 4° apart, so the distance is exact to 0.1 %."""
+
+
+def _reach_m(cylinders_m: Sequence[Sequence[float]]) -> Array:
+    """Return how far the convex hull of cylinders along flange z reaches in each direction."""
+    aside, along_z = np.linalg.norm(_DIRECTIONS[:, :2], axis=1), _DIRECTIONS[:, 2]
+    reaches = []
+    for low, high, diameter, *axis in cylinders_m:
+        ends = np.maximum(along_z * low, along_z * high)
+        reaches.append(ends + aside * diameter / 2 + _DIRECTIONS[:, :2] @ (axis or (0.0, 0.0)))
+    return np.asarray(np.max(reaches, axis=0))
+
+
+# Known values that the data contradict.
+
+SAME_UNIT = 0.04
+"""A ratio this close to that of two units is one."""
+SAME_AXES = 0.1
+"""Entries of a rotation this close to -1, 0 and 1 permute the axes."""
+
+
+def contradictions(
+    known: Known,
+    found: Parameters,
+    covariance: Array,
+    g_m_s2: float,
+    sigmas: float,
+    up_in_base: ArrayLike = UP_IN_BASE,
+) -> list[Finding]:
+    """Name the known values that the data contradict, each with the value from the data.
+
+    Parameters
+    ----------
+    known : Known
+    found : Parameters
+        From a fit without known values.
+    covariance : array, shape (15, 15)
+        Of that fit.
+    g_m_s2 : float
+    sigmas : float
+        Smallest difference to name, in standard deviations.
+    up_in_base : array_like, shape (3,)
+        Where up should be.
+    """
+    contradicted = []
+    weight_N = float(np.linalg.norm(found.gravity_force_base_N))
+    along = found.gravity_force_base_N / (weight_N or 1.0)
+    sigma_N = float(np.sqrt(along @ covariance[3:6, 3:6] @ along))
+    shows_directions = weight_N > sigmas * sigma_N
+    if known.mass_kg is not None:
+        mass_kg, sigma_kg = weight_N / g_m_s2, sigma_N / g_m_s2
+        if abs(mass_kg - known.mass_kg) > sigmas * np.hypot(sigma_kg, known.mass_tolerance_kg):
+            suspects = units.suspects(found, units.by_mass(mass_kg, known.mass_kg, SAME_UNIT))
+            values = {"known_kg": known.mass_kg, "mass_kg": mass_kg, "sigma_kg": sigma_kg, "units": suspects}
+            contradicted.append(Finding.of("known_mass", "limit", **values))
+    if known.gravity_direction_base is not None and shows_directions:
+        direction = np.asarray(known.gravity_direction_base)
+        turn = turn_between(direction, unit_vector(found.gravity_force_base_N))
+        across = np.cross(unit_vector(turn), direction)
+        sigma = float(np.sqrt(across @ covariance[3:6, 3:6] @ across / np.sum(found.gravity_force_base_N**2)))
+        if np.linalg.norm(turn) > sigmas * np.hypot(sigma, known.direction_tolerance_rad):
+            contradicted.append(Finding.of("known_gravity_direction", "limit", **_off(turn, sigma)))
+    if known.R_flange_sensor is not None and shows_directions:
+        turn = Rotation.from_matrix(found.R_flange_sensor @ np.asarray(known.R_flange_sensor).T).as_rotvec()
+        if known.yaw_only:
+            z = np.array([0.0, 0.0, 1.0])
+            turn = turn_between(z, Rotation.from_rotvec(turn).apply(z))
+        axis = unit_vector(turn)
+        sigma = float(np.sqrt(axis @ covariance[:3, :3] @ axis))
+        if np.linalg.norm(turn) > sigmas * np.hypot(sigma, known.R_tolerance_rad):
+            upwards = float(found.gravity_force_base_N @ np.asarray(up_in_base)) > 0  # as mirrored axes read
+            Q = np.asarray(known.R_flange_sensor).T @ found.R_flange_sensor * (-1 if upwards else 1)
+            order = np.round(Q)
+            permuted = np.abs(Q - order).max() <= SAME_AXES and not (order == np.eye(3)).all()
+            corrections = [("wrench", channels(order))] if permuted and not known.yaw_only else []
+            contradicted.append(Finding.of("known_mounting", "limit", **_off(turn, sigma), corrections=corrections))
+    return contradicted
+
+
+def _off(turn_rad: Array, sigma_rad: float) -> dict[str, float]:
+    return {"off_deg": float(np.degrees(np.linalg.norm(turn_rad))), "sigma_deg": float(np.degrees(sigma_rad))}

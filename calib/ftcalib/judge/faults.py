@@ -1,0 +1,331 @@
+"""Mistakes in the data of a bad fit: orientations, pairs, axes, units. Named only if undoing one helps."""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import stdtrit
+
+from ftcalib.findings import Finding
+from ftcalib.judge import units
+from ftcalib.judge.observability import RECOMMENDED_POSES
+from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
+from ftcalib.model import UP_IN_BASE, Array, Parameters, gravity_wrench, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
+
+ROUNDING = 1e-9
+"""Of readings, relative to the largest: what is left at least."""
+READINGS = {
+    "orientations_inverted": "inverted orientations",
+    "quaternion_order": "quaternions in the order ({order})",
+    "euler_angles": "{order} Euler angles",
+}
+EQUAL = 0.1
+"""Scores that differ by less do not decide between two readings of the orientations."""
+COLLAPSE = 0.4
+"""Accept a hypothesis if it reduces the residual to this share."""
+NO_WORSE = 1.2
+"""The other residual may grow by this factor."""
+CORRECTED = 0.1
+"""Forces that a mistake explains leave no more than this share of the weight."""
+IMPLAUSIBLE = 1.0
+"""Penalty of a weight that pulls sideways, and of a tool inside the flange, in the logarithm of the residuals."""
+TIED = 1.3
+"""Residuals that differ by less than this factor are equal: the simpler explanation is taken."""
+OTHER_POSES, OF_A_WEIGHT = 0.03, 0.1
+"""Forces of a weight in other poses than given: large residuals, in shares of the weight, and little of them radial."""
+IN_BASE_RAD = np.deg2rad(10.0)
+"""A constant force that points down this exactly is a weight in base axes."""
+STEADY = 0.05
+"""A force that varies by less than this share of it is constant."""
+FEWEST_SATURATED = 3
+"""Poses with the same extreme reading of a channel."""
+FEWEST_TO_PREDICT = 4
+"""Degrees of freedom of a regression that predicts readings with a noise of its own."""
+UNEQUAL = 0.05
+"""With fewer poses, readings whose fit differs by more than this share of the spread should not be equal."""
+BY_CHANCE = 1e-6
+"""Probability, per reading, of one that is farther from its prediction."""
+CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
+FOR_STEPS = 1000
+"""Poses that show steps of the readings."""
+FEWEST_STEPS = 4
+"""Different readings of a channel that show steps: a weight along each axis reads as -weight, 0 and +weight."""
+COARSE = 0.005
+"""Rounding matters if its standard deviation exceeds this share of the spread."""
+
+
+def rough_fit(R_base_flange: Array, wrench: Array) -> Parameters:
+    """Fit forces alone, then torques to them by linear least squares."""
+    n, force_N, torque_Nm = len(wrench), wrench[:, :3], wrench[:, 3:]
+    best = minima(force_cost(R_base_flange, force_N, np.ones(n)))[0]
+    F_b, F0 = given_rotation(best.R, R_base_flange, force_N, np.ones(n))
+    P, T0 = com_and_torque_bias((F_b @ R_base_flange) @ best.R.T, torque_Nm)
+    return Parameters(best.R.T, F_b, F0, P, T0)
+
+
+def least_rms(R_base_flange: Array, force_N: Array) -> float:
+    """Root mean square force residual (N) that no rotation falls below: that of any (3, 3) matrix of its size."""
+    Q = force_cost(R_base_flange, force_N, np.ones(len(force_N)))
+    return float(np.sqrt(3 * max(np.linalg.eigvalsh(Q)[0], 0.0) / len(force_N)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rough:
+    """A rough fit and what it leaves."""
+
+    parameters: Parameters
+    weight_sensor_N: Array
+    """(n, 3)"""
+    force_rms_N: float
+    torque_rms_Nm: float
+    shares: tuple[float, float]
+    """Residual of the forces relative to the weight, and of the torques relative to their spread."""
+
+    @classmethod
+    def of(cls, R_base_flange: Array, wrench: Array) -> Self:
+        """Fit."""
+        p = rough_fit(R_base_flange, wrench)
+        gravity, torque_Nm = gravity_wrench(p, R_base_flange), wrench[:, 3:]
+        e = wrench - predict(p, R_base_flange)
+        force_rms_N, torque_rms_Nm = (
+            float(np.sqrt(np.mean(np.sum(part**2, axis=1)))) + ROUNDING * float(np.abs(read).max())
+            for part, read in zip(np.hsplit(e, 2), np.hsplit(wrench, 2), strict=True)
+        )
+        weight_N, spread_Nm = _length(p.gravity_force_base_N), _length(torque_Nm.std(axis=0))
+        shares = force_rms_N / (weight_N or 1.0), torque_rms_Nm / (spread_Nm or 1.0)
+        return cls(p, gravity[:, :3], force_rms_N, torque_rms_Nm, shares)
+
+    @property
+    def outwards(self) -> bool:
+        """Whether the centre of mass lies on the tool's side of the sensor."""
+        return bool(self.parameters.p_sensor_com_m @ self.parameters.R_flange_sensor[2] >= 0)
+
+    def score(self, up_in_base: Array) -> float:
+        """Logarithm of the residuals plus the penalty; lower is better.
+
+        Quaternions in another order often fit as well as inverted ones, with another mounting of robot and sensor.
+        """
+        F_b = self.parameters.gravity_force_base_N
+        cosine = -float(F_b @ up_in_base) / (_length(F_b) * _length(up_in_base) or 1.0)
+        implausible = (1 - cosine) / 2 + 0.5 * (not self.outwards)
+        return float(np.log(self.force_rms_N * self.torque_rms_Nm)) + IMPLAUSIBLE * implausible
+
+
+def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:
+    """Find the mistake that explains a bad fit: form of orientations, pairing of wrenches and poses, or axes.
+
+    Reversing all three axes of torque or of force only moves the centre of mass to the other side of the sensor.
+
+    Parameters
+    ----------
+    R_base_flange : array, shape (n, 3, 3)
+        In the order of the poses.
+    wrench : array, shape (n, 6)
+    up_in_base : array_like, shape (3,)
+        Where up should be.
+    """
+    if len(wrench) < RECOMMENDED_POSES + 1:
+        return []
+    if constant := constant_weight(wrench, up_in_base):
+        return constant
+    up = np.asarray(up_in_base, dtype=np.float64)
+    as_read = _Rough.of(R_base_flange, wrench)
+    found = []
+    for code, values, R, y in _readings(R_base_flange, wrench):
+        if code != "columns_swapped" and least_rms(R, y[:, :3]) > COLLAPSE * as_read.force_rms_N:
+            continue
+        trial = _Rough.of(R, y)
+        (force, torque), limit = trial.shares, min(COLLAPSE * as_read.shares[0], CORRECTED)
+        smaller = trial.force_rms_N < COLLAPSE * as_read.force_rms_N or code == "columns_swapped"
+        if smaller and force < limit and torque < NO_WORSE * as_read.shares[1]:
+            found.append((trial.score(up), code, values, trial.force_rms_N))
+    if found:
+        score, code, values, corrected_N = min(found, key=lambda each: each[0])
+        equal = [one for one in found if one[0] < score + EQUAL and one[1] in READINGS]
+        also = [READINGS[name].format(**own) for _, name, own, _ in equal if (name, own) != (code, values)]
+        if code in READINGS:
+            values = {**values, "also": also}
+        return [Finding.of(code, **values, residual_N=as_read.force_rms_N, corrected_N=corrected_N)]
+    return _axes(as_read, wrench[:, 3:], up)
+
+
+def other_poses(R_base_flange: Array, wrench: Array) -> list[Finding]:
+    """Recognise the wrenches of a weight in other poses than given: forces on a sphere, torques that belong to them.
+
+    A sphere does not depend on the orientations, so it also shows an order or a form of them that `faults` cannot undo.
+    """
+    if len(wrench) < RECOMMENDED_POSES + 1:
+        return []
+    as_read, force_N, torque_Nm = _Rough.of(R_base_flange, wrench), wrench[:, :3], wrench[:, 3:]
+    design = np.column_stack([2 * force_N, np.ones(len(force_N))])
+    solution = np.linalg.lstsq(design, np.sum(force_N**2, axis=1))[0]
+    center_N = solution[:3]
+    weight_N = float(np.sqrt(max(float(solution[3] + center_N @ center_N), 0.0)))
+    radial_N = np.linalg.norm(force_N - center_N, axis=1) - weight_N
+    radial_rms_N = float(np.sqrt(np.sum(radial_N**2) / (len(force_N) - len(solution))))
+    torque_rms_Nm = _torque_rms(force_N - center_N, torque_Nm, *com_and_torque_bias(force_N - center_N, torque_Nm))
+    elsewhere = as_read.force_rms_N > OTHER_POSES * weight_N and radial_rms_N < OF_A_WEIGHT * as_read.force_rms_N
+    if not elsewhere or torque_rms_Nm > COLLAPSE * as_read.torque_rms_Nm:
+        return []
+    residual_N = as_read.force_rms_N
+    return [Finding.of("pairing_or_rotations", weight_N=weight_N, radial_N=radial_rms_N, residual_N=residual_N)]
+
+
+def no_weight(R_base_flange: Array, wrench: Array) -> list[Finding]:
+    """Recognise a wrench without weight: compensated already, or zeroed at each pose."""
+    rough = _Rough.of(R_base_flange, wrench)
+    p = rough.parameters
+    return units.too_light(_length(p.gravity_force_base_N), _length(p.p_sensor_com_m), rough.force_rms_N)
+
+
+def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:
+    """Recognise a weight in base axes that was recorded without bias: the force is the same in all poses."""
+    mean, up = wrench[:, :3].mean(axis=0), np.asarray(up_in_base, dtype=np.float64)
+    size_N = float(np.linalg.norm(mean))
+    downwards = float(-mean @ up) > np.cos(IN_BASE_RAD) * size_N * float(np.linalg.norm(up))
+    if not downwards or float(wrench[:, :3].std(axis=0).max()) > STEADY * size_N:
+        return []
+    return [Finding.of("constant_force", force_N=mean)]
+
+
+def _readings(R: Array, wrench: Array) -> Iterator[tuple[str, Mapping[str, Any], Array, Array]]:
+    """Yield each mistake as code and values, with the data as they are without it."""
+    yield "orientations_inverted", {}, np.swapaxes(R, 1, 2), wrench
+    quaternions = Rotation.from_matrix(R).as_quat()
+    yield "columns_swapped", {}, R, np.roll(wrench, 3, axis=1)
+    for read_as, order in (("intrinsic", "extrinsic"), ("extrinsic", "intrinsic")):
+        sequence: dict[str, Literal["XYZ", "xyz"]] = {"intrinsic": "XYZ", "extrinsic": "xyz"}
+        with warnings.catch_warnings():  # gimbal lock: one of the angles is arbitrary
+            warnings.simplefilter("ignore")
+            angles = Rotation.from_matrix(R).as_euler(sequence[read_as])
+        values = {"order": order, "read_as": read_as}
+        yield "euler_angles", values, Rotation.from_euler(sequence[order], angles).as_matrix(), wrench
+    for shift, order, read_as in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
+        values = {"order": order, "read_as": read_as}
+        yield "quaternion_order", values, Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(), wrench
+    in_flange = np.concatenate([np.einsum("nji,nj->ni", R, part) for part in (wrench[:, :3], wrench[:, 3:])], axis=1)
+    yield "wrench_in_base", {}, R, in_flange
+    for side, own, other in (("before", slice(None, -1), slice(1, None)), ("after", slice(1, None), slice(None, -1))):
+        yield "pairing_shifted", {"neighbour": side}, R[own], wrench[other]
+
+
+def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
+    """Find torque axes that disagree with the force axes."""
+    fits = []
+    for Q in SPECIAL_R_flange_base:
+        P, T0 = com_and_torque_bias(as_read.weight_sensor_N, torque_Nm @ Q.T)
+        rms = _torque_rms(as_read.weight_sensor_N, torque_Nm @ Q.T, P, T0)
+        outside = 1.0 if P @ as_read.parameters.R_flange_sensor[2] >= 0 else -1.0  # the tool hangs outside the flange
+        changed = int(np.count_nonzero(np.diag(outside * Q) != 1)) + int(np.count_nonzero(np.diag(Q) == 0))
+        fits.append((rms, changed, outside * Q))
+    least = min(fits, key=lambda fit: fit[0])[0]
+    rms, _, Q = min((fit for fit in fits if fit[0] <= TIED * least), key=lambda fit: fit[1])
+    if rms >= COLLAPSE * as_read.torque_rms_Nm:
+        return []
+    upwards, mirrored = bool(as_read.parameters.gravity_force_base_N @ up > 0), bool(np.linalg.det(Q) < 0)
+    by_force, by_torque = ("force", channels(Q.T)), ("torque", channels(Q))
+    corrections = [by_torque] if mirrored or upwards else [by_torque, by_force]
+    if mirrored and upwards:  # a mirrored force reads like a weight that pulls upwards
+        corrections = [by_force]
+    residual_Nm = as_read.torque_rms_Nm
+    return [Finding.of("axes_disagree", corrections=corrections, residual_Nm=residual_Nm, corrected_Nm=rms)]
+
+
+def channels(Q: Array) -> Sequence[str]:
+    """Name the channels from which the axes of a wrench should be taken, given the signed permutation (3, 3)."""
+    return [("-" if row[k] < 0 else "") + "xyz"[k] for row in Q for k in [int(np.abs(row).argmax())]]
+
+
+def _length(vector: Array) -> float:
+    return float(np.linalg.norm(vector))
+
+
+def _torque_rms(weight_sensor_N: Array, torque_Nm: Array, P: Array, T0: Array) -> float:
+    e = torque_Nm - np.cross(P, weight_sensor_N) - T0
+    return float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) + ROUNDING * float(np.abs(torque_Nm).max())
+
+
+def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
+    """Find channels that do not move, that are coarse or that stop at a limit, and rows that were copied.
+
+    Equal readings count only where the orientations predict different ones.
+    """
+    spread = np.ptp(wrench, axis=0)
+    group = np.repeat([spread[:3].max(), spread[3:].max()], 3)
+    stuck = [name for name, own, all_ in zip(CHANNELS, spread, group, strict=True) if own == 0 < all_]
+    found = [Finding.of("stuck_channels", channels=stuck)] if stuck else []
+    coarse = [_coarse_step(part[:FOR_STEPS]) for part in np.hsplit(wrench, 2)]
+    if any(coarse):
+        return [*found, Finding.of("quantised", step_N=coarse[0], step_Nm=coarse[1])]
+    distinct = len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench)
+    copied = [] if distinct else _copies(wrench)
+    ties = [(k, tied) for k in range(len(CHANNELS)) if spread[k] for tied in _tied(wrench[:, k])]
+    repeated: list[NDArray[np.intp]] = []
+    for rows in copied:
+        same = bool(np.ptp(R_base_flange[rows], axis=0).max() == 0)
+        if same or _unexpected(R_base_flange, wrench, rows, np.flatnonzero(spread)):
+            repeated.append(rows)
+            found.append(Finding.of("repeated_poses" if same else "repeated_wrenches", poses=rows + 1))
+    again = [row for rows in repeated for row in rows[1:]]
+    for k, tied in ties:
+        once = tied[~np.isin(tied, again)]
+        if len(once) >= FEWEST_SATURATED and _unexpected(R_base_flange, wrench, once, np.array([k])):
+            found.append(Finding.of("saturated", channel=CHANNELS[k], poses=once + 1))
+    return found
+
+
+def _tied(readings: Array) -> list[NDArray[np.intp]]:
+    """Return the rows that share the smallest reading, and those that share the largest, where they are enough."""
+    limits = [np.flatnonzero(readings == limit) for limit in (readings.min(), readings.max())]
+    return [rows for rows in limits if len(rows) >= FEWEST_SATURATED]
+
+
+def _unexpected(R_base_flange: Array, wrench: Array, rows: NDArray[np.intp], channels: NDArray[np.intp]) -> bool:
+    """Whether the orientations predict other readings of the channels in `rows` than the equal ones that were read.
+
+    The other poses predict them: each channel is linear in the direction of gravity in flange axes. Rounded readings of
+    poses that share this direction are equal by right: four of the 24 orientations do so on a level base.
+    """
+    others = np.setdiff1d(np.arange(len(wrench)), rows)
+    dof = len(others) - 4
+    if dof < FEWEST_TO_PREDICT:
+        expected = predict(rough_fit(R_base_flange, wrench), R_base_flange[rows])
+        return bool((np.ptp(expected, axis=0) > UNEQUAL * np.ptp(wrench, axis=0))[channels].any())
+    F_b = rough_fit(R_base_flange[others], wrench[others]).gravity_force_base_N
+    design = np.column_stack([F_b @ R_base_flange / (_length(F_b) or 1.0), np.ones(len(wrench))])
+    X = design[others]
+    slope = np.linalg.lstsq(X, wrench[others])[0]
+    squares = np.sum((wrench[others] - X @ slope) ** 2, axis=0).reshape(2, 3).sum(axis=1)
+    noise = np.repeat(np.sqrt(squares / (3 * dof)), 3)  # of force and of torque
+    leverage = np.einsum("ni,ij,nj->n", design[rows], np.linalg.pinv(X.T @ X), design[rows])
+    limit = -stdtrit(3 * dof, BY_CHANCE) * noise * np.sqrt(1 + leverage)[:, None] + _resolution(wrench)
+    return bool((np.abs(design[rows] @ slope - wrench[rows]) > limit)[:, channels].any())
+
+
+def _resolution(wrench: Array) -> Array:
+    """Return the smallest difference of two readings of each channel (6,), as far as it may be that of rounding."""
+    gaps = [np.diff(np.unique(channel)).min(initial=np.inf) for channel in wrench.T]
+    finest, coarsest = ROUNDING * np.abs(wrench).max(axis=0), np.sqrt(12) * COARSE * np.ptp(wrench, axis=0)
+    return np.asarray(np.maximum(np.minimum(gaps, coarsest), finest))
+
+
+def _coarse_step(readings: Array) -> float:
+    """Return the step of which all differences of readings (n, 3) are multiples; 0 without one that matters."""
+    distinct = [np.unique(channel) for channel in readings.T]
+    if max(map(len, distinct)) < FEWEST_STEPS:
+        return 0.0
+    gaps = np.concatenate([np.diff(values) for values in distinct])
+    step, spread = float(gaps.min()), float(np.linalg.norm(readings.std(axis=0)))
+    even = np.abs(gaps / step - np.round(gaps / step)).max() < 1e-6
+    return step if even and step > np.sqrt(12) * COARSE * spread else 0.0
+
+
+def _copies(wrench: Array) -> list[NDArray[np.intp]]:
+    """Return the rows of each wrench that occurs more than once."""
+    _, first, count = np.unique(wrench, axis=0, return_index=True, return_counts=True)
+    return [np.flatnonzero((wrench == wrench[row]).all(axis=1)) for row in np.sort(first[count > 1])]

@@ -1,0 +1,354 @@
+"""What changed during a session: bias, load or mounting from a pose on, or between two sensors that take turns.
+
+Each change competes with drift, inexact orientations, gain and bumped poses: the data without it are fitted again, and
+it is named if their restricted likelihood is clearly larger.
+
+`cable_of` estimates what a cable may have moved.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import fdtrc as f_sf
+
+from ftcalib.findings import CODES, Finding, Severity
+from ftcalib.judge.faults import CORRECTED, rough_fit
+from ftcalib.likelihood.descent import FARTHEST, column_scale
+from ftcalib.likelihood.fit import Fit, fit
+from ftcalib.likelihood.response import response_columns
+from ftcalib.likelihood.session import LEVER_M
+from ftcalib.likelihood.session_noise import summed_products
+from ftcalib.likelihood.variance_components import GAIN, GAIN_OF_RESPONSE, squared_length
+from ftcalib.model import (
+    BIASES,
+    Array,
+    Parameters,
+    angle_between,
+    gravity_wrench,
+    jacobian,
+    nearest_rotation,
+    predict,
+    skew,
+)
+
+FEWEST_POSES = 10
+"""Fewer do not show a change beside 15 parameters."""
+FEWEST_ON_A_SIDE = 3
+"""Poses before and after."""
+MOST_POSES = 300
+"""Of longer sessions every second, third, ... pose is looked at."""
+CLEARLY = 0.5
+"""A change must bring the mean square misfit below this share before the likelihood is asked."""
+MARGIN = 20.0
+"""By which twice the log-likelihood must rise, beside log(6 n) for each number of the change."""
+Rows = NDArray[np.bool_]
+
+TURN, BIAS, COM, LOAD = range(3), range(3, 9), range(10, 13), range(9, 13)
+"""Columns of `_columns`."""
+KINDS = {
+    "bias_stepped": [*BIAS],
+    "com_shifted": [*COM],
+    "load_changed": [*LOAD],
+    "sensor_turned": [*TURN],
+    "sensor_changed": [*TURN, *BIAS],
+}
+"""What changes, by code."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """A change of some rows, relative to the others."""
+
+    code: str
+    rows: Rows
+    """(n,) in the order of time."""
+    values: Mapping[str, float]
+    """Of its finding."""
+    corrected: Array
+    """(n, 6) wrench without it."""
+    misfit: float
+    """Mean square of what it leaves, in noise."""
+    criterion: float
+
+    @property
+    def takes_turns(self) -> bool:
+        """Whether every other pose differs, not all from one on."""
+        return bool(np.count_nonzero(np.diff(self.rows)) > 1)
+
+    @property
+    def first(self) -> int:
+        """The first pose after it."""
+        return int(np.flatnonzero(np.diff(self.rows))[0]) + 1
+
+
+def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma: Array | None) -> list[Finding]:
+    """Find a lasting change, or two sensors that take turns.
+
+    Parameters
+    ----------
+    found : Fit
+        Without known values.
+    order : int array, shape (n,)
+        Rows by time.
+    t_s : array, shape (n,), optional
+    sigma : array, shape (6,), optional
+        Measured noise of a pose.
+    """
+    order = order[:: -(-len(order) // MOST_POSES)]
+    n, R, wrench = len(order), found.R_base_flange[order], found.wrench[order]
+    if n < FEWEST_POSES:
+        return []
+    change = likeliest_change(found.parameters, R, wrench, sigma)
+    times = None if t_s is None else t_s[order]
+    cov = None if sigma is None else np.diag(sigma**2)
+    if change is None or not _is_likelier(change, R, wrench, cov, times):
+        return []
+    code, values = change.code, {"pose": int(order[change.first]) + 1} | dict(change.values)
+    severity: Severity = "reject"
+    if change.takes_turns:
+        code = "sensors_alternate"
+    elif code == "bias_stepped" or not (found.weights[order[: change.first]] > 0.5).any():  # the load as it is now
+        severity = "limit"
+    needed = CODES[code].values
+    return [Finding.of(code, severity, **{name: value for name, value in values.items() if name in needed})]
+
+
+def _is_likelier(change: Change, R: Array, wrench: Array, cov: Array | None, t_s: Array | None) -> bool:
+    without = fit(R, change.corrected, cov, t_s=t_s)
+    weight_N = _length(without.parameters.gravity_force_base_N)
+    if np.sqrt(np.mean(np.sum(without.residuals[without.weights > 0.5, :3] ** 2, axis=1))) > CORRECTED * weight_N:
+        return False
+    as_read = fit(R, wrench, cov, t_s=t_s)
+    costs = len(KINDS[change.code]) * np.log(wrench.size) + 2 * np.log(len(wrench)) + MARGIN
+    return bool(minus_two_log_likelihood(without) + costs < minus_two_log_likelihood(as_read))
+
+
+def minus_two_log_likelihood(found: Fit) -> float:
+    """Restricted, with what its components and its rejected poses cost."""
+    information = found.free.T @ found.information @ found.free
+    value = found.noise.logdet + float(np.linalg.slogdet(information)[1]) + found.chi2
+    value += sum(2 * (GAIN_OF_RESPONSE if name in ("gain", "cross_talk") else GAIN) for name in found.components)
+    rejected = found.weights < 0.5
+    if rejected.any():
+        S = found.left_out_cov[rejected]
+        far = np.maximum(squared_length(found.left_out_residuals[rejected], S), FARTHEST)
+        value += float(np.linalg.slogdet(S)[1].sum() + np.sum(FARTHEST + 6 * np.log(far / FARTHEST)))
+    return value
+
+
+def likeliest_change(parameters: Parameters, R: Array, wrench: Array, sigma: Array | None = None) -> Change | None:
+    """Find the change that leaves the least; None if it does not leave much less than none, or a steady drift.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Estimated from all poses.
+    R : array, shape (n, 3, 3)
+        In the order of time, as the wrench.
+    wrench : array, shape (n, 6)
+    sigma : array, shape (6,), optional
+        Measured noise of a pose.
+    """
+    n = len(wrench)
+    scale = np.repeat([1.0, LEVER_M], 3) if sigma is None else sigma
+    ramp = np.linspace(-1, 1, n)[:, None, None] * np.eye(6)
+    J = np.concatenate([jacobian(parameters, R), response_columns(parameters, R)], axis=2)
+    residuals = wrench - predict(parameters, R)
+    without = min(_least(J, residuals, scale)[0], _least(np.concatenate([J, ramp], axis=2), residuals, scale)[0])
+
+    best: dict[str, tuple[float, Parameters, Rows]] = {}
+    for pure, groups in _groups(n):
+        start = parameters if pure is None else rough_fit(R[pure], wrench[pure])
+        for code, misfits in _misfits(start, R, wrench, scale, groups).items():
+            k = int(np.argmin(misfits))
+            if code not in best or misfits[k] < best[code][0]:
+                best[code] = misfits[k], start, groups[k]
+    changes = [_refined(code, start, R, wrench, scale, rows) for code, (_, start, rows) in best.items()]
+    change = min(changes, key=lambda one: one.criterion)
+    return change if change.misfit < CLEARLY * without else None
+
+
+def _groups(n: int) -> Iterator[tuple[slice | None, NDArray[np.bool_]]]:
+    """Yield rows that may be of one kind, all if None, and the groups of others that may differ from them."""
+    after = np.arange(n) >= np.arange(FEWEST_ON_A_SIDE, n - FEWEST_ON_A_SIDE + 1)[:, None]
+    half = n // 2
+    yield None, after
+    yield slice(0, half), after[~after[:, :half].any(axis=1)]
+    yield slice(half, n), ~after[after[:, half:].all(axis=1)]
+    yield slice(0, n, 2), np.arange(n)[None] % 2 == 1
+
+
+def _misfits(p: Parameters, R: Array, wrench: Array, scale: Array, groups: NDArray[np.bool_]) -> dict[str, Array]:
+    """Squared misfit (k,) of each kind of change of each group (k, n), in closed form; the parameters stay."""
+    y, g, C = (wrench - p.bias) / scale, gravity_wrench(p, R) / scale, _columns(p, R) / scale[:, None]
+    d, count = y - g, groups.sum(axis=1)[:, None, None]
+
+    def sums(of_rows: Array) -> Array:
+        return np.asarray(np.tensordot(groups.astype(np.float64), of_rows, 1))
+
+    def explained(X: Array) -> Array:
+        moment, gram = sums(np.einsum("ncj,nc->nj", X, d)), sums(np.einsum("ncj,nck->njk", X, X))
+        return np.asarray(np.einsum("kj,kji,ki->k", moment, np.linalg.pinv(gram, hermitian=True), moment))
+
+    def turned(cross: Array, square: Array) -> Array:
+        """Leave what the best rotation does (Kabsch 1976)."""
+        s = np.linalg.svd(cross, compute_uv=False)
+        return np.asarray(square - 2 * (s[:, 0] + s[:, 1] + np.sign(np.linalg.det(cross)) * s[:, 2]))
+
+    own = sums((d**2).sum(axis=1))
+    others = (d**2).sum() - own
+    parts = y.reshape(-1, 2, 3), g.reshape(-1, 2, 3)
+    cross, square = sums(np.einsum("npi,npj->nij", *parts)), sums((y**2 + g**2).sum(axis=1))
+    of_y, of_g = (np.tensordot(groups.astype(np.float64), part, 1) for part in parts)
+    means = np.einsum("kpi,kpj->kij", of_y, of_g) / count, ((of_y**2 + of_g**2) / count).sum(axis=(1, 2))
+    linear = {code: others + own - explained(C[..., own_]) for code, own_ in KINDS.items() if 0 not in own_}
+    return {
+        **linear,
+        "sensor_turned": others + turned(cross, square),
+        "sensor_changed": others + turned(cross - means[0], square - means[1]),
+    }
+
+
+def _refined(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, rows: Rows) -> Change:
+    """Undo the change of some rows, and improve it together with all parameters by linear least squares."""
+    y, g, own = wrench - p.bias, gravity_wrench(p, R), KINDS[code]
+    undone, turn, step = y.copy(), np.eye(3), np.zeros(6)
+    if code in ("sensor_turned", "sensor_changed"):
+        mean_y, mean_g = (x[rows].mean(axis=0) if code == "sensor_changed" else np.zeros(6) for x in (y, g))
+        parts = (((x[rows] - mean) / scale).reshape(-1, 2, 3) for x, mean in ((y, mean_y), (g, mean_g)))
+        turn = nearest_rotation(np.einsum("npi,npj->ij", *parts))
+        step = mean_y - _turned(mean_g, turn)[0]
+        undone[rows] = _turned(y[rows] - step, turn.T)
+    C = _columns(p, R)[..., own] * rows[:, None, None]
+    misfit, x = _least(np.concatenate([C, jacobian(p, R), response_columns(p, R)], axis=2), undone - g, scale)
+    moved = np.zeros(13)
+    moved[own] = x[: len(own)]
+    step += moved[BIAS]
+    values = {
+        "turn_deg": float(np.degrees(angle_between(turn, np.eye(3)))),
+        "force_N": _length(step[:3]),
+        "torque_Nm": _length(step[3:]),
+        "change_N": float(moved[9] if rows[-1] else -moved[9]),
+        "shift_mm": 1e3 * _length(moved[COM]),
+    }
+    criterion = wrench.size * np.log(max(misfit, 1e-300)) + len(own) * np.log(wrench.size)
+    return Change(code, rows, values, undone - C @ x[: len(own)] + p.bias, misfit, float(criterion))
+
+
+def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
+    """Mean square of what the columns J (n, 6, m) leave, for each degree of freedom, and their coefficients."""
+    J, r = J / scale[:, None], residuals / scale
+    gram = summed_products(J, J)
+    unit = column_scale(gram)
+    moment = np.tensordot(r, J, ([0, 1], [0, 1])) / unit
+    x = np.linalg.pinv(gram / np.outer(unit, unit), rcond=1e-12, hermitian=True) @ moment
+    left = float(np.sum(r**2) - moment @ x)
+    return max(left, 0.0) / max(r.size - len(x), 1), x / unit
+
+
+def _columns(p: Parameters, R: Array) -> Array:
+    """(n, 6, 13) derivative by a turn of the sensor, both biases, weight and centre of mass."""
+    J, g = jacobian(p, R), gravity_wrench(p, R)
+    down = p.gravity_force_base_N / (_length(p.gravity_force_base_N) or 1.0)
+    turn = -np.concatenate([skew(g[:, :3]), skew(g[:, 3:])], axis=1)
+    bias = np.broadcast_to(np.eye(6), (len(R), 6, 6))
+    return np.concatenate([turn, bias, (J[..., 3:6] @ down)[..., None], J[..., 9:12]], axis=2)
+
+
+def _turned(wrench: Array, turn: Array) -> Array:
+    return np.asarray((wrench.reshape(-1, 2, 3) @ turn.T).reshape(-1, 6))
+
+
+def _length(vector: Array) -> float:
+    return float(np.linalg.norm(vector))
+
+
+# A cable that acts as a spring: how far its torque may have moved mounting, weight and centre of mass.
+#
+#     torque_Nm = K v,    v = rotation vector of an orientation relative to the one in which the cable is slack
+#
+# Over orientations within a cone such a torque looks like a shift of the centre of mass, and its rest like white noise.
+# Where there is such noise, the stiffness K (3, 3) is estimated beside the parameters. These move (the bias of an
+# omitted variable), and their reported sigma allows for this. Compensation does not need it: the cable pulls in the
+# next use too.
+
+FALSE = 1e-3, 1e-4
+"""Probability of a chance finding: slack at the mean orientation, and at the best of about 70."""
+FALSE_IN_NOISE = 0.05
+"""The same where the torques have more noise than was measured: its cause is unknown, and a cable is a usual one."""
+FEWEST, MOST = 8, 1000
+"""Poses: fewer leave nothing for a test. More are seldom of a tour."""
+STIFFNESS, SLACK = 9, 3
+"""Numbers that are estimated."""
+STARTS = 24
+STEPS_RAD = np.deg2rad([40.0, 20.0, 10.0])
+_AROUND = np.array([v for v in product((-1.0, 0.0, 1.0), repeat=3) if np.abs(v).sum() in (1, 3)])
+_AROUND /= np.linalg.norm(_AROUND, axis=1, keepdims=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cable:
+    """What a cable may do to a calibration."""
+
+    torque_Nm: float
+    """Root mean square over the poses."""
+    shift: Array
+    """(15,) of the estimated parameters, in error coordinates; zero for the biases, which belong to the cell."""
+
+
+def cable_of(fit: Fit) -> Cable | None:
+    """Look for the torque of a spring in what a fit leaves; None if chance explains it."""
+    n = len(fit.order)
+    dof = fit.dof - STIFFNESS - SLACK
+    if not FEWEST <= n <= MOST or dof < 1:
+        return None
+    R = fit.R_base_flange[fit.order]
+    J, r = jacobian(fit.parameters, R), fit.wrench[fit.order] - predict(fit.parameters, R)
+    WX = fit.noise.solve(np.concatenate([J, r[..., None]], axis=2))
+    WJ, C = WX[..., :15], fit.given_noise
+    u = WX[..., 15] - WJ @ (C @ summed_products(J, WX[..., 15:])[:, 0])
+    chi2 = float(np.vdot(r, u))
+
+    def best_of(slack: Array) -> tuple[float, Array, Array, Array]:
+        """Of orientations (k, 3, 3) with a slack cable: what chi2 falls by, orientation, torques, moved parameters."""
+        k = len(slack)
+        v = Rotation.from_matrix((np.swapaxes(slack, 1, 2)[:, None] @ R).reshape(-1, 3, 3)).as_rotvec()
+        each = np.zeros((n, 6, k, 3, 3))
+        for axis in range(3):
+            each[:, 3 + axis, :, axis] = v.reshape(k, n, 3).swapaxes(0, 1)
+        X = each.reshape(n, 6, 9 * k)
+        rows, g = X.reshape(6 * n, k, 9), summed_products(X, u[..., None])[:, 0].reshape(k, 9)
+        H = np.einsum("rka,rkb->kab", rows, fit.noise.solve(X).reshape(rows.shape), optimize=True)
+        between = summed_products(WJ, X).reshape(15, k, 9).swapaxes(0, 1)
+        H -= np.swapaxes(between, 1, 2) @ C @ between
+        scale = np.sqrt(np.maximum(np.einsum("kaa->ka", H), 1e-300))
+        # Turns about one axis alone leave a part of the stiffness open.
+        H = np.asarray(H / scale[:, :, None] / scale[:, None] + 1e-6 * np.eye(9))
+        stiffness = np.linalg.solve(H, (g / scale)[..., None])[..., 0] / scale
+        gain = np.sum(g * stiffness, axis=1)
+        i = int(np.argmax(gain))
+        return float(gain[i]), slack[i], rows[:, i] @ stiffness[i], C @ between[i] @ stiffness[i]
+
+    def probability(gain: float, numbers: int) -> float:
+        rest = fit.dof - numbers
+        return float(f_sf(numbers, rest, gain / numbers / (max(chi2 - gain, 1e-12 * chi2) / rest)))
+
+    best = best_of(nearest_rotation(R.sum(axis=0))[None])
+    sure = probability(best[0], STIFFNESS) < FALSE[0]
+    measured = bool(np.isfinite(fit.measured_chi2))
+    noisy = measured and any(name.startswith("white_t") for name in fit.components)
+    if not sure and (noisy or not measured):
+        best = max(best, best_of(R[:: max(1, n // STARTS)]), key=lambda found: found[0])
+        for angle_rad in STEPS_RAD:
+            near = best[1] @ Rotation.from_rotvec(angle_rad * _AROUND).as_matrix()
+            best = max(best, best_of(near), key=lambda found: found[0])
+        sure = probability(best[0], STIFFNESS + SLACK) < (FALSE_IN_NOISE if noisy else FALSE[1])
+    if not sure:
+        return None
+    shift = best[3].copy()
+    shift[BIASES] = 0.0
+    return Cable(float(np.sqrt(np.sum(best[2] ** 2) / n)), shift)

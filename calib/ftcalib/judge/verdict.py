@@ -1,0 +1,453 @@
+"""All findings about a fit, which give its verdict: how well it predicts, and whether it is plausible."""
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc as chi2_sf
+from scipy.special import chdtri as chi2_isf
+from scipy.special import ndtr as normal_cdf
+
+from ftcalib.data.dwell_mean import RESOLUTION
+from ftcalib.findings import Finding, Severity, Verdict, ordered, verdict_of
+from ftcalib.judge import described_cell, units
+from ftcalib.judge.cross_validation import AssessedFit, DriftAhead, drift_ahead, standardized
+from ftcalib.judge.described_cell import contradictions
+from ftcalib.judge.faults import COLLAPSE, ROUNDING, broken_channels, constant_weight, faults, other_poses
+from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
+from ftcalib.judge.session_change import Cable, cable_of, session_change
+from ftcalib.known import NOTHING, Known, Setup
+from ftcalib.likelihood.fit import DriftEstimate, Fit
+from ftcalib.likelihood.response import Response, predicted_covariance
+from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters
+from ftcalib.published.yu import SPECIAL_R_flange_base
+
+SIGNIFICANT_SIGMAS = 5.0
+NOISE_FACTOR = 3.0
+USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
+SENSELESS_SHARE = 0.5
+"""If residuals reach half the weight, neither gravity nor centre of mass mean anything."""
+NOISY_SHARE = 0.01
+"""Largest error of a good result whose residuals exceed the measured noise."""
+USUAL_LEVER_M = 0.1
+"""Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther."""
+CORRELATED = 0.9
+FEW_LEFT_OUT = 0.1
+ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
+"""Poses that show a fault as clearly as all of them, in runs long enough to show a wrong pairing."""
+SURE = 1e-3
+"""Probability of a false reason."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quality:
+    """The judgement on a fit."""
+
+    findings: tuple[Finding, ...]
+    """The first one to be fixed first; notes come last."""
+    chi2_p: float | None
+    """Probability of a larger chi2 if there is only the measured noise; None if the noise was not measured."""
+    noise_factor: float | None
+    """Residuals over measured noise; None if the noise was not measured."""
+    loo_force_rms_N: float
+    """Cross-validated: root mean square error of predicting each used pose from all others."""
+    loo_torque_rms_Nm: float
+    next_use_force_rms_N: float
+    """Of compensating a free tool a minute after the last pose: from noise alone if it explains the residuals, else
+    cross-validated; and the drift from the mean of the tour to then."""
+    next_use_torque_rms_Nm: float
+    ahead: DriftAhead
+    """That drift."""
+    worst_pose: int
+    """Row of the used pose with the largest cross-validated residual."""
+    residual_sigma: Array
+    """(n,) cross-validated residual of each pose in sigma, root mean square over the channels: 1 expected."""
+    lag1: float
+    """Correlation of the residuals of successive used poses; near 0 without drift."""
+    correlations: tuple[tuple[str, str, float], ...]
+    """Pairs of parameters that are correlated by more than 0.9, strongest first."""
+    cable: Cable | None
+    """None: the readings show none."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """That of the worst finding."""
+        return verdict_of(self.findings)
+
+
+def judge(
+    fit: AssessedFit,
+    *,
+    t_s: Array | None = None,
+    measured_sigma: Array | None = None,
+    setup: Setup = NOTHING,
+    known: Known | None = None,
+    unconstrained: AssessedFit | None = None,
+    g_m_s2: float = STANDARD_GRAVITY_M_S2,
+) -> Quality:
+    """Judge a fit.
+
+    Errors count relative to the weight, torques at a lever: the residual, the cross-validated error, which few poses
+    cannot make look small, and the error expected over all orientations. Residuals up to three times the measured noise
+    are good if the errors stay below 1 %, because orientations and cables always add to the noise of a good sensor.
+
+    Parameters
+    ----------
+    fit : AssessedFit
+    t_s : array, shape (n,), optional
+        When each pose was measured; the order of rows counts if it is missing or not finite.
+    measured_sigma : array, shape (6,), optional
+        Measured noise of a pose. With it, a load that shifted during the tour is detected.
+    setup : Setup
+        The described cell.
+    known : Known, optional
+        That `fit` used.
+    unconstrained : AssessedFit, optional
+        The best fit to the same poses without known values, if `fit` used some.
+    g_m_s2 : float
+    """
+    at = _statistics(fit, t_s)
+    parameters, weight_N = fit.parameters, at.weight_N
+    few_rejected = at.used.sum() >= (1 - FEW_LEFT_OUT) * len(at.used)
+    suspect = at.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
+    broken = [] if at.is_exact else broken_channels(fit.wrench, fit.R_base_flange)
+    mistakes = _mistakes(fit, at.used, t_s, setup) if suspect else []
+    changed = [] if mistakes else _change(unconstrained or fit, at, measured_sigma, t_s)
+    if suspect and not (mistakes or changed):
+        mistakes = _other_poses(fit, at.used, t_s)
+    explained = at.is_exact or at.fits_measured_noise or mistakes or changed
+    cable = cable_of(fit) if isinstance(fit, Fit) and not explained else None
+    contradicted: list[Finding] = []
+    if known is not None and unconstrained is not None:
+        at_its_best = unconstrained.parameters, unconstrained.covariance
+        contradicted = contradictions(known, *at_its_best, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
+
+    found = [
+        *broken,
+        *mistakes,
+        *changed,
+        *at.errors,
+        *_weight(fit, weight_N, setup),
+        *_second_solution(fit),
+        *units.implausible(parameters, _rms(fit.residuals[at.used, :3]), described=bool(setup.cylinders_m)),
+        *([] if contradicted or at.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
+        *_noise(fit, at),
+        *_poses(fit, at, "note" if few_rejected else "limit"),
+        *_drift(fit.drift, at.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
+        *_response(fit.response, weight_N),
+        *_cable(cable),
+    ]
+    payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
+    if not mistakes and at.largest_share < SENSELESS_SHARE:
+        found += described_cell.directions(parameters, fit.covariance, setup)
+        found += [one for one in payload if one.code == "payload_units" and not broken]
+    if verdict_of(found) != "rejected":  # its contradictions would be consequences
+        found += [one for one in payload if one not in found]
+        found += described_cell.tool(parameters, fit.covariance, setup, g_m_s2)
+    if not (broken or mistakes or at.fits_measured_noise):
+        harmless = verdict_of(found) == "good"
+        found += [replace(one, severity="note") if harmless else one for one in contradicted]
+    return Quality(
+        findings=ordered(found),
+        chi2_p=at.chi2_p,
+        noise_factor=at.noise_factor,
+        loo_force_rms_N=at.loo_force_rms_N,
+        loo_torque_rms_Nm=at.loo_torque_rms_Nm,
+        next_use_force_rms_N=float(at.next_use_rms[0]),
+        next_use_torque_rms_Nm=float(at.next_use_rms[1]),
+        ahead=at.ahead,
+        worst_pose=at.worst_pose,
+        residual_sigma=at.residual_sigma,
+        lag1=at.lag1,
+        correlations=strong_correlations(fit.covariance),
+        cable=cable,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Statistics:
+    """The numbers that the findings rest on; those with the names of `Quality` have its meaning."""
+
+    used: NDArray[np.bool_]
+    is_exact: bool
+    """Whether no sensor resolves the residuals, as in simulated data. Equal readings are no copies then."""
+    weight_N: float
+    residual_sigma: Array
+    worst_pose: int
+    lag1: float
+    lag1_p: float
+    """Probability of a larger correlation by chance."""
+    largest_share: float
+    """Largest error relative to the weight."""
+    errors: list[Finding]
+    """Of force and torque, if they are too large."""
+    loo_force_rms_N: float
+    loo_torque_rms_Nm: float
+    expected_rms: Array
+    """(2,) from noise alone, over all orientations."""
+    ahead: DriftAhead
+    noise_factor: float | None
+    chi2_p: float | None
+
+    @property
+    def fits_measured_noise(self) -> bool:
+        return self.chi2_p is not None and self.chi2_p >= SURE
+
+    @property
+    def next_use_rms(self) -> Array:
+        """(2,) N, N·m."""
+        left_out = np.array([self.loo_force_rms_N, self.loo_torque_rms_Nm])
+        error = self.expected_rms if self.fits_measured_noise else left_out
+        return np.asarray(np.sqrt(error**2 + self.ahead.square.reshape(2, 3).sum(axis=1)))
+
+
+def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
+    used = fit.weights > 0.5
+    weight_N = float(np.linalg.norm(fit.parameters.gravity_force_base_N))
+    residuals = standardized(fit.left_out_residuals, fit.left_out_cov)
+    residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
+    largest_share, errors, left_out_rms = _errors(fit, used, weight_N)
+    measured = bool(np.isfinite(fit.measured_chi2))
+    rest, largest = (np.abs(x[used]).max(axis=0) for x in (fit.residuals, fit.wrench))
+    return _Statistics(
+        used,
+        bool((rest <= np.maximum(RESOLUTION, ROUNDING * np.repeat(largest.reshape(2, 3).max(axis=1), 3))).all()),
+        weight_N,
+        residual_sigma,
+        int(np.argmax(np.where(used, residual_sigma, -1.0))),
+        *successive_correlation(residuals[used], None if t_s is None else t_s[used]),
+        largest_share,
+        errors,
+        *left_out_rms,
+        np.array(expected_error(fit.parameters, fit.covariance, fit.response)),
+        drift_ahead(fit, t_s),
+        noise_factor=float(np.sqrt(fit.measured_chi2 / fit.dof)) if measured else None,
+        chi2_p=float(chi2_sf(fit.dof, fit.measured_chi2)) if measured else None,
+    )
+
+
+def _mistakes(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, setup: Setup) -> list[Finding]:
+    """Look for mistakes in all poses, or of many in evenly spread runs, and if there are none, in the used poses.
+
+    A wrong pose or two were rejected; only the used poses show whether most of them are wrong.
+    """
+    order = _some_runs(t_s, len(used))
+    found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
+    order = order[used[order]]
+    if not found and not used.all():
+        found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
+    return found
+
+
+def _other_poses(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None) -> list[Finding]:
+    order = _some_runs(t_s, len(used))
+    order = order[used[order]]
+    return other_poses(fit.R_base_flange[order], fit.wrench[order])
+
+
+def _some_runs(t_s: Array | None, n: int) -> NDArray[np.intp]:
+    """Rows by time: all, or of many poses evenly spread runs."""
+    order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
+    return np.asarray(order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0])
+
+
+def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:
+    """Correlation of the residuals of successive poses, and the probability of a larger one by chance.
+
+    Parameters
+    ----------
+    standardized : array, shape (n, 6)
+        Residuals with unit variance.
+    t_s : array, shape (n,), optional
+        Order of the poses; rows in order if missing or not finite.
+    """
+    if t_s is not None and np.isfinite(t_s).all():
+        standardized = standardized[np.argsort(t_s, kind="stable")]
+    products = np.einsum("ni,ni->n", standardized[:-1], standardized[1:])
+    correlation = float(products.mean() / (np.mean(standardized**2) * 6 or 1.0))
+    return correlation, float(normal_cdf(-correlation * np.sqrt(6 * len(products))))
+
+
+def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[tuple[str, str, float], ...]:
+    """Name the pairs of parameters whose estimates are correlated by more than `least`, strongest first."""
+    sigma = np.sqrt(np.diag(covariance))
+    sigma[sigma == 0] = 1.0  # exactly known
+    correlation = covariance / np.outer(sigma, sigma)
+    pairs = [(float(correlation[i, j]), i, j) for i, j in combinations(range(len(sigma)), 2)]
+    strong = sorted((pair for pair in pairs if abs(pair[0]) > least), key=lambda pair: -abs(pair[0]))
+    return tuple((PARAMETER_NAMES[i], PARAMETER_NAMES[j], value) for value, i, j in strong)
+
+
+def expected_error(parameters: Parameters, covariance: Array, response: Response | None = None) -> tuple[float, float]:
+    """Root mean square error of the predicted wrench over all orientations, N and N·m.
+
+    It is of second degree in the orientation, so its mean over the rotations of the cube is the mean over all.
+    """
+    over = predicted_covariance(parameters, covariance, response, np.swapaxes(SPECIAL_R_flange_base, 1, 2))
+    variance = np.diagonal(over, axis1=1, axis2=2).mean(axis=0)
+    return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
+
+
+def _errors(
+    fit: AssessedFit, used: NDArray[np.bool_], weight_N: float
+) -> tuple[float, list[Finding], tuple[float, float]]:
+    """Return the largest error relative to the weight, errors that are too large, and the cross-validated rms.
+
+    Of residual, cross-validated and expected error the first is named that exceeds the highest limit.
+    """
+    lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
+    left_out = _rms(fit.left_out_residuals[used, :3]), _rms(fit.left_out_residuals[used, 3:])
+    expected = expected_error(fit.parameters, fit.covariance, fit.response)
+    largest, found = 0.0, []
+    for k, scale, unit in ((0, weight_N, "N"), (1, weight_N * lever_m, "Nm")):
+        errors = (
+            ("residuals", _rms(fit.residuals[used, 3 * k : 3 * k + 3])),
+            ("cross-validation", left_out[k]),
+            ("uncertainty over all orientations", expected[k]),
+        )
+        limits = [sum(error > limit * scale for limit in (USABLE_SHARE, REJECTED_SHARE)) for _, error in errors]
+        source, error = errors[int(np.argmax(limits))] if max(limits) else max(errors, key=lambda pair: pair[1])
+        share = error / scale if scale else float("inf")
+        largest = max(largest, share)
+        if share > USABLE_SHARE:
+            severity: Severity = "reject" if share > REJECTED_SHARE else "limit"
+            limit_percent = 100 * (REJECTED_SHARE if severity == "reject" else USABLE_SHARE)
+            values = {f"error_{unit}": error, "share_percent": 100 * share, "limit_percent": limit_percent}
+            code = ("force_error", "torque_error")[k]
+            found.append(Finding.of(code, severity, source=source, **values, **({"lever_m": lever_m} if k else {})))
+    return largest, found, left_out
+
+
+def _weight(fit: AssessedFit, weight_N: float, setup: Setup) -> list[Finding]:
+    along = fit.parameters.gravity_force_base_N / (weight_N or 1.0)
+    variance = float(along @ fit.covariance[3:6, 3:6] @ along)
+    sigma_N = np.sqrt(max(variance, 0.0))  # below 0 only by rounding, if the weight is exactly known
+    if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
+        return []
+    if given_in_base := constant_weight(fit.wrench, setup.up):
+        return given_in_base
+    values = {"weight_N": weight_N, "sigma_N": sigma_N, "least_sigmas": SIGNIFICANT_SIGMAS}
+    return [Finding.of("weight_insignificant", **values)]
+
+
+def _second_solution(fit: AssessedFit) -> list[Finding]:
+    if fit.second_basin_chi2 is None:
+        return []
+    delta = fit.second_basin_chi2 / max(1.0, fit.chi2 / fit.dof)
+    if delta >= ACCEPTED_DELTA_CHI2:
+        return []
+    return [Finding.of("second_solution", probability_percent=100 * wrong_basin_probability(max(delta, 0.0)))]
+
+
+def _misfit_of_known_values(fit: AssessedFit, unconstrained: AssessedFit | None) -> list[Finding]:
+    if unconstrained is None:
+        return []
+    used = unconstrained.weights > 0.5
+    return [
+        Finding.of(f"known_values_misfit_{kind}", **{f"residual_{unit}": ours, f"free_{unit}": best})
+        for kind, unit, columns in (("force", "N", slice(0, 3)), ("torque", "Nm", slice(3, 6)))
+        for ours, best in [(_rms(fit.residuals[used, columns]), _rms(unconstrained.residuals[used, columns]))]
+        if best < COLLAPSE * ours
+    ][:1]
+
+
+def _noise(fit: AssessedFit, at: _Statistics) -> list[Finding]:
+    if at.chi2_p is None or at.noise_factor is None:
+        return [Finding.of("noise_unknown")]
+    if at.fits_measured_noise:
+        return []
+    minor = at.noise_factor <= NOISE_FACTOR and at.largest_share <= NOISY_SHARE
+    components = {name: value for name, value in fit.components.items() if value > 0}
+    return [Finding.of("noise_exceeded", "note" if minor else "limit", factor=at.noise_factor, components=components)]
+
+
+def _poses(fit: AssessedFit, at: _Statistics, severity_of_rejected: Severity) -> list[Finding]:
+    """Name poses that were rejected, that nothing checks, or that deviate most, and drift from pose to pose."""
+    found, n = list[Finding](), int(at.used.sum())
+    if not at.used.all():
+        rows = np.flatnonzero(~at.used) + 1
+        values = {"count": len(rows), "n_poses": len(at.used), "poses": rows}
+        found.append(Finding.of("poses_rejected", severity_of_rejected, **values))
+    if n < RECOMMENDED_POSES:
+        found.append(Finding.of("few_poses", n_poses=n, recommended=RECOMMENDED_POSES))
+    uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > at.weight_N**2
+    rows = np.flatnonzero(uncertain & at.used) + 1
+    if 0 < rows.size <= n / 2:
+        found.append(Finding.of("poses_unchecked", poses=rows))
+    if at.is_exact:
+        return found
+    if at.lag1_p < SURE:
+        found.append(Finding.of("residuals_alike", correlation=at.lag1))
+    worst, typical = float(at.residual_sigma[at.worst_pose]), float(np.median(at.residual_sigma[at.used] ** 2))
+    if n >= RECOMMENDED_POSES and worst**2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
+        found.append(Finding.of("pose_deviates", pose=at.worst_pose + 1, sigmas=worst))
+    return found
+
+
+def _drift(drift: DriftEstimate | None, ahead: DriftAhead, weight_N: float, *, is_cause: bool) -> list[Finding]:
+    """Name a significant drift, 0 where it is not.
+
+    It limits the result if it is no consequence, and large from the first pose to the last or up to the next use.
+    """
+    if drift is None:
+        return []
+    force_N, torque_Nm = (float(np.linalg.norm(drift.change[part])) for part in (slice(0, 3), slice(3, 6)))
+    size_N = max(force_N, torque_Nm / USUAL_LEVER_M)
+    channels = np.abs(drift.change) > np.maximum(3 * drift.sigma, RESOLUTION)
+    significant = np.array([channels[:3].any(), channels[3:].any()])
+    if not significant.any():
+        return []
+    next_N, next_Nm = np.sqrt(ahead.square.reshape(2, 3).sum(axis=1))
+    matters = is_cause and max(size_N, next_N, next_Nm / USUAL_LEVER_M) > USABLE_SHARE * weight_N
+    values = {"force_N": force_N * significant[0], "torque_Nm": torque_Nm * significant[1]}
+    return [Finding.of("drift", "limit" if matters else "note", **values)]
+
+
+def _response(response: Response | None, weight_N: float) -> list[Finding]:
+    """Name the axes along which the sensor reads high or low, and how much force leaks into torque."""
+    if response is None:
+        return []
+    gain, cross_talk, sigma = response.force_gain, response.cross_talk_m, response.sigma
+    certain = np.abs(gain) > 3 * sigma["force_gain"]
+    certain &= (sigma["force_gain"] > 0) & (np.abs(gain) * weight_N > RESOLUTION[0])
+    found = [Finding.of(f"gain_{axis}", gain_percent=100 * gain[k, k]) for k, axis in enumerate("xyz") if certain[k, k]]
+    found += [
+        Finding.of("axes_mixed", axes=f"{'xyz'[i]} and {'xyz'[j]}", share_percent=100 * abs(gain[i, j]))
+        for i, j in combinations(range(3), 2)
+        if certain[i, j]
+    ]
+    if (np.abs(cross_talk) > 3 * sigma["cross_talk_m"]).any():
+        found.append(Finding.of("cross_talk", torque_mNm=1e3 * np.abs(cross_talk).max()))
+    return found or [Finding.of("response_small")]
+
+
+def _cable(cable: Cable | None) -> list[Finding]:
+    """Name the torque of a cable, and what it may have done to the centre of mass."""
+    if cable is None:
+        return []
+    shift_mm = 1e3 * float(np.linalg.norm(cable.shift[9:12]))
+    return [Finding.of("cable_spring", torque_Nm=cable.torque_Nm, shift_mm=shift_mm)]
+
+
+def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
+    """Rows of poses that were rejected, or that the others predict badly."""
+    typical = max(float(np.median(residual_sigma[used] ** 2)), 1.0)
+    limit = chi2_isf(6, SURE / len(residual_sigma)) / 6 * typical
+    return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
+
+
+def _change(fit: AssessedFit, at: _Statistics, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
+    """Name a lasting change, where the fit needs what could hide one: drift, more noise, or poses left out."""
+    kinds = ("walk", "slope") if at.chi2_p is None else ("walk", "slope", "white")
+    hides = any(name.startswith(kinds) for name in fit.components)
+    if not isinstance(fit, Fit) or not (at.errors or hides or not at.used.all()):
+        return []
+    if t_s is None or not np.isfinite(t_s).all():
+        t_s = np.arange(len(fit.wrench), dtype=np.float64)
+    return session_change(fit, np.argsort(t_s, kind="stable"), t_s, measured_sigma)
+
+
+def _rms(vectors: Array) -> float:
+    """Root mean square of the lengths of (n, 3) vectors."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))

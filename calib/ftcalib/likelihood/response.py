@@ -1,0 +1,182 @@
+"""How a sensor of inexact calibration responds: a gain of the force, and cross-talk from force to torque.
+
+    force_N = (1 + force_gain) u + force_bias_N        torque_Nm = p x u + cross_talk_m u + torque_bias_Nm
+
+with u the weight in the sensor frame. Both matrices are symmetric, and the gain has no trace: together with mounting,
+weight and centre of mass they describe every linear response to one payload. A gain common to all axes cannot be
+separated from the weight.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ftcalib.files import JSON
+from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, read_only
+
+LEVER_M = 0.05
+"""Cross-talk counts relative to a force at this lever."""
+
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+def _symmetric(i: int, j: int) -> Array:
+    matrix = np.zeros((3, 3))
+    matrix[i, j] = matrix[j, i] = 1.0
+    return matrix
+
+
+_MIXED = [_symmetric(i, j) for i, j in _PAIRS]
+GAIN = np.array([np.diag([1.0, -1, 0]) / np.sqrt(2), np.diag([1.0, 1, -2]) / np.sqrt(6), *_MIXED])
+"""(5, 3, 3) basis of the gain: equal and independent coefficients make the entries so."""
+CROSS_TALK_M = LEVER_M * np.array([*(_symmetric(i, i) for i in range(3)), *_MIXED])
+"""(6, 3, 3) basis of the cross-talk, m."""
+SIZE = len(GAIN) + len(CROSS_TALK_M)
+
+_ENTRIES = np.array([1, 1, 2, 2, 2]) / 5, np.array([1, 1, 1, 2, 2, 2]) / 6
+"""Weights of the squared coefficients whose sum is the variance of one entry, if all nine are independent: the
+symmetric part of two entries has half their variance."""
+_FROM_5, _FROM_6 = 5 / 3, 6 / 4
+"""By which a variance that five or six numbers determine is too small: that of Student's distribution."""
+COMMON_GAIN = float(np.sqrt(_FROM_5 / 3))
+"""Sigma of the mean of three gains over that of one."""
+
+
+def response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
+    """Give the derivative (..., 6, 11) of the wrench by the coefficients of gain and cross-talk."""
+    u = gravity_wrench(parameters, R_base_flange)[..., :3]
+    T = np.zeros((*u.shape[:-1], 6, SIZE))
+    T[..., :3, :5] = np.einsum("kij,...j->...ik", GAIN, u)
+    T[..., 3:, 5:] = np.einsum("kij,...j->...ik", CROSS_TALK_M, u)
+    return T
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Response:
+    """Gain and cross-talk as estimated; what was not looked for, or not found, is zero. Arrays are read-only."""
+
+    coefficients: Array
+    """(11,) of the bases `GAIN` and `CROSS_TALK_M`."""
+    covariance: Array
+    """(26, 26) of the 15 error coordinates of the parameters and of the coefficients."""
+
+    def __post_init__(self) -> None:
+        for name, shape in (("coefficients", (SIZE,)), ("covariance", (15 + SIZE, 15 + SIZE))):
+            value = read_only(getattr(self, name))
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"the response's {name} must be {shape} finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+
+    @property
+    def force_gain(self) -> Array:
+        """(3, 3) symmetric, without trace: read minus true force, over the true force."""
+        return np.asarray(np.tensordot(self.coefficients[:5], GAIN, 1))
+
+    @property
+    def cross_talk_m(self) -> Array:
+        """(3, 3) symmetric: torque read for a force, N·m/N."""
+        return np.asarray(np.tensordot(self.coefficients[5:], CROSS_TALK_M, 1))
+
+    @property
+    def sigma(self) -> dict[str, Array]:
+        """One standard deviation (3, 3) of each entry of both matrices, by their names."""
+        C = self.covariance[15:, 15:]
+        return {
+            name: np.sqrt(np.maximum(np.einsum("kij,kl,lij->ij", basis, C[own, own], basis), 0.0))
+            for name, basis, own in (("force_gain", GAIN, slice(5)), ("cross_talk_m", CROSS_TALK_M, slice(5, None)))
+        }
+
+    @property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the entries of the whole gain, of which the symmetric part without trace shows."""
+        return float(np.sqrt(_ENTRIES[0] @ self._squares[:5]))
+
+    @property
+    def cross_talk_sigma_m(self) -> float:
+        """The same of the cross-talk, N·m/N."""
+        return LEVER_M * float(np.sqrt(_ENTRIES[1] @ self._squares[5:]))
+
+    @property
+    def _squares(self) -> Array:
+        return np.asarray(self.coefficients**2 + np.diag(self.covariance)[15:])
+
+    def wrench(self, parameters: Parameters, R_base_flange: Array) -> Array:
+        """Give what gain and cross-talk add (..., 6) to the wrench of the weight."""
+        return np.asarray(response_columns(parameters, R_base_flange) @ self.coefficients)
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Give what a calibration file holds of it; reading takes `coefficients` and `covariance`."""
+        return {
+            "force_gain": self.force_gain.tolist(),
+            "cross_talk_m": self.cross_talk_m.tolist(),
+            "sigma": {name: value.tolist() for name, value in self.sigma.items()},
+            "coefficients": self.coefficients.tolist(),
+            "covariance": self.covariance.tolist(),
+        }
+
+
+def hidden_covariance(parameters: Parameters, gain_sigma: float, cross_talk_sigma_m: float) -> Array:
+    """Covariance (15, 15) of what gain and cross-talk hide in mounting, weight and centre of mass.
+
+    An antisymmetric gain is a rotation, an antisymmetric cross-talk a shift of the centre of mass, and a gain common to
+    all axes a weight, with a centre of mass that is as much nearer. No orientation reveals them, and the prediction of
+    the wrench does not need them. They are as large as what does show.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    gain_sigma, cross_talk_sigma_m : float
+        Standard deviation of the entries of both matrices, from 5 and 6 numbers.
+    """
+    hidden, common = np.zeros((15, 15)), np.zeros(15)
+    common[3:6], common[9:12] = parameters.gravity_force_base_N, -parameters.p_sensor_com_m
+    hidden[range(3), range(3)] = _FROM_5 * gain_sigma**2 / 2
+    hidden[range(9, 12), range(9, 12)] = _FROM_6 * cross_talk_sigma_m**2 / 2
+    return np.asarray(hidden + (COMMON_GAIN * gain_sigma) ** 2 * np.outer(common, common))
+
+
+def predicted_covariance(
+    parameters: Parameters, covariance: Array, response: Response | None, R_base_flange: Array
+) -> Array:
+    """Covariance (..., 6, 6) of the predicted wrench that the uncertainty of all estimates causes.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    covariance : array, shape (15, 15)
+    response : Response or None
+    R_base_flange : array, shape (..., 3, 3)
+    """
+    J = jacobian(parameters, R_base_flange)
+    if response is not None:
+        J, covariance = np.concatenate([J, response_columns(parameters, R_base_flange)], axis=-1), response.covariance
+    return np.asarray(J @ covariance @ np.swapaxes(J, -1, -2))
+
+
+# How a sensor with hysteresis reads: each axis lags behind by a share of its last swing.
+# Reading i is wrench i less a share of its step, wrench i minus wrench i - 1.
+#
+# Six shares, one for each axis, have one variance. Where the arm came from before the first pose is unknown, so that
+# pose is off by a share of a usual swing. Compensation knows no swing: hysteresis is part of the noise of a reading.
+
+FEW = 1000
+"""More poses need no allowance for the first."""
+
+
+def hysteresis_columns(parameters: Parameters, R_base_flange: Array) -> Array:
+    """Give the derivative (n, 6, 12) of the wrench by the shares, and by those of the swing to the first pose.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    R_base_flange : array, shape (n, 3, 3)
+        In the order of measuring. More than 1000 poses have only the first 6 columns.
+    """
+    wrench = gravity_wrench(parameters, R_base_flange)
+    n, axis = len(wrench), range(6)
+    columns = np.zeros((n, 6, 12 if n <= FEW else 6))
+    swing = np.diff(wrench, axis=0)
+    columns[1:, axis, axis] = -swing
+    if n <= FEW:
+        columns[0, axis, range(6, 12)] = np.sqrt(np.mean(swing**2, axis=0))
+    return columns

@@ -1,0 +1,104 @@
+"""The change of the bias in a verification: right in simulation, with both of its sigmas."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationDataset, Parameters, solve
+from ftcalib.after.expected_readings import BiasChange, Expected, bias_change
+from ftcalib.after.state import Update
+from ftcalib.after.verification import verify
+from ftcalib.model import Array, predict
+
+SIGMA = np.repeat([0.05, 0.002], 3) / np.sqrt(200)
+TRUTH = Parameters(
+    Rotation.from_euler("zx", [20, 3], degrees=True).as_matrix(),
+    np.array([0.2, -0.1, -11.76]),
+    np.array([3.0, -2.0, 5.0]),
+    np.array([0.01, -0.005, 0.07]),
+    np.array([0.1, 0.2, -0.1]),
+)
+CHANGE = np.array([0.1, -0.02, 0.0, 0.001, 0.0, -0.003])
+CHANGED = replace(TRUTH, force_bias_N=TRUTH.force_bias_N + CHANGE[:3], torque_bias_Nm=TRUTH.torque_bias_Nm + CHANGE[3:])
+
+
+def orientations(n: int, seed: int) -> Array:
+    return np.asarray(Rotation.random(n, rng=np.random.default_rng(seed)).as_matrix())
+
+
+def covariance_of_a_calibration() -> Array:
+    R = orientations(24, 1)
+    wrench = predict(TRUTH, R) + np.random.default_rng(1).normal(size=(24, 6)) * SIGMA
+    noise = np.tile(np.diag(SIGMA**2), (24, 1, 1))
+    return solve(CalibrationDataset(R, wrench, noise, np.zeros(24, np.int64), np.full(24, np.nan))).covariance
+
+
+def simulated(verifications: int, calibrations: int) -> list[list[BiasChange]]:
+    """Verify each of several calibrations several times, with six poses whose noise differs."""
+    rng, covariance = np.random.default_rng(2), covariance_of_a_calibration()
+    R, each = orientations(6, 3), np.outer([1.0, 1.0, 3.0, 1.0, 0.5, 2.0], SIGMA)
+    noise = np.asarray(block_diag(*(np.diag(row**2) for row in each)))
+    found = []
+    for _ in range(calibrations):
+        parameters = TRUTH.moved(rng.multivariate_normal(np.zeros(15), covariance))
+        expected = Expected(Update(parameters, covariance, 0.0, 0), noise, np.inf)
+        wrenches = predict(CHANGED, R) + each * rng.normal(size=(verifications, 6, 6))
+        found.append([bias_change(expected, R, wrench) for wrench in wrenches])
+    return found
+
+
+@pytest.mark.slow
+def test_both_sigmas_are_those_of_a_simulation() -> None:
+    """Verifications of one calibration scatter by `sigma`, their means by `calibration_sigma`."""
+    found = simulated(20, 100)
+    values = np.array([[one.value for one in series] for series in found])
+    one = found[0][0]
+    within = (values - values.mean(axis=1, keepdims=True)) / one.sigma
+    assert np.abs((within**2).sum(axis=(0, 1)) / (100 * 19) - 1).max() < 6 * np.sqrt(2 / (100 * 19))
+    means = (values.mean(axis=1) - CHANGE) / np.hypot(one.calibration_sigma, one.sigma / np.sqrt(20))
+    assert np.abs(np.sum(means**2, axis=0) / 100 - 1).max() < 6 * np.sqrt(2 / 100)
+    assert np.abs(means.mean(axis=0)).max() < 6 / np.sqrt(100)
+
+
+def test_a_pose_with_more_noise_counts_less() -> None:
+    """The plain mean of six poses, one of them with three times the noise, would have a larger sigma."""
+    one = simulated(1, 1)[0][0]
+    plain = np.sqrt(np.mean(np.square([1.0, 1.0, 3.0, 1.0, 0.5, 2.0])) / 6) * SIGMA
+    assert (one.sigma < 0.8 * plain).all()
+
+
+def test_a_verification_has_it_whether_it_passes_or_not() -> None:
+    R, new = orientations(24, 1), orientations(6, 4)
+    rng, noise = np.random.default_rng(5), np.diag(SIGMA**2)
+    dataset = CalibrationDataset(
+        R,
+        predict(TRUTH, R) + rng.normal(size=(24, 6)) * SIGMA,
+        np.tile(noise, (24, 1, 1)),
+        np.zeros(24, np.int64),
+        np.full(24, np.nan),
+    )
+    calibration = solve(dataset)
+    for truth, change in ((TRUTH, np.zeros(6)), (CHANGED, CHANGE)):
+        wrench = predict(truth, new) + rng.normal(size=(6, 6)) * SIGMA
+        found = verify(calibration, new, wrench, np.tile(noise, (6, 1, 1)), fitted=dataset)
+        assert found.passed == (truth is TRUTH)
+        one = found.bias_change
+        assert np.abs((one.value - change) / np.hypot(one.sigma, one.calibration_sigma)).max() < 5
+        # Six poses have at most a factor of two over independent averages, and the calibration has 24 of them.
+        assert (one.sigma > SIGMA / np.sqrt(6) / 2).all()
+        assert (one.sigma < 2 * SIGMA / np.sqrt(6)).all()
+        assert (one.calibration_sigma < one.sigma).all()
+        assert found.to_dict()["bias_change"]["value"] == one.value.tolist()
+
+
+def test_a_channel_without_any_noise_has_a_change_too() -> None:
+    """As of a coarse sensor whose samples are all equal."""
+    noise = np.asarray(block_diag(*(np.diag(np.r_[0.0, SIGMA[1:] ** 2]) for _ in range(6))))
+    R = orientations(6, 3)
+    expected = Expected(Update(TRUTH, covariance_of_a_calibration(), 0.0, 0), noise, np.inf)
+    one = bias_change(expected, R, predict(CHANGED, R))
+    np.testing.assert_allclose(one.value, CHANGE, atol=1e-9)
+    assert np.isfinite([one.sigma, one.calibration_sigma]).all()

@@ -1,0 +1,171 @@
+"""A new tool from four poses, and runs with a moved bias as one fit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationDataset, CalibrationResult, solve
+from ftcalib.after.new_tool import new_tool, together
+from ftcalib.data.dataset import pooled_covariance
+from ftcalib.errors import NotObservable
+from ftcalib.likelihood.response import Response
+from ftcalib.model import Array, Parameters, predict
+from tests.first_order import assert_same, propagated
+from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, calibrated
+
+OTHER = replace(
+    TRUTH,
+    gravity_force_base_N=0.6 * TRUTH.gravity_force_base_N,
+    force_bias_N=TRUTH.force_bias_N + np.array([0.4, -0.3, 0.6]),
+    p_sensor_com_m=np.array([-0.02, 0.01, 0.11]),
+    torque_bias_Nm=TRUTH.torque_bias_Nm + np.array([0.01, 0.0, -0.02]),
+)
+_TETRAHEDRON = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3)
+FOUR = np.array([Rotation.align_vectors([[0, 0, -1.0]], [down])[0].as_matrix() for down in _TETRAHEDRON])
+"""Gravity points evenly in all directions of the flange."""
+
+
+def poses(truth: Parameters, R: Array, seed: int, longer: float = 1.0) -> CalibrationDataset:
+    sigma = NOISE / 20 / np.sqrt(longer)
+    wrench = predict(truth, R) + sigma * np.random.default_rng(seed).normal(size=(len(R), 6))
+    covariance = np.tile(np.diag(sigma**2), (len(R), 1, 1))
+    return CalibrationDataset(R, wrench, covariance, np.zeros(len(R), np.int64), np.full(len(R), np.nan))
+
+
+def error(result: CalibrationResult, truth: Parameters) -> Array:
+    return result.parameters.difference(truth)
+
+
+def test_sigmas_of_a_new_tool_hold_and_its_parent_is_named() -> None:
+    z2 = []
+    for seed in range(24):
+        earlier = calibrated(24, seed % 12)
+        result = new_tool(earlier, poses(OTHER, FOUR, seed))
+        e = error(result, OTHER)
+        z2.append(e @ np.linalg.solve(result.covariance, e) / 15)
+        assert result.provenance["parent"] == {"id": earlier.id}
+    assert 0.7 < np.mean(z2) < 1.35  # 5 sigma of the mean of 24
+    assert result.verdict == "good"
+    assert CalibrationResult.from_dict(result.to_dict()).id == result.id
+
+
+def test_a_turned_sensor_and_a_leaning_base_are_named() -> None:
+    turn = Rotation.from_rotvec([0.0, 0.0, 1.0], degrees=True).as_matrix()
+    with pytest.raises(NotObservable, match=r"the sensor is mounted otherwise.*, by (0.9|1|1.1)"):
+        new_tool(calibrated(), poses(replace(OTHER, R_flange_sensor=turn @ TRUTH.R_flange_sensor), FOUR, 1))
+    lean = Rotation.from_rotvec([2.0, 0.0, 0.0], degrees=True).as_matrix()
+    with pytest.raises(NotObservable, match="the base leans otherwise"):
+        new_tool(calibrated(), poses(replace(OTHER, gravity_force_base_N=lean @ OTHER.gravity_force_base_N), FOUR, 1))
+    touched = poses(OTHER, FOUR, 1)
+    wrench = touched.wrench.copy()
+    wrench[1] += [3.0, -2.0, 1.0, 0.3, 0.0, 0.2]
+    with pytest.raises(NotObservable, match=r"check for contact|otherwise"):
+        new_tool(calibrated(), replace(touched, wrench=wrench))
+
+
+def test_poses_without_noise_are_refused() -> None:
+    with pytest.raises(NotObservable, match="noise of the poses was not measured"):
+        new_tool(calibrated(), CalibrationDataset.of(FOUR, predict(OTHER, FOUR)))
+
+
+def test_two_days_with_a_moved_bias_are_one_fit() -> None:
+    z2, sizes = [], []
+    R = Rotation.random(16, rng=np.random.default_rng(5)).as_matrix()
+    moved = replace(TRUTH, force_bias_N=TRUTH.force_bias_N + 2.0, torque_bias_Nm=TRUTH.torque_bias_Nm - 0.05)
+    for seed in range(5):
+        days = [solve(poses(TRUTH, R[:8], 2 * seed)), solve(poses(moved, R[8:], 2 * seed + 1))]
+        both = together(days)
+        e = error(both, moved)
+        z2.append(e @ np.linalg.solve(both.covariance, e) / 15)
+        sizes.append(both.sigma["mass_kg"])
+        assert np.diag(both.covariance)[0] < min(np.diag(one.covariance)[0] for one in days)
+    assert 0.6 < np.mean(z2) < 1.5
+    other = replace(moved, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.002, 0, 0]))
+    with pytest.raises(NotObservable, match="contradict each other"):
+        together([solve(poses(TRUTH, R[:8], 1)), solve(poses(other, R[8:], 2))])
+
+
+@pytest.mark.parametrize("gain", [False, True])
+def test_the_covariance_of_a_new_tool_is_that_of_first_order(gain: bool) -> None:
+    """Of readings, and of mounting, base and gain of the earlier result."""
+    earlier = calibrated(8)
+    root = np.diag(np.repeat([3e-3, 0.03, 0.02, 1e-3, 1e-3], 3)) @ (
+        np.eye(15) + 0.3 * np.random.default_rng(7).normal(size=(15, 15))
+    )
+    C = root @ root.T
+    response = None
+    if gain:
+        C = np.pad(C, (0, 11))
+        C[range(15, 26), range(15, 26)] = 3e-3**2
+        C[0, 15] = C[15, 0] = 0.5 * 3e-3 * np.sqrt(C[0, 0])
+        response = Response(1e-3 * np.random.default_rng(8).normal(size=11), C)
+    earlier = replace(earlier, covariance=C[:15, :15], response=response)
+    R = FOUR
+    p = earlier.parameters
+    now = replace(OTHER, R_flange_sensor=p.R_flange_sensor, gravity_force_base_N=0.6 * p.gravity_force_base_N)
+    y = predict(now, R) if response is None else predict(now, R) + response.wrench(now, R)
+    dataset = replace(poses(now, R, 0), wrench=y)
+    assert dataset.wrench_cov is not None
+    noise = block_diag(*pooled_covariance(dataset.wrench_cov, dataset.n_samples))
+
+    def solved(e: Array, shift: Array) -> Array:
+        other = None if response is None else Response(response.coefficients + e[15:], C)
+        moved = replace(earlier, parameters=p.moved(e[:15]), response=other)
+        new = new_tool(moved, replace(dataset, wrench=y + shift.reshape(4, 6)))
+        extra = np.zeros(0) if new.response is None else new.response.coefficients
+        return np.concatenate([now.difference(new.parameters), extra])
+
+    found = new_tool(earlier, dataset)
+    expected = propagated(lambda e: solved(e, np.zeros(24)), C) + propagated(
+        lambda e: solved(np.zeros(len(C)), e), noise
+    )
+    assert_same(
+        found.covariance if found.response is None else found.response.covariance, expected, 0.03 if gain else 5e-3
+    )
+
+
+def test_the_covariance_of_runs_together_is_that_of_first_order() -> None:
+    rng = np.random.default_rng(11)
+    runs = []
+    for k in range(3):
+        root = np.diag(np.repeat([3e-3, 0.03, 0.02, 1e-3, 1e-3], 3)) @ (np.eye(15) + 0.4 * rng.normal(size=(15, 15)))
+        bias = replace(TRUTH, force_bias_N=TRUTH.force_bias_N + k)
+        runs.append(replace(calibrated(8), parameters=bias, covariance=root @ root.T))
+
+    def joined(k: int, e: Array) -> Array:
+        moved = [replace(one, parameters=one.parameters.moved(e)) if i == k else one for i, one in enumerate(runs)]
+        return np.asarray(runs[-1].parameters.difference(together(moved).parameters))
+
+    found = together(runs)
+    np.testing.assert_allclose(runs[-1].parameters.difference(found.parameters), 0, atol=1e-12)
+    assert (found.provenance["between_chi2"], found.provenance["between_dof"]) == (pytest.approx(0), 18)
+    expected = sum(propagated(lambda e, k=k: joined(k, e), runs[k].covariance) for k in range(3))  # type: ignore[misc]
+    assert_same(found.covariance, np.asarray(expected))
+    shifted = runs[0].parameters.moved(0.5 * np.sqrt(np.diag(runs[0].covariance)))
+    off = runs[0].parameters.difference(shifted)[[0, 1, 2, 3, 4, 5, 9, 10, 11]]
+    two = [replace(runs[0], parameters=shifted), replace(runs[0], parameters=runs[0].parameters)]
+    shared = np.ix_([0, 1, 2, 3, 4, 5, 9, 10, 11], [0, 1, 2, 3, 4, 5, 9, 10, 11])
+    chi2 = off @ np.linalg.solve(2 * runs[0].covariance[shared], off)  # of a difference
+    assert together(two).provenance["between_chi2"] == pytest.approx(chi2)
+
+
+def test_runs_that_cannot_be_joined_are_refused() -> None:
+    one = calibrated(8)
+    with_gain = replace(one, response=Response(np.zeros(11), np.eye(26)))
+    with pytest.raises(NotObservable, match="a run shows gain or cross-talk"):
+        together([one, with_gain])
+    covariance = one.covariance.copy()
+    covariance[0], covariance[:, 0] = 0.0, 0.0
+    with pytest.raises(NotObservable, match="takes a value as exactly known"):
+        together([one, replace(one, covariance=covariance)])
+
+
+def test_poses_that_do_not_show_a_tool_are_refused() -> None:
+    with pytest.raises(NotObservable, match="do not determine the tool"):
+        new_tool(calibrated(), poses(OTHER, np.tile(FOUR[:1], (4, 1, 1)), 0))
+    nothing = replace(OTHER, gravity_force_base_N=1e-4 * TRUTH.gravity_force_base_N)
+    with pytest.raises(NotObservable, match=r"the weight of the tool is .* N, sigma"):
+        new_tool(calibrated(), poses(nothing, FOUR, 0))

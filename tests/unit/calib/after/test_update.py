@@ -1,0 +1,298 @@
+"""Another payload and a new tare on an old calibration: exact without noise, honest with it, refused when needed."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, solve
+from ftcalib.after.state import BLOCKS, Update, reestimate, tare, updated
+from ftcalib.likelihood.response import Response, response_columns
+from ftcalib.model import Array, jacobian, predict
+from tests.first_order import assert_same, propagated
+
+NOISE = np.diag(np.repeat([0.05**2, (0.025 * 0.05) ** 2], 3))
+
+
+def truth(weight_N: float = 20.0, seed: int = 0) -> Parameters:
+    rng = np.random.default_rng(seed)
+    gravity = weight_N * Rotation.from_euler("xy", [2, -1], degrees=True).apply([0, 0, -1])
+    R = Rotation.from_euler("z", 30, degrees=True).as_matrix()
+    return Parameters(R, gravity, rng.normal(size=3) * 5, np.array([0.02, -0.01, 0.077]), rng.normal(size=3))
+
+
+def calibration(parameters: Parameters, n: int = 24, seed: int = 1) -> Update:
+    """A calibration from n poses with the noise above: the truth, moved by an error of its covariance."""
+    rng = np.random.default_rng(seed)
+    J = jacobian(parameters, Rotation.random(n, rng=rng).as_matrix())
+    covariance = np.linalg.inv(np.einsum("nki,kl,nlj->ij", J, np.linalg.inv(NOISE), J))
+    return Update(parameters.moved(rng.multivariate_normal(np.zeros(15), covariance)), covariance, 0.0, 0)
+
+
+def exact(parameters: Parameters) -> Update:
+    return Update(parameters, np.zeros((15, 15)), 0.0, 0)
+
+
+def tilted(*degrees: float) -> Array:
+    return np.array([Rotation.from_euler("x", 180 + d, degrees=True).as_matrix() for d in degrees])
+
+
+def loaded(parameters: Parameters) -> Parameters:
+    """The same sensor with 40 % more payload somewhere else."""
+    return Parameters(
+        parameters.R_flange_sensor,
+        1.4 * parameters.gravity_force_base_N,
+        parameters.force_bias_N,
+        np.array([0.03, 0.04, 0.06]),
+        parameters.torque_bias_Nm,
+    )
+
+
+def noise_of(n: int) -> Array:
+    return np.tile(NOISE, (n, 1, 1))
+
+
+def joint(n: int) -> Array:
+    """Covariance of n poses together."""
+    return np.asarray(np.kron(np.eye(n), NOISE))
+
+
+def dwell(parameters: Parameters, R_base_flange: Array, rng: np.random.Generator, n: int = 200) -> Array:
+    noise = rng.multivariate_normal(np.zeros(6), NOISE, size=n)
+    return np.asarray(predict(parameters, R_base_flange) + noise)
+
+
+def test_no_payload_and_a_reversed_sign_are_rejected() -> None:
+    R, old = tilted(0, 60), truth()
+    bare = Parameters(old.R_flange_sensor, np.zeros(3), old.force_bias_N, np.zeros(3), old.torque_bias_Nm)
+    with pytest.raises(NotObservable, match="uncertainty"):
+        reestimate(exact(old), R, predict(bare, R), joint(2), "payload")
+    with pytest.raises(NotObservable, match="check the sign"):
+        reestimate(exact(old), R, 2 * predict(bare, R) - predict(old, R), joint(2), "payload")
+    with pytest.raises(NotObservable, match="direction of gravity is unknown"):
+        reestimate(exact(bare), R, predict(old, R), joint(2), "payload")
+
+
+def test_updates_can_be_chained_and_keep_what_is_not_updated() -> None:
+    start = calibration(truth())
+    rng = np.random.default_rng(3)
+    R = tilted(0, 60)
+    payload = reestimate(start, R, predict(loaded(truth()), R), joint(2), "payload")
+    both = tare(payload, R[:1], [dwell(loaded(truth()), R[0], rng)])
+    np.testing.assert_array_equal(both.parameters.R_flange_sensor, start.parameters.R_flange_sensor)
+    np.testing.assert_array_equal(both.parameters.p_sensor_com_m, payload.parameters.p_sensor_com_m)
+    np.testing.assert_allclose(both.covariance[:3, :3], start.covariance[:3, :3], rtol=1e-12)
+    assert np.linalg.eigvalsh(both.covariance).min() > 0
+
+
+def test_a_solved_calibration_can_be_updated() -> None:
+    rng = np.random.default_rng(11)
+    R = Rotation.random(12, rng=rng).as_matrix()
+    wrench = predict(truth(), R) + rng.multivariate_normal(np.zeros(6), NOISE, size=12)
+    result = solve(CalibrationDataset(R, wrench, noise_of(12), np.zeros(12, np.int64), np.full(12, np.nan)))
+    new = loaded(truth())
+    update = reestimate(result, tilted(0, 60), predict(new, tilted(0, 60)), joint(2), "payload")
+    error = new.difference(update.parameters)
+    assert error @ np.linalg.solve(update.covariance, error) < 40
+    assert tare(result, R[:1], [dwell(truth(), R[0], rng)]).covariance.shape == (15, 15)
+
+
+def drifted(parameters: Parameters, force_N: Array, torque_Nm: Array) -> Parameters:
+    return parameters.moved(np.concatenate([np.zeros(6), force_N, np.zeros(3), torque_Nm]))
+
+
+def test_a_tare_takes_up_drift_in_any_pose() -> None:
+    rng = np.random.default_rng(4)
+    now = drifted(truth(), np.array([0.5, -0.8, 2.0]), np.array([0.01, 0.02, -0.02]))
+    R = tilted(77)
+    update = tare(exact(truth()), R, [dwell(now, R[0], rng)])
+    assert update.dof == 0
+    np.testing.assert_allclose(update.parameters.force_bias_N, now.force_bias_N, atol=5 * 0.05 / np.sqrt(200))
+    np.testing.assert_allclose(update.parameters.torque_bias_Nm, now.torque_bias_Nm, atol=5 * 0.00125 / np.sqrt(200))
+
+
+def test_the_covariance_of_a_tare_covers_noise_and_the_old_errors() -> None:
+    rng = np.random.default_rng(5)
+    R = tilted(20, 70)
+    for n in (1, 2):
+        distances = []
+        for seed in range(30):
+            update = tare(calibration(truth(), seed=seed), R[:n], [dwell(truth(), R[i], rng, 40) for i in range(n)])
+            error = truth().difference(update.parameters)
+            distances.append(error @ np.linalg.solve(update.covariance, error))
+        assert np.mean(distances) == pytest.approx(15, rel=0.2)  # covariances of 40 samples are themselves uncertain
+
+
+def test_a_tare_makes_the_tared_pose_more_certain_than_others() -> None:
+    """What the weight adds wrongly is the same in the tared pose and taken off with the bias."""
+    start = calibration(truth(), n=6)
+    R = tilted(10, 170)
+    update = tare(start, R[:1], [dwell(truth(), R[0], np.random.default_rng(6), 2000)])
+    J = jacobian(update.parameters, R)
+    here, there = np.trace(J @ update.covariance @ np.swapaxes(J, 1, 2), axis1=1, axis2=2)
+    assert here < 0.1 * there
+
+
+@pytest.mark.parametrize("push", [[0, 0, 8, 0, 0, 0], [5, 5, 0, 0, 0, 0], [0, 0, 0, 0, 0.2, 0]])
+def test_a_tare_under_load_is_rejected(push: list[float]) -> None:
+    R = tilted(30)
+    reading = dwell(truth(), R[0], np.random.default_rng(7)) + push
+    with pytest.raises(BadDataset, match="more than drift explains"):
+        tare(exact(truth()), R, [reading])
+
+
+def test_a_tare_while_the_reading_moves_is_rejected() -> None:
+    R = tilted(30, 60)
+    still, moving = (dwell(truth(), R[i], np.random.default_rng(8 + i)) for i in range(2))
+    moving[:, 0] += np.linspace(0, 0.2, len(moving))
+    with pytest.raises(BadDataset, match="pose 2: the reading changes"):
+        tare(exact(truth()), R, [still, moving])
+
+
+def test_a_tare_with_another_payload_is_rejected_though_every_pose_could_be_drift() -> None:
+    heavier = truth().moved(np.concatenate([np.zeros(3), 0.05 * truth().gravity_force_base_N, np.zeros(9)]))
+    R = tilted(0, 90)
+    with pytest.raises(BadDataset, match="do not agree"):
+        tare(exact(truth()), R, [dwell(heavier, R[i], np.random.default_rng(10 + i)) for i in range(2)])
+
+
+def test_good_tares_pass() -> None:
+    rng = np.random.default_rng(9)
+    R = Rotation.random(2, rng=rng).as_matrix()
+    for seed in range(40):
+        now = drifted(truth(), rng.normal(size=3), rng.normal(size=3) * 0.03)
+        tare(calibration(truth(), seed=seed), R[:1], [dwell(now, R[0], rng, 400)])
+
+
+def with_response(start: Update, seed: int = 12) -> tuple[Update, Array]:
+    """The same for a sensor with 1 % gain and cross-talk, known to 0.1 %, and the true coefficients."""
+    estimated = np.random.default_rng(seed).normal(size=11) * 0.01
+    covariance = np.zeros((26, 26))
+    covariance[:15, :15] = start.covariance
+    covariance[15:, 15:] = 1e-6 * np.eye(11)
+    error = np.random.default_rng(seed + 1).normal(size=11) * 1e-3
+    response = Response(estimated, covariance)
+    return Update(start.parameters, start.covariance, 0.0, 0, response=response), estimated + error
+
+
+def test_a_tare_knows_the_gain_and_cross_talk_of_the_sensor() -> None:
+    rng = np.random.default_rng(17)
+    R = tilted(70)
+    distances = []
+    for seed in range(40):
+        start, coefficients = with_response(calibration(truth(), seed=seed), 2 * seed)
+        reading = dwell(truth(), R[0], rng) + response_columns(truth(), R[0]) @ coefficients
+        update = tare(start, R, [reading])
+        error = truth().difference(update.parameters)[[6, 7, 8, 12, 13, 14]]
+        block = update.covariance[np.ix_([6, 7, 8, 12, 13, 14], [6, 7, 8, 12, 13, 14])]
+        distances.append(error @ np.linalg.solve(block, error))
+        assert update.response is not None
+        assert start.response is not None
+        np.testing.assert_array_equal(update.response.coefficients, start.response.coefficients)
+        np.testing.assert_allclose(update.response.covariance[:15, :15], update.covariance)
+    assert np.mean(distances) == pytest.approx(6, rel=0.35)  # 5 sigma of the mean of 40
+
+
+@pytest.mark.parametrize("kind", BLOCKS)
+def test_every_kind_of_update_is_exact_without_noise(kind: str) -> None:
+    old, rng = truth(), np.random.default_rng(14)
+    R = Rotation.random(6, rng=rng).as_matrix()
+    turned = Rotation.from_euler("xyz", [5, -8, 12], degrees=True)
+    heavier = 1.3 if "weight" in BLOCKS[kind] else 1.0
+    gravity = heavier * old.gravity_force_base_N
+    now = Parameters(
+        turned.as_matrix() @ old.R_flange_sensor if "mounting" in BLOCKS[kind] else old.R_flange_sensor,
+        turned.apply(gravity) if "gravity direction" in BLOCKS[kind] else gravity,
+        old.force_bias_N + 3.0 * ("bias" in BLOCKS[kind]),
+        old.p_sensor_com_m + 0.02 * ("centre of mass" in BLOCKS[kind]),
+        old.torque_bias_Nm - 0.1 * ("bias" in BLOCKS[kind]),
+    )
+    update = reestimate(exact(old), R, predict(now, R), joint(6), kind)
+    np.testing.assert_allclose(now.difference(update.parameters), 0, atol=1e-9)
+    assert update.chi2 < 1e-12
+
+
+def test_the_covariance_covers_noise_and_the_old_errors() -> None:
+    rng = np.random.default_rng(15)
+    R = Rotation.random(5, rng=rng).as_matrix()
+    distances, misfits = [], []
+    for seed in range(30):
+        wrench = predict(truth(), R) + rng.multivariate_normal(np.zeros(6), NOISE, size=5)
+        update = reestimate(calibration(truth(), seed=seed), R, wrench, joint(5), "all")
+        error = truth().difference(update.parameters)
+        distances.append(error @ np.linalg.solve(update.covariance, error))
+        misfits.append(update.chi2 / update.dof)
+    assert np.mean(distances) == pytest.approx(15, rel=0.3)  # 5 sigma of the mean of 30
+    assert np.mean(misfits) == pytest.approx(1, rel=0.2)
+
+
+@pytest.mark.parametrize(("kind", "gain"), [*((kind, False) for kind in BLOCKS), ("all", True)])
+def test_the_covariance_is_that_of_first_order(kind: str, gain: bool) -> None:
+    """Of readings and of the old calibration, whose errors are kept where nothing is estimated."""
+    n = 4 if kind == "all" else 3
+    R, start = Rotation.random(n, rng=np.random.default_rng(21)).as_matrix(), calibration(truth(), 6)
+    if gain:
+        start, _ = with_response(start)
+    C, now = start.covariance if start.response is None else start.response.covariance, start.parameters
+    if "weight" in BLOCKS[kind]:
+        now = replace(now, gravity_force_base_N=1.4 * now.gravity_force_base_N)
+    if "centre of mass" in BLOCKS[kind]:
+        now = replace(now, p_sensor_com_m=np.array([0.03, 0.04, 0.06]))
+    y = predict(now, R) if start.response is None else predict(now, R) + start.response.wrench(now, R)
+
+    def updated_by(e: Array, shift: Array) -> Array:
+        response = None if start.response is None else Response(start.response.coefficients + e[15:], C)
+        moved = Update(start.parameters.moved(e[:15]), start.covariance, 0.0, 0, response=response)
+        new = reestimate(moved, R, y + shift.reshape(n, 6), joint(n), kind)
+        kept = np.zeros(0) if new.response is None else new.response.coefficients
+        return np.concatenate([start.parameters.difference(new.parameters), kept])
+
+    found = reestimate(start, R, y, joint(n), kind)
+    expected = propagated(lambda e: updated_by(e, np.zeros(6 * n)), C)
+    expected += propagated(lambda e: updated_by(np.zeros(len(C)), e), joint(n))
+    covariance = found.covariance if found.response is None else found.response.covariance
+    assert_same(covariance, expected, 0.04 if gain else 1e-3)  # the derivatives are without the gain of 1 %
+
+
+def test_poses_that_do_not_determine_the_parameters_are_rejected() -> None:
+    R = tilted(0, 60)
+    with pytest.raises(NotObservable, match="2 poses do not determine all: add poses"):
+        reestimate(calibration(truth()), R, predict(truth(), R), joint(2), "all")
+    R = tilted(0, 0)
+    with pytest.raises(NotObservable, match="do not determine mounting"):
+        reestimate(calibration(truth()), R, predict(truth(), R), joint(2), "mounting")
+
+
+def test_an_update_makes_a_calibration_that_names_its_parent_and_survives_a_file(tmp_path: Path) -> None:
+    rng = np.random.default_rng(16)
+    R = Rotation.random(12, rng=rng).as_matrix()
+    wrench = predict(truth(), R) + rng.multivariate_normal(np.zeros(6), NOISE, size=12)
+    parent = solve(CalibrationDataset(R, wrench, noise_of(12), np.zeros(12, np.int64), np.full(12, np.nan)))
+    new = loaded(truth())
+    readings = predict(new, tilted(0, 60)) + rng.multivariate_normal(np.zeros(6), NOISE, size=2)
+    update = reestimate(parent, tilted(0, 60), readings, joint(2), "payload")
+    child = updated(parent, update, {"parent": {"path": "old.json"}, "command": "verify"})
+    assert child.provenance["parent"] == {"path": "old.json", "id": parent.id}
+    assert (child.provenance["update"], child.provenance["command"]) == ("payload", "verify")
+    assert child.id != parent.id
+    assert child.findings[-1].values == {"kind": "payload", "n_poses": 2, "parent": parent.id}
+    np.testing.assert_allclose(child.residuals, readings - predict(update.parameters, tilted(0, 60)), atol=1e-12)
+    assert (child.chi2, child.dof, child.n_poses) == (update.chi2, 8, 2)
+    child.save(tmp_path / "child.json")
+    again = CalibrationResult.load(tmp_path / "child.json")
+    assert again.id == child.id
+    one = tare(parent, R[:1], [dwell(truth(), R[0], rng)])
+    with pytest.raises(NotObservable, match="use 2 poses or more"):
+        updated(parent, one)
+
+
+def test_shapes_that_do_not_fit_are_rejected() -> None:
+    R = tilted(0, 60)
+    with pytest.raises(BadDataset, match=r"R_base_flange .*\(1, 3, 3\).*\(2, 3, 3\)"):
+        reestimate(exact(truth()), tilted(0), predict(truth(), R), joint(2), "payload")
+    with pytest.raises(BadDataset, match="R_base_flange"):
+        tare(exact(truth()), R, [dwell(truth(), R[0], np.random.default_rng(0))])
+    with pytest.raises(BadDataset, match="there is no dwell"):
+        tare(exact(truth()), R, [])

@@ -1,0 +1,336 @@
+"""Verification: unchanged cells pass, each change is named with its update, contact is not explained away."""
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib.after.expected_readings import expected_with_inexact_orientations
+from ftcalib.after.state import updated
+from ftcalib.after.verification import Verification, verify
+from ftcalib.likelihood.response import response_columns
+from ftcalib.model import Array, predict
+from ftcalib.poses.information import SUBSET_6, special
+from ftcalib.result import DriftResult
+
+SIGMA = np.repeat([0.05, 0.002], 3) / np.sqrt(200)
+TRUTH = Parameters(
+    Rotation.from_euler("zx", [20, 3], degrees=True).as_matrix(),
+    np.array([0.2, -0.1, -11.76]),
+    np.array([3.0, -2.0, 5.0]),
+    np.array([0.01, -0.005, 0.07]),
+    np.array([0.1, 0.2, -0.1]),
+)
+COEFFICIENTS = 0.01 * np.random.default_rng(0).normal(size=11)
+TURN = Rotation.from_rotvec(np.deg2rad(1.0) * np.array([0.6, 0.0, 0.8]))
+CHANGED = {
+    "bias": replace(TRUTH, force_bias_N=TRUTH.force_bias_N + np.array([0.3, 0.0, 0.4])),
+    "payload": replace(
+        TRUTH, gravity_force_base_N=TRUTH.gravity_force_base_N * 1.025, p_sensor_com_m=TRUTH.p_sensor_com_m + 0.001
+    ),
+    "centre of mass": replace(TRUTH, p_sensor_com_m=TRUTH.p_sensor_com_m + np.array([0.0, 0.003, 0.0])),
+    "mounting": replace(TRUTH, R_flange_sensor=TURN.as_matrix() @ TRUTH.R_flange_sensor),
+    "base": replace(
+        TRUTH,
+        gravity_force_base_N=Rotation.from_euler("x", 0.5, degrees=True).apply(np.array(TRUTH.gravity_force_base_N)),
+    ),
+}
+
+
+def readings(parameters: Parameters, R: Array, seed: int, coefficients: Array | None = None) -> Array:
+    noise = np.random.default_rng(seed).normal(size=(len(R), 6)) * SIGMA
+    added = 0.0 if coefficients is None else response_columns(parameters, R) @ coefficients
+    return np.asarray(predict(parameters, R) + added + noise)
+
+
+def noise_of(n: int) -> Array:
+    return np.tile(np.diag(SIGMA**2), (n, 1, 1))
+
+
+@lru_cache(maxsize=64)
+def calibrated(seed: int = 2, *, poses: int = 24, gain: bool = False) -> CalibrationResult:
+    R = special(range(1, 25)) if poses == 24 else special(SUBSET_6)
+    wrench = readings(TRUTH, R, seed, COEFFICIENTS if gain else None)
+    return solve(CalibrationDataset(R, wrench, noise_of(poses), np.zeros(poses, np.int64), np.full(poses, np.nan)))
+
+
+def orientations(n: int, seed: int = 2) -> Array:
+    return np.asarray(Rotation.random(n, rng=np.random.default_rng(seed)).as_matrix())
+
+
+def verified(parameters: Parameters, n: int = 6, seed: int = 3, *, gain: bool = False) -> Verification:
+    wrench = readings(parameters, orientations(n), seed, COEFFICIENTS if gain else None)
+    return verify(calibrated(gain=gain), orientations(n), wrench, noise_of(n))
+
+
+@pytest.mark.parametrize("gain", [False, True])
+@pytest.mark.parametrize("n", [2, 6])
+def test_an_unchanged_cell_passes(n: int, gain: bool) -> None:
+    found = verified(TRUTH, n, gain=gain)
+    assert found.passed
+    assert (found.change, found.update, found.dof) == (None, None, 6 * n)
+    assert "agree with the calibration" in found.reason
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+@pytest.mark.parametrize("gain", [False, True])
+@pytest.mark.parametrize("what", CHANGED)
+def test_a_change_is_named_and_the_smallest_update_makes_up_for_it(what: str, gain: bool) -> None:
+    found = verified(CHANGED[what], gain=gain)
+    assert not found.passed
+    assert (found.change, found.alternatives) == (what, ())
+    assert found.update is not None
+    assert found.update.kind == what
+    error = CHANGED[what].difference(found.update.parameters)
+    assert error @ np.linalg.solve(found.update.covariance, error) < 45  # chi-square, 15 dof: one in 10 000
+    child = updated(calibrated(gain=gain), found.update)
+    wrench = readings(CHANGED[what], orientations(6, 9), 9, COEFFICIENTS if gain else None)
+    assert verify(child, orientations(6, 9), wrench, noise_of(6)).passed
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_the_reason_states_the_change_with_its_size() -> None:
+    assert "the bias has changed by 0.5 N" in verified(CHANGED["bias"]).reason
+    assert "the payload has changed by +30 g" in verified(CHANGED["payload"]).reason
+    assert "the centre of mass has moved by 3.0 mm" in verified(CHANGED["centre of mass"]).reason
+    assert "turned on the flange by 1°" in verified(CHANGED["mounting"]).reason
+    assert "gravity has turned in the base by 0.5" in verified(CHANGED["base"]).reason
+
+
+def test_bias_and_payload_together_are_several() -> None:
+    both = replace(CHANGED["payload"], force_bias_N=CHANGED["bias"].force_bias_N)
+    found = verified(both)
+    assert found.change == "several"
+    assert found.update is not None
+    assert found.update.kind == "bias and payload"
+    error = both.difference(found.update.parameters)
+    assert error @ np.linalg.solve(found.update.covariance, error) < 45
+
+
+def test_everything_changed_needs_all() -> None:
+    everything = replace(CHANGED["base"], R_flange_sensor=CHANGED["mounting"].R_flange_sensor)
+    everything = replace(everything, force_bias_N=CHANGED["bias"].force_bias_N)
+    found = verified(everything, 8)
+    assert found.change == "several"
+    assert found.update is not None
+    assert found.update.kind == "all"
+
+
+def test_a_hand_on_the_tool_in_one_pose_is_no_change_of_the_calibration() -> None:
+    wrench = readings(TRUTH, orientations(6), 3)
+    wrench[3] += [2.0, 1.0, 0.0, 0.1, 0.0, 0.05]
+    found = verify(calibrated(), orientations(6), wrench, noise_of(6))
+    assert not found.passed
+    assert (found.change, found.update) == (None, None)
+    assert "the farthest is pose 4" in found.reason
+    assert "free tool and cables" in found.reason
+
+
+def test_two_poses_that_do_not_separate_mounting_from_base_say_so() -> None:
+    """Without a turn between them, the poses show a turned sensor and a tilted base alike."""
+    R = np.array([Rotation.from_euler("x", 180 + d, degrees=True).as_matrix() for d in (-2.0, 2.0)])
+    turned = Rotation.from_euler("y", 1.0, degrees=True).as_matrix() @ TRUTH.R_flange_sensor
+    found = verify(calibrated(), R, readings(replace(TRUTH, R_flange_sensor=turned), R, 4), noise_of(2))
+    assert not found.passed
+    assert {found.change, *found.alternatives} >= {"mounting", "base"}
+    assert "do not distinguish it from a change of" in found.reason
+
+
+def test_sigma_holds_noise_and_the_uncertainty_of_the_calibration() -> None:
+    new = orientations(6)
+    for gain in (False, True):
+        found, calibration = verified(TRUTH, gain=gain), calibrated(gain=gain)
+        variance = SIGMA**2 + np.diagonal(calibration.wrench_covariance(new), axis1=1, axis2=2)
+        factor = 1.0 if gain else calibration.chi2 / calibration.dof  # the residuals of the fit show it
+        np.testing.assert_allclose(found.predicted_sigma**2, factor * variance, rtol=1e-9)
+
+
+def test_the_uncertainty_of_the_calibration_is_common_to_all_poses() -> None:
+    """Six calibration poses: as independent errors of each pose, chi2 would scatter far more than 6n degrees do."""
+    calibration, rng = calibrated(poses=6), np.random.default_rng(11)
+    chi2 = []
+    for seed in range(40):
+        error = rng.multivariate_normal(np.zeros(15), calibration.covariance)
+        drawn = replace(calibration, parameters=TRUTH.moved(error))
+        wrench = readings(TRUTH, orientations(12), seed)
+        chi2.append(verify(drawn, orientations(12), wrench, noise_of(12)).chi2)
+    assert np.mean(chi2) == pytest.approx(72, abs=6 * np.sqrt(2 * 72 / 40))
+    assert np.std(chi2) < 20  # 12 expected
+
+
+def test_errors_of_each_pose_that_the_fit_found_are_expected_again() -> None:
+    calibration = calibrated()
+    inexact = Rotation.from_rotvec(0.003 * np.random.default_rng(5).normal(size=(6, 3))).as_matrix()
+    wrench = readings(TRUTH, orientations(6) @ inexact, 6)
+    assert not verify(calibration, orientations(6), wrench, noise_of(6)).passed
+    aware = replace(calibration, components={"rotation_rad": 0.003})
+    assert verify(aware, orientations(6), wrench, noise_of(6)).passed
+    noisy = replace(calibration, components={"white_force_N": 0.05, "white_torque_Nm": 0.004})
+    assert verify(noisy, orientations(6), wrench, noise_of(6)).passed
+
+
+def test_a_bias_that_walked_in_the_tour_may_walk_on() -> None:
+    calibration = calibrated()
+    walk = np.cumsum(np.random.default_rng(7).normal(size=(6, 6)) * np.repeat([0.05, 0.001], 3), axis=0)
+    wrench = readings(TRUTH, orientations(6), 8) + 1.5 * walk[-1] + walk
+    assert not verify(calibration, orientations(6), wrench, noise_of(6)).passed
+    walking = replace(calibration, components={"walk_force_N": 0.05, "walk_torque_Nm": 0.001})
+    found = verify(walking, orientations(6), wrench, noise_of(6))
+    assert found.passed
+    jumped = verify(walking, orientations(6), wrench + np.array([2.0, 0, 0, 0, 0, 0]), noise_of(6))
+    assert (jumped.passed, jumped.change) == (False, "bias")
+    drift = DriftResult(np.repeat([0.4, 0.005], 3), np.full(6, 0.01))
+    linear = replace(calibration, drift=drift)
+    ramp = readings(TRUTH, orientations(6), 8) + np.outer(0.5 + np.arange(6) / 24, drift.change)
+    assert not verify(calibration, orientations(6), ramp, noise_of(6)).passed
+    assert verify(linear, orientations(6), ramp, noise_of(6)).passed
+
+
+def test_noise_estimated_from_few_residuals_raises_the_limit() -> None:
+    """Chi-square would give false alarms: six poses leave few degrees of freedom for the noise."""
+    wrench = readings(TRUTH, orientations(6), 3) + 0.09 * np.random.default_rng(10).normal(size=(6, 6)) * [
+        1, 1, 1, 0.04, 0.04, 0.04,
+    ]  # fmt: skip
+    found = [
+        verify(
+            replace(calibrated(poses=n), components={"white_force_N": 0.05, "white_torque_Nm": 0.002}),
+            orientations(6),
+            wrench,
+            noise_of(6),
+        )
+        for n in (24, 6)
+    ]
+    assert found[1].p_value > 10 * found[0].p_value
+
+
+def test_the_stated_noise_need_not_be_that_of_the_sensor() -> None:
+    """The fit shows its size: a factor common to all covariances changes neither the limit nor what is found."""
+    calibration, new = calibrated(), orientations(6)
+    for parameters in (TRUTH, CHANGED["bias"]):
+        wrench = readings(parameters, new, 3)
+        found = [
+            verify(
+                replace(calibration, covariance=k * calibration.covariance, chi2=calibration.chi2 / k),
+                new,
+                wrench,
+                k * noise_of(6),
+            )
+            for k in (1.0, 1.4)
+        ]
+        assert found[0].p_value == pytest.approx(found[1].p_value, rel=1e-6)
+        assert found[0].change == found[1].change
+        np.testing.assert_allclose(found[0].predicted_sigma, found[1].predicted_sigma)
+
+
+def inexact(poses: int, seed: int) -> tuple[CalibrationDataset, Array, Array]:
+    """Readings of a fit and of six new poses, whose orientations are off by 0.02°; the fit often does not find it."""
+    rng, R = np.random.default_rng(seed), special(SUBSET_6 if poses == 6 else range(1, 25))
+    parts = []
+    for part in (R, orientations(6, seed)):
+        off = Rotation.from_rotvec(np.deg2rad(0.02) * rng.normal(size=(len(part), 3))).as_matrix()
+        parts.append(readings(TRUTH, part @ off, seed + len(part)))
+    fitted = CalibrationDataset(R, parts[0], noise_of(poses), np.zeros(poses, np.int64), np.full(poses, np.nan))
+    return fitted, orientations(6, seed), parts[1]
+
+
+def test_an_error_that_a_fit_of_six_poses_cannot_find_is_no_false_alarm() -> None:
+    for seed in (20, 23, 47):  # taken for linear drift, or for noise of the torque alone
+        fitted, R, wrench = inexact(6, seed)
+        calibration = solve(fitted)
+        assert "rotation_rad" not in calibration.components
+        assert not verify(calibration, R, wrench, noise_of(6)).passed
+        assert verify(calibration, R, wrench, noise_of(6), fitted=fitted).passed
+
+
+@pytest.mark.slow
+def test_a_walk_that_a_fit_of_six_poses_finds_in_part_is_no_false_alarm() -> None:
+    for seed in (19, 56, 61):  # taken in part for a slope or noise, or all for noise
+        rng = np.random.default_rng(seed)
+        R = np.concatenate([special(SUBSET_6), Rotation.random(6, rng=rng).as_matrix()])
+        walk = np.cumsum(np.repeat([0.02, 6e-4], 3) * rng.normal(size=(12, 6)), axis=0)
+        wrench = readings(TRUTH, R, seed) + walk
+        fitted = CalibrationDataset(R[:6], wrench[:6], noise_of(6), np.full(6, 200), np.arange(6.0))
+        calibration, new = solve(fitted), (R[6:], wrench[6:])
+        assert not verify(calibration, *new, noise_of(6)).passed
+        assert verify(calibration, *new, noise_of(6), fitted=fitted).passed
+        jumped = new[1] + np.array([0.6, 0, -0.8, 0, 0, 0])
+        assert not verify(calibration, new[0], jumped, noise_of(6), fitted=fitted).passed
+
+
+def test_a_change_is_found_all_the_same() -> None:
+    fitted, R, wrench = inexact(6, 1)
+    found = verify(solve(fitted), R, wrench + np.array([0.3, 0.0, 0.4, 0, 0, 0]), noise_of(6), fitted=fitted)
+    assert (found.passed, found.change) == (False, "bias")
+
+
+@pytest.mark.parametrize("poses", [24, pytest.param(6, marks=pytest.mark.slow)])
+def test_hysteresis_is_no_false_alarm_and_hides_no_change(poses: int) -> None:
+    R, new = special(range(1, 25)) if poses == 24 else special(SUBSET_6), orientations(6)
+    lag = 0.002
+    y, y_new = readings(TRUTH, R, 0), readings(TRUTH, new, 100)
+    y[1:] -= lag * np.diff(predict(TRUTH, R), axis=0)
+    moved = -lag * np.diff(predict(TRUTH, np.concatenate([R[-1:], new])), axis=0)
+    fitted = CalibrationDataset(R, y, noise_of(poses), np.zeros(poses, np.int64), np.full(poses, np.nan))
+    calibration = solve(fitted)
+    assert verify(calibration, new, y_new + moved, noise_of(6), fitted=fitted).passed
+    for what in ("bias", "payload", "centre of mass"):
+        changed = readings(CHANGED[what], new, 100) + moved
+        assert verify(calibration, new, changed, noise_of(6), fitted=fitted).change == what
+
+
+def test_a_shifted_centre_of_mass_is_named_although_the_gain_turns_the_forces() -> None:
+    """The antisymmetric part of a gain is taken for a turn of the sensor, which the torques do not make."""
+    R, new, turn = special(range(1, 25)), orientations(6), Rotation.from_rotvec([0.02, -0.02, 0.02]).as_matrix()
+
+    def read(parameters: Parameters, R: Array, seed: int) -> Array:
+        y = readings(parameters, R, seed, COEFFICIENTS)
+        y[:, :3] = (y[:, :3] - parameters.force_bias_N) @ turn.T + parameters.force_bias_N
+        return y
+
+    fitted = CalibrationDataset(R, read(TRUTH, R, 2), noise_of(24), np.zeros(24, np.int64), np.full(24, np.nan))
+    moved = read(CHANGED["centre of mass"], new, 3)
+    found = verify(solve(fitted), new, moved, noise_of(6), fitted=fitted)
+    assert (found.change, found.alternatives) == ("centre of mass", ())
+
+
+def test_gain_and_cross_talk_keep_the_size_that_the_fit_found() -> None:
+    R = special(range(1, 25))
+    wrench = readings(TRUTH, R, 2, COEFFICIENTS)
+    fitted = CalibrationDataset(R, wrench, noise_of(24), np.zeros(24, np.int64), np.full(24, np.nan))
+    calibration = calibrated(gain=True)
+    assert calibration.response is not None
+    new = orientations(6)
+    for components in (calibration.components, {"gain": calibration.components["gain"]}):  # cross-talk not found
+        other = replace(calibration, components=components)
+        least = expected_with_inexact_orientations(other, fitted, new, noise_of(6))[0]
+        _, sigma, _ = least.distance(new, readings(TRUTH, new, 3, COEFFICIENTS))
+        assert least.factor == pytest.approx(1.0, abs=0.5)
+        own = verify(calibration, new, readings(TRUTH, new, 3, COEFFICIENTS), noise_of(6)).predicted_sigma
+        np.testing.assert_allclose(sigma, np.sqrt(least.factor) * own, rtol=0.35)
+
+
+def test_poses_of_another_kind_of_fit_explain_nothing() -> None:
+    fitted, R, _ = inexact(6, 1)
+    calibration = solve(fitted)
+    weights = [one.weight for one in expected_with_inexact_orientations(calibration, fitted, R, noise_of(6))]
+    assert sum(weights) == pytest.approx(1)
+    assert min(weights) > 0
+    for other in (replace(calibration, method="srom"), replace(calibration, dof=24)):
+        assert expected_with_inexact_orientations(other, fitted, R, noise_of(6)) == []
+    unmeasured = replace(fitted, wrench_cov=None)
+    assert expected_with_inexact_orientations(calibration, unmeasured, R, noise_of(6)) == []
+    with pytest.raises(BadDataset, match="6 poses are not those of the calibration, which has 24"):
+        verify(calibrated(), R, readings(TRUTH, R, 0), noise_of(6), fitted=fitted)
+
+
+def test_what_cannot_be_verified_is_refused() -> None:
+    with pytest.raises(BadDataset, match="1 pose is too few for a verification: record 2 or more"):
+        verify(calibrated(), orientations(1), readings(TRUTH, orientations(1), 0), noise_of(1))
+    with pytest.raises(BadDataset, match="wrench_cov"):
+        verify(calibrated(), orientations(2), readings(TRUTH, orientations(2), 0), noise_of(3))
+    with pytest.raises(ValueError, match="false_alarms is 0"):
+        verify(calibrated(), orientations(2), readings(TRUTH, orientations(2), 0), noise_of(2), false_alarms=0)

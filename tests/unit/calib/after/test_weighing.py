@@ -1,0 +1,281 @@
+"""Weighing: sigmas that hold, faults that are named, and a tool with a part as one load."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ftcalib.after.state import Calibrated, tare
+from ftcalib.after.weighing import Weight, drift_since, holding, weigh
+from ftcalib.data.dwell_mean import mean_and_covariance
+from ftcalib.errors import BadDataset
+from ftcalib.likelihood.response import Response, predicted_covariance
+from ftcalib.model import Array, Parameters, predict
+from tests.first_order import assert_same, propagated
+from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, G, calibrated
+
+NEAR = 2 * TRUTH.p_sensor_com_m
+NEVER = float("inf")
+
+
+class Gripper:
+    """A tool that holds a part; readings of half a second."""
+
+    def __init__(self, seed: int) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.mass_kg, self.com_m = float(self.rng.uniform(0.2, 3)), NEAR + self.rng.uniform(-0.04, 0.04, 3)
+        self.extra = np.zeros(6)
+
+    def turn(self) -> Array:
+        return np.asarray(Rotation.random(rng=self.rng).as_matrix())
+
+    def part(self, R_base_flange: Array) -> Array:
+        down = TRUTH.gravity_force_base_N / np.linalg.norm(TRUTH.gravity_force_base_N)
+        force_N = self.mass_kg * G * down @ (R_base_flange @ TRUTH.R_flange_sensor)
+        return np.concatenate([force_N, np.cross(self.com_m, force_N)])
+
+    def dwell(self, R_base_flange: Array, *, empty: bool = False, n: int = 250) -> Array:
+        wrench = predict(TRUTH, R_base_flange) + self.extra + (0 if empty else self.part(R_base_flange))
+        return np.asarray(wrench + NOISE * self.rng.normal(size=(n, 6)))
+
+    def weigh(self, reference: Calibrated, *R: Array, since_s: float = 1.0, **options: Any) -> Weight:
+        means = [mean_and_covariance(self.dwell(one)) for one in R]
+        return weigh(
+            reference,
+            np.array(R),
+            np.array([one.mean for one in means]),
+            np.array([one.covariance for one in means]),
+            **{"drift": drift_since(since_s), "g_m_s2": G, "p_sensor_near_m": NEAR, **options},
+        )
+
+
+@pytest.mark.slow
+def test_sigmas_hold_after_a_zero_in_the_same_pose() -> None:
+    errors, com = [], []
+    for seed in range(100):
+        gripper = Gripper(seed)
+        R = gripper.turn()
+        gripper.extra = gripper.rng.normal(size=6) * np.repeat([0.3, 0.01], 3)  # drift before the zero
+        weight = gripper.weigh(tare(calibrated(12, seed % 20), R[None], [gripper.dwell(R, empty=True)]), R)
+        assert weight.fault is None
+        assert weight.mass_sigma_kg < 1e-3
+        errors.append((weight.mass_kg - gripper.mass_kg) / weight.mass_sigma_kg)
+        off_m = weight.p_sensor_com_m - gripper.com_m
+        com.append(off_m @ np.linalg.solve(weight.com_covariance, off_m) / 3)
+        assert weight.line is not None
+        force_N = gripper.part(R)[:3]
+        assert abs(weight.line @ force_N) == pytest.approx(np.linalg.norm(force_N), rel=1e-2)
+    assert 0.85 < np.sqrt(np.mean(np.square(errors))) < 1.15
+    assert np.abs(errors).max() < 4
+    assert np.mean(com) < 1.2  # along gravity it is assumed, and mostly nearer
+
+
+@pytest.mark.slow
+def test_without_a_zero_the_sigma_covers_half_a_newton_of_drift() -> None:
+    for seed in range(30):
+        gripper = Gripper(seed)
+        drift = gripper.rng.normal(size=3)
+        gripper.extra[:3] = 0.5 * drift / np.linalg.norm(drift)
+        weight = gripper.weigh(calibrated(12, seed % 20), gripper.turn(), since_s=NEVER)
+        assert weight.fault is None
+        assert abs(weight.mass_kg - gripper.mass_kg) < 2 * weight.mass_sigma_kg
+        assert weight.least_kg > 0.2
+
+
+def test_several_poses_show_the_whole_centre_of_mass() -> None:
+    z = []
+    for seed in range(20):
+        gripper = Gripper(seed)
+        weight = gripper.weigh(calibrated(12, seed % 20), *(gripper.turn() for _ in range(3)))
+        assert weight.line is None
+        assert weight.com_sigma_m.max() < 2e-3
+        z += ((weight.p_sensor_com_m - gripper.com_m) / weight.com_sigma_m).tolist()
+    assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.2
+
+
+def test_what_is_no_weight_is_named() -> None:
+    gripper = Gripper(1)
+    R = np.array(Rotation.from_euler("x", 180, degrees=True).as_matrix())
+    u = gripper.part(R)[:3] / np.linalg.norm(gripper.part(R)[:3])
+    aside = np.cross(u, [0.3, 1.0, 0.2])
+
+    def fault(wrench: Array) -> str | None:
+        gripper.extra = np.zeros(6)
+        reference = tare(calibrated(), R[None], [gripper.dwell(R, empty=True)])
+        gripper.extra = np.asarray(wrench)
+        return gripper.weigh(reference, R).fault
+
+    assert fault(np.zeros(6)) is None
+    assert fault(np.concatenate([0.1 * aside / np.linalg.norm(aside), np.zeros(3)])) == "contact"
+    assert fault(np.concatenate([np.zeros(3), 0.02 * u])) == "cable"
+    assert fault(np.concatenate([-40 * u, np.zeros(3)])) == "lifted"
+    gripper.mass_kg = 0.02
+    assert fault(np.concatenate([np.zeros(3), 0.3 * aside])) == "cable"  # a centre of mass far outside
+
+
+def test_poses_that_disagree_are_named() -> None:
+    gripper = Gripper(2)
+    poses = [gripper.turn() for _ in range(3)]
+    means = []
+    for R in poses:
+        means.append(mean_and_covariance(gripper.dwell(R)))
+        gripper.com_m = gripper.com_m + np.array([0.01, 0, 0])  # it slips
+    weight = weigh(
+        calibrated(),
+        np.array(poses),
+        np.array([one.mean for one in means]),
+        np.array([one.covariance for one in means]),
+        drift=drift_since(1.0),
+        g_m_s2=G,
+        p_sensor_near_m=NEAR,
+    )
+    assert weight.fault == "changed"
+
+
+def test_a_gain_that_was_found_acts_on_the_part() -> None:
+    coefficients = np.array([0.01, -0.008, 0.004, 0.0, 0.006, *np.full(6, 0.01)])
+    covariance = np.zeros((26, 26))
+    covariance[:15, :15] = calibrated().covariance
+    response = Response(coefficients, covariance)
+    gripper = Gripper(3)
+    reference = holding(calibrated(), Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1), G)
+    with_gain = type(reference)(TRUTH, reference.covariance, response)
+    R = np.array([gripper.turn() for _ in range(3)])
+    part = Parameters(
+        TRUTH.R_flange_sensor,
+        TRUTH.gravity_force_base_N * (gripper.mass_kg * G / np.linalg.norm(TRUTH.gravity_force_base_N)),
+        np.zeros(3),
+        gripper.com_m,
+        np.zeros(3),
+    )
+    read = predict(TRUTH, R) + response.wrench(TRUTH, R) + predict(part, R) + response.wrench(part, R)
+    noise = np.tile(np.diag(NOISE**2) / 250, (3, 1, 1))
+    weight = weigh(with_gain, R, read, noise, drift=np.zeros(6), g_m_s2=G, p_sensor_near_m=gripper.com_m)
+    assert weight.mass_kg == pytest.approx(gripper.mass_kg, abs=1e-9)
+    np.testing.assert_allclose(weight.p_sensor_com_m, gripper.com_m, atol=1e-9)
+
+
+def rough(seed: int = 1, *, gain: bool = False) -> tuple[Parameters, Array, Response | None]:
+    """Parameters with large and correlated errors, their covariance, and gain and cross-talk if wanted."""
+    rng = np.random.default_rng(seed)
+    size = 26 if gain else 15
+    sigma = np.concatenate([np.repeat([0.01, 0.05, 0.04, 5e-4, 3e-3], 3), np.full(size - 15, 5e-3)])
+    root = sigma[:, None] * (np.eye(size) + 0.3 * rng.normal(size=(size, size)))
+    C = root @ root.T
+    return TRUTH, C, Response(0.01 * rng.normal(size=11), C) if gain else None
+
+
+class Known:
+    """A calibration of given parameters."""
+
+    def __init__(self, parameters: Parameters, covariance: Array, response: Response | None) -> None:
+        self.parameters, self.covariance, self.response = parameters, covariance[:15, :15], response
+
+
+def moved(known: Known, error: Array) -> Known:
+    response, C = known.response, known.covariance
+    if response is not None:
+        C, response = response.covariance, Response(response.coefficients + error[15:], response.covariance)
+    return Known(known.parameters.moved(error[:15]), C, response)
+
+
+@pytest.mark.parametrize("gain", [False, True])
+def test_the_covariance_has_all_errors_of_readings_and_calibration(gain: bool) -> None:
+    gripper, (tool, C, response) = Gripper(5), rough(gain=gain)
+    reference = Known(tool, C, response)
+    R = np.array([gripper.turn() for _ in range(3)])
+    part = np.array([gripper.part(one) for one in R])
+    y = predict(tool, R) + part
+    if response is not None:
+        y += response.wrench(tool, R)
+        y[:, :3] += part[:, :3] @ response.force_gain.T
+        y[:, 3:] += part[:, :3] @ response.cross_talk_m.T
+    noise, drift, turn_rad = (
+        np.tile(np.diag((0.3 * NOISE) ** 2), (3, 1, 1)),
+        3 * NOISE[::-1] * [1, 1, 1, 0.02, 0.02, 0.02],
+        4e-3,
+    )
+
+    def weighed(y: Array, reference: Known = reference, R: Array = R) -> Weight:
+        options: dict[str, Any] = {"drift": drift, "g_m_s2": G, "orientation_sigma_rad": turn_rad}
+        return weigh(reference, R, y, noise, p_sensor_near_m=gripper.com_m, **options)
+
+    def turned(e: Array) -> Array:
+        return np.asarray(R @ Rotation.from_rotvec(e.reshape(3, 3)).as_matrix())
+
+    found = weighed(y)
+    x, covariance = found.moment
+    np.testing.assert_allclose(x, gripper.mass_kg * np.append(1.0, gripper.com_m), rtol=1e-9)
+    expected = (
+        propagated(lambda e: weighed(y + e.reshape(3, 6)).moment[0], np.kron(np.eye(3), noise[0]))
+        + propagated(lambda e: weighed(y + e).moment[0], np.diag(drift**2))
+        + propagated(lambda e: weighed(y, moved(reference, e)).moment[0], C)
+        + propagated(lambda e: weighed(y, reference, turned(e)).moment[0], turn_rad**2 * np.eye(9))
+    )
+    assert_same(covariance, expected, 0.02)
+    assert found.mass_sigma_kg == pytest.approx(np.sqrt(covariance[0, 0]))
+    assert found.least_kg == pytest.approx(4 * found.mass_sigma_kg)
+    com = propagated(lambda e: (x + e)[1:] / (x + e)[0], covariance)
+    assert_same(found.com_covariance, com)
+    assert found.chi2 < 1e-6
+    assert (found.dof, found.poses) == (17, 3)
+
+
+@pytest.mark.parametrize("gain", [False, True])
+def test_the_covariance_of_a_tool_with_a_part_has_the_errors_of_both(gain: bool) -> None:
+    tool, C, response = rough(2, gain=gain)
+    empty = Known(tool, C, response)
+    rng = np.random.default_rng(3)
+    root = np.array([0.02, 1e-3, 1e-3, 1e-3])[:, None] * (np.eye(4) + 0.3 * rng.normal(size=(4, 4)))
+    x, x_cov = np.array([0.8, 0.01, -0.02, 0.09]), root @ root.T
+
+    def joined(e: Array, x: Array = x) -> Array:
+        weight = Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1, moment=(x, x_cov))
+        load = holding(moved(empty, e), weight, G)
+        extra = np.zeros(0) if load.response is None else load.response.coefficients
+        return np.concatenate([tool.difference(load.parameters), extra])
+
+    found = holding(empty, Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1, moment=(x, x_cov)), G)
+    expected = propagated(joined, C) + propagated(lambda e: joined(np.zeros(len(C)), x + e), x_cov)
+    assert_same(found.covariance if found.response is None else found.response.covariance, expected)
+
+
+def test_one_pose_shows_the_centre_of_mass_only_across_gravity() -> None:
+    gripper = Gripper(4)
+    R = gripper.turn()
+    weight = gripper.weigh(calibrated(), R)
+    u = gripper.part(R)[:3] / np.linalg.norm(gripper.part(R)[:3])
+    assert weight.line is not None
+    assert abs(weight.line @ u) == pytest.approx(1, abs=1e-3)
+    assert weight.line @ weight.com_covariance @ weight.line == pytest.approx(0.1**2, rel=0.02)
+    assert np.sqrt(np.linalg.eigvalsh(weight.com_covariance)[:2]).max() < 5e-3
+    assert abs((weight.p_sensor_com_m - NEAR) @ u) < 0.02
+    assert (weight.dof, weight.poses) == (5, 1)
+
+
+def test_a_tool_with_a_part_predicts_both() -> None:
+    z2 = []
+    for seed in range(40):
+        gripper = Gripper(seed)
+        empty = calibrated(12, seed % 20)
+        weight = gripper.weigh(empty, *(gripper.turn() for _ in range(4)))
+        load = holding(empty, weight, G)
+        R = gripper.turn()
+        off = predict(load.parameters, R) - predict(TRUTH, R) - gripper.part(R)
+        C = predicted_covariance(load.parameters, load.covariance, load.response, R)
+        z2.append(off @ np.linalg.solve(C, off) / 6)
+    assert 0.4 < np.mean(z2) < 1.3
+
+
+def test_a_tool_without_weight_has_no_direction_of_gravity() -> None:
+    nothing = Parameters(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    reference = holding(calibrated(), Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1), G)
+    with pytest.raises(BadDataset, match="no weight"):
+        Gripper(0).weigh(type(reference)(nothing, reference.covariance, None), np.eye(3))
+
+
+def test_drift_grows_and_ends() -> None:
+    assert drift_since(36.0).tolist() == pytest.approx([0.05] * 3 + [1.5e-3] * 3)
+    assert not drift_since(-5.0).any()
+    assert drift_since(NEVER).tolist() == [1.0] * 3 + [0.03] * 3

@@ -1,0 +1,64 @@
+"""Residuals in units of their covariance, and the drift until the next use."""
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from ftcalib.judge.cross_validation import AssessedFit, drift_ahead, standardized
+from ftcalib.likelihood.fit import DriftEstimate
+from ftcalib.model import Array
+
+
+def test_a_covariance_that_rounding_made_indefinite_still_scales_residuals() -> None:
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(3, 6, 6))
+    covariance = A @ np.swapaxes(A, 1, 2)
+    e = rng.normal(size=(3, 6))
+    exact = np.linalg.solve(covariance, e[..., None])[..., 0]
+    value, vector = np.linalg.eigh(covariance[1])
+    covariance[1] = vector @ np.diag([-1e-18, *value[1:]]) @ vector.T
+    z = standardized(e, covariance)
+    assert np.isfinite(z).all()
+    np.testing.assert_allclose(np.sum(z**2, axis=1)[[0, 2]], np.sum(e * exact, axis=1)[[0, 2]])
+
+
+CHANGE, SIGMA = np.array([0.3, 0, 0.4, 0, 0.01, 0]), np.array([0.02, 0.02, 0.02, 1e-3, 1e-3, 1e-3])
+
+
+def drifting(components: dict[str, float], rows: Array) -> AssessedFit:
+    """Of 12 poses, whose bias grows by a twelfth of its change at each; the first and the last are left out."""
+    share = (rows - 5.5) / 12
+    drift, used = DriftEstimate(CHANGE, SIGMA, share[:, None] * CHANGE), (rows > 0) & (rows < 11)
+    return cast(AssessedFit, SimpleNamespace(drift=drift, weights=used.astype(float), components=components))
+
+
+@pytest.mark.parametrize(("interval_s", "per_min"), [(20.0, 3), (None, 6)])
+def test_a_bias_goes_on_as_it_moved(interval_s: float | None, per_min: int) -> None:
+    rows = np.arange(12.0) if interval_s is None else np.random.default_rng(0).permutation(12).astype(float)
+    times = None if interval_s is None else 100 + interval_s * rows
+    last = CHANGE * 4.5 / 12
+    line = drift_ahead(drifting({}, rows), times)
+    np.testing.assert_allclose(line.offset, last)
+    growth = CHANGE * per_min / 9  # nine intervals between the used poses
+    np.testing.assert_allclose(line.growth_per_min, growth)
+    np.testing.assert_allclose(line.square, (last + growth) ** 2 + SIGMA**2 / 2)
+
+    walks = {"walk_force_N": 0.1, "walk_fy_N": 0.2, "walk_tz_Nm": 0.01, "white_force_N": 5.0}
+    walk = drift_ahead(drifting(walks, rows), times)
+    variance = per_min * np.array([0.01, 0.01 + 0.04, 0.01, 0, 0, 1e-4])
+    growth = np.where(variance > 0, 0.0, growth)
+    np.testing.assert_allclose(walk.growth_per_min, np.sqrt(variance) + growth)
+    np.testing.assert_allclose(walk.square, (last + growth) ** 2 + variance + SIGMA**2 / 2)
+
+
+def test_times_that_are_no_times_are_intervals_of_ten_seconds() -> None:
+    fit, rows = drifting({"walk_force_N": 0.1}, np.arange(12.0)), np.arange(12.0)
+    for times in (np.full(12, 7.0), np.where(rows == 3, np.nan, rows)):
+        np.testing.assert_array_equal(drift_ahead(fit, times).square, drift_ahead(fit).square)
+
+
+def test_without_drift_nothing_is_ahead() -> None:
+    ahead = drift_ahead(cast(AssessedFit, SimpleNamespace(drift=None)))
+    assert not np.concatenate([ahead.offset, ahead.growth_per_min, ahead.square]).any()

@@ -1,0 +1,368 @@
+"""A result that contradicts the described cell is usable at best, and its findings say why."""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, Setup, solve
+from ftcalib.judge.described_cell import _OTHER_ORDERS, LEAN_DEG, directions, lean_from, payload, tool
+from ftcalib.model import predict
+from ftcalib.poses.information import special
+from ftcalib.published.yu import SPECIAL_R_flange_base
+
+Array = NDArray[np.float64]
+
+SIGMA = np.repeat([0.01, 0.0005], 3)
+R_FLANGE_SENSOR = Rotation.from_rotvec([0.0, 0.0, 0.7]).as_matrix()
+COM_FLANGE_M = np.array([0.012, -0.005, 0.06])
+"""From the sensor, which is 40 mm above the flange."""
+WEIGHT_N = 15.0
+LOAD_KG = WEIGHT_N / 9.80665
+TOOL: dict[str, Any] = {"cylinders_m": [(0.0, 0.16, 0.08)], "sensor_height_m": 0.04, "up_in_base": (0, 0, 1)}
+
+
+def session(
+    mass_factor: float = 1.0, com_factor: float = 1.0, down: tuple[float, ...] = (0, 0, -1)
+) -> CalibrationDataset:
+    F_b, com_m = WEIGHT_N * mass_factor * np.array(down), com_factor * R_FLANGE_SENSOR.T @ COM_FLANGE_M
+    truth = Parameters(R_FLANGE_SENSOR, F_b, np.array([1.0, 2, 3]), com_m, np.array([0.1, 0.2, 0.3]))
+    R = special(range(1, 25))
+    wrench = predict(truth, R) + SIGMA * np.random.default_rng(3).normal(size=(24, 6))
+    return CalibrationDataset(R, wrench, np.tile(np.diag(SIGMA**2), (24, 1, 1)), np.full(24, 100), np.arange(24.0))
+
+
+@cache
+def sound() -> CalibrationDataset:
+    return session()
+
+
+def codes(result: CalibrationResult) -> list[str]:
+    return [one.code for one in result.findings]
+
+
+# ---------------------------------------------------------------------------------------------- directions of a session
+
+
+@pytest.mark.parametrize("shift", [-1, 1])
+@pytest.mark.parametrize("measured", [True, False])
+def test_an_inverted_quaternion_in_another_order_is_not_good_unless_its_mounting_is_declared(
+    shift: int, measured: bool
+) -> None:
+    data = sound()
+    quaternions = Rotation.from_matrix(np.swapaxes(data.R_base_flange, 1, 2)).as_quat()
+    R = Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix()
+    wrong = CalibrationDataset(R, data.wrench, data.wrench_cov if measured else None, data.n_samples, data.t_s)
+    result = solve(wrong)
+    assert (result.verdict, codes(result)[0]) == ("usable", "mounting_undeclared")
+    fix = result.findings[0].fix
+    assert "mounting" in fix
+    assert "rotations" in fix
+    declared = solve(wrong, setup=Setup(up_in_base=tuple(-result.gravity_force_base_N)))
+    assert declared.verdict == "good"
+
+
+def test_a_known_direction_of_gravity_declares_the_mounting() -> None:
+    wall = session(down=(-1, 0, 0))
+    assert codes(solve(wall)) == ["mounting_undeclared"]
+    assert solve(wall, known=Known(gravity_direction_base=(-1, 0, 0))).verdict == "good"
+
+
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.5, 0, 0.866)])
+@pytest.mark.parametrize("heading_deg", range(0, 360, 15))
+def test_the_low_side_is_named(up: tuple[float, ...], heading_deg: float) -> None:
+    # Tip the mounted base over the horizontal direction `heading` of the world, as a floor that gives way there.
+    other = np.array([0.0, 1.0, 0.0])
+    R_world_mounted = np.array([np.cross(other, up), other, up])
+    heading = np.radians(heading_deg)
+    hinge = np.cross([0, 0, 1], [np.cos(heading), np.sin(heading), 0])
+    R_world_base = Rotation.from_rotvec(np.radians(0.8) * hinge).as_matrix() @ R_world_mounted
+    lean = lean_from(-np.array(up, dtype=float), R_world_base.T @ [0, 0, -12.0], np.eye(3) * 1e-6)
+    assert lean.is_significant
+    assert lean.deg == pytest.approx(0.8, abs=0.01)
+    side = sum((-1 if name[0] == "-" else 1) * np.eye(3)["xyz".index(name[1])] for name in lean.side.split(" and "))
+    # A point on that side has sunk from where a true mounting would have it, nearly as far as any point could.
+    sunk = (R_world_mounted @ side - R_world_base @ side)[2] / np.linalg.norm(side)
+    assert sunk > np.cos(np.radians(31)) * np.sin(np.radians(0.8))
+
+
+@pytest.mark.parametrize(
+    ("angle_deg", "sigma_N", "significant"),
+    [
+        (0, 0.001, False),
+        (0.9 * LEAN_DEG, 0.001, False),
+        (1.1 * LEAN_DEG, 0.001, True),
+        (1, 12 * np.radians(1) / 3.9, False),
+        (1, 12 * np.radians(1) / 4.1, True),
+    ],
+)
+def test_a_base_that_is_level_or_may_be_does_not_lean(angle_deg: float, sigma_N: float, significant: bool) -> None:
+    gravity_N = 12 * np.array([np.sin(np.radians(angle_deg)), 0, -np.cos(np.radians(angle_deg))])
+    assert lean_from(np.array([0.0, 0, -1]), gravity_N, np.eye(3) * sigma_N**2).is_significant == significant
+
+
+@pytest.mark.parametrize(("shift", "order"), [(1, "w, x, y, z"), (-1, "x, y, z, w")])
+def test_orientations_in_another_order_and_inverted_are_turned_by_fixed_rotations(shift: int, order: str) -> None:
+    true = Rotation.random(5, rng=0).as_matrix()
+    as_read = Rotation.from_quat(np.roll(Rotation.from_matrix(true).as_quat(), shift, axis=1)).inv().as_matrix()
+    U = _OTHER_ORDERS[order]
+    V = (U @ as_read[0]).T @ true[0]
+    np.testing.assert_allclose(U @ as_read @ V, true, atol=1e-12)
+
+
+NO_LEAN = Parameters(np.eye(3), np.array([0.0, 0, -20]), np.zeros(3), np.array([0.0, 0, 0.05]), np.zeros(3))
+CERTAIN = np.diag(np.repeat(1e-12, 15))
+
+
+def tilted(angle_deg: float) -> Parameters:
+    angle = np.radians(angle_deg)
+    return replace(NO_LEAN, gravity_force_base_N=20 * np.array([0.0, np.sin(angle), -np.cos(angle)]))
+
+
+@pytest.mark.parametrize(
+    ("off_deg", "undeclared", "declared"),
+    [
+        (0.1, None, None),
+        (0.3, None, "base_leans"),
+        (9.9, None, "base_leans"),
+        (10.1, "gravity_tilted", "gravity_off_mounting"),
+        (59.9, "gravity_tilted", "gravity_off_mounting"),
+        (60.1, "mounting_undeclared", "gravity_off_mounting"),
+        (134.9, "mounting_undeclared", "gravity_off_mounting"),
+        (135.1, "weight_upwards", "weight_upwards"),
+    ],
+)
+def test_gravity_off_the_mounting_is_named_by_its_angle(
+    off_deg: float, undeclared: str | None, declared: str | None
+) -> None:
+    for setup, code in ((Setup(), undeclared), (Setup(up_in_base=(0, 0, 2)), declared)):
+        found = directions(tilted(off_deg), CERTAIN, setup)
+        assert [one.code for one in found] == [code] * (code is not None)
+        for one in found:
+            assert one.values["lean_deg" if code == "base_leans" else "off_deg"] == pytest.approx(off_deg)
+            if "direction" in one.values:
+                np.testing.assert_allclose(one.values["direction"], tilted(off_deg).gravity_force_base_N / 20)
+
+
+@pytest.mark.parametrize(
+    ("inside_m", "aside_m", "sigma_m", "reversed_torques"),
+    [
+        (-0.3, 0.0, 1e-6, False),
+        (0.009, 0.005, 1e-6, False),
+        (0.011, 0.005, 1e-6, True),
+        (0.029, 0.02, 0.01, False),
+        (0.031, 0.02, 0.01, True),
+        (0.1, 0.099, 1e-6, True),
+        (0.1, 0.101, 1e-6, False),
+        (0.49, 0.2, 1e-6, True),
+        (0.51, 0.2, 1e-6, False),
+    ],
+)
+def test_a_centre_of_mass_behind_the_sensor_but_not_beside_it_shows_reversed_torques(
+    inside_m: float, aside_m: float, sigma_m: float, reversed_torques: bool
+) -> None:
+    mount = Rotation.from_rotvec([0.5, -0.2, 0.4]).as_matrix()
+    com_flange_m = [0.6 * aside_m, -0.8 * aside_m, -inside_m]
+    behind = replace(NO_LEAN, R_flange_sensor=mount, p_sensor_com_m=mount.T @ com_flange_m)
+    covariance = CERTAIN.copy()
+    covariance[9:12, 9:12] = mount.T @ np.diag([1.0, 1.0, sigma_m**2]) @ mount
+    found = directions(behind, covariance, Setup())
+    assert [one.code for one in found] == ["torques_reversed"] * reversed_torques
+    if found:
+        assert found[0].values["inside_mm"] == pytest.approx(1e3 * inside_m)
+    upwards = replace(behind, gravity_force_base_N=np.array([0.0, 0, 20]))
+    (found_up,) = directions(upwards, covariance, Setup())
+    assert found_up.code == ("forces_reversed" if reversed_torques or inside_m > 0.5 else "weight_upwards")
+
+
+# ------------------------------------------------------------------------------------------------------------- the tool
+
+
+@pytest.mark.parametrize(
+    ("load_kg", "tool_kg", "sigma_kg", "code"),
+    [
+        (0.29, 0.2, 0.0, None),
+        (0.31, 0.2, 0.0, "tool_mass_mismatch"),
+        (1.29, 1.0, 0.0, None),
+        (1.31, 1.0, 0.0, "tool_mass_mismatch"),
+        (1.79, 1.0, 0.2, None),
+        (1.81, 1.0, 0.2, "tool_mass_mismatch"),
+        (1.4, 10.0, 0.0, "tool_mass_mismatch"),
+        (0.07, 1.0, 0.0, "weight_compensated"),  # a remainder
+        (0.14, 1.0, 0.0, "tool_mass_mismatch"),
+    ],
+)
+def test_a_mass_is_compared_with_that_of_the_tool(
+    load_kg: float, tool_kg: float, sigma_kg: float, code: str | None
+) -> None:
+    weight = replace(NO_LEAN, gravity_force_base_N=9.8 * load_kg * np.array([0.6, 0, -0.8]))
+    across = np.array([0.8, 0, 0.6])
+    covariance = CERTAIN.copy()
+    covariance[3:6, 3:6] += 100 * np.outer(across, across)
+    covariance[3:6, 3:6] += (9.8 * sigma_kg) ** 2 * np.outer([0.6, 0, -0.8], [0.6, 0, -0.8])
+    found = tool(weight, covariance, Setup(tool_mass_kg=tool_kg), 9.8)
+    assert [one.code for one in found] == [code] * (code is not None)
+    if code == "tool_mass_mismatch":
+        assert found[0].values["load_kg"] == pytest.approx(load_kg)
+        assert found[0].values["units"] == []
+    elif code:
+        assert found[0].values["weight_N"] == pytest.approx(9.8 * load_kg)
+
+
+@pytest.mark.parametrize(
+    ("beyond_m", "sigma_m", "severity"),
+    [(0.009, 0.0, None), (0.011, 0.0, "limit"), (0.099, 0.0, "limit"), (0.101, 0.0, "reject"), (0.049, 0.01, None)],
+)
+@pytest.mark.parametrize("height_m", [0.04, None])
+def test_a_centre_of_mass_beyond_the_tool_is_named_by_its_distance(
+    beyond_m: float, sigma_m: float, severity: str | None, height_m: float | None
+) -> None:
+    covariance = CERTAIN.copy()
+    covariance[9:12, 9:12] += sigma_m**2 * np.eye(3)
+    tip_m = 0.09  # above the flange; the sensor may be at its face where its height is not described
+    far = replace(NO_LEAN, p_sensor_com_m=np.array([0.0, 0, tip_m + beyond_m - (height_m or 0.0)]))
+    found = tool(far, covariance, Setup(cylinders_m=[(0.0, tip_m, 0.08)], sensor_height_m=height_m), 9.8)
+    assert [one.severity for one in found] == [severity] * (severity is not None)
+    for one in found:
+        assert one.values["outside_mm"] == pytest.approx(1e3 * beyond_m, abs=0.2)
+        assert one.values["origin"] == ("flange" if height_m else "sensor")
+        assert bool(one.values["units"]) == (far.p_sensor_com_m[2] > 0.1)
+
+
+@pytest.mark.parametrize(
+    "setup",
+    [
+        Setup(),
+        Setup(**TOOL),
+        Setup(**TOOL | {"sensor_height_m": None}),
+        Setup(tool_mass_kg=1.4, payload_kg=1.7),
+        Setup(tool_mass_kg=1.25 * LOAD_KG),
+    ],
+)
+def test_a_result_that_agrees_with_the_cell_is_good(setup: Setup) -> None:
+    assert solve(sound(), setup=setup).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("cylinder", "height_m", "outside_mm"),
+    [
+        ((0.0, 0.07, 0.08), 0.04, 30),  # beyond the tip
+        ((0.0, 0.07, 0.08), None, 0),  # the sensor may be at the flange face
+        ((0.0, 0.04, 0.08), None, 20),
+        ((0.0, 0.16, 0.08, 0.072, -0.005), 0.04, 20),  # beside it
+        ((0.12, 0.16, 0.08), 0.04, 20),  # below it
+        ((0.0, 0.095, 0.08), 0.04, 0),  # within the margin
+    ],
+)
+def test_a_centre_of_mass_outside_the_described_tool_is_named(
+    cylinder: tuple[float, ...], height_m: float | None, outside_mm: float
+) -> None:
+    result = solve(sound(), setup=Setup(cylinders_m=[cylinder], sensor_height_m=height_m))
+    assert codes(result) == ["com_outside_tool"] * bool(outside_mm)
+    if outside_mm:
+        values = result.findings[0].values
+        assert result.verdict == "usable"
+        assert values["outside_mm"] == pytest.approx(outside_mm, abs=1)
+        from_m = 0.0 if height_m is None else height_m
+        np.testing.assert_allclose(values["com_mm"], 1e3 * np.add(COM_FLANGE_M, (0, 0, from_m)), atol=0.5)
+
+
+def test_a_centre_of_mass_between_two_cylinders_is_inside_their_hull() -> None:
+    fingers = [(0.0, 0.2, 0.02, 0.04, 0.0), (0.0, 0.2, 0.02, -0.04, 0.0), (0.0, 0.04, 0.08)]
+    assert solve(sound(), setup=Setup(cylinders_m=fingers, sensor_height_m=0.04)).verdict == "good"
+
+
+def test_a_centre_of_mass_far_outside_is_rejected_and_units_are_named() -> None:
+    far = session(com_factor=4.448)
+    result = solve(far, setup=Setup(**TOOL))
+    assert (result.verdict, codes(result)[0]) == ("rejected", "com_outside_tool")
+    assert ["lbf", "N·m"] in result.findings[0].values["units"]
+    undescribed = solve(far)
+    assert (undescribed.verdict, undescribed.findings[0].code) == ("usable", "com_too_far")
+
+
+def test_a_description_decides_how_far_the_centre_of_mass_may_be() -> None:
+    """The first setup of Yu et al., Table I, has it at 2 m."""
+    R = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+    mount = Rotation.from_euler("ZYX", [0, 7, 3], degrees=True).as_matrix().T
+    zero = np.zeros(3)
+    readings = predict(Parameters(mount, np.array([0.0, 0, -10]), zero, np.array([0.0, 0, 2]), zero), R)
+    data = CalibrationDataset.of(R, readings)
+    undescribed, short, long = (
+        solve(data, setup=Setup(cylinders_m=rows, sensor_height_m=0.04))
+        for rows in ((), [(0.0, 0.2, 0.1)], [(0.0, 2.1, 0.6)])
+    )
+    assert (undescribed.verdict, codes(undescribed)[0]) == ("rejected", "com_too_far")
+    assert (short.verdict, codes(short)[0]) == ("rejected", "com_outside_tool")
+    assert long.verdict == "good"
+
+
+def test_reversed_torques_come_before_what_they_put_outside() -> None:
+    result = solve(session(com_factor=-1), setup=Setup(**TOOL | {"cylinders_m": [(0.04, 0.16, 0.08)]}))
+    assert (result.verdict, codes(result)) == ("usable", ["torques_reversed", "com_outside_tool"])
+
+
+@pytest.mark.parametrize(
+    ("factor", "code", "units"),
+    [
+        (0.6, "tool_mass_mismatch", []),
+        (1 / 4.448, "tool_mass_mismatch", [["lbf", "N·m"], ["lbf", "lbf·ft"]]),
+        (1000.0, "weight_implausible", [["mN", "N·m"], ["mN", "N·mm"]]),  # without a tool, too
+    ],
+)
+def test_a_mass_unlike_the_described_tool_is_named(factor: float, code: str, units: list[list[str]]) -> None:
+    result = solve(session(factor), setup=Setup(tool_mass_kg=LOAD_KG))
+    assert codes(result)[0] == code
+    assert all(pair in units for pair in result.findings[0].values["units"])
+    assert bool(units) == bool(result.findings[0].values["units"])
+
+
+# ---------------------------------------------------------------------------------------------------------- the payload
+
+
+@pytest.mark.parametrize(
+    ("payload_kg", "load_kg", "sensor_kg", "fits"),
+    [
+        (1.50, 0.64, None, False),  # 0.86 kg off, which no usual sensor explains
+        (1.40, 0.64, None, True),
+        (1.40, 0.64, 0.1, False),
+        (0.10, 0.64, None, False),
+        (0.20, 0.64, None, True),  # smaller by the limit: a sensor cannot weigh less than nothing
+        (0.20, 0.64, 0.1, False),
+        (6.4, 5.0, 0.1, True),  # 30 %
+        (6.7, 5.0, 0.1, False),
+        (0.0, 1.5, None, False),
+    ],
+)
+def test_a_payload_is_compared_with_all_that_hangs_on_the_flange(
+    payload_kg: float, load_kg: float, sensor_kg: float | None, fits: bool
+) -> None:
+    found = payload(payload_kg, load_kg, sensor_kg)
+    assert (found == []) is fits
+    if not fits:
+        assert (found[0].code, found[0].values["set_kg"]) == ("payload_mismatch", load_kg + (sensor_kg or 0))
+        assert ("[sensor] mass_kg" in found[0].fix) is (sensor_kg is None)
+
+
+@pytest.mark.parametrize("sensor_kg", [None, 0.3])
+def test_no_payload_is_advised_that_would_be_right_in_pounds(sensor_kg: float | None) -> None:
+    (finding,) = payload(1.5 + (sensor_kg or 0), 1.5 / 4.448, sensor_kg)
+    assert (finding.code, finding.values["units"]) == ("payload_units", [["lbf", "N·m"]])
+
+
+def test_payload_and_lean_limit_and_accompany_a_result() -> None:
+    data = session(down=(np.sin(0.018), 0.0, -np.cos(0.018)))
+    result = solve(data, setup=Setup(payload_kg=3.0, sensor_mass_kg=0.4, up_in_base=(0, 0, 1)))
+    assert (result.verdict, codes(result)) == ("usable", ["payload_mismatch", "base_leans"])
+    lean = result.findings[1].values
+    assert (lean["lean_deg"], lean["side"]) == (pytest.approx(1.03, abs=0.04), "+x")
+
+
+def test_a_setup_is_checked() -> None:
+    for wrong in ({"up_in_base": (0, 0, 0)}, {"up_in_base": (0, 1)}, {"cylinders_m": [(0.0, 0.1)]}):
+        with pytest.raises(ValueError, match=r"expected three numbers|give from, to"):
+            Setup(**wrong)

@@ -1,0 +1,272 @@
+"""Observability of poses: exact ranks, correct reasons, and advice that helps."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from syrupy.assertion import SnapshotAssertion
+
+from ftcalib import NotObservable, Parameters
+from ftcalib.judge.observability import (
+    AMBIGUOUS_GAP,
+    NOMINAL,
+    Observability,
+    assess,
+    different_orientations,
+    require_observable,
+    require_orientations,
+    scaled_information,
+    second_minimum,
+    wrong_basin_probability,
+)
+from ftcalib.model import Array, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
+
+R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+T12 = R24[np.array([1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22]) - 1]
+DOWN = Rotation.from_euler("x", 180, degrees=True)
+RNG = np.random.default_rng(2021)
+ANY = Rotation.random(12, rng=RNG).as_matrix()
+
+# A tool hung askew on a tilted sensor of a robot on a wall.
+WALL = Parameters(
+    Rotation.from_euler("ZYX", [50, 10, 175], degrees=True).as_matrix(),
+    np.array([-12.0, 3.0, 0.5]),
+    np.array([3.0, -2, 8]),
+    np.array([0.03, -0.02, -0.06]),
+    np.array([0.1, 0.2, -0.3]),
+)
+
+
+def turned(axis: str, n: int = 8, tilt_deg: float = 0.0) -> Array:
+    """The tool at a tilt, turned about one axis of its flange."""
+    about = Rotation.from_euler(axis, np.arange(n)[:, None] * 360.0 / n, degrees=True)
+    return np.asarray((Rotation.from_euler("y", tilt_deg, degrees=True) * about).as_matrix())
+
+
+def about_the_vertical(n: int = 8) -> Array:
+    about = Rotation.from_euler("z", np.arange(n)[:, None] * 0.7)
+    return np.asarray((about * Rotation.from_euler("xy", [150, 20], degrees=True)).as_matrix())
+
+
+def leaning(tilt_deg: float, n: int = 8) -> Array:
+    azimuth = np.arange(n) * 2 * np.pi / n
+    lean = np.deg2rad(tilt_deg) * np.column_stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth])
+    return np.asarray((Rotation.from_rotvec(lean) * DOWN).as_matrix())
+
+
+def within(tilt_deg: float, n: int) -> Array:
+    rng = np.random.default_rng(int(tilt_deg))
+    axis = rng.normal(size=(n, 3))
+    axis *= np.deg2rad(tilt_deg) * rng.uniform(0, 1, (n, 1)) ** (1 / 3) / np.linalg.norm(axis, axis=1)[:, None]
+    return np.asarray((Rotation.from_rotvec(axis) * DOWN).as_matrix())
+
+
+OBLIQUE = (
+    Rotation.from_euler("y", 0.5) * Rotation.from_rotvec(np.arange(8)[:, None] * np.array([[0.5, 0.3, 0.2]]))
+).as_matrix()
+
+HALF_TURNS = np.array([np.diag(d) for d in ([1.0, 1, 1], [1.0, -1, -1], [-1.0, 1, -1], [-1.0, -1, 1])])
+
+DEGENERATE = {
+    "one pose": (ANY[:1], 6, "there is only one orientation"),
+    "one pose, repeated": (np.tile(ANY[:1], (5, 1, 1)), 6, "there is only one orientation"),
+    "two poses": (ANY[:2], 11, "there are only 2 different orientations"),
+    "about the vertical": (about_the_vertical(), 8, "turned about the vertical only"),
+    "last joint at one tilt": (turned("z", tilt_deg=150), 13, "only the last joint was turned"),
+    "about flange x": (turned("x"), 13, "turned about the flange's x axis only"),
+    "about an oblique axis": (OBLIQUE, 13, r"turned about the axis \(.*\) of the flange only"),
+    "half turns": (HALF_TURNS, 13, "gravity acts along one line of the tool only"),
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_sets_have_their_rank_a_reason_and_advice_that_helps(name: str) -> None:
+    R, rank, words = DEGENERATE[name]
+    found = assess(R)
+    assert found.rank == rank
+    assert found.condition == float("inf")
+    assert not found.sound
+    assert re.search(words, found.ambiguities[0])
+    assert len(found.advice) == len(found.advised_R_base_flange) <= 3
+    completed = assess(np.concatenate([R, found.advised_R_base_flange]))
+    assert completed.sound
+    assert completed.ambiguities == completed.advice == ()
+
+
+@pytest.mark.parametrize("tool", [NOMINAL, WALL], ids=["upright", "wall"])
+def test_named_ambiguities_exist(tool: Parameters, snapshot: SnapshotAssertion) -> None:
+    """The changes named for a one-axis sweep leave every reading alone, whatever hangs on the sensor."""
+    found = assess(OBLIQUE, tool, advise=False)
+    assert found.rank == 13
+    assert found.ambiguities[1:] == snapshot
+    axis_flange = np.array([0.5, 0.3, 0.2]) / np.linalg.norm([0.5, 0.3, 0.2])
+    axis_base, turn = OBLIQUE[0] @ axis_flange, 0.3
+    around = Rotation.from_rotvec(turn * axis_base).as_matrix(), Rotation.from_rotvec(turn * axis_flange).as_matrix()
+    other = Parameters(
+        around[1] @ tool.R_flange_sensor,
+        around[0] @ tool.gravity_force_base_N + 2.0 * axis_base,
+        tool.force_bias_N - 2.0 * tool.R_flange_sensor.T @ axis_flange,
+        tool.p_sensor_com_m,
+        tool.torque_bias_Nm - np.cross(tool.p_sensor_com_m, 2.0 * tool.R_flange_sensor.T @ axis_flange),
+    )
+    np.testing.assert_allclose(predict(other, OBLIQUE), predict(tool, OBLIQUE), atol=1e-12)
+
+
+def test_turning_about_the_vertical_mixes_bias_with_everything(snapshot: SnapshotAssertion) -> None:
+    assert assess(about_the_vertical(), advise=False).ambiguities[1:] == snapshot
+    # Gravity of a robot on a wall is across that axis: the same motion is an ordinary sweep about one axis.
+    assert assess(about_the_vertical(), WALL, advise=False).rank == 13
+
+
+@pytest.mark.parametrize("tilt_deg", [20, 40, 60])
+def test_one_tilt_has_full_rank_and_an_exact_second_solution(tilt_deg: float) -> None:
+    R = leaning(tilt_deg)
+    found = assess(R)
+    assert found.rank == 15
+    assert found.second_gap < 1e-12
+    assert f"one angle to gravity, {tilt_deg}° from the vertical" in found.ambiguities[0]
+    assert "tilt the tool" in found.sentence()
+    assert len(found.advice) == 1
+    completed = assess(np.concatenate([R, found.advised_R_base_flange]))
+    assert completed.sound
+    # The second solution itself.
+    over = Rotation.from_euler("z", 180, degrees=True).as_matrix()
+    height_N = float((NOMINAL.gravity_force_base_N @ R)[0, 2])
+    shift = 2 * height_N * NOMINAL.R_flange_sensor.T @ [0, 0, 1]
+    P = NOMINAL.p_sensor_com_m
+    second = Parameters(over @ NOMINAL.R_flange_sensor, -NOMINAL.gravity_force_base_N, shift, P, np.cross(P, shift))
+    np.testing.assert_allclose(predict(second, R), predict(NOMINAL, R), atol=1e-12)
+
+
+def test_a_tool_that_never_turns_about_its_own_axis_is_caught_although_it_tilts() -> None:
+    rng = np.random.default_rng(3)
+    R = Rotation.from_euler("ZY", rng.uniform(-3, 3, (12, 2))).as_matrix()
+    found = assess(R)
+    assert (found.rank, found.second_gap < 1e-12) == (15, True)
+    assert "flange's y axis" in found.ambiguities[0]
+    assert "90°" in found.ambiguities[0]
+    assert "turn the last joint" in found.advice[0]
+    assert assess(np.concatenate([R, found.advised_R_base_flange])).sound
+
+
+def test_little_tilt_is_called_so() -> None:
+    found = assess(within(15, 12))
+    assert found.rank == 15
+    assert "gravity stays within 1" in found.ambiguities[0]
+    assert assess(np.concatenate([within(15, 12), found.advised_R_base_flange])).sound
+
+
+def test_inexact_poses_do_not_hide_a_degenerate_set() -> None:
+    exact = turned("z", tilt_deg=150)
+    real = exact @ Rotation.from_rotvec(2e-4 * np.random.default_rng(4).normal(size=(8, 3))).as_matrix()
+    found = assess(real)
+    assert found.rank == 15
+    assert found.condition > 1e6
+    assert "the last joint" in found.ambiguities[0]
+    assert assess(np.concatenate([real, found.advised_R_base_flange])).sound
+
+
+@pytest.mark.parametrize("R", [R24, T12, ANY, ANY[:6]], ids=["24", "12", "any 12", "any 6"])
+@pytest.mark.parametrize("tool", [NOMINAL, WALL], ids=["upright", "wall"])
+def test_sound_sets_get_no_advice(R: Array, tool: Parameters) -> None:
+    found = assess(R, tool)
+    assert found.sound
+    assert found.ambiguities == found.advice == ()
+    require_observable(R, tool)
+    require_observable(R[:4] if R is ANY else R, tool)  # any four are enough, if the tool is not too light
+
+
+def test_gaps_are_those_of_the_literature() -> None:
+    assert second_minimum(R24)[0] == pytest.approx(8 / 9, abs=1e-6)
+    assert second_minimum(T12)[0] == pytest.approx(8 / 9, abs=1e-6)
+    eight = R24[np.array([2, 3, 6, 8, 17, 19, 22, 23]) - 1]
+    assert second_minimum(eight)[0] == pytest.approx(0.50, abs=0.01)
+    six = R24[np.array([9, 10, 16, 19, 21, 22]) - 1]
+    assert second_minimum(six)[0] == pytest.approx(0.28, abs=0.01)
+    rim = np.concatenate([leaning(40, 7), DOWN.as_matrix()[None]])
+    assert second_minimum(rim)[0] == pytest.approx(0.024, abs=0.001)
+
+
+def test_three_orientations_are_never_enough_although_their_rank_is_full() -> None:
+    R = np.concatenate([ANY[:3], ANY[:3]])
+    found = assess(R)
+    assert (found.rank, found.orientations) == (15, 3)
+    assert second_minimum(R)[0] < AMBIGUOUS_GAP
+    assert not found.sound
+    assert assess(np.concatenate([R, found.advised_R_base_flange])).sound
+    with pytest.raises(NotObservable, match="only 3 different"):
+        require_orientations(R)
+
+
+@pytest.mark.parametrize(
+    "R",
+    [ANY[:3], np.tile(ANY[:1], (9, 1, 1)), turned("z", tilt_deg=150), leaning(40), about_the_vertical()],
+    ids=["few", "one orientation", "last joint", "one tilt", "about the vertical"],
+)
+def test_rejections_are_one_sentence_with_advice(R: Array, snapshot: SnapshotAssertion) -> None:
+    with pytest.raises(NotObservable) as refusal:
+        require_observable(R, NOMINAL)
+    reason, _, _ = str(refusal.value).partition("from the last one")  # which of equal turns is proposed may vary
+    assert reason == snapshot
+
+
+def test_without_parameters_only_the_count_is_checked() -> None:
+    require_orientations(leaning(40))
+    with pytest.raises(NotObservable, match=r"4 poses .* add 1"):
+        require_orientations(ANY[:4], least=5)
+
+
+def test_orientations_are_counted_with_half_a_degree() -> None:
+    near = Rotation.from_euler("x", [[0], [0.4], [0.6]], degrees=True).as_matrix()
+    assert different_orientations(near) == 2
+    assert different_orientations(R24) == 24
+
+
+def test_odds_of_the_second_solution() -> None:
+    assert wrong_basin_probability(0) == 0.5
+    assert wrong_basin_probability(2) == pytest.approx(0.27, abs=0.01)
+    assert wrong_basin_probability(12) == pytest.approx(0.0025, abs=1e-4)
+
+
+SOUND = Observability(4, 15, 0.99e4, (), (), np.zeros((0, 3, 3)), 0.021)
+
+
+def test_a_set_is_sound_up_to_its_limits() -> None:
+    assert SOUND.sound
+    assert not replace(SOUND, orientations=3).sound
+    assert not replace(SOUND, rank=14).sound
+    assert not replace(SOUND, condition=1.01e4).sound
+    assert not replace(SOUND, second_gap=0.019).sound
+
+
+@pytest.mark.parametrize(
+    ("ambiguities", "advice", "sentence"),
+    [
+        ((), (), "the poses determine all parameters (condition 9.9e+03, gap 0.021)."),
+        (("a",), (), "a."),
+        (("a", "b"), ("x",), "a: b; add a pose: from the last one, x."),
+        (("a", "b", "c"), ("x", "y"), "a: b, and c; add 2 poses, each from the last one: x; y."),
+    ],
+)
+def test_reason_and_advice_are_one_sentence(
+    ambiguities: tuple[str, ...], advice: tuple[str, ...], sentence: str
+) -> None:
+    assert replace(SOUND, ambiguities=ambiguities, advice=advice).sentence() == sentence
+
+
+@pytest.mark.parametrize(("com_m", "lever_m"), [(0.08, 0.08), (0.01, 0.025)])
+def test_information_counts_poses(com_m: float, lever_m: float) -> None:
+    weight_N = 20.0
+    tool = replace(NOMINAL, gravity_force_base_N=np.array([0, 0, -weight_N]), p_sensor_com_m=np.array([0, 0, com_m]))
+    information = scaled_information(R24, tool)
+    in_torque_noise = (lever_m / 0.025) ** 2  # by which torques at the lever exceed their usual noise
+    np.testing.assert_allclose(information[6:9, 6:9], 24 * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(information[12:, 12:], 24 * in_torque_noise * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(information[9:12, 9:12], 24 * 2 / 3 * in_torque_noise * np.eye(3), atol=1e-9)
+    noise = weight_N**2 * np.diag(np.repeat([1.0, 0.025**2], 3))
+    np.testing.assert_allclose(scaled_information(R24, tool, np.tile(noise, (24, 1, 1))), information, atol=1e-9)
+    louder = scaled_information(R24, tool, np.tile(4 * noise, (24, 1, 1)))
+    np.testing.assert_allclose(louder, information / 4, atol=1e-9)

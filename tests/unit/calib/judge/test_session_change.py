@@ -1,0 +1,214 @@
+"""A change in mid-session is found, named, and refused where poses of both kinds were used."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationDataset, CalibrationResult, solve
+from ftcalib.judge.faults import rough_fit
+from ftcalib.judge.session_change import _groups, likeliest_change, minus_two_log_likelihood
+from ftcalib.likelihood.fit import fit
+from ftcalib.likelihood.response import SIZE, response_columns
+from ftcalib.model import Parameters, jacobian, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
+
+Array = NDArray[np.float64]
+
+ORIENTATIONS = np.swapaxes(SPECIAL_R_flange_base, 1, 2)[np.random.default_rng(0).permutation(24)]
+SIGMA = np.repeat([0.002, 1e-4], 3)
+TOOL = Parameters(
+    R_flange_sensor=Rotation.from_euler("z", 30, degrees=True).as_matrix(),
+    gravity_force_base_N=np.array([0.1, -0.2, -12.0]),
+    force_bias_N=np.array([3.0, -2.0, 5.0]),
+    p_sensor_com_m=np.array([0.004, -0.003, 0.06]),
+    torque_bias_Nm=np.array([0.2, 0.1, -0.3]),
+)
+SHIFTED = replace(TOOL, p_sensor_com_m=TOOL.p_sensor_com_m + np.array([0.001, 0.002, 0]))
+LIGHTER = replace(TOOL, gravity_force_base_N=0.97 * TOOL.gravity_force_base_N)
+TARED = replace(TOOL, force_bias_N=TOOL.force_bias_N - 0.3)
+
+
+def turned(parameters: Parameters, angle_deg: float) -> Parameters:
+    turn = Rotation.from_rotvec([0, 0, angle_deg], degrees=True).as_matrix()
+    com = turn.T @ parameters.p_sensor_com_m
+    return replace(parameters, R_flange_sensor=parameters.R_flange_sensor @ turn, p_sensor_com_m=com)
+
+
+TURNED = turned(TOOL, 5)
+OTHER = replace(turned(TOOL, 70), force_bias_N=np.array([-1.0, 2.0, 1.0]))
+
+
+def session(
+    after: Parameters,
+    which: int | slice,
+    seed: int,
+    rows: NDArray[np.int64] | None = None,
+    *,
+    added: Array | float = 0.0,
+    measured: bool = True,
+) -> CalibrationResult:
+    """24 poses, the later ones of another tool; `rows`: the pose in each row of the dataset."""
+    which = slice(which, None) if isinstance(which, int) else which
+    wrench = predict(TOOL, ORIENTATIONS) + added
+    wrench[which] += predict(after, ORIENTATIONS[which]) - predict(TOOL, ORIENTATIONS[which])
+    wrench += np.random.default_rng(seed).normal(0, SIGMA, wrench.shape)
+    order = np.arange(24) if rows is None else rows
+    dataset = CalibrationDataset(
+        R_base_flange=ORIENTATIONS[order],
+        wrench=wrench[order],
+        wrench_cov=np.broadcast_to(np.diag(SIGMA**2), (24, 6, 6)) if measured else None,
+        n_samples=np.full(24, 200),
+        t_s=np.arange(24.0)[order] * 3,
+    )
+    return solve(dataset)
+
+
+def sigmas(result: CalibrationResult, truth: Parameters) -> Array:
+    return np.asarray(result.parameters.difference(truth) / np.sqrt(np.diag(result.covariance)))
+
+
+@pytest.mark.parametrize(("after", "code", "position"), [(SHIFTED, "com_shifted", 10), (LIGHTER, "load_changed", 21)])
+def test_poses_of_two_loads_are_refused(after: Parameters, code: str, position: int) -> None:
+    result = session(after, position, seed=position)
+    first = result.findings[0]
+    assert (result.verdict, first.code, first.values["pose"]) == ("rejected", code, position + 1)
+    if after is LIGHTER:
+        assert first.values["change_N"] == pytest.approx(-0.36, abs=0.01)
+
+
+def test_the_load_as_it_is_now_is_kept_where_the_others_were_left_out() -> None:
+    result = session(SHIFTED, 3, seed=1)
+    assert result.verdict == "usable"
+    assert np.abs(sigmas(result, SHIFTED)).max() < 4
+
+
+def test_poses_count_as_they_were_taken_not_as_they_stand() -> None:
+    rows = np.random.default_rng(3).permutation(24)
+    result = session(LIGHTER, 12, seed=2, rows=rows)
+    assert result.verdict == "rejected"
+    assert result.findings[0].values["pose"] == np.flatnonzero(rows == 12)[0] + 1
+
+
+@pytest.mark.parametrize(
+    ("after", "code", "measured"),
+    [(TARED, "bias_stepped", False), (TURNED, "sensor_turned", True), (OTHER, "sensor_changed", False)],
+)
+def test_other_changes_are_named_before_the_drift_that_they_look_like(
+    after: Parameters, code: str, measured: bool
+) -> None:
+    result = session(after, 13, seed=4, measured=measured)
+    first = result.findings[0]
+    assert (first.code, first.values["pose"]) == (code, 14)
+    assert (result.verdict == "rejected") == (code != "bias_stepped")
+
+
+def test_rows_of_two_sensors_are_named() -> None:
+    assert session(OTHER, slice(1, None, 2), seed=1).findings[0].code == "sensors_alternate"
+
+
+@pytest.mark.parametrize("after", [TOOL, TARED])
+def test_a_quiet_run_and_one_that_was_tared_are_not_refused(after: Parameters) -> None:
+    result = session(after, 12, seed=0)
+    assert result.verdict == ("good" if after is TOOL else "usable")
+    sure = [0, 1, 2, 3, 4, 5, 9, 10, 11]  # the bias is that of no single moment
+    assert np.abs(sigmas(result, TOOL)[sure]).max() < 4.5
+
+
+@pytest.mark.parametrize(("seed", "measured"), [(0, True), (1, False)])
+def test_a_random_walk_is_no_step(seed: int, measured: bool) -> None:
+    walk = np.cumsum(10 * SIGMA * np.random.default_rng(seed).normal(size=(24, 6)), axis=0)
+    found = {one.code for one in session(TOOL, 12, seed, added=walk, measured=measured).findings}
+    assert not found & {"bias_stepped", "com_shifted", "load_changed", "sensor_turned", "sensor_changed"}
+
+
+def test_gain_and_cross_talk_of_a_fit_hide_no_part_of_a_change() -> None:
+    rng = np.random.default_rng(0)
+    wrench = np.where(np.arange(24)[:, None] < 14, predict(TOOL, ORIENTATIONS), predict(LIGHTER, ORIENTATIONS))
+    wrench += rng.normal(0, SIGMA, wrench.shape) + response_columns(TOOL, ORIENTATIONS) @ rng.normal(0, 0.01, SIZE)
+    change = likeliest_change(TOOL, ORIENTATIONS, wrench, SIGMA)
+    assert change is not None
+    assert (change.code, change.first) == ("load_changed", 14)
+    # Beside 15 free parameters the sigma of a step between two halves is about that of a mean of 4 poses.
+    lighter_N = np.linalg.norm(LIGHTER.gravity_force_base_N) - np.linalg.norm(TOOL.gravity_force_base_N)
+    assert change.values["change_N"] == pytest.approx(lighter_N, abs=3 * SIGMA[0] / 2)
+
+
+COUNT = np.arange(24)
+STEP_N = np.array([0.2, 0, 0.1])
+STEPPED = replace(TOOL, force_bias_N=TOOL.force_bias_N + STEP_N, torque_bias_Nm=TOOL.torque_bias_Nm - 0.01)
+TOUCHED = replace(OTHER, torque_bias_Nm=TOOL.torque_bias_Nm + np.array([0.03, 0, 0.04]))
+
+
+@pytest.mark.parametrize(
+    ("rows", "measured"),
+    [(COUNT >= 3, True), (COUNT >= 10, False), (COUNT >= 21, True), (COUNT % 2 == 1, False)],
+)
+@pytest.mark.parametrize(
+    ("after", "code", "values"),
+    [
+        (STEPPED, "bias_stepped", {"force_N": np.sqrt(0.05), "torque_Nm": np.sqrt(3e-4)}),
+        (SHIFTED, "com_shifted", {"shift_mm": np.sqrt(5.0)}),
+        (LIGHTER, "load_changed", {"change_N": -0.03 * np.linalg.norm(TOOL.gravity_force_base_N)}),
+        (TURNED, "sensor_turned", {"turn_deg": 5.0}),
+        (TOUCHED, "sensor_changed", {"turn_deg": 70.0, "force_N": np.sqrt(48.0), "torque_Nm": 0.05}),
+    ],
+)
+def test_a_change_is_as_large_as_it_is_and_can_be_undone(
+    after: Parameters, code: str, values: dict[str, float], rows: NDArray[np.bool_], measured: bool
+) -> None:
+    wrench = np.where(rows[:, None], predict(after, ORIENTATIONS), predict(TOOL, ORIENTATIONS))
+    wrench += 0.01 * np.random.default_rng(5).normal(0, SIGMA, wrench.shape)
+    change = likeliest_change(rough_fit(ORIENTATIONS, wrench), ORIENTATIONS, wrench, SIGMA if measured else None)
+    assert change is not None
+    assert (change.code, change.takes_turns) == (code, not rows[22])
+    assert change.first == np.flatnonzero(rows)[0]
+    assert {name: change.values[name] for name in values} == pytest.approx(values, rel=0.02)
+    left = change.corrected - predict(rough_fit(ORIENTATIONS, change.corrected), ORIENTATIONS)
+    assert np.sqrt(np.mean((left / SIGMA) ** 2)) < 0.1
+    if measured:
+        assert change.misfit < 1e-3
+
+
+@pytest.mark.parametrize("n", [12, 13])
+def test_changes_are_tried_that_leave_three_poses_on_each_side(n: int) -> None:
+    found = [(pure, [row.tolist() for row in groups]) for pure, groups in _groups(n)]
+    half = n // 2
+
+    def later(first: int) -> list[bool]:
+        return [k >= first for k in range(n)]
+
+    assert found == [
+        (None, [later(first) for first in range(3, n - 2)]),
+        (slice(0, half), [later(first) for first in range(half, n - 2)]),
+        (slice(half, n), [[not one for one in later(first)] for first in range(3, half + 1)]),
+        (slice(0, n, 2), [[k % 2 == 1 for k in range(n)]]),
+    ]
+
+
+def test_the_likelihood_is_that_of_the_dense_covariance_less_what_components_must_bring() -> None:
+    rng = np.random.default_rng(7)
+    wrench = predict(TOOL, ORIENTATIONS) + rng.normal(0, SIGMA, (24, 6))
+    wrench += np.cumsum(rng.normal(0, 5 * SIGMA, (24, 6)), axis=0)
+    found = fit(ORIENTATIONS, wrench, np.diag(SIGMA**2), drift="random-walk")
+    assert found.components.keys() == {"walk_force_N", "walk_torque_Nm"}
+    W = found.noise.solve(np.eye(144).reshape(24, 6, 144)).reshape(144, 144)
+    J, e = jacobian(found.parameters, ORIENTATIONS).reshape(144, 15), found.residuals.ravel()
+    logdet = np.linalg.slogdet(J.T @ W @ J)[1] - np.linalg.slogdet(W)[1]
+    assert minus_two_log_likelihood(found) == pytest.approx(logdet + e @ W @ e + 2 * (2 + 2), abs=1e-4)
+
+
+def test_a_rejected_pose_costs_the_limit_and_a_logarithm_beyond_it() -> None:
+    wrench = predict(TOOL, ORIENTATIONS) + np.random.default_rng(8).normal(0, SIGMA, (24, 6))
+    wrench[5] += 30 * SIGMA
+    found = fit(ORIENTATIONS, wrench, np.diag(SIGMA**2), drift="none")
+    assert np.flatnonzero(found.weights == 0).tolist() == [5]
+    others = fit(np.delete(ORIENTATIONS, 5, 0), np.delete(wrench, 5, 0), np.diag(SIGMA**2), drift="none")
+    e, S = found.left_out_residuals[5], found.left_out_cov[5]
+    limit, distance = stats.chi2.isf(1e-3, 6), e @ np.linalg.solve(S, e)
+    cost = np.linalg.slogdet(S)[1] + limit + 6 * np.log(distance / limit)
+    assert found.components == others.components == {}
+    assert minus_two_log_likelihood(found) - minus_two_log_likelihood(others) == pytest.approx(cost, abs=0.01)

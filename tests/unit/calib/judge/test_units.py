@@ -1,0 +1,79 @@
+"""Units by the weight and the centre of mass that they make: where suspicion begins, and which units it names."""
+
+import numpy as np
+import pytest
+from scipy import constants
+
+from ftcalib import Parameters
+from ftcalib.judge.units import FORCE_UNITS_N, TORQUE_UNITS_NM, by_mass, implausible
+
+
+def found(
+    weight_N: float, com_m: float, residual_N: float = 1.0, *, described: bool = False
+) -> list[tuple[object, ...]]:
+    zero = np.zeros(3)
+    tool = Parameters(np.eye(3), np.array([0.0, 0, -weight_N]), zero, np.array([0.0, 0, com_m]), zero)
+    findings = implausible(tool, residual_N, described=described)
+    return [(one.code, one.severity, one.values.get("units"), one.values.get("most_m")) for one in findings]
+
+
+def test_units_are_as_large_as_defined() -> None:
+    inch, foot = constants.inch, constants.foot
+    in_newtons = {"lbf": constants.pound_force, "kgf": constants.g, "gf": constants.g / 1e3}
+    assert {name: FORCE_UNITS_N[name] for name in in_newtons} == pytest.approx(in_newtons)
+    levers = {"lbf·in": ("lbf", inch), "lbf·ft": ("lbf", foot), "kgf·cm": ("kgf", 0.01), "kgf·m": ("kgf", 1.0)}
+    expected = {name: in_newtons[force] * lever for name, (force, lever) in levers.items()}
+    assert {name: TORQUE_UNITS_NM[name] for name in levers} == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("weight_N", "com_m", "residual_N", "expected"),
+    [
+        (0.31, 0.1, 1.0, []),
+        (0.29, 0.1, 1.0, [("weight_compensated", "limit", None)]),
+        (0.2, 0.1, 0.0061, [("weight_compensated", "limit", None)]),
+        (0.2, 0.1, 0.0059, [("weight_implausible", "limit", [["kN", "kN·m"]])]),
+        (0.2, 0.019, 0.0, [("weight_compensated", "limit", None)]),
+        (0.2, 0.021, 0.0, [("weight_implausible", "limit", [["kN", "kN·m"]])]),
+        (0.2, 0.19, 0.0, [("weight_implausible", "limit", [["kN", "kN·m"]])]),
+        (0.2, 0.21, 0.0, [("weight_compensated", "limit", None)]),
+        (490.0, 0.1, 1.0, []),
+        (510.0, 0.1, 1.0, [("weight_implausible", "limit", [["mN", "N·mm"]])]),
+        (1990.0, 0.1, 1.0, [("weight_implausible", "limit", [["mN", "N·mm"]])]),
+        (2010.0, 0.1, 1.0, [("weight_implausible", "reject", [["mN", "N·mm"]])]),
+        (50_000.0, 1e-3, 1.0, [("weight_implausible", "reject", [["gf", "N·m"]])]),
+        (52_000.0, 1e-3, 1.0, [("weight_implausible", "reject", [["mN", "N·m"]])]),  # 510 N of gf are no tool
+    ],
+)
+def test_a_weight_of_no_tool_is_named_with_the_units_that_make_it_one(
+    weight_N: float, com_m: float, residual_N: float, expected: list[object]
+) -> None:
+    assert [one[:3] for one in found(weight_N, com_m, residual_N)] == expected
+
+
+@pytest.mark.parametrize(
+    ("com_m", "described", "expected"),
+    [
+        (4.9e-4, False, [("com_too_near", "limit", None)]),
+        (5.1e-4, False, []),
+        (0.24, False, []),
+        (0.26, False, [("com_too_far", "limit", 0.25)]),
+        (0.26, True, []),
+        (0.49, False, [("com_too_far", "limit", 0.25)]),
+        (0.49, True, []),
+        (0.51, False, [("com_too_far", "reject", 0.5)]),
+        (0.51, True, []),
+        (2.0, True, []),
+    ],
+)
+def test_a_centre_of_mass_of_no_tool_is_named(com_m: float, described: bool, expected: list[object]) -> None:
+    assert [
+        (code, severity, most_m) for code, severity, _, most_m in found(20.0, com_m, described=described)
+    ] == expected
+
+
+def test_a_mass_agrees_with_another_in_the_unit_that_makes_it_so() -> None:
+    assert by_mass(4.5, 20.0, 0.01) == ["lbf"]
+    assert by_mass(4.5, 20.5, 0.01) == []
+    assert by_mass(20.0, 20.0, 0.01) == []
+    assert by_mass(4.5, 0.0, 0.01) == []

@@ -1,0 +1,673 @@
+"""The judgement: cross-validation that is exact, chances that are as stated, and every finding where it is true."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from ftcalib import CalibrationDataset, CalibrationResult, Finding, Parameters, Setup, solve
+from ftcalib.data.dataset import read_csv
+from ftcalib.judge.cross_validation import DriftAhead, IndependentFit, standardized
+from ftcalib.judge.faults import faults
+from ftcalib.judge.verdict import (
+    Quality,
+    _drift,
+    _errors,
+    _noise,
+    _poses,
+    _response,
+    _second_solution,
+    _some_runs,
+    _Statistics,
+    _weight,
+    expected_error,
+    judge,
+    out_of_line,
+    strong_correlations,
+    successive_correlation,
+)
+from ftcalib.likelihood.fit import DriftEstimate
+from ftcalib.likelihood.response import SIZE, Response, predicted_covariance
+from ftcalib.model import Array, jacobian, predict
+from ftcalib.published.yu import SPECIAL_R_flange_base
+
+R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+SIGMA = np.repeat([0.05, 0.05 * 0.025], 3)
+TRUTH = Parameters(
+    Rotation.from_euler("ZYX", [105, 2, 179], degrees=True).as_matrix(),
+    np.array([0.6, -0.4, -20.0]),
+    np.array([3.0, -5.0, 8.0]),
+    np.array([0.01, -0.02, -0.07]),
+    np.array([0.1, 0.2, -0.3]),
+)
+
+
+def white(n: int, sigma: Array = SIGMA) -> Array:
+    return np.tile(np.diag(sigma**2), (n, 1, 1))
+
+
+def gauss_newton(R: Array, wrench: Array, cov: Array, start: Parameters = TRUTH) -> Parameters:
+    """An estimator of the test's own: plain Gauss-Newton from close by."""
+    whiten = np.linalg.inv(np.linalg.cholesky(cov))
+    for _ in range(6):
+        J = (whiten @ jacobian(start, R)).reshape(-1, 15)
+        e = (whiten @ (wrench - predict(start, R))[..., None]).ravel()
+        start = start.moved(np.asarray(np.linalg.solve(J.T @ J, J.T @ e)))
+    return start
+
+
+def fit(
+    R: Array,
+    wrench: Array,
+    cov: Array | None = None,
+    *,
+    start: Parameters = TRUTH,
+    second: float | None = None,
+    weights: Array | None = None,
+    components: Mapping[str, float] | None = None,
+) -> IndependentFit:
+    n, noise = len(R), white(len(R)) if cov is None else cov
+    weights = np.ones(n) if weights is None else weights
+    used = weights > 0
+    parameters = gauss_newton(R[used], wrench[used], noise[used], start)
+    if cov is None:  # one scale from the residuals
+        noise = noise * float(np.sum(((wrench - predict(parameters, R)) / SIGMA) ** 2) / (6 * n - 15))
+    J = jacobian(parameters, R[used])
+    information = np.einsum("nki,nkl,nlj->ij", J, np.linalg.inv(noise[used]), J)
+    covariance = np.asarray(np.linalg.inv(information))
+    return IndependentFit(parameters, covariance, R, wrench, noise, cov is not None, weights, second, components or {})
+
+
+def noisy(rng: np.random.Generator, R: Array, truth: Parameters = TRUTH, sigma: Array = SIGMA) -> Array:
+    return np.asarray(predict(truth, R) + rng.normal(size=(len(R), 6)) * sigma)
+
+
+def codes(judged: Quality | CalibrationResult) -> list[str]:
+    return [one.code for one in judged.findings]
+
+
+def the(code: str, judged: Quality | CalibrationResult) -> Finding:
+    """The one finding with this code."""
+    (finding,) = (one for one in judged.findings if one.code == code)
+    return finding
+
+
+# Cross-validation
+
+
+def test_left_out_residuals_are_those_of_real_refits() -> None:
+    rng = np.random.default_rng(1)
+    R = Rotation.random(8, rng=rng).as_matrix()
+    A = rng.normal(size=(8, 6, 9))
+    cov = SIGMA[:, None] * SIGMA * (A @ np.swapaxes(A, 1, 2)) / 9e4  # correlated, uneven, small: the model is linear
+    wrench = predict(TRUTH, R) + (np.linalg.cholesky(cov) @ rng.normal(size=(8, 6, 1)))[..., 0]
+    best = gauss_newton(R, wrench, cov)
+    fitted = IndependentFit(best, np.eye(15), R, wrench, cov, True, np.ones(8))
+    left_out, left_out_cov = fitted.left_out_residuals, fitted.left_out_cov
+    for k in range(8):
+        others = np.arange(8) != k
+        refit = gauss_newton(R[others], wrench[others], cov[others])
+        error = wrench[k] - predict(refit, R[k])
+        sigma = np.sqrt(np.diag(left_out_cov[k]))
+        np.testing.assert_allclose(left_out[k] / sigma, error / sigma, atol=1e-3)
+        np.testing.assert_allclose(left_out[k], error, atol=1e-4 * float(np.linalg.norm(error)))
+        J = (np.linalg.inv(np.linalg.cholesky(cov[others])) @ jacobian(refit, R[others])).reshape(-1, 15)
+        J_k = jacobian(refit, R[k])
+        np.testing.assert_allclose(
+            left_out_cov[k] / np.outer(sigma, sigma),
+            (cov[k] + J_k @ np.linalg.inv(J.T @ J) @ J_k.T) / np.outer(sigma, sigma),
+            atol=1e-3,
+        )
+
+
+def test_poses_that_were_not_used_are_predicted_like_new_ones() -> None:
+    rng = np.random.default_rng(23)
+    weights = np.where(np.arange(24) < 8, 0.0, 1.0)
+    squares = []
+    for _ in range(50):
+        f = fit(R24, noisy(rng, R24), white(24), weights=weights)
+        np.testing.assert_allclose(f.left_out_residuals[:8], f.residuals[:8], atol=1e-12)
+        squares.append(standardized(f.left_out_residuals, f.left_out_cov)[:8] ** 2)
+    assert np.mean(squares) == pytest.approx(1, abs=0.1)
+
+
+def test_left_out_residuals_spread_as_stated() -> None:
+    rng = np.random.default_rng(2)
+    squares = []
+    for _ in range(60):
+        R = Rotation.random(6, rng=rng).as_matrix()
+        quality = judge(fit(R, noisy(rng, R), white(6)))
+        squares.append(quality.residual_sigma**2)
+    assert np.mean(squares) == pytest.approx(1, abs=0.05)
+
+
+def test_the_cross_validated_error_predicts_new_poses_where_the_residual_flatters() -> None:
+    rng = np.random.default_rng(3)
+    left_out, residual, new = [], [], []
+    for _ in range(60):
+        R, fresh = Rotation.random(6, rng=rng).as_matrix(), Rotation.random(50, rng=rng).as_matrix()
+        f = fit(R, noisy(rng, R), white(6))
+        left_out.append(judge(f).loo_force_rms_N)
+        residual.append(np.sqrt(np.mean(np.sum(f.residuals[:, :3] ** 2, axis=1))))
+        error = noisy(rng, fresh) - predict(f.parameters, fresh)
+        new.append(np.sqrt(np.mean(np.sum(error[:, :3] ** 2, axis=1))))
+    assert np.median(residual) < 0.75 * np.median(new)
+    assert 1.0 < np.median(left_out) / np.median(new) < 1.4  # from five poses, not six
+
+
+def test_a_pose_that_nothing_checks_is_named() -> None:
+    spin = Rotation.from_euler("y", 150, degrees=True) * Rotation.from_euler("z", np.arange(9)[:, None] * 0.7)
+    R = np.concatenate([spin.as_matrix(), Rotation.from_euler("x", [[100.0]], degrees=True).as_matrix()])
+    quality = judge(fit(R, noisy(np.random.default_rng(4), R), white(10)))
+    assert the("poses_unchecked", quality).values == {"poses": [10]}
+    assert quality.verdict != "good"
+
+
+def test_the_expected_error_is_the_mean_over_all_orientations() -> None:
+    f = fit(R24[:9], noisy(np.random.default_rng(5), R24[:9]), white(9))
+    J = jacobian(f.parameters, Rotation.random(20000, rng=np.random.default_rng(6)).as_matrix())
+    variance = np.einsum("nki,ij,nkj->k", J, f.covariance, J) / len(J)
+    force_N, torque_Nm = expected_error(f.parameters, f.covariance)
+    assert force_N == pytest.approx(np.sqrt(variance[:3].sum()), rel=0.02)
+    assert torque_Nm == pytest.approx(np.sqrt(variance[3:].sum()), rel=0.02)
+
+
+# Statistics
+
+
+def test_p_values_are_uniform_and_clean_runs_are_good_without_a_finding() -> None:
+    rng = np.random.default_rng(7)
+    judged = [judge(fit(R24, noisy(rng, R24), white(24))) for _ in range(80)]
+    p = np.sort([q.chi2_p for q in judged if q.chi2_p is not None])
+    assert len(p) == 80
+    assert np.abs(p - np.arange(1, 81) / 80).max() < 0.18  # Kolmogorov's 1 %
+    assert all(q.verdict == "good" for q in judged)
+    assert sum(bool(q.findings) for q in judged) <= 2
+    assert np.mean([q.lag1 for q in judged]) == pytest.approx(0, abs=0.04)
+
+
+def test_drift_shows_between_successive_poses_in_time_not_in_rows() -> None:
+    rng = np.random.default_rng(8)
+    drift = np.linspace(0, 1.0, 24)[:, None] * [0, 0, 1.0, 0, 0, 0]
+    wrench = noisy(rng, R24) + drift
+    quality = judge(fit(R24, wrench, white(24)))
+    assert quality.lag1 > 0.25
+    assert the("residuals_alike", quality).values["correlation"] == quality.lag1
+    order = rng.permutation(24)
+    shuffled = fit(R24[order], wrench[order], white(24))
+    assert judge(shuffled, t_s=order.astype(float)).lag1 == pytest.approx(quality.lag1, abs=1e-6)
+    assert judge(shuffled).lag1 < 0.2
+    assert judge(shuffled, t_s=np.full(24, np.nan)).lag1 == judge(shuffled).lag1
+
+
+def test_correlation_of_successive_poses_has_its_chance() -> None:
+    rng = np.random.default_rng(9)
+    p = [successive_correlation(rng.normal(size=(24, 6)))[1] for _ in range(2000)]
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.015)
+    assert successive_correlation(np.tile(rng.normal(size=6), (9, 1)))[0] == pytest.approx(1)
+
+
+def test_strong_correlations_are_named() -> None:
+    covariance = np.eye(15)
+    covariance[5, 8] = covariance[8, 5] = -0.95
+    assert strong_correlations(covariance) == (("gravity_force_base_N.z", "force_bias_N.z", -0.95),)
+
+
+@pytest.mark.parametrize(("n", "alone"), [(24, 0.014), (6, 0.10)])
+def test_readings_of_a_free_tool_scatter_by_noise_and_calibration(n: int, alone: float) -> None:
+    rng = np.random.default_rng(n)
+    alarms, noise_only, seen = list[Array](), list[Array](), list[Array]()
+    for _ in range(120):
+        R = R24 if n == 24 else Rotation.random(n, rng=rng).as_matrix()
+        J = (jacobian(TRUTH, R) / SIGMA[:, None]).reshape(-1, 15)
+        covariance = np.linalg.inv(J.T @ J)
+        found = TRUTH.moved(np.linalg.cholesky(covariance) @ rng.normal(size=15))
+        there = Rotation.random(120, rng=rng).as_matrix()
+        residual, noise = noisy(rng, there) - predict(found, there), white(len(there))
+        total = noise + predicted_covariance(found, covariance, None, there)
+        push = 12 * SIGMA * np.array([0, 0, 1, 0, 0, 0])
+        for found_by, e, cov in (
+            (alarms, residual, total),
+            (noise_only, residual, noise),
+            (seen, residual + push, total),
+        ):
+            found_by.append((standardized(e, cov) ** 2).sum(axis=1) > chi2.isf(0.01, 6))
+    assert 0.007 < np.mean(alarms) < 0.014
+    assert np.mean(noise_only) > alone
+    assert np.mean(seen) > 0.95
+
+
+# Reasons
+
+
+def test_noise_beyond_the_measured_is_good_only_while_errors_are_small() -> None:
+    rng = np.random.default_rng(10)
+    small, large = 0.04, 0.25  # N at 20 N: with three axes 0.3 % and 2.2 %
+    for sigma_N, factor, verdict in ((small, 2.0, "good"), (small, 5.0, "usable"), (large, 2.0, "usable")):
+        sigma = np.repeat([sigma_N, 0.025 * sigma_N], 3)
+        quality = judge(fit(R24, noisy(rng, R24, sigma=sigma), white(24, sigma / factor), components={}))
+        assert quality.verdict == verdict
+        assert quality.noise_factor == pytest.approx(factor, rel=0.2)
+        assert the("noise_exceeded", quality).severity == ("note" if verdict == "good" else "limit")
+    known = judge(fit(R24, noisy(rng, R24, sigma=2 * SIGMA), white(24), components={"rotation_rad": 0.002}))
+    assert the("noise_exceeded", known).values["components"] == {"rotation_rad": 0.002}
+
+
+def test_errors_are_stated_relative_to_the_weight() -> None:
+    rng = np.random.default_rng(11)
+    usable = judge(fit(R24, noisy(rng, R24, sigma=np.repeat([0.4, 0.01], 3))))
+    error = usable.findings[0]
+    assert (usable.verdict, error.code, error.severity) == ("usable", "force_error", "limit")
+    assert error.values["share_percent"] == pytest.approx(2.8, abs=0.05)
+    assert (error.values["source"], error.values["limit_percent"]) == ("residuals", 2)
+    assert "torque_error" not in codes(usable)
+    sigma = np.repeat([0.05, 0.2], 3)
+    rejected = judge(fit(R24, noisy(rng, R24, sigma=sigma), white(24, sigma)))
+    error = rejected.findings[0]
+    assert (rejected.verdict, error.code, error.severity) == ("rejected", "torque_error", "reject")
+    assert 10 < error.values["share_percent"] < 20
+
+
+def test_few_poses_and_rejected_poses_are_reported() -> None:
+    rng = np.random.default_rng(12)
+    five = R24[[0, 6, 10, 15, 21]]
+    quality = judge(fit(five, noisy(rng, five), white(5)))
+    assert (quality.verdict, the("few_poses", quality).values["n_poses"]) == ("usable", 5)
+
+    wrench = noisy(rng, R24)
+    for bumped, verdict in (([4, 9], "good"), ([4, 9, 11, 20], "usable")):
+        hit = wrench.copy()
+        hit[bumped, 2] += 5
+        weights = np.ones(24)
+        weights[bumped] = 0
+        quality = judge(fit(R24, hit, white(24), weights=weights))
+        assert quality.verdict == verdict
+        rejected = {"count": len(bumped), "n_poses": 24, "poses": [k + 1 for k in bumped]}
+        assert the("poses_rejected", quality).values == rejected
+        assert quality.loo_force_rms_N < 0.15
+        assert quality.worst_pose not in bumped
+
+
+@pytest.mark.parametrize("channel", range(6))
+def test_what_is_known_is_doubted_where_the_data_fit_without_it(channel: int) -> None:
+    wrench = noisy(np.random.default_rng(24), R24)
+    free = fit(R24, wrench, white(24))
+    off = 3.0 if channel < 3 else 0.2  # N or N·m of every pose, as from a constraint that is wrong
+    constrained = replace(free, wrench=wrench + off * np.eye(6)[channel])
+    kind, unit = ("force", "N") if channel < 3 else ("torque", "Nm")
+    finding = the(f"known_values_misfit_{kind}", judge(constrained, unconstrained=free))
+    assert finding.values[f"residual_{unit}"] == pytest.approx(off, rel=0.02)
+    assert not any(code.startswith("known") for code in codes(judge(free, unconstrained=free)))
+
+
+def test_a_pose_out_of_line_is_pointed_at() -> None:
+    wrench = noisy(np.random.default_rng(13), R24)
+    wrench[12, 0] += 0.5
+    quality = judge(fit(R24, wrench, white(24)))
+    assert quality.worst_pose == 12
+    assert the("pose_deviates", quality).values["pose"] == 13
+
+
+def test_a_second_solution_is_given_its_odds() -> None:
+    wrench = noisy(np.random.default_rng(14), R24)
+    quality = judge(fit(R24, wrench, white(24), second=2.0))
+    assert quality.verdict == "rejected"
+    assert quality.findings[0].code == "second_solution"
+    assert quality.findings[0].values["probability_percent"] == pytest.approx(27, abs=0.5)
+    assert judge(fit(R24, wrench, white(24), second=13.0)).verdict == "good"
+
+
+def test_a_weight_lost_in_noise_is_rejected() -> None:
+    light = replace(TRUTH, gravity_force_base_N=np.array([0, 0, -0.03]))
+    quality = judge(fit(R24, noisy(np.random.default_rng(15), R24, light), white(24), start=light))
+    assert quality.verdict == "rejected"
+    assert quality.findings[0].code == "weight_insignificant"
+
+
+@pytest.mark.parametrize(
+    ("F_b", "up", "code", "off_deg"),
+    [
+        ([-20.0, 0, 0], None, "mounting_undeclared", 90),
+        ([0, -17.4, -10.0], None, "mounting_undeclared", 60),
+        ([0, 0, 20.0], None, "weight_upwards", 180),
+        ([0, -5.0, -19.0], None, "gravity_tilted", 15),
+        ([0, -0.5, -20.0], None, None, 0),
+        ([-20.0, 0, 0], (0, 0, 1), "gravity_off_mounting", 90),
+        ([0, -5.0, -19.0], (0, 0, 2), "gravity_off_mounting", 15),
+        ([0, -0.5, -20.0], (0, 0, 1), "base_leans", 1.4),
+        ([0, 0, 20.0], (0, 0, 1), "weight_upwards", 180),
+        ([0, 0, 20.0], (0, 0, -1), None, 0),
+        ([-20.0, 0, 0], (1, 0, 0), None, 0),
+    ],
+)
+def test_a_robot_that_hangs_otherwise_than_declared_is_not_good(
+    F_b: list[float], up: tuple[float, ...] | None, code: str | None, off_deg: float
+) -> None:
+    truth = replace(TRUTH, gravity_force_base_N=np.array(F_b))
+    setup = Setup(up_in_base=up)
+    quality = judge(fit(R24, noisy(np.random.default_rng(16), R24, truth), white(24), start=truth), setup=setup)
+    assert codes(quality) == ([] if code is None else [code])
+    assert quality.verdict == ("good" if code in {None, "gravity_tilted", "base_leans"} else "usable")
+    if code is not None:
+        values = quality.findings[0].values
+        assert values["lean_deg" if code == "base_leans" else "off_deg"] == pytest.approx(off_deg, abs=0.7)
+
+
+# Signs, axes and units: what a wrongly wired sensor reads, solved without knowing better.
+
+
+def solved(R: Array, wrench: Array) -> CalibrationResult:
+    n = len(R)
+    return solve(CalibrationDataset(R, wrench, None, np.zeros(n, np.int64), np.full(n, np.nan)))
+
+
+F, T = ["fx", "fy", "fz"], ["tx", "ty", "tz"]
+DISAGREE = {"orientations_inverted", "axes_disagree", "weight_upwards", "forces_reversed", "torques_reversed"}
+
+
+@pytest.mark.parametrize(
+    ("reversed_channels", "code", "corrections"),
+    [
+        (F + T, "weight_upwards", None),
+        (["fx", "tx"], "weight_upwards", None),
+        (F, "forces_reversed", None),
+        (T, "torques_reversed", None),
+        (["tx"], "axes_disagree", [["torque", ["-x", "y", "z"]]]),
+        (["fy"], "axes_disagree", [["force", ["x", "-y", "z"]]]),
+        (["ty", "tz"], "axes_disagree", [["torque", ["x", "-y", "-z"]], ["force", ["x", "-y", "-z"]]]),
+        (["fx", "fy"], "axes_disagree", [["torque", ["-x", "-y", "z"]], ["force", ["-x", "-y", "z"]]]),
+    ],
+)
+def test_reversed_channels_are_detected(
+    reversed_channels: list[str], code: str, corrections: list[object] | None
+) -> None:
+    rng = np.random.default_rng(17)
+    R = Rotation.random(11, rng=rng).as_matrix()
+    signs = [-1.0 if channel in reversed_channels else 1.0 for channel in F + T]
+    result = solved(R, noisy(rng, R) * signs)
+    assert result.verdict == ("rejected" if corrections else "usable")
+    assert result.findings[0].code == code
+    assert result.findings[0].values.get("corrections") == corrections
+
+
+def test_nothing_is_suspected_of_a_sound_sensor() -> None:
+    rng = np.random.default_rng(19)
+    for sigma in (SIGMA, 10 * SIGMA, 40 * SIGMA):
+        R = Rotation.random(12, rng=rng).as_matrix()
+        wrench = noisy(rng, R, sigma=sigma)
+        assert faults(R, wrench) == []
+        assert not DISAGREE & set(codes(solved(R, wrench)))
+
+
+def test_inverted_orientations_are_detected() -> None:
+    R = Rotation.random(10, rng=np.random.default_rng(20)).as_matrix()
+    result = solved(np.swapaxes(R, 1, 2), noisy(np.random.default_rng(21), R))
+    assert (result.verdict, result.findings[0].code) == ("rejected", "orientations_inverted")
+
+
+@pytest.mark.parametrize(
+    ("factor", "code", "distance", "suspects"),
+    [
+        (1e3, "com_too_far", 73.5, [["N", "N·mm"], ["kN", "N·m"]]),
+        (1e-3, "com_too_near", 0.074, None),
+        (10, "com_too_far", 0.735, [["N", "lbf·in"], ["lbf", "N·m"], ["kgf", "N·m"]]),
+    ],
+)
+def test_wrong_units_of_torque_are_detected(
+    factor: float, code: str, distance: float, suspects: list[object] | None
+) -> None:
+    wrench = noisy(np.random.default_rng(22), R24)
+    result = solved(R24, wrench * np.repeat([1, factor], 3))
+    assert result.verdict == ("usable" if factor < 1 else "rejected")
+    values = the(code, result).values
+    assert values["distance_mm" if factor < 1 else "distance_m"] == pytest.approx(distance, rel=0.02)
+    assert values.get("units") == suspects
+
+
+# Limits
+
+
+FITTED = fit(R24, noisy(np.random.default_rng(30), R24), white(24))
+WEIGHT_N = float(np.linalg.norm(FITTED.parameters.gravity_force_base_N))
+
+
+def statistics(**values: Any) -> _Statistics:
+    """Of 24 good poses, except for these values."""
+    usual = {
+        "used": np.ones(24, bool),
+        "is_exact": False,
+        "weight_N": WEIGHT_N,
+        "residual_sigma": np.ones(24),
+        "worst_pose": 3,
+    }
+    usual |= {"lag1": 0.3, "lag1_p": 0.5, "largest_share": 0.001, "noise_factor": 1.0, "chi2_p": 0.5}
+    one = SimpleNamespace(**usual | values)
+    one.fits_measured_noise = one.chi2_p is not None and one.chi2_p >= 1e-3
+    return cast(_Statistics, one)
+
+
+@pytest.mark.parametrize(("delta", "found"), [(11.9, True), (12.1, False)])
+@pytest.mark.parametrize("noise_factor", [0.5, 2.0])
+def test_a_second_solution_counts_in_noise_as_it_is(delta: float, noise_factor: float, found: bool) -> None:
+    scale = FITTED.chi2 / FITTED.dof / noise_factor**2
+    noisier = replace(FITTED, wrench_cov=FITTED.wrench_cov * scale, second_basin_chi2=delta * max(1, noise_factor**2))
+    assert [one.code for one in _second_solution(noisier)] == ["second_solution"] * found
+    (close,) = _second_solution(replace(FITTED, second_basin_chi2=-1.0))
+    assert close.values["probability_percent"] == 50
+
+
+def test_of_a_rejected_result_only_units_are_suspected_of_the_payload() -> None:
+    rejected, broken = replace(FITTED, second_basin_chi2=2.0), FITTED.wrench.copy()
+    broken[:, 5] = broken[0, 5]
+    mass_kg = WEIGHT_N / 9.80665
+    for payload_kg, code in ((2.5 * mass_kg, "payload_mismatch"), (4.448 * mass_kg, "payload_units")):
+        setup = Setup(payload_kg=payload_kg, sensor_mass_kg=0.0)
+        assert (code in codes(judge(rejected, setup=setup))) == (code == "payload_units")
+        assert code in codes(judge(FITTED, setup=setup))
+        assert code not in codes(judge(replace(rejected, wrench=broken), setup=setup))
+
+
+@pytest.mark.parametrize(("sigmas", "significant"), [(4.9, False), (5.1, True)])
+def test_a_weight_is_one_from_five_sigmas_on(sigmas: float, significant: bool) -> None:
+    along = FITTED.parameters.gravity_force_base_N / WEIGHT_N
+    across = np.cross(along, [1.0, 0, 0])
+    covariance = 1e-9 * np.eye(15)
+    covariance[3:6, 3:6] += (WEIGHT_N / sigmas) ** 2 * np.outer(along, along) + 1e3 * np.outer(across, across)
+    found = _weight(replace(FITTED, covariance=covariance), WEIGHT_N, Setup())
+    assert [one.code for one in found] == ["weight_insignificant"] * (not significant)
+
+
+@pytest.mark.parametrize(
+    ("factor", "share", "severity"),
+    [(2.9, 0.009, "note"), (3.1, 0.009, "limit"), (2.9, 0.011, "limit")],
+)
+def test_more_noise_than_measured_is_minor_up_to_three_times_and_one_percent(
+    factor: float, share: float, severity: str
+) -> None:
+    loud = replace(FITTED, components={"walk_force_N": 0.1, "white_force_N": 0.0})
+    (finding,) = _noise(loud, statistics(chi2_p=0.9e-3, noise_factor=factor, largest_share=share))
+    assert (finding.severity, finding.values["components"]) == (severity, {"walk_force_N": 0.1})
+    assert _noise(loud, statistics(chi2_p=1.1e-3, noise_factor=factor)) == []
+    assert [one.code for one in _noise(loud, statistics(chi2_p=None))] == ["noise_unknown"]
+
+
+def test_poses_are_pointed_at_beyond_their_limits() -> None:
+    def found(fitted: IndependentFit = FITTED, **values: Any) -> list[str]:
+        return [one.code for one in _poses(fitted, statistics(**values), "note")]
+
+    assert found() == []
+    assert found(lag1_p=0.9e-3) == ["residuals_alike"]
+    assert found(lag1_p=1.1e-3) == found(lag1_p=0.9e-3, is_exact=True) == []
+    for n, codes_of_few in ((5, ["poses_rejected", "few_poses"]), (6, ["poses_rejected"])):
+        assert found(used=np.arange(24) < n) == codes_of_few
+    limit = np.sqrt(chi2.isf(1e-3 / 24, 6) / 6)
+    for typical in (0.5, 3.0):
+        sigmas = np.full(24, typical)
+        for off, codes_of_far in ((0.99, []), (1.01, ["pose_deviates"])):
+            sigmas[3] = off * limit * max(typical, 1.0)
+            assert found(residual_sigma=sigmas) == codes_of_far
+            assert out_of_line(sigmas, np.arange(24) != 5) == [3] * bool(codes_of_far) + [5]
+    sigmas[[3, 4, 5, 6]] = 1e6
+    assert found(residual_sigma=sigmas, used=np.arange(24) < 5) == ["poses_rejected", "few_poses"]
+    cov = np.zeros((24, 6, 6))
+    for rows, unchecked in ((12, ["poses_unchecked"]), (13, []), (0, [])):
+        cov[:, 1, 1] = np.where(np.arange(24) < rows, 1.01, 0.99) * WEIGHT_N**2
+        uncertain = cast(IndependentFit, SimpleNamespace(left_out_cov=cov))
+        assert found(uncertain) == unchecked
+    assert found(uncertain, weight_N=0.9 * WEIGHT_N, used=np.arange(24) < 6) == ["poses_rejected"]
+
+
+def test_errors_count_relative_to_the_weight_at_a_lever() -> None:
+    used = np.arange(24) > 1
+    for com_m, lever_m in ((0.05, 0.1), (0.3, 0.3)):
+        com = com_m * np.array([0.6, 0.0, 0.8])
+        truth = replace(TRUTH, p_sensor_com_m=com)
+        sigma = np.repeat([0.05, 0.04 * lever_m * WEIGHT_N / np.sqrt(3)], 3)
+        wrench = noisy(np.random.default_rng(31), R24, truth, sigma)
+        loud = fit(R24, wrench, white(24, sigma), start=truth, weights=used.astype(float))
+        largest, (finding,), left_out = _errors(loud, used, WEIGHT_N)
+        length = [np.sqrt(np.mean(np.sum(part[used] ** 2, axis=1))) for part in np.hsplit(loud.left_out_residuals, 2)]
+        assert left_out == pytest.approx(tuple(length))
+        residual_Nm = np.sqrt(np.mean(np.sum(loud.residuals[used, 3:] ** 2, axis=1)))
+        assert (finding.code, finding.severity, finding.values["source"]) == ("torque_error", "limit", "residuals")
+        assert finding.values["error_Nm"] == pytest.approx(residual_Nm)
+        assert finding.values["lever_m"] == pytest.approx(lever_m, rel=0.01)
+        assert largest == pytest.approx(residual_Nm / WEIGHT_N / finding.values["lever_m"])
+        assert (finding.values["share_percent"], finding.values["limit_percent"]) == (100 * largest, 2)
+
+
+def test_the_next_use_has_the_noise_that_explains_the_residuals_or_else_those_of_left_out_poses() -> None:
+    wrench = noisy(np.random.default_rng(32), R24)
+    measured, unknown = fit(R24, wrench, white(24)), fit(R24, wrench)
+    expected = expected_error(measured.parameters, measured.covariance)
+    quality, other = judge(measured), judge(unknown)
+    assert (quality.next_use_force_rms_N, quality.next_use_torque_rms_Nm) == pytest.approx(expected)
+    left_out = other.loo_force_rms_N, other.loo_torque_rms_Nm
+    assert (other.next_use_force_rms_N, other.next_use_torque_rms_Nm) == pytest.approx(left_out)
+
+
+def test_many_poses_are_looked_at_in_runs() -> None:
+    np.testing.assert_array_equal(_some_runs(None, 3999), np.arange(3999))
+    np.testing.assert_array_equal(_some_runs(None, 4000), np.arange(4000).reshape(20, 2, 100)[:, 0].ravel())
+    backwards = np.arange(6.0)[::-1]
+    np.testing.assert_array_equal(_some_runs(backwards, 6), [5, 4, 3, 2, 1, 0])
+    np.testing.assert_array_equal(_some_runs(np.where(backwards == 2, np.nan, backwards), 6), np.arange(6))
+
+
+@pytest.mark.parametrize(
+    ("change", "is_cause", "found"),
+    [
+        ([0.029, 0, 0, 0, 0, 0], True, None),
+        ([0.031, 0, 0, 0, 0, 0], True, ("note", 0.031, 0.0)),
+        ([0.39, 0, 0, 0, 0, 0], True, ("note", 0.39, 0.0)),
+        ([0.41, 0, 0, 0, 0, 0], True, ("limit", 0.41, 0.0)),
+        ([0.41, 0, 0, 0, 0, 0], False, ("note", 0.41, 0.0)),
+        ([0, 0, 0, 0, 0.039, 0], True, ("note", 0.0, 0.039)),
+        ([0, 0, 0, 0, 0.041, 0], True, ("limit", 0.0, 0.041)),  # at the lever 0.41 N
+    ],
+)
+def test_a_drift_is_named_from_three_sigmas_on_and_limits_from_two_percent_of_the_weight(
+    change: list[float], is_cause: bool, found: tuple[str, float, float] | None
+) -> None:
+    drift = DriftEstimate(np.array(change), np.repeat([0.01, 0.001], 3), np.zeros((2, 6)))
+    ahead = DriftAhead(np.zeros(6), np.zeros(6), np.zeros(6))
+    findings = _drift(drift, ahead, 20.0, is_cause=is_cause)
+    named = [(one.severity, one.values["force_N"], one.values["torque_Nm"]) for one in findings]
+    assert named == ([] if found is None else [found])
+    if change[4]:
+        still = DriftAhead(np.zeros(6), np.zeros(6), np.array([0, 0, 0, 0, 0.041**2, 0]))
+        assert _drift(drift, still, 20.0, is_cause=True)[0].severity == "limit"
+
+
+@pytest.mark.parametrize(("sigmas", "certain"), [(2.9, False), (3.1, True)])
+def test_a_response_is_named_from_three_sigmas_on(sigmas: float, certain: bool) -> None:
+    covariance = np.diag(np.append(np.zeros(15), np.full(SIZE, 0.001**2)))
+    for k, code in ((2, "axes_mixed"), (8, "cross_talk")):
+        coefficients = sigmas * 0.001 * np.eye(SIZE)[k]
+        (finding,) = _response(Response(coefficients, covariance), WEIGHT_N)
+        assert finding.code == (code if certain else "response_small")
+
+
+@pytest.mark.parametrize(("share", "doubted"), [(0.39, True), (0.41, False)])
+def test_known_values_are_doubted_where_the_data_leave_less_than_four_tenths_without_them(
+    share: float, doubted: bool
+) -> None:
+    free = fit(R24, noisy(np.random.default_rng(33), R24), white(24))
+    rms = np.sqrt(np.mean(np.sum(free.residuals[:, :3] ** 2, axis=1)))
+    scale = 0.5 / rms  # so large that the misfit matters
+    free = replace(free, wrench=predict(free.parameters, R24) + scale * free.residuals)
+    off = 0.5 * np.sqrt(1 / share**2 - 1)
+    constrained = replace(free, wrench=free.wrench + off * np.eye(6)[2])
+    assert ("known_values_misfit_force" in codes(judge(constrained, unconstrained=free))) == doubted
+
+
+# Real sessions
+
+
+def test_a_drift_of_rounding_size_is_no_drift() -> None:
+    change, sigma = np.array([0.0, 0.1, 0.0, 0.0, 0.0, 3e-20]), np.array([0.01] * 3 + [1e-21] * 3)
+    drift, zero = DriftEstimate(change, sigma, np.zeros((2, 6))), np.zeros(6)
+    for at_next_use_N, severity in ((0.3, "note"), (0.5, "limit")):  # of 20 N, 2 % are 0.4
+        ahead = DriftAhead(zero, zero, np.array([0.0, at_next_use_N**2, 0, 0, 0, 0]))
+        (finding,) = _drift(drift, ahead, 20.0, is_cause=True)
+        assert (finding.severity, finding.values) == (severity, {"force_N": 0.1, "torque_Nm": 0.0})
+
+
+@pytest.mark.parametrize(("share", "codes"), [(1e-3, ["gain_x", "gain_y"]), (1e-6, ["response_small"])])
+def test_a_gain_that_no_sensor_resolves_is_not_named(share: float, codes: list[str]) -> None:
+    covariance = 1e-16 * np.eye(15 + SIZE)
+    found = _response(Response(share * np.eye(SIZE)[0], covariance), 20.0)  # a sensor resolves 1 mN
+    assert [one.code for one in found] == codes
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_a_linear_drift_goes_on_for_the_next_minute(timed: bool) -> None:
+    ramp = np.linspace(-1, 1, 24)[:, None] * [0.3, 0, 0.4, 0, 0.01, 0]
+    times = 20.0 * np.arange(24, dtype=np.float64) if timed else np.full(24, np.nan)
+    noise = 0.01 * np.random.default_rng(26).normal(size=(24, 6)) * SIGMA / SIGMA[0]
+    wrench = predict(TRUTH, R24) + ramp + noise
+    result = solve(CalibrationDataset(R24, wrench, None, np.zeros(24, np.int64), times), drift="linear")
+    steps = 3 if timed else 6  # of 20 s; of 10 s where no time is known
+    at_the_end = np.array([0.3, 0, 0.4, 0, 0.01, 0])
+    np.testing.assert_allclose(result.quality["last_bias_offset"], at_the_end, atol=0.02)
+    np.testing.assert_allclose(result.quality["bias_growth_per_min"], steps * at_the_end * 2 / 23, atol=0.02)
+    np.testing.assert_allclose(result.likely_error(), (1 + steps * 2 / 23) * np.array([0.5, 0.01]), rtol=0.1)
+
+
+@pytest.mark.slow
+def test_the_likely_error_is_that_of_the_next_use_where_the_bias_walks() -> None:
+    walk, rng, ratios = np.repeat([0.1, 0.003], 3), np.random.default_rng(27), []
+    times = 10.0 * np.arange(24, dtype=np.float64)
+    for _ in range(12):
+        moved = np.cumsum(rng.normal(size=(30, 6)) * walk, axis=0)  # six more in the minute after
+        wrench = noisy(rng, R24) + moved[:24]
+        result = solve(CalibrationDataset(R24, wrench, white(24), np.full(24, 500), times))
+        error = result.compensate(predict(TRUTH, R24) + moved[-1], R24)
+        ratios.append(np.mean(np.sum(error.reshape(-1, 2, 3) ** 2, axis=2), axis=0) / result.likely_error() ** 2)
+        assert result.likely_error()[0] > 1.5 * result.quality["loo_force_rms_N"]
+    assert 0.6 < np.sqrt(np.mean(ratios)) < 1.3
+
+
+def test_a_real_session_read_with_wrong_signs_is_found_out(real_data: Path) -> None:
+    dataset = read_csv(real_data / "agimus_mini45_b" / "poses.csv", "R_flange_base")
+    R, wrench = dataset.R_base_flange, dataset.wrench
+    assert "weight_upwards" in codes(solved(R, -wrench))
+    corrections = the("axes_disagree", solved(R, wrench * [1, 1, 1, -1, 1, 1])).values["corrections"]
+    assert corrections == [["torque", ["-x", "y", "z"]]]
+
+
+@pytest.mark.parametrize(("sigma", "digits"), [(None, 15), (None, 6), (1e-9, 15), (0.01, 15), (0.01, 6)])
+def test_findings_are_not_made_of_rounding(sigma: float | None, digits: int) -> None:
+    cov = None if sigma is None else np.eye(6) * sigma**2
+    textbook = Parameters(np.eye(3), np.array([0.0, 0, -10]), np.zeros(3), np.array([0, 0, 0.05]), np.zeros(3))
+    poses = [R24, *(Rotation.random(n, random_state=n).as_matrix() for n in (24, 12, 6))]
+    for truth in (textbook, replace(TRUTH, gravity_force_base_N=np.array([0.0, 0, -17.3]))):
+        for R in poses:
+            result = solve(CalibrationDataset.of(R, predict(truth, R).round(digits), wrench_cov=cov))
+            assert {one.code for one in result.findings} <= {"noise_unknown"}
