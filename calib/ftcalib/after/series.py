@@ -5,11 +5,8 @@ from dataclasses import dataclass, fields
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import scipy
+import scipy  # its parts are imported at their first use: lists of calibrations start without them
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
-from scipy.special import chdtrc as chi2_sf
-from scipy.special import fdtrc as f_sf
 
 from ftcalib.model import Array, Parameters, read_only
 
@@ -84,7 +81,7 @@ def difference(first: Estimated, second: Estimated) -> Difference:
     old, new = first.parameters, second.parameters
     change = old.difference(new)
     # The left Jacobian of the rotation drops out of the Mahalanobis distance, because it leaves its own axis in place.
-    turn = block_diag(new.R_flange_sensor @ old.R_flange_sensor.T, np.eye(12))
+    turn = scipy.linalg.block_diag(new.R_flange_sensor @ old.R_flange_sensor.T, np.eye(12))
     covariance = second.covariance + turn @ first.covariance @ turn.T
     for i, field in enumerate(fields(Parameters)):
         if np.array_equal(getattr(old, field.name), getattr(new, field.name)):
@@ -113,7 +110,7 @@ def _test(change: Array, covariance: Array, rows: NDArray[np.intp]) -> ChiSquare
     if np.any(np.abs(along[~usable]) > _ROUNDING_SIGMAS):
         return ChiSquare(np.inf, len(free), 0.0)
     chi2, dof = float(np.sum(along[usable] ** 2 / eigenvalues[usable])), int(usable.sum())
-    return ChiSquare(chi2, dof, float(chi2_sf(dof, chi2)))
+    return ChiSquare(chi2, dof, float(scipy.special.chdtrc(dof, chi2)))
 
 
 # Whether a bias has begun to drift: the onset of a linear change in a series of verifications of one calibration.
@@ -244,7 +241,7 @@ def _from_here(rows: Array) -> Array:
 def _p_value(chi2: Array, total: Array, dof: int) -> Array:
     """Return the larger p-value of one coefficient: against the stated sigmas, and against the scatter."""
     rest = np.maximum(total - chi2, 1e-12) / dof
-    return np.maximum(chi2_sf(1, chi2), f_sf(1, dof, chi2 / rest))
+    return np.maximum(scipy.special.chdtrc(1, chi2), scipy.special.fdtrc(1, dof, chi2 / rest))
 
 
 # Linear change of an estimate from calibration to calibration, and whether it is significant.
@@ -393,7 +390,7 @@ def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Ar
         with_T, without = (_fitted(X, walk, y[:, group], noise) for X in (line, alone))
         slope[0, group], slope[1, group] = with_T.x[1], with_T.sigma
         error[k], errors[k] = with_T.left_out, without.left_out
-        p_values[k] = f_sf(3, 3 * (n - 2), float(np.mean(np.square(with_T.x[1] / with_T.sigma))))
+        p_values[k] = scipy.special.fdtrc(3, 3 * (n - 2), float(np.mean(np.square(with_T.x[1] / with_T.sigma))))
     return BiasTemperature(slope[0], slope[1], n, float(T.min()), float(T.max()), error, errors, p_values)
 
 

@@ -13,7 +13,6 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtri as chi2_isf
 
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
@@ -389,7 +388,7 @@ def _covariance_problem(C: Array) -> str | None:
 
 TRUSTED_SAMPLES = 100.0
 """With this many independent samples, the covariance of a pose counts as much as the common shape."""
-MEDIAN_SCATTER = float(chi2_isf(5, 0.5)) / 5
+MEDIAN_SCATTER = 0.8702920382191053  # chdtri(5, 0.5) / 5
 """Median of the variance of six Gaussian values, relative to its mean."""
 UNLIKE = 3.0
 """A pose whose variances scatter more than this, relative to their freedom, has a shape of its own: 1 % by chance."""
