@@ -102,7 +102,7 @@ class Clock(ABC):
         return nullcontext()
 
 
-class RealClock(Clock):
+class _RealClock(Clock):
     """The computer's monotonic clock."""
 
     def now_ns(self) -> int:
@@ -124,7 +124,7 @@ class RealClock(Clock):
         return waitable.wait(max(0.0, timeout_s))
 
 
-REAL = RealClock()
+REAL = _RealClock()
 
 
 class Follower(threading.Thread):

@@ -18,8 +18,7 @@ import click
 from ftcalib.errors import DeviceError
 from ftdrive import __version__
 from ftdrive.errors import SupervisorGone, exit_code
-from ftdrive.terminal.command_names import COMMANDS
-from ftdrive.terminal.text import echo, in_one_line
+from ftdrive.terminal.text import COMMANDS, echo, in_one_line
 
 _EPILOG = """\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,

@@ -1,10 +1,11 @@
-"""A gate before a local server: it refuses web pages of others, by the `Host` and `Origin` of a request.
+"""Addresses of our servers, and a gate that refuses web pages of others by `Host` and `Origin` of a request.
 
 A browser sends both, and a page cannot change them. Without the gate, any page that an operator opens could use a
 server on this computer. Programs send no `Origin`.
 """
 
 import asyncio
+import ipaddress
 import logging
 import os
 import random
@@ -20,6 +21,8 @@ from ipaddress import ip_address
 from threading import Thread
 from typing import Final
 from urllib.parse import urlsplit
+
+from ftdrive.errors import ConfigError
 
 Address = tuple[str, int]
 
@@ -201,3 +204,24 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
     while piece := await reader.read(_PIECE):
         writer.write(piece)
         await writer.drain()
+
+
+def host_and_port(option: str, text: str, example: str, *, lowest: int = 1) -> tuple[str, int]:
+    """Read HOST:PORT, with brackets round an IPv6 address; raises `ConfigError`."""
+    host, _, port = text.rpartition(":")
+    if not host or not (port.isascii() and port.isdecimal()) or not lowest <= int(port) < 65536:
+        raise ConfigError(f"{option} is '{text}': give HOST:PORT, such as {example}")
+    return host.strip("[]"), int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer reaches an address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def with_port(host: str, port: int) -> str:
+    """Write HOST:PORT, with brackets round an IPv6 address."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ftcalib.after.series import drift_onset
 from ftcalib.model import Array
-from ftdrive.fleet.observed import WINDOW
+from ftdrive.fleet.cells import WINDOW
 
 YEAR = 365
 COMMON = 0.5

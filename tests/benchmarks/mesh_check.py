@@ -33,7 +33,7 @@ from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
-from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.planning.search.nodes import constant_tour
 from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, forward
 from tests.benchmarks.planning import FIXED_POINTS_M
 from tests.own_kinematics import of_dh

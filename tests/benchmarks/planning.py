@@ -16,15 +16,14 @@ import numpy as np
 from ftcalib.poses.information import special
 from ftdrive.errors import PlanRefused
 from ftdrive.planning.approach import plan_approach
-from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Bodies, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import inverse
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
-from ftdrive.planning.geometry.shapes import Bodies
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
-from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.planning.search.nodes import constant_tour
 from ftdrivers.ur.kinematics import Array
 
 MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")

@@ -29,7 +29,7 @@ import numpy as np
 from ftdrive.cell.emulated import REAL_PACE, Station
 from ftdrive.live.samples import Block
 from ftdrive.live.stream import CompensatedStream
-from ftdrive.servers.averaged import Averaged
+from ftdrive.servers.rates import Averaged
 from ftdrivers.clock import REAL
 from tests.unit.ftdrive.live.simulated import calibrated_from
 
@@ -70,7 +70,7 @@ class Kept(CompensatedStream):
 
 def play_node(sensor: str, out: Path) -> None:
     """Serve a stream; write stamps, wrenches and the share of a core that this process used."""
-    from ftdrive.servers.ros2.node import Ros2Node
+    from ftdrive.servers.ros2 import Ros2Node
 
     with Station(sensor, REAL_PACE) as station, closing(Ros2Node(RELIABLE)) as node:
         stream = Kept(replace(station.cell, clock=REAL), calibrated_from(station.truth))

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ftdrive.recording import Recorder
-from ftdrive.terminal.command_names import COMMANDS
+from ftdrive.terminal.text import COMMANDS
 from tests.unit.ftdrive.recorded import block, info
 
 _PEER = ("-c", "import numpy, scipy.optimize, scipy.spatial.transform, click")

@@ -24,7 +24,7 @@ from pathlib import Path
 
 from ftdrivers.errors import ConnectError, DeviceError
 from ftdrivers.ur.arm import UrArm
-from ftdrivers.ur.control_process import ControlProcess
+from ftdrivers.ur.control import ControlProcess
 from tests.wire.conftest import Station
 from tests.wire.moves import STEP_RAD, away, no_guard
 from tests.wire.test_ur_failures import EVENTS, Once, nothing, on, wait_until_moving

@@ -12,7 +12,7 @@ import numpy as np
 
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, LinkStatus, StreamEvent, StreamStatus
-from ftdrive.servers.ros2.node import Ros2Node
+from ftdrive.servers.ros2 import Ros2Node
 from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.servers import fake_stream
 from tests.unit.ftdrive.servers.fake_stream import FakeStream, block

@@ -18,8 +18,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftdrive.errors import ConfigError
-from ftdrive.exports.calibration.registry import export
-from ftdrive.exports.calibration.settings import Settings
+from ftdrive.exports.registry import export
+from ftdrive.exports.settings import Settings
 from ftdrive.live.processing import Processor
 from ftdrive.live.samples import EventKind, Stages, StreamEvent, WrenchFrame
 from ftdrivers.errors import NoRos2
@@ -46,7 +46,7 @@ class Served:
     """A node that serves a stream in a thread."""
 
     def __init__(self, stack: ExitStack, *arguments: str, tool: str = "", fails: tuple[Exception, ...] = ()) -> None:
-        from ftdrive.servers.ros2.node import Ros2Node
+        from ftdrive.servers.ros2 import Ros2Node
 
         self.stream = Stream()
         self.failures = list(fails)
@@ -195,7 +195,7 @@ def test_a_silent_sensor_is_reported_and_nothing_is_published(stack: ExitStack) 
 def test_a_wrong_calibration_is_reported_until_the_stream_opens(
     stack: ExitStack, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ftdrive.servers.ros2.node._RETRY_CONFIG_S", 1.0)
+    monkeypatch.setattr("ftdrive.servers.ros2._RETRY_CONFIG_S", 1.0)
     wrong = ConfigError("the calibration is of another sensor: calibrate this cell")
     served, listener = Served(stack, fails=(wrong,)), Listener(stack)
     until(lambda: any(found["stream"] == (2, str(wrong)) for _, found in listener.reports))
@@ -253,18 +253,18 @@ def test_parameters_are_applied_or_rejected_with_a_reason(stack: ExitStack) -> N
     ],
 )
 def test_wrong_arguments_end_it_before_any_work(argument: str, error: type[Exception]) -> None:
-    from ftdrive.servers.ros2.node import Ros2Node
+    from ftdrive.servers.ros2 import Ros2Node
 
     with pytest.raises(error, match=r"axes|rate|sensor_frame|reliable"):
         Ros2Node(("--ros-args", "-p", argument))
 
 
 def test_of_two_nodes_the_second_needs_another_name(stack: ExitStack) -> None:
-    from ftdrive.servers.ros2.node import Ros2Node
+    from ftdrive.servers.ros2 import Ros2Node
 
     Served(stack)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ftdrive.servers.ros2.node._DISCOVERY_S", 10.0)  # a busy computer
+        patch.setattr("ftdrive.servers.ros2._DISCOVERY_S", 10.0)  # a busy computer
         with pytest.raises(ConfigError, match=r"another node /ftdrive runs already: .* __node:=ftdrive_2"):
             Ros2Node()
     other = Ros2Node(("--ros-args", "-r", "__node:=ftdrive_2"))

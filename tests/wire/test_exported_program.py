@@ -15,7 +15,7 @@ from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
-from ftdrivers.ur.control_program import without_comments
+from ftdrivers.ur.script_control import without_comments
 from tests.wire.conftest import Station
 
 pytestmark = pytest.mark.slow  # every test needs a process of its own

@@ -29,7 +29,7 @@ from ftdrivers.interfaces import Array, DeviceInfo, FtSamples
 from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.wires.can_bus import CanBus
-from ftdrivers.wires.status_word import describe_status
+from ftdrivers.wires.framing import describe_status
 
 log = logging.getLogger(__name__)
 

@@ -26,7 +26,7 @@ from ftdrivers.errors import UNUSABLE, ConnectError, DeviceFault, ProtocolError,
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, FtSamples, Health
 from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits, scale_facts
-from ftdrivers.wires.status_word import describe_status
+from ftdrivers.wires.framing import describe_status
 
 log = logging.getLogger(__name__)
 

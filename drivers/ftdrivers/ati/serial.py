@@ -22,9 +22,9 @@ from ftdrivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import StreamingSensor, scale_facts
+from ftdrivers.wires.framing import describe_status
 from ftdrivers.wires.modbus import ask
 from ftdrivers.wires.serial_port import SerialPort
-from ftdrivers.wires.status_word import describe_status
 
 log = logging.getLogger(__name__)
 

@@ -12,8 +12,7 @@ import struct
 from typing import NamedTuple
 
 from ftdrivers.errors import ProtocolError
-from ftdrivers.wires.crc import crc16_x25
-from ftdrivers.wires.framing import Deframer
+from ftdrivers.wires.framing import Deframer, crc16_x25
 
 HEADER = b"\xaa"
 _PAYLOAD = struct.Struct("<H6fIf")

@@ -23,8 +23,8 @@ from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBro
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
 from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
+from ftdrivers.wires.framing import describe_status
 from ftdrivers.wires.serial_port import SerialPort
-from ftdrivers.wires.status_word import describe_status
 
 log = logging.getLogger(__name__)
 

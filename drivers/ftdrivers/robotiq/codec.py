@@ -15,8 +15,7 @@ from functools import partial
 from ftdrivers.errors import ProtocolError
 from ftdrivers.interfaces import NOT_REPORTED
 from ftdrivers.wires import modbus as _modbus
-from ftdrivers.wires.crc import crc16_modbus
-from ftdrivers.wires.framing import Deframer
+from ftdrivers.wires.framing import Deframer, crc16_modbus
 
 ADDRESS = 9
 

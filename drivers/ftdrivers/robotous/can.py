@@ -1,16 +1,141 @@
-"""Robotous fields over CAN: a command is one frame, a reply or sample two.
+"""Robotous over CAN: a sample comes in two halves, which are paired by order and clock.
+
+Pure: halves go in with their time of receipt, fields come out whose halves belong to one sample.
 
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.8: 1 Mbit/s, 11-bit identifiers, configurable.
 """
 
+import math
 from typing import Self
 
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.registry import Options
+from ftdrivers.robotous import codec
 from ftdrivers.robotous.codec import Field
-from ftdrivers.robotous.halves import Halves
 from ftdrivers.robotous.sensor import RobotousSensor
 from ftdrivers.wires.can_bus import CanBus
+
+_SILENCE_S = 0.002
+"""The halves of a field follow each other directly. Between two fields lies this silence, or half a period."""
+_DRIFT = 0.12
+"""The sensor may be slower than its rate by this fraction: manual and vendor's header differ by 0.1 on one rate."""
+_LATE = 0.5
+"""Fraction of a period by which the host may be late when it has all fields."""
+_EARLY = 0.25
+"""Fraction of a period by which the clock may be late when it counts missing fields."""
+_MOST_WAITING = 1000
+
+
+class Halves:
+    """Pairs halves, and drops every pair that may be of two samples.
+
+    Halves must take turns. That is not enough: when a second half and the next first one are lost, the others still
+    take turns, but one field is missing by the clock. So a run of fields is accepted in the first silence after it, and
+    only if all fields due since the last run have arrived. A late host reads all of them together. So after a deficit
+    the fields wait, and the next run shows whether the host was late or a field was lost. After a half out of turn, all
+    fields up to the next silence are dropped. The run that follows only sets the clock, as do the first two.
+
+    Parameters
+    ----------
+    period_s : float
+        Between two samples; NaN for replies to requests.
+    late_s : float
+        How late the sensor itself may be: `Clock.lead_s`. A shorter deficit then counts as late, so two neighbouring
+        losses are not detected.
+    """
+
+    def __init__(self, period_s: float = math.nan, late_s: float = 0.0) -> None:
+        self.silence_s = _SILENCE_S if math.isnan(period_s) else min(_SILENCE_S, period_s / 2)
+        """Call `silence` after this time without a half."""
+        self.lost = 0
+        """Fields that were due and were not accepted."""
+        self.quiet = True
+        """Whether nothing arrived since a silence."""
+        self._period_ns = period_s * 1e9
+        self._late_ns = late_s * 1e9
+        self._number = 0
+        self._clock_ns: float | None = None
+        """Arrival of the field `_number`."""
+        self._first = b""
+        self._waiting: list[Field] = []
+        """Fields since then, which the clock has not confirmed yet."""
+        self._doubtful = 0
+        """How many of them arrived late or after a loss."""
+        self._in_turn = True
+        self._in_step = False
+        """Whether the clock is valid for these fields: none was out of turn since it was set."""
+
+    def take(self, t_host_ns: int, data: bytes, *, second: bool) -> None:
+        """Add a received half."""
+        self.quiet = False
+        if second != bool(self._first) or len(data) != codec.REPLY_SIZE // 2 or len(self._waiting) == _MOST_WAITING:
+            self._in_turn = False
+        if second:
+            self._waiting.append(Field(self._number + len(self._waiting) + 1, t_host_ns, self._first + data))
+            self._first = b""
+        else:
+            self._first = data
+
+    def silence(self) -> list[Field]:
+        """Return the accepted fields, after `silence_s` without a half."""
+        if self.quiet:
+            return []
+        self.quiet = True
+        if not self._in_turn:
+            # a first half at the end may belong to the next field, or have lost its second half
+            self._first, self._waiting, self._doubtful = b"", [], 0
+            self._in_turn, self._in_step = True, False
+        if self._first or not self._waiting:
+            return []
+        if not self._in_step and not math.isnan(self._period_ns):
+            self._set_clock(len(self._waiting))
+        elif self._complete():
+            return self._accept()
+        elif not self._doubtful:
+            self._doubtful = len(self._waiting)
+        else:
+            self._set_clock(self._doubtful)
+            if self._complete():
+                return self._accept()
+            self._set_clock(len(self._waiting), by_period=False)  # twice: the sensor's clock has shifted
+        return []
+
+    def _complete(self) -> bool:
+        """Return whether all fields that were due since the clock was set have arrived."""
+        if self._clock_ns is None:
+            return True
+        # more fields than due mean that the clock was set late
+        due_ns = (len(self._waiting) + _LATE) * self._period_ns + self._late_ns
+        return self._waiting[-1].t_host_ns - self._clock_ns < due_ns
+
+    def _accept(self) -> list[Field]:
+        fields, self._waiting, self._doubtful = self._waiting, [], 0
+        self._number = fields[-1].number
+        if self._clock_ns is not None:
+            latest_ns = self._clock_ns + len(fields) * self._period_ns * (1 + _DRIFT)
+            self._clock_ns = min(latest_ns, fields[-1].t_host_ns)
+        return fields
+
+    def _set_clock(self, fields: int, *, by_period: bool = True) -> None:
+        """Set the clock by the last of the oldest `fields`, and drop them.
+
+        The host may be late, so a clock that was set before moves by whole periods.
+        """
+        clock_ns: float = self._waiting[fields - 1].t_host_ns
+        self._in_step = by_period and self._clock_ns is not None  # else it may be late, so the next run sets it again
+        if self._clock_ns is not None:
+            missed = max(1, math.floor((clock_ns - self._clock_ns) / self._period_ns + _EARLY))
+            if by_period:
+                clock_ns = min(clock_ns, self._clock_ns + missed * self._period_ns)
+            if self._number:  # the stream begins with the first accepted field
+                self._number += missed
+                self.lost += missed
+        self._clock_ns = clock_ns
+        self._waiting = [
+            field._replace(number=self._number + place) for place, field in enumerate(self._waiting[fields:], 1)
+        ]
+        self._doubtful = 0
+
 
 IDS = (0x64, 0x01, 0x02)
 """The factory's identifiers of commands, and of the first and second half of a field."""

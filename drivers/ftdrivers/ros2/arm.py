@@ -20,10 +20,8 @@ from ftdrivers.follow import Follow, Unread
 from ftdrivers.interfaces import NOT_REPORTED, ArmState, ArmStates, DeviceInfo, Diagnosis, Fact
 from ftdrivers.read_only_arm import ReadOnlyArm
 from ftdrivers.registry import Options, split_url
-from ftdrivers.ros2.kinematics import Chain
-from ftdrivers.ros2.middleware import Node
-from ftdrivers.ros2.poses import Joints, PoseReader, Poses, StampedPose, Transforms
-from ftdrivers.ros2.subscription import OnePublisher, Received, clock_diagnosis, subscribe, subscribe_to_tf
+from ftdrivers.ros2.middleware import Node, OnePublisher, Received, clock_diagnosis, subscribe, subscribe_to_tf
+from ftdrivers.ros2.poses import Chain, Joints, PoseReader, Poses, StampedPose, Transforms
 
 SCHEME: Final = "ros2:"
 _FIRST_S: Final = 2.0

@@ -1,17 +1,20 @@
-"""The way to rclpy: that of a sourced ROS 2, else the wheels of the extra `ros2`. Nothing else of ROS is used.
+"""A node of ROS 2 and its subscriptions.
 
 docs/decisions/0179-ros-2-through-rclpy-alone.md gives the reason.
 """
 
 import importlib
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Thread
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from ftdrivers.errors import NoRos2
+from ftdrivers.clock import Clock
+from ftdrivers.errors import ConnectError, NoRos2, ProtocolError
+from ftdrivers.interfaces import Diagnosis
 
 WAYS: Final = (
     "source a ROS 2 (`source /opt/ros/jazzy/setup.bash`, ftdrive in a venv with --system-site-packages and its "
@@ -107,3 +110,167 @@ class Node:
                 self._thread.join(1.0)
             self.node.destroy_node()
             self.context.try_shutdown()
+
+
+DISCOVERY_S: Final = 3.0
+"""Until the publishers of a topic are known."""
+_SAME_CLOCK_MS: Final = 2.0
+_LONGEST_WAY_MS: Final = 30.0
+"""A stamp that is older by the clock of this computer was given by another clock."""
+_OTHERS_S: Final = 0.5
+"""Until a second publisher is known too."""
+_LOOK_S: Final = 1.0
+"""Between two looks whether another node publishes too."""
+_UNNAMED: Final = "NAME_UNKNOWN"
+_UNNUMBERED: Final = (1 << 64) - 1
+
+
+class Received(NamedTuple):
+    """A message with what is known of its way."""
+
+    message: Any
+    t_host_ns: int
+    number: int
+    """Of its publisher, so that lost messages are gaps; counted here where the middleware gives none."""
+
+
+def subscribe(
+    ros: Node, topic: str, kind: str, on_message: Callable[[Received], None], clock: Clock, *, reliable: bool = False
+) -> str:
+    """Wait for the one publisher of a topic, and receive its messages from now on, in the thread of the node.
+
+    Parameters
+    ----------
+    ros : Node
+    topic : str
+    kind : str
+        Such as "geometry_msgs/msg/WrenchStamped".
+    reliable : bool
+        Request reliable delivery, which the publisher must offer.
+
+    Returns
+    -------
+    str
+        Name of the publishing node.
+
+    Raises
+    ------
+    ConnectError
+        No node publishes the topic, its type is another one, or it offers best effort alone.
+    ProtocolError
+        Two nodes publish it.
+    """
+    package, _, name = kind.partition("/msg/")
+    message_type = getattr(ros2_module(f"{package}.msg"), name)
+    publisher = _publisher(ros, topic, kind, clock, reliable=reliable)
+    qos = ros2_module("rclpy.qos")
+    reliability = qos.ReliabilityPolicy.RELIABLE if reliable else qos.ReliabilityPolicy.BEST_EFFORT
+    profile = qos.QoSProfile(depth=1000, reliability=reliability)
+    count = 0
+
+    def received(message: Any, info: Any) -> None:
+        nonlocal count
+        t_host_ns = clock.now_ns()
+        count += 1
+        number = _number(info)
+        on_message(Received(message, t_host_ns, count if number is None else number))
+
+    ros.node.create_subscription(message_type, topic, received, profile)
+    return publisher
+
+
+def subscribe_to_tf(ros: Node, topic: str, on_message: Callable[[Received], None], clock: Clock) -> None:
+    """Receive /tf or /tf_static, which many nodes publish. Raises `NoRos2` where tf2_msgs is missing."""
+    qos = ros2_module("rclpy.qos")
+    is_static = topic == "/tf_static"
+    profile = qos.QoSProfile(
+        depth=1000,
+        reliability=qos.ReliabilityPolicy.RELIABLE if is_static else qos.ReliabilityPolicy.BEST_EFFORT,
+        durability=qos.DurabilityPolicy.TRANSIENT_LOCAL if is_static else qos.DurabilityPolicy.VOLATILE,
+    )
+    message_type = ros2_module("tf2_msgs.msg").TFMessage
+    ros.node.create_subscription(
+        message_type, topic, lambda message: on_message(Received(message, clock.now_ns(), 0)), profile
+    )
+
+
+def clock_diagnosis(ros: Node, newest_s: float) -> Diagnosis:
+    """Compare the newest stamp with the clock of this computer."""
+    behind_ms = 1e3 * (ros.node.get_clock().now().nanoseconds * 1e-9 - newest_s)
+    if -_SAME_CLOCK_MS < behind_ms < _LONGEST_WAY_MS:
+        return Diagnosis("clock", True, f"the newest stamp is {behind_ms:.1f} ms old by the clock of this computer")
+    where = f"{behind_ms:.0f} ms behind" if behind_ms > 0 else f"{-behind_ms:.0f} ms ahead of"
+    found = f"another clock: the stamps are {where} that of this computer; the delay is estimated from motion"
+    return Diagnosis("clock", True, found)
+
+
+def _number(info: Any) -> int | None:
+    """Return the number that the publisher gave a message; rclpy passes a mapping, or before Jazzy an object."""
+    found = info.get("publication_sequence_number") if isinstance(info, Mapping) else None
+    return None if found is None or found >= _UNNUMBERED else int(found)
+
+
+def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool) -> str:
+    found: list[Any] = []
+    for _ in clock.looks(DISCOVERY_S):
+        found = ros.node.get_publishers_info_by_topic(topic)
+        if found and not any(_UNNAMED in one.node_name for one in found):  # names arrive later
+            clock.sleep(_OTHERS_S)
+            found = ros.node.get_publishers_info_by_topic(topic)
+            break
+        clock.sleep(0.05)
+    kinds, names = sorted({one.topic_type for one in found}), _names(found)
+    if not found:
+        same = [name for name, types in ros.node.get_topic_names_and_types() if kind in types and name != topic]
+        others = f"topics of this type: {', '.join(same)}" if same else "no topic has this type"
+        domain = "check the name, ROS_DOMAIN_ID and that its driver runs"
+        raise ConnectError(f"no node publishes {topic} ({kind}); {others}", domain)
+    if kinds != [kind]:
+        raise ConnectError(f"{topic} has the type {', '.join(kinds)}, needed is {kind}", "give another topic")
+    OnePublisher(ros, topic, clock).check()
+    best_effort = ros2_module("rclpy.qos").ReliabilityPolicy.BEST_EFFORT
+    if reliable and found[0].qos_profile.reliability == best_effort:
+        raise ConnectError(f"{topic} is offered with best effort alone", "leave the option reliable out")
+    return names[0]
+
+
+class OnePublisher:
+    """Looks again and again whether another node publishes a topic too; some are discovered after seconds."""
+
+    def __init__(self, ros: Node, topic: str, clock: Clock) -> None:
+        self._ros, self._topic, self._clock = ros, topic, clock
+        self._looked_s = -math.inf
+
+    def check(self, *, in_order: bool = True) -> None:
+        """Raise `ProtocolError` if there is another; stamps that are not in order are a reason to look at once."""
+        if in_order and self._clock.now_s() - self._looked_s < _LOOK_S:
+            return
+        self._looked_s = self._clock.now_s()
+        names = _names(self._ros.node.get_publishers_info_by_topic(self._topic))
+        if len(names) > 1:
+            raise ProtocolError(
+                f"{len(names)} nodes publish {self._topic}: {', '.join(names)}", "stop all but one of them"
+            )
+
+
+def _names(publishers: Sequence[Any]) -> list[str]:
+    return sorted(
+        "a program without a node" if _UNNAMED in one.node_name else f"{one.node_namespace.rstrip('/')}/{one.node_name}"
+        for one in publishers
+    )
+
+
+def stamp_ns(header: Any, topic: str) -> int:
+    """Return the time of a header in nanoseconds. Raises `ProtocolError` for one that was not set."""
+    t_ns = int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+    if t_ns <= 0:
+        raise ProtocolError(
+            f"the messages of {topic} have the stamp {t_ns * 1e-9:g}, so they cannot be paired",
+            "set header.stamp to the time of measurement in its driver",
+        )
+    return t_ns
+
+
+def is_finite(*values: float) -> bool:
+    """Return whether all are numbers."""
+    return all(map(math.isfinite, values))

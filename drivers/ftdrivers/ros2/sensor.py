@@ -15,8 +15,7 @@ import numpy as np
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError, ProtocolError
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Diagnosis, Fact, FtSamples
-from ftdrivers.ros2.middleware import Node
-from ftdrivers.ros2.subscription import OnePublisher, Received, clock_diagnosis, stamp_ns, subscribe
+from ftdrivers.ros2.middleware import Node, OnePublisher, Received, clock_diagnosis, stamp_ns, subscribe
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor
 
 if TYPE_CHECKING:

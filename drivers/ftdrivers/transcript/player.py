@@ -9,7 +9,7 @@ from typing import Final
 
 from ftdrivers.clock import REAL, Clock, Follower
 from ftdrivers.transcript.recorder import Passage, Transcript
-from ftdrivers.wires.parity import leave_marks_to_far_side, marks_asked_for
+from ftdrivers.wires.serial_port import leave_marks_to_far_side, marks_asked_for
 
 _EARLY_S: Final = 0.05
 """A driver may send a request this much earlier than recorded; earlier data of the device is then sent at once."""

@@ -10,9 +10,9 @@ time of the driver's clock as `t_ns`:
 {"t_ns", "event": "end", "error"}   the error at the end; without one, what the driver decoded: "identity", "samples",
                                     "mean_force_N", "mean_torque_Nm" and more
 
-Where `parity_marks` is true, received bytes contain the marks of `drivers/ftdrivers/wires/parity.py`. An slcan adapter
-is recorded as a serial port. The frames of other CAN interfaces are written as lines of slcan, and an emulated slcan
-adapter plays them. Commands of python-can to that adapter are not compared.
+Where `parity_marks` is true, received bytes contain the marks of `drivers/ftdrivers/wires/serial_port.py`. An slcan
+adapter is recorded as a serial port. The frames of other CAN interfaces are written as lines of slcan, and an emulated
+slcan adapter plays them. Commands of python-can to that adapter are not compared.
 """
 
 import json

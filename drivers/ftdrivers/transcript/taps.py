@@ -9,7 +9,7 @@ import can
 import serial
 
 from ftdrivers.transcript.recorder import Writer
-from ftdrivers.wires.parity import marks_asked_for
+from ftdrivers.wires.serial_port import marks_asked_for
 
 
 @contextlib.contextmanager

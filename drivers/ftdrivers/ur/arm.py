@@ -34,11 +34,10 @@ from ftdrivers.sweep import Sweep
 from ftdrivers.ur.control import CONTROL_SETTINGS, STOP_RAD_S2, Control, ControlSetting
 from ftdrivers.ur.controller_settings import checked_gravity, checked_payload, read_controller_settings
 from ftdrivers.ur.kinematics import MODELS, model_named
-from ftdrivers.ur.opening import SIMULATORS, Opening, path_for
-from ftdrivers.ur.own_program import OwnProgram
+from ftdrivers.ur.opening import SIMULATORS, Opening, OwnProgram, path_for
 from ftdrivers.ur.reading import Reader
-from ftdrivers.ur.robot_api import PORT as API_PORT
 from ftdrivers.ur.sample import PROGRAM_PLAYING, PROGRAM_STOPPED, ROBOT_RUNNING, Sample
+from ftdrivers.ur.services import ROBOT_API_PORT as API_PORT
 from ftdrivers.ur.timing import STRICT, UrTiming
 
 log = logging.getLogger(__name__)

@@ -126,7 +126,7 @@ class Calls:
         self._control.stopScript()
 
 
-def main() -> None:
+def _main() -> None:
     """Serve until stdin ends."""
     host = sys.argv[1]
     frequency_Hz, stop_rad_s2, starting_s, leaving_s, unwatched_s = map(float, sys.argv[2:])
@@ -187,4 +187,4 @@ def _listen(requests: "SimpleQueue[str | None]", leaving_s: float) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    _main()

@@ -1,7 +1,8 @@
-"""Taking control of an arm: which control path, what it needs, and the program's start."""
+"""Open an arm: its own program, connections, recipe, control path."""
 
 import logging
 import platform
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -10,19 +11,73 @@ from typing import Final
 from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import Diagnosis
-from ftdrivers.ur import control_process, control_program, primary
-from ftdrivers.ur.control import Control, ControlPath, ControlSetting, ProgramRefused
-from ftdrivers.ur.control_process import ControlProcess
-from ftdrivers.ur.own_program import OwnProgram
+from ftdrivers.ur import control, primary, script_control
+from ftdrivers.ur.control import Control, ControlPath, ControlProcess, ControlSetting, ProgramRefused
 from ftdrivers.ur.primary import find_program_port
 from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.rtde import registers_in_use, registers_taken
 from ftdrivers.ur.sample import PROGRAM_STOPPED
 from ftdrivers.ur.script_control import ScriptControl
-from ftdrivers.ur.services import POLYSCOPE_X, Services
+from ftdrivers.ur.services import POLYSCOPE_X, Services, ServicesOf
 from ftdrivers.ur.timing import UrTiming
 
 log = logging.getLogger(__name__)
+
+
+class OwnProgram:
+    """Remembers whether a program of ours may run, and ends it through the services of the controller."""
+
+    def __init__(self, timing: UrTiming) -> None:
+        self._timing = timing
+        self._services: ServicesOf | None = None
+        self._starting = False  # it was sent and has not been seen to play: it may still start after a stop
+        self._stops_itself = False
+        self._stop_wanted = threading.Event()  # by an attempt in the background
+        self.left_behind = False
+        """Whether a program of ours may run on the controller."""
+
+    def is_sent(self, services: ServicesOf, *, stops_itself: bool) -> None:
+        """Note that a program is on its way to the controller; `services` can end it."""
+        self._services, self._stops_itself = services, stops_itself
+        self.left_behind = self._starting = True
+
+    def has_started(self) -> None:
+        """Note that it runs."""
+        self._starting = False
+
+    def is_stopped(self) -> None:
+        """Note that no program runs: one that runs later is not ours, unless ours is still to start."""
+        self.left_behind = self._starting
+
+    def is_gone(self) -> None:
+        """Note that it was not taken, has ended or was replaced."""
+        self.left_behind = self._starting = False
+
+    def cancel_stop(self) -> None:
+        """Let no attempt in the background stop the next program."""
+        self._stop_wanted.clear()
+
+    def stop(self, *, silent: bool = False) -> None:
+        """End it; an attempt that takes longer than its limit goes on in the background. Never raises `DeviceError`."""
+
+        def stop(services: Services) -> None:
+            if self._stop_wanted.is_set():
+                services.stop()
+
+        if self._services is None:
+            return
+        self._stop_wanted.set()
+        limit_s = self._timing.stop_silent_s if silent else self._timing.stop_s
+        try:
+            self._services.ask(stop, timeout_s=limit_s, connect_s=self._timing.reach_s)
+            self.left_behind = self._starting
+        except DeviceError as error:
+            if self._stops_itself:
+                log.info("the control program stops the arm by itself: %s", error)
+            else:
+                host = self._services.host
+                log.warning("%s did not receive the stop; press the emergency stop if it moves: %s", host, error)
+
 
 SIMULATORS: Final = ("localhost", "127.0.0.1", "192.168.56.101")
 """Addresses of URSim, at which ur_rtde does not require remote control."""
@@ -156,7 +211,7 @@ class Opening:
 
     def require_registers(self) -> None:
         """Raise `ConnectError` when another client keeps the registers, before any of its programs is stopped."""
-        inputs = control_process.INPUTS if self.path == "ur-rtde" else tuple(control_program.INPUTS)
+        inputs = control.INPUTS if self.path == "ur-rtde" else tuple(script_control.INPUTS)
         deadline_s = self.clock.now_s() + self.timing.release_s
         while taken := registers_in_use(self.host, inputs, timeout_s=self.timing.connect_s, clock=self.clock):
             if self.clock.now_s() > deadline_s:
@@ -165,7 +220,7 @@ class Opening:
 
     @property
     def _port(self) -> int:
-        return control_process.PROGRAM_PORT if self.path == "ur-rtde" else primary.PORT
+        return control.PROGRAM_PORT if self.path == "ur-rtde" else primary.PORT
 
     def _start(self, path: ControlPath) -> Control:
         if path == "script":

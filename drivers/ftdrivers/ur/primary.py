@@ -193,7 +193,7 @@ class Primary:
         try:
             self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
         except OSError as error:
-            raise unreachable(host, PORT, error) from error
+            raise _unreachable(host, PORT, error) from error
         self._timeout_s = timeout_s
         self._buffer = bytearray()
 
@@ -257,10 +257,10 @@ def find_program_port(host: str, port: int, *, timeout_s: float) -> None:
     try:
         socket.create_connection((host, port), timeout=timeout_s).close()
     except OSError as error:
-        raise unreachable(host, port, error) from error
+        raise _unreachable(host, port, error) from error
 
 
-def unreachable(host: str, port: int, error: OSError) -> ConnectError:
+def _unreachable(host: str, port: int, error: OSError) -> ConnectError:
     """Return the error for a port that takes programs."""
     name = "primary" if port == PORT else "real-time"
     return ConnectError(

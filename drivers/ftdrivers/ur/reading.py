@@ -37,9 +37,9 @@ from ftdrivers.follow import Follow, Unread
 from ftdrivers.interfaces import NOT_REPORTED, ArmState, ArmStates, ArmStatus, Array, DeviceInfo, Fact
 from ftdrivers.ur.kinematics import MODELS, Kinematics, Pose, flange_poses, forward, kinematics_of, model_named
 from ftdrivers.ur.primary import read_arm
-from ftdrivers.ur.robot_api import PORT as API_PORT
 from ftdrivers.ur.rtde import Subscription
 from ftdrivers.ur.sample import MEASURING, OPTIONAL, OUTPUTS, Sample
+from ftdrivers.ur.services import ROBOT_API_PORT as API_PORT
 from ftdrivers.ur.services import Services, ServicesOf
 from ftdrivers.ur.timing import Lateness, Patience, UrTiming
 

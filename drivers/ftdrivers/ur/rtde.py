@@ -59,7 +59,7 @@ def encode_setup_outputs(frequency_Hz: float, names: tuple[str, ...]) -> bytes:
     return encode(SETUP_OUTPUTS, struct.pack(">d", frequency_Hz) + ",".join(names).encode("ascii"))
 
 
-def encode_setup_inputs(names: tuple[str, ...]) -> bytes:
+def _encode_setup_inputs(names: tuple[str, ...]) -> bytes:
     """Build the request for one recipe of inputs."""
     return encode(SETUP_INPUTS, ",".join(names).encode("ascii"))
 
@@ -302,7 +302,7 @@ class Subscription:
             raise ProtocolError("the controller does not start the stream")
 
     def _claim(self, host: str, inputs: Mapping[str, str]) -> None:
-        recipe = Recipe.decode(self._connection.ask(encode_setup_inputs(tuple(inputs))))
+        recipe = Recipe.decode(self._connection.ask(_encode_setup_inputs(tuple(inputs))))
         if taken := recipe.taken(tuple(inputs)):
             self.close()
             raise registers_taken(host, taken)
@@ -338,7 +338,7 @@ def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float, clo
         connection = _Connection(host, timeout_s, clock)
         try:
             connection.ask(encode(REQUEST_PROTOCOL_VERSION, b"\x00\x02"))
-            recipe = Recipe.decode(connection.ask(encode_setup_inputs(names)))
+            recipe = Recipe.decode(connection.ask(_encode_setup_inputs(names)))
         finally:
             connection.close()
     except TimeoutError as error:

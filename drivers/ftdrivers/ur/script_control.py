@@ -1,8 +1,9 @@
-"""The control path without ur_rtde: a program of ours on the controller, which stops the arm when we fall silent.
+"""The control path `script`: our program on the controller, and the commands to it over RTDE registers.
 
-`program.script` describes the registers. A thread answers every sample of the controller with a heartbeat, on the
-connection that owns the inputs. If the heartbeat stands still for 0.2 s of the controller's time, the program stops the
-arm and ends: after a crash, a suspension, a cut cable or a power failure of this computer.
+`program.script` describes the registers; tests compare both. Its constructs are those of programs that are known to run
+on controllers: docs/reference/urscript-constructs.md. A thread answers every sample of the controller with a heartbeat,
+on the connection that owns the inputs. If the heartbeat stands still for 0.2 s of the controller's time, the program
+stops the arm and ends: after a crash, a suspension, a cut cable or a power failure of this computer.
 
 Ref: Universal Robots, URScript manual, "Real-Time Data Exchange (RTDE) Guide".
 Checked on hardware: no.
@@ -14,16 +15,103 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from copy import copy
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
+from importlib.resources import files
+from types import MappingProxyType
+from typing import Any, Final, Self
 
 from ftdrivers.clock import Clock, Follower
 from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.ur.control import Control, LookOut, ProgramRefused
-from ftdrivers.ur.control_program import COMMANDS, INPUTS, MOVING, NAME, NUMBERS, OUTPUTS, Report, program_text
 from ftdrivers.ur.primary import Code, Failed, Primary, RobotType, Stopped
 from ftdrivers.ur.rtde import Subscription
 from ftdrivers.ur.timing import Patience, UrTiming, held
+
+NAME: Final = "ftdrive_control"
+"""Of the program on the controller."""
+INPUTS: Final = MappingProxyType(
+    {f"input_int_register_{k}": "INT32" for k in range(32, 36)}
+    | {f"input_double_register_{k}": "DOUBLE" for k in range(24, 34)}
+)
+"""Heartbeat, token, sequence number, command; numbers of the command."""
+OUTPUTS: Final = MappingProxyType(
+    {"timestamp": "DOUBLE"}
+    | {f"output_int_register_{k}": "INT32" for k in range(32, 36)}
+    | {f"output_double_register_{k}": "DOUBLE" for k in range(24, 30)}
+)
+"""The controller's time; token, state, sequence number and answer of the last command; the TCP."""
+NUMBERS: Final = 10
+"""Of a command, at most."""
+COMMANDS: Final = MappingProxyType(
+    {
+        "move": 1,
+        "stop": 2,
+        "within_safety_limits": 3,
+        "tcp_offset": 4,
+        "set_payload": 5,
+        "set_gravity": 6,
+        "quit": 7,
+        "wave": 8,
+        "sweep": 9,
+    }
+)
+"""By the names of `control_child.Calls`, which has no sweep."""
+MOVING: Final = ("move", "sweep")
+"""Commands that begin a motion."""
+_MOVING: Final = 2
+_NO_HEARTBEAT: Final = -2
+
+
+@dataclass(frozen=True, slots=True)
+class _Report:
+    """What the program has written into its output registers."""
+
+    token: int = 0
+    state: int = 0
+    sequence: int = 0
+    answer: int = 0
+    tcp_offset: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, numbers: Sequence[Any]) -> Self:
+        """Read the values of `OUTPUTS` after the first."""
+        token, state, sequence, answer, *tcp_offset = numbers
+        return cls(token, state, sequence, answer, tuple(tcp_offset))
+
+    @property
+    def moves(self) -> bool:
+        """Whether the program is carrying out a move."""
+        return self.state == _MOVING
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether it has ended by itself."""
+        return self.state < 0
+
+    @property
+    def missed_heartbeat(self) -> bool:
+        """Whether it has ended because no heartbeat came."""
+        return self.state == _NO_HEARTBEAT
+
+
+def without_comments(text: str) -> str:
+    """Return a program without its lines of comment and empty lines, as UR's client library sends it too."""
+    return "".join(f"{line}\n" for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
+
+
+def program_text(token: int, version: Sequence[int], stop_rad_s2: float) -> str:
+    """Return the program for one session on a controller of this version, with the deceleration of its stops."""
+    com, inertia = (", ".join(f"ft_number({k})" for k in numbers) for numbers in (range(1, 4), range(4, 10)))
+    payload = f"set_payload(ft_number(0), [{com}])"
+    if tuple(version[:2]) >= (5, 10):
+        payload = f"set_target_payload(ft_number(0), [{com}], [{inertia}])"
+    text = without_comments(files("ftdrivers.ur").joinpath("program.script").read_text("ascii"))
+    fields = {"$TOKEN": str(token), "$DECELERATION": f"{stop_rad_s2:.4f}", "$SET_PAYLOAD": payload}
+    for field, value in fields.items():
+        text = text.replace(field, value)
+    return text
+
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +140,7 @@ class ScriptControl(Control):
         self._beat = secrets.randbelow(_LARGEST)
         self._command: tuple[int, int, tuple[float, ...]] = (0, 0, (0.0,) * NUMBERS)
         """Sequence number, command, numbers."""
-        self._report = Report()
+        self._report = _Report()
         self._beats = 0
         self._failure: DeviceError | None = None
         self._error: DeviceFault | None = None
@@ -224,7 +312,7 @@ class ScriptControl(Control):
         with self._changed:
             if self._killed:
                 return False
-            self._report = Report.of(numbers)
+            self._report = _Report.of(numbers)
             if self.has_ended and self._report.missed_heartbeat:
                 self._end_reason = self._end_reason or DeviceTimeout(
                     "the control program has stopped the arm and ended, because it saw no heartbeat for 0.2 s",

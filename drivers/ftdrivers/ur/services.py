@@ -1,18 +1,152 @@
-"""What a controller answers beside RTDE: its dashboard server, or the Robot API of PolyScope X.
+"""The services of a controller beside RTDE: the dashboard server, or the Robot API of PolyScope X.
+
+Ref: Universal Robots, "Dashboard Server, e-Series" and "Dashboard Server, CB-Series" manuals;
+"Robot API" (OpenAPI document of PolyScope X); `dashboard_client_implementation_x.cpp` of
+Universal Robots' client library, which lists since when there is each path: `program/v1/state` 10.11,
+`system/v1/controlmode` 10.12, `system/v1/information` and `versions/v1` 10.14.
+Checked on hardware: no.
 
 A call to a dead controller takes seconds. So every request runs in its own thread.
 """
 
+import json
+import re
+import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final, Protocol, TypeVar
+from http.client import HTTPConnection, HTTPException
+from typing import Any, Final, Protocol, TypeVar
 
 from ftdrivers.clock import Clock
 from ftdrivers.errors import NoDashboard
-from ftdrivers.ur.dashboard import Dashboard
-from ftdrivers.ur.robot_api import PORT, RobotApi
+
+DASHBOARD_PORT: Final = 29999
+_REPLY_S: Final = 2.5
+
+
+class _Dashboard:
+    """One connection; see `services.Services`. Raises `OSError` when it is lost or silent for 2.5 s."""
+
+    def __init__(self, host: str, connect_s: float) -> None:
+        self._socket = socket.create_connection((host, DASHBOARD_PORT), timeout=connect_s)
+        self._socket.settimeout(_REPLY_S)
+        self._lines = self._socket.makefile("r", encoding="utf-8", errors="replace", newline="\n")
+        try:
+            self._read()  # a line of greeting
+        except BaseException:
+            self.close()
+            raise
+
+    def stop(self) -> None:
+        """Stop the program, and the arm with it."""
+        if (reply := self._ask("stop")) != "Stopped":
+            raise RuntimeError(reply)
+
+    def model(self) -> str | None:
+        """Return the model without its generation, such as UR5; from PolyScope 3.12 and 5.6 on."""
+        reply = self._ask("get robot model")
+        return reply if reply.startswith("UR") else None
+
+    def serial(self) -> str | None:
+        """Return the serial number, in digits; from PolyScope 3.12 and 5.6 on."""
+        reply = self._ask("get serial number")
+        return reply if reply.isdigit() else None
+
+    def polyscope(self) -> str | None:
+        """Return the version, such as 5.15.0.1261331."""
+        found = re.search(r"\d+(\.\d+)+", self._ask("PolyscopeVersion"))
+        return found and found[0]
+
+    def program(self) -> str | None:
+        """Return state and name, such as "PLAYING pick.urp"."""
+        return self._ask("programState") or None
+
+    def in_remote_control(self) -> bool | None:
+        """Return whether programs sent over the network are accepted; e-Series from 5.6 on."""
+        return {"true": True, "false": False}.get(self._ask("is in remote control").lower())
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._lines.close()
+        self._socket.close()
+
+    def _ask(self, command: str) -> str:
+        self._socket.sendall(command.encode() + b"\n")
+        return self._read()
+
+    def _read(self) -> str:
+        line = self._lines.readline()
+        if not line.endswith("\n"):
+            raise ConnectionError("it closed the connection")
+        return line.strip()
+
+
+ROBOT_API_PORT: Final = 80
+_PATH: Final = "/universal-robots/robot-api"
+
+
+class _RobotApi:
+    """Requests to one controller; see `services.Services`. Raises `OSError` when it does not answer."""
+
+    def __init__(self, host: str, port: int, connect_s: float) -> None:
+        self._connection = HTTPConnection(host, port, timeout=connect_s)
+        self._connection.connect()
+        self._connection.sock.settimeout(_REPLY_S)
+
+    def stop(self) -> None:
+        """Stop the program, and the arm with it; refused in local control."""
+        self._request("PUT", "/program/v1/state", {"action": "stop"})
+
+    def model(self) -> str | None:
+        """Return the model, such as UR15."""
+        return self._value("/system/v1/information", "robotType")
+
+    def serial(self) -> str | None:
+        """Return the serial number."""
+        return self._value("/system/v1/information", "serialNumber")
+
+    def polyscope(self) -> str | None:
+        """Return the version."""
+        return self._value("/versions/v1", "marketingVersion")
+
+    def program(self) -> str | None:
+        """Return the state of the program, such as PLAYING."""
+        return self._value("/program/v1/state", "state")
+
+    def in_remote_control(self) -> bool | None:
+        """Return whether programs sent over the network are accepted."""
+        mode = self._value("/system/v1/controlmode", "mode")
+        return None if mode is None else mode == "REMOTE"
+
+    def close(self) -> None:
+        """Disconnect."""
+        self._connection.close()
+
+    def _value(self, path: str, key: str) -> str | None:
+        answer = self._request("GET", path)
+        value = answer.get(key) if isinstance(answer, dict) else None
+        return value if isinstance(value, str) and value else None
+
+    def _request(self, method: str, path: str, content: dict[str, str] | None = None) -> Any:
+        """Return the answer; None for a path that this version does not have."""
+        body = None if content is None else json.dumps(content)
+        try:
+            self._connection.request(method, _PATH + path, body, {"Content-Type": "application/json"})
+            response = self._connection.getresponse()
+            text = response.read().decode("utf-8", "replace")
+        except HTTPException as error:
+            raise RuntimeError(f"no valid answer to {method} {path} ({type(error).__name__}: {error})") from error
+        if response.status == 404 and method == "GET":
+            return None
+        if not 200 <= response.status < 300:
+            raise RuntimeError(f"{method} {path} is refused with status {response.status}: {text[:200]}")
+        try:
+            return json.loads(text) if text else None
+        except ValueError as error:
+            raise RuntimeError(f"the answer to {method} {path} is no JSON: {text[:200]}") from error
+
 
 T = TypeVar("T")
 
@@ -60,7 +194,7 @@ class ServicesOf:
     version: tuple[int, int, int, int]
     """As RTDE reports it."""
     clock: Clock
-    api_port: int = PORT
+    api_port: int = ROBOT_API_PORT
 
     @property
     def name(self) -> str:
@@ -83,7 +217,7 @@ class ServicesOf:
 
         def session() -> T:
             services: Services = (
-                RobotApi(self.host, self.api_port, limit_s) if self.has_api else Dashboard(self.host, limit_s)
+                _RobotApi(self.host, self.api_port, limit_s) if self.has_api else _Dashboard(self.host, limit_s)
             )
             try:
                 return question(services)

@@ -1,6 +1,35 @@
-"""Frames of fixed size in a stream of bytes, whose header may also occur in the data."""
+"""Frames in a stream of bytes: their limits, checksums and status words."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+
+
+def _table(polynomial: int) -> tuple[int, ...]:
+    def entry(byte: int) -> int:
+        for _ in range(8):
+            byte = byte >> 1 ^ (polynomial if byte & 1 else 0)
+        return byte
+
+    return tuple(entry(byte) for byte in range(256))
+
+
+_MODBUS, _X25 = _table(0xA001), _table(0x8408)
+
+
+def crc16_modbus(data: bytes) -> int:
+    """CRC-16/MODBUS; of ``b"123456789"`` it is 0x4B37."""
+    return _crc(data, _MODBUS)
+
+
+def crc16_x25(data: bytes) -> int:
+    """CRC-16/X-25; of ``b"123456789"`` it is 0x906E."""
+    return _crc(data, _X25) ^ 0xFFFF
+
+
+def _crc(data: bytes, table: tuple[int, ...]) -> int:
+    crc = 0xFFFF
+    for byte in data:
+        crc = crc >> 8 ^ table[(crc ^ byte) & 0xFF]
+    return crc
 
 
 class Deframer:
@@ -62,3 +91,9 @@ class Deframer:
         self._skipped = 0
         self.number += 1
         return self.number
+
+
+def describe_status(status: int, bits: Mapping[int, str], width: int = 16) -> str:
+    """Describe a status word of `width` bits, such as ``0x0040 (bit 6: no valid calibration in the active slot)``."""
+    words = [f"bit {n}: {bits.get(n, 'reserved')}" for n in range(width) if status >> n & 1]
+    return f"0x{status:0{width // 4}X} ({', '.join(words) or 'ok'})"

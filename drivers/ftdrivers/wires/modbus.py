@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceTimeout, ProtocolError
-from ftdrivers.wires.crc import crc16_modbus
+from ftdrivers.wires.framing import crc16_modbus
 from ftdrivers.wires.serial_port import SerialPort
 
 T = TypeVar("T")

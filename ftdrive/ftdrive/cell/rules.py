@@ -104,16 +104,16 @@ _TYPES = {**_TYPES, str | None: _TYPES[str], float | None: _TYPES[float]}
 # Conditions that are not a range. ----------------------------------------------------------------------------------
 
 
-def unless(fits: Callable[[Any], bool], fix: str) -> Reject:
+def _unless(fits: Callable[[Any], bool], fix: str) -> Reject:
     """Reject values that do not fit."""
     return lambda value: None if fits(value) else fix
 
 
-reject_empty = unless(lambda text: bool(text.strip()), "it is empty, give one or leave it out")
-reject_sign = unless({-1, 1}.__contains__, "give 1, or -1 for a sensor that reports the reaction")
-reject_height = unless(lambda mm: not 0 < mm < 1, "is it mm? Give the height in mm, such as 33, or 0")
-reject_store = unless(lambda url: "://" in url, "it is no address, give one such as sqlite:////data/store.sqlite")
-reject_record = unless(lambda s: s == 0 or s >= 3, "give 3 or more, or 0 for none: a shorter record is of no use")
+reject_empty = _unless(lambda text: bool(text.strip()), "it is empty, give one or leave it out")
+reject_sign = _unless({-1, 1}.__contains__, "give 1, or -1 for a sensor that reports the reaction")
+reject_height = _unless(lambda mm: not 0 < mm < 1, "is it mm? Give the height in mm, such as 33, or 0")
+reject_store = _unless(lambda url: "://" in url, "it is no address, give one such as sqlite:////data/store.sqlite")
+reject_record = _unless(lambda s: s == 0 or s >= 3, "give 3 or more, or 0 for none: a shorter record is of no use")
 
 
 def reject_host(value: str) -> str | None:

@@ -19,7 +19,7 @@ from ftdrive.commands.common import (
     simulate,
     write_json,
 )
-from ftdrive.exports.calibration.formats import FORMATS, MAX_FORCE_ERROR_N
+from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     """
     from ftcalib.files import write_new
     from ftdrive.errors import ConfigError
-    from ftdrive.exports import targets_csv, urscript
+    from ftdrive.exports import urscript
     from ftdrive.planning.plan import Plan
     from ftdrive.terminal.console import beside
 
@@ -65,7 +65,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
         made = Plan.load(path)
     else:
         raise ConfigError("which plan? Give the file that `ftdrive plan --output` has written, or --simulate")
-    text = urscript.program(made, dwell_s=dwell_s) if target == "urscript" else targets_csv.table(made)
+    text = urscript.program(made, dwell_s=dwell_s) if target == "urscript" else urscript.table(made)
     if output is not None:
         write_new(output, text)
         beside(as_json).print(f" Saved {output}")
@@ -156,8 +156,8 @@ def calibration(
     target cannot express. The text is not written if the force would be wrong by more than --max-force-error.
     """
     from ftcalib.files import write_new
-    from ftdrive.exports.calibration import registry
-    from ftdrive.exports.calibration.settings import Settings, recorded_sensor
+    from ftdrive.exports import registry
+    from ftdrive.exports.settings import Settings, recorded_sensor
     from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verification_record import marks_of, verification_near
     from ftdrive.terminal.console import beside, hanging, messages

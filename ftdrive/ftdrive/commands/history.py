@@ -71,7 +71,7 @@ def history(
     found, advice = drifts(results), list(warnings(results, checks, now))
     warmth = []
     if any(one.temperature_C is not None for one in results):
-        from ftdrive.store.temperature import temperatures
+        from ftdrive.store.trends import temperatures
 
         warmth = temperatures(results, checks)
     last = {check.calibration_id: check for check in checks}
@@ -119,7 +119,7 @@ _RECENT = timedelta(days=90)
 
 
 def _show_weighings(days: "Sequence[StoredWeighings]", name: str, left_out: Sequence[str], as_json: bool) -> None:
-    from ftdrive.terminal.table import print_table
+    from ftdrive.terminal.text import print_table
 
     _print_left_out(left_out)
     if as_json:
@@ -189,7 +189,7 @@ def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime)
 
 def _print_table(rows: Sequence[Sequence[str]]) -> None:
     """Print the columns that every table has, and those that a result has."""
-    from ftdrive.terminal.table import print_table
+    from ftdrive.terminal.text import print_table
 
     shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
     print_table(

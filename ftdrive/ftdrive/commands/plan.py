@@ -166,7 +166,7 @@ def plan(
             tip_unlimited=_unlimited(tip_speed_limit),
         )
     if png is not None:
-        from ftdrive.planning.show.picture import draw
+        from ftdrive.planning.drawing import draw
 
         with working("Drawing"):
             draw(made, certifier, png)
@@ -177,7 +177,7 @@ def plan(
         write_json({"schema_version": 1} | made.to_dict())
         messages.print(*saved, sep="\n", end="\n" if saved else "")
     else:
-        from ftdrive.planning.show.words import plan_in_words, stop_in_words
+        from ftdrive.planning.words import plan_in_words, stop_in_words
 
         answer.print(*filter(None, (plan_in_words(made), stop_in_words(made, cell.robot))), *saved, sep="\n")
         same = f"{' --simulate' if simulate else ''}{f' --set {sets}' if sets else ''}"
@@ -190,7 +190,7 @@ def _look(made: "Plan", certifier: "Certifier") -> None:
     import threading
     from contextlib import suppress
 
-    from ftdrive.planning.show.view import open_in_browser, shown
+    from ftdrive.planning.drawing import open_in_browser, shown
     from ftdrive.terminal.console import print_address
 
     with shown(made, certifier) as url, suppress(KeyboardInterrupt):

@@ -20,8 +20,8 @@ from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.outcome import solve_records
-from ftdrive.runs.replay_source import RecordedRun
 from ftdrive.runs.run import Run
+from ftdrive.runs.source import RecordedRun
 from ftdrive.terminal.console import answer, hanging, messages, working
 from ftdrive.terminal.report import print_result
 

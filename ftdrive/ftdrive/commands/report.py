@@ -31,8 +31,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.report.facts import facts_of
 from ftdrive.report.report import Format
 from ftdrive.report.report import report as written
-from ftdrive.report.subject import SolveOptions, read_subject
-from ftdrive.report.trust import trust
+from ftdrive.report.subject import SolveOptions, read_subject, trust
 from ftdrive.runs.bundle import unpacked
 from ftdrive.runs.run import unused_path
 from ftdrive.terminal.console import beside, hanging, messages, working

@@ -51,7 +51,7 @@ def ros2(
     ros2_module("rclpy")  # before any work
     from ftdrive.live.stream import CompensatedStream
     from ftdrive.runs.source import read_calibration
-    from ftdrive.servers.ros2.node import Ros2Node
+    from ftdrive.servers.ros2 import Ros2Node
     from ftdrive.session.rehearsal import short_calibration, station_of
     from ftdrive.terminal.console import messages
     from ftdrive.terminal.screen import open_operator

@@ -41,8 +41,7 @@ from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.recording.bag import bag_means, is_bag, read_bag
 from ftdrive.recording.files import is_recording
 from ftdrive.runs.bundle import unpacked
-from ftdrive.runs.new_tool import require_same_cell
-from ftdrive.runs.outcome import solve_in_motion
+from ftdrive.runs.outcome import require_same_cell, solve_in_motion
 from ftdrive.runs.pose_hints import hints, numbers_in_dataset
 from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import Source, read_calibration, read_dataset, read_source

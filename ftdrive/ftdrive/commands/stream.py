@@ -14,7 +14,6 @@ from ftdrive.commands.common import (
     Source,
     read_frame,
 )
-from ftdrive.servers.address import host_and_port, is_loopback, with_port
 
 if TYPE_CHECKING:
     from ftdrive.live.processing import ProcessedStream
@@ -58,6 +57,7 @@ def stream(
     browser is served if it is of Foxglove or Lichtblick. The arm is only read, never moved. Ctrl-C ends.
     """
     from ftdrive.commands.live_source import open_source
+    from ftdrive.http_gate import host_and_port
     from ftdrive.servers.foxglove import FoxgloveServer
     from ftdrive.servers.udp import UdpSender
 
@@ -112,6 +112,7 @@ def _send_events(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | 
 
 def _introduce(source: "ProcessedStream", server: "FoxgloveServer", host: str, udp: tuple[str, int] | None) -> None:
     """Print what is served, and how to open it."""
+    from ftdrive.http_gate import is_loopback, with_port
     from ftdrive.terminal.console import messages, print_address
 
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host

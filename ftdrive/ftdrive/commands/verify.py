@@ -198,7 +198,7 @@ def _report(verified: "Verified", update: Answer, *, simulated: bool, as_json: b
     """Print the outcome and what to do next; save the update if it is wanted."""
     from ftdrive.runs.verified import save_update
     from ftdrive.terminal.console import answer, messages
-    from ftdrive.terminal.verification_text import print_verification
+    from ftdrive.terminal.report import print_verification
 
     if not as_json:
         print_verification(verified)

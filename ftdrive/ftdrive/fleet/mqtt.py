@@ -13,7 +13,7 @@ from urllib.parse import unquote, urlsplit
 from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.serve import Reading
-from ftdrive.servers.address import with_port
+from ftdrive.http_gate import with_port
 
 try:
     from paho.mqtt.client import Client

@@ -5,10 +5,9 @@ from datetime import datetime
 import numpy as np
 
 from ftdrive import __version__
-from ftdrive.fleet.observed import WINDOW, BiasChanges, Observed, when
-from ftdrive.fleet.state import CellState, Fleet
-from ftdrive.fleet.words import attention, due_in_words, summary, verified_in_words, weighed_in_words
-from ftdrive.report.page import templates, with_code
+from ftdrive.fleet.cells import WINDOW, BiasChanges, Observed, when
+from ftdrive.fleet.state import CellState, Fleet, attention, due_in_words, summary, verified_in_words, weighed_in_words
+from ftdrive.report.report import templates, with_code
 from ftdrive.runs.verification_record import age_in_words
 
 WIDTH, HEIGHT, MARGIN = 220, 44, 3
@@ -38,7 +37,7 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     for state in fleet.cells:
         result = None if state.calibration_id is None else results[state.calibration_id]
         changes = None if result is None else observed.changes.get(result.id)
-        drawn = "" if result is None or changes is None else plot(changes, when(result), observed.now)
+        drawn = "" if result is None or changes is None else _plot(changes, when(result), observed.now)
         rows.append({"state": state, "plot": Markup(drawn), **_words(state, observed.now)})
     return environment.get_template("fleet.html.j2").render(
         rows=rows,
@@ -51,7 +50,7 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     )
 
 
-def plot(changes: BiasChanges, start: datetime, now: datetime) -> str:
+def _plot(changes: BiasChanges, start: datetime, now: datetime) -> str:
     """Draw the changes of the six biases over the last 90 days as SVG, in sigmas of each verification.
 
     Force is drawn in one colour, torque in another; the gray band is two sigmas to both sides.

@@ -92,13 +92,13 @@ def solved(dataset: bytes, task: bytes) -> bytes:
     return _content(result)
 
 
-def files_of(folder: Path) -> tuple[str, dict[str, bytes]]:
+def _files_of(folder: Path) -> tuple[str, dict[str, bytes]]:
     """Return the name of a run in motion and the files of which its result is made, for another computer."""
     found = {file for pattern in _IN_MOTION for file in folder.glob(pattern)}
     return folder.name, {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(found)}
 
 
-def solved_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
+def _solved_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
     """Return the calibration file of a run in motion: a pure function as `solved`."""
     with TemporaryDirectory(prefix="ftdrive-solve-", dir=folder_of_worker()) as place:
         folder = Path(place) / name
@@ -107,10 +107,10 @@ def solved_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
             (folder / path).write_bytes(content)
         if not any(path.startswith("motion/") for path in files):
             (folder / "motion").rmdir()
-        return solved_motion(folder, version)
+        return _solved_motion(folder, version)
 
 
-def solved_motion(folder: Path, version: str) -> bytes:
+def _solved_motion(folder: Path, version: str) -> bytes:
     """Return the calibration file of a run in motion, from its folder; raises as `solved`, and `OSError`."""
     require_version(version)
     run = Run(folder)
@@ -171,8 +171,8 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
         else:
             rest.append(folder)
     moved = dict.fromkeys(folder for folder in rest if in_motion(folder))
-    here = answers(solved_motion, lambda folder: (folder, __version__), moved, workers)
-    there = answers(solved_files, lambda folder: (*files_of(folder), __version__), moved, replace(workers, group=1))
+    here = answers(_solved_motion, lambda folder: (folder, __version__), moved, workers)
+    there = answers(_solved_files, lambda folder: (*_files_of(folder), __version__), moved, replace(workers, group=1))
     at_rest = answers(solved, task_of, (folder for folder in rest if folder not in moved), workers)
     for folder, answer in chain(at_rest, here if workers.share_files else there):
         if isinstance(answer, OtherVersion):

@@ -34,7 +34,7 @@ class Sink(Protocol):
         """Take the newest reading; returns at once. Raises `ConfigError` if the sink can never work."""
 
 
-def utc_now() -> datetime:
+def _utc_now() -> datetime:
     """Return the time of this computer, UTC."""
     return datetime.now(UTC)
 
@@ -47,7 +47,7 @@ def serve(
     *,
     say: Callable[[str], None],
     every_s: float = EVERY_S,
-    now: Callable[[], datetime] = utc_now,
+    now: Callable[[], datetime] = _utc_now,
 ) -> None:
     """Read the state and pass it on until an exception ends it, such as `KeyboardInterrupt`.
 

@@ -6,10 +6,10 @@ from typing import Final
 import numpy as np
 
 from ftcalib.after.series import drift_onset
+from ftdrive.fleet.cells import BiasChanges, Observed, when
 from ftdrive.fleet.findings import findings
-from ftdrive.fleet.observed import BiasChanges, Observed, when
 from ftdrive.fleet.state import BiasDrift, CellState, Fleet, Weighings
-from ftdrive.report.words import rounded
+from ftdrive.report.document import rounded
 from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification, StoredWeighings
 from ftdrive.store.store import Store
 
@@ -40,7 +40,7 @@ def fleet_of(observed: Observed, store: Store) -> Fleet:
     return Fleet(tuple(states), findings(observed, states))
 
 
-def drift_of(changes: BiasChanges | None, start: datetime) -> BiasDrift | None:
+def _drift_of(changes: BiasChanges | None, start: datetime) -> BiasDrift | None:
     """Return the drift of a bias since its calibration at `start`; None with too few verifications."""
     if changes is None:
         return None
@@ -83,7 +83,7 @@ def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: St
         due=max(calibrated, verified or calibrated) + timedelta(days=cell.verify_every_days),
         mass_kg=result.mass_kg,
         temperature_C=next((one for one in temperatures if one is not None), None),
-        drift=drift_of(observed.changes.get(result.id), calibrated),
+        drift=_drift_of(observed.changes.get(result.id), calibrated),
         weighings=_weighings(observed.weighings.get((cell.name, result.tool, result.emulated))),
         emulated=result.emulated,
     )

@@ -291,7 +291,7 @@ class Pairing:
         self._waiting = [(samples.rows(slice(end, None)), t_ns[end:])] if end < len(t_ns) else []
         if first >= end:
             return None
-        paired = paired_with(self._poses, t_ns[first:end], samples.rows(slice(first, end)))
+        paired = _paired_with(self._poses, t_ns[first:end], samples.rows(slice(first, end)))
         if self._estimator:
             self._estimator.add(paired)
         return paired
@@ -314,7 +314,7 @@ def _clock_of(states: ArmStates) -> Timeline:
     return Timeline(host_s / device_s, _SCALED)
 
 
-def paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:
+def _paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:
     """Give each sample the pose at its time, which must be inside the track."""
     return Paired(t_ns, samples.t_device_s, samples.seq, samples.status, samples.wrench, *poses.at(t_ns))
 
@@ -346,7 +346,7 @@ def paired_blocks(samples: Iterable[FtSamples], states: Iterable[ArmStates], del
         inside = slice(*np.searchsorted(t_ns, [span_ns[0], span_ns[1] + 1]).tolist())
         if len(t_ns[inside]):
             found = True
-            yield paired_with(poses, t_ns[inside], block.rows(inside))
+            yield _paired_with(poses, t_ns[inside], block.rows(inside))
     if not found:
         raise BadDataset("wrench and pose have no time in common: give files of the same recording and one clock")
 

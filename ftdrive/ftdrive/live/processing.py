@@ -145,7 +145,7 @@ class Processor:
         self._events: list[StreamEvent] = []
         self._contacts: list[Contact] = []
         self._frame, self._transform = frame, FrameTransform(frame, info)
-        self._stages = stages or standard_stages(info)
+        self._stages = stages or _standard_stages(info)
         self._filter = self._filter_of(self._stages)
 
     # ------------------------------------------------------------------------------------------------ what is settable
@@ -695,7 +695,7 @@ class ProcessedStream(ABC):
         return self._processor.sigma(R_base_flange, duration_s)
 
 
-def standard_stages(info: StreamInfo) -> Stages:
+def _standard_stages(info: StreamInfo) -> Stages:
     """Return bias and gravity, with inertia where calibration and cell have what it needs."""
     return Stages(inertia=info.calibration.motion is not None and bool(np.isfinite(info.p_flange_sensor_m).all()))
 

@@ -98,7 +98,7 @@ def certifier_for(cell: CellConfig, model: str | None, kinematics: Kinematics | 
         raise ConfigError("what is mounted? Give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml")
     planes = (BASE_PLANE, *map(plane_from_mm, cell.workcell.planes_mm))
     scene = Scene(planes, tuple(map(box_from_mm, cell.workcell.boxes_mm)), lean_of(cell.workcell.mounting))
-    arm = ArmModel(model, [cylinder_from_mm(values) for values in cell.tool.cylinders_mm], kinematics)
+    arm = ArmModel(model, [_cylinder_from_mm(values) for values in cell.tool.cylinders_mm], kinematics)
     certifier = Certifier(arm, scene)
     require_possible(cell, model)
     return certifier
@@ -184,7 +184,7 @@ def _words(row: Sequence[float]) -> str:
     return f"[{', '.join(f'{value + 0.0:g}' for value in row)}]"
 
 
-def cylinder_from_mm(values: Sequence[float]) -> Cylinder:
+def _cylinder_from_mm(values: Sequence[float]) -> Cylinder:
     """Read from, to, diameter, and x, y of an axis beside the flange's."""
     return Cylinder(*_metres("a cylinder of the tool", "from, to, diameter, or these and x, y", values, (3, 5)))
 

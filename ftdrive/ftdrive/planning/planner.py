@@ -19,10 +19,9 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan, make_plan
-from ftdrive.planning.search import constant_tour
+from ftdrive.planning.search import nodes
 from ftdrive.planning.search.chosen import Chosen, chosen_tour, tour_of_sets, verification_tour
-from ftdrive.planning.search.nodes import WRIST_6_RAD, box_nodes, wrist_nodes
-from ftdrive.planning.search.postures import with_room
+from ftdrive.planning.search.nodes import WRIST_6_RAD, box_nodes, with_room, wrist_nodes
 from ftdrive.planning.search.tours import clear_tour
 from ftdrivers.ur.kinematics import Array
 
@@ -86,13 +85,13 @@ def _attempts(certifier: Certifier, q_now: Array, poses: int, speeds: Speeds, gu
     numbers, reason = NUMBERS[poses], _reason(poses)
     if poses == 24:
         why = "The constant tour is proven clear at the present posture; base, shoulder and elbow stay at rest."
-        q = constant_tour.constant_tour(q_now, certifier.arm.kinematics)
+        q = nodes.constant_tour(q_now, certifier.arm.kinematics)
         fits = _winds_little(q, q_now) and certifier.clear_around(q)
-        yield "constant", [why], (constant_tour.NUMBERS, q) if fits else None
+        yield "constant", [why], (nodes.NUMBERS, q) if fits else None
     why = f"{reason}: the wrist visits them in the fastest order that is clear, base, shoulder and elbow at rest."
     yield "wrist", [why], _wrist(certifier, q_now, numbers, speeds)
     for tour in filter(certifier.clear_around, with_room(certifier, q_now)):
-        elsewhere: Found | None = constant_tour.NUMBERS, tour
+        elsewhere: Found | None = nodes.NUMBERS, tour
         if poses != 24 or not _winds_little(tour, q_now):
             elsewhere = _wrist(certifier, np.append(tour[0, :5], q_now[5]), numbers, speeds)
         why = f"{reason}, and the wrist alone has no clear tour there."

@@ -26,9 +26,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import PROOF_S, Plan, Step, ball_of, description_of, fingerprints
-from ftdrive.planning.search.constant_tour import constant_tour
-from ftdrive.planning.search.nodes import WRIST_6_RAD
-from ftdrive.planning.search.postures import with_room
+from ftdrive.planning.search.nodes import WRIST_6_RAD, constant_tour, with_room
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 

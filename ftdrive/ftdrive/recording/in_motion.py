@@ -15,10 +15,10 @@ from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
 from ftdrive.recording.compensation import NEEDED
+from ftdrive.recording.csv_pair import ORIENTATION, WRENCH, Wanted, read_table
 from ftdrive.recording.files import RecordingReader
-from ftdrive.recording.number_table import ORIENTATION, WRENCH, Wanted, read_table
 from ftdrive.recording.recording import Header
-from ftdrive.runs.new_tool import require_same_cell
+from ftdrive.runs.outcome import require_same_cell
 from ftdrive.runs.run import made_now
 
 _POSITION = ("x", "y", "z")
@@ -65,13 +65,13 @@ def solve_recording(
         wrench, poses = means
         provenance |= {"recording": path.name}
     elif pair is None:
-        wrench, poses, header = read_in_motion(path)
+        wrench, poses, header = _read_in_motion(path)
         devices = {"arm": asdict(header.info.arm), "sensor": asdict(header.info.sensor)}
         provenance |= {"recording": path.name, "devices": devices}
         g_m_s2 = header.info.calibration.g_m_s2
         height_m = float(header.info.p_flange_sensor_m[2])
     else:
-        wrench, poses = read_wrench_file(pair[0]), read_pose_file(pair[1])
+        wrench, poses = _read_wrench_file(pair[0]), _read_pose_file(pair[1])
         provenance |= {"wrench": pair[0].name, "orientation": pair[1].name}
     if earlier is not None:
         require_same_cell(earlier, provenance)
@@ -91,7 +91,7 @@ def solve_recording(
     )
 
 
-def read_in_motion(path: Path) -> tuple[Means, Means, Header]:
+def _read_in_motion(path: Path) -> tuple[Means, Means, Header]:
     """Read a recording of `ftdrive record`; without positions where it has none. Raises as `RecordingReader.pieces`."""
     reader, wrench, poses = RecordingReader(path, NEEDED), Means(), Means()
     start_ns, with_position = None, False
@@ -106,7 +106,7 @@ def read_in_motion(path: Path) -> tuple[Means, Means, Header]:
     return wrench, poses, reader.header
 
 
-def read_wrench_file(path: Path) -> Means:
+def _read_wrench_file(path: Path) -> Means:
     """Read columns t in s, fx, fy, fz in N, tx, ty, tz in N·m. Raises `BadDataset` or `OSError`."""
     means = Means()
     for part in read_table(path, WRENCH):
@@ -114,7 +114,7 @@ def read_wrench_file(path: Path) -> Means:
     return means
 
 
-def read_pose_file(path: Path) -> Means:
+def _read_pose_file(path: Path) -> Means:
     """Read columns t in s, the orientation of the flange in base and, if they are there, x, y, z in m.
 
     The orientation is r11..r33, qx, qy, qz, qw, or rx, ry, rz in rad. Raises `BadDataset` or `OSError`.

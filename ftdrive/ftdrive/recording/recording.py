@@ -90,7 +90,7 @@ def rows_of(samples: Block | Paired) -> Rows:
     return rows
 
 
-def paired_of(*parts: Rows) -> Paired:
+def _paired_of(*parts: Rows) -> Paired:
     """Return samples as measured, each with its pose; columns that were not read are 0."""
 
     def column(name: str) -> NDArray[Any]:
@@ -263,7 +263,7 @@ class Recording:
 
     def paired(self) -> Paired:
         """Return the samples as measured, each with its pose; columns that were not read are 0."""
-        return paired_of(self.rows)
+        return _paired_of(self.rows)
 
     def pieces(self) -> Iterator[Piece]:
         """Give samples in pieces of one frame, the events since the piece before, and the header that holds there."""
@@ -318,13 +318,13 @@ def measured(pieces: Iterable[Piece]) -> Iterator[Measured]:
             share = piece.share
             while count + len(rows) >= PIECE_ROWS:
                 here = PIECE_ROWS - count
-                yield Measured(paired_of(*waiting, rows[:here]), events, share)
+                yield Measured(_paired_of(*waiting, rows[:here]), events, share)
                 waiting, count, events, rows = [], 0, [], rows[here:]
             waiting.append(rows)
             count += len(rows)
     except BadRecording as error:
         failure = error
     if events or count:
-        yield Measured(paired_of(*waiting), events, share)
+        yield Measured(_paired_of(*waiting), events, share)
     if failure is not None:
         raise failure

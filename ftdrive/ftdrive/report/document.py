@@ -1,7 +1,11 @@
-"""A report as sections of sentences, tables and figures, whatever its format."""
+"""A report as sections of sentences, tables and figures, and the words that all formats share."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,3 +42,63 @@ class Section:
     text: Sequence[str] = ()
     figures: Sequence[Figure] = ()
     tables: Sequence[Table] = ()
+
+
+_LABELS = {
+    "R_flange_sensor": "mounting",
+    "gravity_force_base_N": "weight",
+    "force_bias_N": "force bias",
+    "p_sensor_com_m": "centre of mass",
+    "torque_bias_Nm": "torque bias",
+}
+
+
+def label_of(parameter: str) -> str:
+    """Name an error coordinate, such as "force bias x" for "force_bias_N.x"."""
+    name, _, axis = parameter.partition(".")
+    return f"{_LABELS[name]} {axis}"
+
+
+def rounded(value: float | None, digits: int = 3) -> str:
+    """Write a number with this many significant digits, without an exponent; "-" for None."""
+    if value is None:
+        return "-"
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    places = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
+    return f"{value:.{min(places, 9)}f}"
+
+
+def capital(words: str) -> str:
+    """Begin a sentence with a capital letter."""
+    return words[:1].upper() + words[1:]
+
+
+def in_words(p_value: float) -> str:
+    """Write a probability."""
+    return "< 0.0001" if p_value < 1e-4 else f"{p_value:.2g}"
+
+
+def shown_poses(poses: Sequence[Any], most: int = 200) -> list[Any]:
+    """Choose the poses to list and draw, in their order: all, or the worst quarter and evenly spread others."""
+    if len(poses) <= most:
+        return list(poses)
+    size = np.array([pose["sigmas"] or pose["force_N"] for pose in poses])
+    worst = np.argsort(-size)[: most // 4]
+    even = np.linspace(0, len(poses) - 1, most - len(worst)).astype(int)
+    return [poses[row] for row in np.unique([*worst, *even])]
+
+
+def flattened(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the values of nested objects with their full names, as text."""
+    for name, inner in value.items():
+        if isinstance(inner, Mapping):
+            yield from flattened(inner, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", _text(inner)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return " ".join(map(_text, value))
+    return "-" if value is None else str(value)

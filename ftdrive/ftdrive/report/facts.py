@@ -1,28 +1,133 @@
 """All facts of a report as one JSON object; every format shows only what is here."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
+from ftcalib.after.series import difference
 from ftcalib.compare import compare
 from ftcalib.errors import NotObservable
 from ftcalib.judge.observability import assess
 from ftcalib.judge.verdict import strong_correlations
 from ftcalib.model import PARAMETER_NAMES, Array
 from ftcalib.routine import drift_check
-from ftcalib.sphere import largest_gap
+from ftcalib.sphere import axes_along, largest_gap
 from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.plan import Plan
-from ftdrive.report.comparison import compared
-from ftdrive.report.error_map import direction_in_words, error_map
 from ftdrive.report.subject import Subject
 from ftdrive.runs.pose_hints import hints, names_of
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification_record import MARKS, marks_of
 from ftdrive.terminal.report import drift_in_use, drift_in_words, error_in_words
+
+NAMES = {
+    "R_flange_sensor": "mounting of the sensor",
+    "gravity_force_base_N": "weight in base",
+    "force_bias_N": "force bias",
+    "p_sensor_com_m": "centre of mass",
+    "torque_bias_Nm": "torque bias",
+}
+
+
+def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, Any]:
+    """Compare a result with an earlier one of other data.
+
+    Returns
+    -------
+    dict
+        `parameters`: for each error coordinate its `name`, `change` (rad, N, m, N·m) and `sigmas`, null if it was known
+        exactly in both; `groups`: `name`, `chi2`, `dof`, `p_value`; `same_data`: whether both rest on one dataset, so
+        that the test does not apply.
+    """
+    found = difference(before, result)
+    data = [one.provenance.get("dataset_sha256") for one in (result, before)]
+    tests = {NAMES[name]: test for name, test in found.groups.items() if test.dof} | {"all": found.joint}
+    return {
+        "id": before.id,
+        "verdict": before.verdict,
+        "created_utc": before.provenance.get("created_utc"),
+        "mass_kg": before.mass_kg,
+        "same_data": data[0] is not None and data[0] == data[1],
+        "parameters": [
+            {"name": name, "change": change, "sigmas": sigmas if sigma > 0 and np.isfinite(sigmas) else None}
+            for name, change, sigma, sigmas in zip(
+                PARAMETER_NAMES, found.change.tolist(), found.sigma.tolist(), found.in_sigmas.tolist(), strict=True
+            )
+        ],
+        "groups": [{"name": name, **asdict(test)} for name, test in tests.items()],
+    }
+
+
+STEP_DEG = 10
+"""Grid of elevation and azimuth."""
+TURNS = 12
+"""Turns of the tool about its axis at each direction, over a whole turn."""
+
+
+def error_map(result: CalibrationResult) -> dict[str, Any]:
+    """Return the error of the compensation of a free tool over the directions of the tool axis, one standard deviation.
+
+    Returns
+    -------
+    dict
+        `elevation_deg` (n,) and `azimuth_deg` (m,) of flange z in base axes; `force_N` and `torque_Nm`, each a dict of
+        `map` (n, m): largest error over the turns of the tool about its axis, `largest`, `rms` over all orientations,
+        `worst_direction` (3,) of flange z in base, and that direction as `axes` and in `words`.
+    """
+    elevation = np.radians(np.arange(-90, 91, STEP_DEG))
+    azimuth = np.radians(np.arange(-180, 181, STEP_DEG))
+    R = orientations(elevation, azimuth)
+    variance = np.diagonal(result.wrench_covariance(R), axis1=-2, axis2=-1)
+    document: dict[str, Any] = {
+        "elevation_deg": np.degrees(elevation).round().tolist(),
+        "azimuth_deg": np.degrees(azimuth).round().tolist(),
+    }
+    for k, name in enumerate(("force_N", "torque_Nm")):
+        error = np.sqrt(variance[..., 3 * k : 3 * k + 3].sum(axis=-1))
+        worst = np.unravel_index(int(np.argmax(error)), error.shape)
+        direction = R[worst][:, 2]
+        document[name] = {
+            "map": error.max(axis=-1).tolist(),
+            "largest": float(error.max()),
+            "rms": result.predicted_error()[k],
+            "worst_direction": direction.tolist(),
+            "axes": _along_axes(direction),
+            "words": _direction_in_words(direction, "base"),
+        }
+    return document
+
+
+def orientations(elevation_rad: Array, azimuth_rad: Array) -> Array:
+    """Return R_base_flange (n, m, TURNS, 3, 3): flange z in these directions, turned about itself.
+
+    Parameters
+    ----------
+    elevation_rad : array, shape (n,)
+        From the base xy-plane.
+    azimuth_rad : array, shape (m,)
+        About base z, from base x.
+    """
+    tip, turn = np.meshgrid(np.pi / 2 - elevation_rad, azimuth_rad, indexing="ij")
+    point = Rotation.from_euler("ZY", np.stack([turn, tip], axis=-1).reshape(-1, 2)).as_matrix()
+    spin = Rotation.from_rotvec(np.outer(np.linspace(0, 2 * np.pi, TURNS, endpoint=False), [0, 0, 1])).as_matrix()
+    return np.asarray(point[:, None] @ spin).reshape(*tip.shape, TURNS, 3, 3)
+
+
+def _along_axes(direction: Array) -> str:
+    """Name the axis along which a unit vector (3,) points, or the two or three between which it does."""
+    names = axes_along(direction)
+    return f"along {names[0]}" if len(names) == 1 else f"between {' and '.join(names)}"
+
+
+def _direction_in_words(direction: Array, frame: str) -> str:
+    """Name the direction of a unit vector (3,) in a frame."""
+    return f"{_along_axes(direction)} of the {frame}"
+
 
 FORMAT = "ftdrive.report/1"
 NEXT_STEP = {
@@ -191,7 +296,7 @@ def _coverage(subject: Subject, R_base_flange: Array) -> dict[str, Any]:
         "tool_in_base": tool.tolist(),
         "largest_gap_rad": gap_rad,
         "gap_towards": towards.tolist(),
-        "gap_words": direction_in_words(towards, "flange"),
+        "gap_words": _direction_in_words(towards, "flange"),
     }
 
 

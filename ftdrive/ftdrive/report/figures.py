@@ -14,9 +14,8 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftdrive.errors import ConfigError
-from ftdrive.report.fit_sections import SUSPICIOUS_SIGMAS
-from ftdrive.report.origin_sections import LIMIT_SIGMAS
-from ftdrive.report.words import label_of, shown_poses
+from ftdrive.report.document import label_of, shown_poses
+from ftdrive.report.sections import LIMIT_SIGMAS, SUSPICIOUS_SIGMAS
 from ftdrivers.sweep import WRISTS, Sweep
 
 Facts = Mapping[str, Any]
@@ -84,10 +83,10 @@ def draw(name: str, facts: Facts) -> str:
         fill(figure, facts)
         written = StringIO()
         figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    return inlined(written.getvalue(), name)
+    return _inlined(written.getvalue(), name)
 
 
-def inlined(svg: str, name: str) -> str:
+def _inlined(svg: str, name: str) -> str:
     """Make a file of matplotlib an element of a page: unique ids, no prologue or size, colours as variables."""
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     svg = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)
@@ -173,7 +172,7 @@ def _dots(axes: Any, directions: Any, **style: Any) -> None:
 
 
 def _sweep(figure: Any, facts: Facts) -> None:
-    from ftdrive.planning.show.words import JOINTS
+    from ftdrive.planning.words import JOINTS
 
     axes, sweep = figure.add_subplot(), Sweep.from_dict(facts["motion"]["sweep"])
     t_s = np.linspace(0.0, sweep.duration_s, 400)

@@ -1,12 +1,465 @@
 """The sections of a report, in the order in which a reader needs them."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from ftdrive.report.document import Section
-from ftdrive.report.fit_sections import coverage, cross_validation, drift, error, estimates, noise, residuals
-from ftdrive.report.motion_section import motion
-from ftdrive.report.origin_sections import comparison, provenance, tour
+import numpy as np
+
+from ftcalib.rounding import to_place_of, with_sigma
+from ftdrive.report.document import Figure, Section, Table, capital, flattened, in_words, label_of, rounded, shown_poses
+from ftdrive.terminal.report import SIGMA_OF_THE_TOOL, axes_of, quantities_of, values_of
+
+Facts = Mapping[str, Any]
+
+SUSPICIOUS_SIGMAS = 1.9
+"""One good pose in 1000 deviates more, in root mean square over the six channels."""
+_ROUNDED = 1e-9
+"""A sigma below this share of the largest one belongs to a known value."""
+_AXES = "xyz"
+
+
+def estimates(facts: Facts) -> Section:
+    """Show the estimates with sigma, their correlations, and gain and cross-talk if found."""
+    result, strong = facts["result"], facts["correlation"]["strong"]
+    rows = "poses" if facts["motion"] is None else "parts of the motion"
+    pairs = "; ".join(f"{label_of(one)} and {label_of(other)} {value:+.2f}" for one, other, value in strong[:5])
+    text = [
+        f"Method {result['method']}, {result['n_poses']} {rows}, gravity {result['g_m_s2']:g} m/s². Wrenches are on "
+        "the sensor, in its axes, about its origin. Centre of mass and biases are in sensor axes.",
+        f"Strongest correlations: {pairs}." if pairs else "No two parameters are correlated by more than 0.7.",
+    ]
+    figure = Figure(
+        "correlation",
+        f"Matrix of the correlations of the 15 estimated parameters. {text[1]}",
+        "Correlation of the estimates. Good: faint everywhere beside the diagonal. A strong field means that the poses "
+        "hardly separate two parameters: add other orientations.",
+    )
+    tables = [Table("", ("quantity", "estimate", "± 1 sigma"), list(_estimate_rows(result)))]
+    if result["response"] is not None:
+        text.append(f"Sigma: {SIGMA_OF_THE_TOOL}.")
+        columns = ("entry", "value", "± 1 sigma")
+        tables.append(Table("Gain and cross-talk of the sensor", columns, _response(result), folded=True))
+    return Section("estimates", "Estimates", text, [figure], tables)
+
+
+def _estimate_rows(result: Facts) -> Iterator[tuple[str, str, str]]:
+    fixed_below = _ROUNDED * float(np.sqrt(np.diag(result["covariance"]).max()))
+    for label, scale, unit, key in quantities_of(result):
+        values, sigmas = (values_of(source[key], key) * scale for source in (result, result["sigma"]))
+        fixed = sigmas <= fixed_below * scale
+        for axis, value, sigma, known in zip(axes_of(len(values)), values, sigmas, fixed, strict=True):
+            name = f"{label} {axis}, {unit}" if len(values) > 1 else f"{label}, {unit}"
+            spread = 0.0 if known else float(sigma)
+            yield name, to_place_of(value, spread), "fixed" if known else to_place_of(spread, spread)
+
+
+def _response(result: Facts) -> list[tuple[str, str, str]]:
+    kinds = (("force_gain", 100, "%", "force gain"), ("cross_talk_m", 1e3, "mN·m/N", "cross-talk"))
+    return [
+        (
+            f"{label} {_AXES[i]}{_AXES[j]}, {unit}",
+            *_pair(scale * result["response"][key][i][j], scale * result["response"]["sigma"][key][i][j]),
+        )
+        for key, scale, unit, label in kinds
+        for i in range(3)
+        for j in range(i, 3)
+    ]
+
+
+def _pair(value: float, sigma: float) -> tuple[str, str]:
+    return to_place_of(value, sigma), to_place_of(sigma, sigma)
+
+
+def error(facts: Facts) -> Section:
+    """Show the predicted error over all orientations, and its worst direction."""
+    force, torque = facts["error_map"]["force_N"], facts["error_map"]["torque_Nm"]
+    text = [
+        f"Compensation error of a free tool at the next use: {facts['error']['words']}.",
+        f"Worst direction of the tool axis for the force: {force['words']}, {rounded(force['largest'])} N.",
+        f"Worst direction for the torque: {torque['words']}, {rounded(torque['largest'])} N·m.",
+    ]
+    trust = (
+        "The map shows the stated uncertainty only: the error above has what the model lacks."
+        if facts["error"]["cross_validated"]
+        else "The measured noise explains the residuals, so the map can be trusted."
+    )
+    figures = [
+        Figure(
+            f"{kind}_map",
+            f"Map of the predicted {kind} error over the directions of the tool axis, "
+            f"{rounded(float(np.min(one['map'])))} to {rounded(one['largest'])} {unit}, largest {one['words']}.",
+            f"Predicted {kind} error (one sigma, worst turn of the tool about its axis) for each direction of the tool "
+            "axis (flange z) in base. Dots: poses. Cross: worst direction. Good: one colour, and every value below "
+            f"the contact {kind} that matters to you. {trust}",
+        )
+        for kind, one, unit in (("force", force, "N"), ("torque", torque, "N·m"))
+    ]
+    rows = [
+        (name, rounded(one["rms"]), rounded(one["largest"]), one["axes"])
+        for name, one in (("force, N", force), ("torque, N·m", torque))
+    ]
+    caption = "Predicted error, one sigma: rms over all orientations, and largest"
+    columns = ("error", "rms", "largest", "tool axis there, in base")
+    return Section("error", "Compensation error over all orientations", text, figures, [Table(caption, columns, rows)])
+
+
+def cross_validation(facts: Facts) -> Section:
+    """Show the error in predicting each pose from the others, by method."""
+    found = facts["cross_validation"]
+    text = []
+    if found["force_N"] is not None:
+        text.append(
+            f"Each pose predicted from all others: {rounded(found['force_N'])} N, {rounded(found['torque_Nm'])} N·m "
+            "rms. Good: well below the contact that matters to you."
+        )
+    if found["reason"]:
+        text.append(f"Methods are not compared. {found['reason']}")
+        return Section("cross-validation", "Cross-validation", text)
+    solved = [one for one in found["methods"] if "reason" not in one]
+    rows = [
+        (
+            one["method"],
+            rounded(one["mass_kg"], 4),
+            f"{math.degrees(one['rotation_difference_rad']):.2f}",
+            rounded(one["residual"]["force_rms_N"]),
+            rounded(one["residual"]["torque_rms_Nm"]),
+            rounded(one["cross_validated"]["force_rms_N"]),
+            rounded(one["cross_validated"]["torque_rms_Nm"]),
+        )
+        for one in solved
+    ]
+    columns = (
+        "method",
+        "mass, kg",
+        "mounting differs, °",
+        "residual, N",
+        "residual, N·m",
+        "left out, N",
+        "left out, N·m",
+    )
+    tables = [Table("Methods on the same poses", columns, rows)]
+    if missing := [(one["method"], one["reason"]) for one in found["methods"] if "reason" in one]:
+        tables.append(Table("Methods without a result", ("method", "reason"), missing, folded=True))
+    crossed = [one for one in solved if one["cross_validated"]["force_rms_N"]]
+    best = min(crossed, key=lambda one: float(one["cross_validated"]["force_rms_N"]), default=None)
+    figure = Figure(
+        "methods",
+        "Bars of the cross-validated force and torque error of each method"
+        + (f"; {best['method']} has the smallest force error." if best else "."),
+        "Error in predicting each pose from all others, by method, logarithmic. Good: the method of this result "
+        "(orange) has one of the shortest bars. Methods with a known mounting fail if the sensor is mounted otherwise.",
+    )
+    return Section("cross-validation", "Cross-validation", text, [figure] if crossed else [], tables)
+
+
+def residuals(facts: Facts) -> Section:
+    """Show the residuals of each pose, and in time; of a motion, of its parts."""
+    result, poses, in_motion = facts["result"], facts["poses"], facts["motion"] is not None
+    sums = result["residual"]
+    text = [
+        f"Residuals: force {rounded(sums['force_rms_N'])} N rms, {rounded(sums['force_max_N'])} N at most; torque "
+        f"{rounded(sums['torque_rms_Nm'])} N·m rms, {rounded(sums['torque_max_Nm'])} N·m at most.",
+        f"They are {result['noise_factor']:.2f} times the measured noise (p = {in_words(result['p_value'])})."
+        if result["p_value"] is not None
+        else "The noise was not measured but estimated from the residuals, so their size does not test the fit.",
+    ]
+    if result["rejected_poses"]:
+        names = ", ".join(poses[row - 1]["name"] for row in result["rejected_poses"])
+        text.append(f"Rejected, because they do not fit the others: pose {names}.")
+    known = [] if in_motion else [pose for pose in poses if pose["sigmas"] is not None]
+    figures = []
+    if known:
+        worst = max(known, key=lambda pose: float(pose["sigmas"]))
+        figures.append(
+            Figure(
+                "pose_residuals",
+                f"Bars of the cross-validated residual of each pose in sigma; the largest is {worst['sigmas']:.1f} at "
+                f"pose {worst['name']}.",
+                "Residual of each pose if all others predict it, in sigma. Good: bars about 1, none above the dashed "
+                f"line at {SUSPICIOUS_SIGMAS:g}. Repeat a pose above it. Hatched: rejected.",
+            )
+        )
+    timed = in_motion or all(pose["t_s"] is not None for pose in poses)
+    order = "time" if timed else "the order of the poses"
+    figures.append(
+        Figure(
+            "time_residuals",
+            f"Force and torque residuals along x, y and z against {order}.",
+            f"Measured minus predicted wrench, drift included, against {order}. "
+            "Good: a scatter about zero. A slope or slow wave is drift; one point far away is contact or a cable.",
+        )
+    )
+    rows = [
+        (
+            pose["name"],
+            "-" if pose["t_s"] is None else f"{pose['t_s']:.0f}",
+            *(f"{value:.3f}" for value in pose["residual"][:3]),
+            *(f"{1e3 * value:.1f}" for value in pose["residual"][3:]),
+            rounded(pose["sigmas"], 2),
+            "yes" if pose["used"] else "no",
+        )
+        for pose in shown_poses(poses)
+    ]
+    columns = ("pose", "t, s", *(f"F{a}, N" for a in _AXES), *(f"T{a}, mN·m" for a in _AXES), "sigma", "used")
+    few = "" if len(rows) == len(poses) else f" ({len(rows)} of {len(poses)} poses, the worst among them)"
+    tables = [] if in_motion else [Table(f"Table of the residuals{few}", columns, rows, folded=True)]
+    return Section("residuals", "Residuals", text, figures, tables)
+
+
+def drift(facts: Facts) -> Section:
+    """Show the drift in the fit and of the repeated first pose."""
+    seen = facts["drift"]
+    found, again = seen["in_fit"], seen["first_pose_again"]
+    text = []
+    if again is not None:
+        text.append(f"{capital(again['words'])}.")
+    if seen["lag1"] is not None:
+        text.append(
+            f"Residuals of successive poses are correlated by {seen['lag1']:.2f}. Good: near 0. Drift makes it larger."
+        )
+    if found is None:
+        text.append("The fit found no drift of the bias.")
+    else:
+        model = "random walk" if any(name.startswith("walk") for name in seen["components"]) else "linear"
+        text.append(f"The fit includes a drift of the bias ({model}), listed below. Good: within 3 sigma.")
+    if seen["in_use"] is not None:
+        text.append(f"{capital(seen['in_use'])}. Tare before use.")
+    rows = [
+        (
+            f"{name}, {unit}",
+            to_place_of(scale * change, scale * sigma, "+"),
+            to_place_of(scale * sigma, scale * sigma),
+            f"{change / sigma:+.1f}",
+        )
+        if sigma > _ROUNDED
+        else (f"{name}, {unit}", "-", "-", "-")
+        for name, unit, scale, change, sigma in (
+            ()
+            if found is None
+            else (
+                (f"{'FT'[k // 3]}{_AXES[k % 3]}", *(("N", 1.0), ("mN·m", 1e3))[k // 3], *pair)
+                for k, pair in enumerate(zip(found["change"], found["sigma"], strict=True))
+            )
+        )
+    ]
+    columns = ("channel", "change of the bias", "± 1 sigma", "in sigma")
+    return Section(
+        "drift",
+        "Drift",
+        text,
+        (),
+        [Table("Bias at the last pose minus bias at the first", columns, rows)] if rows else (),
+    )
+
+
+def noise(facts: Facts) -> Section:
+    """Show the noise of the mean at each pose."""
+    measured = facts["noise"]
+    if measured is None:
+        why = "The source states no noise of its poses: add columns sigma_fx to sigma_tz, or calibrate with ftdrive."
+        return Section("noise", "Noise of each pose", [why])
+    force, torque = np.array(measured["force_N"]), np.array(measured["torque_Nm"])
+    text = [
+        f"Standard error of the mean of one axis, median over the poses: {rounded(float(np.median(force)))} N, "
+        f"{rounded(float(np.median(torque)))} N·m. Largest: {rounded(float(force.max()))} N, "
+        f"{rounded(float(torque.max()))} N·m."
+    ]
+    if measured["unsteady"]:
+        stops = ", ".join(map(str, measured["unsteady"]))
+        text.append(f"Not steady while averaged: stop {stops}. Something swung or was touched there.")
+    figure = Figure(
+        "noise",
+        f"Noise of the mean at each pose, {rounded(float(force.min()))} to {rounded(float(force.max()))} N.",
+        "Noise of the mean wrench at each pose (one axis, one sigma). Good: bars of similar height. A pose far above "
+        "the others swung, was touched, or was averaged over too few samples.",
+    )
+    return Section("noise", "Noise of each pose", text, [figure])
+
+
+def coverage(facts: Facts) -> Section:
+    """Show which directions of gravity the poses cover."""
+    found, title = facts["coverage"], "Coverage of orientations"
+    if found is None:
+        return Section("coverage", title, ["The calibration file holds no orientations: report its run folder."])
+    gap_deg = math.degrees(found["largest_gap_rad"])
+    text = [
+        capital(found["words"]),
+        f"{found['orientations']} different orientations (24 or more count as 24) determine {found['rank']} of 15 "
+        "parameters.",
+        f"Largest gap: {gap_deg:.0f}° around the direction {found['gap_words']}.",
+    ]
+    figure = Figure(
+        "coverage",
+        f"Map of the directions of gravity in flange axes; the largest gap has a radius of {gap_deg:.0f}°.",
+        "Direction of gravity in flange axes at each pose. Good: dots in all parts of the map. The circle is the "
+        f"largest gap, {gap_deg:.0f}°; the 24 orientations of the paper leave 55°.",
+    )
+    return Section("coverage", title, text, [figure])
+
+
+LIMIT_SIGMAS = 3
+"""One difference in 370 is larger by chance."""
+CHANGED_P = 1e-3
+"""Two results of one tool differ more than this by chance in one case of 1000."""
+
+
+def tour(facts: Facts) -> Section:
+    """Show run, plan, devices and settings."""
+    run, title = facts["tour"], "Tour and settings"
+    if run is None:
+        return Section("tour", title, ["The source is not a run folder: it holds no plan, devices or settings."])
+    started = f"{str(run['created_utc'])[:19]} UTC"
+    text = [f"Run {run['run']}, started {started}, mode {run['mode']}, {run['stops']} stops."]
+    tables = [
+        Table("Devices", ("device", "model", "serial", "firmware"), _devices(run["devices"])),
+        Table("Settings", ("setting", "value"), list(flattened(run["config"])), folded=True),
+    ]
+    plan = run["plan"]
+    if plan is None:
+        text.append(run["plan_error"] or "The poses were chosen by hand: there is no plan.")
+        return Section("tour", title, text, (), tables)
+    text += plan["why"]
+    if "sweep" in plan:
+        text.append(f"Proven clear along the whole curve, nearest {plan['min_clearance_mm']:.0f} mm.")
+        return Section("tour", title, text, (), tables)
+    text.append(
+        f"{plan['poses']} poses, {plan['motion_time_s']:.0f} s of motion, no move above {plan['max_move_deg']:.0f}°, "
+        f"{'all' if plan['certified'] else 'NOT all'} proven clear, nearest {plan['min_clearance_mm']:.0f} mm."
+    )
+    rows = [
+        (name, rounded(scale * _largest(plan["predicted_sigma"].get(key)), 2), rounded(scale * got, 2))
+        for name, scale, key, got in _predicted(facts)
+    ]
+    caption = "One sigma as the plan predicted it, and as obtained. Good: obtained at most as predicted"
+    return Section("tour", title, text, (), [Table(caption, ("sigma", "predicted", "obtained"), rows), *tables])
+
+
+def _predicted(facts: Facts) -> Iterator[tuple[str, float, str, float]]:
+    sigma, predicted = facts["result"]["sigma"], facts["result"]["predicted_error"]
+    for name, scale, key in (
+        ("mass, g", 1e3, "mass_kg"),
+        ("centre of mass, mm", 1e3, "p_sensor_com_m"),
+        ("force bias, N", 1.0, "force_bias_N"),
+        ("torque bias, N·m", 1.0, "torque_bias_Nm"),
+    ):
+        yield name, scale, key, _largest(sigma[key])
+    yield "compensation, N", 1.0, "force_rms_N", predicted["force_rms_N"]
+    yield "compensation, N·m", 1.0, "torque_rms_Nm", predicted["torque_rms_Nm"]
+
+
+def _largest(values: Any) -> float:
+    return float(np.max(np.array(values, dtype=np.float64)))
+
+
+def _devices(devices: Facts) -> list[Sequence[str]]:
+    keys = ("model", "serial", "firmware")
+    return [(name, *(str(one.get(key, "-")) for key in keys)) for name, one in devices.items()]
+
+
+def comparison(facts: Facts) -> Section:
+    """Show the differences from the previous result."""
+    found, title = facts["comparison"], "Comparison with the previous result"
+    if found is None:
+        why = facts["compared_with"] or "There is no result to compare with: name one with --parent."
+        return Section("comparison", title, [why])
+    text = [
+        f"Compared with {facts['compared_with']}: id {found['id']}, {found['verdict']}, mass {found['mass_kg']:.4f} kg."
+    ]
+    if found["same_data"]:
+        text.append("Both rest on the same data: the test below does not apply, because it assumes independent noise.")
+    else:
+        changed = [one["name"] for one in found["groups"][:-1] if one["p_value"] < CHANGED_P]
+        text.append(
+            f"Changed by more than chance explains: {', '.join(changed)}."
+            if changed
+            else "Nothing changed by more than chance explains."
+        )
+        text.append("A bias may change from day to day; a change of anything else means another tool or mounting.")
+    groups = [(one["name"], f"{one['chi2']:.4g}", str(one["dof"]), in_words(one["p_value"])) for one in found["groups"]]
+    rows = [
+        (label_of(one["name"]), f"{one['change']:+.2g}", "-" if one["sigmas"] is None else f"{one['sigmas']:+.1f}")
+        for one in found["parameters"]
+    ]
+    figure = Figure(
+        "comparison",
+        "Bars of the difference of each parameter in sigma.",
+        "This result minus the previous one, in sigma of the difference; beyond the dashed lines at "
+        f"{LIMIT_SIGMAS} the scale is logarithmic. Good: bars within them, except for the biases.",
+    )
+    tables = [
+        Table("Joint test of each group", ("group", "chi2", "dof", "p"), groups),
+        Table("Differences (rad, N, m, N·m)", ("parameter", "difference", "in sigma"), rows, folded=True),
+    ]
+    return Section("comparison", title, text, [figure], tables)
+
+
+def provenance(facts: Facts) -> Section:
+    """Show where the result comes from and how to get it again."""
+    text = [f"Report of {facts['source']}, written {facts['created_utc']}. Calibration id {facts['id']}."]
+    if facts["reproduce"]:
+        text.append(f"Reproduce the result: `{facts['reproduce']}`. The id must be {facts['id']}.")
+    else:
+        text.append("The file holds no data: solve the dataset with the hash below to reproduce the result.")
+    text += _last_verification(facts["trust"] or {})
+    rows, columns = list(flattened(facts["result"]["provenance"])), ("field", "value")
+    long = [row for row in rows if row[0].startswith(("devices.", "station."))]
+    tables = [Table("", columns, [row for row in rows if row not in long])]
+    tables += [Table("Devices", columns, long, folded=True)] if long else []
+    return Section("provenance", "Provenance and how to reproduce the result", text, (), tables)
+
+
+def _last_verification(trust: Facts) -> Iterator[str]:
+    if last := trust.get("last_verification"):
+        outcome = "passed" if last["passed"] else "FAILED"
+        yield f"Last verification {last['created_utc'][:16]} UTC, {outcome}: {last['reason']}. File {last['path']}."
+    if trust.get("store_error"):
+        yield f"A later verification may be missing, because {trust['store_error']}."
+
+
+def motion(facts: Facts) -> Section:
+    """Show what only motion gives, and the planned sweep."""
+    found = facts["motion"]
+    sigma = found["sigma"]
+    moments, of_moments = (np.array(values) for values in (found["inertia_kg_m2"], sigma["inertia_kg_m2"]))
+    principal = np.linalg.eigvalsh(moments)
+    text = [
+        f"{100 * found['used_share']:.0f} % of the recording was used. Not used: contact, gaps, both ends, which the "
+        "filter needs, and what is too fast where the position is unknown.",
+        f"The wrench follows the pose by {with_sigma(1e3 * found['delay_s'], 1e3 * sigma['delay_s'])} ms.",
+        f"The origin of the sensor is {with_sigma(1e3 * found['height_m'], 1e3 * sigma['height_m'])} mm above the "
+        "flange face, as the acceleration shows it.",
+        f"Principal moments of inertia about the centre of mass: {', '.join(rounded(1e3 * one) for one in principal)} "
+        "g·m². Good: all positive, and each at most the sum of the others.",
+    ]
+    rows = [
+        (f"{'xyz'[i]}{'xyz'[j]}", f"{1e3 * moments[i, j]:.3f}", f"{1e3 * of_moments[i, j]:.3f}")
+        for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    ]
+    tables = [Table("Inertia about the centre of mass, sensor axes, g·m²", ("axes", "estimate", "± 1 sigma"), rows)]
+    touches = [
+        (
+            f"{one['t_s']:.1f}",
+            *(rounded(one[key], 2) for key in ("duration_s", "force_N", "torque_Nm")),
+        )
+        for one in found["contacts"]
+    ]
+    if touches:
+        columns = ("at, s", "for, s", "force, N", "torque, N·m")
+        tables.append(Table("Contact, which was left out", columns, touches))
+    else:
+        text.append("No contact was found.")
+    figures = []
+    if found["sweep"] is not None:
+        figures.append(
+            Figure(
+                "sweep",
+                f"Angles of the three wrist joints against time in the planned sweep of "
+                f"{found['sweep']['duration_s']:.0f} s.",
+                "The planned sweep: wrist joints against time at the planned speed. It begins and ends at rest.",
+            )
+        )
+    return Section("motion", "Motion", text, figures, tables)
 
 
 def sections_of(facts: Mapping[str, Any]) -> list[Section]:

@@ -1,8 +1,9 @@
-"""What a report is about: a result, and as much of its data as its source holds."""
+"""What a report is about: a result, as much of its data as its source holds, and whether the data are as they were."""
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,59 @@ from ftcalib.files import read_object
 from ftcalib.likelihood.session import Drift
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord
-from ftdrive.errors import ConfigError
+from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs.outcome import solve_in_motion
 from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import read_source
+from ftdrive.runs.verification_record import age_of, outcome_in_words, verification_near
+
+
+def trust(
+    result: CalibrationResult, source: Path, store_url: Callable[[], str | None], now: datetime
+) -> dict[str, Any]:
+    """Return age and last verification of a result; a store that cannot be read is named in `store_error`.
+
+    Parameters
+    ----------
+    result : CalibrationResult
+    source : Path
+        Its file or run folder.
+    store_url : callable
+        Reads `[store] url`; None is the user's store.
+    now : datetime
+    """
+    near = verification_near(source, result.id)
+    kept, error = _of_store(result.id, store_url)
+    known = [_plain(one) for one in (near, kept) if one is not None and one.created_utc]
+    last = max(known, key=lambda one: datetime.fromisoformat(one["created_utc"]), default=None)
+    verified = "not verified"
+    if last is not None:
+        age = now - datetime.fromisoformat(last["created_utc"])
+        verified = outcome_in_words(age, passed=last["passed"], change=last["change"])
+    words = ", ".join([*age_of(result, now), verified])
+    return {"words": words, "last_verification": last, "store_error": error}
+
+
+def _of_store(calibration_id: str, url: Callable[[], str | None]) -> tuple[Any, str]:
+    """Return what the store has, and why it cannot be read."""
+    from ftdrive.store.store import Store
+
+    try:
+        return Store(url()).last_verification(calibration_id), ""
+    except (BadStore, ConfigError) as error:
+        return None, str(error)
+
+
+def _plain(one: Any) -> dict[str, Any]:
+    """Return the fields that a `VerificationRecord` and a `StoredVerification` share."""
+    at = one.created_utc if isinstance(one.created_utc, datetime) else datetime.fromisoformat(one.created_utc)
+    return {
+        "created_utc": at.astimezone(UTC).isoformat(),
+        "passed": one.passed,
+        "change": one.change,
+        "reason": one.reason or "",
+        "path": str(one.path),
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +99,7 @@ class Subject:
     parent_name: str = ""
     """Of the result to compare with, or why there is none."""
     trust: Mapping[str, Any] | None = None
-    """Age and last verification, from `ftdrive.report.trust`; None if nothing was looked up."""
+    """Age and last verification, from `ftdrive.report.subject`; None if nothing was looked up."""
 
 
 def read_subject(source: Path, options: SolveOptions, parent: Path | None = None) -> Subject:
@@ -69,7 +119,7 @@ def read_subject(source: Path, options: SolveOptions, parent: Path | None = None
     ------
     ConfigError, DataError, NotObservable, OSError
     """
-    if is_calibration(source):
+    if _is_calibration(source):
         if options != SolveOptions():
             raise ConfigError(f"{source} is solved already: give its dataset or run, or leave out the options of solve")
         subject = _of_result(source, CalibrationResult.load(source))
@@ -79,7 +129,7 @@ def read_subject(source: Path, options: SolveOptions, parent: Path | None = None
     return replace(subject, parent=before, parent_name=name)
 
 
-def is_calibration(source: Path) -> bool:
+def _is_calibration(source: Path) -> bool:
     """Check whether a file says that it is a calibration; False if it is no JSON, which reading it as data reports."""
     if source.is_dir() or source.suffix != ".json":
         return False

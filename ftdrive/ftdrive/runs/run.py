@@ -158,7 +158,7 @@ class Run:
             "format": RUN_FORMAT,
             "created_utc": now.isoformat(),
             "created_host_ns": clock.now_ns(),
-            "argv": command_line(),
+            "argv": _command_line(),
             "versions": versions(),
             **description,
         }
@@ -474,10 +474,10 @@ def _record(data: Mapping[str, Any]) -> PoseRecord:
 
 def made_now() -> dict[str, Any]:
     """Return what every file says of its making: when, by which command line, with which versions."""
-    return {"created_utc": datetime.now(UTC).isoformat(), "argv": command_line(), "versions": versions()}
+    return {"created_utc": datetime.now(UTC).isoformat(), "argv": _command_line(), "versions": versions()}
 
 
-def command_line() -> list[str]:
+def _command_line() -> list[str]:
     """Return the command line without passwords in addresses."""
     return [without_password(word) for word in sys.argv]
 

@@ -25,7 +25,7 @@ REFUSALS: Final = (
     "other",  # of a newer version
 )
 """Why nothing was weighed: the codes of `ftdrive.live.weighing.WORDS`. Each is a column of the store: a change raises
-`ftdrive.store.tables.SCHEMA`."""
+`ftdrive.store.database.SCHEMA`."""
 _TAIL: Final = 1 << 16
 """Bytes that contain the end of the line before, if a power failure cut the last one off."""
 

@@ -1,4 +1,4 @@
-"""A WebSocket server for Foxglove, Lichtblick and PlotJuggler from 3.16.
+"""The stream for Foxglove, Lichtblick and PlotJuggler: one WebSocket server, its parameters and its scene.
 
 Wrenches, poses and joint angles are ROS 2 messages, because the viewers know no other wrench and PlotJuggler no other
 encoding. Frames, arrows and events are Foxglove's own. A program can tare, and set frame and stages. A page in a
@@ -25,22 +25,141 @@ from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
 from ftdrive.http_gate import Gate, hidden_host
 from ftdrive.live import ros2
+from ftdrive.live.frames import frames_in_flange
 from ftdrive.live.processing import ProcessedStream
-from ftdrive.live.samples import Block, StreamEvent
-from ftdrive.servers.picked import Picked
+from ftdrive.live.quaternions import quaternions
+from ftdrive.live.samples import Block, Stages, StreamEvent, StreamInfo, WrenchFrame
+from ftdrive.servers.parameters import checked_value
+from ftdrive.servers.rates import Picked
+from ftdrivers.interfaces import Array
 
 try:
     import foxglove as sdk
 except ImportError:
     raise ConfigError("a server needs foxglove-sdk: install ftdrive with its extra stream, `ftdrive[stream]`") from None
 
-from foxglove import Channel, Context, MessageSchema, Schema, Service, ServiceRequest, ServiceSchema
+from foxglove import Channel, Context, MessageSchema, Parameter, Schema, Service, ServiceRequest, ServiceSchema
 from foxglove.channels import FrameTransformsChannel, LogChannel, SceneUpdateChannel
-from foxglove.messages import Log, LogLevel
-from foxglove.websocket import Capability, StatusLevel
+from foxglove.messages import (
+    ArrowPrimitive,
+    Color,
+    FrameTransform,
+    FrameTransforms,
+    Log,
+    LogLevel,
+    Pose,
+    Quaternion,
+    SceneEntity,
+    SceneUpdate,
+    Timestamp,
+    Vector3,
+)
+from foxglove.websocket import Capability, Client, ServerListener, StatusLevel
 
-from ftdrive.servers import scene
-from ftdrive.servers.parameters import Parameters
+FORCE_M_N, TORQUE_M_NM = 0.01, 0.1
+"""Lengths of the arrows: 10 N and 1 N·m are 100 mm."""
+_ORANGE, _BLUE = Color(r=1.0, g=0.5, b=0.0, a=1.0), Color(r=0.1, g=0.4, b=1.0, a=1.0)
+_HEAD_M = 0.02
+
+
+def _stamp(t_utc_ns: int) -> Timestamp:
+    """Convert nanoseconds since 1970."""
+    return Timestamp(*divmod(t_utc_ns, 1_000_000_000))
+
+
+def _transforms(block: Block, info: StreamInfo, t_utc_ns: int) -> FrameTransforms:
+    """Return the frames of the last sample of a block: flange in base; sensor, tcp and the wrench's frame in flange."""
+    R_base_flange = block.R_base_flange[-1]
+    frames = frames_in_flange(block.frame, info, R_base_flange)
+    return FrameTransforms(
+        transforms=[
+            _transform("base", "flange", R_base_flange, block.p_base_flange_m[-1], t_utc_ns),
+            *(_transform("flange", name, R, p, t_utc_ns) for name, (R, p) in frames.items()),
+        ]
+    )
+
+
+def _transform(parent: str, child: str, R: Array, p_m: Array, t_utc_ns: int) -> FrameTransform:
+    x, y, z = np.nan_to_num(p_m).tolist()
+    return FrameTransform(
+        timestamp=_stamp(t_utc_ns),
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=Vector3(x=x, y=y, z=z),
+        rotation=Quaternion(**dict(zip("xyzw", quaternions(R[None])[0].tolist(), strict=True))),
+    )
+
+
+def _arrows(block: Block, t_utc_ns: int) -> SceneUpdate:
+    """Return force (orange) and torque (blue) of the last sample, in the frame of the wrench, from its point."""
+    force_N, torque_Nm = block.wrench[-1, :3], block.wrench[-1, 3:]
+    entity = SceneEntity(
+        timestamp=_stamp(t_utc_ns),
+        frame_id=ros2.frame_id(block.frame),
+        id="wrench",
+        frame_locked=True,
+        arrows=[_arrow(FORCE_M_N * force_N, _ORANGE), _arrow(TORQUE_M_NM * torque_Nm, _BLUE)],
+    )
+    return SceneUpdate(entities=[entity])
+
+
+def _arrow(vector_m: Array, color: Color) -> ArrowPrimitive:
+    length_m = float(np.linalg.norm(vector_m))
+    # An arrow points along x. Half a turn about the bisector of x and a direction swaps the two.
+    bisector = np.array([1.0, 0.0, 0.0]) + (vector_m / length_m if length_m > 0 else 0.0)
+    half_turn = bisector / norm if (norm := np.linalg.norm(bisector)) > 1e-9 else np.array([0.0, 0.0, 1.0])
+    orientation = Quaternion(**dict(zip("xyz", half_turn.tolist(), strict=True)), w=0.0)
+    head_m = min(_HEAD_M, length_m / 2)
+    return ArrowPrimitive(
+        pose=Pose(position=Vector3(), orientation=orientation),
+        shaft_length=length_m - head_m,
+        shaft_diameter=0.4 * _HEAD_M,
+        head_length=head_m,
+        head_diameter=0.8 * _HEAD_M,
+        color=color,
+    )
+
+
+class Parameters(ServerListener):
+    """Lets clients read and set `axes`, `about` and each stage. Called in threads of the SDK.
+
+    Parameters
+    ----------
+    stream : ProcessedStream
+    warn : callable
+        Receives the reason when a value is rejected; the parameters keep their values then.
+    """
+
+    def __init__(self, stream: ProcessedStream, warn: Callable[[str], None]) -> None:
+        self._stream = stream
+        self._warn = warn
+
+    def on_get_parameters(
+        self, _client: Client, param_names: list[str], _request: str | None = None
+    ) -> list[Parameter]:
+        """Return those named; all if there are no names."""
+        frame, stages = self._stream.frame, asdict(self._stream.stages)
+        values: dict[str, JSON] = {
+            **frame.to_dict(),
+            # A parameter cannot be None: a filter that is off has 0 Hz.
+            **{name: 0.0 if value is None else value for name, value in stages.items()},
+        }
+        return [Parameter(name, value=value) for name, value in values.items() if name in (param_names or values)]
+
+    def on_set_parameters(
+        self, client: Client, parameters: list[Parameter], _request: str | None = None
+    ) -> list[Parameter]:
+        """Set them; return all as they are then."""
+        frame, stages = asdict(self._stream.frame), asdict(self._stream.stages)
+        try:
+            for parameter in parameters:
+                group = frame if parameter.name in frame else stages
+                group[parameter.name] = checked_value(parameter.name, parameter.get_value())
+            self._stream.frame, self._stream.stages = WrenchFrame(**frame), Stages(**stages)
+        except ConfigError as error:
+            self._warn(str(error))
+        return self.on_get_parameters(client, [])
+
 
 TRANSFORMS, ARROWS, EVENTS, STATUS = "/tf", "/wrench_arrows", "/events", "/stream_status"
 
@@ -172,8 +291,8 @@ class FoxgloveServer:
             self._send(ros2.JOINTS, t_arm_ns, lambda: ros2.pack_joints(t_arm_ns, poses.q_rad).tolist())
         newest = t_ns[-1:]
         if self._scene.rows(newest).any():
-            self._send(TRANSFORMS, newest, lambda: [scene.transforms(block, self._info, int(newest[0]))])
-            self._send(ARROWS, newest, lambda: [scene.arrows(block, int(newest[0]))])
+            self._send(TRANSFORMS, newest, lambda: [_transforms(block, self._info, int(newest[0]))])
+            self._send(ARROWS, newest, lambda: [_arrows(block, int(newest[0]))])
         if self._status.rows(newest).any():
             self._send(STATUS, newest, lambda: [json.dumps(_without_nan(self._state())).encode()])
 
@@ -181,7 +300,7 @@ class FoxgloveServer:
         """Send an event."""
         t_ns = np.array([event.t_host_ns + self._info.utc_offset_ns])
         level = LogLevel.Warning if event.kind in _WARNINGS else LogLevel.Info
-        log = Log(timestamp=scene.stamp(int(t_ns[0])), level=level, message=event.text, name=event.kind)
+        log = Log(timestamp=_stamp(int(t_ns[0])), level=level, message=event.text, name=event.kind)
         self._send(EVENTS, t_ns, lambda: [log])
 
     def close(self) -> None:

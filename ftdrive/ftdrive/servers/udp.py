@@ -7,7 +7,7 @@ from math import isfinite
 from ftdrive.errors import ConfigError
 from ftdrive.live import ros2
 from ftdrive.live.samples import Block, StreamEvent, StreamInfo
-from ftdrive.servers.picked import Picked
+from ftdrive.servers.rates import Picked
 
 RATE_HZ = 200.0
 """A plot of 5 s is about 1000 pixels wide: a higher rate is not visible. PlotJuggler parses datagrams in the thread of

@@ -1,9 +1,13 @@
-"""Poses along a plan, in stages: look, check, choose the pace, tour."""
+"""A session along a plan: shown, confirmed, approached, driven; and the register of plans driven to their end."""
 
+import json
+import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -18,11 +22,10 @@ from ftdrive.planning.cell_plan import certifier_for, speeds_of
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.search.constant_tour import constant_tour
-from ftdrive.planning.show.words import stop_in_words, way_in_words
+from ftdrive.planning.search.nodes import constant_tour
+from ftdrive.planning.words import point_in_words, stop_in_words, turns_in_words, way_in_words
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
-from ftdrive.session.completed_plans import has_completed, remember_completed
 from ftdrive.session.events import GuardTripped, Planned
 from ftdrive.session.forecast import Averages, at_most, moves_s
 from ftdrive.session.live_fit import Judge
@@ -31,14 +34,83 @@ from ftdrive.session.options import SessionOptions
 from ftdrive.session.pose_book import PoseBook
 from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
 from ftdrive.session.recovery import GuardedCell
-from ftdrive.session.safety_questions import SafetyQuestions
-from ftdrive.session.sweep import SweepTour
-from ftdrive.session.sweeping import sweep_pace
+from ftdrive.session.sweep import SweepTour, sweep_pace
 from ftdrive.session.task import Task
 from ftdrive.session.tour import SLOW, Pace, Tour
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.interfaces import NOT_REPORTED
 from ftdrivers.ur.kinematics import kinematics_of
+
+FORMAT = "ftdrive.completed/1"
+
+
+def _state_file() -> Path:
+    """Return the user's register of completed plans; it need not exist."""
+    home = os.environ.get("XDG_STATE_HOME", "")
+    folder = Path(home) if Path(home).is_absolute() else Path("~/.local/state").expanduser()
+    return folder / "ftdrive" / "completed.ndjson"
+
+
+def has_completed(arm_serial: str, plan_sha256: str) -> bool:
+    """Whether this arm has driven this plan to its end before; unreadable lines are ignored.
+
+    False for an arm that reports no serial number, because it may be another one.
+    """
+    path = _state_file()
+    if arm_serial == NOT_REPORTED or not path.is_file():
+        return False
+    wanted = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256}
+    return any(
+        wanted.items() <= _read(line).items()
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines()
+    )
+
+
+def remember_completed(arm_serial: str, plan_sha256: str) -> None:
+    """Record that one session drove every move of the plan, slowly, and took every pose."""
+    path = _state_file()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    line = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256, "utc": datetime.now(UTC).isoformat()}
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def _read(line: str) -> dict[str, object]:
+    try:
+        found = json.loads(line)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+class _SafetyQuestions:
+    """Asks for a free tool, free room, the emergency stop, and reduced mode; raises `Declined` unless all are yes."""
+
+    def __init__(self, cell: OpenCell, plan: Plan) -> None:
+        self._arm, self._journal, self._plan = cell.arm, cell.journal, plan
+        self._reduced = False  # whether the operator has confirmed the reduced mode that is active
+
+    def ask(self, way_rad: Array, *, assumed: bool) -> None:
+        """Ask everything before the arm moves along `way_rad` (k, 6); with `assumed`, `--yes` may answer."""
+        room = "" if self._plan.arm_rests else ", and the space of the whole arm, which moves too,"
+        if arm_moves(way_rad):
+            room = f", and the space of the whole arm, which moves in the approach ({turns_in_words(way_rad)}),"
+        for text in (
+            "Is the tool free: no contact, no workpiece, no fluid, cables slack? Is the base bolted?",
+            f"Is the ball of {self._plan.ball_m:.2f} m around {point_in_words(self._plan)} (the wrist){room} free of "
+            "obstacles and people?",
+            "Is the emergency stop in reach, and tested?",
+        ):
+            self._journal.require(text, assumed=assumed)
+        self.ask_reduced(assumed=assumed)
+
+    def ask_reduced(self, *, assumed: bool) -> None:
+        """Ask whether reduced mode is intended, once as long as it lasts."""
+        reduced = self._arm.status().safety_mode == "reduced"
+        if reduced and not self._reduced:
+            self._journal.require("The controller is in reduced mode. Is that intended?", assumed=assumed)
+        self._reduced = reduced
+
 
 _GRID_RAD: Final = float(np.radians(0.1))
 """Joints 1 to 3 are rounded to this grid before planning, so that the same posture gives the same plan and hash."""
@@ -140,7 +212,7 @@ class AlongPlan:
             quiet=cell.listen(LISTEN_S),
             resumed=self.resumed is not None,
         )
-        show_plan(before, options)
+        _show_plan(before, options)
         return before
 
     def _pace(self, before: Before, todo: Sequence[int], *, taken: int) -> Pace:
@@ -196,7 +268,7 @@ class AlongPlan:
                 cell.journal.show(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
         watcher = Watcher(cell, rows, on_trip)
-        questions = SafetyQuestions(cell, before.plan)
+        questions = _SafetyQuestions(cell, before.plan)
         recheck = partial(self._recheck, before, questions)
         with watcher:  # sees an emergency stop at a question too
             if options.questions and todo:
@@ -227,7 +299,7 @@ class AlongPlan:
         self.cell.journal.keep_in(run)
         return run
 
-    def _recheck(self, before: Before, questions: SafetyQuestions, asks: bool) -> None:
+    def _recheck(self, before: Before, questions: _SafetyQuestions, asks: bool) -> None:
         """Repeat the checks after a stop; with `asks`, all the safety questions too."""
         q = self.cell.arm.state().q_rad
         stays = plan_approach(before.certifier, q, q, SLOW)  # the next approach is checked when its goal is known
@@ -253,7 +325,7 @@ class AlongPlan:
         self.cell.note(f"the next run of this plan is slow again and needs the typed word: {why}")
 
 
-def show_plan(before: Before, options: SessionOptions) -> None:
+def _show_plan(before: Before, options: SessionOptions) -> None:
     """Show every motion to come: in words, and as the options ask in files and in the browser."""
     cell, plan, way = before.cell, before.plan, before.approach.way_rad
     words = "The arm stands at the first pose."
@@ -266,12 +338,12 @@ def show_plan(before: Before, options: SessionOptions) -> None:
         plan.save(options.output)
         cell.note(f"plan saved as {options.output}")
     if options.png is not None:
-        from ftdrive.planning.show.picture import draw
+        from ftdrive.planning.drawing import draw
 
         draw(plan, before.certifier, options.png, way)
         cell.note(f"plan drawn in {options.png}")
     if options.view:
-        from ftdrive.planning.show.view import open_in_browser, shown
+        from ftdrive.planning.drawing import open_in_browser, shown
 
         with shown(plan, before.certifier, way) as url:
             open_in_browser(url)

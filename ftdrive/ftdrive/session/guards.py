@@ -17,7 +17,7 @@ from ftcalib.model import Array
 from ftdrive.checks.devices import AXES, SATURATION
 from ftdrive.errors import SupervisorGone
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.session.hazards import Hazard
+from ftdrive.session.events import Hazard
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ArmState, ArmStatus

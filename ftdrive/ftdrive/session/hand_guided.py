@@ -43,11 +43,11 @@ LEAST_TO_COMPARE: Final = 6
 T = TypeVar("T")
 
 
-class Interrupted(Exception):
+class _Interrupted(Exception):
     """The stream of the sensor was interrupted, and is back."""
 
 
-class Moved(Exception):
+class _Moved(Exception):
     """The arm moved while a pose was measured; it was seen in this state."""
 
     def __init__(self, state: ArmState) -> None:
@@ -73,7 +73,7 @@ class _Held:
         if self._before is None:
             self._before = state
         elif turned_rad(self._before, state) >= MOVED_RAD or np.abs(state.qd_rad_s).max() >= STILL_RAD_S:
-            raise Moved(state)
+            raise _Moved(state)
         return state
 
     def collect(self, duration_s: float) -> FtSamples:
@@ -161,7 +161,7 @@ class HandGuided:
             self._show_state(State.MOVE)
             while not self._over:
                 state = self._ask(self._arm.state)
-                with suppress(Interrupted):
+                with suppress(_Interrupted):
                     self._collect(LOOK_S)  # paces the loop, and raises as soon as the sensor fails
                 self._obey_keys()
                 if self._over or not self._may_measure():
@@ -187,7 +187,7 @@ class HandGuided:
             if not getattr(self._sensor, "recover", False):
                 raise
             self._wait_out(self._sensor.check, StreamBroken, DeviceTimeout)
-            raise Interrupted from error
+            raise _Interrupted from error
         finally:
             self._sensor_events.show_new()
 
@@ -274,12 +274,12 @@ class HandGuided:
         pose = TourPose(number, state.q_rad)
         try:
             record = take_pose(held, held, stop, pose, self._sampling, on_stage=on_stage, quiet_std=self._level)
-        except Moved as moved:
+        except _Moved as moved:
             self._still_since_s = moved.state.t_device_s
             self._note(f"The arm moved while pose {stop} was measured: {self._hold_still()}.", warning=True)
             self._show_state(State.SETTLE)
             return False
-        except Interrupted:
+        except _Interrupted:
             return False
         if not record.steady and held.samples is not None:
             again = "; press r to take it again" if self._operator.has_keys else ""

@@ -96,7 +96,7 @@ class RunningFit:
             cond_u1=coverage.cond_u1,
             empty_cap_deg=float(np.degrees(largest_gap(gravity_flange)[0])),
             light=light,
-            hint=hint(R_base_flange, self._guess(), down) if self._advise and light != "green" else "",
+            hint=_hint(R_base_flange, self._guess(), down) if self._advise and light != "green" else "",
         )
 
     def remove(self, stop: int) -> None:
@@ -184,7 +184,7 @@ def faces(gravity_flange: Array) -> tuple[int, int, int, int, int, int]:
     return a, b, c, d, e, f
 
 
-def hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
+def _hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
     """Describe the simple motion from the last of the poses taken (n, 3, 3) to the most useful next one."""
     last = R_base_flange[-1]
     words, candidates = _motions(last, down_base)

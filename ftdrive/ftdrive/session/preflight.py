@@ -80,7 +80,7 @@ class Row:
         return Checked(name=self.name, passed=check.state != "failed", words=words)
 
 
-def check_model(before: Before) -> Check:
+def _check_model(before: Before) -> Check:
     """Check that this is the configured arm, and that its flange is where the forward kinematics have it."""
     check = devices.check_arm(before.cell.arm.identify(), before.config.robot)
     if check.state == "failed":
@@ -109,14 +109,14 @@ def check_link(before: Before) -> Check:
     return devices.check_link(arm, before.cell.clock, usual_s=usual_s, gap_s=limits.link_gap_s)
 
 
-def check_sensor(before: Before) -> Check:
+def _check_sensor(before: Before) -> Check:
     """Check that all six axes are alive, at the nominal rate."""
     wrench = before.quiet.wrench
     rate = devices.check_rate(len(wrench) / LISTEN_S, before.cell.sensor.health().nominal_rate_Hz)
     return merged("sensor", [rate, devices.check_level(wrench)])
 
 
-def check_load(before: Before) -> Check:
+def _check_load(before: Before) -> Check:
     """Check that the sensor's range is enough for the tool and for what the sensor reads at rest."""
     limits, config = before.sensor_range, before.config
     is_arbitrary = before.cell.sensor.identify().has_arbitrary_zero
@@ -124,13 +124,13 @@ def check_load(before: Before) -> Check:
     return merged("load", [devices.check_load(limits, config), rest])
 
 
-def check_workcell(before: Before) -> Check:
+def _check_workcell(before: Before) -> Check:
     """Check that tool and surroundings are described and measured; `doctor` only warns of a missing tool."""
     check = computer.check_workcell(before.config, before.certifier.arm.name)
     return check if check.state == "ok" else replace(check, state="failed")
 
 
-def check_plan(before: Before) -> Check:
+def _check_plan(before: Before) -> Check:
     """Check that every move of the plan is proven clear, for this arm, tool and scene."""
     try:
         before.plan.require(before.certifier)
@@ -142,7 +142,7 @@ def check_plan(before: Before) -> Check:
     return Check("plan", "ok", found)
 
 
-def check_approach(before: Before) -> Check:
+def _check_approach(before: Before) -> Check:
     """Check that the moves to the first pose are proven clear."""
     approach = before.approach
     if not approach.certified:
@@ -169,7 +169,7 @@ def check_cable(before: Before) -> Check:
     return Check("cable", "failed", f"{found}, more than {window:.0f}° to one side: the cable may wind up", fix)
 
 
-def check_safety_limits(before: Before) -> Check:
+def _check_safety_limits(before: Before) -> Check:
     """Check that the controller accepts every pose, and before the first run of a plan points between them."""
     nodes = np.array([step.q_rad for step in before.plan.steps])
     path = np.vstack([nodes, nodes[:1]])
@@ -184,7 +184,7 @@ def check_safety_limits(before: Before) -> Check:
 
 def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
     """Return where the controller's safety limits forbid straight moves through joint vectors (n, 6); empty if none."""
-    for q in edges(q_rad, step_rad):
+    for q in _edges(q_rad, step_rad):
         if not arm.within_safety_limits(q.tolist()):
             return (
                 f"the controller's safety limits forbid joints {np.degrees(q).round().astype(int).tolist()} degrees: "
@@ -205,33 +205,33 @@ def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
         clock.sleep(0.02)
 
 
-_APPROACH: Final = Row("approach", check_approach)
+_APPROACH: Final = Row("approach", _check_approach)
 
 CHECKS: Final[Sequence[Row]] = (
     Row("safety", lambda before: devices.check_safety(before.cell.arm.status())),
     Row("remote", lambda before: devices.check_remote(before.cell.arm)),
-    Row("model", check_model),
+    Row("model", _check_model),
     Row("payload", check_payload),
     Row("slider", lambda before: devices.check_speed(before.cell.arm.status())),
     Row("link", check_link),
-    Row("sensor", check_sensor),
-    Row("load", check_load),
-    Row("workcell", check_workcell),
-    Row("plan", check_plan),
+    Row("sensor", _check_sensor),
+    Row("load", _check_load),
+    Row("workcell", _check_workcell),
+    Row("plan", _check_plan),
     _APPROACH,
     Row("cable", check_cable),
     Row("disk", lambda before: computer.check_disk(before.runs)),
 )
 """In the order of their events. None of them takes control of the arm."""
 
-IN_CONTROL: Final[Sequence[Row]] = (Row("limits", check_safety_limits),)
+IN_CONTROL: Final[Sequence[Row]] = (Row("limits", _check_safety_limits),)
 """Checks that need a program on the controller, made when all others have passed."""
 
 AGAIN: Final[Sequence[Row]] = (*(row for row in CHECKS if row is not _APPROACH), *IN_CONTROL)
 """Checks before a stopped session goes on: all, except that its new approach is judged by itself."""
 
 
-def edges(q_rad: Array, step_rad: float) -> Array:
+def _edges(q_rad: Array, step_rad: float) -> Array:
     """Return points (m, 6) along straight moves through joint vectors (n, 6), at most `step_rad` apart."""
     parts = []
     for start, end in pairwise(q_rad):

@@ -5,9 +5,8 @@ from contextlib import suppress
 from typing import Final
 
 from ftdrive.errors import SupervisorGone
-from ftdrive.session.events import GuardTripped, SensorEvents
+from ftdrive.session.events import GuardTripped, Hazard, SensorEvents
 from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, arm_lost, by_safety
-from ftdrive.session.hazards import Hazard
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.errors import DeviceError, DeviceFault

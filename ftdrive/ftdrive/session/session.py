@@ -1,13 +1,17 @@
-"""A whole session: open the cell, then take poses along a plan or by hand. A calibration is then solved and saved."""
+"""A session from its cell to its result."""
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import asdict
-from typing import Any
+from typing import Any, Final
 
-from ftdrive.cell.config import CellConfig
+import numpy as np
+
+from ftcalib import CalibrationResult
+from ftdrive.cell.config import CellConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.errors import ConfigError, Declined
+from ftdrive.checks.devices import belonging
+from ftdrive.errors import ConfigError, Declined, PlanRefused
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.outcome import Outcome, circumstances_of, solve_and_save
 from ftdrive.runs.run import Run
@@ -16,16 +20,75 @@ from ftdrive.session.along_plan import AlongPlan
 from ftdrive.session.events import State, StateChanged
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import HandGuided
-from ftdrive.session.identity import require_devices
-from ftdrive.session.journal import Journal
-from ftdrive.session.open_cell import OpenCell
+from ftdrive.session.open_cell import Journal, OpenCell
 from ftdrive.session.operator import Operator
 from ftdrive.session.options import SessionOptions, plan_on_disk, with_recorded_mode
 from ftdrive.session.passive import record_passively
 from ftdrive.session.pose_book import PoseBook
-from ftdrive.session.sweeping import Sweeping, on_script_path
+from ftdrive.session.sweep import Sweeping, on_script_path
 from ftdrive.session.task import Calibrating, Task
-from ftdrivers.interfaces import DeviceInfo
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
+from ftdrivers.registry import Options, split_url
+
+_CHOOSES_CALIBRATION: Final = {"slot": 0, "calibration": 1}
+"""Options of a sensor's address that choose one of its calibrations, with their defaults."""
+_OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range", "software_bias")
+"""Facts that differ for another scale or calibration."""
+
+
+def _require_devices(
+    connected: Mapping[str, DeviceInfo], config: SensorConfig, *, calibration: CalibrationResult | None, run: Run | None
+) -> tuple[str, ...]:
+    """Return what is uncertain about the connected devices, where a calibration or a resumed run must have the same.
+
+    Raises
+    ------
+    ConfigError
+        Arm, sensor or mounting is not that of the calibration.
+    PlanRefused
+        As `_require_same_devices`.
+    """
+    belongs = None if calibration is None else belonging(calibration, connected, config.mount)
+    if belongs is not None and belongs.others:
+        raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
+    if run is not None:
+        _require_same_devices(run, config, connected)
+    return () if belongs is None else belongs.unknown
+
+
+def _require_same_devices(run: Run, config: SensorConfig, connected: Mapping[str, DeviceInfo]) -> None:
+    """Raise `PlanRefused` for other devices than those of the run, or a sensor that is scaled otherwise now.
+
+    Without a serial number a device counts as the same if its model is, and the run has no serial number either.
+    """
+    header = run.header()
+    devices = header["devices"]
+    for name, info in connected.items():
+        model, serial = devices[name]["model"], devices[name]["serial"]
+        if (model, serial) == (info.model, info.serial):
+            continue
+        fix = "connect that of the run"
+        if name == "sensor" and NOT_REPORTED in {serial, info.serial}:
+            fix += ", or set serial=… in its address as in the run"
+        raise PlanRefused(
+            f"the run was made with the {name} {model}, serial {serial}, connected is {info.model}, serial "
+            f"{info.serial}: {fix}, or start a new run"
+        )
+    then = _meaning(header["config"]["sensor"], devices["sensor"].get("facts", {}))
+    now = _meaning(asdict(config), asdict(connected["sensor"])["facts"])
+    if other := [name for name in then if name in now and not np.array_equal(then[name], now[name])]:
+        changes = " and ".join(f"{name} was {then[name]} and is {now[name]}" for name in other)
+        raise PlanRefused(
+            f"the sensor is configured otherwise than in the run, {changes}: set it back, or start a new run"
+        )
+
+
+def _meaning(config: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return what defines a sensor's values: sign, calibration, scale and range."""
+    options = Options(config["url"], split_url(config["url"]).query)
+    chosen = {f"option {name}": options.integer(name, usual, 0, 255) for name, usual in _CHOOSES_CALIBRATION.items()}
+    scale = {name: fact["value"] for name, fact in facts.items() if name in _OF_NUMBERS}
+    return {"[sensor] sign": config.get("sign", 1), **chosen, **scale}
 
 
 def calibrate(cell: CellConfig, operator: Operator, options: SessionOptions) -> Outcome | None:
@@ -75,7 +138,7 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
             if options.real and not options.dry_run:
                 cell.note(kept_awake)
         connected = {"arm": arm.identify(), "sensor": sensor.identify()}
-        uncertain = require_devices(connected, config.sensor, calibration=task.calibration, run=resumed)
+        uncertain = _require_devices(connected, config.sensor, calibration=task.calibration, run=resumed)
         for words in (*uncertain, *task.warnings):
             cell.note(words, warning=True)
 

@@ -86,7 +86,7 @@ def propose(
     connected = {"arm": arm.identify(), "sensor": sensor.identify()}
     if others := devices.belonging(result, connected, cell.sensor.mount).others:
         raise NotAccepted(f"{others[0]}: push the calibration of this cell")
-    require_ready(cell, arm)
+    _require_ready(cell, arm)
     load, old = flange_load(result, mass_kg, height_m), arm.controller_settings()
     down = down_of(cell.workcell.mounting) if old.up_base_m_s2 is None else -_unit(old.up_base_m_s2)
     lean = lean_from(down, result.gravity_force_base_N, result.covariance[3:6, 3:6])
@@ -129,7 +129,7 @@ def _sensor_of(cell: CellConfig) -> tuple[float, float]:
     return mass_kg, height_mm / 1e3
 
 
-def require_ready(cell: CellConfig, arm: RobotArm) -> None:
+def _require_ready(cell: CellConfig, arm: RobotArm) -> None:
     """Raise `NotAccepted` unless this is the configured arm, free of programs, in remote control, and at rest."""
     require_no_program(arm, cell.clock, Limits())
     for check in (
@@ -225,7 +225,7 @@ def send(
     finally:
         values = {"old": push.old, "new": push.new, "read_back": read_back}
         path = write_receipt(folder, push.devices, push.reason, values, failure)
-    if different := differences(push.new, read_back):
+    if different := _differences(push.new, read_back):
         raise NotAccepted(f"the controller reports another {' and '.join(different)} than was sent; receipt: {path}")
     return path, read_back
 
@@ -252,7 +252,7 @@ def _set(arm: RobotArm, new: ControllerSettings, guard: Guard) -> None:
         arm.set_gravity(new.up_base_m_s2)
 
 
-def differences(sent: ControllerSettings, read_back: ControllerSettings | None) -> list[str]:
+def _differences(sent: ControllerSettings, read_back: ControllerSettings | None) -> list[str]:
     """Return which settings were read back with another value; what is not reported does not count."""
     back = read_back or ControllerSettings()
     pairs = {
@@ -277,7 +277,7 @@ def restore(cell: CellConfig, arm: RobotArm, receipt: Receipt) -> Push:
             f"{receipt.path} is of the arm {made[0]}, serial {made[1]}, but {info.model}, serial {info.serial} is "
             "connected: connect the arm of the receipt"
         )
-    require_ready(cell, arm)
+    _require_ready(cell, arm)
     old, changed = receipt.old, receipt.new
     payload = changed.mass_kg is not None
     if payload and (old.mass_kg is None or old.p_flange_com_m is None):

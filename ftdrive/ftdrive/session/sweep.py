@@ -1,14 +1,104 @@
-"""The state machine of a sweep: a tour with one stop, at which the arm follows a curve and everything is recorded."""
+"""A calibration from a sweep: its curve, its state machine, and what its guards know about the tool."""
 
-from typing import Final
+from collections import deque
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Final
 
 import numpy as np
 
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, noise_level
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
+from ftcalib.routine import PoseRecord
+from ftdrive.cell.config import CellConfig
+from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.planning.cell_plan import sweep_for
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import down_of
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.sweep_planner import at_speed
 from ftdrive.runs.motion import MotionRecording
-from ftdrive.session.events import MotionRecorded, State
+from ftdrive.session.events import Estimated, MotionRecorded, State
+from ftdrive.session.forecast import moves_s
+from ftdrive.session.guards import Guard, Seen
+from ftdrive.session.live_fit import Judge
 from ftdrive.session.operator import Question
-from ftdrive.session.tour import Tour, question_of
+from ftdrive.session.preflight import Before
+from ftdrive.session.task import Calibrating
+from ftdrive.session.tour import Pace, Tour, question_of
 from ftdrivers.sweep import Sweep
+
+KNOWN_S: Final = 3.0
+"""The motion teaches so long before anything is predicted."""
+BEHIND_S: Final = 1.0
+"""The newest looks do not teach: a contact that grows must not pass for weight."""
+_NOISE_N: Final = 2.0
+"""Of one look, vibration and acceleration included."""
+_UNSURE_N: Final = 2.5
+"""A prediction with a larger sigma is none."""
+
+
+@dataclass
+class FreeTool(Guard):
+    """Recursive least squares of the wrench as a linear function of the direction of gravity in the flange.
+
+    Force and torque are linear in it, whatever mounting, weight, centre of mass and bias are. It looks as a guard, but
+    never trips.
+    """
+
+    weighed_kg: ClassVar[None] = None
+    down_base: Array
+    """(3,) unit vector."""
+    heaviest_kg: float
+    """Of a possible tool: the size of what is unknown."""
+    _moving_s: float = field(default=0.0, init=False)
+    _sample: int = field(default=-1, init=False)
+    _waiting: deque[tuple[float, Array, Array]] = field(default_factory=deque, init=False)
+    _covariance: Array = field(default_factory=lambda: np.zeros((4, 4)), init=False)
+    _coefficients: Array = field(default_factory=lambda: np.zeros((4, 6)), init=False)
+
+    def begin(self, seen: Seen) -> None:
+        """Forget everything: after a stop the tool may be another, and the sensor may have another zero."""
+        unknown = (self.heaviest_kg * STANDARD_GRAVITY_M_S2 / _NOISE_N) ** 2
+        self._covariance = np.diag([unknown, unknown, unknown, 1e6])
+        self._coefficients = np.zeros((4, 6))
+        self._waiting.clear()
+        self._moving_s = 0.0
+        del seen
+
+    def look(self, seen: Seen) -> None:
+        """Learn from what was seen a second ago."""
+        if seen.motion.curve_rad is not None:
+            self._moving_s += seen.dt_s
+        if seen.sample == self._sample:
+            return
+        self._sample = seen.sample
+        self._waiting.append((seen.t_s, self._features(seen.state.R_base_flange), seen.wrench))
+        while self._waiting[0][0] < seen.t_s - BEHIND_S:
+            _, x, wrench = self._waiting.popleft()
+            Px = self._covariance @ x
+            gain = Px / (1.0 + x @ Px)
+            self._coefficients = self._coefficients + np.outer(gain, wrench - x @ self._coefficients)
+            self._covariance = self._covariance - np.outer(gain, Px)
+
+    def add(self, record: PoseRecord) -> Estimated:
+        """Raise: a sweep has no poses."""
+        raise NotImplementedError(f"pose {record.stop} of a sweep")
+
+    def remove(self, stop: int) -> None:
+        """Do nothing."""
+
+    def predict(self, R_base_flange: Array) -> Array | None:
+        """Wrench (6,) of a free tool at this orientation (3, 3); None while it is uncertain."""
+        if self._moving_s < KNOWN_S:
+            return None
+        x = self._features(R_base_flange)
+        if float(x @ self._covariance @ x) > (_UNSURE_N / _NOISE_N) ** 2:
+            return None
+        return np.asarray(x @ self._coefficients)
+
+    def _features(self, R_base_flange: Array) -> Array:
+        return np.append(self.down_base @ R_base_flange, 1.0)
+
 
 REST_S: Final = 2.0
 """Recorded before the sweep and after it."""
@@ -93,3 +183,69 @@ class SweepTour(Tour):
             for _ in clock.looks(REST_S):
                 self._between_looks()
                 clock.sleep(0.02)
+
+
+FIRST_SHARE: Final = 0.5
+"""Of the planned speed, in the first run of a plan."""
+LEAST_SLIDER: Final = 0.5
+_HEAVIEST_KG: Final = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class Sweeping(Calibrating):
+    """A calibration in motion."""
+
+    seconds: float = 20.0
+    """Of the sweep, at the planned speed."""
+
+    def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
+        """Return a sweep around joint angles (6,)."""
+        del poses
+        return sweep_for(self.cell, certifier, q_rad, self.seconds)
+
+    def judge(self, *, by_hand: bool) -> Judge:
+        """Return what learns the weight of the tool for the contact guard."""
+        del by_hand
+        return FreeTool(down_of(self.cell.workcell.mounting), self.cell.tool.mass_kg or _HEAVIEST_KG)
+
+
+def on_script_path(cell: CellConfig) -> CellConfig:
+    """Return the cell with the control path that follows a curve; raises `ConfigError` if another one is set."""
+    if cell.robot.control == "ur-rtde":
+        raise ConfigError(
+            "a sweep needs the control path script, whose program evaluates the curve on the controller and stops "
+            "with it: give --control script, or set [robot] control"
+        )
+    return replace(cell, robot=replace(cell.robot, control="script"))
+
+
+def sweep_pace(before: Before, *, slow: bool) -> Pace:
+    """Choose the speed of a sweep, on which the speed slider does not act while it runs, and show it.
+
+    Raises `NotAccepted` if the slider is too low.
+    """
+    cell, slider = before.cell, before.cell.arm.status().speed_slider
+    if slider < LEAST_SLIDER:
+        raise NotAccepted(
+            f"the speed slider is at {100 * slider:.0f} %, at which a sweep shows too little: set it to "
+            f"{100 * LEAST_SLIDER:.0f} % or more"
+        )
+    share = min(slider, 1.0) * (FIRST_SHARE if slow else 1.0)
+    plan = at_speed(before.plan, share)
+    if plan.sweep is None:
+        raise NotAccepted("the plan holds no sweep: make it with --sweep")
+    why = "the first run of a plan is slow" if slow else f"speed slider {100 * slider:.0f} %"
+    total_s = plan.sweep.duration_s + 2 * REST_S + moves_s(plan, (), before.approach)
+    cell.note(
+        f"sweep of {plan.sweep.duration_s:.0f} s at {100 * share:.0f} % of the planned speed ({why}), at most "
+        f"{np.degrees(plan.top_speed_rad_s):.0f}°/s: about {total_s:.0f} s of motion"
+    )
+    quiet_std = noise_level(before.quiet.wrench, max(LEAST_SAMPLES, len(before.quiet) // 2))
+    return Pace(
+        plan,
+        before.certifier,
+        before.config.sampling,
+        quiet_std=quiet_std,
+        sensor_kg=before.config.sensor.mass_kg,
+        trusted=before.known,
+    )

@@ -23,10 +23,9 @@ from ftdrive.planning.approach import arm_moves, plan_approach
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.show.words import way_in_words
-from ftdrive.session.events import GuardTripped, State, StateChanged, Weighed
+from ftdrive.planning.words import way_in_words
+from ftdrive.session.events import GuardTripped, Hazard, State, StateChanged, Weighed
 from ftdrive.session.guards import Tripped, fault
-from ftdrive.session.hazards import Hazard
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.pose_book import PoseBook
@@ -47,7 +46,7 @@ _NEAR_RAD: Final = float(np.radians(10))
 _FIRST_WORD: Final = "MOVE"
 
 
-class OperatorStop(Exception):
+class _OperatorStop(Exception):
     """The operator paused, stopped, sent the arm back or answered no; the tour holds until the operator decides."""
 
     def __init__(self, words: str, *, for_good: bool = False) -> None:
@@ -55,7 +54,7 @@ class OperatorStop(Exception):
         self.for_good = for_good
 
 
-class Turned(Exception):
+class _Turned(Exception):
     """The operator wants another pose than the one under way: the next, or the last one again."""
 
     def __init__(self, key: Key) -> None:
@@ -111,9 +110,9 @@ class Tour:
         while self._now.todo:
             try:
                 self._next()
-            except Turned as turned:
+            except _Turned as turned:
                 self._turn(turned.key)
-            except (Tripped, DeviceError, OSError, OperatorStop, TooFewSamples, NotAccepted, SupervisorGone) as error:
+            except (Tripped, DeviceError, OSError, _OperatorStop, TooFewSamples, NotAccepted, SupervisorGone) as error:
                 self._hold(error)
         self._guarded.show_new()
         self._show_state(State.CLOSE)
@@ -197,13 +196,13 @@ class Tour:
         """
         while (key := self._journal.pressed()) is not None:
             if key is Key.STOP:
-                raise OperatorStop("stopped by the operator", for_good=True)
+                raise _OperatorStop("stopped by the operator", for_good=True)
             if key is Key.SKIP and self._now.under_way is not None:
-                raise Turned(key)
+                raise _Turned(key)
             if key is Key.REDO and self._redoable():
-                raise Turned(key)
+                raise _Turned(key)
             if key is Key.PAUSE or self._now.moving:
-                raise OperatorStop("paused by the operator" if key is Key.PAUSE else "stopped by a key")
+                raise _OperatorStop("paused by the operator" if key is Key.PAUSE else "stopped by a key")
             if key is Key.KEEP:
                 self._note("every pose is saved without a key; press r to take it again")
             if key is Key.SKIP:
@@ -292,7 +291,7 @@ class Tour:
         self._now.back, self._now.under_way = None, self._now.todo[0]
         self._approach(self._arm.state().q_rad, index, index + 1, back=True)
         self._now.arrive(index)
-        raise OperatorStop(f"back at pose {index + 1}; what stopped the arm: {why}")
+        raise _OperatorStop(f"back at pose {index + 1}; what stopped the arm: {why}")
 
     def _own_speed(self, index: int) -> float | None:
         """Speed of the plan's move from where the arm stands to a pose, rad/s; None if the plan has no such move."""
@@ -341,7 +340,7 @@ class Tour:
         trusted = self._pace.trusted and not by_operator
         if self._now.confirmed:
             if self._journal.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
-                raise OperatorStop(f"not confirmed: {text}")
+                raise _OperatorStop(f"not confirmed: {text}")
             return
         assumed = _FIRST_WORD if trusted else None
         question = Question(f"{text} Hand on the emergency stop. Type {_FIRST_WORD}", (_FIRST_WORD,), assumed)
@@ -385,7 +384,7 @@ class Tour:
     def _hold(self, error: Exception) -> None:
         """Show why the arm has stopped, and wait for the operator; returns when the tour may go on."""
         self._arm.stop()
-        if isinstance(error, OperatorStop) and error.for_good:
+        if isinstance(error, _OperatorStop) and error.for_good:
             self._show_state(State.STOP, words=str(error))
             raise Declined(str(error))
         trip = self._guarded.cause(error, moving=not self._now.standing)
@@ -405,7 +404,7 @@ class Tour:
         self._show_state(State.STOP, words=words)
         self._guarded.show_new()
         self._show_state(State.HOLD, words=words)
-        by_operator = isinstance(error, OperatorStop)
+        by_operator = isinstance(error, _OperatorStop)
         end = Declined(words) if by_operator else error if trip is None else trip.error
         if trip is not None and trip.error is not error and trip is not error and trip.error.__cause__ is None:
             end.__cause__ = error  # which a guard may have overtaken: an arm that fails ends its own program

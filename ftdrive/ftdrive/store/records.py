@@ -230,7 +230,7 @@ def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
     records, unreadable = list[Record](), list[str]()
     for path in paths:
         try:
-            records.append(read_record(path))
+            records.append(_read_record(path))
         except (DataError, OSError) as error:
             unreadable.append(f"{path}: {error}")
     return records, tuple(unreadable)
@@ -243,7 +243,7 @@ def _is_run(folder: Path) -> bool:
         return False
 
 
-def read_record(path: Path) -> Record:
+def _read_record(path: Path) -> Record:
     """Read one file of a run folder or of weighings; fields that this version does not know are ignored.
 
     Raises

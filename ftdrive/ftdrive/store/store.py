@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
 
 from ftdrive.runs.weighings import is_weighings
-from ftdrive.store import tables
+from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import (
     BriefVerification,
@@ -110,13 +110,13 @@ class Store:
 
     def put_cells(self, cells: Iterable[StoredCell]) -> None:
         """Insert cells, or replace those of the same name: all or none."""
-        if rows := [tables.to_row(cell) for cell in cells]:
+        if rows := [database.to_row(cell) for cell in cells]:
             with self._current.writing() as connection:
-                connection.execute(self._database.upsert(tables.cells), rows)
+                connection.execute(self._database.upsert(database.cells), rows)
 
     def remove_cells(self, names: Iterable[str]) -> None:
         """Remove cells by name; an unknown one is no error."""
-        by_name = delete(tables.cells).where(tables.cells.c.name == bindparam("cell"))
+        by_name = delete(database.cells).where(database.cells.c.name == bindparam("cell"))
         with self._current.writing() as connection:
             for name in names:
                 connection.execute(by_name, {"cell": name})
@@ -132,8 +132,8 @@ class Store:
 
     def _write(self, connection: Connection, records: Sequence[Record], forget: Sequence[str] = ()) -> None:
         """Insert records; of two files with the same content the first by path counts, whatever the order."""
-        for kind, table in tables.RECORDS.items():
-            rows = [tables.to_row(one) for one in records if isinstance(one, kind)]
+        for kind, table in database.RECORDS.items():
+            rows = [database.to_row(one) for one in records if isinstance(one, kind)]
             same = _paths_where(connection, table, table.c.id, [row["id"] for row in rows])
             if gone := [*forget, *(path for path in same if not Path(path).exists())]:
                 which = delete(table).where(table.c.path == bindparam("gone"))
@@ -145,22 +145,22 @@ class Store:
 
     def results(self, tool: str | None = None) -> list[StoredResult]:
         """Return all results, or those of a tool, the oldest first."""
-        query = _oldest_first(tables.results)
+        query = _oldest_first(database.results)
         if tool is not None:
-            query = query.where(tables.results.c.tool == tool)
-        return self._read(query, tables.to_result)
+            query = query.where(database.results.c.tool == tool)
+        return self._read(query, database.to_result)
 
     def find(self, start: str) -> list[StoredResult]:
         """Return the results whose id begins so."""
-        query = select(tables.results).where(tables.results.c.id.startswith(start, autoescape=True))
-        return self._read(query, tables.to_result)
+        query = select(database.results).where(database.results.c.id.startswith(start, autoescape=True))
+        return self._read(query, database.to_result)
 
     def verifications(self, calibration_id: str | None = None) -> list[StoredVerification]:
         """Return all verifications, or those of a calibration, the oldest first."""
-        query = _oldest_first(tables.verifications)
+        query = _oldest_first(database.verifications)
         if calibration_id is not None:
-            query = query.where(tables.verifications.c.calibration_id == calibration_id)
-        return self._read(query, tables.to_verification)
+            query = query.where(database.verifications.c.calibration_id == calibration_id)
+        return self._read(query, database.to_verification)
 
     def last_verification(self, calibration_id: str) -> StoredVerification | None:
         """Return the newest verification of a calibration, if there is one."""
@@ -168,19 +168,19 @@ class Store:
 
     def weighings(self, most: int, tool: str | None = None) -> list[StoredWeighings]:
         """Return the last days with weighings, or those of a tool, the oldest first."""
-        table = tables.weighings
+        table = database.weighings
         query = select(table).order_by(table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id).limit(most)
         if tool is not None:
             query = query.where(table.c.tool == tool)
-        return self._read(query, tables.to_weighings)[::-1]
+        return self._read(query, database.to_weighings)[::-1]
 
     def last_weighings(self, since_day: str, tool: str | None = None) -> list[StoredWeighings]:
         """Return the last day with weighings of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
-        return summed(self._read(_last_weighings(since_day, tool), tables.to_weighings))
+        return summed(self._read(_last_weighings(since_day, tool), database.to_weighings))
 
     def cells(self) -> list[StoredCell]:
         """Return all cells by name."""
-        return sorted(self._read(select(tables.cells), tables.to_cell), key=lambda cell: cell.name)
+        return sorted(self._read(select(database.cells), database.to_cell), key=lambda cell: cell.name)
 
     def fleet(
         self, newest: int, since: datetime
@@ -197,12 +197,12 @@ class Store:
             Verifications and weighings made then or later.
         """
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
-        checks = select(*tables.CHECK).where(tables.verifications.c.created_utc >= start)
+        checks = select(*database.CHECK).where(database.verifications.c.created_utc >= start)
         with self._current.reading() as connection:
-            cells = _rows(connection, select(tables.cells), tables.to_cell)
-            results = _rows(connection, _newest_accepted(newest), tables.to_result)
-            found = _rows(connection, checks, tables.to_check)
-            weighings = _rows(connection, _last_weighings(start[:10]), tables.to_weighings)
+            cells = _rows(connection, select(database.cells), database.to_cell)
+            results = _rows(connection, _newest_accepted(newest), database.to_result)
+            found = _rows(connection, checks, database.to_check)
+            weighings = _rows(connection, _last_weighings(start[:10]), database.to_weighings)
         cells.sort(key=lambda cell: cell.name)
         return cells, results, sorted(found, key=lambda check: check.created_utc), summed(weighings)
 
@@ -218,11 +218,13 @@ def _rows(connection: Connection | None, query: Select[Any], make: Callable[[Row
 def _known(connection: Connection, paths: Sequence[Path]) -> set[str]:
     """Return those of the paths that have a record of the whole file."""
     texts = [str(path) for path in paths]
-    known = {path for table in tables.RECORDS.values() for path in _paths_where(connection, table, table.c.path, texts)}
+    known = {
+        path for table in database.RECORDS.values() for path in _paths_where(connection, table, table.c.path, texts)
+    }
     growing = [path for path in paths if str(path) in known and is_weighings(path)]
     for start in range(0, len(growing), _MOST):
         sizes = {str(path): path.stat().st_size for path in growing[start : start + _MOST]}
-        table = tables.weighings
+        table = database.weighings
         read = connection.execute(select(table.c.path, table.c.size).where(table.c.path.in_(sizes))).all()
         known -= {path for path, size in read if size != sizes[path]}
     return known
@@ -239,7 +241,7 @@ def _oldest_first(table: Table) -> Select[Any]:
 
 
 def _newest_accepted(most: int) -> Select[Any]:
-    table = tables.results
+    table = database.results
     one = (table.c.arm_serial, table.c.robot_host, table.c.tool)
     rank = func.row_number().over(partition_by=one, order_by=(table.c.created_utc.desc(), table.c.id.desc()))
     ranked = select(table.c.id, rank.label("rank")).where(
@@ -251,7 +253,7 @@ def _newest_accepted(most: int) -> Select[Any]:
 
 def _last_weighings(since_day: str, tool: str | None = None) -> Select[Any]:
     """Select the files of the last day of each tool on each arm."""
-    table = tables.weighings
+    table = database.weighings
     key = (table.c.tool, table.c.arm_serial, table.c.robot_host, table.c.emulated)
     rank = func.rank().over(partition_by=key, order_by=table.c.day.desc()).label("rank")
     ranked = select(table.c.id, rank).where(table.c.day >= since_day)

@@ -108,7 +108,7 @@ def _load(one: StoredResult, *, accept_edited: bool = False) -> CalibrationResul
 
 def _temperature(store: Store, one: StoredResult, results: Iterable[StoredResult]) -> BiasTemperature | None:
     """Return what the other runs of the sensor show, if the temperature of this one is known."""
-    from ftdrive.store.temperature import temperatures
+    from ftdrive.store.trends import temperatures
 
     if one.temperature_C is None:
         return None

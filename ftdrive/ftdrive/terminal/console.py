@@ -10,8 +10,7 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 
-from ftdrive.terminal.command_names import as_typed, is_command
-from ftdrive.terminal.text import NARROWEST, visible
+from ftdrive.terminal.text import NARROWEST, as_typed, is_command, visible
 
 
 class CommandConsole(Console):

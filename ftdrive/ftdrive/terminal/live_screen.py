@@ -168,7 +168,7 @@ class _UntilClosed:
             self.file.flush()
 
 
-class Canvas(Widget):
+class _Canvas(Widget):
     """Shows lines; only those that changed are drawn again."""
 
     DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
@@ -211,7 +211,7 @@ class LiveApp(ClosableApp):
         super().__init__(ansi_color=True)  # the terminal's own colours, light or dark
         self.theme = "ansi-dark"
         self._feed, self._summary = feed, summary
-        self._canvas = Canvas()
+        self._canvas = _Canvas()
         self._helping = False
 
     def compose(self) -> ComposeResult:

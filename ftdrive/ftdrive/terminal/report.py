@@ -1,4 +1,4 @@
-"""Results as text."""
+"""A result and a verification as text."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +13,8 @@ from ftcalib import CalibrationResult
 from ftcalib.compare import Compared
 from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
-from ftdrive.runs.pose_hints import hints, names_of
+from ftdrive.runs.pose_hints import hints, moved, names_of
+from ftdrive.runs.verified import FALSE_ALARMS, Verified
 from ftdrive.terminal.console import answer, hanging, messages
 from ftdrivers.interfaces import Array
 
@@ -68,7 +69,7 @@ def print_result(
     head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
     answer.print(hanging(head, f"compensation error {error_in_words(result)}", answer))
     if truth is not None:
-        raw, left = free_tool_wrench(truth, _RANDOM), compensation_error(result, truth)
+        raw, left = _free_tool_wrench(truth, _RANDOM), compensation_error(result, truth)
         words = (
             f"a free tool reads {left['force_rms_N']:.4f} N, {left['torque_rms_Nm']:.5f} N·m rms; "
             f"before {_rms(raw[:, :3]):.1f} N, {_rms(raw[:, 3:]):.2f} N·m"
@@ -254,7 +255,7 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
     return errors
 
 
-def free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
+def _free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
     """Return what the sensor of a free tool reads, (n, 6): computed from the truth, not with the solver's model."""
     weight = np.einsum(
         "ji,nkj,k->ni", np.asarray(truth["R_flange_sensor"]), R_base_flange, np.asarray(truth["gravity_force_base_N"])
@@ -266,7 +267,7 @@ def free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
 
 def compensation_error(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
     """Rms of the wrench that remains of a free tool after compensation, over `_RANDOM` orientations."""
-    left = result.compensate(free_tool_wrench(truth, _RANDOM), _RANDOM)
+    left = result.compensate(_free_tool_wrench(truth, _RANDOM), _RANDOM)
     return {"force_rms_N": _rms(left[:, :3]), "torque_rms_Nm": _rms(left[:, 3:])}
 
 
@@ -366,3 +367,62 @@ def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
     in_force = np.max(np.abs(drift.change[:3]) / drift.sigma[:3]) >= 4
     rate = f"{force_N / minutes:.2g} N/min" if in_force else f"{torque_Nm / minutes:.2g} N·m/min"
     return words + rate, True
+
+
+def print_verification(verified: Verified) -> None:
+    """Print measured and predicted wrench of each pose, the verdict with its limits, and what has changed."""
+    found, n = verified.verification, len(verified.records)
+    count = f"{n} poses" if n > 1 else "1 pose"
+    answer.print(Text.assemble(("Verification", "bold cyan"), f"  {count}, calibration {verified.calibration.id[:6]}"))
+    for mark in verified.marks:
+        answer.print(f" {mark}", style="yellow")
+    answer.print(_verification_table(verified))
+    verdict = ("PASS", "bold green") if verified.passed else ("FAILED", "bold red")
+    answer.print(hanging(Text.assemble(" ", verdict, "  "), verdict_in_words(verified), answer))
+    if not found.passed:
+        answer.print(hanging("   ", found.reason, answer), style="yellow")
+    for finding in moved(verified.records):
+        answer.print(hanging(" ? ", finding.words, answer), style="yellow")
+    if verified.drift is not None:
+        words, bad = drift_in_words(verified.drift)
+        if bad or messages.verbose:
+            answer.print(hanging(" drift: ", words, answer), style="yellow" if bad else None)
+    if not verified.passed and found.passed:
+        words = "Nothing has changed: the differences agree with their sigma. Average longer, or raise the limit."
+        answer.print(hanging("   ", words, answer), style="yellow")
+    elif not verified.passed and verified.update is None:
+        answer.print(hanging("   ", "No update makes up for the change: calibrate again.", answer), style="yellow")
+    answer.print(f" Saved {verified.path}")
+
+
+def verdict_in_words(verified: Verified) -> str:
+    """Describe the largest differences, and the limits that decide."""
+    limits = verified.limits
+    words = f"largest difference {verified.force_N.max():.3f} N, {verified.torque_Nm.max():.4f} N·m"
+    if limits.given:
+        given = ((limits.force_N, "N"), (limits.torque_Nm, "N·m"))
+        return f"{words}; limit {', '.join(f'{limit:g} {unit}' for limit, unit in given if limit is not None)}"
+    found = verified.verification
+    alarms = f"{100 * FALSE_ALARMS:g} % of unchanged cells fail"
+    return f"{words}; chi2 {found.chi2:.0f} for {found.dof} degrees of freedom, p {found.p_value:.2g} ({alarms})"
+
+
+def _verification_table(verified: Verified) -> Table:
+    table = Table(box=None, padding=(0, 1))
+    for title in ("", "measured x, y, z", "predicted x, y, z", "differs", "± 1 sigma"):
+        table.add_column(title, justify="right" if title else "left", no_wrap=True)
+    found, wrench = verified.verification, verified.dataset.wrench
+    for row, record in enumerate(verified.records):
+        for axes, unit, digits in ((slice(3), "N", 3), (slice(3, 6), "N·m", 4)):
+            measured, residual = wrench[row, axes], found.residual[row, axes]
+            sigma = float(np.linalg.norm(found.predicted_sigma[row, axes]))
+            size = float(np.linalg.norm(residual))
+            style = "bold yellow" if size > 3 * sigma else ""
+            name = f"R{record.pose.number:02d} {unit}" if axes.start is None else f"    {unit}"
+            values = (_vector(measured, digits), _vector(measured - residual, digits))
+            table.add_row(name, *values, Text(to_place_of(size, sigma), style), to_place_of(sigma, sigma))
+    return table
+
+
+def _vector(values: Array, digits: int) -> str:
+    return " ".join(f"{value:7.{digits}f}" for value in values)

@@ -37,13 +37,13 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.live_fit import GREEN
 from ftdrive.session.operator import Key, Operator, Question
-from ftdrive.terminal.command_names import as_typed
 from ftdrive.terminal.console import hanging, messages
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
 from ftdrive.terminal.session_text import SessionText, TextLine, in_words, rms_sigma, sigmas_of
 from ftdrive.terminal.supervisor import Supervisor
+from ftdrive.terminal.text import as_typed
 from ftdrivers.interfaces import Array
 
 REFRESH_HZ = 4

@@ -6,7 +6,7 @@ import numpy as np
 
 from ftcalib.rounding import with_sigma
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.show.words import plan_in_words, point_in_words
+from ftdrive.planning.words import plan_in_words, point_in_words
 from ftdrive.session.events import (
     Asked,
     Checked,
@@ -93,7 +93,7 @@ class SessionText:
             case Planned() if not self._verbose:
                 return [
                     TextLine("   ", words)
-                    for words in (*plan_in_brief(event.plan), event.stop_words, event.way_words)
+                    for words in (*_plan_in_brief(event.plan), event.stop_words, event.way_words)
                     if words
                 ]
             case RunOpened() | PoseTaken() | Compared() if not self._poses:
@@ -102,7 +102,7 @@ class SessionText:
                 return []
             case StateChanged(state=State.PREFLIGHT | State.CLOSE, words="") if not self._verbose:
                 return []
-        head, words = head_and_words(event)
+        head, words = _head_and_words(event)
         if not words:
             return []
         style = ""
@@ -115,7 +115,7 @@ class SessionText:
         return [TextLine(f" {head}" if head.strip() else "   ", words, style)]
 
 
-def plan_in_brief(plan: Plan) -> tuple[str, str]:
+def _plan_in_brief(plan: Plan) -> tuple[str, str]:
     """Describe a plan in two lines: its motion and clearance, and the room to keep free."""
     nearest = min(plan.steps, key=lambda step: step.clearance_m)
     count = len(plan.steps)
@@ -134,10 +134,10 @@ def plan_in_brief(plan: Plan) -> tuple[str, str]:
 
 def in_words(event: Event) -> str:
     """Return all words of an event: a plan in many lines, others in one. Empty for events that only a screen shows."""
-    return "".join(head_and_words(event))
+    return "".join(_head_and_words(event))
 
 
-def head_and_words(event: Event) -> tuple[str, str]:
+def _head_and_words(event: Event) -> tuple[str, str]:
     """Return the mark an event begins with, under which its lines are not continued, and its words."""
     match event:
         case RunOpened():
@@ -155,11 +155,11 @@ def head_and_words(event: Event) -> tuple[str, str]:
         case Noted():
             return "! " if event.warning else "", event.words
         case PoseTaken() | MotionRecorded():
-            return "", pose_in_words(event) if isinstance(event, PoseTaken) else motion_in_words(event)
+            return "", _pose_in_words(event) if isinstance(event, PoseTaken) else _motion_in_words(event)
         case Estimated():
-            return "  ", estimate_in_words(event)
+            return "  ", _estimate_in_words(event)
         case Compared():
-            return "  ", comparison_in_words(event)
+            return "  ", _comparison_in_words(event)
         case GuardTripped():
             return "", f"STOPPED by guard {event.hazard}: {event.words}"
         case Asked():
@@ -169,13 +169,13 @@ def head_and_words(event: Event) -> tuple[str, str]:
             return "", ""
 
 
-def motion_in_words(event: MotionRecorded) -> str:
+def _motion_in_words(event: MotionRecorded) -> str:
     """Describe what was recorded in motion."""
     words = f"recorded {event.samples} samples of the sensor, {event.states} of the arm"
     return f"{words}; {event.duration_s:.1f} s"
 
 
-def pose_in_words(event: PoseTaken) -> str:
+def _pose_in_words(event: PoseTaken) -> str:
     """Describe how a pose was averaged."""
     force_N, torque_Nm = rms_sigma(event)
     words = (
@@ -187,7 +187,7 @@ def pose_in_words(event: PoseTaken) -> str:
     return words if event.steady else words + ", NOT STEADY"
 
 
-def estimate_in_words(event: Estimated) -> str:
+def _estimate_in_words(event: Estimated) -> str:
     """Describe coverage and running fit."""
     words = f"coverage {event.light}"
     if "mass_kg" in event.values:
@@ -197,7 +197,7 @@ def estimate_in_words(event: Estimated) -> str:
     return f"{words}; helps most: {event.hint}" if event.hint else words
 
 
-def comparison_in_words(event: Compared) -> str:
+def _comparison_in_words(event: Compared) -> str:
     """Describe how far a pose is from the prediction, and how far it is expected to be (one sigma)."""
     found, expected = (
         f"{np.linalg.norm(vector[:3]):.3f} N, {np.linalg.norm(vector[3:]):.4f} N·m"

@@ -24,7 +24,7 @@ from ftdrive.planning.planner import USUAL_POSTURE_RAD
 from ftdrive.runs.outcome import Outcome
 from ftdrive.runs.run import Run
 from ftdrive.session import along_plan, session, task
-from ftdrive.session.completed_plans import remember_completed
+from ftdrive.session.along_plan import remember_completed
 from ftdrive.session.events import (
     Event,
     Noted,
@@ -33,11 +33,10 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.guards import Limits
-from ftdrive.session.journal import Journal
-from ftdrive.session.open_cell import OpenCell
+from ftdrive.session.open_cell import Journal, OpenCell
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.options import SessionOptions
-from ftdrive.session.sweeping import Sweeping
+from ftdrive.session.sweep import Sweeping
 from ftdrive.session.task import Calibrating
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock

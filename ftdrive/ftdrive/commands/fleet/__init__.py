@@ -2,13 +2,9 @@
 
 import click
 
-from ftdrive.commands.fleet.add import add
-from ftdrive.commands.fleet.compensate import compensate
-from ftdrive.commands.fleet.index import index
-from ftdrive.commands.fleet.remove import remove
-from ftdrive.commands.fleet.serve import serve
-from ftdrive.commands.fleet.solve import solve
-from ftdrive.commands.fleet.status import status
+from ftdrive.commands.fleet.cells import add, index, remove
+from ftdrive.commands.fleet.solve import compensate, solve
+from ftdrive.commands.fleet.status import serve, status
 from ftdrive.commands.fleet.verify import verify
 
 

@@ -1,4 +1,8 @@
-"""The shapes of arm and tool, where they are at given joint angles, and how far a turn of a joint can move them.
+"""The shapes of arm and tool, where they are at given joint angles, and their distances.
+
+A body is a cylinder with flat ends, grown by a rounding radius: radius 0 with a rounding is a capsule. A direction u
+from body A to body B separates them by at least `min_B(u·x) - max_A(u·x)`. The best direction is found by projecting
+back and forth between the bodies; any other one only makes the answer smaller, so the search need not be perfect.
 
 Radii and hub widths were measured from the convex hulls of the collision meshes in the ROS 2 description of the arms,
 version 2.4.5. Those of UR3e, UR5e, UR10e and UR16e were then fitted to meshes with all lids and edges: none stands out
@@ -7,7 +11,7 @@ the UR5e by the length of wrist 2. Models without measured shapes are refused.
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,8 +21,167 @@ from numpy.typing import ArrayLike, NDArray
 from ftcalib.model import cross
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.kinematics import Frames, deviation, frames
-from ftdrive.planning.geometry.shapes import Bodies
 from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, model_named
+
+PROJECTIONS = 24
+TINY_M = 1e-12
+CLOSE_M = 1e-5
+"""A lower bound that is as close to the true distance is good enough."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bodies:
+    """Any number of bodies at once; metres, base axes."""
+
+    centre_m: Array
+    """(..., 3)"""
+    axis: Array
+    """(..., 3) unit vector along each cylinder."""
+    half_length_m: Array
+    """(...) of the cylinder, without the rounding."""
+    radius_m: Array
+    """(...) of the cylinder, without the rounding."""
+    rounding_m: Array
+    """(...)"""
+
+    @property
+    def reach_m(self) -> Array:
+        """(...) Radius of a ball about the centre that holds the body."""
+        return np.asarray(np.hypot(self.half_length_m, self.radius_m) + self.rounding_m)
+
+    def centre_at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> Array:
+        """Centres (m, 3) of some of the bodies of (n, k), one a pair of indices."""
+        return self.centre_m.reshape(-1, 3).take(row * len(self.half_length_m) + column, axis=0)
+
+    def at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> "Bodies":
+        """Take some of the bodies of (n, k), one a pair of indices."""
+        return Bodies(
+            self.centre_at(row, column),
+            self.axis.reshape(-1, 3).take(row * len(self.half_length_m) + column, axis=0),
+            self.half_length_m.take(column),
+            self.radius_m.take(column),
+            self.rounding_m.take(column),
+        )
+
+    def some(self, index: NDArray[np.intp]) -> "Bodies":
+        """Take some of a flat list of bodies."""
+        return Bodies(
+            self.centre_m.take(index, axis=0),
+            self.axis.take(index, axis=0),
+            self.half_length_m.take(index),
+            self.radius_m.take(index),
+            self.rounding_m.take(index),
+        )
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Scalar products (...) of vectors (..., 3)."""
+    return np.asarray(np.einsum("...i,...i->...", a, b))
+
+
+def _extent(bodies: Bodies, direction: Array) -> Array:
+    """How far each body reaches along a unit direction, from its centre."""
+    along = dot(bodies.axis, direction)
+    across = np.sqrt(np.maximum(1 - along**2, 0.0))
+    return bodies.half_length_m * np.abs(along) + bodies.radius_m * across + bodies.rounding_m
+
+
+def height_above(bodies: Bodies, normal: Array, offset_m: float) -> Array:
+    """Exact distance (...) of bodies to the half-space `normal · x < offset_m`; negative inside."""
+    return np.asarray(bodies.centre_m @ normal - offset_m - _extent(bodies, -normal))
+
+
+def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:
+    """Lower bound (k,) of the distance between bodies, pair by pair; negative or zero where none can be shown.
+
+    Parameters
+    ----------
+    a, b : Bodies
+        k of each.
+    enough_m : array, shape (k,)
+        A pair that is shown to be this far apart is not looked at any more.
+    """
+    between, capsule_distance = _between_axes(a, b)
+    bound = capsule_distance - (a.radius_m + a.rounding_m + b.radius_m + b.rounding_m)
+    # Capsules are judged exactly by their axes; flat ends are not.
+    open_ = np.flatnonzero((bound < enough_m) & (a.radius_m + b.radius_m > 0))
+    if len(open_):
+        inner_a, inner_b = (replace(body.some(open_), rounding_m=np.zeros(len(open_))) for body in (a, b))
+        grown = (a.rounding_m + b.rounding_m)[open_]
+        bound[open_] = np.maximum(bound[open_], _by_projections(inner_a, inner_b, between[open_]) - grown)
+    return np.asarray(bound)
+
+
+def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array, enough_m: Array) -> Array:
+    """Lower bound (k,) of the distance between each body and a box parallel to the base axes.
+
+    A body that is shown to be `enough_m` (k,) away is not looked at any more.
+    """
+    centre, half = (low_m + high_m) / 2, (high_m - low_m) / 2
+    point = bodies.centre_m
+    best = np.full(len(point), -1.0)  # if a body intersects the box, the depth is not computed
+    open_ = np.arange(len(point))
+    for _ in range(PROJECTIONS):
+        on_box = np.clip(point, low_m, high_m)
+        gap = on_box - point
+        length = np.sqrt(dot(gap, gap))
+        u = gap / np.maximum(length, TINY_M)[:, None]
+        reach = dot(u, centre - bodies.centre_m) - np.abs(u) @ half - _extent(bodies, u)
+        best[open_] = np.maximum(best[open_], np.where(length > TINY_M, reach, -1.0))
+        still = np.flatnonzero((best[open_] < enough_m[open_]) & (length - bodies.rounding_m - best[open_] >= CLOSE_M))
+        if not len(still):
+            break
+        open_, bodies = open_[still], bodies.some(still)
+        point = _nearest(bodies, on_box[still])
+    return best
+
+
+def _by_projections(a: Bodies, b: Bodies, on_b: Array) -> Array:
+    best = np.full(len(on_b), -1.0)
+    open_ = np.arange(len(on_b))
+    for _ in range(PROJECTIONS):
+        on_a = _nearest(a, on_b)
+        on_b = _nearest(b, on_a)
+        gap = on_b - on_a
+        length = np.sqrt(dot(gap, gap))
+        u = gap / np.maximum(length, TINY_M)[:, None]
+        reach = dot(u, b.centre_m - a.centre_m) - _extent(a, u) - _extent(b, u)
+        best[open_] = np.maximum(best[open_], np.where(length > TINY_M, reach, -1.0))
+        still = np.flatnonzero(length - best[open_] >= CLOSE_M)
+        if not len(still):
+            break
+        open_, on_b, a, b = open_[still], on_b[still], a.some(still), b.some(still)
+    return best
+
+
+def _nearest(bodies: Bodies, point: Array) -> Array:
+    """Point (k, 3) of each cylinder, without rounding, that is nearest to a given one."""
+    from_centre = point - bodies.centre_m
+    along = dot(from_centre, bodies.axis)
+    across = from_centre - along[:, None] * bodies.axis
+    radius = np.sqrt(dot(across, across))
+    shrink = np.minimum(1.0, bodies.radius_m / np.maximum(radius, TINY_M))
+    along = np.clip(along, -bodies.half_length_m, bodies.half_length_m)
+    return np.asarray(bodies.centre_m + along[:, None] * bodies.axis + shrink[:, None] * across)
+
+
+def _between_axes(a: Bodies, b: Bodies) -> tuple[Array, Array]:
+    """Point (k, 3) of each segment b nearest to the segment a, and the distance (k,) of the two.
+
+    The distance is convex in the two positions: the unconstrained answer, clipped on one and then on the other segment,
+    is exact (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
+    """
+    gap = a.centre_m - b.centre_m
+    cosine, on_a, on_b = dot(a.axis, b.axis), dot(a.axis, gap), dot(b.axis, gap)
+    sine2 = 1 - cosine**2
+    s = np.where(sine2 > 1e-9, (cosine * on_b - on_a) / np.maximum(sine2, 1e-9), 0.0)
+    s = np.clip(s, -a.half_length_m, a.half_length_m)
+    t = np.clip(cosine * s + on_b, -b.half_length_m, b.half_length_m)
+    s = np.clip(cosine * t - on_a, -a.half_length_m, a.half_length_m)
+    point = b.centre_m + t[:, None] * b.axis
+    difference = a.centre_m + s[:, None] * a.axis - point
+    return point, np.sqrt(dot(difference, difference))
+
 
 HUB_ROUNDING_M = 0.020
 """Of the edges of the housings at the joints. On the constant tour a UR3e then comes within 22 mm of itself; the convex
@@ -29,7 +192,7 @@ FOREARM_END_ROUNDING_M = 0.010
 
 
 @dataclass(frozen=True, slots=True)
-class Shape:
+class _Shape:
     """Sizes of one arm, metres. Ranges are along the lift axis, from the shoulder's centre."""
 
     upper_arm_offset_m: float
@@ -49,20 +212,20 @@ class Shape:
     """From the centres of joints 5 and 6 back to the lids of wrists 1 and 2."""
 
 
-_UR5E = Shape(
+_UR5E = _Shape(
     0.138, 0.007, 0.081, 0.088, 0.062, 0.062, 0.050, 0.042, 0.048, (0.065, 0.217), (0.053, 0.217), (-0.035, 0.068),
     (-0.052, 0.063), 0.057,
 )  # fmt: skip
-_UR10E = Shape(
+_UR10E = _Shape(
     0.1762, 0.0393, 0.101, 0.111, 0.077, 0.071, 0.059, 0.048, 0.057, (0.084, 0.275), (0.084, 0.256), (-0.005, 0.112),
     (-0.022, 0.109), 0.060,
 )  # fmt: skip
-_UR20 = Shape(
+_UR20 = _Shape(
     0.260, 0.043, 0.125, 0.150, 0.095, 0.097, 0.075, 0.070, 0.065, (0.117, 0.358), (0.134, 0.346), (-0.036, 0.154),
     (-0.033, 0.143), 0.091,
 )  # fmt: skip
 SHAPES = {
-    "UR3e": Shape(
+    "UR3e": _Shape(
         0.120, 0.027, 0.069, 0.073, 0.048, 0.048, 0.040, 0.035, 0.040, (0.054, 0.187), (0.062, 0.180), (0.004, 0.070),
         (-0.020, 0.080), 0.048,
     ),
@@ -70,7 +233,7 @@ SHAPES = {
     "UR7e": _UR5E,
     "UR10e": _UR10E,
     "UR12e": _UR10E,
-    "UR16e": Shape(
+    "UR16e": _Shape(
         0.176, 0.040, 0.101, 0.111, 0.077, 0.071, 0.059, 0.048, 0.057, (0.084, 0.275), (0.084, 0.256), (-0.005, 0.113),
         (-0.021, 0.110), 0.060,
     ),

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ftdrive.planning.geometry.arm_model import ArmModel
+from ftdrive.planning.geometry.arm_model import ArmModel, Bodies, dot, height_above, separation, separation_from_box
 from ftdrive.planning.geometry.scene import Scene
-from ftdrive.planning.geometry.shapes import Bodies, dot, height_above, separation, separation_from_box
 from ftdrivers.ur.kinematics import Array
 
 FIRST_STEP_RAD = np.radians(15)

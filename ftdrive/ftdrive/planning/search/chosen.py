@@ -15,8 +15,7 @@ from ftcalib.poses.selection import choose, choose_verification_poses, cone_cand
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import wrist_inverse
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.search.nodes import Nodes, wrist_nodes
-from ftdrive.planning.search.postures import grid
+from ftdrive.planning.search.nodes import Nodes, grid, wrist_nodes
 from ftdrive.planning.search.tours import clear_tour, connected
 from ftdrivers.ur.kinematics import Array
 

@@ -87,7 +87,7 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
         return []
     columns = view.columns(2 * cells)
     full = [panels.full_scale(columns, view.reading, first) for first in (0, 3)]
-    drawn = [plot(view, columns, i, full[i // 3], each, with_value=across == 1) for i in range(6)]
+    drawn = [_plot(view, columns, i, full[i // 3], each, with_value=across == 1) for i in range(6)]
     lines = []
     for first in range(6 // across):
         beside = drawn[first::3] if across == 2 else [drawn[first]]
@@ -109,7 +109,7 @@ def _time_axis(columns: Columns, cells: int) -> Line:
     return line.to(_GUTTER + cells - 3).add("now", FAINT)
 
 
-def plot(view: View, columns: Columns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
+def _plot(view: View, columns: Columns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
     """Draw one component: a line with contacts, marks and perhaps the value, then `rows` - 1 lines of Braille.
 
     The envelope of the samples stands before the zero line and the band of ±1 sigma of a sample about it.

@@ -197,7 +197,7 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
             if bar_cells:
                 line.to(_NUMBERS).join(_bar(view, i, full, bar_cells))
             if trace_cells:
-                line.add("  ").join(trace(columns, i, full))
+                line.add("  ").join(_trace(columns, i, full))
             lines.append(line.fit(width))
         size = _size(view, first, places).to(_NUMBERS)
         lines.append(size.join(_contact(view) if first == 0 else line_of_force(view.reading)).fit(width))
@@ -280,7 +280,7 @@ def _bar(view: View, i: int, full: float, cells: int) -> Line:
     return Line(rest, FAINT).add(filled[::-1], style).add("│" + "·" * half, FAINT)
 
 
-def trace(columns: Columns, i: int, full: float) -> Line:
+def _trace(columns: Columns, i: int, full: float) -> Line:
     """Draw the recent past of a component in one row."""
     ink = braille.characters(braille.envelope(columns.low[i], columns.high[i], 1, full))[0]
     return layers(ink, np.zeros_like(ink), columns.contact_cells)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ftdrivers.ati import codec
 from ftdrivers.errors import ProtocolError
-from ftdrivers.wires.status_word import describe_status
+from ftdrivers.wires.framing import describe_status
 
 i16 = st.integers(-32768, 32767)
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from ftdrivers.ati import modbus
 from ftdrivers.errors import ProtocolError
+from ftdrivers.wires.framing import describe_status
 from ftdrivers.wires.modbus import Refused
-from ftdrivers.wires.status_word import describe_status
 
 V1 = bytes.fromhex("00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50")
 V2 = bytes.fromhex("00 DD 00 45 09 26 FC 62 FB C2 04 F2 62")

@@ -25,7 +25,7 @@ from ftdrivers.ati.netft import (
 from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, StreamBroken
 from ftdrivers.interfaces import Fact, Health
 from ftdrivers.registry import sensor_from_url
-from ftdrivers.wires.status_word import describe_status
+from ftdrivers.wires.framing import describe_status
 from tests.cell_time import CellTime
 
 START, STOP = bytes.fromhex("1234 0002 0000 0000"), bytes.fromhex("1234 0000 0000 0000")

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from ftdrivers.bota import codec
 from ftdrivers.errors import ProtocolError
-from ftdrivers.wires.crc import crc16_x25
+from ftdrivers.wires.framing import crc16_x25
 
 FRAME = bytes.fromhex("AA 0000 0000803F 000000C0 C3F51C41 CDCCCC3D CDCC4CBE 9A99993E 40420F00 0000CC41 3D0D")
 f32 = st.floats(width=32)

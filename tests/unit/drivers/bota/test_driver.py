@@ -10,7 +10,7 @@ import pytest
 from ftdrivers.bota.sensor import BotaSensor
 from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, StreamBroken
-from ftdrivers.wires.crc import crc16_x25
+from ftdrivers.wires.framing import crc16_x25
 from tests.unit.drivers.dialogue import Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread
 

@@ -8,7 +8,7 @@ import pytest
 import serial
 
 from ftdrivers.probe.serial_line import Answer, probe
-from ftdrivers.wires.crc import crc16_modbus
+from ftdrivers.wires.framing import crc16_modbus
 from tests.fake_clock import FakeClock
 
 EVEN, NONE = serial.PARITY_EVEN, serial.PARITY_NONE

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from ftdrivers.errors import ProtocolError
 from ftdrivers.robotiq import codec
-from ftdrivers.wires.crc import crc16_modbus
-from ftdrivers.wires.framing import Deframer
+from ftdrivers.wires.framing import Deframer, crc16_modbus
 
 FRAME = bytes.fromhex("20 4E D2 04 C9 FD 10 27 96 00 E7 FF E8 03 86 DC")
 START, STARTED = bytes.fromhex("09 10 01 9A 00 01 02 02 00 CD CA"), bytes.fromhex("09 10 01 9A 00 01 21 52")

@@ -12,7 +12,7 @@ from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, DeviceFault
 from ftdrivers.interfaces import Fact
 from ftdrivers.robotiq.sensor import RobotiqFt300
-from ftdrivers.wires.crc import crc16_modbus
+from ftdrivers.wires.framing import crc16_modbus
 from tests.unit.drivers.dialogue import Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ftdrivers.robotous.can import RobotousCan
-from ftdrivers.robotous.halves import Halves
+from ftdrivers.robotous.can import Halves, RobotousCan
 from tests.fake_clock import FakeClock
 
 PERIOD_S = 0.005

@@ -118,6 +118,6 @@ def install(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
         QoSProfile=SimpleNamespace,
     )
     modules = {"rclpy.qos": qos}
-    monkeypatch.setattr("ftdrivers.ros2.subscription.ros2_module", lambda name: modules.get(name, _Messages()))
+    monkeypatch.setattr("ftdrivers.ros2.middleware.ros2_module", lambda name: modules.get(name, _Messages()))
     for module in ("arm", "sensor"):
         monkeypatch.setattr(f"ftdrivers.ros2.{module}.Node", graph.create_node)

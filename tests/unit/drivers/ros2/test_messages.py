@@ -18,10 +18,9 @@ from ftdrivers.errors import BadUrl, DeviceError, ProtocolError
 from ftdrivers.interfaces import FtSamples
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.ros2.arm import Ros2Arm, pose_reader_of
-from ftdrivers.ros2.kinematics import Chain
-from ftdrivers.ros2.poses import Joints, Poses, Transforms
+from ftdrivers.ros2.middleware import Received
+from ftdrivers.ros2.poses import Chain, Joints, Poses, Transforms
 from ftdrivers.ros2.sensor import Ros2Sensor
-from ftdrivers.ros2.subscription import Received
 from tests.ros2.seven_joints import JOINTS, URDF, flange, posture
 from tests.unit.drivers.ros2.graph_in_memory import joints, pose, tf, wrench
 

@@ -5,7 +5,7 @@ from typing import Any, cast
 import pytest
 
 from ftdrivers.errors import ConnectError, ProtocolError
-from ftdrivers.ros2.subscription import OnePublisher, Received, clock_diagnosis, subscribe
+from ftdrivers.ros2.middleware import OnePublisher, Received, clock_diagnosis, subscribe
 from tests.unit.drivers.ros2.graph_in_memory import RELIABLE, Graph
 
 TOPIC, KIND = "/ft/wrench", "geometry_msgs/msg/WrenchStamped"

@@ -12,8 +12,7 @@ import serial
 
 from ftdrivers.transcript.player import Player, _Terminal
 from ftdrivers.transcript.recorder import Passage, Transcript
-from ftdrivers.wires.parity import ask_for_marks
-from ftdrivers.wires.serial_port import SerialPort
+from ftdrivers.wires.serial_port import SerialPort, ask_for_marks
 from tests.fake_clock import FakeClock
 
 OPENED_NS = 7_000_000_000

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from ftdrivers.errors import StreamBroken
 from ftdrivers.ur import opening, script_control
 from ftdrivers.ur.control import STOP_RAD_S2
-from ftdrivers.ur.control_program import INPUTS, OUTPUTS
 from ftdrivers.ur.primary import Message
-from ftdrivers.ur.script_control import ScriptControl
+from ftdrivers.ur.script_control import INPUTS, OUTPUTS, ScriptControl
 from ftdrivers.ur.timing import UrTiming
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, HOST, Controller
 

@@ -9,12 +9,11 @@ from numpy.typing import NDArray
 
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.sweep import Sweep
-from ftdrivers.ur import control_program
+from ftdrivers.ur import script_control
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import ControlSetting
-from ftdrivers.ur.control_program import OUTPUTS, program_text
 from ftdrivers.ur.primary import Code, Failed, Note, Stopped
-from ftdrivers.ur.script_control import STOPS_ITSELF_S
+from ftdrivers.ur.script_control import OUTPUTS, STOPS_ITSELF_S, program_text
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, MakeArm, away, no_guard
 from tests.unit.drivers.ur.program_in_memory import COMMANDS, Script, ScriptInMemory
@@ -54,10 +53,10 @@ def test_program_and_driver_agree_on_registers_and_commands() -> None:
     numbers = {int(k) for k in re.findall(r"ft_number\((\d+)\)", text)}
     assert numbers == set(range(10))
     for command in (f"input_int_register_{k}" for k in range(32, 36)):
-        assert command in control_program.INPUTS
+        assert command in script_control.INPUTS
     named = {int(number): name for name, number in re.findall(r"global ft_(\w+) = ([1-9])\n", text)}
-    assert len(named) == len(control_program.COMMANDS) == len(COMMANDS)
-    for name, number in control_program.COMMANDS.items():
+    assert len(named) == len(script_control.COMMANDS) == len(COMMANDS)
+    for name, number in script_control.COMMANDS.items():
         stem = {"within_safety_limits": "limits", "quit": "end"}.get(name, name.removeprefix("set_").split("_")[0])
         assert named[number] == stem
 

@@ -12,7 +12,7 @@ import pytest
 
 from ftdrivers.clock import REAL
 from ftdrivers.errors import NoDashboard
-from ftdrivers.ur import dashboard
+from ftdrivers.ur import services
 from ftdrivers.ur.services import Services, ServicesOf
 
 HOST = "127.0.0.1"
@@ -44,7 +44,7 @@ def a_dashboard(replies: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> Ite
                 self.wfile.write(reply.encode() + b"\n")
 
     with socketserver.TCPServer((HOST, 0), Handler) as server, serving(server):
-        monkeypatch.setattr(dashboard, "PORT", server.server_address[1])
+        monkeypatch.setattr(services, "DASHBOARD_PORT", server.server_address[1])
         yield asked
 
 
@@ -151,6 +151,6 @@ def test_a_robot_api_that_refuses(status: int, answer: Any, says: str) -> None:
 def test_a_device_that_does_not_answer(
     version: tuple[int, int, int, int], name: str, fix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dashboard, "PORT", 1)
+    monkeypatch.setattr(services, "DASHBOARD_PORT", 1)
     with pytest.raises(NoDashboard, match=f"the {name} of .* reports: .*refused.*{fix}"):
         ask(version, everything)

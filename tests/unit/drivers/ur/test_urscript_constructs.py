@@ -12,7 +12,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.planner import guess_of, plan_tour
-from ftdrivers.ur.control_program import program_text, without_comments
+from ftdrivers.ur.script_control import program_text, without_comments
 
 PAGE = Path(__file__).parents[4] / "docs" / "reference" / "urscript-constructs.md"
 KEYWORDS = {"def", "thread", "run", "kill", "while", "if", "elif", "else", "return", "halt", "global", "local"}

@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ftdrivers.wires.crc import crc16_modbus, crc16_x25
-from ftdrivers.wires.framing import Deframer
+from ftdrivers.wires.framing import Deframer, crc16_modbus, crc16_x25
 
 
 def test_checksums_of_the_standard_text() -> None:

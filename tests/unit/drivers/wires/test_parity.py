@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ftdrivers.ati import modbus
-from ftdrivers.wires.parity import Unmarker
+from ftdrivers.wires.serial_port import Unmarker
 
 RECORDS = [
     bytes.fromhex("00 64 01 2C 01 F4 FF 38 FE 70 FD A8 50"),

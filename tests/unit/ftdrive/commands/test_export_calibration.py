@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 from ftdrive.cli import cli
 from ftdrive.commands import emulated_run
 from ftdrive.errors import ConfigError, exit_code
-from ftdrive.exports.calibration.formats import FORMATS
+from ftdrive.exports.formats import FORMATS
 from ftdrive.runs.run import Run
 from tests.unit.ftdrive.exports.calibration.example import calibration, tilted
 from tests.unit.ftdrive.store.run_folders import new_run, verified

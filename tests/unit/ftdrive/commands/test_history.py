@@ -21,10 +21,9 @@ from ftdrive.commands.live_source import open_log
 from ftdrive.runs.run import Run
 from ftdrive.runs.weighings import FOLDER, WeighingsFile
 from ftdrive.session import session
-from ftdrive.store.database import default_file
+from ftdrive.store.database import SCHEMA, default_file
 from ftdrive.store.records import user_folder
 from ftdrive.store.store import Store
-from ftdrive.store.tables import SCHEMA
 from tests.unit.ftdrive.live.simulated import calibrated, info
 from tests.unit.ftdrive.store.run_folders import new_run, result, verified
 

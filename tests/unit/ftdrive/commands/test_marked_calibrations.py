@@ -118,7 +118,7 @@ def emulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CalibrationResu
 def test_every_output_of_an_emulated_calibration_says_so(
     run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ftdrive.report.page.draw", lambda *_: "")  # figures take most of the time
+    monkeypatch.setattr("ftdrive.report.report.draw", lambda *_: "")  # figures take most of the time
     for form in ("html", "md"):
         run("report", "e.json", "--format", form, "-o", f"report.{form}")
         text = Path(f"report.{form}").read_text(encoding="utf-8")

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from ftcalib.model import Array
-from ftdrive.fleet.observed import Observed
+from ftdrive.fleet.cells import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
 from ftdrive.runs.weighings import REFUSALS

@@ -4,8 +4,8 @@ from datetime import timedelta
 
 import numpy as np
 
+from ftdrive.fleet.state import attention, summary, weighed_in_words
 from ftdrive.fleet.status import fleet_state
-from ftdrive.fleet.words import attention, summary, weighed_in_words
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.fleet.fleet_records import NOW, cell, check, daily, fleet, result, time, weighed
 

@@ -5,8 +5,7 @@ from datetime import timedelta
 
 import pytest
 
-from ftdrive.fleet.state import Fleet, FleetFinding
-from ftdrive.fleet.words import summary
+from ftdrive.fleet.state import Fleet, FleetFinding, summary
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated
 
 SOUND = cell("A")

@@ -12,9 +12,8 @@ from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfi
 from ftdrive.cell.rules import Rows
 from ftdrive.errors import ConfigError
 from ftdrive.planning.cell_plan import box_from_mm, certifier_for, plane_from_mm, require_possible
-from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder, height_above, separation_from_box
 from ftdrive.planning.geometry.certify import Margins
-from ftdrive.planning.geometry.shapes import height_above, separation_from_box
 
 Row = Sequence[float]
 SHOULDER = 1

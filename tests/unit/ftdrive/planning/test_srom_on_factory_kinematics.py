@@ -8,7 +8,7 @@ from ftcalib.model import Array, Parameters, predict
 from ftcalib.published.yu import lrom, special_deviation_rad, special_numbers, srom
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
-from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.planning.search.nodes import constant_tour
 from ftdrivers.ur.kinematics import MODELS
 from tests.own_kinematics import drawn
 

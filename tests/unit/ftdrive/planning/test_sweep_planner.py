@@ -14,8 +14,8 @@ from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of
 from ftdrive.planning.search.nodes import WRIST_6_RAD
-from ftdrive.planning.show.words import plan_in_words
 from ftdrive.planning.sweep_planner import at_speed, plan_sweep, winds_little
+from ftdrive.planning.words import plan_in_words
 
 SPEEDS = Speeds()
 STOP_RAD_S2 = float(np.radians(300))

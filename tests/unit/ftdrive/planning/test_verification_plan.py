@@ -14,7 +14,7 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_verification
-from ftdrive.planning.show.words import plan_in_words
+from ftdrive.planning.words import plan_in_words
 from ftdrive.session.forecast import moves_s
 from ftdrive.session.tour import SLOW
 

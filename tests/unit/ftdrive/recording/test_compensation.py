@@ -12,7 +12,7 @@ from ftcalib.errors import BadDataset
 from ftcalib.model import predict
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
-from ftdrive.recording import Header, Recording, number_table, read_recording
+from ftdrive.recording import Header, Recording, csv_pair, read_recording
 from ftdrive.recording.compensation import compensated, estimated_bias
 from ftdrive.recording.csv_pair import CsvPair, numbers_of, read_orientation
 from ftdrive.recording.recording import rows_of
@@ -161,7 +161,7 @@ def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
     lines = (tmp_path / damaged).read_text().splitlines()
     lines[len(lines) * 2 // 3] = "?"
     (tmp_path / damaged).write_text("\n".join(lines))
-    monkeypatch.setattr(number_table, "_READ_BYTES", 1 << 15)
+    monkeypatch.setattr(csv_pair, "_READ_BYTES", 1 << 15)
     found = CsvPair(*files, calibration(), "c", None)
     assert found.delay_s == pytest.approx(0.012, abs=2e-3)
     numbers, failure = compensated(found, WrenchFrame(), tmp_path / "new.csv")

@@ -9,8 +9,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ftcalib.errors import BadDataset
-from ftdrive.recording import number_table
-from ftdrive.recording.number_table import WRENCH, Part, mean_rate_Hz, parsed, read_table
+from ftdrive.recording import csv_pair
+from ftdrive.recording.csv_pair import WRENCH, Part, mean_rate_Hz, parsed, read_table
 from ftdrivers.interfaces import Array
 
 _PARTS = ["0", "1", "97", ".", "-", "e", "+", ",", "\n", "1.5", "-2.25", "1e-05", "7,8", "\r\n", " ", "#", "inf", "E"]
@@ -56,7 +56,7 @@ def test_decimals_need_no_slow_reader(text: str, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_long_table_is_read_in_parts_up_to_its_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(number_table, "_READ_BYTES", 1 << 18)
+    monkeypatch.setattr(csv_pair, "_READ_BYTES", 1 << 18)
     path = tmp_path / "w.csv"
     rows = np.c_[np.arange(4000) / 1000, np.random.default_rng(3).normal(0, 10, (4000, 6))]
     with path.open("w") as file:

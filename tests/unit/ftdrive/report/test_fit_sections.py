@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftdrive.report.fit_sections import coverage, cross_validation, drift, error, estimates, noise, residuals
+from ftdrive.report.sections import coverage, cross_validation, drift, error, estimates, noise, residuals
 from tests.unit.ftdrive.exports.calibration.example import calibration, responding
 
 

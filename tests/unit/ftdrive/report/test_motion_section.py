@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ftdrive.report.motion_section import motion
+from ftdrive.report.sections import motion
 
 MOMENTS = np.array([[2.0, 0.1, -0.2], [0.1, 2.4, 0.3], [-0.2, 0.3, 1.4]]) * 1e-3
 SIGMA = {"inertia_kg_m2": np.arange(9).reshape(3, 3) * 1e-6, "delay_s": 1.2e-4, "height_m": 0.0006}

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from ftdrive.report.origin_sections import comparison, provenance, tour
+from ftdrive.report.sections import comparison, provenance, tour
 
 PLAN: dict[str, Any] = {
     "why": ["24 poses were asked for."],

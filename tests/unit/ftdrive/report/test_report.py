@@ -24,14 +24,12 @@ from ftcalib.result import MotionResult
 from ftcalib.routine import PoseRecord, TourPose
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError
-from ftdrive.report.comparison import compared
-from ftdrive.report.error_map import error_map, orientations
-from ftdrive.report.facts import about_of, facts_of
+from ftdrive.report.document import shown_poses
+from ftdrive.report.facts import about_of, compared, error_map, facts_of, orientations
 from ftdrive.report.figures import VARIABLES
 from ftdrive.report.report import report
 from ftdrive.report.sections import sections_of
 from ftdrive.report.subject import SolveOptions, Subject, read_subject
-from ftdrive.report.words import shown_poses
 from ftdrive.runs.run import Reading, Run
 from ftdrivers.interfaces import FtSamples
 

@@ -12,9 +12,9 @@ from click.testing import CliRunner, Result
 
 from ftcalib import CalibrationResult
 from ftdrive.cli import cli
-from ftdrive.report.origin_sections import provenance
-from ftdrive.report.page import page
-from ftdrive.report.trust import trust
+from ftdrive.report.report import page
+from ftdrive.report.sections import provenance
+from ftdrive.report.subject import trust
 from ftdrive.store.database import default_file
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified

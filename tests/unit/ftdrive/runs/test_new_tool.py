@@ -12,7 +12,7 @@ from ftcalib.findings import Finding
 from ftdrive.errors import ConfigError
 from ftdrive.runs import outcome
 from ftdrive.runs.motion import MotionRecording
-from ftdrive.runs.new_tool import require_same_cell
+from ftdrive.runs.outcome import require_same_cell
 from ftdrive.runs.run import Run
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.moving_load import Truth, record, sweep

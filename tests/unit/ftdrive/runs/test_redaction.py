@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from ftdrive.runs.redaction import Redaction
+from ftdrive.runs.bundle import Redaction
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ftdrive.live.samples import WrenchFrame
-from ftdrive.servers.averaged import Averaged
+from ftdrive.servers.rates import Averaged
 from tests.unit.ftdrive.servers.fake_stream import block
 
 

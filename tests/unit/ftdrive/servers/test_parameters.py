@@ -10,10 +10,9 @@ from foxglove import Parameter
 
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Stages, WrenchFrame
-from ftdrive.servers.parameter_values import checked_value
-from ftdrive.servers.parameters import Parameters
-from ftdrive.servers.ros2 import parameters as of_ros2
-from ftdrive.servers.ros2.parameters import Fixed, NodeParameters
+from ftdrive.servers import parameters as of_ros2
+from ftdrive.servers.foxglove import Parameters
+from ftdrive.servers.parameters import Fixed, NodeParameters, checked_value
 
 FRAME = WrenchFrame("base", "tcp")
 

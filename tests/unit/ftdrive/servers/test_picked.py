@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ftdrive.servers.picked import Picked
+from ftdrive.servers.rates import Picked
 
 
 @pytest.mark.parametrize("size", [1, 7, 70, 7000])

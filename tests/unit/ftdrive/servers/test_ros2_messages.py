@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from ftdrive.live.samples import LinkStatus, Stages, StreamStatus, WrenchFrame
-from ftdrive.servers.ros2 import diagnostics, transforms
-from ftdrive.servers.ros2.diagnostics import Level, Report, not_open, reports_of
-from ftdrive.servers.ros2.parameters import Fixed
-from ftdrive.servers.ros2.transforms import Transforms
+from ftdrive.servers import ros2
+from ftdrive.servers.parameters import Fixed
+from ftdrive.servers.ros2 import Level, Report, Transforms, not_open, reports_of
 from ftdrivers.errors import NoRos2
 from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, FakeStream
 
@@ -66,7 +65,7 @@ def test_what_is_wrong_has_its_level() -> None:
 
 def test_a_report_becomes_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = SimpleNamespace(DiagnosticStatus=SimpleNamespace, KeyValue=SimpleNamespace)
-    monkeypatch.setattr(diagnostics, "ros2_module", lambda _: fake)
+    monkeypatch.setattr(ros2, "ros2_module", lambda _: fake)
     message = reports(lost_before=0)[1].message("ftdrive")
     assert (message.level, message.name, message.hardware_id) == (b"\x01", "ftdrive: sensor", "ATI Mini45 FT12345")
     assert {one.key: one.value for one in message.values}["lost"] == "7"
@@ -96,8 +95,8 @@ def node(monkeypatch: pytest.MonkeyPatch) -> FakeNode:
 
     policy = SimpleNamespace(TRANSIENT_LOCAL=1)
     fake = SimpleNamespace(TFMessage=object, DurabilityPolicy=policy, QoSProfile=SimpleNamespace)
-    monkeypatch.setattr(transforms, "ros2_module", lambda _: fake)
-    monkeypatch.setattr(transforms, "pack", kept)
+    monkeypatch.setattr(ros2, "ros2_module", lambda _: fake)
+    monkeypatch.setattr(ros2, "pack", kept)
     return FakeNode()
 
 
@@ -153,7 +152,7 @@ def test_without_tf2_nothing_is_published(node: FakeNode, monkeypatch: pytest.Mo
     def missing(name: str) -> Any:
         raise NoRos2(name)
 
-    monkeypatch.setattr(transforms, "ros2_module", missing)
+    monkeypatch.setattr(ros2, "ros2_module", missing)
     found = Transforms(node, FIXED)
     found.use(INFO)
     found.publish(FakeStream().read(), INFO, 10**9)

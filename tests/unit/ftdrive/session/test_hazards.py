@@ -4,8 +4,7 @@ import json
 import re
 from pathlib import Path
 
-from ftdrive.session.events import GuardTripped
-from ftdrive.session.hazards import Hazard
+from ftdrive.session.events import GuardTripped, Hazard
 
 ROOT = Path(__file__).parents[4]
 PAGE = ROOT / "docs/reference/hazards.md"

@@ -17,7 +17,7 @@ from ftcalib.model import predict
 from ftcalib.poses.information import T12, Prediction, TOOL_DOWN_R_base_flange, special
 from ftcalib.poses.selection import cone_candidates
 from ftcalib.routine import PoseRecord, TourPose, dataset_from, drift_check
-from ftdrive.planning.search.constant_tour import NUMBERS
+from ftdrive.planning.search.nodes import NUMBERS
 from ftdrive.runs.pose_hints import _CHANGES, hints
 from ftdrive.session.events import Estimated
 from ftdrive.session.live_fit import RunningFit, _light, faces

@@ -13,7 +13,7 @@ from ftcalib.routine import DriftCheck
 from ftdrive.cell.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.planning.search.nodes import constant_tour
 from ftdrive.runs.run import Run
 from ftdrive.session import session, tour
 from ftdrive.session.events import (

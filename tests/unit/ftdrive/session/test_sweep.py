@@ -15,13 +15,12 @@ from ftdrive.planning import sweep_planner
 from ftdrive.planning.cell_plan import certifier_for, sweep_for
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.motion import MotionRecording
-from ftdrive.session import sweeping
+from ftdrive.session import sweep
 from ftdrive.session.events import Event, GuardTripped, MotionRecorded, State, StateChanged
-from ftdrive.session.free_tool import FreeTool
 from ftdrive.session.guards import ExpectedMotion, Seen
 from ftdrive.session.operator import Key
 from ftdrive.session.options import SessionOptions, with_recorded_mode
-from ftdrive.session.sweeping import on_script_path
+from ftdrive.session.sweep import FreeTool, on_script_path
 from ftdrivers.clock import REAL
 from ftdrivers.interfaces import ArmState
 from tests.unit.ftdrive.fake_cell import STATUS, Lab
@@ -44,7 +43,7 @@ def _short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     def planned_once(cell: CellConfig, _: object, q_rad: Array, seconds: float) -> Plan:
         return planned(tuple(q_rad.tolist()), replace(cell, clock=REAL), seconds)
 
-    monkeypatch.setattr(sweeping, "sweep_for", planned_once)
+    monkeypatch.setattr(sweep, "sweep_for", planned_once)
 
 
 @pytest.mark.slow

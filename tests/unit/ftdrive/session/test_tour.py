@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import WorkcellConfig
 from ftdrive.errors import Declined, NotAccepted
+from ftdrive.planning import drawing
 from ftdrive.planning.cell_plan import certifier_for
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
-from ftdrive.planning.show import view
 from ftdrive.session import preflight
-from ftdrive.session.completed_plans import has_completed, remember_completed
+from ftdrive.session.along_plan import has_completed, remember_completed
 from ftdrive.session.events import (
     Asked,
     Checked,
@@ -326,8 +326,8 @@ def test_the_browser_is_waited_for(lab: Lab, monkeypatch: pytest.MonkeyPatch) ->
         yield "http://here"
         served.append("closed")
 
-    monkeypatch.setattr(view, "shown", shown)
-    monkeypatch.setattr(view, "open_in_browser", served.append)
+    monkeypatch.setattr(drawing, "shown", shown)
+    monkeypatch.setattr(drawing, "open_in_browser", served.append)
     lab.operator.answers["http://here"] = ["yes", "no"]
     assert lab.take_poses(dry_run=True, view=True) is None
     assert served == ["open", "http://here", "closed"]

@@ -10,8 +10,7 @@ import pytest
 from ftcalib.model import BIASES, Array
 from ftdrive.store.history import age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
-from ftdrive.store.temperature import temperatures
-from ftdrive.store.trends import QuantityTrend
+from ftdrive.store.trends import QuantityTrend, temperatures
 from tests.unit.ftdrive.live.simulated import calibrated
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
 

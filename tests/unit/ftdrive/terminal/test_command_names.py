@@ -3,8 +3,8 @@
 import pytest
 
 from ftdrive import cli
-from ftdrive.terminal.command_names import as_typed
 from ftdrive.terminal.console import hanging
+from ftdrive.terminal.text import as_typed
 
 
 @pytest.fixture

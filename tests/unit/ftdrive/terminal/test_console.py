@@ -34,8 +34,7 @@ from ftdrive.terminal.console import answer, hanging, messages
 from ftdrive.terminal.live.view import Line
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.screen import open_operator
-from ftdrive.terminal.table import print_table
-from ftdrive.terminal.text import echo, in_whole_words, visible
+from ftdrive.terminal.text import echo, in_whole_words, print_table, visible
 
 PLAN = ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal"]
 HELD = ["calibrate", "--robot", "10.0.0.1", "--sensor", "ati-can://can0"]

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ftdrive.terminal.table import print_table
+from ftdrive.terminal.text import print_table
 
 TITLES = ("cell", "tool", "due")
 ROWS = [("press-4", "a gripper with a long name", "now"), ("b", "", "in 5 d")]

@@ -10,9 +10,9 @@ import pytest
 from ftcalib.after.expected_readings import BiasChange
 from ftcalib.after.verification import Verification
 from ftdrive.runs.verified import AcceptanceLimits
-from ftdrive.terminal import verification_text
+from ftdrive.terminal import report
 from ftdrive.terminal.console import messages
-from ftdrive.terminal.verification_text import print_verification
+from ftdrive.terminal.report import print_verification
 
 FOUND = Verification(
     residual=np.array([[0.03, -0.04, 0.0, 0.003, 0.0, 0.004], [0.0, 0.0, -0.5, 0.0, 0.0, 0.0]]),
@@ -49,10 +49,8 @@ def verified(found: Verification = FOUND, *, passed: bool = True, drift: Any = N
 
 @pytest.fixture
 def printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(verification_text, "moved", lambda _: [SimpleNamespace(words="R03 was not steady")])
-    monkeypatch.setattr(
-        verification_text, "drift_in_words", lambda drift: ("0.1 N since the first pose", drift == "bad")
-    )
+    monkeypatch.setattr(report, "moved", lambda _: [SimpleNamespace(words="R03 was not steady")])
+    monkeypatch.setattr(report, "drift_in_words", lambda drift: ("0.1 N since the first pose", drift == "bad"))
 
     def run(one: Any) -> list[str]:
         print_verification(cast("Any", one))
@@ -101,5 +99,5 @@ def test_a_drift_is_printed_if_it_is_bad(
 
 
 def test_only_a_difference_beyond_three_sigma_is_marked() -> None:
-    table = verification_text._table(verified())
+    table = report._verification_table(verified())
     assert [cast("Any", cell).style for cell in list(table.columns[3].cells)] == ["", "", "bold yellow", ""]

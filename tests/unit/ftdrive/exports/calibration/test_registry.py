@@ -13,10 +13,9 @@ from ftcalib import CalibrationResult
 from ftcalib.compensation import Compensator
 from ftcalib.model import Parameters
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.exports.calibration.difference import largest_difference
-from ftdrive.exports.calibration.formats import FORMATS
-from ftdrive.exports.calibration.registry import TARGETS, export
-from ftdrive.exports.calibration.settings import Settings
+from ftdrive.exports.formats import FORMATS
+from ftdrive.exports.registry import TARGETS, export, largest_difference
+from ftdrive.exports.settings import Settings
 from tests.unit.ftdrive.exports.calibration.example import (
     MEASURED,
     UPRIGHT,

@@ -16,9 +16,9 @@ from ftcalib import CalibrationResult, Parameters
 from ftcalib.likelihood.response import SIZE, Response
 from ftcalib.model import Array
 from ftdrive.errors import NotAccepted
-from ftdrive.exports.calibration.formats import FORMATS, Property
-from ftdrive.exports.calibration.registry import Export, export
-from ftdrive.exports.calibration.settings import Settings
+from ftdrive.exports.formats import FORMATS, Property
+from ftdrive.exports.registry import Export, export
+from ftdrive.exports.settings import Settings
 from tests.target_files import tool0_from, world_from_base
 from tests.target_formulas import evaluate
 from tests.target_payloads import mujoco_plugin

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationResult
 from ftcalib.result import MotionResult
 from ftdrive import __version__
-from ftdrive.exports.calibration.formats import FORMATS
-from ftdrive.exports.calibration.registry import TARGETS, Export, export
-from ftdrive.exports.calibration.settings import Settings
+from ftdrive.exports.formats import FORMATS
+from ftdrive.exports.registry import TARGETS, Export, export
+from ftdrive.exports.settings import Settings
 from tests.unit.ftdrive.exports.calibration.example import (
     MEASURED,
     calibration,

@@ -9,11 +9,18 @@ from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
 from ftdrive.errors import ConfigError
-from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.geometry.arm_model import (
+    SHAPES,
+    ArmModel,
+    Bodies,
+    Cylinder,
+    height_above,
+    separation,
+    separation_from_box,
+)
 from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.scene import Box, Plane, Scene
-from ftdrive.planning.geometry.shapes import Bodies, height_above, separation, separation_from_box
-from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.planning.search.nodes import constant_tour
 from ftdrivers.ur.kinematics import MODELS as NOMINAL
 from ftdrivers.ur.kinematics import Array, Kinematics
 from tests.own_kinematics import drawn, real

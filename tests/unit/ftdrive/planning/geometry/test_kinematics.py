@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from ftdrive.planning.geometry.kinematics import frames, inverse, wrist_inverse
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
-from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.planning.search.nodes import constant_tour
 from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, forward
 from tests.own_kinematics import drawn, of_dh, real
 from tests.real_arms import RealArm, real_arms

@@ -15,8 +15,7 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
-from ftdrive.planning.search.constant_tour import DIFFERENT_SHAPES, NUMBERS, constant_tour
-from ftdrive.planning.search.nodes import WINDOW_RAD
+from ftdrive.planning.search.nodes import DIFFERENT_SHAPES, NUMBERS, WINDOW_RAD, constant_tour
 from ftdrivers.ur.kinematics import MODELS
 
 TOOL = (Cylinder(0, 0.2, 0.1),)

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from ftdrive.planning.drawing import draw, title_of
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
-from ftdrive.planning.show.picture import draw, title_of
 
 TUBE, LUMP = Cylinder(0.0, 0.2, 0.1), Cylinder(0.05, 0.15, 0.05, 0.08, 0.0)
 WALL, BOX = Plane((-1.0, 0.0, 0.0), -0.8), Box((0.5, 0.5, 0.0), (0.7, 0.7, 0.2))

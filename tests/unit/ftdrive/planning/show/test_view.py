@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ftdrive.errors import ConfigError
+from ftdrive.planning.drawing import describe, path, revolved, shown, turned_up
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
-from ftdrive.planning.show.view import describe, path, revolved, shown, turned_up
 
 
 @pytest.fixture(scope="module")

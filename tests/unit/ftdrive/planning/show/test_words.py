@@ -14,7 +14,7 @@ from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
-from ftdrive.planning.show.words import plan_in_words, room_in_words, stop_in_words, turns_in_words, way_in_words
+from ftdrive.planning.words import plan_in_words, room_in_words, stop_in_words, turns_in_words, way_in_words
 
 
 @pytest.fixture(scope="module")

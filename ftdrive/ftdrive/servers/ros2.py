@@ -1,27 +1,182 @@
-"""The node of `ftdrive ros2`: a compensated stream as topics, services, parameters and diagnostics.
+"""The node of `ftdrive ros2`: a compensated stream as topics, transforms, services and diagnostics.
 
 Conventions are those of REP 103, 105 and 107: SI units, a `frame_id` whose axes and origin a wrench has, stamps of the
 time of measurement. A fault is a missing message and a diagnostic, never an old or a zero wrench.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from enum import IntEnum
 from queue import Empty, SimpleQueue
 from threading import Event
 from typing import Any, Final
 
+import numpy as np
+
 from ftdrive.errors import ConfigError
 from ftdrive.live import ros2
-from ftdrive.live.processing import SENSOR_FRAME
-from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
+from ftdrive.live.frames import frames_in_flange
+from ftdrive.live.processing import SENSOR_FRAME, ProcessedStream, stages_in_words
+from ftdrive.live.samples import Block, LinkStatus, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
-from ftdrive.servers.averaged import Averaged
-from ftdrive.servers.ros2.diagnostics import Level, Report, not_open, reports_of
-from ftdrive.servers.ros2.parameters import NodeParameters
-from ftdrive.servers.ros2.transforms import Transforms
-from ftdrivers.errors import DeviceError
+from ftdrive.servers.parameters import Fixed, NodeParameters
+from ftdrive.servers.rates import Averaged, Picked
+from ftdrivers.errors import DeviceError, NoRos2
+from ftdrivers.interfaces import Array
 from ftdrivers.ros2.middleware import Node, ros2_module
+
+_TF_HZ: Final = 50.0
+
+
+class Transforms:
+    """Publishes sensor and tcp in the flange once, and on request what moves: base to flange.
+
+    A frame of base axes about another point also moves, because the flange turns in the base. It is published too.
+    """
+
+    def __init__(self, node: Any, fixed: Fixed) -> None:
+        self._node, self._fixed = node, fixed
+        self._names = {"sensor": fixed.sensor_frame, "flange": fixed.flange_frame, "base": fixed.base_frame}
+        self._picked = Picked(_TF_HZ)
+        try:
+            message = ros2_module("tf2_msgs.msg").TFMessage
+        except NoRos2:
+            self._static = self._moving = None
+            node.get_logger().info(
+                f"tf2_msgs is not installed, so {fixed.flange_frame} to {fixed.sensor_frame} is not published: "
+                "`ftdrive export calibration --format static-transform` writes a command that does"
+            )
+            return
+        qos = ros2_module("rclpy.qos")
+        latched = qos.QoSProfile(depth=1, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
+        self._static = node.create_publisher(message, "/tf_static", latched)
+        self._moving = node.create_publisher(message, "/tf", 100)
+
+    def frame_id(self, frame: WrenchFrame) -> str:
+        """Return the name of the axes and the point of a wrench, in the names of the parameters."""
+        axes = self._names.get(frame.axes, frame.axes)
+        if frame.axes == frame.about:
+            return axes
+        if isinstance(frame.about, str):
+            return f"{axes}_at_{self._names.get(frame.about, frame.about)}"
+        return ros2.frame_id(frame).replace(frame.axes, axes, 1)
+
+    def use(self, info: StreamInfo) -> None:
+        """Publish where sensor and tcp are, unless the height of the sensor is unknown."""
+        if self._static is None or not np.isfinite(info.p_flange_sensor_m).all():
+            return
+        frames = frames_in_flange(WrenchFrame(), info, np.eye(3))
+        fixed = [(self._fixed.flange_frame, self._names.get(name, name), R, p) for name, (R, p) in frames.items()]
+        t_ns = self._node.get_clock().now().nanoseconds
+        self._static.publish(pack(fixed, t_ns))
+
+    def publish(self, block: Block, info: StreamInfo, t_ns: int) -> None:
+        """Publish what moves, at the time of the newest sample of a block."""
+        if self._moving is None or not self._picked.rows(np.array([t_ns])).any():
+            return
+        R_base_flange = block.R_base_flange[-1]
+        frames = frames_in_flange(block.frame, info, R_base_flange)
+        name = ros2.frame_id(block.frame)
+        moving = []
+        if name in frames and name not in ("sensor", "tcp"):
+            moving.append((self._fixed.flange_frame, self.frame_id(block.frame), *frames[name]))
+        p_m = block.p_base_flange_m[-1]
+        if self._fixed.publish_base_tf and np.isfinite(p_m).all():
+            moving.append((self._fixed.base_frame, self._fixed.flange_frame, R_base_flange, p_m))
+        if moving:
+            self._moving.publish(pack(moving, t_ns))
+
+
+def pack(transforms: Sequence[tuple[str, str, Array, Array]], t_ns: int) -> bytes:
+    """Return a TFMessage of (parent, child, orientation (3, 3), origin (3,) in m) as CDR."""
+    packed = ros2.pack_transforms(np.array([t_ns]), [(parent, child, p, R) for parent, child, R, p in transforms])
+    return bytes(packed.tolist()[0])
+
+
+class Level(IntEnum):
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
+
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """One part of the node: "stream", "sensor", "arm" or "calibration"."""
+
+    part: str
+    level: Level
+    text: str
+    values: Mapping[str, str] = field(default_factory=dict)
+    hardware: str = ""
+
+    def message(self, node: str) -> Any:
+        """Return a DiagnosticStatus."""
+        messages = ros2_module("diagnostic_msgs.msg")
+        return messages.DiagnosticStatus(
+            level=bytes([self.level]),
+            name=f"{node}: {self.part}",
+            message=self.text,
+            hardware_id=self.hardware,
+            values=[messages.KeyValue(key=key, value=value) for key, value in self.values.items()],
+        )
+
+
+def not_open(text: str, level: Level) -> list[Report]:
+    """Report a stream that is not open."""
+    return [Report("stream", level, text)]
+
+
+def reports_of(stream: ProcessedStream, warnings: tuple[str, ...], lost_before: int, sent: int) -> list[Report]:
+    """Report an open stream; `lost_before` is the number of lost samples at the report before."""
+    status, info = stream.status(), stream.info
+    sensor = _link("sensor", status.sensor, info.sensor, status.sensor.lost - lost_before)
+    arm = _link("arm", status.arm, info.arm, 0)
+    doubts = [*info.marks, *warnings]
+    calibration = info.calibration
+    usable = calibration.verdict != "rejected"
+    level = Level.ERROR if not usable else Level.WARN if doubts else Level.OK
+    text = "; ".join(doubts) or info.calibration_state
+    state = Report("calibration", level, text, {"file": info.calibration_name, "verdict": calibration.verdict})
+    failed = status.sensor.error or status.arm.error
+    words = failed or f"{stream.frame}; {stages_in_words(stream.stages)}"
+    whole = Report("stream", Level.ERROR if failed else Level.OK, words, _values(stream, status, sent))
+    return [whole, sensor, arm, state]
+
+
+def _link(part: str, link: LinkStatus, device: Any, lost: int) -> Report:
+    values = {"rate_Hz": f"{link.rate_Hz:.1f}", "lost": str(link.lost), "age_s": f"{link.age_s:.3f}"}
+    if link.error:
+        level, text = Level.ERROR, link.error
+    elif lost > 0:
+        level, text = Level.WARN, f"{lost} samples lost since the report before"
+    else:
+        level, text = Level.OK, f"{link.rate_Hz:.0f} Hz"
+    return Report(part, level, text, values, f"{device.model} {device.serial}")
+
+
+def _values(stream: ProcessedStream, status: StreamStatus, sent: int) -> dict[str, str]:
+    """Return the state of the stream as texts, as ROS has them."""
+    info = stream.info
+    tare = "none" if status.tare is None else " ".join(f"{value:.6g}" for value in status.tare)
+    return {
+        "axes": stream.frame.axes,
+        "about": str(stream.frame.to_dict()["about"]),
+        "stages": stages_in_words(stream.stages),
+        "tool": info.tool,
+        "calibration": str(info.calibration.id),
+        "verdict": info.calibration.verdict,
+        "tare": tare,
+        "delay_s": f"{status.delay_s:.6g}",
+        "delay_sigma_s": f"{status.delay_sigma_s:.6g}",
+        "drift_N_h": f"{status.drift_N_h:.6g}",
+        "messages_sent": str(sent),
+    }
+
 
 NAME: Final = "ftdrive"
 REPORT_S: Final = 0.4

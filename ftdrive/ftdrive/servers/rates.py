@@ -1,4 +1,4 @@
-"""Blocks at a lower rate: the mean of the samples of each interval."""
+"""Samples of blocks at a lower rate: picked, or averaged."""
 
 from typing import NamedTuple
 
@@ -7,6 +7,27 @@ from numpy.typing import NDArray
 
 from ftdrive.live.samples import Block
 from ftdrivers.interfaces import Array
+
+
+class Picked:
+    """Picks at most `rate_Hz` samples a second, also across the limits of blocks: the first of each period.
+
+    A sample is picked, never averaged: what is sent was measured. The low-pass stage of the stream limits aliasing.
+    """
+
+    def __init__(self, rate_Hz: float) -> None:
+        self._period_ns = round(1e9 / rate_Hz)
+        self._last = -1
+
+    def rows(self, t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which samples (n,) to send, by their times in the order of measurement."""
+        period = t_ns // self._period_ns
+        chosen = np.empty(len(period), bool)
+        if len(period):
+            chosen[0] = period[0] != self._last
+            chosen[1:] = period[1:] != period[:-1]
+            self._last = int(period[-1])
+        return chosen
 
 
 class Means(NamedTuple):

@@ -1,1 +1,0 @@
-"""A calibration as a file of another program: `formats` lists them, `export` writes one."""

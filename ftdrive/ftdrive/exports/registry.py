@@ -1,0 +1,225 @@
+"""The function of each target, the complete JSON and YAML, and how far a target is from the calibration."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from math import degrees
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult
+from ftcalib.compensation import Compensator
+from ftcalib.files import JSON
+from ftcalib.model import Array, angle_between, angle_between_vectors, nearest_rotation
+from ftdrive import __version__
+from ftdrive.errors import NotAccepted
+from ftdrive.exports import robots, ros
+from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, Format
+from ftdrive.exports.settings import Settings
+from ftdrive.exports.shared import Exported, made_by, with_header, yaml_text
+from ftdrive.runs.verification_record import MARKS, marks_of
+
+FORMAT = "ftdrive.export/1"
+
+_FIELDS = (
+    *("mass_kg", "g_m_s2", "weight_N", "gravity_force_base_N"),
+    *("R_flange_sensor", "p_sensor_com_m", "force_bias_N", "torque_bias_Nm"),
+)
+"""Named and defined as in a calibration file."""
+
+
+def _as_json(calibration: CalibrationResult, settings: Settings) -> Exported:
+    """Write a JSON object for a program of the user.
+
+    Reader: none in particular. With u = R_flange_sensor^T R_base_flange^T gravity_force_base_N, the weight in the
+    sensor frame, and zeros where there is no `response`:
+
+        force = raw - force_bias_N - u - force_gain u
+        torque = raw - torque_bias_Nm - p_sensor_com_m x u - cross_talk_m u
+    """
+    return Exported(json.dumps(_document(calibration, settings), indent=1, allow_nan=False) + "\n")
+
+
+def _as_yaml(calibration: CalibrationResult, settings: Settings) -> Exported:
+    """Write the object of `as_json` as YAML, with the same fields and formula."""
+    return Exported(yaml_text(_document(calibration, settings)))
+
+
+def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
+    result = calibration.to_dict()
+    response = calibration.response
+    origin_m = None if settings.height_mm is None else settings.p_flange_sensor_m("json").tolist()
+    made, last = calibration.provenance.get("created_utc"), settings.verification
+    return {
+        "format": FORMAT,
+        "id": calibration.id,
+        "marks": list(marks_of(calibration)),
+        "created_utc": made if isinstance(made, str) else None,
+        "verification": None
+        if last is None
+        else {"created_utc": last.created_utc.isoformat(), "passed": last.passed, "change": last.change},
+        "made_by": f"ftdrive {__version__}",
+        "sign": "wrench on the sensor, sensor axes, about the sensor origin; contact = raw - bias - weight",
+        **{name: result[name] for name in _FIELDS},
+        "p_flange_sensor_m": origin_m,
+        "response": None
+        if response is None
+        else {"force_gain": response.force_gain.tolist(), "cross_talk_m": response.cross_talk_m.tolist()},
+        "sigma": {name: np.asarray(value).tolist() for name, value in calibration.sigma.items()},
+    }
+
+
+_STEPS = 500
+_CONVERGED = 1e-12
+"""Relative gain of a step, at the start that gains most."""
+
+
+def _compensations(calibration: CalibrationResult, target: Format) -> tuple[Compensator, Compensator]:
+    """Return our compensation, and that of a target that expresses all but what its `expresses` lacks.
+
+    Without tilt, gravity points along -z of the base. Without rotation, the sensor's axes are those of the flange.
+    Where the target has another sensor, or none, neither has the response of ours.
+    """
+    parameters = calibration.parameters
+    response = None if target.has_own_reading else calibration.response
+    ours = Compensator(parameters, response=response)
+    if "tilt" not in target.expresses:
+        parameters = replace(parameters, gravity_force_base_N=np.array([0.0, 0.0, -calibration.weight_N]))
+    if "rotation" not in target.expresses:
+        parameters = replace(parameters, R_flange_sensor=np.eye(3))
+    return ours, Compensator(parameters, response=response if "response" in target.expresses else None)
+
+
+def largest_difference(one: Compensator, other: Compensator) -> tuple[float, float]:
+    """Return the largest norms of the difference of force (N) and torque (N·m) over all orientations."""
+    matrix, offset = other.matrix - one.matrix, other.offset - one.offset
+    return _largest_norm(matrix[:3], offset[:3]), _largest_norm(matrix[3:], offset[3:])
+
+
+def _largest_norm(matrix: Array, offset: Array) -> float:
+    """Maximise |matrix @ vec(R) + offset| over rotations R.
+
+    The square is convex in R, so that the rotation which is best for its tangent never lowers it. Ascent from the 60
+    rotations of the icosahedron reaches every maximum.
+    """
+    R = Rotation.create_group("I").as_matrix()
+    norms = np.zeros(len(R))
+    for _ in range(_STEPS):
+        error = R.reshape(-1, 9) @ matrix.T + offset
+        before, norms = norms, np.linalg.norm(error, axis=1)
+        if (norms - before).max() <= _CONVERGED * norms.max():
+            break
+        R = nearest_rotation((error @ matrix).reshape(-1, 3, 3))
+    return float(norms.max())
+
+
+TARGETS: Mapping[str, Callable[[CalibrationResult, Settings], Exported]] = {
+    "kth": ros.kth,
+    "ft-tools": ros.ft_tools,
+    "ros2-message": ros.ros2_message,
+    "calaw": ros.calaw,
+    "ros2-control": ros.ros2_control,
+    "admittance": ros.admittance,
+    "kit": ros.kit,
+    "code-iai": ros.code_iai,
+    "mc-rtc": robots.mc_rtc,
+    "xarm": robots.xarm,
+    "franka": robots.franka,
+    "ur-payload": robots.ur_payload,
+    "urdf": robots.urdf,
+    "mujoco": robots.mujoco,
+    "static-transform": ros.static_transform,
+    "json": _as_json,
+    "yaml": _as_yaml,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """The text of one target and what must be known with it."""
+
+    text: str
+    notes: tuple[str, ...]
+    elsewhere: Mapping[str, JSON]
+    max_force_error_N: float
+    """Largest difference to `CalibrationResult.compensate` over all orientations."""
+    max_torque_error_Nm: float
+
+
+def export(
+    calibration: CalibrationResult, name: str, settings: Settings, *, max_force_error_N: float = MAX_FORCE_ERROR_N
+) -> Export:
+    """Write a calibration for one target.
+
+    Parameters
+    ----------
+    name : str
+        A key of `FORMATS`.
+    max_force_error_N : float
+        The target may differ by so much from `CalibrationResult.compensate`, in any orientation.
+
+    Raises
+    ------
+    ConfigError
+        The target needs a value that was not measured.
+    NotAccepted
+        The calibration is rejected, or the target would differ by more.
+    """
+    if calibration.verdict == "rejected":
+        raise NotAccepted(
+            f"the calibration is rejected and not exported: {'; '.join(calibration.reasons)}. Calibrate again"
+        )
+    target = FORMATS[name]
+    exported = TARGETS[name](calibration, settings)
+    force_N, torque_Nm = 0.0, 0.0
+    notes = list(exported.notes)
+    if target.subtracts:
+        force_N, torque_Nm = largest_difference(*_compensations(calibration, target))
+        if lost := list(_lost(calibration, target)):
+            words = (
+                f"{name} cannot express {' and '.join(lost)}: its result differs from that of ftdrive by up to "
+                f"{force_N:.3g} N and {torque_Nm:.3g} N·m"
+            )
+            if force_N > max_force_error_N:
+                raise NotAccepted(
+                    f"{words}, and the limit is {max_force_error_N:g} N. Choose another format "
+                    f"({', '.join(_lossless(calibration, target))}), or raise --max-force-error"
+                )
+            notes.insert(0, f"{words}.")
+    notes[:0] = [MARKS[mark] for mark in marks_of(calibration)]
+    notes += [f"Also set {place} = {_in_words(value)}." for place, value in exported.elsewhere.items()]
+    origin = made_by(calibration, settings.verification)
+    text = with_header(exported.text, target.comment, [origin, target.description, *notes])
+    return Export(text, tuple(notes), exported.elsewhere, force_N, torque_Nm)
+
+
+def _lost(calibration: CalibrationResult, target: Format) -> Iterator[str]:
+    """Name what the calibration has and the target cannot express, beyond rounding."""
+    down = np.array([0.0, 0.0, -1.0])
+    gravity = calibration.gravity_force_base_N
+    tilt_rad = angle_between_vectors(down, gravity)
+    turn_rad = float(angle_between(calibration.R_flange_sensor, np.eye(3)))
+    if "tilt" not in target.expresses and tilt_rad > 1e-9:
+        yield f"the base tilt of {degrees(tilt_rad):.3g}°"
+    if "rotation" not in target.expresses and turn_rad > 1e-9:
+        yield f"the sensor turned by {degrees(turn_rad):.3g}° in the flange"
+    if "response" not in target.expresses and calibration.response is not None:
+        yield "gain and cross-talk of the sensor"
+
+
+def _lossless(calibration: CalibrationResult, target: Format) -> Iterator[str]:
+    """Name the formats that lose nothing, subtract as much, and read our sensor if the target does."""
+    for name, other in FORMATS.items():
+        as_much = set(other.subtracts) >= set(target.subtracts) and other.has_own_reading <= target.has_own_reading
+        if as_much and not list(_lost(calibration, other)):
+            yield name
+
+
+def _in_words(value: JSON) -> str:
+    """Write a value of `elsewhere` for people."""
+    if isinstance(value, Mapping):
+        return f"({', '.join(f'{name} {_in_words(one)}' for name, one in value.items())})"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_in_words, value))}]"
+    return str(value)  # of a float every digit

@@ -1,0 +1,240 @@
+"""Targets that are controllers of arms, and models of a robot: URDF and MuJoCo."""
+
+import xml.etree.ElementTree as ET
+
+import numpy as np
+
+from ftcalib import CalibrationResult
+from ftdrive.exports.settings import Settings
+from ftdrive.exports.shared import (
+    Exported,
+    R_frame_sensor,
+    gravity_in_frame_m_s2,
+    gravity_m_s2,
+    inertia_kg_m2,
+    inertia_note,
+    numbers,
+    payload_inertia_kg_m2,
+    quaternion_xyzw,
+    rpy_rad,
+    world_note,
+    yaml_text,
+)
+
+MC_RTC_G_M_S2 = 9.80665
+"""mc_rtc/constants.h."""
+
+
+def mc_rtc(calibration: CalibrationResult, settings: Settings) -> Exported:
+    """Write the 13 numbers of calib_data.NAME, one a line.
+
+    Reader: jrl-umi3218/mc_rtc, src/mc_rbdyn/ForceSensor.cpp, master; Robot.cpp gives it the gravity of constants.h. The
+    order is mass, rpy, com, offset. `rpy` turns the sensor of the model into the real one, here that of a model whose
+    sensor has the axes of the flange. `com` is in the axes of the sensor's parent body, from its origin: here the
+    flange. The offset has the couple first. With g = 9.80665 m/s2 along -z of the world, and p the place of the sensor
+    in the flange:
+
+        force = raw - offset[3:] - mass g          couple = raw - offset[:3] - (com - p) x (mass g), in sensor axes
+
+    White space must follow the last number. The reader stops there.
+    """
+    origin_m, R = settings.p_frame_sensor_m("mc-rtc"), R_frame_sensor(calibration, settings)
+    values = [
+        calibration.weight_N / MC_RTC_G_M_S2,
+        *rpy_rad(R),
+        *numbers(origin_m + R @ calibration.p_sensor_com_m),
+        *numbers(calibration.torque_bias_Nm),
+        *numbers(calibration.force_bias_N),
+    ]
+    notes = (
+        f"The parent body of the force sensor must be the flange ({settings.flange_frame}), with the sensor at "
+        f"({', '.join(map(str, numbers(origin_m)))}) m and its axes. World z must point up.",
+        f"mass is weight / {MC_RTC_G_M_S2:g} m/s2, because mc_rtc multiplies it by that. Old versions have 9.81.",
+    )
+    return Exported("".join(f"{value!r}\n" for value in values), notes)
+
+
+def xarm(calibration: CalibrationResult, _: Settings) -> Exported:
+    """Write the list for `XArmAPI.ft_sensor_cali_load`.
+
+    Reader: xArm-Developer/xArm-Python-SDK, xarm/x3/ft_sensor.py, 1.11 or newer: mass (kg), centre of mass (mm), offsets
+    of force (N) and torque (N·m). The origin of `com` is that of the sensor: with `association_setting_tcp_load`, the
+    SDK adds 32 mm to reach the flange. The formula of the firmware is not public. It is taken to be
+
+        force = raw - offset[:3] - mass g          torque = raw - offset[3:] - com x (mass g)
+
+    with g of the calibration, and a sensor that has the axes of the flange.
+    """
+    ten = [
+        calibration.mass_kg,
+        *numbers(1e3 * calibration.p_sensor_com_m),
+        *numbers(calibration.force_bias_N),
+        *numbers(calibration.torque_bias_Nm),
+    ]
+    notes = (
+        "The centre of mass is in mm. An SDK before 1.11 takes metres.",
+        "The formula of the firmware and the sign of the offsets are not public. Read the sensor without contact in "
+        "two poses before you use them.",
+    )
+    down = gravity_m_s2(calibration)
+    elsewhere = {"set_gravity_direction": numbers(down / np.linalg.norm(down))}
+    return Exported(yaml_text(ten), notes, elsewhere)
+
+
+def franka(calibration: CalibrationResult, settings: Settings) -> Exported:
+    """Write the arguments of `franka::Robot::setLoad`, which are those of the service SetLoad of franka_ros.
+
+    Reader: frankarobotics/libfranka, include/franka/robot.h, 0.8 or newer: mass (kg), centre of mass in flange axes
+    from the flange (m), inertia about the centre of mass (kg m2, column by column). The load is all that the flange
+    carries:
+
+        force on the flange = mass g               torque about the flange = F_x_Cload x (mass g)
+
+    with g along -z of the base, which cannot be changed. The formula of the firmware is not public, nor is its g.
+    """
+    mass_kg, com_m = settings.payload("franka", calibration)
+    document = {"mass": mass_kg, "F_x_Cload": numbers(com_m), "load_inertia": [0.0] * 9}
+    notes = (
+        *settings.assumed,
+        "The inertia was not identified: zeros stand for a point mass. Put values of the CAD model there.",
+        "Franka names the centre of mass F_x_center_load in ROS 1 and center_of_mass in ROS 2.",
+        "The load has no bias. How the controller uses the load is not public: compare O_F_ext_hat_K without "
+        "contact in two poses.",
+    )
+    return Exported(yaml_text(document), notes)
+
+
+def ur_payload(calibration: CalibrationResult, settings: Settings) -> Exported:
+    """Write one statement of URScript that sets the payload.
+
+    Reader: Universal Robots controller, URScript manual 5.10 or newer, set_target_payload(m, cog, inertia): kg, and m
+    in flange axes from the flange. The payload is all that the flange carries:
+
+        force on the flange = m g                  torque about the flange = cog x (m g)
+
+    with g that of `set_gravity`. The formula of the controller is not public. The statement zeroes the sensor of an
+    e-Series arm.
+    """
+    mass_kg, com_m = settings.payload("ur-payload", calibration)
+    cog = ", ".join(_fixed(x) for x in com_m)
+    J = payload_inertia_kg_m2(calibration, mass_kg, np.asarray(com_m), settings.p_flange_sensor_m("ur-payload"))
+    inertia = "0, 0, 0, 0, 0, 0" if J is None else ", ".join(map(_fixed, J[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]))
+    text = f"set_target_payload({_fixed(mass_kg)}, [{cog}], [{inertia}])\n"
+    notes = (
+        *settings.assumed,
+        "The controller zeroes its own force sensor when this runs: keep the tool free and the arm still.",
+        f"{inertia_note(calibration)} Needs PolyScope 5.10; set_payload before that.",
+        "The payload has no bias. How the controller uses it is not public: compare get_tcp_force() without contact in "
+        "two poses.",
+        "set_gravity takes the acceleration away from the earth, in base axes. The mounting in PolyScope sets it too.",
+    )
+    return Exported(text, notes, {"set_gravity": numbers(-gravity_m_s2(calibration))})
+
+
+def _fixed(value: float) -> str:
+    """Write a number without exponent, which the URScript manual does not mention."""
+    return f"{float(value) + 0.0:.12f}"
+
+
+def urdf(calibration: CalibrationResult, settings: Settings) -> Exported:
+    """Write sensor and tool as links, to be included below the flange of a robot.
+
+    Reader: URDF 1.0, ros/urdfdom. The tool link has the frame of the sensor, so that `origin` of `inertial` is the
+    centre of mass in the sensor frame. `rpy` is R = Rz(yaw) Ry(pitch) Rx(roll). With g the gravity of the simulation,
+    in sensor axes:
+
+        force on the sensor = mass g               torque about its origin = origin x (mass g)
+    """
+    origin_m = settings.p_frame_sensor_m("urdf")
+    robot = ET.Element("robot", name=settings.tool_frame)
+    for name in (settings.flange_frame, settings.sensor_frame):
+        ET.SubElement(robot, "link", name=name)
+    inertial = ET.SubElement(ET.SubElement(robot, "link", name=settings.tool_frame), "inertial")
+    ET.SubElement(inertial, "origin", xyz=_words(calibration.p_sensor_com_m.tolist()), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=repr(calibration.mass_kg))
+    J = inertia_kg_m2(calibration)
+    if J is None:
+        inertial.append(ET.Comment(" not identified: zeros stand for a point mass; put values of the CAD model here "))
+    moments = np.zeros((3, 3)) if J is None else J
+    elements = {f"i{'xyz'[i]}{'xyz'[j]}": repr(float(moments[i, j])) for i in range(3) for j in range(i, 3)}
+    ET.SubElement(inertial, "inertia", elements)
+    _fix(
+        robot,
+        settings.flange_frame,
+        settings.sensor_frame,
+        origin_m.tolist(),
+        rpy_rad(R_frame_sensor(calibration, settings)),
+    )
+    _fix(robot, settings.sensor_frame, settings.tool_frame, [0.0] * 3, [0.0] * 3)
+    ET.indent(robot)
+    notes = (
+        inertia_note(calibration),
+        f"Leave out the link {settings.flange_frame} if your robot has it.",
+        "The mass of the sensor itself is not in it, nor its bias.",
+        world_note(settings),
+    )
+    elsewhere = {"gravity of the simulation": numbers(gravity_in_frame_m_s2(calibration, settings))}
+    return Exported(ET.tostring(robot, encoding="unicode") + "\n", notes, elsewhere)
+
+
+def mujoco(calibration: CalibrationResult, settings: Settings) -> Exported:
+    """Write the tool with its sensor as MJCF, and in a comment the parameters of the plugin that removes its weight.
+
+    Readers: MuJoCo, whose element `attach` puts the body into the flange, and ros-controls/mujoco_ros2_control, which
+    looks for the sensors NAME_force and NAME_torque. The plugin is mujoco_ros2_control_plugins/src/
+    fts_grav_comp_plugin.cpp, pull request 308 of September 2026. Without it the simulated sensor shows the weight, as a
+    real one does. With g the gravity of the model, turned into the site of the sensor, the tool at rest reads
+
+        force = mass g                             torque = pos x (mass g)
+
+    and the plugin gives
+
+        force = reading - CoG.mass g               torque = reading - CoG.pos x (CoG.mass g)
+
+    with the reading as the hardware interface gives it, which is minus that of MuJoCo.
+    """
+    com_m = numbers(calibration.p_sensor_com_m)
+    x, y, z, w = quaternion_xyzw(R_frame_sensor(calibration, settings))
+    compensation = {"frame_id": settings.sensor_frame, "CoG": {"pos": com_m, "mass": calibration.mass_kg}}
+    plugin = {"type": "mujoco_ros2_control_plugins/FtsGravCompPlugin", settings.sensor_frame: compensation}
+    parameters = yaml_text({"/**": {"ros__parameters": {"mujoco_plugins": {"fts_grav_comp_plugin": plugin}}}})
+    root = ET.Element("mujoco", model=settings.tool_frame)
+    root.append(
+        ET.Comment(f" parameters of the plugin that removes the weight, for a file of their own:\n{parameters}")
+    )
+    body = ET.SubElement(ET.SubElement(root, "worldbody"), "body", name=settings.tool_frame)
+    body.attrib |= {"pos": _words(settings.p_frame_sensor_m("mujoco").tolist()), "quat": _words([w, x, y, z])}
+    J = inertia_kg_m2(calibration)
+    inertial = ET.SubElement(body, "inertial", pos=_words(com_m), mass=repr(calibration.mass_kg))
+    if J is None:
+        note = " inertia not identified: zeros stand for a point mass; put values of the CAD model here "
+        body.insert(0, ET.Comment(note))
+        inertial.set("diaginertia", "0 0 0")
+    else:
+        inertial.set("fullinertia", _words(J[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].tolist()))
+    ET.SubElement(body, "site", name=settings.sensor_frame)
+    sensors = ET.SubElement(root, "sensor")
+    for kind in ("force", "torque"):
+        ET.SubElement(sensors, kind, name=f"{settings.sensor_frame}_{kind}", site=settings.sensor_frame)
+    ET.indent(root)
+    notes = (
+        f"Attach the body {settings.tool_frame} to {settings.flange_frame}. A simulated sensor has no bias.",
+        "Plain MuJoCo sensors have the opposite sign: negate sensordata, as the hardware interface of "
+        "mujoco_ros2_control does, to get the wrench on the sensor.",
+        f"{inertia_note(calibration)} The mass of the sensor itself is not in it.",
+        "The plugin FtsGravCompPlugin needs a mujoco_ros2_control newer than 0.1.2 (pull request 308, September 2026).",
+        world_note(settings),
+    )
+    elsewhere = {"option gravity": numbers(gravity_in_frame_m_s2(calibration, settings))}
+    return Exported(ET.tostring(root, encoding="unicode") + "\n", notes, elsewhere)
+
+
+def _fix(robot: ET.Element, parent: str, child: str, xyz: list[float], rpy: list[float]) -> None:
+    joint = ET.SubElement(robot, "joint", name=f"{parent}_to_{child}", type="fixed")
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=child)
+    ET.SubElement(joint, "origin", xyz=_words(xyz), rpy=_words(rpy))
+
+
+def _words(values: list[float]) -> str:
+    return " ".join(repr(value) for value in numbers(values))

@@ -1,0 +1,190 @@
+"""What several targets share: numbers, YAML and header; gravity, rotations and frames in their conventions."""
+
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from math import pi, radians
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult
+from ftcalib.files import JSON
+from ftcalib.model import Array
+from ftdrive import __version__
+from ftdrive.errors import PlanRefused
+from ftdrive.exports.formats import Comment
+from ftdrive.exports.settings import Settings
+from ftdrive.planning.plan import Plan
+from ftdrive.runs.verification_record import VerificationRecord, marks_of
+
+_FASTEST_RAD_S, _FASTEST_RAD_S2 = pi + 1e-9, radians(300) + 1e-9
+_SPELLED = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"})
+
+
+def require_usable(plan: Plan) -> None:
+    """Raise `PlanRefused` for sweeps, placeholders, moves that are not proven clear, and values no arm can follow."""
+    if plan.sweep is not None:
+        raise PlanRefused("this plan is a sweep, which no other program can follow: export the plan of a tour")
+    if not plan.measured:
+        raise PlanRefused(
+            "tool, planes and boxes of this plan are not marked as measured: "
+            "measure them, set measured = true in [workcell], and make a new plan"
+        )
+    if not plan.certified:
+        raise PlanRefused("a move of the plan is not proven clear: it is not exported")
+    angles = [angle for step in plan.steps for angle in step.q_rad]
+    if (
+        any(len(step.q_rad) != 6 for step in plan.steps)
+        or not all(abs(angle) <= 2 * pi + 1e-9 for angle in angles)
+        or not all(0 < step.speed_rad_s <= _FASTEST_RAD_S for step in plan.steps)
+        or not 0 < plan.acceleration_rad_s2 <= _FASTEST_RAD_S2
+    ):
+        raise PlanRefused("the plan holds a joint angle, speed or acceleration that no arm can follow: make a new plan")
+
+
+def plain(text: str) -> str:
+    """Reduce a text to printable ASCII without quotes and backslashes, because URScript strings have no escapes."""
+    return "".join(c if " " <= c <= "~" and c not in "\"'\\" else "?" for c in text.translate(_SPELLED))
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """What one target gets."""
+
+    text: str
+    notes: tuple[str, ...] = ()
+    """What the user of the target must know; sentences."""
+    elsewhere: Mapping[str, JSON] = field(default_factory=dict)
+    """What the target reads from another place, by its name there."""
+
+
+def numbers(values: ArrayLike) -> list[float]:
+    """Return plain floats without a negative zero."""
+    return [float(value) + 0.0 for value in np.ravel(values)]
+
+
+def xyz(values: ArrayLike) -> dict[str, float]:
+    """Return a vector as ROS messages have it."""
+    return dict(zip("xyz", numbers(values), strict=True))
+
+
+def yaml_text(document: Mapping[str, Any] | list[float]) -> str:
+    """Return YAML that keeps every bit of a float and the order of the keys."""
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10**6)
+
+
+def made_by(calibration: CalibrationResult, verification: VerificationRecord | None) -> str:
+    """Say which calibration this is, when it was made and last verified, and by which version."""
+    made = calibration.provenance.get("created_utc")
+    date = made if isinstance(made, str) else "at an unknown time"
+    verified = "not verified"
+    if verification is not None:
+        verified = "last verified" if verification.passed else "VERIFICATION FAILED"
+        verified += f" {verification.created_utc.isoformat()}"
+    marks = "".join(f"{mark} " for mark in marks_of(calibration))
+    return f"{marks}ftdrive calibration {calibration.id}, made {date}, {verified}; made by ftdrive {__version__}"
+
+
+def with_header(text: str, comment: Comment, lines: Iterable[str]) -> str:
+    """Add comment lines, reduced to printable ASCII."""
+    clean = [plain(line) for line in lines]
+    if comment == "none":
+        return text
+    if comment == "<!-- -->":
+        inside = "\n".join(f"  {line.replace('--', '- -')}" for line in clean)
+        return f"<!--\n{inside}\n-->\n{text}"
+    head = "".join(f"# {line}\n" for line in clean)
+    return text + head if comment == "# at the end" else head + text
+
+
+def gravity_m_s2(calibration: CalibrationResult) -> Array:
+    """Return gravity (3,) in axes of the controller's base, pointing down, m/s²; along -z if nothing hangs."""
+    if calibration.mass_kg == 0.0:
+        return np.array([0.0, 0.0, -calibration.g_m_s2])
+    return calibration.gravity_force_base_N / calibration.mass_kg
+
+
+def gravity_in_frame_m_s2(calibration: CalibrationResult, settings: Settings) -> Array:
+    """Return gravity (3,) in axes of the frame `settings.base_frame`, m/s²."""
+    return settings.R_frame_base @ gravity_m_s2(calibration)
+
+
+def R_frame_sensor(calibration: CalibrationResult, settings: Settings) -> Array:
+    """Return the orientation (3, 3) of the sensor in the frame `settings.flange_frame`."""
+    return settings.R_frame_flange @ calibration.R_flange_sensor
+
+
+def rpy_rad(R: Array) -> list[float]:
+    """Return a rotation as URDF has it: roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # at a pitch of 90 degrees roll is set to zero
+        return numbers(Rotation.from_matrix(R).as_euler("xyz"))
+
+
+def quaternion_xyzw(R: Array) -> list[float]:
+    """Return a rotation as a quaternion, scalar last and not negative."""
+    return numbers(Rotation.from_matrix(R).as_quat(canonical=True))
+
+
+def world_note(settings: Settings) -> str:
+    """Say in which axes gravity is, for simulations."""
+    return f"Gravity is in axes of {settings.base_frame}, {settings.base_axes}: turn it if those of the world differ."
+
+
+def frame_note(calibration: CalibrationResult, settings: Settings) -> str:
+    """Say how the robot model must turn the sensor frame, for targets that look it up there."""
+    rpy = ", ".join(str(angle) for angle in rpy_rad(R_frame_sensor(calibration, settings)))
+    return (
+        f"The robot model must turn {settings.sensor_frame} against {settings.flange_frame} by roll, pitch, yaw = "
+        f"({rpy}) rad: the formats urdf and static-transform write it. {settings.base_frame} must have the axes of "
+        f"{settings.base_axes}."
+    )
+
+
+def inertia_kg_m2(calibration: CalibrationResult) -> Array | None:
+    """Return the inertia (3, 3) about the centre of mass, sensor axes; None if motion did not identify one of a body.
+
+    A body has positive moments, none larger than the sum of the others.
+    """
+    if calibration.motion is None:
+        return None
+    J = calibration.motion.inertia_kg_m2
+    low, middle, high = np.linalg.eigvalsh(J)
+    return J if low > 0 and high <= low + middle else None
+
+
+def payload_inertia_kg_m2(
+    calibration: CalibrationResult, mass_kg: float, p_flange_com_m: Array, p_flange_sensor_m: Array
+) -> Array | None:
+    """Return the inertia (3, 3) of all that the flange carries, about its centre of mass, flange axes; None as above.
+
+    The sensor itself counts as a point at its centre of mass.
+    """
+    J = inertia_kg_m2(calibration)
+    if J is None:
+        return None
+    Q, tool_kg = calibration.R_flange_sensor, calibration.mass_kg
+    tool_m = p_flange_sensor_m + Q @ calibration.p_sensor_com_m - p_flange_com_m
+    total, sensor_kg = Q @ J @ Q.T + tool_kg * _steiner(tool_m), mass_kg - tool_kg
+    if sensor_kg > 0:
+        total += sensor_kg * _steiner(-tool_kg / sensor_kg * tool_m)
+    return np.asarray(total)
+
+
+def _steiner(p_m: Array) -> Array:
+    """Inertia per mass (3, 3) of a point about the origin."""
+    return np.asarray(p_m @ p_m * np.eye(3) - np.outer(p_m, p_m))
+
+
+def inertia_note(calibration: CalibrationResult) -> str:
+    """Say whether the inertia was identified."""
+    motion = calibration.motion
+    if motion is None or inertia_kg_m2(calibration) is None:
+        why = "" if motion is None else " well enough"
+        return f"The inertia was not identified{why}: zeros stand for a point mass. Take the values of a CAD model."
+    sigma = 1e3 * float(np.sqrt(np.diag(motion.covariance)[15:21].max()))
+    return f"The inertia was identified from motion, with a sigma of {sigma:.2g} g·m2 at most."

@@ -1,1 +1,0 @@
-"""The compensated wrench as topics of ROS 2."""
