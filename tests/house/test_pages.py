@@ -91,6 +91,16 @@ def test_pages_that_the_code_names_exist() -> None:
     assert [page for page in named if not (ROOT / page).exists()] == []
 
 
+def test_decisions_have_a_number_each_and_stay_out_of_the_search() -> None:
+    pages = {page: page.read_text(encoding="utf-8") for page in (ROOT / "docs/decisions").glob("*.md")}
+    assert [page.name for page, text in pages.items() if not text.startswith("---\nnosearch: true\n---\n")] == []
+    anchors = [int(number) for text in pages.values() for number in re.findall(r"^\(decision-(\d{4})\)=", text, re.M)]
+    headings = [int(number) for text in pages.values() for number in re.findall(r"^## (\d+)\. .* \(2\d", text, re.M)]
+    assert len(anchors) == len(set(anchors)) > 100
+    assert len(headings) == len(set(headings))
+    assert set(headings) <= set(anchors)
+
+
 def test_no_merge_was_left_half_done() -> None:
     assert len(PAGES) > 5
     assert [page for page in PAGES if re.search(r"^(<{7}|>{7}) ", page.read_text(encoding="utf-8"), re.MULTILINE)] == []

@@ -1,6 +1,6 @@
 """A node of ROS 2 and its subscriptions.
 
-docs/decisions/0179-ros-2-through-rclpy-alone.md gives the reason.
+Reason: docs/decisions/sensors.md, 179.
 """
 
 import importlib

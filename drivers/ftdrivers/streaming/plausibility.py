@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 _FROZEN_S = 0.2
 _FROZEN_SAMPLES = (20, 50)
 """A sensor is frozen after identical readings for this time, if they are as many as arrive in it, within these bounds.
-docs/decisions/0038-frozen-means-0-2-s-of-identical-readings-and-at-least-20.md gives the reason."""
+Reason: docs/decisions/sensors.md, 38."""
 _CLOCK_JUMP_S = 0.5
 """The most that the device's clock may gain on ours between two blocks; a late block only makes it fall behind."""
 _CLOCK_DRIFT = 0.02

@@ -163,7 +163,7 @@ class CompensatedStream(ProcessedStream):
     def station(self) -> Station:
         """The emulated cell, such as `station.control(do="push", wrench=[0, 0, -5, 0, 0, 0], seconds=1)`.
 
-        docs/reference/emulated-cell.md lists the requests. Raises `ConfigError` for a real cell.
+        docs/contributing/emulated-cell.md lists the requests. Raises `ConfigError` for a real cell.
         """
         if not isinstance(self._given, Station):
             raise ConfigError("this is a real cell: only a stream with simulate=True has a station")

@@ -1,7 +1,7 @@
 """Recordings of other programs in ROS 2: rosbag2 folders, and MCAP files without our header. Needs the extra `ros2`.
 
-`compensate` reads them as two CSV files, as it does recordings of any other program: decision 181. `solve`
-takes the same numbers without files, so that both agree with the CSV files of the same data.
+`compensate` reads them as two CSV files, as it does recordings of any other program (docs/decisions/recordings.md,
+181). `solve` takes the same numbers without files, so that both agree with the CSV files of the same data.
 """
 
 import struct
