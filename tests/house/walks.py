@@ -30,7 +30,7 @@ WALKS = {
         ftdrive.cell.devices               build_sensor               makes the driver of a URL
         ftdrive.cell.devices               build_arm                  makes the driver of the arm
         ftdrivers.ur.arm                   UrArm.open                 connects, still without control
-        ftdrive.session.identity           require_devices            compares serial numbers
+        ftdrive.session.session            _require_devices           compares serial numbers
         ftdrive.session.along_plan         AlongPlan.take             goes through the stages of a session
         ftdrive.planning.cell_plan         certifier_for              describes arm, tool and surroundings
         ftdrive.session.task               Calibrating.plan           plans for the method
@@ -38,9 +38,9 @@ WALKS = {
         ftdrive.planning.planner           plan_tour                  finds poses, proves each move
         ftdrive.planning.approach          plan_approach              proves the way to the first pose
         ftdrive.session.preflight          check                      refuses a cell that is not ready
-        ftcalib.data.averaging_time        averaging_time             chooses the time at each pose
+        ftcalib.data.dwell_mean            averaging_time             chooses the time at each pose
         ftdrive.session.watchdog           Watcher                    starts the thread of the guards
-        ftdrive.session.safety_questions   SafetyQuestions.ask        asks what no device reports
+        ftdrive.session.along_plan         _SafetyQuestions.ask       asks what no device reports
         ftdrive.session.recovery           GuardedCell                leads from a stop back to motion
         ftdrive.session.tour               Tour.run                   goes from stop to stop
         ftdrive.session.tour               Tour._move                 first move, after a typed word
@@ -71,7 +71,7 @@ WALKS = {
         ftdrive.terminal.live.summary      Summary.view               means, peaks and history so far
         ftdrive.terminal.live.layout       frame                      places the panels
         ftdrive.terminal.live.panels       table                      writes numbers with their digits
-        ftdrive.terminal.live_screen       Canvas.show                sends the lines that changed
+        ftdrive.terminal.live_screen       _Canvas.show               sends the lines that changed
     """,
     "From poses to a calibration": """
         ftdrive.commands.solve                    solve                    reads the options
@@ -80,36 +80,36 @@ WALKS = {
         ftcalib.routine                           dataset_from             makes arrays of records
         ftcalib.data.dataset                      read_csv                 reads poses of another program
         ftcalib.solver                            solve                    chooses, fits, judges
-        ftcalib.assessment.observability          require_orientations     refuses poses that are alike
-        ftcalib.data.pooling                      pooled_covariance        gives each pose its weight
+        ftcalib.judge.observability               require_orientations     refuses poses that are alike
+        ftcalib.data.dataset                      pooled_covariance        gives each pose its weight
         ftcalib.likelihood.fit                    fit                      maximises the likelihood
         ftcalib.likelihood.session                Session                  holds what all steps share
         ftcalib.likelihood.explanation            explain                  looks for what explains the noise
         ftcalib.likelihood.descent                Descent.minima           descends from every minimum
         ftcalib.likelihood.rotation_minima        minima                   finds those of the force cost
-        ftcalib.likelihood.component_selection    select                   adds components, drops others
+        ftcalib.likelihood.explanation            select                   adds components, drops others
         ftcalib.likelihood.variance_components    maximise                 estimates their variances
         ftcalib.likelihood.fit                    fit_of                   adds covariance and response
-        ftcalib.likelihood.component_selection    rivals                   finds other explanations
-        ftcalib.assessment.verdict                judge                    makes findings and verdict
-        ftcalib.assessment.faults                 faults                   names mistakes in the data
-        ftcalib.assessment.described_cell         tool                     compares with the described tool
+        ftcalib.likelihood.explanation            rivals                   finds other explanations
+        ftcalib.judge.verdict                     judge                    makes findings and verdict
+        ftcalib.judge.faults                      faults                   names mistakes in the data
+        ftcalib.judge.described_cell              tool                     compares with the described tool
         ftcalib.result                            CalibrationResult        keeps all with its provenance
         ftdrive.terminal.report                   print_result             prints estimates and verdict
     """,
     "From a recording to a calibration": """
         ftdrive.commands.solve                    solve                    reads the options
         ftdrive.recording.in_motion               solve_recording          chooses the reader
-        ftdrive.recording.in_motion               read_in_motion           goes through the file once
+        ftdrive.recording.in_motion               _read_in_motion          goes through the file once
         ftdrive.recording.files                   RecordingReader          reads piece by piece
         ftcalib.motion.samples                    Means.add                keeps means of 10 ms
         ftcalib.motion.solve                      solve_motion             chooses, fits, judges
         ftcalib.motion.samples                    rows_of                  makes rows of both streams
         ftcalib.motion.estimate                   rough_delay              finds the delay to start from
         ftcalib.motion.estimate                   fit                      fits load, delay and inertia
-        ftcalib.motion.noise                      Noise.of                 takes the noise from residuals
+        ftcalib.motion.model                      Noise.of                 takes the noise from residuals
         ftcalib.motion.model                      wrench_of                predicts a load in motion
-        ftcalib.assessment.verdict                judge                    judges rows as poses
+        ftcalib.judge.verdict                     judge                    judges rows as poses
         ftcalib.findings                          ordered                  ranks the findings
         ftcalib.result                            CalibrationResult        keeps all with its provenance
         ftdrive.terminal.report                   print_result             prints estimates and verdict

@@ -134,7 +134,7 @@ FEWEST = 6
 """Verifications: fewer do not show their scatter."""
 SIGNIFICANT = 1e-5
 """Largest p-value of an onset that counts, in one component at one look. It allows for the search over onsets, six
-components and 365 looks a year: false alarms and delays in simulation are in docs/reference/figures/fleet.md."""
+components and 365 looks a year: false alarms and delays in simulation are in docs/contributing/figures/fleet.md."""
 LEAST_DAYS = 7.0
 """A drift has gone on for so long: a sudden change of the last days is no drift yet."""
 NEAR_DAYS = 14.0
