@@ -13,8 +13,8 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import Final, Protocol, TypeVar
 
 Heard = TypeVar("Heard")
+# After a wait that ends this late the computer was busy, and something may have arrived meanwhile.
 _OVERSLEPT_S: Final = 0.002
-"""After a wait that ends this late the computer was busy, and something may have arrived meanwhile."""
 
 
 class Waitable(Protocol):
@@ -62,6 +62,7 @@ class Clock(ABC):
 
         The last turn finds what arrived in time, however late this thread is.
         """
+        # After its deadline a wait looks once more, because this process may be late and not the device.
         end_ns = self.now_ns() + round(duration_s * 1e9)
         while (left_ns := end_ns - self.now_ns()) > 0:
             yield left_ns / 1e9
@@ -143,6 +144,7 @@ class Follower(threading.Thread):
 
     def start(self) -> None:
         """Start the thread and wait until it keeps up."""
+        # An emulated cell waits for this thread, so a busy computer makes the cell slow, never late.
         super().start()
         self._decided.wait()
         if self._refusal is not None:

@@ -34,8 +34,8 @@ SENSORS: Mapping[str, str] = {
 }
 ARMS: Mapping[str, str] = {"ros2": "ftdrivers.ros2.arm:Ros2Arm", "ur": "ftdrivers.ur.arm:UrArm"}
 
+# The optional part of ftdrive that installs a library.
 _EXTRAS: Mapping[str, str] = {"pynetft": "netft"}
-"""The optional part of ftdrive that installs a library."""
 
 _EXAMPLES = (
     "ati-can://can0?bitrate=250000&base=0x20",

@@ -35,17 +35,19 @@ log = logging.getLogger(__name__)
 
 _TRANSACTION_S = 0.1
 _ATTEMPTS = 3
+# A poll takes 1 to 3 ms, more on a busy computer. A lost frame must not make the stream stale.
 _POLL_S = 0.05
-"""A poll takes 1 to 3 ms, more on a busy computer. A lost frame must not make the stream stale."""
+# Read after the deadline, because on a busy host often this process is late, not the reply.
 _LATE_FRAMES = 32
-"""Read after the deadline, because on a busy host often this process is late, not the reply."""
+# After a missed poll the bus must be silent, so that a late half is not paired with the next reading.
 _QUIET_S = 0.01
+# How long a reading whose halves came in the wrong order waits for a contradicting frame.
 _STRAGGLER_S = 0.004
-"""How long a reading whose halves came in the wrong order waits for a contradicting frame."""
 _ANOTHER_SLOT = "choose another slot, slot=0 to 15 in its address"
+# The manual fixes 1 000 000 counts per unit for firmware that does not report them.
 _MILLION = (1_000_000, 1_000_000)
+# About what a 250 kbit/s bus carries; faster polls of a faster bus or an emulator would load a CPU core.
 _PERIOD_S = 1e-3
-"""About what a 250 kbit/s bus carries; faster polls of a faster bus or an emulator would load a CPU core."""
 
 
 class AtiCanSensor(StreamingSensor):
@@ -137,6 +139,7 @@ class AtiCanSensor(StreamingSensor):
         )
 
     def _read_block(self) -> FtSamples:
+        # The next poll leaves before this reply is decoded: a slow NETCANOEM is then polled as fast as it can reply.
         if not self._asked:
             self._clock.sleep(self._next_poll_s - self._clock.now_s())
             self._poll()
@@ -172,6 +175,7 @@ class AtiCanSensor(StreamingSensor):
         self._bus.close()
 
     def _select_slot(self) -> None:
+        # After a watchdog reset the sensor is back at slot 0, and two missed polls in a row may be such a reset.
         echo = codec.decode_slot(*self._ask(Op.SELECT_SLOT, self._slot))
         if echo != self._slot:
             raise ConnectError(
@@ -215,6 +219,7 @@ class AtiCanSensor(StreamingSensor):
 
     def _judge(self, reading: codec.GaugeReading) -> None:
         """Raise when a reading is unusable; log other status bits once."""
+        # A healthy unit on a shared bus had bit 14 set, so bits 0, 8, 14 and 15 are logged once and no fault.
         status = reading.status
         if status & codec.CRITICAL:
             raise DeviceFault(f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}", UNUSABLE)

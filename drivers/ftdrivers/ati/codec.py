@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ftdrivers.errors import ProtocolError
 from ftdrivers.interfaces import Array
 
+# Firmware before 3.7 reports neither units nor counts per unit.
 COUNTS_PER_UNIT_SINCE = (3, 7)
 """First firmware that answers `COUNTS_PER_UNIT` and `UNIT_CODES`; older ones use 1 000 000 for both."""
 
@@ -60,6 +61,7 @@ STATUS_BITS: Mapping[int, str] = {
     15: "any error",
 }
 WATCHDOG_RESET = 0x0001
+# All bits but watchdog reset, configuration, CAN and the summary: a healthy unit on a shared bus had the CAN bit set.
 CRITICAL = 0x18FE
 """Status bits with which the data is unusable. The device keeps sending, so the host has to check them."""
 

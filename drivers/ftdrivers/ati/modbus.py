@@ -26,6 +26,7 @@ START_STREAM, STORAGE = 0x46, 0x6A
 
 GAINS, OFFSETS, STATUS = 0x0000, 0x0006, 0x001D
 
+# Only a jamming sequence stops the stream, which outlives the program that started it.
 JAM = b"\xaa" * 14
 """Any 14 bytes stop a running stream; these are not a Modbus frame."""
 
@@ -136,6 +137,7 @@ class Records:
 
 
 _RECORD = np.dtype([("gauges", ">i2", 6), ("last", "u1")])
+# The record has the gauges as G0 G2 G4 G1 G3 G5.
 _NATURAL_ORDER = np.array([0, 3, 1, 4, 2, 5])
 
 
@@ -173,6 +175,8 @@ def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, boo
     slipped : bool
         All bytes behind `settled` are misaligned.
     """
+    # There is no sync byte, and after a slip one record in 128 passes the sum: three damaged ones in a row mean a
+    # slip, and an intact one between two damaged ones is dropped.
     bad = ~intact
     n = len(bad)
     runs = np.flatnonzero(bad[:-2] & bad[1:-1] & bad[2:]) if n >= 3 else np.zeros(0, np.intp)

@@ -30,20 +30,23 @@ from ftdrivers.wires.framing import describe_status
 
 log = logging.getLogger(__name__)
 
+# A longer silence ends the stream: a sensor set to less than 10 Hz is too slow for this driver.
 _SILENCE_S = 0.3
-"""A longer silence ends the stream: a sensor set to less than 10 Hz is too slow for this driver."""
+# The request to start is a datagram, which can be lost.
 _STARTS = 5
-"""The request to start is a datagram, which can be lost."""
 _HTTP_S = 1.0
+# pynetft's fail-stop mode ends at one duplicate or late datagram; its reconnecting mode with so long a delay never
+# acts before this driver.
 _NEVER_S = 3600.0
+# In real time, for the first sample and then for those after it.
 _WAIT_S, _BATCH_S = 0.05, 0.002
-"""In real time, for the first sample and then for those after it."""
+# More than 2 s at 7 kHz. A full queue drops the oldest sample, whose number is then missing.
 _QUEUE = 16_384
-"""More than 2 s at 7 kHz. A full queue drops the oldest sample, whose number is then missing."""
+# Per N and per N·m, fixed by the manual: an OnRobot converter does not report them.
 _ONROBOT_COUNTS = (10_000, 100_000)
-"""Per N and per N·m, fixed by the manual: an OnRobot converter does not report them."""
 _DISTANCES_M = {"in": 0.0254, "ft": 0.3048, "mm": 0.001, "cm": 0.01, "m": 1.0}
 
+# pynetft ends the stream at every other status, so the Axia's warning of a gauge near its limit is a fault.
 MONITOR_LATCHED = 0x80010000
 """A monitored threshold was crossed earlier; the data is valid."""
 

@@ -29,12 +29,14 @@ from ftdrivers.wires.serial_port import SerialPort
 log = logging.getLogger(__name__)
 
 _BAUD = 1_250_000
+# The longest wait of one read, and the silence that proves that a stream has stopped.
 _READ_S = 0.02
-"""The longest wait of one read, and the silence that proves that a stream has stopped."""
 _REPLY_S = 0.1
 _SILENCE_S = 0.2
+# Larger batches cost less of a core and delay the guards; evenly spread stamps would be invented precision.
+# The least that one read waits for, 4 ms of stream: few wake-ups, and far less than a port buffers.
 _BATCH_BYTES = 28 * modbus.RECORD_SIZE
-"""The least that one read waits for, 4 ms of stream: few wake-ups, and far less than a port buffers."""
+# An error bit without a bit in the word is a damaged byte; three in a row are not.
 _MAX_RESTARTS = 3
 
 
@@ -62,12 +64,12 @@ class AtiSerialSensor(StreamingSensor):
         self._calibration_index = calibration
         self._port = SerialPort(self.name, port, _BAUD, even_parity=True, read_s=_READ_S, clock=clock)
         self._buffer = bytearray()
+        # Places in the buffer of bytes with wrong parity.
         self._damaged: list[int] = []
-        """Places in the buffer of bytes with wrong parity."""
         self._seq = self._status = self._restarts = 0
         self._slipped = False
+        # Until a restarted stream delivers: when the old one last delivered.
         self._last_good_ns: int | None = None
-        """Until a restarted stream delivers: when the old one last delivered."""
 
     @classmethod
     def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
@@ -107,6 +109,7 @@ class AtiSerialSensor(StreamingSensor):
 
     def _set_gauges(self, gains: Sequence[int], offsets: Sequence[int]) -> None:
         """Write the active gains and offsets where they are not those of the calibration in use."""
+        # Gains and offsets are volatile: at power-up they are those of the lowest calibration in force.
         active = self._ask(modbus.read_registers(modbus.GAINS, len(gains) + len(offsets)))
         if active == struct.pack(f">{len(gains) + len(offsets)}H", *gains, *offsets):
             return
@@ -208,6 +211,7 @@ class AtiSerialSensor(StreamingSensor):
         self._damaged.clear()
 
     def _restart(self) -> None:
+        # A restart takes 40 ms; `seq` and `lost` are then estimates from the clock at 7 kHz.
         self._restarts += 1
         if self._restarts > _MAX_RESTARTS:
             raise ProtocolError(
@@ -230,6 +234,7 @@ class AtiSerialSensor(StreamingSensor):
 
     def _judge_status(self, status: int) -> None:
         """Raise when the data is unusable; log other status bits once."""
+        # The RS-485 port of a NETCANOEM without CAN has bit 15 ("any error") set all the time.
         new, self._status = status & ~self._status, status
         text = describe_status(status, modbus.STATUS_BITS)
         if status & modbus.CRITICAL:

@@ -28,19 +28,19 @@ from ftdrivers.wires.serial_port import SerialPort
 
 log = logging.getLogger(__name__)
 
+# Of the maker's examples, and the default of its ROS 2 driver.
 _USUAL_BAUDS = (460_800, 230_400)
-"""Of the maker's examples, and the default of its ROS 2 driver."""
+# The median of their spacing is the sample period.
 _FIRST_FRAMES = 8
-"""The median of their spacing is the sample period."""
+# The longest wait for a sensor that boots.
 _BOOT_S = 5.0
-"""The longest wait for a sensor that boots."""
+# More than the boot text: so many without an intact frame are of another baud rate or format.
 _NOISE_BYTES = 40 * codec.FRAME_SIZE
-"""More than the boot text: so many without an intact frame are of another baud rate or format."""
+# A port that is closed for less may not restart the sensor, which then prints no boot text.
 _CLOSED_S = 0.1
-"""A port that is closed for less may not restart the sensor, which then prints no boot text."""
 _REPLY_S = 1.0
+# The first ones are not heard while the sensor boots.
 _ATTEMPTS = 5
-"""The first ones are not heard while the sensor boots."""
 _CLOCK = 1 << 32
 
 
@@ -72,12 +72,12 @@ class BotaSensor(StreamingSensor):
         if sinc is not None and not 64 <= sinc <= 2048:
             raise ValueError(f"sinc is {sinc}; choose 64 to 2048")
         bauds = _USUAL_BAUDS if baud is None else (baud,)
+        # The one that was opened last comes first.
         self._ports = [(baud, SerialPort(self.name, port, baud, clock=clock)) for baud in bauds]
-        """The one that was opened last comes first."""
         self._port = self._ports[0][1]
         self._sinc = sinc
+        # What has arrived since the port was opened, before the first frames.
         self._text = b""
-        """What has arrived since the port was opened, before the first frames."""
         self._temperature_C = math.nan
 
     @classmethod
@@ -133,10 +133,12 @@ class BotaSensor(StreamingSensor):
         )
 
     def _disconnect(self) -> None:
+        # The sensor is left streaming, as it was found.
         self._port.close()
 
     def _find(self) -> list[codec.Frame]:
         """Open the port at the baud rate of the sensor, configure it if requested, and return its first frames."""
+        # The boot text is not waited for, because a sensor that runs already sends none.
         found: list[str] = []
         for baud, port in tuple(self._ports):
             self._port, self._text, self._frames = port, b"", codec.deframer()
@@ -157,6 +159,7 @@ class BotaSensor(StreamingSensor):
         )
 
     def _configure(self, baud: int, sinc: int) -> None:
+        # Only what the address requests is changed; an unusual mode needs ?sinc=512 once.
         self._command(codec.ENTER_SETUP)
         if not codec.find_identity(self._text).serial:  # it has not just booted
             with contextlib.suppress(DeviceTimeout):

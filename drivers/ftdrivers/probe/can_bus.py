@@ -22,14 +22,14 @@ from ftdrivers.robotous import can as robotous_can
 from ftdrivers.robotous import codec as robotous
 from ftdrivers.wires.can_bus import CanBus
 
+# Ten samples of the slowest Robotous, and about the slowest usual heartbeat.
 _LISTEN_S = 1.0
-"""Ten samples of the slowest Robotous, and about the slowest usual heartbeat."""
 _REPLY_S = 0.25
+# So many in a row and in order identify a sensor.
 _ENOUGH_SAMPLES = 5
-"""So many in a row and in order identify a sensor."""
 
+# Nodes of CANopen. On their bus every lower identifier may be a command, even one that is silent now.
 _HEARTBEATS = frozenset(range(0x701, 0x780))
-"""Nodes of CANopen. On their bus every lower identifier may be a command, even one that is silent now."""
 
 Frame = tuple[int, bytes]
 
@@ -38,8 +38,8 @@ Frame = tuple[int, bytes]
 class _Known:
     name: str
     url: str
+    # Identifiers that must be silent before the sensor is asked.
     must_be_silent: AbstractSet[int]
-    """Identifiers that must be silent before the sensor is asked."""
     shows_itself: Callable[[Sequence[Frame]], str | None]
     ask: Callable[[CanBus, Clock], str | None]
 

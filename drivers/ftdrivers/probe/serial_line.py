@@ -21,10 +21,10 @@ from ftdrivers.wires.serial_port import SerialPort
 _LISTEN_S = 0.25
 _REPLY_S = 0.25
 _BOOT_S = 2.5
+# A port that is closed for less may not restart the sensor.
 _CLOSED_S = 0.1
-"""A port that is closed for less may not restart the sensor."""
+# So many with a right checksum identify a stream.
 _ENOUGH_FRAMES = 5
-"""So many with a right checksum identify a stream."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +44,8 @@ class _Known:
     even_parity: bool
     streams: Callable[[bytes], bool]
     request: bytes | None = None
+    # What the device reports about itself; raises `ProtocolError`.
     reply: Callable[[bytes], str] | None = None
-    """What the device reports about itself; raises `ProtocolError`."""
 
 
 def probe(port: str, clock: Clock = REAL) -> Answer | None:
@@ -105,8 +105,8 @@ def _ati_streams(data: bytes) -> bool:
     return False
 
 
+# Serial and part number of the first stored calibration.
 _ATI_REQUEST = modbus.read_registers(modbus.calibration_reads(1)[0][0], 20)
-"""Serial and part number of the first stored calibration."""
 _ROBOTIQ_REQUEST = robotiq.read_registers(robotiq.SERIAL, 4)
 _ROBOTOUS_REQUEST = robotous.encode_frame(robotous.encode(robotous.Command.MODEL))
 

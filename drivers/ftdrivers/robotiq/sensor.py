@@ -21,10 +21,10 @@ from ftdrivers.wires.serial_port import SerialPort
 
 _BAUD = 19_200
 _REPLY_S = 0.2
+# The silence that proves that a stream has stopped, and the longest wait for it.
 _SILENCE_S, _STOP_S = 0.05, 1.0
-"""The silence that proves that a stream has stopped, and the longest wait for it."""
+# Around 62.5 Hz, one delivery in each 16 ms of an FTDI adapter's latency timer.
 _LATENT_RATE_Hz = (55.0, 70.0)
-"""Around 62.5 Hz, one delivery in each 16 ms of an FTDI adapter's latency timer."""
 
 
 class RobotiqFt300(StreamingSensor):

@@ -22,10 +22,10 @@ from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 PORT = 63351
 _CONNECT_S = 2.0
 _RECEIVE_BYTES = 65536
+# (6,) N and N·m: the end of the sensor's 16 bits. The URCap's zero may hide it.
 _END = 32_767 / np.array(codec.COUNTS_PER_UNIT)
-"""(6,) N and N·m: the end of the sensor's 16 bits. The URCap's zero may hide it."""
+# No reading is longer.
 _MOST_BYTES = 512
-"""No reading is longer."""
 
 
 class Readings:

@@ -15,14 +15,14 @@ from ftdrivers.robotous.codec import Field
 from ftdrivers.robotous.sensor import RobotousSensor
 from ftdrivers.wires.can_bus import CanBus
 
+# The halves of a field follow each other directly. Between two fields lies this silence, or half a period.
 _SILENCE_S = 0.002
-"""The halves of a field follow each other directly. Between two fields lies this silence, or half a period."""
+# The sensor may be slower than its rate by this fraction: manual and vendor's header differ by 0.1 on one rate.
 _DRIFT = 0.12
-"""The sensor may be slower than its rate by this fraction: manual and vendor's header differ by 0.1 on one rate."""
+# Fraction of a period by which the host may be late when it has all fields.
 _LATE = 0.5
-"""Fraction of a period by which the host may be late when it has all fields."""
+# Fraction of a period by which the clock may be late when it counts missing fields.
 _EARLY = 0.25
-"""Fraction of a period by which the clock may be late when it counts missing fields."""
 _MOST_WAITING = 1000
 
 
@@ -54,16 +54,16 @@ class Halves:
         self._period_ns = period_s * 1e9
         self._late_ns = late_s * 1e9
         self._number = 0
+        # Arrival of the field `_number`.
         self._clock_ns: float | None = None
-        """Arrival of the field `_number`."""
         self._first = b""
+        # Fields since then, which the clock has not confirmed yet.
         self._waiting: list[Field] = []
-        """Fields since then, which the clock has not confirmed yet."""
+        # How many of them arrived late or after a loss.
         self._doubtful = 0
-        """How many of them arrived late or after a loss."""
         self._in_turn = True
+        # Whether the clock is valid for these fields: none was out of turn since it was set.
         self._in_step = False
-        """Whether the clock is valid for these fields: none was out of turn since it was set."""
 
     def take(self, t_host_ns: int, data: bytes, *, second: bool) -> None:
         """Add a received half."""
@@ -78,6 +78,7 @@ class Halves:
 
     def silence(self) -> list[Field]:
         """Return the accepted fields, after `silence_s` without a half."""
+        # In every silence the count is compared with the clock, so two neighbouring losses are found.
         if self.quiet:
             return []
         self.quiet = True
@@ -102,6 +103,8 @@ class Halves:
 
     def _complete(self) -> bool:
         """Return whether all fields that were due since the clock was set have arrived."""
+        # Halves carry no number: they must take turns, and a silence must have as many samples as the output rate
+        # demands.
         if self._clock_ns is None:
             return True
         # more fields than due mean that the clock was set late
@@ -109,6 +112,7 @@ class Halves:
         return self._waiting[-1].t_host_ns - self._clock_ns < due_ns
 
     def _accept(self) -> list[Field]:
+        # After any irregularity the next sample is dropped, because neighbouring values prove nothing.
         fields, self._waiting, self._doubtful = self._waiting, [], 0
         self._number = fields[-1].number
         if self._clock_ns is not None:
@@ -141,10 +145,10 @@ IDS = (0x64, 0x01, 0x02)
 """The factory's identifiers of commands, and of the first and second half of a field."""
 BITRATE = 1_000_000
 _WAIT_S = 0.05
+# Since the last half: shorter than `StreamLimits.stale_s`, longer than the slowest sensor's period.
 _HEARD_S = 0.15
-"""Since the last half: shorter than `StreamLimits.stale_s`, longer than the slowest sensor's period."""
+# After so many without a silence the reader looks at its other tasks.
 _MOST_FRAMES = 50
-"""After so many without a silence the reader looks at its other tasks."""
 
 
 class RobotousCan(RobotousSensor):
@@ -217,6 +221,7 @@ class RobotousCan(RobotousSensor):
 
     def _receive(self) -> list[Field]:
         """Return the fields of a run of frames, which ends with a silence."""
+        # The adapter's time stamps differ between adapters or are missing, so they are not used.
         wait_s = min(_WAIT_S, self._clock.poll_s) if self._halves.quiet else self._halves.silence_s
         frame = self._bus.look(wait_s)
         with self._clock.held():  # else an emulated sensor might send as fast as a starved program reads

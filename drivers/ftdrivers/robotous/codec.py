@@ -31,6 +31,7 @@ RATE_CODES = {10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8}
 FASTEST_Hz = {57_600: 200, 115_200: 333, 230_400: 500, 460_800: 500, 921_600: 1000}
 """The highest output rate at each baud rate of a UART."""
 
+# By the whole model, because its first number does not determine the scale of torque.
 _COUNTS_PER_N_NM = {
     "RFT40-SA01": (50, 2000),
     "RFT44-SB01": (50, 2000),
@@ -41,10 +42,11 @@ _COUNTS_PER_N_NM = {
     "RFT80-6A01": (50, 1000),
     "RFT80-6A02": (50, 1000),
 }
-"""By the whole model, because its first number does not determine the scale of torque."""
 _FAILURES = {1: "not supported", 2: "value out of range", 3: "failed to set"}
 
 
+# The filter command is left out: manual and vendor's header number its settings in opposite order. So is the bias
+# command.
 class Command(IntEnum):
     """The commands of this driver, which never sends the bias command, 0x11."""
 

@@ -69,4 +69,5 @@ class RobotousSerial(RobotousSensor):
         return [Field(number, t_host_ns, frame[1:-2]) for number, frame in frames]
 
     def _damaged(self) -> int:
+        # Frames carry no number: only damaged ones are counted, and one lost as a whole shows in the rate.
         return self._frames.damaged

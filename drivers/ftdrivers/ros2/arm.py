@@ -24,16 +24,16 @@ from ftdrivers.ros2.middleware import Node, OnePublisher, Received, clock_diagno
 from ftdrivers.ros2.poses import Chain, Joints, PoseReader, Poses, StampedPose, Transforms
 
 SCHEME: Final = "ros2:"
+# From the publisher to the first pose.
 _FIRST_S: Final = 2.0
-"""From the publisher to the first pose."""
 _STALE_S: Final = 0.3
+# The speed is that of so long, because encoders have steps and stamps scatter.
 _SPEED_NS: Final = 100_000_000
-"""The speed is that of so long, because encoders have steps and stamps scatter."""
+# A translation counts as a turn with this lever.
 _LEVER_M: Final = 1.0
-"""A translation counts as a turn with this lever."""
 _MOST_UNREAD: Final = 1_000_000
+# A clock that goes back by more belongs to another publisher.
 _BACK_S: Final = 0.5
-"""A clock that goes back by more belongs to another publisher."""
 
 
 class Ros2Arm(ReadOnlyArm):

@@ -21,12 +21,13 @@ WAYS: Final = (
     "Python), or install the extra on Linux x86-64: pip install 'ftdrive[ros2]'"
 )
 """Both ways to rclpy."""
+# Variables that name the user's profiles of Fast DDS; it also reads DEFAULT_FASTDDS_PROFILES.xml where it starts.
 _PROFILES: Final = {"FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"}
-"""Variables that name the user's profiles of Fast DDS; it also reads DEFAULT_FASTDDS_PROFILES.xml where it starts."""
 
 
 def ros2_module(name: str) -> Any:
     """Import a module of ROS 2, such as "rclpy" or "geometry_msgs.msg". Raises `NoRos2`."""
+    # The wheels start each Python again to set LD_LIBRARY_PATH (30 ms), and have no tf2_msgs: tf needs a sourced ROS.
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -39,6 +40,7 @@ def _stay_on_loopback() -> None:
 
     The range of discovery by itself leaves them open on all interfaces. A profile of the user goes first.
     """
+    # The discovery range by itself leaves the ports of Fast DDS open on all interfaces.
     if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") != "LOCALHOST" or _PROFILES & os.environ.keys():
         return
     if not Path("DEFAULT_FASTDDS_PROFILES.xml").exists():
@@ -115,12 +117,12 @@ class Node:
 DISCOVERY_S: Final = 3.0
 """Until the publishers of a topic are known."""
 _SAME_CLOCK_MS: Final = 2.0
+# A stamp that is older by the clock of this computer was given by another clock.
 _LONGEST_WAY_MS: Final = 30.0
-"""A stamp that is older by the clock of this computer was given by another clock."""
+# Until a second publisher is known too.
 _OTHERS_S: Final = 0.5
-"""Until a second publisher is known too."""
+# Between two looks whether another node publishes too.
 _LOOK_S: Final = 1.0
-"""Between two looks whether another node publishes too."""
 _UNNAMED: Final = "NAME_UNKNOWN"
 _UNNUMBERED: Final = (1 << 64) - 1
 

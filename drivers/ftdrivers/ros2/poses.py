@@ -115,8 +115,8 @@ def _numbers(text: str) -> Array:
 
 UNIT_TOLERANCE: Final = 1e-3
 """Of the length of a quaternion."""
+# The parts of a chain of tf may differ by so much in time.
 _SPREAD_NS: Final = 100_000_000
-"""The parts of a chain of tf may differ by so much in time."""
 
 
 class StampedPose(NamedTuple):
@@ -209,8 +209,8 @@ class Transforms:
     def __init__(self, base: str, flange: str) -> None:
         self._base, self._flange = base, flange
         self.topics = {"/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage"}
+        # By child: parent, time or None if it is static, orientation, origin.
         self._parts: dict[str, tuple[str, int | None, Array, Array]] = {}
-        """By child: parent, time or None if it is static, orientation, origin."""
         self._last_ns = 0
 
     def read(self, topic: str, message: Any) -> Iterator[StampedPose]:

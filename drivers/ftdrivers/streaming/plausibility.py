@@ -12,13 +12,14 @@ from ftdrivers.interfaces import Array, FtSamples
 log = logging.getLogger(__name__)
 
 _FROZEN_S = 0.2
+# White noise of 0.4 steps on every axis repeats a reading 20 times once in 10^12; at 0.3 steps once in 10^5.
+# A sensor is frozen after identical readings for this time, if they are as many as arrive in it, within these bounds.
+# Reason: docs/decisions/sensors.md, 38.
 _FROZEN_SAMPLES = (20, 50)
-"""A sensor is frozen after identical readings for this time, if they are as many as arrive in it, within these bounds.
-Reason: docs/decisions/sensors.md, 38."""
+# The most that the device's clock may gain on ours between two blocks; a late block only makes it fall behind.
 _CLOCK_JUMP_S = 0.5
-"""The most that the device's clock may gain on ours between two blocks; a late block only makes it fall behind."""
+# The device's clock may run slower than ours by this fraction; beyond it, its samples count as late.
 _CLOCK_DRIFT = 0.02
-"""The device's clock may run slower than ours by this fraction; beyond it, its samples count as late."""
 _RATE_TOLERANCE, _RATE_WINDOW_S = 0.1, 2.0
 
 
@@ -36,6 +37,7 @@ class Liveness:
 
     def judge(self, samples: FtSamples, nominal_Hz: float) -> None:
         """Raise when a wrench is not finite, or has not changed for too long."""
+        # A strong low-pass filter in the device could make healthy readings repeat; not checked on hardware.
         wrench, t_host_ns = samples.wrench, samples.t_host_ns
         if not np.isfinite(wrench).all():
             raise ProtocolError(f"{self._name}: the sensor sends a wrench that is not finite", "power it off and on")
@@ -71,6 +73,7 @@ class DeviceClock:
 
         Raises `StreamBroken` when the device's clock jumps back or ahead.
         """
+        # A slow clock falls behind steadily, which is no delay.
         newest_s = float(t_device_s[-1])
         if math.isnan(newest_s):
             return np.zeros(len(t_device_s))

@@ -33,6 +33,7 @@ def scale_facts(
     return {"counts_per_N": Fact(counts_per_N, source), "counts_per_Nm": Fact(counts_per_Nm, source)}
 
 
+# A busy computer delays everything by 0.1 s, so a stale stream is an error of the call and not final.
 @dataclass(frozen=True, slots=True)
 class StreamLimits:
     """Every time limit of a stream, in seconds of its clock. The defaults are those of a real sensor."""
@@ -123,14 +124,14 @@ class StreamingSensor(ForceTorqueSensor):
         self.configured: dict[str, Fact] = {}
         """`serial` and `range`, may be set until `open`. A device that reports another serial number is rejected; this
         range replaces the one that the device reports."""
+        # A subclass that knows its rate sets it in `_connect`.
         self._nominal_Hz = math.nan
-        """A subclass that knows its rate sets it in `_connect`."""
         self._thread: threading.Thread | None = None
         self._news = threading.Condition()
         self._info: DeviceInfo | None = None
         self._failure: Exception | None = None
+        # While it reconnects: the first error, and when to give up.
         self._interruption: tuple[DeviceError, float] | None = None
-        """While it reconnects: the first error, and when to give up."""
         self._taps: list[Unread[FtSamples]] = []
         self._arrivals: deque[tuple[int, int]] = deque()
         self._reset()
@@ -149,6 +150,7 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _discard_backlog(self) -> None:
         """Drop what has accumulated in port or socket while the reader paused: read until a read waits."""
+        # Reads until one has to wait, because only then the port is empty.
         begin_s = self._turn_s
         while self._is_mine():
             rows = len(self._read_block())
@@ -295,6 +297,7 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _read_on(self, unread: Unread[FtSamples], timeout_s: float) -> FtSamples:
         """Return what a follower has not read."""
+        # What arrived before a failure is read before the failure is raised.
         with self._news:
             for left_s in self._clock.looks(timeout_s):
                 if blocks := unread.take():
@@ -328,17 +331,17 @@ class StreamingSensor(ForceTorqueSensor):
         self._newest = NOTHING
         self._interruption = None
         self._opened_ns = self._newest_ns = self._clock.now_ns()
+        # When the newest sample arrived, and when a read last returned.
         self._heard_s = self._turn_s = self._clock.awake_s()
-        """When the newest sample arrived, and when a read last returned."""
         self._pauses, self._pause, self._fresh_from_ns = 0, "", 0
+        # Whether a sample has arrived since the last pause.
         self._is_back = True
-        """Whether a sample has arrived since the last pause."""
         self._taps = []
         self._arrivals.clear()
         self._received = self._duplicated = self._out_of_order = self._silences = self._reconnects = 0
         self._earlier_lost = self._earlier_malformed = 0
+        # Since the last `_connect`; a subclass may count or assign them.
         self._lost = self._malformed = 0
-        """Since the last `_connect`; a subclass may count or assign them."""
         self._events: deque[tuple[int, str]] = deque(maxlen=_EVENTS)
         self._rate = Rate(self.name, self._rate_fix)
         self._seq_offset = 0
@@ -351,6 +354,8 @@ class StreamingSensor(ForceTorqueSensor):
         self._is_late = False
 
     def _start_reader(self) -> None:
+        # The reader claims its slot of the clock before `open` continues, so no limit expires on a thread that has
+        # not started.
         self._thread = Follower(self._clock, self._run, f"reader of {self.name}")
         self._thread.start()
 
@@ -397,6 +402,8 @@ class StreamingSensor(ForceTorqueSensor):
         return self._turn_s - before_s
 
     def _was_away(self, turn_s: float) -> bool:
+        # After Ctrl-Z, sleep or a debugger the port holds old samples that look new; the clock that also counts sleep
+        # shows it.
         return turn_s > max(self._limits.away_s, self._limits.stale_s)
 
     def _drop_backlog(self, away_s: float, rows: int) -> None:
@@ -510,6 +517,7 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _fresh_rows(self, block: FtSamples, heard_s: float) -> FtSamples:
         """Drop samples that are stale by the device's clock, wherever they have waited."""
+        # Samples that lag by the device's own clock were waiting somewhere, however new their receipt is.
         late_s = self._device_clock.late_s(block.t_device_s, heard_s)
         is_late = bool(late_s[-1] > self._limits.stale_s)
         if is_late and not self._is_late:
@@ -572,6 +580,7 @@ class StreamingSensor(ForceTorqueSensor):
         return f"look at health() for {cause} samples, and check the rate that is set in the sensor"
 
     def _raise_failure(self) -> None:
+        # A copy for each call: every later call fails with the same cause until `open` or `close`.
         if self._failure is not None:
             raise copy.copy(self._failure) from self._failure
         if self._thread is None:

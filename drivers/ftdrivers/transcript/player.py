@@ -11,8 +11,8 @@ from ftdrivers.clock import REAL, Clock, Follower
 from ftdrivers.transcript.recorder import Passage, Transcript
 from ftdrivers.wires.serial_port import leave_marks_to_far_side, marks_asked_for
 
+# A driver may send a request this much earlier than recorded; earlier data of the device is then sent at once.
 _EARLY_S: Final = 0.05
-"""A driver may send a request this much earlier than recorded; earlier data of the device is then sent at once."""
 
 
 class Player:
@@ -116,6 +116,7 @@ class Player:
         return next((i for i in range(start, len(self._passages)) if self._passages[i].sent), None)
 
 
+# Playing uses a pseudo-terminal, so the driver runs on the real pyserial.
 class _Terminal:
     """A pseudo-terminal; for CAN frames an slcan adapter on it, which accepts every command and does nothing."""
 

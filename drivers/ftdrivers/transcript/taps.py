@@ -29,6 +29,8 @@ def recording(writer: Writer) -> Iterator[None]:
 
     They keep the driver's settings, so the device sees no difference.
     """
+    # Bytes are recorded inside pyserial: a pseudo-terminal in between would hide parity and latency settings from the
+    # device.
     plain_bus = can.Bus
     opened: list[serial.Serial] = []
 
@@ -92,6 +94,7 @@ def recording(writer: Writer) -> Iterator[None]:
 
 def _slcan_line(frame: can.Message) -> bytes:
     """Write a frame as an slcan adapter does; empty for one that it cannot carry."""
+    # Frames of adapters without a serial port become lines of slcan, so one player serves both.
     if frame.is_error_frame or frame.is_fd:
         return b""
     kind, data = ("r", "") if frame.is_remote_frame else ("t", frame.data.hex().upper())

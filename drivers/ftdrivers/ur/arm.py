@@ -43,11 +43,11 @@ from ftdrivers.ur.timing import STRICT, UrTiming
 log = logging.getLogger(__name__)
 
 _ARRIVED_RAD: Final = 1e-3
+# Speed of the set-point, which is exactly zero at rest.
 _STANDING_RAD_S: Final = 1e-6
-"""Speed of the set-point, which is exactly zero at rest."""
 _STILL_RAD_S: Final = 0.002
+# Within this time after the end of a sweep the arm stands.
 _SETTLES_S: Final = 5.0
-"""Within this time after the end of a sweep the arm stands."""
 
 
 class UrArm(RobotArm):
@@ -355,6 +355,8 @@ class UrArm(RobotArm):
         Our program evaluates it in every cycle of the controller. The path "ur-rtde" cannot: the arm would follow this
         computer, and not stop with it.
         """
+        # ur_rtde's servoJ would follow Python's timing, and a suspended computer would leave the last set-point
+        # without any stop.
         centre = _joints(sweep.centre_rad)
         speed = float(sweep.largest(1).max())
         _check_speed(speed, float(sweep.largest(2).max()))
@@ -384,6 +386,7 @@ class UrArm(RobotArm):
         guard: Guard,
     ) -> None:
         """Begin a motion that ends at `q`, and return when it has."""
+        # A program of another client found before a move is not stopped.
         control = self._in_control()
         self._stop_requested.clear()
         self._goal = None
@@ -524,6 +527,8 @@ class UrArm(RobotArm):
 
     def _halt(self) -> None:
         """Stop the arm with `stopJ`, or else by ending its program; never raises."""
+        # Time-outs of TCP are far longer than the 0.2 s after which a controller is lost, so the child is killed and
+        # the services are asked to stop the program.
         control = self._control
         if control is None:
             return
@@ -557,6 +562,8 @@ class UrArm(RobotArm):
 
     def _check_ours(self, control: Control) -> None:
         """Raise `DeviceFault` when another program runs, whose registers mean nothing to us."""
+        # Another program looks like ours: playing, with our last values in its registers. So ours is asked for its
+        # TCP offset.
         if not self._is_ours(control, timeout_s=self._timing.ours_s, look_out=self._look_out):
             raise (
                 control.end_reason()
@@ -569,6 +576,7 @@ class UrArm(RobotArm):
             )
 
     def _is_ours(self, control: Control, *, timeout_s: float, look_out: Callable[[], object] = lambda: None) -> bool:
+        # Writes nothing: the registers of another program mean something else.
         try:
             control.call("tcp_offset", timeout_s=timeout_s, look_out=look_out)
         except DeviceTimeout as error:

@@ -26,6 +26,7 @@ ControlPath = Literal["ur-rtde", "script"]
 ControlSetting = Literal["auto", "ur-rtde", "script"]
 CONTROL_SETTINGS: Final[tuple[ControlSetting, ...]] = ("auto", "ur-rtde", "script")
 
+# 300 °/s² is the most that UR's staff recommend for a joint; from 60 °/s the arm turns 1.8° less than at 4 rad/s².
 STOP_RAD_S2: Final = radians(300)
 """Default deceleration of a stop: the most that UR's staff recommend for joints. UR's own programs stop with 2 to 4."""
 
@@ -99,8 +100,8 @@ INPUTS: Final = (
 """The RTDE inputs that ur_rtde's control interface writes, exclusively."""
 PROGRAM_PORT: Final = 30003
 """To which ur_rtde sends its program."""
+# Rate of ur_rtde's own connection: the full rate of the CB3 generation.
 _FREQUENCY_HZ: Final = 125.0
-"""Rate of ur_rtde's own connection: the full rate of the CB3 generation."""
 
 
 class ControlProcess(Control):

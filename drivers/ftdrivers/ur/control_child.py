@@ -30,6 +30,8 @@ class _Progress(Protocol):
     def isAsyncOperationRunning(self) -> bool: ...
 
 
+# setWatchdog is not used: it cannot be disarmed while an operator reads a prompt, and was seen to cause a protective
+# stop (C207A0).
 class _Control(Protocol):
     def moveJ(self, q: list[float], speed: float, acceleration: float, asynchronous: bool, /) -> bool: ...
 
@@ -74,6 +76,7 @@ class Calls:
 
     def progress(self) -> tuple[bool, bool]:
         """Return whether the move has ended, and whether it was stopped because the parent did not watch it."""
+        # If no caller asks for 0.5 s, the arm is stopped and the program stays: a guard may hang.
         progress = self._control.getAsyncOperationProgressEx()
         if not self._control.isConnected():  # a lost link looks like arrival
             raise RuntimeError("the control connection was lost")
@@ -180,6 +183,7 @@ def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[...
 
 
 def _listen(requests: "SimpleQueue[str | None]", leaving_s: float) -> None:
+    # A child whose parent was killed ends its program within 0.5 s.
     for line in sys.stdin:
         requests.put(line)
     signal.setitimer(signal.ITIMER_REAL, leaving_s)

@@ -28,14 +28,16 @@ OUTPUTS: Final = MappingProxyType(
     }
 )
 """Names and types; a controller may lack any but the first."""
+# Limit of `set_target_payload` for each element.
 _LARGEST_INERTIA_KG_M2: Final = 133.0
-"""Limit of `set_target_payload` for each element."""
 _RATE_HZ: Final = 125.0
 _G_M_S2: Final = (8.0, 12.0)
 
 
 def read_controller_settings(host: str, *, timeout_s: float, clock: Clock) -> ControllerSettings:
     """Read them once. Raises `ConnectError`, `DeviceTimeout`, `StreamBroken` or `ProtocolError`."""
+    # Over a connection of its own: the type of target_gravity stands in no source, and one wrong type ends a
+    # connection.
     stream = Subscription(host, OUTPUTS, _RATE_HZ, timeout_s=timeout_s, clock=clock)
     try:
         outputs = stream.decode(stream.read(timeout_s)[-1:])

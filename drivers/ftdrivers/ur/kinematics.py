@@ -66,8 +66,8 @@ class Kinematics:
         axis is turned by alpha about x.
         """
         a, d, alpha = np.array([self.a_m, self.d_m, self.alpha_rad])
+        # From the origin of each frame of Denavit and Hartenberg to the chosen point, along the axis of its joint.
         along = np.zeros(7)
-        """From the origin of each frame of Denavit and Hartenberg to the chosen point, along the axis of its joint."""
         for joint in (1, 2):
             along[joint + 1] = (along[joint] - d[joint]) / np.cos(alpha[joint])
         sideways = -along[1:] * np.sin(alpha)

@@ -81,8 +81,8 @@ class OwnProgram:
 
 SIMULATORS: Final = ("localhost", "127.0.0.1", "192.168.56.101")
 """Addresses of URSim, at which ur_rtde does not require remote control."""
+# Minor version by major: of the control script of ur_rtde; of the registers 24 to 47, and of the Robot API.
 _LEAST: Final[dict[ControlPath, dict[int, int]]] = {"ur-rtde": {3: 4, 5: 4}, "script": {3: 9, 5: 3, POLYSCOPE_X: 11}}
-"""Minor version by major: of the control script of ur_rtde; of the registers 24 to 47, and of the Robot API."""
 _LOCAL: Final = (
     "press Local, Remote Control at the top right of the pendant (enable it first under Settings, System, Remote "
     "Control)"
@@ -92,6 +92,7 @@ _LOCAL_X: Final = "set Control mode to Remote in the Safety overview of the pend
 
 def path_for(setting: ControlSetting, version: tuple[int, ...]) -> tuple[ControlPath, str]:
     """Return the control path, and in words why it is taken."""
+    # ur-rtde needs a dashboard server, which PolyScope X has not.
     if setting != "auto":
         return setting, "as configured"
     if version[0] >= POLYSCOPE_X:
@@ -244,6 +245,8 @@ class Opening:
 
     def _require_no_program(self) -> None:
         """Raise `ConnectError` when a program stays on the controller: ours would replace it."""
+        # A program whose child was killed looks like one of another client, and writing to its registers could
+        # command it, so none is stopped at the start.
         deadline_s = self.clock.now_s() + self.timing.release_s
         while self.reader.look().program_state != PROGRAM_STOPPED:
             if self.clock.now_s() > deadline_s:

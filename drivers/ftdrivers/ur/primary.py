@@ -33,12 +33,13 @@ _TEXT, _ERROR_CODE, _KEY, _EXCEPTION = 0, 6, 7, 10
 _KEY_HEAD: Final = struct.Struct(">iiB")  # code, argument, length of the title
 _EXCEPTION_HEAD: Final = struct.Struct(">ii")  # line, column
 _CODE_HEAD: Final = struct.Struct(">iiiBI")  # code, argument, level, type of the data (4 bytes in old documents), data
+# A controller in local control refuses the program with this code, or closes the connection.
 _READ_ONLY_CODE: Final = 210
 _KINEMATICS, _CONFIGURATION = 5, 6
+# Behind six checksums: theta, a, d and alpha of all joints.
 _KINEMATIC_DATA: Final = struct.Struct(">24x24d")
-"""Behind six checksums: theta, a, d and alpha of all joints."""
+# In the configuration data, behind limits, defaults and lengths of the arm.
 _ROBOT_TYPE: Final = struct.Struct(">432xi")
-"""In the configuration data, behind limits, defaults and lengths of the arm."""
 _ROBOT_TYPES: Final = MappingProxyType(
     {1: "UR5", 2: "UR10", 3: "UR3", 4: "UR16", 5: "UR18", 6: "UR8long", 7: "UR20", 8: "UR30", 9: "UR15"}
 )

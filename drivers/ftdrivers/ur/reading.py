@@ -45,27 +45,28 @@ from ftdrivers.ur.timing import Lateness, Patience, UrTiming
 
 log = logging.getLogger(__name__)
 
+# Until the first `follow()`, 125 Hz suffice.
 STATES_HZ: Final = 125.0
 """Rate of states and status: the full rate of the CB3 generation, a quarter of that of the e-Series."""
+# Samples that may wait for one follower: 33 minutes at 500 Hz.
 _MOST_UNREAD: Final = 1_000_000
-"""Samples that may wait for one follower: 33 minutes at 500 Hz."""
 Received = tuple[int, list[bytes]]
 """Samples of one read, and their `t_host_ns`."""
+# A reader that has had no turn for so long was suspended, or starved.
 _PAUSE_S: Final = 0.1
-"""A reader that has had no turn for so long was suspended, or starved."""
+# The first output, after the number of the recipe.
 _TIMESTAMP: Final = struct.Struct(">xd")
-"""The first output, after the number of the recipe."""
 _MODEL_M: Final = 0.020
+# Of 30 real arms, none is more than 7.5 mm and 1.32 degrees from its nominal model. Another model of a similar arm is
+# at least 8.5 mm from it in every posture, and real arms are always nearest to their own.
 _MODEL_RAD: Final = radians(3.0)
-"""Of 30 real arms, none is more than 7.5 mm and 1.32 degrees from its nominal model. Another model of a similar arm is
-at least 8.5 mm from it in every posture, and real arms are always nearest to their own."""
 _OWN_M: Final = 0.001
+# The controller calculates its pose with the parameters that it sends, and both are rounded to micrometres at most.
 _OWN_RAD: Final = radians(0.1)
-"""The controller calculates its pose with the parameters that it sends, and both are rounded to micrometres at most."""
+# Joint angles and pose of one sample may be a control cycle apart; a CB3 has the longest.
 _LAG_S: Final = 0.008
-"""Joint angles and pose of one sample may be a control cycle apart; a CB3 has the longest."""
+# Between two comparisons of followed poses with the model: one takes as long as reading ten samples.
 _CHECK_S: Final = 0.1
-"""Between two comparisons of followed poses with the model: one takes as long as reading ten samples."""
 
 
 def _apart(one: Pose, other: Pose) -> tuple[float, float]:
@@ -98,19 +99,19 @@ class Reader:
         self._clock = clock
         self._timing = timing
         self._changed = threading.Condition()
+        # The newest sample for a state or a status, and its `t_host_ns`.
         self._live: tuple[int, bytes] | None = None
-        """The newest sample for a state or a status, and its `t_host_ns`."""
+        # Samples after it.
         self._since_live = 0
-        """Samples after it."""
+        # When a read last returned, when with a sample, and when with `_live`.
         self._turn_s = self._read_s = self._live_s = clock.awake_s()
-        """When a read last returned, when with a sample, and when with `_live`."""
         self._t_device_s = math.nan
         self._lateness, self._late_s = Lateness(), 0.0
         self._followers: list[Unread[Received]] = []
+        # When a followed pose is compared with the model again.
         self._check_s = -math.inf
-        """When a followed pose is compared with the model again."""
+        # Whether a pose has agreed with the kinematics of this arm.
         self._fits = False
-        """Whether a pose has agreed with the kinematics of this arm."""
         self._failure: DeviceError | None = None
         self.silent = False
         """Whether no sample has arrived since `DeviceTimeout` was raised."""
@@ -361,6 +362,8 @@ class Reader:
 
     def _follow(self) -> bool:
         """Read what has arrived; return whether to continue. An error is raised at the next look."""
+        # Followers receive late samples too, because a recording must not miss them; only `state` and `status` leave
+        # them out.
         try:
             samples = self._stream.read(self._clock.poll_s)
         except TimeoutError:

@@ -45,8 +45,8 @@ _FORMATS: Final[Mapping[str, tuple[str, tuple[int, ...]]]] = {
 }
 _INPUTS: Final[Mapping[str, str]] = {"INT32": "i", "DOUBLE": "d"}
 _RECEIVE_BYTES: Final = 65536
+# Of the CB3 generation, and from the e-Series on.
 _FULL_RATE_HZ: Final = (125.0, 500.0)
-"""Of the CB3 generation, and from the e-Series on."""
 
 
 def encode(kind: int, payload: bytes = b"") -> bytes:

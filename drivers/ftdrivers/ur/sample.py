@@ -83,6 +83,7 @@ _SAFETY_MODES: Final = {
     22: "safety API safeguard stop",
 }
 _ENABLING: Final = "hold the enabling device in its middle position, or switch to automatic mode at the pendant"
+# Of modes whose source the status bits do not name.
 _MODE_FIXES: Final = {
     12: "close the safeguard of automatic mode and reset it",
     13: _ENABLING,
@@ -95,7 +96,6 @@ _MODE_FIXES: Final = {
     20: "clear the emergency stop in the safety PLC, then power the arm on at the pendant",
     22: "clear the stop in the program that uses the safety API",
 }
-"""Of modes whose source the status bits do not name."""
 _SAFETY: Final = (  # the first that applies is the most specific
     (0b0_1110_0000, "emergency stop", "make the cell safe, release the button, power the arm on at the pendant"),
     (0b0_0000_0100, "protective stop", "find and remove its cause, then clear it at the pendant"),

@@ -26,6 +26,7 @@ DASHBOARD_PORT: Final = 29999
 _REPLY_S: Final = 2.5
 
 
+# Our own client: that of ur_rtde does not exist on most platforms.
 class _Dashboard:
     """One connection; see `services.Services`. Raises `OSError` when it is lost or silent for 2.5 s."""
 
@@ -105,6 +106,7 @@ class _RobotApi:
 
     def serial(self) -> str | None:
         """Return the serial number."""
+        # Reported from 10.14 on; the control mode from 10.12 on.
         return self._value("/system/v1/information", "serialNumber")
 
     def polyscope(self) -> str | None:
@@ -186,6 +188,7 @@ class Services(Protocol):
         """Disconnect."""
 
 
+# PolyScope X has a Robot API in place of the dashboard, and neither reports everything: what is not known is None.
 @dataclass(frozen=True, slots=True)
 class ServicesOf:
     """Asks the services of one controller."""

@@ -70,6 +70,7 @@ class UrTiming:
     @classmethod
     def emulated(cls) -> Self:
         """Return the limits of an emulated cell, whose processes may be starved."""
+        # Limits on samples are the same in every cell; those on other processes are generous.
         return cls(
             connect_s=30.0,
             release_s=5.0,  # another client gives no answer, so this wait always ends at its limit
@@ -105,6 +106,8 @@ class Lateness:
 
     def late_s(self, t_device_s: float, heard_s: float) -> float:
         """Return how late a sample is; `heard_s` is the time of its receipt. Only differences of both clocks count."""
+        # After a stall, samples arrive that are seconds old with stamps that advance like new ones: the quickest of
+        # the last second is the measure.
         lead_s = t_device_s - heard_s
         if self._since_s is None or heard_s - self._since_s > _QUICKEST_OF_S:
             self._quickest_before_s, self._quickest_s, self._since_s = self._quickest_s, lead_s, heard_s

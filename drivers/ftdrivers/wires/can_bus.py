@@ -52,8 +52,8 @@ class CanBus:
         self._identifiers = frozenset(identifiers)
         self._clock = clock
         self._bus: can.BusABC | None = None
+        # File descriptor that locks the serial port of an slcan adapter.
         self._lock: int | None = None
-        """File descriptor that locks the serial port of an slcan adapter."""
         self.malformed = 0
         """Lines of an slcan adapter that are not frames."""
 

@@ -61,6 +61,7 @@ class Deframer:
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
         """Take received bytes and return the frames that they complete as (number, frame)."""
+        # A header occurs in data and nothing is escaped: after a failed checksum the search continues one byte later.
         buffer, at = self._buffer, 0
         buffer += data
         frames = []

@@ -103,6 +103,7 @@ def ask(
     ProtocolError
         The error of `check`, with the name of the device and a fix. A refusal is raised at once.
     """
+    # No library: the port changes from Modbus to a bare stream.
     for _ in range(_ATTEMPTS - 1):
         try:
             return _exchange(port, name, request, check, clock, timeout_s)

@@ -23,6 +23,7 @@ from ftdrivers.errors import ConnectError, PortInUse, StreamBroken
 
 def ask_for_marks(port: serial.Serial | int) -> bool:
     """Let the system mark damaged bytes; return whether it can. Drops earlier bytes, which have no marks."""
+    # Some adapters (FTDI) report parity for a whole USB packet, and all its records are dropped.
     if sys.platform != "linux":  # setting flags may undo pyserial's unusual bit rates there
         return False
     settings = termios.tcgetattr(port)
@@ -41,6 +42,7 @@ def marks_asked_for(port: serial.Serial | int) -> bool:
 
 def leave_marks_to_far_side(port: serial.Serial | int) -> None:
     """Let the system pass bytes unchanged, because the far side makes the marks itself."""
+    # A pseudo-terminal rejects parity, but an emulator or a transcript can make the marks itself.
     if sys.platform == "linux":
         settings = termios.tcgetattr(port)
         settings[0] &= ~termios.PARMRK
@@ -48,19 +50,21 @@ def leave_marks_to_far_side(port: serial.Serial | int) -> None:
 
 
 _PLAIN: Final = re.compile(rb"(?:[^\xff]+|\xff\xff)+")
+# FF 00 X, or an FF whose second FF is lost, which counts as damaged.
 _MARKED: Final = re.compile(rb"\xff(?:\0.|(?=[^\0]))", re.DOTALL)
-"""FF 00 X, or an FF whose second FF is lost, which counts as damaged."""
 
 
 class Unmarker:
     """Restores the bytes on the line from marked bytes, however reads divide them."""
 
     def __init__(self) -> None:
+        # The beginning of a mark or of a doubled FF whose rest has not arrived.
         self._cut = b""
-        """The beginning of a mark or of a doubled FF whose rest has not arrived."""
 
     def undo(self, data: bytes) -> tuple[bytes, list[int]]:
         """Return the true bytes, and the places of those received with wrong parity or framing."""
+        # pyserial delivers bytes of wrong parity unmarked, so Linux marks them as POSIX defines, and the marks are
+        # removed here.
         data = self._cut + data
         true, damaged, at = bytearray(), list[int](), 0
         while at < len(data):
@@ -85,8 +89,8 @@ LINK_ERRORS = (OSError, termios.error)
 """Raised by a vanished serial port; `termios.error` is not an `OSError`."""
 
 _WRITE_S = 0.2
+# 5 ms of the fastest sensor.
 _DRAIN_BYTES = 416
-"""5 ms of the fastest sensor."""
 
 
 def refusal(owner: str, path: str, error: Exception, found: str, fix: str) -> ConnectError:
@@ -133,8 +137,8 @@ class SerialPort:
         self._read_s = min(read_s, clock.poll_s)
         self._clock = clock
         self._port: serial.Serial | None = None
+        # While the system marks damaged bytes.
         self._marks: Unmarker | None = None
-        """While the system marks damaged bytes."""
 
     def open(self) -> None:
         """Open the port and lock it. Raises `ConnectError`."""
