@@ -1,22 +1,17 @@
-"""All accuracy figures that this project states, measured by simulation against their targets.
+"""The accuracy of the calibration, measured by simulation and on recordings against targets, beside other methods.
 
     uv run python -m tests.benchmarks.accuracy [--quick] [--only WORD]
 
 Prints one row per figure: name, figure, target, pass or FAIL, number of runs; the exit code is the number of rows that
-failed. Quick runs have few samples, so their targets are wider by the sampling error. Terms:
-docs/contributing/figures/calibration.md.
+failed. Quick runs have few samples, so their targets are wider by the sampling error. The table of the README is that
+of `side_by_side`. Terms: docs/reference/figures/calibration.md.
 """
 
-import argparse
 import os
 import sys
-import time
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
-from multiprocessing.pool import Pool
 from pathlib import Path
 
 import numpy as np
@@ -24,21 +19,16 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationDataset, NotObservable, Parameters, read_csv, solve
-from ftcalib.judge.cross_validation import standardized
-from ftcalib.judge.observability import AMBIGUOUS_GAP, assess
-from ftcalib.known import Known
+from ftcalib import CalibrationDataset, NotObservable, read_csv, solve
+from ftcalib.assessment.cross_validation import standardized
 from ftcalib.likelihood import fit as likelihood
-from ftcalib.likelihood import rotation_minima
-from ftcalib.likelihood.response import predicted_covariance
+from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
 from ftcalib.model import UP_IN_BASE, Array, predict
-from ftcalib.published.carlson import iterative, relaxation
 from ftcalib.published.methods import published
 from ftcalib.published.yu import SPECIAL_R_flange_base, lrom, srom
 from tests.benchmarks import scenarios as sim
-from tests.benchmarks import speed
-from tests.benchmarks.scenarios import Rng, Truth
-from tests.pose_sets import optimised
+from tests.benchmarks.common import Lab, Record, Row, all_within, band, most, run
+from tests.benchmarks.scenarios import Truth
 
 GROSS_RAD = np.deg2rad(20.0)
 RANDOM_STARTS = 12
@@ -46,72 +36,7 @@ DELTA_BINS = (0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0)
 ENOUGH_WRONG = 15
 """Smallest expected number of wrong answers in a bin that is tested."""
 SROM_POSES = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
-YU_MOUNT = Rotation.from_euler("ZYX", [45, 7, 3], degrees=True).as_matrix()
-YU_F0, YU_T0, YU_P = np.array([63.0, 5, 21]), np.array([87.0, 45, 6]), np.array([0.1, 0.1, 0.1])
-YU_WEIGHT_N = np.array([1.0, 3, -40])
-
-Record = dict[str, NDArray[np.float64]]
-Worker = Callable[[int], dict[str, object]]
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the table."""
-
-    name: str
-    figure: str
-    target: str
-    passed: bool
-    runs: int
-
-
-class Lab:
-    """Runs simulations on two workers."""
-
-    def __init__(self, pool: Pool, *, quick: bool) -> None:
-        self.pool, self.quick = pool, quick
-        self.refused = 0
-
-    def count(self, full: int, quick: int) -> int:
-        """Choose the number of runs for the available time."""
-        return quick if self.quick else full
-
-    def simulate(self, worker: Worker, runs: int, seed: int = 0) -> Record:
-        """Run a worker for consecutive seeds and stack the results; `refused` counts the refused runs."""
-        jobs = self.pool.imap(partial(_attempt, worker), range(seed, seed + runs), chunksize=max(1, min(20, runs // 8)))
-        records = [record for record in jobs if record is not None]
-        self.refused = runs - len(records)
-        return {key: np.array([record[key] for record in records], dtype=np.float64) for key in records[0]}
-
-
-def _attempt(worker: Worker, seed: int) -> dict[str, object] | None:
-    try:
-        return worker(seed)
-    except NotObservable:
-        return None
-
-
-def band(name: str, value: float, low: float, high: float, runs: int, unit: str = "", digits: int = 3) -> Row:
-    """Compare with an interval; `low` of minus infinity or `high` of infinity disables that side."""
-    if low == -np.inf:
-        target = f"<= {high:.{digits}g}"
-    elif high == np.inf:
-        target = f">= {low:.{digits}g}"
-    else:
-        target = f"{low:.{digits}g} to {high:.{digits}g}"
-    return Row(name, f"{value:.{digits}g}{unit}", target + unit, bool(low <= value <= high), runs)
-
-
-def most(name: str, value: float, high: float, runs: int, unit: str = "", digits: int = 3) -> Row:
-    """Compare with an upper limit."""
-    return band(name, value, -np.inf, high, runs, unit, digits)
-
-
-def all_within(name: str, values: Array, low: float, high: float, runs: int) -> Row:
-    """Compare each of several figures, in the order of the parameter blocks, with one interval."""
-    figure = "/".join(f"{v:.2f}" for v in values)
-    target = f"{low:.2f} to {high:.2f}" if low > 0 else f"<= {high:.2f}"
-    return Row(name, figure, target, bool(((values >= low) & (values <= high)).all()), runs)
+YU_F0, YU_T0, YU_WEIGHT_N = (63.0, 5, 21), (87.0, 45, 6), (1.0, 3, -40)
 
 
 # Exactness
@@ -124,12 +49,9 @@ def exact_run(seed: int, name: str) -> dict[str, object]:
     return {"error": np.abs(sim.error(truth, result.parameters)).max()}
 
 
-def plain(R_base_flange: Array, wrench: Array, cov: Array | None = None, n_samples: int = 0) -> CalibrationDataset:
-    """Make a dataset; `cov` is (n, 6, 6), or (6, 6) for all poses."""
+def plain(R_base_flange: Array, wrench: Array) -> CalibrationDataset:
     n = len(wrench)
-    if cov is not None:
-        cov = np.broadcast_to(cov, (n, 6, 6))
-    return CalibrationDataset(R_base_flange, wrench, cov, np.full(n, n_samples), np.full(n, np.nan))
+    return CalibrationDataset(R_base_flange, wrench, None, np.zeros(n, int), np.full(n, np.nan))
 
 
 def exactness(lab: Lab) -> Iterator[Row]:
@@ -230,8 +152,6 @@ def estimator(lab: Lab) -> Iterator[Row]:
     for name in sim.SETS:
         yield most(f"wrong basin against multistart, {name}, SNR 100", int(at_100[name]["wrong"].sum()), 0, runs)
 
-    yield from certificates(lab)
-
     for method, key, (force_low, force_high), (torque_low, torque_high) in (
         ("ML", "prediction", (0, 55), (0, 2.0)),
         ("SROM", "srom", (70, 86), (4.0, 4.9)),
@@ -267,28 +187,6 @@ def estimator(lab: Lab) -> Iterator[Row]:
         distance = at_100[name]["distance"][:1000]
         p = float(stats.kstest(distance, "chi2", args=(15,)).pvalue)
         yield band(f"normalised error is chi-square(15), KS p, {name}", p, 1e-3, np.inf, len(distance))
-
-
-def certificate_run(seed: int, name: str, snr: float) -> dict[str, object]:
-    rng = np.random.default_rng(seed)
-    truth, R = sim.tool(rng), sim.poses(name, rng)
-    force = sim.readings(truth, R)[:, :3] + sim.sigma(snr)[:3] * rng.normal(size=(len(R), 3))
-    Q = rotation_minima.force_cost(R, force, np.ones(len(R)))
-    best = rotation_minima.minima(Q)[0]
-    brute = sim.lowest_quadratic(Q, 60, rng)
-    return {"gap": rotation_minima.certificate(Q, best.R), "agrees": brute >= best.cost - 1e-9 * np.trace(Q) / 3}
-
-
-def certificates(lab: Lab) -> Iterator[Row]:
-    runs = lab.count(150, 3)
-    cells = [
-        lab.simulate(partial(certificate_run, name=name, snr=snr), runs)
-        for name in sim.SETS
-        for snr in (100.0, 10.0, 3.0)
-    ]
-    gap, agrees = (np.concatenate([cell[key] for cell in cells]) for key in ("gap", "agrees"))
-    yield most("certificate gap, largest, all sets, SNR 100/10/3", float(gap.max()), 1e-8, len(gap), digits=2)
-    yield most("60 random starts find a lower force cost", int((agrees == 0).sum()), 0, len(gap))
 
 
 # Noise that the estimator does not expect
@@ -374,76 +272,7 @@ def outliers(lab: Lab) -> Iterator[Row]:
         yield most(f"{what}: good poses rejected", 100 * float(record["false"].mean()), 0.5, runs, " %")
 
 
-def few_samples_run(seed: int, n_samples: int) -> dict[str, object]:
-    rng = np.random.default_rng(seed)
-    truth, R, s = sim.tool(rng), sim.poses("haar24", rng), sim.sigma(100)
-    raw = sim.readings(truth, R)[:, None] + s * np.sqrt(n_samples) * rng.normal(size=(24, n_samples, 6))
-    y = raw.mean(axis=1)
-    e = raw - y[:, None]
-    cov = np.einsum("nki,nkj->nij", e, e) / (n_samples - 1) / n_samples
-    result = solve(plain(R, y, cov, n_samples))
-    L = np.linalg.inv(np.linalg.cholesky(cov))
-    x = truth  # direct use: Gauss-Newton from the truth, weighted with each pose's own covariance
-    for _ in range(6):
-        J, r = L @ sim.derivative(x, R), (L @ (y - sim.readings(x, R))[..., None]).ravel()
-        x = x.moved(np.linalg.lstsq(J.reshape(-1, 15), r, rcond=None)[0])
-    direct = sim.error(truth, Parameters(x.R.T, x.b, x.F0, x.P, x.T0))
-    return {
-        "square": sim.blocks(sim.error(truth, result.parameters) ** 2),
-        "direct": sim.blocks(direct**2),
-        "bound": sim.blocks(np.diag(sim.bound(truth, R, np.diag(s**2)))),
-    }
-
-
-def few_samples(lab: Lab) -> Iterator[Row]:
-    runs = lab.count(800, 40)
-    record = lab.simulate(partial(few_samples_run, n_samples=10), runs)
-    limit = 1.7 if lab.quick else 1.2
-    yield all_within("covariances from 10 samples, haar24: efficiency", efficiency_of(record), 0, limit, runs)
-    direct = float(np.mean(record["direct"] / record["bound"]))
-    yield band("  used as they are, for comparison: mean efficiency", direct, 2.5, 4.5, runs)
-
-
-# Observability of poses
-
-
-def degenerate(lab: Lab) -> Iterator[Row]:
-    rng = np.random.default_rng(3)
-    azimuth = np.arange(8) * np.pi / 4
-    spin = Rotation.from_rotvec(np.outer(azimuth, [0.0, 0, 1]))
-    tilted = Rotation.from_euler("y", 40, degrees=True)
-    sets = (
-        ("wrist turned at one tilt", (tilted * sim.DOWN * spin).as_matrix(), 13),
-        ("turned about the vertical", (spin * tilted * sim.DOWN).as_matrix(), 8),
-        ("two poses", Rotation.random(2, rng=rng).as_matrix(), 11),
-        ("one pose", Rotation.random(1, rng=rng).as_matrix(), 6),
-    )
-    upright = sim.tool(rng, tilt_deg=0.0)  # with the vertical along base z, as the words say
-    guess = Parameters(upright.R.T, upright.b, upright.F0, upright.P, upright.T0)
-    for name, R, rank in sets:
-        found = assess(R, guess, advise=False)
-        J = sim.derivative(upright, R) / np.repeat([1.0, sim.LEVER_M], 3)[:, None]
-        scale = np.repeat([1, 20, 20, 0.08, 1.6], 3)
-        own = int(np.linalg.matrix_rank((J * scale).reshape(-1, 15), tol=1e-6))
-        yield Row(f"rank, {name}", f"{found.rank} (numeric: {own})", str(rank), found.rank == own == rank, 1)
-    rim = sim.leaning(np.full(8, np.deg2rad(40.0)), azimuth, np.zeros(8))
-    found = assess(rim, guess, advise=False)
-    flagged = found.rank == 15 and found.second_gap < AMBIGUOUS_GAP and bool(found.ambiguities)
-    yield Row(
-        "8 poses on the rim of a cone: flagged",
-        f"rank {found.rank}, gap {found.second_gap:.1g}",
-        "ambiguous",
-        flagged,
-        1,
-    )
-    s = sim.sigma(1000)
-    y = sim.readings(upright, rim) + s * rng.normal(size=(8, 6))
-    try:
-        verdict: str = solve(plain(rim, y, np.diag(s**2))).verdict
-    except NotObservable:
-        verdict = "refused"
-    yield Row("  and its calibration", verdict, "rejected or refused", verdict in ("rejected", "refused"), 1)
-    yield from odds_rows(odds(lab))
+# The second solution of poses that are too much alike
 
 
 ODDS_CELLS = (
@@ -483,200 +312,14 @@ def odds_table(record: Record) -> list[tuple[float, float, int, float, float]]:
     return table
 
 
-def odds_rows(record: Record) -> Iterator[Row]:
-    for low, high, n, observed, stated in odds_table(record):
+def odds_rows(lab: Lab) -> Iterator[Row]:
+    for low, high, n, observed, stated in odds_table(odds(lab)):
         name = f"odds of a wrong basin, gap {low:g} to {high:g}"
         figure = f"{observed:.2g} of {stated:.2g} stated"
         if high == np.inf:
             yield Row(name, figure, "<= 0.001", observed <= 1e-3, n)
         elif n * stated >= ENOUGH_WRONG:
             yield Row(name, figure, "within x1.5", stated / 1.5 <= observed <= 1.5 * stated, n)
-
-
-def design(lab: Lab) -> Iterator[Row]:
-    del lab
-    reference = _worth(SROM_POSES)
-    ratio = np.mean([r / own for r, own in zip(reference, _worth(optimised(8)), strict=True)], axis=0)
-    for name, value in zip(("D", "A", "I_F"), ratio, strict=True):
-        yield band(f"8-pose design against SROM-24, per sample, {name}", float(value), 0.99, np.inf, 1)
-    truth = sim.tool(np.random.default_rng(0))
-    R = optimised(8)
-    force = sim.readings(truth, R)[:, :3]
-    minima = rotation_minima.minima(rotation_minima.force_cost(R, force, np.ones(8)))
-    others = [m.cost for m in minima if np.linalg.norm(m.R - truth.R) > 0.1]
-    yield band("8-pose design: gap to the second solution", min(others) / (8 * sim.WEIGHT_N**2), 0.5, np.inf, 1)
-
-
-def _worth(R_base_flange: Array) -> list[Array]:
-    """D, A and I_F variances of one average pose, for centres of mass in twelve directions."""
-    golden = (1 + np.sqrt(5)) / 2
-    axes = [np.roll([0, s, t * golden], k) for k in range(3) for s in (1, -1) for t in (1, -1)]
-    worth = []
-    for axis in axes:
-        truth = Truth(
-            np.eye(3),
-            np.array([0, 0, -sim.WEIGHT_N]),
-            np.zeros(3),
-            sim.ARM_M * axis / np.linalg.norm(axis),
-            np.zeros(3),
-        )
-        C = len(R_base_flange) * sim.bound(truth, R_base_flange, np.diag(sim.sigma(100) ** 2))
-        scaled = C / np.outer(*[np.repeat([1, sim.WEIGHT_N, sim.WEIGHT_N, sim.ARM_M, sim.WEIGHT_N * sim.ARM_M], 3)] * 2)
-        J = sim.derivative(truth, sim.CUBE)[:, :3]
-        force = np.einsum("nki,ij,nkj->", J, C, J) / 24
-        worth.append(np.array([np.exp(np.linalg.slogdet(scaled)[1] / 15), np.trace(scaled), force]))
-    return worth
-
-
-# The papers' figures
-
-
-CARLSON_SIGMA_N = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
-
-
-def carlson_figure_1(trials: int, rng: Rng) -> Array:
-    """Median |R_error|_F² of the relaxation at each noise, with 100 poses and 1 kg."""
-    gravity, errors = np.array([0, 0, -9.82]), np.empty((len(CARLSON_SIGMA_N), trials))
-    for i, sigma_N in enumerate(CARLSON_SIGMA_N):
-        for trial in range(trials):
-            X, R = Rotation.from_rotvec(rng.normal(size=3)).as_matrix(), Rotation.random(100, rng=rng).as_matrix()
-            force_N = gravity @ R @ X + sigma_N * rng.normal(size=(100, 3))
-            fit = relaxation(R, force_N, gravity, bias=False)
-            errors[i, trial] = np.sum((fit.R_flange_sensor - X) ** 2)
-    return np.asarray(np.median(errors, axis=1))
-
-
-def carlson_figure_2(runs: int, rng: Rng) -> tuple[Array, Array]:
-    """(run,) errors of R in degrees and of gravity as a share, where algorithm 1 ends."""
-    R_error, gravity_error = np.empty((2, runs))
-    for run in range(runs):
-        X, R = Rotation.random(rng=rng).as_matrix(), Rotation.random(100, rng=rng).as_matrix()
-        gravity = 100 * rng.normal(size=3)
-        fit = iterative(R, gravity @ R @ X + rng.normal(size=(100, 3)), bias=False)
-        R_error[run] = np.rad2deg(np.linalg.norm(Rotation.from_matrix(fit.R_flange_sensor.T @ X).as_rotvec()))
-        gravity_error[run] = np.linalg.norm(fit.gravity_force_base_N - gravity) / np.linalg.norm(gravity)
-    return R_error, gravity_error
-
-
-def carlson(lab: Lab) -> Iterator[Row]:
-    trials, runs = lab.count(1000, 60), lab.count(1000, 60)
-    margin = 1.5 if lab.quick else 1.3
-    medians = carlson_figure_1(trials, np.random.default_rng(1))
-    ratio = medians / (7e-12 * (np.array(CARLSON_SIGMA_N) / 1e-4) ** 2)
-    worst = float(ratio[np.abs(np.log(ratio)).argmax()])
-    yield band("Carlson Fig. 1: relaxation over 7e-12 (sigma / 1e-4)², worst", worst, 2 - margin, margin, trials)
-    R_error, gravity_error = carlson_figure_2(runs, np.random.default_rng(2))
-    yield most("Carlson Fig. 2: median error of R", float(np.median(R_error)), 0.09 if lab.quick else 0.075, runs, "°")
-    at_95 = 100 * float(np.percentile(gravity_error, 95))
-    yield most("Carlson Fig. 2: error of gravity, 95 %", at_95, 0.45 if lab.quick else 0.32, runs, " %")
-
-
-FIG_9_YAW_DEG = 30.0
-"""Of the sensor while its roll is varied."""
-
-
-def yaw_run(seed: int, yaw_deg: float, roll_deg: float) -> dict[str, object]:
-    """Yu Fig. 9: squared error of the predicted force of methods with more or less knowledge of the mounting."""
-    rng = np.random.default_rng(seed)
-    R_se = Rotation.from_euler("ZYX", [yaw_deg, 0, roll_deg], degrees=True).as_matrix()
-    truth, R, s = sim.tool(rng, R=R_se), sim.poses("cone60_24", rng), sim.sigma(100)
-    y = sim.readings(truth, R) + s * rng.normal(size=(24, 6))
-    knowledge = (None, Known(yaw_only=True), Known(R_flange_sensor=np.eye(3)))
-    fits = [likelihood.fit(R, y, np.diag(s**2), drift="none", known=known) for known in knowledge]
-    return {"force": [sim.prediction_square(truth, fit.parameters)[0] for fit in fits]}
-
-
-def figure_9(lab: Lab) -> dict[tuple[float, float], Array]:
-    """Force rms in N of the three methods, by yaw and roll of the sensor in degrees."""
-    runs = lab.count(60, 8)
-    cells = [(yaw, 0.0) for yaw in (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 45.0)] + [
-        (FIG_9_YAW_DEG, roll) for roll in (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)
-    ]
-    return {
-        cell: np.sqrt(lab.simulate(partial(yaw_run, yaw_deg=cell[0], roll_deg=cell[1]), runs)["force"].mean(axis=0))
-        for cell in cells
-    }
-
-
-def coefficient_run(
-    seed: int, n1: float, n2: float, com: tuple[float, float, float] = (0.1, 0.1, 0.1)
-) -> dict[str, object]:
-    """Yu Figs 14 and 15: slopes (2, 6) of the largest error of each channel over its range, for SROM and ML.
-
-    The range of the forces is 2 |F_b|, that of the torques 2 |P| |F_b|. As in the paper each orientation is off by
-    up to n2 in each Euler angle, that of the test poses too, and each reading of the calibration by up to n1.
-    """
-    rng = np.random.default_rng(seed)
-    nominal = SPECIAL_R_flange_base
-    weights = np.linspace(0.1, 1, 7)
-    worst = np.empty((len(weights), 2, 6))
-    for i, a in enumerate(weights):
-        truth = Truth(YU_MOUNT, a * YU_WEIGHT_N, YU_F0, np.array(com), YU_T0)
-        y = sim.readings(truth, _off(nominal, n2, rng)) + rng.uniform(-n1, n1, (24, 6))
-        test = Rotation.random(500, rng=rng).as_matrix()
-        measured = sim.readings(truth, _off(test, n2, rng))
-        R = np.swapaxes(nominal, 1, 2)
-        fits = srom(R, y), likelihood.fit(R, y, np.eye(6) * n1**2 / 3, drift="none").parameters
-        for k, p in enumerate(fits):
-            worst[i, k] = np.abs(measured - sim.readings(sim.as_truth(p), np.swapaxes(test, 1, 2))).max(axis=0)
-    range_N = 2 * weights * np.linalg.norm(YU_WEIGHT_N)
-    slope = np.polyfit(range_N, worst.reshape(len(weights), 12), 1)[0].reshape(2, 6)
-    slope[:, 3:] /= np.linalg.norm(com)
-    return {"slope": slope}
-
-
-def _off(A: Array, n2: float, rng: Rng) -> Array:
-    """R_base_flange of base-to-flange matrices, each Euler angle off by up to n2 rad."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # at the singularity any of the possible angles will do
-        angles = Rotation.from_matrix(A).as_euler("ZYX") + rng.uniform(-n2, n2, (len(A), 3))
-    return np.swapaxes(Rotation.from_euler("ZYX", angles).as_matrix(), 1, 2)
-
-
-def coefficients(lab: Lab, n1: float, n2: float, com: tuple[float, float, float] = (0.1, 0.1, 0.1)) -> Array:
-    """Mean slopes (2, 6) of SROM and ML."""
-    worker = partial(coefficient_run, n1=n1, n2=n2, com=com)
-    return np.asarray(lab.simulate(worker, lab.count(24, 4))["slope"].mean(axis=0))
-
-
-def yu_figures(lab: Lab) -> Iterator[Row]:
-    table = figure_9(lab)
-    runs = lab.count(60, 8)
-    ours = np.array([row[0] for row in table.values()])
-    flat = float(ours.max() / ours.min())
-    yield most("Yu Fig. 9: ML, largest over smallest error, any mounting", flat, 1.5 if lab.quick else 1.25, runs)
-    known = [table[yaw, 0.0][2] for yaw in (0.0, 1.0, 2.0, 5.0, 10.0, 20.0, 45.0)]
-    yaw_only = [table[FIG_9_YAW_DEG, roll][1] for roll in (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)]
-    for name, curve, at in (
-        ("known rotation, yaw 10°", known, table[10.0, 0.0][[0, 2]]),
-        ("yaw only, roll 2°", yaw_only, table[FIG_9_YAW_DEG, 2.0][[0, 1]]),
-    ):
-        grows = bool((np.diff(curve[1:]) > 0).all())
-        row = band(f"Yu Fig. 9: {name}: error over that of ML", float(at[1] / at[0]), 2, np.inf, runs)
-        yield Row(
-            row.name,
-            row.figure + (", growing" if grows else ", not growing"),
-            row.target + ", growing",
-            row.passed and grows,
-            runs,
-        )
-    runs = lab.count(24, 4)
-    slopes = coefficients(lab, 0.2, 0.04)
-    force = slopes[:, :3].mean(axis=1)
-    for name, value in zip(("SROM", "ML"), force, strict=True):
-        yield band(f"Yu Fig. 14: slope at n1 0.2, n2 0.04, {name}", value, 0.0285, 0.0345, runs)
-    torque = slopes[:, 3:].mean(axis=1)
-    yield band("Yu Fig. 14: slope of torques over that of forces, ML", torque[1] / force[1], 0.7, 1.3, runs)
-    worst = max(
-        float((s[1] / s[0]).max())
-        for n1, n2 in ((0.05, 0.02), (0.2, 0.02), (0.2, 0.04), (0.4, 0.04), (0.2, 0.08))
-        for s in [coefficients(lab, n1, n2)[:, :3].mean(axis=1, keepdims=True)]
-    )
-    yield most("Yu Fig. 14: slope of ML over that of SROM, worst of 5 noises", worst, 1.03, runs)
-    on_axis = coefficients(lab, 0.2, 0.04, (0.0, 0.0, 0.1))[1]
-    yield most("Yu Fig. 15: centre on z: slope of torque z over that of x", on_axis[5] / on_axis[3], 0.5, runs)
-    moved = coefficients(lab, 0.2, 0.04, (0.3, 0.0, 0.1))[1, :3].mean() / force[1]
-    yield band("Yu Fig. 15: force slope with another centre, over that above", moved, 0.9, 1.1, runs)
 
 
 # Side by side
@@ -839,57 +482,16 @@ def real_data(lab: Lab) -> Iterator[Row]:
     MARKDOWN.extend(["", *lines, "", "Leave-one-out force in mN / torque in mN·m."])
 
 
-def speeds(lab: Lab) -> Iterator[Row]:
-    for figure in lab.pool.apply(_speeds, (lab.quick,)):  # a worker has one thread of linear algebra
-        yield Row(figure.name, figure.value, figure.target, figure.passed, figure.repeats)
-
-
-def _speeds(quick: bool) -> list[speed.Figure]:
-    return list(speed.measure(quick=quick))
-
-
 SECTIONS: dict[str, Callable[[Lab], Iterator[Row]]] = {
     "exact": exactness,
     "estimator": estimator,
     "orientations": inexact_orientations,
     "drift": drift,
     "outliers": outliers,
-    "samples": few_samples,
-    "poses": degenerate,
-    "design": design,
-    "carlson": carlson,
-    "yu": yu_figures,
+    "odds": odds_rows,
     "side": side_by_side,
     "real": real_data,
-    "speed": speeds,
 }
-
-
-def laboratory(*, quick: bool) -> tuple[Pool, Lab]:
-    """Start two workers, each with one thread of linear algebra."""
-    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
-    pool = get_context("spawn").Pool(2)
-    return pool, Lab(pool, quick=quick)
-
-
-def run(parts: Mapping[str, Callable[[Lab], Iterator[Row]]], description: str, after: Sequence[str] = ()) -> int:
-    """Print the rows of all parts, or of those named on the command line; return how many failed."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--quick", action="store_true", help="few runs, wider targets")
-    parser.add_argument("--only", choices=parts, action="append", help="one part; may be repeated")
-    options = parser.parse_args()
-    failed, start, write = 0, time.perf_counter(), partial(print, flush=True)
-    pool, lab = laboratory(quick=options.quick)
-    with pool:
-        for name in options.only or parts:
-            for row in parts[name](lab):
-                failed += not row.passed
-                mark = "pass" if row.passed else "FAIL"
-                write(f"{row.name:75} {row.figure:>28}   {row.target:24} {mark} {row.runs:8}")
-    for line in after:
-        write(line)
-    write(f"{failed} rows failed; {time.perf_counter() - start:.0f} s")
-    return failed
 
 
 if __name__ == "__main__":

@@ -32,10 +32,11 @@ from ftdrivers.errors import BadTranscript, BadUrl, ProtocolError
 from ftdrivers.registry import SENSORS, sensor_from_url
 from ftdrivers.robotiq import codec as robotiq
 from ftdrivers.robotous import codec as robotous
-from ftdrivers.robotous.can import Halves
+from ftdrivers.robotous.halves import Halves
 from ftdrivers.transcript.recorder import FORMAT, Transcript
 from ftdrivers.ur import rtde
-from ftdrivers.wires.framing import crc16_modbus, crc16_x25
+from ftdrivers.wires.crc import crc16_modbus, crc16_x25
+from tests.benchmarks.common import show
 
 LONGEST = 400
 SLOWEST_S = 0.5
@@ -66,12 +67,9 @@ def halves(*sizes: int) -> Callable[[bytes], list[bytes]]:
     return cut
 
 
-def reply_to(request: bytes) -> Callable[[bytes], object]:
-    return lambda data: modbus.check_reply(request, data)
-
-
-def robotiq_reply_to(request: bytes) -> Callable[[bytes], object]:
-    return lambda data: robotiq.check_reply(request, data)
+def words(data: bytes, count: int) -> list[int]:
+    """Cut bytes into numbers of two bytes; the last one gets the rest."""
+    return [int.from_bytes(piece, "big") for piece in halves(*[2] * count)(data)]
 
 
 def rtde_packages(data: bytes) -> None:
@@ -139,7 +137,6 @@ TRANSCRIPT = "\n".join(
 def targets() -> list[Target]:
     ati_row = halves(8, 8, 8)
     ati_pair = halves(8, 6)
-    words = halves(2, 2, 2, 2)
     robotous_stream = robotous.deframer()
     robotiq_stream = robotiq.deframer()
     bota_stream = bota.deframer()
@@ -147,6 +144,8 @@ def targets() -> list[Target]:
     record = bytes.fromhex("0064012C01F4FF38FE70FDA850")
     registers = modbus.read_registers(modbus.STATUS, 1)
     few = robotiq.read_registers(robotiq.SERIAL, 4)
+    few_answer = bytes.fromhex("090308465453 0004D2 0000")
+    netft_page = b"<cfgtfx>0;0;132.71;0;0;9</cfgtfx><scfgtdu>mm</scfgtdu><scfgtau>degrees</scfgtau>"
     calibration = bytes(2 * 117) + bytes.fromhex("000F4240000F4240") + bytes(338 - 2 * 117 - 8)
     bota_frame = bota.HEADER + with_crc(crc16_x25, bytes(34))
     frame = robotous.encode_frame(sample)
@@ -165,7 +164,7 @@ def targets() -> list[Target]:
         Target("ati.codec.decode_counts_per_unit", ati.decode_counts_per_unit, bytes.fromhex("000F4240000F4240")),
         Target("ati.codec.decode_unit_codes", ati.decode_unit_codes, b"\x02\x03"),
         Target("ati.codec.decode_firmware", ati.decode_firmware, b"\x03\x08\x00\x01"),
-        Target("ati.modbus.check_reply", reply_to(registers), modbus.frame(0x03, b"\x02\0\0")),
+        Target("ati.modbus.check_reply", lambda d: modbus.check_reply(registers, d), modbus.frame(0x03, b"\x02\0\0")),
         Target("ati.modbus.decode_calibration_block", modbus.decode_calibration_block, calibration),
         Target("ati.modbus.decode_records", keep, record * 8),
         Target("robotous.codec.decode_sample", robotous.decode_sample, sample),
@@ -174,28 +173,14 @@ def targets() -> list[Target]:
         Target("robotous.codec.check_set", robotous.check_set, bytes([0x0F, 1]).ljust(16, b"\0")),
         Target("robotous.halves", robotous_halves(), b"\0" + sample[:8] + b"\3" + sample[8:]),
         Target("robotous frames", robotous_stream.feed, frame),
-        Target(
-            "robotiq.codec.check_reply",
-            robotiq_reply_to(few),
-            with_crc(crc16_modbus, bytes.fromhex("090308465453 0004D2 0000")),
-        ),
+        Target("robotiq.codec.check_reply", lambda d: robotiq.check_reply(few, d), with_crc(crc16_modbus, few_answer)),
         Target("robotiq.codec.decode_frame", robotiq.decode_frame, with_crc(crc16_modbus, robotiq.HEADER + bytes(12))),
-        Target(
-            "robotiq.codec.decode_serial", lambda d: robotiq.decode_serial([*map(big, words(d))]), b"FTS\0\x04\xd2\0\0"
-        ),
+        Target("robotiq.codec.decode_serial", lambda d: robotiq.decode_serial(words(d, 4)), b"FTS\0\x04\xd2\0\0"),
         Target("robotiq frames", robotiq_stream.feed, with_crc(crc16_modbus, robotiq.HEADER + bytes(12))),
-        Target(
-            "robotiq.codec.decode_firmware",
-            lambda d: robotiq.decode_firmware([*map(big, halves(2, 2, 2)(d))]),
-            b"FTS\1\2\3",
-        ),
+        Target("robotiq.codec.decode_firmware", lambda d: robotiq.decode_firmware(words(d, 3)), b"FTS\1\2\3"),
         Target("bota.codec.decode_frame", bota.decode_frame, bota_frame),
         Target("bota frames", bota_stream.feed, bota_frame),
-        Target(
-            "netft.transformation_in",
-            transformation_in,
-            b"<cfgtfx>0;0;132.71;0;0;9</cfgtfx><scfgtdu>mm</scfgtdu><scfgtau>degrees</scfgtau>",
-        ),
+        Target("netft.transformation_in", transformation_in, netft_page),
         Target("ur.rtde.take_package", rtde_packages, rtde.encode(rtde.DATA, bytes(57)) * 2),
         Target("ur.rtde.decode_version", rtde.decode_version, struct.pack(">4I", 5, 15, 0, 1)),
         Target("ur.rtde.Recipe.decode", rtde.Recipe.decode, recipe),
@@ -209,10 +194,6 @@ def targets() -> list[Target]:
 
 def with_crc(crc: Callable[[bytes], int], data: bytes) -> bytes:
     return data + crc(data).to_bytes(2, "little")
-
-
-def big(data: bytes) -> int:
-    return int.from_bytes(data, "big")
 
 
 def inputs_for(golden: bytes, count: int, rng: random.Random) -> list[bytes]:
@@ -296,12 +277,11 @@ def main() -> int:
     for target in [target for target in targets() if options.only in target.name]:
         outcome = fuzz(target, options.inputs)
         failed |= not outcome.passed
-        sys.stdout.write(
+        show(
             f"{target.name:38} {outcome.inputs:8} inputs, {outcome.refused:8} refused, slowest "
             f"{outcome.slowest_s * 1e3:7.2f} ms, kept {outcome.kept_bytes:7} bytes   "
-            f"{'pass' if outcome.passed else 'FAIL'} {outcome.undocumented}\n"
+            f"{'pass' if outcome.passed else 'FAIL'} {outcome.undocumented}"
         )
-        sys.stdout.flush()
     return int(failed)
 
 

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -102,7 +102,7 @@ class Fault:
     name: str
     inject: Deed
     repair: Deed
-    hazards: frozenset[int]
+    hazards: Set[int]
     """The rows that may name it."""
     detect_s: float = 0.05
     at: str = "move"
@@ -174,101 +174,70 @@ def by_hand(scene: Scene) -> None:
     scene.do(do="hand-move", q_rad=[*others, last - 1.0], speed_rad_s=0.2)
 
 
-PUSH: Final = [0.0, 25.0, 0.0, 0.0, 0.0, 0.0]
-HARD: Final = [0.0, 140.0, 0.0, 0.0, 0.0, 0.0]
-RELEASE: Final = ask(do="push", wrench=[0.0] * 6)
+def switch(do: str, **details: Any) -> tuple[Deed, Deed]:
+    """Switch something in the emulated cell on, and off again as the repair."""
+    return ask(do=do, **details), ask(do=do, on=False)
 
+
+def push(force_y_N: float) -> tuple[Deed, Deed]:
+    """Push the tool sideways, and let go as the repair."""
+    return ask(do="push", wrench=[0.0, force_y_N, 0.0, 0.0, 0.0, 0.0]), ask(do="push", wrench=[0.0] * 6)
+
+
+def displace(joint: int, off_deg: float) -> tuple[Deed, Deed]:
+    """Take a joint off its line, and back as the repair."""
+    return ask(do="push-joint", joint=joint, off_deg=off_deg), ask(do="push-joint", joint=joint, off_deg=0)
+
+
+STALL: Final = ask(do="sensor-faults", stall=True), ask(do="sensor-faults", stall=False)
+EMERGENCY_STOP: Final = ask(do="emergency-stop", on=True), power_up
+PAYLOAD: Final = ask(do="set-payload", payload_kg=3.0), ask(do="set-payload", payload_kg=PAYLOAD_KG)
+TCP: Final = ask(do="set-tcp", tcp=[0, 0, 0.1, 0, 0, 0]), ask(do="set-tcp", tcp=[0.0] * 6)
+PROTECTIVE_STOP: Final = ask(do="protective-stop"), unlock
+RTDE_SILENT: Final = ask(do="silent", what="rtde"), ask(do="silent", what="rtde", on=False)
+SLIDER: Final = ask(do="slider", fraction=0.0), ask(do="slider", fraction=1.0)
+ONE_MOVE: Final = "it ends the one move it was given"
+
+# fmt: off
 FAULTS: Final[Sequence[Fault]] = (
-    Fault(
-        "1", "cable pulls hard", ask(do="cable", force_N=[0, 20, 0]), ask(do="cable", on=False), frozenset({14}), stop=7
-    ),
-    Fault(
-        "2",
-        "a joint off its line",
-        ask(do="push-joint", joint=2, off_deg=1.5),
-        ask(do="push-joint", joint=2, off_deg=0),
-        frozenset({2}),
-    ),
-    Fault("5", "protective stop on the approach", ask(do="protective-stop"), unlock, frozenset({10}), at="approach"),
-    Fault(
-        "7",
-        "payload changed",
-        ask(do="set-payload", payload_kg=3.0),
-        ask(do="set-payload", payload_kg=PAYLOAD_KG),
-        frozenset({7}),
-        words="payload",
-    ),
-    Fault(
-        "8",
-        "TCP changed",
-        ask(do="set-tcp", tcp=[0, 0, 0.1, 0, 0, 0]),
-        ask(do="set-tcp", tcp=[0.0] * 6),
-        frozenset({8}),
-    ),
-    Fault("7, 10", "protective stop", ask(do="protective-stop"), unlock, frozenset({10}), words="wrong payload"),
-    Fault("11", "emergency stop", ask(do="emergency-stop", on=True), power_up, frozenset({11})),
-    Fault("11", "safeguard stop", ask(do="safeguard", on=True), ask(do="safeguard", on=False), frozenset({11, 21})),
-    Fault("12", "reduced mode", ask(do="reduced", on=True), ask(do="reduced", on=False), frozenset({12})),
-    Fault("13", "an axis saturates", ask(do="saturate", axis=2), ask(do="saturate", on=False), frozenset({13, 14, 15})),
-    Fault("14", "push, tool not yet known", ask(do="push", wrench=HARD), RELEASE, frozenset({14})),
-    Fault("14", "push, tool known", ask(do="push", wrench=PUSH), RELEASE, frozenset({14}), stop=7),
-    Fault(
-        "14", "push while a pose is averaged", ask(do="push", wrench=HARD), RELEASE, frozenset({14}), 0.1, at="sample"
-    ),
-    Fault(
-        "15",
-        "sensor silent",
-        ask(do="sensor-faults", stall=True),
-        ask(do="sensor-faults", stall=False),
-        frozenset({15}),
-        0.15,
-    ),
-    Fault("15", "sensor stuck", ask(do="freeze-sensor"), ask(do="freeze-sensor", on=False), frozenset({15}), 0.25),
-    Fault("15", "sensor unplugged", ask(do="unplug"), nothing, frozenset({15}), 0.15, restart=True),
-    Fault(
-        "16",
-        "controller silent",
-        ask(do="silence-arm"),
-        ask(do="silence-arm", on=False),
-        frozenset({16}),
-        0.5,
-        ends_its_move=True,
-        words="it ends the one move it was given",
-    ),
-    Fault(
-        "16",
-        "state stream silent",
-        ask(do="silent", what="rtde"),
-        ask(do="silent", what="rtde", on=False),
-        frozenset({16}),
-        0.3,
-    ),
-    Fault("16", "state stream hangs up", ask(do="drop", what="rtde", reset=True), nothing, frozenset({16, 21}), 0.3),
-    Fault("17", "Ctrl-C", send(signal.SIGINT), nothing, frozenset(), resumed=True),
-    Fault("18", "killed", send(signal.SIGKILL), nothing, frozenset(), 0.5, resumed=True),
-    Fault(
-        "18", "killed with all its processes", send(signal.SIGKILL, group=True), nothing, frozenset(), 0.5, resumed=True
-    ),
-    Fault("18", "suspended", send(signal.SIGSTOP), send(signal.SIGCONT), frozenset(), 0.5, resumed=True),
-    Fault("19", "moved by hand, resume meanwhile", ask(do="dashboard-stop"), by_hand, frozenset({21})),
-    Fault(
-        "19",
-        "pushed while a pose is averaged",
-        ask(do="push-joint", joint=6, off_deg=1.0),
-        ask(do="push-joint", joint=6, off_deg=0),
-        frozenset({21}),
-        0.1,
-        at="sample",
-    ),
-    Fault("21", "program of another client", ask(do="foreign-program", seconds=1), nothing, frozenset({21})),
-    Fault("21", "another client's stop", ask(do="dashboard-stop"), nothing, frozenset({21})),
-    Fault("21", "program ends by itself", ask(do="crash-script"), nothing, frozenset({21})),
-    Fault("22", "slider at 0", ask(do="slider", fraction=0.0), ask(do="slider", fraction=1.0), frozenset({22}), 11.0),
-    Fault("26", "poses cannot be written", hide_poses, show_poses, frozenset({26}), 2.0, at="sample"),
+    Fault("1", "cable pulls hard", *switch("cable", force_N=[0, 20, 0]), {14}, stop=7),
+    Fault("2", "a joint off its line", *displace(2, 1.5), {2}),
+    Fault("5", "protective stop on the approach", *PROTECTIVE_STOP, {10}, at="approach"),
+    Fault("7", "payload changed", *PAYLOAD, {7}, words="payload"),
+    Fault("8", "TCP changed", *TCP, {8}),
+    Fault("7, 10", "protective stop", *PROTECTIVE_STOP, {10}, words="wrong payload"),
+    Fault("11", "emergency stop", *EMERGENCY_STOP, {11}),
+    Fault("11", "safeguard stop", ask(do="safeguard", on=True), ask(do="safeguard", on=False), {11, 21}),
+    Fault("12", "reduced mode", ask(do="reduced", on=True), ask(do="reduced", on=False), {12}),
+    Fault("13", "an axis saturates", *switch("saturate", axis=2), {13, 14, 15}),
+    Fault("14", "push, tool not yet known", *push(140.0), {14}),
+    Fault("14", "push, tool known", *push(25.0), {14}, stop=7),
+    Fault("14", "push while a pose is averaged", *push(140.0), {14}, 0.1, at="sample"),
+    Fault("15", "sensor silent", *STALL, {15}, 0.15),
+    Fault("15", "sensor stuck", *switch("freeze-sensor"), {15}, 0.25),
+    Fault("15", "sensor unplugged", ask(do="unplug"), nothing, {15}, 0.15, restart=True),
+    Fault("16", "controller silent", *switch("silence-arm"), {16}, 0.5, ends_its_move=True, words=ONE_MOVE),
+    Fault("16", "state stream silent", *RTDE_SILENT, {16}, 0.3),
+    Fault("16", "state stream hangs up", ask(do="drop", what="rtde", reset=True), nothing, {16, 21}, 0.3),
+    Fault("17", "Ctrl-C", send(signal.SIGINT), nothing, set(), resumed=True),
+    Fault("18", "killed", send(signal.SIGKILL), nothing, set(), 0.5, resumed=True),
+    Fault("18", "killed with all its processes", send(signal.SIGKILL, group=True), nothing, set(), 0.5, resumed=True),
+    Fault("18", "suspended", send(signal.SIGSTOP), send(signal.SIGCONT), set(), 0.5, resumed=True),
+    Fault("19", "moved by hand, resume meanwhile", ask(do="dashboard-stop"), by_hand, {21}),
+    Fault("19", "pushed while a pose is averaged", *displace(6, 1.0), {21}, 0.1, at="sample"),
+    Fault("21", "program of another client", ask(do="foreign-program", seconds=1), nothing, {21}),
+    Fault("21", "another client's stop", ask(do="dashboard-stop"), nothing, {21}),
+    Fault("21", "program ends by itself", ask(do="crash-script"), nothing, {21}),
+    Fault("22", "slider at 0", *SLIDER, {22}, 11.0),
+    Fault("26", "poses cannot be written", hide_poses, show_poses, {26}, 2.0, at="sample"),
 )
+# fmt: on
 
 
 # -- before anything moves ---------------------------------------------------------------------------------------------
+
+
+MINIMAL: Final = ("--minimal",)
 
 
 @dataclass(frozen=True)
@@ -282,7 +251,7 @@ class Beforehand:
     options: tuple[str, ...] = ()
     do: Json | None = None
     change: Callable[[CellConfig], CellConfig] = lambda cell: cell
-    arguments: tuple[str, ...] = ("--minimal",)
+    arguments: tuple[str, ...] = MINIMAL
     sensor: str = "can"
 
 
@@ -304,43 +273,29 @@ def _caged(cell: CellConfig) -> CellConfig:
     return replace(_of_tool(0.0, 1200.0, 100.0)(cell), workcell=WorkcellConfig(planes_mm=walls, measured=True))
 
 
+BOX_MM: Final = (-400.0, -600.0, 300.0, 100.0, 0.0, 600.0)
+HEAVY_SET: Final = ("--payload", "14")
+HEAVY: Final = _of_tool(0.0, 300.0, 100.0, mass_kg=14.0)
+SHORT: Final = _of_tool(0.0, 150.0, 90.0)
+
+# fmt: off
 BEFOREHAND: Final[Sequence[Beforehand]] = (
     Beforehand("2, 3", "a tool longer than its cage", 7, "proven clear", change=_caged),
     Beforehand("3", "not measured", 7, "measured", change=_of_workcell(measured=False)),
     Beforehand("3", "a safety plane in the way", 7, "safety limits", ("--plane", "0,0,1,1.0")),
-    Beforehand(
-        "5",
-        "the arm stands in a box",
-        7,
-        "0 mm from contact",
-        change=_of_workcell(boxes_mm=((-400.0, -600.0, 300.0, 100.0, 0.0, 600.0),)),
-    ),
+    Beforehand("5", "the arm stands in a box", 7, "0 mm from contact", change=_of_workcell(boxes_mm=(BOX_MM,))),
     Beforehand("7", "payload 0 in the controller", 7, "payload", ("--payload", "0")),
     Beforehand("8", "a turned TCP, not reported", 0, options=("--tcp", "0,0,0.2,0.3,0,0", "--no-tcp-offset")),
     Beforehand("9", "another model", 3, "UR10e", change=_of_model("UR10e")),
     Beforehand("10", "protective stop", 7, "protective", do={"do": "protective-stop"}),
     Beforehand("11", "emergency stop", 5, "emergency", do={"do": "emergency-stop"}),
-    Beforehand(
-        "13",
-        "a tool of 14 kg, 300 mm",
-        7,
-        "of the sensor's range",
-        ("--payload", "14"),
-        change=_of_tool(0.0, 300.0, 100.0, mass_kg=14.0),
-        sensor="serial",
-    ),
+    Beforehand("13", "a tool of 14 kg, 300 mm", 7, "of the sensor's range", HEAVY_SET, None, HEAVY, MINIMAL, "serial"),
     Beforehand("15", "sensor silent", 3, "no answer", do={"do": "sensor-faults", "stall": True}),
     Beforehand("15", "sensor stuck", 5, "frozen", do={"do": "freeze-sensor"}),
     Beforehand("16", "controller silent", 3, "did not answer", do={"do": "silence-arm"}),
     Beforehand("21", "program of another client", 7, "stop it at the", do={"do": "foreign-program", "seconds": 60}),
     Beforehand("21", "local control", 7, "remote", do={"do": "remote-control", "on": False}),
-    Beforehand(
-        "25",
-        "a plan for another tool",
-        7,
-        "another tool",
-        change=_of_tool(0.0, 150.0, 90.0),
-        arguments=("--plan", "PLAN"),
-    ),
+    Beforehand("25", "a plan for another tool", 7, "another tool", (), None, SHORT, ("--plan", "PLAN")),
     Beforehand("26", "a folder that cannot be written", 7, "written", arguments=("--minimal", "--runs", "/proc/none")),
 )
+# fmt: on

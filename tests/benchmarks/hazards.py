@@ -14,7 +14,6 @@ import argparse
 import json
 import os
 import shutil
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
@@ -25,6 +24,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
+from tests.benchmarks.common import show
 from tests.benchmarks.hazard_rows import BEFOREHAND, FAULTS, UNSEEN, Beforehand, Fault, Json
 from tests.benchmarks.hazard_sessions import QUIET, Observed, begin, disturb, undisturbed
 
@@ -81,11 +81,6 @@ def in_groups(groups: Mapping[str, float]) -> str:
 # -- the table ---------------------------------------------------------------------------------------------------------
 
 
-def say(words: str) -> None:
-    sys.stdout.write(words + "\n")
-    sys.stdout.flush()
-
-
 class Table:
     """Rows as they come, counted; one that breaks is a row that failed."""
 
@@ -102,7 +97,7 @@ class Table:
         quiet = [undisturbed(self.folder, QUIET, "--plan", str(self.plan), "--fast") for _ in range(2)]
         one, other = (result_of(self.folder, answer) for answer in quiet)
         self.reference = {name: getattr(one, name) for name in GROUPS.values()}
-        say(f"load {os.getloadavg()[0]:.1f}; differences in sigma of one run with the usual noise")
+        show(f"load {os.getloadavg()[0]:.1f}; differences in sigma of one run with the usual noise")
         for name, groups in (
             (
                 "the undisturbed run from the truth, noise as usual",
@@ -111,7 +106,7 @@ class Table:
             ("the same with a tenth of the noise", self._from_truth(one, quiet[0])),
             ("two undisturbed runs with a tenth of the noise", largest(one, other, self.sigma)),
         ):
-            say(f"{name:52} {in_groups(groups)}")
+            show(f"{name:52} {in_groups(groups)}")
 
     def _from_truth(self, result: CalibrationResult, answer: Json) -> dict[str, float]:
         return largest(result, Known(answer["truth"]), self.sigma)
@@ -124,7 +119,7 @@ class Table:
         except Exception as error:  # the other rows are worth something without it
             seen, complaints = "", [f"broke off: {error!r}"]
         self.failed += bool(complaints)
-        say(f"{self.done:2}/{self.rows} {head} {seen}  {'FAIL: ' + '; '.join(complaints) if complaints else 'pass'}")
+        show(f"{self.done:2}/{self.rows} {head} {seen}  {'FAIL: ' + '; '.join(complaints) if complaints else 'pass'}")
 
     def fault(self, fault: Fault) -> tuple[str, Sequence[str]]:
         """Judge what a fault did."""
@@ -233,19 +228,19 @@ def main() -> int:
     table = Table(folder, len(faults) + len(beforehand))
     try:
         table.begin()
-        say(f"\n{'':5} row   {'fault':32} {'reaction':30} {'limit':>7} kept  difference from undisturbed, sigma")
+        show(f"\n{'':5} row   {'fault':32} {'reaction':30} {'limit':>7} kept  difference from undisturbed, sigma")
         for fault in faults:
             table.row(f"{fault.row:5} {fault.name:32}", partial(table.fault, fault))
-        say(f"\nlargest difference of a resumed run, by group: {in_groups(table.worst)}")
-        say("\nbefore anything moves")
+        show(f"\nlargest difference of a resumed run, by group: {in_groups(table.worst)}")
+        show("\nbefore anything moves")
         for row in beforehand:
             table.row(f"{row.row:5} {row.name:32}", partial(table.beforehand, row))
-        say("\nnot injected here")
+        show("\nnot injected here")
         for name, why in UNSEEN.items():
-            say(f"{name:32} {why}")
+            show(f"{name:32} {why}")
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-    say(f"\n{table.failed} rows failed")
+    show(f"\n{table.failed} rows failed")
     return table.failed
 
 

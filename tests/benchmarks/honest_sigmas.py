@@ -20,13 +20,13 @@ far          gain of 1 to 3 %, centre of mass at 20 to 200 mm
 Columns: for each reported parameter root mean square of error / sigma over all sessions, and in brackets the share
 within two sigmas where GOOD or USABLE is printed; true error of the next use over the shown one, median over the
 sessions, force and torque, for poses that continue the tour and for any orientation at its end; largest true error of
-the next use in medians of the cell; sessions accepted, refused, and with a number that is not finite, a negative
-eigenvalue or a traceback; milliseconds of CPU, mean and largest. The true bias is the mean over the tour.
+the next use in medians of the cell; false alarms in % of a verification with six poses that continue the tour, 1 %
+expected at most; sessions accepted, refused, and with a number that is not finite, a negative eigenvalue or a
+traceback; milliseconds of CPU, mean and largest. The true bias is the mean over the tour.
 """
 
 import argparse
 import json
-import os
 import sys
 import time
 from collections.abc import Iterator
@@ -38,6 +38,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib import CalibrationDataset, CalibrationResult, NotObservable, solve
+from ftcalib.extras.verification import verify
+from tests.benchmarks.common import restart_with_one_thread, show
 
 Array = NDArray[np.float64]
 
@@ -174,6 +176,12 @@ class Session:
         yield "P", (result.p_sensor_com_m - self.P) / sigma["p_sensor_com_m"]
         yield "T0", (result.torque_bias_Nm - self.bias[3:]) / sigma["torque_bias_Nm"]
 
+    def is_false_alarm(self, result: CalibrationResult, data: CalibrationDataset) -> bool:
+        """Whether a verification with six poses that continue the tour finds a change, although nothing changed."""
+        new = slice(self.n, self.n + 6)
+        cov = np.tile(np.diag(SIGMA**2), (6, 1, 1))
+        return verify(result, self.R[new], self.readings[new], cov, fitted=data).p_value < 0.01
+
     def next_use(self, result: CalibrationResult) -> Array:
         """Mean square true error (2, 2) of poses that continue the tour, and at its end: force, torque."""
         rows = []
@@ -197,7 +205,7 @@ def cell(name: str, n: int, where: str, *, measured: bool, sessions: int, seed: 
     """Run the sessions of a cell and format its row."""
     scaled: dict[str, list[Array]] = {p: [] for p in PARAMETERS}
     within: dict[str, list[Array]] = {p: [] for p in PARAMETERS}
-    true, shown, ms, unsound, refused, accepted = [], [], [], [], 0, 0
+    true, shown, alarms, ms, unsound, refused, accepted = [], [], [], [], [], 0, 0
     for k in range(sessions):
         identity = [seed, k, n, list(CELLS).index(name), where == "any", measured]
         session = Session(np.random.default_rng(identity), n, where, CELLS[name])
@@ -224,6 +232,7 @@ def cell(name: str, n: int, where: str, *, measured: bool, sessions: int, seed: 
                 within[parameter].append((np.abs(z) < 2).astype(float))
         if passed:
             true.append(session.next_use(result))
+            alarms.append(session.is_false_alarm(result, data))
             # What noise explains is shown without the noise of a reading, which the next use has too.
             noise = np.sum(SIGMA.reshape(2, 3) ** 2, axis=1) if result.noise_explains else 0.0
             shown.append(result.likely_error() ** 2 + noise)
@@ -238,10 +247,11 @@ def cell(name: str, n: int, where: str, *, measured: bool, sessions: int, seed: 
         use = np.sqrt(np.median(np.array(true) / np.array(shown)[:, None], axis=0))
     figures = " ".join(f"{ratio[p]:5.2f} ({cover[p]:3.0f})" for p in PARAMETERS)
     next_use = " ".join(f"{part[0]:5.2f} {part[1]:5.2f}" for part in use)
+    alarm = 100 * float(np.mean(alarms)) if alarms else np.nan
     source = "given" if measured else "unknown"
     cost = f"{np.mean(ms) if ms else np.nan:6.1f} {max(ms, default=np.nan):6.0f}"
     counts = f"{accepted:4} {refused:3} {len(unsound):3}"
-    return f"{name:11} {n:3} {where:5} {source:7} {figures}  {next_use} {worst:5.1f}  {counts} {cost}"
+    return f"{name:11} {n:3} {where:5} {source:7} {figures}  {next_use} {worst:5.1f} {alarm:6.1f}  {counts} {cost}"
 
 
 def main() -> int:
@@ -257,17 +267,14 @@ def main() -> int:
     heads: list[Any] = [f"{p:>11}" for p in PARAMETERS]
     sys.stdout.write(
         f"{'cell':11} {'n':>3} {'range':5} {'noise':7} {' '.join(heads)}  {'next use':>11} {'at the end':>11}"
-        " worst  kept ref bad   ms    most\n"
+        " worst alarms  kept ref bad   ms    most\n"
     )
     for name, n, where, noise in product(options.cells, options.poses, options.where, options.noise):
         row = cell(name, n, where, measured=noise == "given", sessions=options.sessions, seed=options.seed)
-        sys.stdout.write(row + "\n")
-        sys.stdout.flush()
+        show(row)
     return 0
 
 
 if __name__ == "__main__":
-    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
-        os.environ["OPENBLAS_NUM_THREADS"] = "1"
-        os.execv(sys.executable, sys.orig_argv)
+    restart_with_one_thread()
     sys.exit(main())

@@ -11,7 +11,7 @@ of a row has the seed k. Prints one row a figure; the exit code is the number of
 import resource
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -25,6 +25,7 @@ from ftcalib.motion.estimate import fit
 from ftcalib.motion.model import DELAY, INERTIA, Load
 from ftcalib.motion.samples import Means, rows_of
 from ftcalib.motion.solve import solve_motion
+from tests.benchmarks.common import Row, show_rows
 from tests.moving_load import Recorded, Truth, means_of, programme, record, sweep
 
 SWEEP_S = 20.0
@@ -61,37 +62,28 @@ def _errors(kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return error, np.sqrt(np.diag(found.covariance))
 
 
-class Table:
-    """Rows of figures."""
-
-    failed = 0
-
-    def row(self, name: str, figure: str, target: str, passed: bool | None) -> None:
-        """Print one; None is for information."""
-        self.failed += passed is False
-        click.echo(f"{name:34}{figure:44}{target:24}{'' if passed is None else 'pass' if passed else 'FAIL'}")
-
-
-def _sigmas(table: Table, runs: int) -> None:
+def _sigmas(runs: int) -> Iterator[Row]:
     slack = 2.5 / np.sqrt(2 * runs)  # of the ratio of one parameter, by chance
     for kind in ("plain", "gain", "drift", "poses", "posture"):
         results = [_errors(kind, seed) for seed in range(runs)]
         errors, sigmas = (np.array(each)[:, :23] for each in zip(*results, strict=True))
         ratio = np.sqrt(np.mean((errors / sigmas) ** 2, axis=0))
         mean, inside = float(np.sqrt(np.mean(ratio**2))), float(np.mean(np.abs(errors / sigmas) < 2))
-        judged = None if kind == "posture" else True
-        passed = judged and 0.9 <= mean <= 1.15 and ratio.max() < 1.15 * (1 + slack)
-        figure = f"{mean:.3f} ({ratio.min():.2f} to {ratio.max():.2f} by parameter)"
-        table.row(f"{kind}: error / sigma", figure, ".9 to 1.15", passed)
-        table.row(f"{kind}: within 2 sigma", f"{inside:.3f}", ".93 to .97", judged and 0.93 <= inside <= 0.97)
+        # No method can see a smooth error of the poses that looks like another mounting: those rows have no target.
+        unseen = kind == "posture"
+        passed = unseen or bool(0.9 <= mean <= 1.15 and ratio.max() < 1.15 * (1 + slack))
+        figure = f"{mean:.3f} ({ratio.min():.2f} to {ratio.max():.2f})"
+        yield Row(f"{kind}: error / sigma (by parameter)", figure, "" if unseen else ".9 to 1.15", passed, runs)
+        passed = unseen or 0.93 <= inside <= 0.97
+        yield Row(f"{kind}: within 2 sigma", f"{inside:.3f}", "" if unseen else ".93 to .97", passed, runs)
         if kind == "plain":
             inertia = float(np.percentile(np.abs(errors[:, INERTIA]).max(axis=1), 95)) / 2e-3
             delay_ms = 1e3 * float(np.abs(errors[:, DELAY]).max())
-            table.row("inertia, of 2e-3 kg m², 95 %", f"{100 * inertia:.2f} %", "3 %", inertia <= 0.03)
-            table.row("delay, worst", f"{delay_ms:.3f} ms", ".1 ms", delay_ms <= 0.1)
+            yield Row("inertia, of 2e-3 kg m², 95 %", f"{100 * inertia:.2f} %", "3 %", inertia <= 0.03)
+            yield Row("delay, worst", f"{delay_ms:.3f} ms", ".1 ms", delay_ms <= 0.1)
 
 
-def _wrong(table: Table, _runs: int) -> None:
+def _wrong(_runs: int) -> Iterator[Row]:
     truth = Truth()
     good = record(truth, sweep(SWEEP_S), SWEEP_S, 1)
     still = Truth(noise=(0, 0), vibration=(0, 0))
@@ -121,10 +113,10 @@ def _wrong(table: Table, _runs: int) -> None:
         except FtdriveError as error:
             verdict, named = "rejected", {type(error).__name__}
         shown = ", ".join(sorted(named & expected)) or "not named"
-        table.row(name, f"{verdict}: {shown}", "named, not good", bool(named & expected) and verdict != "good")
+        yield Row(name, f"{verdict}: {shown}", "named, not good", bool(named & expected) and verdict != "good")
 
 
-def _contacts(table: Table, runs: int) -> None:
+def _contacts(runs: int) -> Iterator[Row]:
     """Random programs with touches of 2 to 20 N for 30 % of the time, beside the same motion without."""
     seconds, share = 90.0, 0.3
     found = touches = false = rejected = 0
@@ -155,15 +147,15 @@ def _contacts(table: Table, runs: int) -> None:
             rejected += result.verdict == "rejected"
             error.append(float(np.linalg.norm(result.gravity_force_base_N - truth.mass_kg * truth.gravity_m_s2)))
         ratios.append(error)
-    table.row("contacts of 2 to 20 N found", f"{found} of {touches}", "95 %", found >= 0.95 * touches)
-    table.row("false contacts", f"{false} in {minutes:.0f} min", "1 in 10 min", false <= minutes / 10)
+    yield Row("contacts of 2 to 20 N found", f"{found} of {touches}", "95 %", found >= 0.95 * touches)
+    yield Row("false contacts", f"{false} in {minutes:.0f} min", "1 in 10 min", false <= minutes / 10)
     with_contact, free = np.sqrt(np.mean(np.square(ratios), axis=0))
     ratio = float(with_contact / free)
-    table.row("error with contact / without", f"{ratio:.2f}", "2", ratio <= 2)
-    table.row("rejected with contact", f"{rejected}", "0", rejected == 0)
+    yield Row("error with contact / without", f"{ratio:.2f}", "2", ratio <= 2)
+    yield Row("rejected with contact", f"{rejected}", "0", rejected == 0)
 
 
-def _hour(table: Table, _runs: int) -> None:
+def _hour(_runs: int) -> Iterator[Row]:
     minute = programme(5, 50.0)[0]
 
     def joints(t: np.ndarray) -> np.ndarray:  # there and back, so that minutes join
@@ -191,9 +183,9 @@ def _hour(table: Table, _runs: int) -> None:
     spent_s += time.process_time() - begun
     used_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     off = abs(result.mass_kg - truth.mass_kg) / (float(np.sqrt(np.diag(result.covariance)[3:6].max())) / G_M_S2)
-    table.row("hour at 7 kHz: CPU time", f"{spent_s:.0f} s, mass off {off:.1f} sigma", "120 s", spent_s <= 120)
+    yield Row("hour at 7 kHz: CPU time", f"{spent_s:.0f} s, mass off {off:.1f} sigma", "120 s", spent_s <= 120)
     figure = f"{used_mb:.0f} MB, {before_mb:.0f} before"
-    table.row("hour at 7 kHz: memory of the process", figure, "600 MB", used_mb <= 600)
+    yield Row("hour at 7 kHz: memory of the process", figure, "600 MB", used_mb <= 600)
 
 
 def _columns(one: Recorded) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -209,10 +201,7 @@ PARTS = {"sigmas": _sigmas, "wrong": _wrong, "contacts": _contacts, "hour": _hou
 @click.option("--only", type=click.Choice(list(PARTS)), multiple=True)
 def main(runs: int, only: Sequence[str]) -> None:
     """Print the rows."""
-    table = Table()
-    for name in only or PARTS:
-        PARTS[name](table, runs)
-    sys.exit(table.failed)
+    sys.exit(sum(show_rows(PARTS[name](runs)) for name in only or PARTS))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ Run: python -m tests.benchmarks.planning [--plans 1000]
 """
 
 import argparse
-import sys
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -13,18 +12,18 @@ from typing import TypeVar
 
 import numpy as np
 
-from ftcalib.poses.information import special
 from ftdrive.errors import PlanRefused
 from ftdrive.planning.approach import plan_approach
-from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Bodies, Cylinder
+from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.geometry.kinematics import inverse
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
-from ftdrive.planning.motion import Speeds, move_duration_s
+from ftdrive.planning.geometry.shapes import Bodies
+from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
-from ftdrive.planning.search.nodes import constant_tour
+from ftdrive.planning.search.constant_tour import constant_tour
 from ftdrivers.ur.kinematics import Array
+from tests.benchmarks.common import show
 
 MODELS = ("UR3e", "UR5e", "UR10e", "UR16e", "UR20", "UR30")
 TOOLS = {
@@ -37,12 +36,6 @@ LUMP = (Cylinder(0, 0.2, 0.1), Cylinder(0.05, 0.1, 0.03, 0.06, 0.0))
 FIXED_POINTS_M = {"UR3e": (0.283, 0.283, 0.3), "UR5e": (0.3, 0.52, 0.5), "UR10e": (0.742, 0.742, 0.55)}
 """Flange points at which all 24 orientations have a free posture."""
 T = TypeVar("T")
-
-
-def show(line: str) -> None:
-    """Write a line."""
-    sys.stdout.write(line + "\n")
-    sys.stdout.flush()
 
 
 def timed(make: Callable[[], T]) -> tuple[T, float]:
@@ -136,35 +129,6 @@ def row(name: str, target_s: float, make: Callable[[], Plan]) -> None:
         f"{document['min_clearance_mm']:5.1f} mm   {document['predicted_sigma']['force_rms_N']:.3f} N  "
         f"{judged(took_s <= target_s, plan.certified)}"
     )
-
-
-def naive() -> None:
-    """The paper's order at one flange point, always the nearest posture, beside the plans."""
-    show("\n24 poses at 60 deg/s            motion  joint travel  moves not clear")
-    speeds = Speeds(tip_m_s=None)
-    for model, point in FIXED_POINTS_M.items():
-        certifier = certifier_of(model)
-        guess = guess_of(certifier)
-        branches = inverse(certifier.arm.kinematics, special(range(1, 25)), np.tile(point, (24, 1)))
-        q = [USUAL_POSTURE_RAD]
-        for options in branches:
-            reached = options[~np.isnan(options[:, 0])]
-            q.append(reached[np.abs(reached - q[-1]).max(axis=1).argmin()])
-        compare(f"{model:6s} paper order", certifier, np.array(q[1:]))
-        for name, plan in (
-            ("free box", plan_box(certifier, centre_m=point, speeds=speeds, guess=guess)),
-            ("constant tour", plan_tour(certifier, speeds=speeds, guess=guess)),
-        ):
-            compare(f"{model:6s} {name}", certifier, np.array([step.q_rad for step in plan.steps]))
-
-
-def compare(name: str, certifier: Certifier, q_rad: Array) -> None:
-    """Show what a closed tour costs."""
-    following = np.roll(q_rad, -1, axis=0)
-    turn = np.abs(following - q_rad)
-    duration = move_duration_s(turn.max(axis=1), np.radians(60), np.radians(80)).sum()
-    clear = certifier.certify(q_rad, following, tight=False).clear
-    show(f"{name:28s}  {duration:5.1f} s     {np.degrees(turn.sum()):6.0f} deg  {24 - clear.sum():2d} of 24")
 
 
 def random_plans(wanted: int) -> None:
@@ -283,5 +247,4 @@ if __name__ == "__main__":
     arguments = parser.parse_args()
     constant_tours()
     searches()
-    naive()
     random_plans(arguments.plans)

@@ -1,14 +1,12 @@
 """Calibrate the kinematics of real arms as emulated arms, on both control paths, and refuse what contradicts them.
 
-    FTDRIVE_REAL_DATA=… python -m tests.benchmarks.real_arms [--arms 01,13] [--paths script] [--plans FOLDER]
+    FTDRIVE_REAL_DATA=… python -m tests.benchmarks.real_arms [--arms 01,13] [--paths script]
 
 Each arm of `ur_calibrations/arms.csv` is a station with these kinematics. `doctor`, `plan`, `calibrate` along that
 plan, `verify`, and `solve --method srom` have to find it good, as they would with a configuration file and typed
 answers. An arm whose shape is not measured (UR3, UR5 and UR10 of the CB3 generation) cannot be planned: `doctor` has to
 accept it, `calibrate` to refuse it in a sentence, `calibrate --manual` to take poses by hand. The exit code is the
 number of rows that failed.
-
-`--plans` keeps the plan of each run for `tests.benchmarks.mesh_check --arm NUMBER --plan FILE`.
 """
 
 import argparse
@@ -24,6 +22,7 @@ from ftdrive.cell.emulated import Station
 from ftdrive.planning.geometry.arm_model import SHAPES
 from ftdrive.planning.plan import Plan
 from ftdrivers.ur.control import ControlPath
+from tests.benchmarks.common import show
 from tests.own_kinematics import of_dh
 from tests.real_arms import RealArm, real_arms
 from tests.system.command_line import CommandLine
@@ -45,7 +44,7 @@ def connected(ftdrive: CommandLine, station: Station) -> Path:
     return config
 
 
-def calibrated(arm: RealArm, path: ControlPath, folder: Path, plans: Path | None) -> Iterator[Row]:
+def calibrated(arm: RealArm, path: ControlPath, folder: Path) -> Iterator[Row]:
     """Run the commands on one arm, which may move."""
     options = ("--seed", arm.number, "--kinematics", str(arm.save(folder)))
     with Station("can", options, control_path=path) as station:
@@ -70,8 +69,6 @@ def calibrated(arm: RealArm, path: ControlPath, folder: Path, plans: Path | None
             yield f"{name} calibrate", outcome.stderr.splitlines()[-1], False
             return
         plan = Plan.load(runs[-1] / "plan.json")
-        if plans is not None:
-            plan.save(plans / f"{arm.number}-{path}.json")
         is_own = plan.kinematics is not None and np.allclose(
             plan.kinematics.numbers, of_dh(arm.dh()).numbers, atol=1e-9
         )
@@ -107,13 +104,13 @@ def read_only(arm: RealArm, folder: Path) -> Iterator[Row]:
         yield f"{name} manual", f"{taken} poses, exit code {manual.returncode}", taken >= 6
 
 
-def rows(arms: list[RealArm], paths: tuple[ControlPath, ...], plans: Path | None) -> Iterator[Row]:
+def rows(arms: list[RealArm], paths: tuple[ControlPath, ...]) -> Iterator[Row]:
     """Run everything that was asked for, each in a folder of its own."""
     for arm in arms:
         for path in paths:
             with tempfile.TemporaryDirectory() as folder:
                 if arm.model in SHAPES:
-                    yield from calibrated(arm, path, Path(folder), plans)
+                    yield from calibrated(arm, path, Path(folder))
                 elif path == paths[0]:
                     yield from read_only(arm, Path(folder))
 
@@ -123,18 +120,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", help="numbers, separated by commas")
     parser.add_argument("--paths", default=",".join(PATHS))
-    parser.add_argument("--plans", type=Path)
     arguments = parser.parse_args()
     wanted = arguments.arms.split(",") if arguments.arms else [arm.number for arm in real_arms()]
     arms = [arm for arm in real_arms() if arm.number in wanted]
     paths = tuple(path for path in PATHS if path in arguments.paths.split(","))
-    if arguments.plans:
-        arguments.plans.mkdir(parents=True, exist_ok=True)
     failed = 0
-    for name, figures, passed in rows(arms, paths, arguments.plans):
+    for name, figures, passed in rows(arms, paths):
         failed += not passed
-        sys.stdout.write(f"{name:30s} {figures:76s} {'pass' if passed else 'FAIL'}\n")
-        sys.stdout.flush()
+        show(f"{name:30s} {figures:76s} {'pass' if passed else 'FAIL'}")
     return failed
 
 

@@ -265,28 +265,6 @@ def _residual(R: Array, linear: Array, triangle: Array, y: Array, noise: Array) 
     return r.reshape(B, 6 * m), np.swapaxes(J.reshape(B, 15, 6 * m), 1, 2)
 
 
-def lowest_quadratic(Q: Array, starts: int, rng: Rng) -> float:
-    """Lowest `r.T @ Q @ r` over the rotations from so many random starts; r is the rotation row by row."""
-    R = Rotation.random(starts, rng=rng).as_matrix()
-    half = np.linalg.cholesky(Q + 1e-15 * np.trace(Q) * np.eye(9)).T
-    damping = np.full(starts, 1e-3)
-    r = R.reshape(-1, 9) @ half.T
-    for _ in range(80):
-        J = np.stack([(R @ G).reshape(-1, 9) @ half.T for G in _GENERATORS], axis=2)
-        H = np.swapaxes(J, 1, 2) @ J
-        H += (damping * np.einsum("bii->b", H))[:, None, None] * np.eye(3)
-        step = -np.linalg.solve(H, np.einsum("bki,bk->bi", J, r)[..., None])[..., 0]
-        trial = R @ Rotation.from_rotvec(step).as_matrix()
-        r_trial = trial.reshape(-1, 9) @ half.T
-        better = (r_trial**2).sum(axis=1) < (r**2).sum(axis=1)
-        R, r = np.where(better[:, None, None], trial, R), np.where(better[:, None], r_trial, r)
-        damping = np.where(better, damping / 10, damping * 5)
-        if np.abs(step).max() < 1e-10:
-            break
-    flat = R.reshape(-1, 9)
-    return float(np.einsum("bi,ij,bj->b", flat, Q, flat).min())
-
-
 def ten_parameters(R_base_flange: Array, wrench: Array) -> Parameters:
     """Mass, centre of mass and bias by one linear least squares, like the ROS packages.
 

@@ -7,11 +7,8 @@ far as it can. Linear algebra has one thread.
 """
 
 import argparse
-import os
 import sys
-import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -24,34 +21,13 @@ from ftcalib.compensation import Compensator
 from ftcalib.likelihood import fit as likelihood
 from ftcalib.model import Array
 from tests.benchmarks import scenarios as sim
+from tests.benchmarks.common import Row, best_seconds, restart_with_one_thread, show_rows
 
 MANY = 1_000_000
 Floats = NDArray[np.floating[Any]]
 
 
-@dataclass(frozen=True)
-class Figure:
-    """One line of the table."""
-
-    name: str
-    value: str
-    target: str
-    passed: bool
-    repeats: int
-
-
-def best_seconds(repeats: int, *calls: Callable[[], object]) -> list[float]:
-    """Shortest time of each call over rounds in which each runs once."""
-    best = [float("inf")] * len(calls)
-    for _ in range(repeats):
-        for i, call in enumerate(calls):
-            start = time.perf_counter()
-            call()
-            best[i] = min(best[i], time.perf_counter() - start)
-    return best
-
-
-def few_poses(repeats: int) -> Iterator[Figure]:
+def few_poses(repeats: int) -> Iterator[Row]:
     """Time nine calibrations, because the time of one depends on its noise."""
     rng = np.random.default_rng(0)
     R, s = np.swapaxes(sim.CUBE, 1, 2), sim.sigma(100)
@@ -69,12 +45,12 @@ def few_poses(repeats: int) -> Iterator[Figure]:
     *solves, plain = best_seconds(repeats, *(partial(solve, dataset) for dataset in datasets), hundred_lstsq)
     whole = float(np.median(solves))
     ratio = whole / (plain / 100)
-    yield Figure("whole solve, 24 poses", f"{1e3 * whole:.1f} ms", "<= 10 ms", whole <= 10e-3, repeats)
-    yield Figure("  the slowest of nine", f"{1e3 * max(solves):.1f} ms", "<= 40 ms", max(solves) <= 40e-3, repeats)
-    yield Figure("  over one plain 10-parameter lstsq", f"{ratio:.0f}", "<= 300", ratio <= 300, repeats)
+    yield Row("whole solve, 24 poses", f"{1e3 * whole:.1f} ms", "<= 10 ms", whole <= 10e-3, repeats)
+    yield Row("  the slowest of nine", f"{1e3 * max(solves):.1f} ms", "<= 40 ms", max(solves) <= 40e-3, repeats)
+    yield Row("  over one plain 10-parameter lstsq", f"{ratio:.0f}", "<= 300", ratio <= 300, repeats)
 
 
-def poses_of_own_covariance(repeats: int) -> Iterator[Figure]:
+def poses_of_own_covariance(repeats: int) -> Iterator[Row]:
     """Time 10⁴ poses whose noise is as measured, and 1.3 and 3 times as large: looking for the cause costs no more."""
     rng, n = np.random.default_rng(0), 10_000
     truth, s, R = sim.tool(rng), sim.sigma(100), Rotation.random(n, rng=rng).as_matrix()
@@ -90,15 +66,15 @@ def poses_of_own_covariance(repeats: int) -> Iterator[Figure]:
         lambda: np.linalg.lstsq(columns, noise.ravel(), rcond=None),
     )
     good, *bad, plain = times
-    yield Figure(
+    yield Row(
         "10⁴ poses over one plain 10-parameter lstsq", f"{good / plain:.0f}", "<= 60", good / plain <= 60, repeats
     )
     for size, seconds in zip((1.3, 3.0), bad, strict=True):
         ratio = seconds / good
-        yield Figure(f"  noise {size:g} times the measured, over that", f"{ratio:.2f}", "<= 2", ratio <= 2, repeats)
+        yield Row(f"  noise {size:g} times the measured, over that", f"{ratio:.2f}", "<= 2", ratio <= 2, repeats)
 
 
-def many_poses(repeats: int) -> Iterator[Figure]:
+def many_poses(repeats: int) -> Iterator[Row]:
     rng = np.random.default_rng(0)
     truth, s = sim.tool(rng), sim.sigma(100)
     R = np.tile(Rotation.random(1000, rng=rng).as_matrix(), (MANY // 1000, 1, 1))
@@ -109,9 +85,9 @@ def many_poses(repeats: int) -> Iterator[Figure]:
     whole, plain = best_seconds(
         repeats, lambda: likelihood.fit(R, y, cov, drift="none"), lambda: np.copyto(copy, source)
     )
-    yield Figure("10⁶ poses, covariance given, no drift", f"{1e3 * whole:.0f} ms", "<= 60 ms", whole <= 60e-3, repeats)
+    yield Row("10⁶ poses, covariance given, no drift", f"{1e3 * whole:.0f} ms", "<= 60 ms", whole <= 60e-3, repeats)
     ratio = whole / plain
-    yield Figure("  over np.copyto of the same bytes", f"{ratio:.1f}", "<= 8", ratio <= 8, repeats)
+    yield Row("  over np.copyto of the same bytes", f"{ratio:.1f}", "<= 8", ratio <= 8, repeats)
 
 
 def naive(parameters: Parameters, wrench: Array, R_base_flange: Array) -> Array:
@@ -121,7 +97,7 @@ def naive(parameters: Parameters, wrench: Array, R_base_flange: Array) -> Array:
     return np.asarray(wrench - np.concatenate([force_N, torque_Nm]))
 
 
-def compensated_sample(repeats: int) -> Iterator[Figure]:
+def compensated_sample(repeats: int) -> Iterator[Row]:
     rng, calls = np.random.default_rng(0), 2000
     parameters = Parameters(Rotation.random(rng=rng).as_matrix(), *rng.normal(size=(4, 3)))
     wrench, R, out = rng.normal(size=6), Rotation.random(rng=rng).as_matrix(), np.empty(6)
@@ -142,11 +118,11 @@ def compensated_sample(repeats: int) -> Iterator[Figure]:
     )
     for name, seconds in (("one sample", new), ("one sample into a buffer", into)):
         ratio = seconds / slow
-        yield Figure(f"compensation, {name}, over naive numpy", f"{ratio:.3f}", "<= 0.10", ratio <= 0.1, repeats)
-    yield Figure("  into a buffer", f"{1e6 * into / calls:.2f} µs", "<= 1.5 µs", into / calls <= 1.5e-6, repeats)
+        yield Row(f"compensation, {name}, over naive numpy", f"{ratio:.3f}", "<= 0.10", ratio <= 0.1, repeats)
+    yield Row("  into a buffer", f"{1e6 * into / calls:.2f} µs", "<= 1.5 µs", into / calls <= 1.5e-6, repeats)
 
 
-def compensated_samples(repeats: int, dtype: type[np.float64 | np.float32]) -> Iterator[Figure]:
+def compensated_samples(repeats: int, dtype: type[np.float64 | np.float32]) -> Iterator[Row]:
     rng, name = np.random.default_rng(0), np.dtype(dtype).name
     parameters = Parameters(Rotation.random(rng=rng).as_matrix(), *rng.normal(size=(4, 3)))
     wrench: Floats = rng.normal(size=(MANY, 6)).astype(dtype)
@@ -156,14 +132,14 @@ def compensated_samples(repeats: int, dtype: type[np.float64 | np.float32]) -> I
     target = np.ones_like(source)
     copy, batch = best_seconds(repeats, lambda: np.copyto(target, source), lambda: compensator.batch(wrench, R, out))
     speed = MANY / batch / 1e6
-    yield Figure(
+    yield Row(
         f"compensation, {name}, of copy bandwidth", f"{copy / batch:.3f}", ">= 0.35", copy / batch >= 0.35, repeats
     )
     if dtype is np.float64:
-        yield Figure(f"  {name}", f"{speed:.0f} M/s", ">= 70 M/s", speed >= 70, repeats)
+        yield Row(f"  {name}", f"{speed:.0f} M/s", ">= 70 M/s", speed >= 70, repeats)
 
 
-def measure(*, quick: bool = False) -> Iterator[Figure]:
+def measure(*, quick: bool = False) -> Iterator[Row]:
     """Measure everything."""
     yield from few_poses(5 if quick else 30)
     yield from poses_of_own_covariance(3 if quick else 10)
@@ -177,18 +153,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Speed of calibration and compensation.")
     parser.add_argument("--quick", action="store_true", help="fewer repetitions")
     options = parser.parse_args()
-    failed = 0
-    for figure in measure(quick=options.quick):
-        failed += not figure.passed
-        sys.stdout.write(
-            f"{figure.name:66} {figure.value:>28}   {figure.target:24} {'pass' if figure.passed else 'FAIL'}\n"
-        )
-        sys.stdout.flush()
-    return failed
+    return show_rows(measure(quick=options.quick))
 
 
 if __name__ == "__main__":
-    if os.environ.get("OPENBLAS_NUM_THREADS") != "1":
-        os.environ["OPENBLAS_NUM_THREADS"] = "1"
-        os.execv(sys.executable, sys.orig_argv)
+    restart_with_one_thread()
     sys.exit(main())

@@ -13,6 +13,7 @@ import sys
 import numpy as np
 
 from ftdrivers.ur.control import ControlPath
+from tests.benchmarks.common import show
 from tests.wire.conftest import Station
 from tests.wire.stop_trial import Cause, stop
 
@@ -25,7 +26,7 @@ def main() -> int:
     parser.add_argument("--trials", type=int, default=5)
     parser.add_argument("--stop-deceleration", type=float, default=300.0, help="deg/s²")
     options = parser.parse_args()
-    sys.stdout.write("path     cause    deg/s   brakes s        rests s         angle deg\n")
+    show("path     cause    deg/s   brakes s        rests s         angle deg")
     for path, cause in ROWS:
         for speed_deg_s in (15.0, 30.0, 60.0):
             with Station("--time-scale", "1") as station:
@@ -37,8 +38,7 @@ def main() -> int:
                 f"{median:5.2f} to {most:5.2f}"
                 for median, most in zip(np.median(columns, axis=0), columns.max(axis=0), strict=True)
             )
-            sys.stdout.write(f"{path:8} {cause:8} {speed_deg_s:4.0f}   {figures}\n")
-            sys.stdout.flush()
+            show(f"{path:8} {cause:8} {speed_deg_s:4.0f}   {figures}")
     return 0
 
 

@@ -36,6 +36,7 @@ from ftdrivers.clock import REAL
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 from ftdrivers.ur.arm import UrArm
+from tests.benchmarks.common import show
 from tests.wire.conftest import Station
 from tests.wire.laboratory import Laboratory, numbers_in
 from tests.wire.test_sensor_faults import (
@@ -59,8 +60,7 @@ FOLLOW_SENSOR_TARGET, FOLLOW_ARM_TARGET = 0.25, 0.10
 
 
 def report(name: str, figure: str, target: str, passed: bool) -> bool:
-    sys.stdout.write(f"{name:52} {figure:>34}   target {target:16} {'pass' if passed else 'FAIL'}\n")
-    sys.stdout.flush()
+    show(f"{name:52} {figure:>34}   target {target:16} {'pass' if passed else 'FAIL'}")
     return passed
 
 

@@ -12,7 +12,7 @@ from tests.system.supervisor_trial import ANSWERS, GONE, Kind, push_trial, trial
 from tests.ur_rtde import require_ur_rtde
 
 LONG_BEFORE_ITS_GOAL_S = 1.0
-"""The move takes 3 s. `tests/benchmarks/supervisor.py` has the figure of 0.3 s: here the computer may be busy."""
+"""The move takes 3 s. An idle computer needs 0.3 s at most, but here it may be busy."""
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,8 @@ def station(request: pytest.FixtureRequest) -> Iterator[Station]:
         yield station
 
 
-ALONE = [  # `tests/benchmarks/supervisor.py` has all: each kind at rest and in mid-move, on both paths
+# Each kind was tried at rest and in mid-move, on both paths, before these were chosen.
+ALONE = [
     ("reader killed", True, "ur-rtde"),
     ("stdout closed", False, "ur-rtde"),
     ("stdin closed", False, "script"),

@@ -1,7 +1,4 @@
-"""The heartbeat of the script path: however the computer fails in mid-move, the controller stops the arm by itself.
-
-tests/benchmarks/heartbeat.py makes 100 trials of each kind.
-"""
+"""The heartbeat of the script path: however the computer fails in mid-move, the controller stops the arm by itself."""
 
 from collections.abc import Callable
 

@@ -2,8 +2,8 @@
 
 Required of every row: reported as below, with a fix; the arm stopped, or known to be finishing the one move it was
 given; no crash; after the operator has cleared it, `open(control=True)` on the same object moves the arm again. We
-never unlock and never play. The limits themselves are proved in `tests/unit/drivers/ur`;
-tests/benchmarks/ur_failures.py measures times, and what happens when our processes are killed or suspended.
+never unlock and never play. The limits themselves are proved in `tests/unit/drivers/ur`; docs/reference/figures/devices.md
+has times, also for processes of ours that are killed or suspended.
 
 ======================  ================  =============================  ==========================================
 event                   what is raised    arm                            test of this file

@@ -1,0 +1,171 @@
+"""Draw the pictures of the documentation: `uv run python -m tests.benchmarks.pictures [demo] [live]`.
+
+demo  runs `ftdrive demo` in tmux at 80x24, copies its screen about once a second, and animates the screens as SVG
+live  runs the real app of `ftdrive live` with a stream without devices, and draws one SVG for each of its states
+"""
+
+import asyncio
+import os
+import re
+import subprocess
+import sys
+import time
+from html import unescape
+from io import StringIO
+from pathlib import Path
+from typing import get_args
+
+from rich.console import Console
+from rich.text import Text
+
+from ftdrive.checks.check import Check
+from ftdrive.terminal.live.feed import Feed
+from ftdrive.terminal.live.summary import Summary
+from ftdrive.terminal.live_screen import LiveApp
+from tests.benchmarks.common import show
+from tests.unit.ftdrive.terminal.fake_stream import FakeStream, Scenario
+
+FOLDER = Path(__file__).parents[2] / "docs/pictures"
+COLUMNS, ROWS = 80, 24
+CELL_PX, ROW_PX = 12.2, 24.4
+"""Of rich's SVG, whose characters are 20 px high."""
+
+# The animated demo
+
+SHOWN_S, LAST_SHOWN_S = 1.0, 8.0
+MOST_SCREENS = 12
+TMUX = ("tmux", "-L", "ftdrive-demo")
+
+# rich fills in its own fields; what is ours stands between @.
+STRIP = """\
+<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} @height@" role="img" aria-label="ftdrive demo">
+<style>
+.{unique_id}-matrix {{ font-family: "DejaVu Sans Mono", Menlo, Consolas, monospace; font-size: {char_height}px; }}
+{styles}
+.strip {{ transform: translateY(-@last@px); animation: strip @total@s infinite step-end; }}
+@keyframes strip {{ @keyframes@ }}
+</style>
+<rect width="100%" height="100%" rx="8" fill="#292929"/>
+<svg x="12" y="12" width="@inner_width@" height="@inner_height@">
+<g class="strip {unique_id}-matrix">{backgrounds}{matrix}</g>
+</svg>
+</svg>
+"""
+
+
+def screens() -> list[str]:
+    """Run the demo; return its distinct screens with their colours, the last one when the prompt is back."""
+    command = 'echo "$ uv run ftdrive demo"; uv run -q ftdrive demo; printf READY; sleep 60'
+    subprocess.run([*TMUX, "new-session", "-d", "-x", str(COLUMNS), "-y", str(ROWS), command], check=True)
+    found: list[str] = []
+    try:
+        while not (found and "READY" in found[-1]):
+            time.sleep(0.7)
+            screen = subprocess.run(
+                [*TMUX, "capture-pane", "-p", "-e"], check=True, capture_output=True, text=True
+            ).stdout
+            if screen.strip() and screen not in found:
+                found.append(screen)
+    finally:
+        subprocess.run([*TMUX, "kill-server"], check=False)
+    return [screen.replace("READY", "") for screen in found]
+
+
+def chosen(found: list[str]) -> list[str]:
+    """Thin out the screens evenly; the last one stays."""
+    step = max(1, -(-(len(found) - 1) // (MOST_SCREENS - 1)))
+    return [*found[:-1:step], found[-1]]
+
+
+def animated(strip: list[str]) -> str:
+    """Draw all screens in one column; the animation shows one at a time. Without animation the last one is shown."""
+    console = Console(width=COLUMNS, record=True, file=StringIO(), force_terminal=True)
+    for screen in strip:
+        lines = screen.split("\n")[:ROWS]
+        for line in [*lines, *[""] * (ROWS - len(lines))]:
+            console.print(Text.from_ansi(line), no_wrap=True, crop=True, soft_wrap=False)
+    screen_px, total_s = ROWS * ROW_PX, SHOWN_S * (len(strip) - 1) + LAST_SHOWN_S
+    frames = " ".join(
+        f"{100 * SHOWN_S * i / total_s:.2f}% {{{{ transform: translateY({-screen_px * i:g}px) }}}}"
+        for i in range(len(strip))
+    )
+    code = STRIP.replace("@keyframes@", frames).replace("@total@", f"{total_s:g}")
+    code = code.replace("@last@", f"{screen_px * (len(strip) - 1):.1f}").replace("@height@", f"{screen_px + 24:.0f}")
+    code = code.replace("@inner_width@", f"{CELL_PX * COLUMNS + 2:.0f}").replace("@inner_height@", f"{screen_px:.1f}")
+    picture = console.export_svg(code_format=code, unique_id="d")
+    return re.sub(r' (clip-path|textLength)="[^"]*"', "", picture)  # each line is cut by the screen already
+
+
+# The states of the live screen
+
+BLOCKS = 1200
+CHECKS = (
+    Check("calibration.devices", "ok", "verdict good, with these devices"),
+    Check("robot.payload", "ok", "robot 1.74 kg; weighed 1.44 kg + 0.30 kg sensor"),
+)
+DOTS = ((0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1), (3, 0), (3, 1))
+"""Row and column of the dot of each bit."""
+
+
+async def picture(scenario: Scenario) -> str:
+    """Run the app in a state and draw it."""
+    stream = FakeStream(scenario, silent_after=BLOCKS if scenario == "stale" else None)
+    feed = Feed(stream)
+    summary = Summary(feed, CHECKS)
+    for _ in range(BLOCKS):
+        feed.step()
+    if scenario == "tare-refused":
+        feed.request(stream.tare)
+    feed.step()
+    app = LiveApp(feed, summary)
+    async with app.run_test(size=(COLUMNS, ROWS)) as pilot:
+        app.draw()
+        await pilot.pause()
+        return app.export_screenshot(simplify=True)
+
+
+def with_dots(svg: str) -> str:
+    """Replace Braille, which many fonts lack, by one path a line, and the web fonts by those of the reader."""
+    svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
+    svg = svg.replace("Fira Code", "DejaVu Sans Mono, Menlo, Consolas")
+    svg = re.sub(r'<text class="([^"]*)" x="([\d.]+)" y="([\d.]+)"[^>]*>([^<]*)</text>', _dots, svg)
+    colours = dict(re.findall(r"\.(\S+-r\d+) \{ fill: (#\w+)", svg))
+    strokes = "".join(f".{name}.dots {{ stroke: {colour} }}\n" for name, colour in colours.items())
+    dots = f".dots {{ stroke-width: 3.2; stroke-linecap: round }}\n{strokes}"
+    return svg.replace("</style>", f"{dots}</style>", 1)
+
+
+def _dots(text: re.Match[str]) -> str:
+    style, x, y, content = text[1], float(text[2]), float(text[3]), unescape(text[4])
+    path = ""
+    for i, character in enumerate(content):
+        code = ord(character) - 0x2800
+        for bit, (row, column) in enumerate(DOTS):
+            if 0 <= code < 256 and code >> bit & 1:
+                path += f"M{x + CELL_PX * (i + 0.27 + 0.5 * column):.1f} {y - 15 + ROW_PX * row / 4:.1f}h0"
+    if not path:
+        return text[0]
+    rest = re.sub("[\u2800-\u28ff]", "\N{NO-BREAK SPACE}", text[0])
+    return f'{rest}<path class="{style} dots" d="{path}"/>'
+
+
+def write(name: str, svg: str) -> None:
+    path = FOLDER / name
+    path.write_text(svg, encoding="utf-8")
+    show(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
+
+
+def main(wanted: list[str]) -> None:
+    """Write the pictures asked for, or all."""
+    FOLDER.mkdir(exist_ok=True)
+    if "demo" in wanted or not wanted:
+        write("demo.svg", animated(chosen(screens())))
+    if "live" in wanted or not wanted:
+        for scenario in get_args(Scenario):
+            write(f"live-{scenario}.svg", with_dots(asyncio.run(picture(scenario))))
+
+
+if __name__ == "__main__":
+    os.environ["TZ"] = "UTC"  # the screens show the time of day
+    time.tzset()
+    main(sys.argv[1:])
