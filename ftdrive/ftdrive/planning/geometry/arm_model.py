@@ -6,8 +6,8 @@ back and forth between the bodies; any other one only makes the answer smaller, 
 
 Radii and hub widths were measured from the convex hulls of the collision meshes in the ROS 2 description of the arms,
 version 2.4.5. Those of UR3e, UR5e, UR10e and UR16e were then fitted to meshes with all lids and edges: none stands out
-by more than 1 mm (tests/benchmarks/mesh_check.py). Those of UR20 and UR30 were widened alike, their lids scaled from
-the UR5e by the length of wrist 2. Models without measured shapes are refused.
+by more than 1 mm. Those of UR20 and UR30 were widened alike, their lids scaled from the UR5e by the length of wrist 2.
+Models without measured shapes are refused.
 """
 
 from collections.abc import Sequence
