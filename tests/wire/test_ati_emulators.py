@@ -8,7 +8,6 @@ import can
 import numpy as np
 import pytest
 import serial
-from can.interfaces.slcan import slcanBus
 
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.ati_serial import AtiSerialBox
@@ -39,16 +38,6 @@ def test_unplugging_fails_the_client_and_stop_is_idempotent(make: type[AtiCanNod
             port.write(b"\r")
     device.stop()
     device.stop()
-
-
-def test_can_adapter_answers_its_own_questions() -> None:
-    node = AtiCanNode(constant)
-    with ExitStack() as stack:
-        stack.callback(node.stop)
-        bus = slcanBus(node.start(), bitrate=250_000, sleep_after_open=0)
-        stack.callback(bus.shutdown)
-        assert bus.get_version(1.0) == (10, 13)
-        assert bus.get_serial_number(1.0) == "EMUL"
 
 
 def test_can_host_that_never_reads_costs_frames_not_memory() -> None:

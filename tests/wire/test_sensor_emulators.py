@@ -24,38 +24,7 @@ def constant(wrench: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]
     return lambda n: np.tile(wrench, (n, 1))
 
 
-@contextmanager
-def serial_client(device: BotaBox) -> Iterator[serial.Serial]:
-    try:
-        with serial.Serial(device.start(), 460_800, timeout=LIMIT_S) as port:
-            yield port
-    finally:
-        device.stop()
-
-
 # ---------------------------------------------------------------- Bota
-
-
-@pytest.mark.parametrize(
-    ("written", "answers"),
-    [
-        (b"f,0,0,0,0", b"r,1,f,0\r\n"),
-        (b"c,0,1,0,9", b"r,1,c,0\r\n"),
-        (b"x", b"r,1,x,0\r\n"),
-        (b"C", b"r,0,C,0\r\n"),
-        (b"\r\n c,1,1,0,4 f,512,0,0,0\r\n", b"r,0,c,0\r\nr,0,f,0\r\n"),
-        (b"cccccccccccccccccc", b"r,1,c,0\r\n"),
-    ],
-)
-def test_bota_configuration_answers(written: bytes, answers: bytes) -> None:
-    box = BotaBox(constant(BOTA_WRENCH), streaming_at_start=True)
-    with serial_client(box) as port:
-        port.write(b"garbage C")
-        read_to(port, b"r,0,C,0\r\n")
-        port.write(written)
-        assert port.read(len(answers)) == answers
-        port.write(b"C")
-        assert read_to(port, b"r,0,C,0\r\n") == b"", "and nothing else"
 
 
 def test_bota_restarts_when_its_port_is_opened_and_is_heard_at_its_own_speed_only() -> None:

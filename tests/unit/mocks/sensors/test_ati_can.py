@@ -84,6 +84,7 @@ def test_adapter_needs_a_bit_rate_and_an_open_channel() -> None:
     assert adapter.feed(b"O\rt2000\rC\rF\r") == (b"\a\a\a\a", [])
     assert adapter.feed(b"\rS5\rO\rO\rS6\r") == (b"\r\r\r\a\a", [])
     assert adapter.bitrate == 250_000
+    assert adapter.feed(b"V\rN\r") == (b"V1013\rNEMUL\r", [])
 
 
 @pytest.mark.parametrize(

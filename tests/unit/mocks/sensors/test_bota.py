@@ -4,36 +4,17 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ftmocks.clock import CellClock
-from ftmocks.sensors.bota import BotaBox, banner, crc16_x25, stream_frame
+from ftmocks.sensors.bota import BotaBox, banner, stream_frame
 from tests.unit.mocks.real_time import RealTime
 
 WRENCH = [1, -2, 9.81, 0.1, -0.2, 0.3]
 FRAME = "AA 0000 0000803F 000000C0 C3F51C41 CDCCCC3D CDCC4CBE 9A99993E 40420F00 0000CC41 3D0D"
 
 
-def test_crc_check_value() -> None:
-    assert crc16_x25(b"123456789") == bytes.fromhex("6E 90")
-
-
 def test_documented_frame() -> None:
     assert stream_frame(0, WRENCH, 1_000_000, 25.5) == bytes.fromhex(FRAME)
-
-
-@given(
-    st.integers(0, 0xFFFF),
-    st.lists(st.floats(width=32, allow_nan=False), min_size=6, max_size=6),
-    st.integers(0, 2**32 - 1),
-    st.floats(-40, 85, width=32),
-)
-def test_frames_hold_their_values(status: int, wrench: list[float], timestamp_us: int, temperature_C: float) -> None:
-    frame = stream_frame(status, wrench, timestamp_us, temperature_C)
-    assert len(frame) == 37
-    assert struct.unpack("<cH6fIf", frame[:-2]) == (b"\xaa", status, *wrench, timestamp_us, temperature_C)
-    assert crc16_x25(frame[1:-2]) == frame[-2:]
 
 
 @pytest.fixture
@@ -67,12 +48,12 @@ def test_it_boots_for_three_seconds_then_says_who_it_is_and_streams() -> None:
 
 def test_samples_carry_time_status_and_temperature(box: BotaBox) -> None:
     box.temperature_C = 31.25
-    box.status = 0x0001
+    box.status = 0x8001
     box._stream_start_us = 2**32 - 10_000
     box._pacer.made = 3
     fields = [struct.unpack("<H6fIf", frame[1:-2]) for frame in box._samples(3)]
     assert [f[7] for f in fields] == [2**32 - 10_000, 0, 10_000], "the counter wraps"
-    assert {f[0] for f in fields} == {1}
+    assert {f[0] for f in fields} == {0x8001}
     assert {f[8] for f in fields} == {31.25}
 
 
@@ -91,6 +72,23 @@ def test_overrange_and_uncalibrated_bits(box: BotaBox) -> None:
 def test_text_and_uncalibrated_output(box: BotaBox) -> None:
     assert answers(box, b"C c,0,0,1,4\r\nR") == b"r,0,C,0\r\nr,0,c,0\r\nr,0,R,0\r\n"
     assert box._samples(1)[0].decode().split(",")[:7] == ["8", "1", "-2", "9.81", "0.1", "-0.2", "0.3"]
+
+
+@pytest.mark.parametrize(
+    ("written", "answered"),
+    [
+        (b"f,0,0,0,0", b"r,1,f,0\r\n"),
+        (b"c,0,1,0,9", b"r,1,c,0\r\n"),
+        (b"x", b"r,1,x,0\r\n"),
+        (b"C", b"r,0,C,0\r\n"),
+        (b"\r\n c,1,1,0,4 f,512,0,0,0\r\n", b"r,0,c,0\r\nr,0,f,0\r\n"),
+        (b"cccccccccccccccccc", b"r,1,c,0\r\n"),
+    ],
+)
+def test_configuration_answers(box: BotaBox, written: bytes, answered: bytes) -> None:
+    assert answers(box, b"garbage C") == b"r,0,C,0\r\n"
+    assert answers(box, written) == answered
+    assert answers(box, b"C") == b"r,0,C,0\r\n", "and nothing else"
 
 
 @pytest.mark.parametrize(("sinc", "rate_hz"), [(2048, 25), (512, 100), (256, 200), (128, 400), (64, 800)])

@@ -112,12 +112,6 @@ def test_tool_transformation_in_inches_and_radians() -> None:
     assert page(box, "/netftapi2.xml")["scfgtau"] == "radians"
 
 
-def test_by_default_only_the_torque_of_the_displacement_differs(box: NetFtBox) -> None:
-    fx, fy, *_ = WRENCH
-    moved = [0.1 + 0.13271 * fy, -0.05 - 0.13271 * fx, 0.025]
-    assert sent(box) == pytest.approx([*WRENCH[:3], *moved])
-
-
 def test_the_bias_is_in_gauge_counts_before_the_transformation() -> None:
     bias = [100, -200, 300, -400, 500, -600]
     box = NetFtBox(lambda n: np.tile(WRENCH, (n, 1)), bias=bias, gauge_offset=0, tool_transform=(0, 0, 100, 0, 0, 0))
