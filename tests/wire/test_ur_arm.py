@@ -257,8 +257,7 @@ class EnoughError(Exception):
 
 
 @pytest.mark.parametrize(
-    "by",
-    ["ctrl-c", "stop", *(pytest.param(by, marks=pytest.mark.slow) for by in ("guard", "time-out"))],
+    "by", ["ctrl-c", "stop", *(pytest.param(by, marks=pytest.mark.slow) for by in ("guard", "time-out"))]
 )
 def test_whatever_ends_the_wait_stops_the_arm_and_leaves_it_usable(station: Station, arm: UrArm, by: str) -> None:
     def enough() -> None:

@@ -133,11 +133,7 @@ LOST = (StreamBroken, DeviceTimeout)
 EVENTS = [
     Event("protective-stop", on("protective-stop"), unlock, DeviceFault, r"protective stop .* remove its cause"),
     Event(
-        "emergency-stop",
-        on("emergency-stop", on=True),
-        release,
-        DeviceFault,
-        r"emergency stop .* release the button",
+        "emergency-stop", on("emergency-stop", on=True), release, DeviceFault, r"emergency stop .* release the button"
     ),
     Event(
         "safeguard",
@@ -148,21 +144,9 @@ EVENTS = [
     ),
     Event("power-off", lambda s: s.dashboard("power off"), power_up, DeviceFault, "power the arm on"),
     Event("brakes", on("mode", robot=5), on("mode", robot=7), DeviceFault, r"\(idle\); release its brakes"),
+    Event("program-stop", on("dashboard-stop"), nothing, DeviceFault, "stopped or paused", hits_opening=False),
     Event(
-        "program-stop",
-        on("dashboard-stop"),
-        nothing,
-        DeviceFault,
-        "stopped or paused",
-        hits_opening=False,
-    ),
-    Event(
-        "program-pause",
-        lambda s: s.dashboard("pause"),
-        nothing,
-        DeviceFault,
-        "stopped or paused",
-        hits_opening=False,
+        "program-pause", lambda s: s.dashboard("pause"), nothing, DeviceFault, "stopped or paused", hits_opening=False
     ),
     Event("crash-script", on("crash-script"), nothing, DeviceFault, "stopped or paused|in line", hits_opening=False),
     Event(

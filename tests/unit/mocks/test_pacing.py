@@ -98,11 +98,7 @@ def fast_uart(**options: Any) -> RobotousSerialBox:
 STREAMS: dict[str, tuple[Callable[..., Any], int, float]] = {
     "ati-serial": (lambda **options: AtiSerialBox(still, streaming_at_start=True, **options), 13, 7000),
     "bota": (lambda **options: BotaBox(still, streaming_at_start=True, **options), 37, 100),
-    "bota-fast": (
-        lambda **options: BotaBox(still, streaming_at_start=True, sinc_length=64, **options),
-        37,
-        800,
-    ),
+    "bota-fast": (lambda **options: BotaBox(still, streaming_at_start=True, sinc_length=64, **options), 37, 800),
     "robotiq": (lambda **options: RobotiqBox(still, streaming_at_start=True, **options), 16, 100),
     "robotous-serial": (fast_uart, 19, 1000),
     "robotous-can": (opened_node, 44, 1000),

@@ -98,17 +98,8 @@ def _state(reader: Reader) -> dict[str, Any]:
 
 
 def _mode(part: Reader) -> dict[str, Any]:
-    names = (
-        "connected",
-        "enabled",
-        "power_on",
-        "emergency",
-        "protective",
-        "running",
-        "paused",
-        "robot_mode",
-        "control",
-    )
+    flags = ("connected", "enabled", "power_on", "emergency", "protective", "running", "paused")
+    names = (*flags, "robot_mode", "control")
     fields = {"timestamp": part.take("Q")} | dict(zip(names, part.take("7BbB"), strict=True))
     return fields | dict(zip(("fraction", "scaling", "limit", "reserved"), part.take("3dB"), strict=True))
 

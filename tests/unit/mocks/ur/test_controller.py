@@ -4,32 +4,21 @@ import math
 from collections.abc import Callable
 from itertools import pairwise
 
-import numpy as np
 import pytest
 
-from ftmocks.kinematics import MODELS, vector6
+from ftmocks.kinematics import vector6
 from ftmocks.ur.dashboard import LOCAL_CONTROL, TOO_EARLY, answer
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import RobotMode, Runtime, SafetyMode
-from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.ur.robot import Robot
 from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.ur.variables import OUTPUTS, output_type
-from ftmocks.world import Truth, World
+from tests.unit.mocks.ur.urscript_robot import HOME, new_robot, run
 
-HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 GOAL = vector6([*HOME[:5], HOME[5] + 1.0])
 CONTROL = Upload("rtde_control", "", secondary=False)
 OTHER = Upload("other", "", secondary=False)
 SLEEPING = Upload("other", "def other():\n  sleep(2)\nend\n", secondary=False)
-
-
-def new_robot(polyscope: tuple[int, int, int] = (5, 15, 0)) -> Robot:
-    return Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME, 0), RobotSettings(polyscope=polyscope))
-
-
-def run(robot: Robot, seconds: float) -> None:
-    for _ in range(round(seconds * robot.frequency_hz)):
-        robot.tick()
 
 
 def moving_robot() -> Robot:

@@ -10,9 +10,9 @@ from ftmocks.ur.robot import Robot, RobotSettings
 from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.ur.variables import OUTPUTS
 from ftmocks.world import Truth, World
+from tests.unit.mocks.ur.urscript_robot import HOME, run
 
 DH = MODELS["UR5e"]
-HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 TURNED = vector6(np.radians([20, -80, 70, -120, 40, -30]))
 UPRIGHT = (0.0, 0.0, 9.82)
 WALL = (9.82, 0.0, 0.0)
@@ -45,11 +45,6 @@ def started(name: str, body: str, robot: Robot) -> Robot:
     assert start_upload(robot, Upload(name, f"def {name}():\n  {body}\nend\n", secondary=False)), robot.events[-1].why
     run(robot, 0.2)
     return robot
-
-
-def run(robot: Robot, seconds: float) -> None:
-    for _ in range(round(seconds * robot.frequency_hz)):
-        robot.tick()
 
 
 def command(robot: Robot, number: int, *doubles: float) -> None:

@@ -13,6 +13,7 @@ from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot, RobotSettings
 from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.world import Truth, World
+from tests.unit.mocks.ur.urscript_robot import run
 
 UR5E = MODELS["UR5e"]
 HOME = vector6(np.radians([45, -100, 60, -50, 70, 0]))
@@ -24,11 +25,6 @@ REST_S = 0.2
 
 def new_robot() -> Robot:
     return Robot(World(Truth.drawn(0), UR5E, HOME, 0), RobotSettings(time_scale=SCALE))
-
-
-def run(robot: Robot, seconds: float) -> None:
-    for _ in range(round(seconds * robot.frequency_hz)):
-        robot.tick()
 
 
 def rests(robot: Robot, count: int) -> list[tuple[Vector6, float]]:

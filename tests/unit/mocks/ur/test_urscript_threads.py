@@ -142,8 +142,7 @@ def test_a_killed_thread_gives_the_arm_away_to_another_move() -> None:
     assert list(robot.arm.q) == goal
 
 
-def test_threads_run_side_by_side_in_the_order_of_their_start_and_are_joined() -> None:
-    before = """
+SIDE_BY_SIDE = """
 order = 0
 n = 0
 thread first():
@@ -165,11 +164,7 @@ run second()
 order = order * 10 + 3
 join worker
 """
-    assert results("order", before=before) == ["3121212121"]
-
-
-def test_a_thread_sees_the_globals_and_keeps_its_own_variables() -> None:
-    before = """
+OWN_VARIABLES = """
 shared = 1
 thread t():
   shared = 2
@@ -179,11 +174,7 @@ end
 join run t()
 own = 4
 """
-    assert results("shared", "own", before=before) == ["2", "4"]
-
-
-def test_a_critical_section_is_executed_and_lets_others_run_while_it_waits() -> None:
-    before = """
+CRITICAL = """
 n = 0
 thread t():
   enter_critical
@@ -198,7 +189,19 @@ while n < 3:
 end
 exit_critical
 """
-    assert results("n", before=before) == ["3"]
+
+
+@pytest.mark.parametrize(
+    ("before", "values"),
+    [
+        (SIDE_BY_SIDE, {"order": "3121212121"}),  # in the order of their start, and joined
+        (OWN_VARIABLES, {"shared": "2", "own": "4"}),
+        (CRITICAL, {"n": "3"}),  # it is executed, and lets others run while it waits
+    ],
+    ids=["side-by-side", "own-variables", "critical-section"],
+)
+def test_threads(before: str, values: dict[str, str]) -> None:
+    assert results(*values, before=before) == list(values.values())
 
 
 def test_the_end_of_the_program_ends_its_threads() -> None:
@@ -211,7 +214,7 @@ def test_settings_and_registers_of_a_program() -> None:
     robot = start(
         "def f():\n  set_payload(1.5, [0, 0, 0.1])\n  write_output_float_register(24, 2)\n"
         "  write_output_integer_register(25, read_output_integer_register(24) - 3)\n"
-        "  write_output_float_register(25, read_input_float_register(24))\nend\n",
+        "  write_output_float_register(25, read_input_float_register(24))\nend\n"
     )
     assert (robot.payload_kg, robot.payload_cog_m) == (1.5, (0.0, 0.0, 0.1))
     assert (robot.output_doubles[24], robot.output_ints[25]) == (2.0, -3)
