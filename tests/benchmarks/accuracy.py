@@ -28,15 +28,10 @@ from ftcalib.published.methods import published
 from ftcalib.published.yu import SPECIAL_R_flange_base, lrom, srom
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.common import Lab, Record, Row, all_within, band, most, run
-from tests.benchmarks.scenarios import Truth
 
 GROSS_RAD = np.deg2rad(20.0)
 RANDOM_STARTS = 12
-DELTA_BINS = (0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0)
-ENOUGH_WRONG = 15
-"""Smallest expected number of wrong answers in a bin that is tested."""
 SROM_POSES = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
-YU_F0, YU_T0, YU_WEIGHT_N = (63.0, 5, 21), (87.0, 45, 6), (1.0, 3, -40)
 
 
 # Exactness
@@ -63,35 +58,6 @@ def exactness(lab: Lab) -> Iterator[Row]:
         ok = row.passed and lab.refused <= (0.01 * runs if name == "haar4" else 0)
         figure = row.figure + (f", {lab.refused} refused" if lab.refused else "")
         yield Row(row.name, figure, row.target, ok, runs)
-    for method, error in yu_table_1().items():
-        yield most(f"Yu Table I, {method}, parameters and compensation", error, 1e-12, 6, digits=2)
-
-
-def yu_table_1() -> dict[str, float]:
-    """Largest error of six setups, of parameters and of 200 compensated contacts."""
-    rng = np.random.default_rng(1)
-    setups = (
-        ((0, 7, 3), (0, 0, -10), (0, 0, 2), (0, 0, 0), (0, 0, 0)),
-        ((0, 7, 3), (0, 0, 10), (0, 0, 2), (0, 0, 0), YU_T0),
-        ((0, 7, 3), (0, 0, -10), (0, 0, 2), YU_F0, YU_T0),
-        ((0, 7, 3), (0, 0, -10), (0.1, 0.1, 1), YU_F0, YU_T0),
-        ((45, 7, 3), YU_WEIGHT_N, (0.1, 0.1, 1), YU_F0, YU_T0),
-        ((70, 15, 13), YU_WEIGHT_N, (0.1, 0.1, 1), YU_F0, YU_T0),
-    )
-    worst = {"srom": 0.0, "ml": 0.0}
-    for angles, b, P, F0, T0 in setups:
-        R_se = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
-        truth = Truth(R_se, *(np.array(v, dtype=np.float64) for v in (b, F0, P, T0)))
-        R = Rotation.random(200, rng=rng).as_matrix()
-        contact = np.concatenate([[sim.direction(rng), 0.5 * sim.direction(rng)] for _ in R]).reshape(-1, 6)
-        measured = sim.readings(truth, R) + contact
-        for method, estimate in (
-            ("srom", srom(SROM_POSES, sim.readings(truth, SROM_POSES))),
-            ("ml", solve(plain(SROM_POSES, sim.readings(truth, SROM_POSES))).parameters),
-        ):
-            left = measured - sim.readings(sim.as_truth(estimate), R) - contact
-            worst[method] = max(worst[method], np.abs(sim.error(truth, estimate)).max(), np.abs(left).max())
-    return worst
 
 
 # Efficiency, basins and stated uncertainty, all from one simulation
@@ -272,56 +238,6 @@ def outliers(lab: Lab) -> Iterator[Row]:
         yield most(f"{what}: good poses rejected", 100 * float(record["false"].mean()), 0.5, runs, " %")
 
 
-# The second solution of poses that are too much alike
-
-
-ODDS_CELLS = (
-    ("ball20_24", 5), ("ball20_24", 8), ("ball20_24", 10), ("ball20_24", 15), ("ball40_12", 5), ("ball40_12", 8),
-    ("haar6", 3), ("haar6", 4), ("ball40_24", 4), ("cone40_24", 4), ("cone20_24", 6), ("cone20_24", 8),
-    ("cone20_24", 10), ("cone40_08", 8),
-)  # fmt: skip
-
-
-def odds_run(seed: int, name: str, snr: float) -> dict[str, object]:
-    rng = np.random.default_rng(seed)
-    truth, R, s = sim.tool(rng), sim.poses(name, rng), sim.sigma(snr)
-    y = sim.readings(truth, R) + s * rng.normal(size=(len(R), 6))
-    fit = likelihood.fit(R, y, np.diag(s**2))
-    gap = fit.second_basin_chi2
-    if gap is None:
-        return {"gap": np.inf, "wrong": float(np.linalg.norm(sim.error(truth, fit.parameters)[:3]) > np.pi / 2)}
-    first, second = (np.linalg.norm(sim.error(truth, m.parameters)[:3]) for m in fit.minima[:2])
-    return {"gap": gap, "wrong": float(second < first)}
-
-
-def odds(lab: Lab) -> Record:
-    """Gap to the second minimum, and whether that was right, for calibrations with excessive noise."""
-    runs = lab.count(900, 20)
-    cells = [lab.simulate(partial(odds_run, name=name, snr=snr), runs) for name, snr in ODDS_CELLS]
-    return {key: np.concatenate([cell[key] for cell in cells]) for key in ("gap", "wrong")}
-
-
-def odds_table(record: Record) -> list[tuple[float, float, int, float, float]]:
-    """For each bin of the gap: limits, runs, share of wrong answers, and the stated share."""
-    table = []
-    for low, high in zip(DELTA_BINS, (*DELTA_BINS[1:], np.inf), strict=True):
-        inside = (record["gap"] >= low) & (record["gap"] < high)
-        stated = 1 / (1 + np.exp(np.minimum(record["gap"][inside], 700) / 2))
-        observed = float(record["wrong"][inside].mean()) if inside.any() else np.nan
-        table.append((low, high, int(inside.sum()), observed, float(stated.mean()) if inside.any() else np.nan))
-    return table
-
-
-def odds_rows(lab: Lab) -> Iterator[Row]:
-    for low, high, n, observed, stated in odds_table(odds(lab)):
-        name = f"odds of a wrong basin, gap {low:g} to {high:g}"
-        figure = f"{observed:.2g} of {stated:.2g} stated"
-        if high == np.inf:
-            yield Row(name, figure, "<= 0.001", observed <= 1e-3, n)
-        elif n * stated >= ENOUGH_WRONG:
-            yield Row(name, figure, "within x1.5", stated / 1.5 <= observed <= 1.5 * stated, n)
-
-
 # Side by side
 
 PEERS = ("10-parameter LS", "relaxation", "LROM", "SROM", "ours")
@@ -488,7 +404,6 @@ SECTIONS: dict[str, Callable[[Lab], Iterator[Row]]] = {
     "orientations": inexact_orientations,
     "drift": drift,
     "outliers": outliers,
-    "odds": odds_rows,
     "side": side_by_side,
     "real": real_data,
 }
