@@ -3,7 +3,6 @@
 import json
 import os
 import threading
-import time
 import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ from ftdrivers.errors import ConnectError
 from ftdrivers.interfaces import DeviceInfo, ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import Passage, Transcript, Writer
+from ftdrivers.transcript.recorder import Transcript, Writer
 from ftdrivers.transcript.taps import recording
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.ati_serial import AtiSerialBox
@@ -221,75 +220,3 @@ def test_a_sensor_that_fails_leaves_a_transcript_that_fails_alike(tmp_path: Path
     assert not any(not passage.sent for passage in transcript.passages)
     with Player(transcript, clock) as port, pytest.raises(ConnectError):
         look(sensor_from_url(transcript.url_at(port), clock=clock), 1.0)
-
-
-def made_up(*passages: tuple[float, bool, bytes]) -> Transcript:
-    recorded = tuple(Passage(round(1e9 * t_s), sent, data) for t_s, sent, data in passages)
-    return Transcript({"url": "x:///y", "duration_s": 1.0}, 0, recorded, {})
-
-
-DIALOGUE = made_up(
-    (0.00, True, b"ab"), (0.05, False, b"1"), (0.10, True, b"cd"), (0.11, False, b"2"), (0.12, True, b"ef")
-)
-
-
-@pytest.fixture
-def dialogue() -> Iterator[tuple[Player, serial.Serial]]:
-    player = Player(DIALOGUE)
-    with player as path, serial.Serial(path, timeout=5.0) as port:
-        yield player, port
-
-
-def is_silent(port: serial.Serial) -> bool:
-    port.timeout = 0.1
-    data = port.read(1)
-    port.timeout = 5.0
-    return not data
-
-
-def test_a_request_is_answered_after_the_recorded_time(dialogue: tuple[Player, serial.Serial]) -> None:
-    _, port = dialogue
-    port.write(b"a")
-    assert is_silent(port)  # the request is not whole yet
-    start = time.monotonic()
-    port.write(b"b")
-    assert port.read(1) == b"1"
-    assert time.monotonic() - start >= 0.05
-    port.write(b"cd")
-    assert port.read(1) == b"2"
-
-
-def test_the_player_knows_how_much_is_left(dialogue: tuple[Player, serial.Serial]) -> None:
-    player, port = dialogue
-    assert player.left_s == pytest.approx(0.12)
-    port.write(b"ab")
-    assert port.read(1) == b"1"
-    assert player.left_s <= 0.07
-    port.write(b"cd")
-    assert port.read(1) == b"2"
-    port.write(b"ef")
-    deadline = time.monotonic() + 2
-    while player._next < 5:
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    assert player.left_s == 0
-
-
-def test_a_request_may_be_left_out(dialogue: tuple[Player, serial.Serial]) -> None:
-    player, port = dialogue
-    port.write(b"cd")
-    assert port.read(1) == b"2"
-    assert player.divergence is None
-
-
-def test_a_request_that_was_not_recorded_ends_in_silence_with_a_reason(dialogue: tuple[Player, serial.Serial]) -> None:
-    player, port = dialogue
-    port.write(b"ab")
-    assert port.read(1) == b"1"
-    port.write(b"xy")
-    assert is_silent(port)
-    assert player.divergence is not None
-    assert "78 79" in player.divergence
-    assert "63 64" in player.divergence
-    port.write(b"cd")
-    assert is_silent(port)
