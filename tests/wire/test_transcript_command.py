@@ -12,9 +12,7 @@ from click.testing import CliRunner, Result
 from ftdrive.cell.config import CLOCK
 from ftdrive.commands import transcript
 from ftdrive.errors import ConfigError
-from ftdrivers.errors import BadTranscript, StreamBroken
-from ftdrivers.registry import sensor_from_url
-from ftdrivers.streaming.sensor import StreamingSensor
+from ftdrivers.errors import BadTranscript
 from ftmocks.sensors.bota import BotaBox
 
 pytestmark = pytest.mark.slow  # every test needs a process of its own
@@ -39,23 +37,6 @@ def answer_of(outcome: Result) -> dict[str, Any]:
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
     answer: dict[str, Any] = json.loads(outcome.stdout)
     return answer
-
-
-def test_a_recording_may_be_longer_than_what_one_collect_holds(
-    url: str, cell_time: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    sensor = sensor_from_url(url, clock=cell_time.of_drivers)
-    assert isinstance(sensor, StreamingSensor)
-    with sensor:
-        rate_Hz = len(sensor.collect(0.3)) / 0.3
-        sensor._max_unread_samples = round(0.4 * rate_Hz)
-        with pytest.raises(StreamBroken, match="in shorter pieces"):
-            sensor.collect(0.9)
-        monkeypatch.setattr(transcript, "_PIECE_S", 0.25)
-        seen = transcript._watch(sensor, 0.9)
-    assert seen["samples"] == pytest.approx(0.9 * rate_Hz, rel=0.2)
-    assert seen["mean_force_N"] == pytest.approx(WRENCH[:3], abs=0.02)
-    assert seen["mean_torque_Nm"] == pytest.approx(WRENCH[3:], abs=0.02)
 
 
 @pytest.mark.parametrize(("name", "words"), [("there", "never overwritten"), ("no/there", "create it first")])

@@ -40,21 +40,17 @@ def reach(rotation_vector: list[float]) -> Vector6:
     return q
 
 
-def test_one_kilogram_under_a_sensor_that_points_down_reads_plus_9_81() -> None:
-    world = World(plain(), DH, reach([math.pi, 0.0, 0.0]))
-    np.testing.assert_allclose(world.true_wrench(), [0, 0, 9.81, 0, 0, 0], atol=1e-9)
-
-
-def test_one_kilogram_on_a_sensor_that_points_up_reads_minus_9_81() -> None:
-    world = World(plain(), DH, reach([0.0, 0.0, 0.0]))
-    np.testing.assert_allclose(world.true_wrench(), [0, 0, -9.81, 0, 0, 0], atol=1e-9)
-
-
-def test_a_weight_at_the_end_of_a_horizontal_lever_turns_the_sensor() -> None:
-    # sensor z along base x: weight along sensor x or y, 50 mm away along z
-    world = World(plain(), DH, reach([0.0, math.pi / 2, 0.0]))
-    # rotation about base y by 90 degrees: sensor x points along base -z, so the weight is along +x
-    np.testing.assert_allclose(world.true_wrench(), [9.81, 0, 0, 0, 0.05 * 9.81, 0], atol=1e-9)
+@pytest.mark.parametrize(
+    ("rotation_vector", "wrench"),
+    [
+        ([math.pi, 0.0, 0.0], [0, 0, 9.81, 0, 0, 0]),  # sensor z points down
+        ([0.0, 0.0, 0.0], [0, 0, -9.81, 0, 0, 0]),  # up
+        ([0.0, math.pi / 2, 0.0], [9.81, 0, 0, 0, 0.05 * 9.81, 0]),  # z along base x, x down: a lever of 50 mm
+    ],
+)
+def test_one_kilogram_pulls_down_in_sensor_axes(rotation_vector: list[float], wrench: list[float]) -> None:
+    world = World(plain(), DH, reach(rotation_vector))
+    np.testing.assert_allclose(world.true_wrench(), wrench, atol=1e-9)
 
 
 def test_the_model_of_the_papers_holds_in_any_posture() -> None:
