@@ -33,7 +33,7 @@ class Observed:
 
     injected_ns: int = 0
     stands_ns: int | None = None
-    told_ns: int | None = None
+    reported_ns: int | None = None
     hazards: tuple[int, ...] = ()
     kept: int = 0
     was_moving: bool = False
@@ -74,7 +74,7 @@ def conduct(scene: Scene, fault: Fault | None = None, seen: Observed | None = No
             continue
         if name == "guard-tripped" and injected:
             hazards.append(event["hazard"])
-            seen.told_ns, seen.words = seen.told_ns or at_ns, seen.words or event["words"]
+            seen.reported_ns, seen.words = seen.reported_ns or at_ns, seen.words or event["words"]
         if _here(event, fault) and not injected:
             injected = True
             inject(scene, fault, seen)
@@ -130,7 +130,7 @@ def _held(scene: Scene, fault: Fault, seen: Observed, hazards: Sequence[int]) ->
     now_ns, state = time.monotonic_ns(), scene.state()
     seen.hazards, seen.kept = tuple(hazards), len(scene.poses())
     times = arm_events(state["events"], "stands", seen.injected_ns, now_ns)
-    seen.stands_ns = seen.told_ns if fault.at == "sample" else max(times, default=None)
+    seen.stands_ns = seen.reported_ns if fault.at == "sample" else max(times, default=None)
     again = times and arm_events(state["events"], "moves", min(times), now_ns)
     seen.moved_while_held = bool(state["moving"] or again)
     seen.ended_at_deg = np.degrees(state["q_rad"])

@@ -127,7 +127,7 @@ class Table:
         seen, attempts = disturb(self.folder, self.plan, fault), 1
         while not _came(fault, seen) and attempts < ATTEMPTS:
             seen, attempts = disturb(self.folder, self.plan, fault), attempts + 1
-        reacted_ns = seen.told_ns if fault.ends_its_move else seen.stands_ns
+        reacted_ns = seen.reported_ns if fault.ends_its_move else seen.stands_ns
         took_s = None if reacted_ns is None else (reacted_ns - seen.injected_ns) / 1e9
         complaints = [*_wrong_reaction(fault, seen, took_s, limit_s), *self._wrong_end(fault, seen)]
         differs = "not resumed"

@@ -55,7 +55,7 @@ def test_bota_restarts_when_its_port_is_opened_and_is_heard_at_its_own_speed_onl
 
 
 class RdtClient:
-    """A UDP socket that talks to the box."""
+    """A UDP socket connected to the box."""
 
     def __init__(self, box: NetFtBox) -> None:
         self.box = box
