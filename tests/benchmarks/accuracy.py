@@ -20,9 +20,9 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, NotObservable, read_csv, solve
-from ftcalib.assessment.cross_validation import standardized
+from ftcalib.judge.cross_validation import standardized
 from ftcalib.likelihood import fit as likelihood
-from ftcalib.likelihood.gain_and_cross_talk import predicted_covariance
+from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import UP_IN_BASE, Array, predict
 from ftcalib.published.methods import published
 from ftcalib.published.yu import SPECIAL_R_flange_base, lrom, srom

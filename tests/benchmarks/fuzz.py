@@ -32,10 +32,10 @@ from ftdrivers.errors import BadTranscript, BadUrl, ProtocolError
 from ftdrivers.registry import SENSORS, sensor_from_url
 from ftdrivers.robotiq import codec as robotiq
 from ftdrivers.robotous import codec as robotous
-from ftdrivers.robotous.halves import Halves
+from ftdrivers.robotous.can import Halves
 from ftdrivers.transcript.recorder import FORMAT, Transcript
 from ftdrivers.ur import rtde
-from ftdrivers.wires.crc import crc16_modbus, crc16_x25
+from ftdrivers.wires.framing import crc16_modbus, crc16_x25
 from tests.benchmarks.common import show
 
 LONGEST = 400

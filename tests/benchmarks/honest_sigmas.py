@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib import CalibrationDataset, CalibrationResult, NotObservable, solve
-from ftcalib.extras.verification import verify
+from ftcalib.after.verification import verify
 from tests.benchmarks.common import restart_with_one_thread, show
 
 Array = NDArray[np.float64]

@@ -14,14 +14,13 @@ import numpy as np
 
 from ftdrive.errors import PlanRefused
 from ftdrive.planning.approach import plan_approach
-from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Bodies, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
-from ftdrive.planning.geometry.shapes import Bodies
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
-from ftdrive.planning.search.constant_tour import constant_tour
+from ftdrive.planning.search.nodes import constant_tour
 from ftdrivers.ur.kinematics import Array
 from tests.benchmarks.common import show
 
