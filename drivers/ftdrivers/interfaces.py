@@ -154,9 +154,9 @@ class Health:
     malformed: int
     """Frames that arrived damaged and were dropped."""
     rate_Hz: float
-    """Over the last second."""
+    """Mean rate over the last second."""
     age_s: float
-    """Since the newest sample."""
+    """Time since the newest sample."""
     duplicated: int = 0
     """Frames or samples that arrived twice; one of them was kept."""
     out_of_order: int = 0

@@ -28,7 +28,7 @@ from ftdrivers.wires.serial_port import SerialPort
 
 log = logging.getLogger(__name__)
 
-# Of the maker's examples, and the default of its ROS 2 driver.
+# The rates of the maker's examples, and the default of its ROS 2 driver.
 _USUAL_BAUDS = (460_800, 230_400)
 # The median of their spacing is the sample period.
 _FIRST_FRAMES = 8

@@ -33,7 +33,7 @@ class Readings:
 
     def __init__(self) -> None:
         self.number = 0
-        """Of the last reading, damaged ones included."""
+        """Number of the last reading, damaged ones included."""
         self.damaged = 0
         self._rest = b""
 

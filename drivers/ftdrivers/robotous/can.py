@@ -145,7 +145,7 @@ IDS = (0x64, 0x01, 0x02)
 """The factory's identifiers of commands, and of the first and second half of a field."""
 BITRATE = 1_000_000
 _WAIT_S = 0.05
-# Since the last half: shorter than `StreamLimits.stale_s`, longer than the slowest sensor's period.
+# The silence after the last half: shorter than `StreamLimits.stale_s`, longer than the slowest sensor's period.
 _HEARD_S = 0.15
 # After so many without a silence the reader looks at its other tasks.
 _MOST_FRAMES = 50

@@ -21,7 +21,7 @@ from ftdrivers.wires.framing import Deframer
 COMMAND_SIZE, REPLY_SIZE = 8, 16
 START_OF_FRAME, END_OF_FRAME = 0x55, 0xAA
 FRAME_SIZE = REPLY_SIZE + 3
-"""Of a frame from the sensor."""
+"""Size of a frame from the sensor, in bytes."""
 
 AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 

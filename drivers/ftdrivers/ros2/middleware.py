@@ -133,7 +133,7 @@ class Received(NamedTuple):
     message: Any
     t_host_ns: int
     number: int
-    """Of its publisher, so that lost messages are gaps; counted here where the middleware gives none."""
+    """The number of the publisher, so that lost messages are gaps; counted here where the middleware gives none."""
 
 
 def subscribe(

@@ -114,7 +114,7 @@ def _numbers(text: str) -> Array:
 
 
 UNIT_TOLERANCE: Final = 1e-3
-"""Of the length of a quaternion."""
+"""Largest difference between the length of a quaternion and 1."""
 # The parts of a chain of tf may differ by so much in time.
 _SPREAD_NS: Final = 100_000_000
 

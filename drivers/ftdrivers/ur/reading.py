@@ -117,7 +117,7 @@ class Reader:
         """Whether no sample has arrived since `DeviceTimeout` was raised."""
         self._stream = Subscription(host, OUTPUTS, rate_Hz, timeout_s=timing.connect_s, clock=clock)
         self.version = self._stream.version
-        """Of the controller: major, minor, bugfix, build."""
+        """Version of the controller: major, minor, bugfix, build."""
         self.services = ServicesOf(host, self.version, clock, api_port)
         missing = set(self._stream.missing)
         self.reports_tcp = "tcp_offset" not in missing

@@ -230,9 +230,9 @@ class Subscription:
     ) -> None:
         where = f"{host}:{PORT}"
         self.version = (0, 0, 0, 0)
-        """Of the controller: major, minor, bugfix, build."""
+        """Version of the controller: major, minor, bugfix, build."""
         self.rate_Hz = frequency_Hz
-        """At which the controller sends."""
+        """Rate at which the controller sends."""
         self.is_full_rate = False
         self.missing: list[str] = []
         """Outputs that this controller does not know; samples lack them."""

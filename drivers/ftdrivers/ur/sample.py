@@ -83,7 +83,7 @@ _SAFETY_MODES: Final = {
     22: "safety API safeguard stop",
 }
 _ENABLING: Final = "hold the enabling device in its middle position, or switch to automatic mode at the pendant"
-# Of modes whose source the status bits do not name.
+# What to do in modes whose source the status bits do not name.
 _MODE_FIXES: Final = {
     12: "close the safeguard of automatic mode and reset it",
     13: _ENABLING,

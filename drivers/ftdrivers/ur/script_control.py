@@ -29,7 +29,7 @@ from ftdrivers.ur.rtde import Subscription
 from ftdrivers.ur.timing import Patience, UrTiming, held
 
 NAME: Final = "ftdrive_control"
-"""Of the program on the controller."""
+"""Name of the program on the controller."""
 INPUTS: Final = MappingProxyType(
     {f"input_int_register_{k}": "INT32" for k in range(32, 36)}
     | {f"input_double_register_{k}": "DOUBLE" for k in range(24, 34)}
@@ -42,7 +42,7 @@ OUTPUTS: Final = MappingProxyType(
 )
 """The controller's time; token, state, sequence number and answer of the last command; the TCP."""
 NUMBERS: Final = 10
-"""Of a command, at most."""
+"""Most numbers of one command."""
 COMMANDS: Final = MappingProxyType(
     {
         "move": 1,

@@ -43,13 +43,13 @@ class UrTiming:
     call_s: float = 2.0
     """A reply of the control process, which takes 10 ms. Motion is watched meanwhile."""
     progress_s: float = 0.4
-    """The same for the progress of a move, which takes 0.03 ms. The guard is not called meanwhile."""
+    """Such a reply about the progress of a move, which takes 0.03 ms. The guard is not called meanwhile."""
     ours_s: float = 0.4
     """A question to the control program, which answers within two control cycles."""
     ours_again_s: float = 1.0
-    """The same when the arm is reopened."""
+    """This question when the arm is reopened."""
     ours_closing_s: float = 0.3
-    """The same when the arm is closed."""
+    """This question when the arm is closed."""
     quit_s: float = 0.7
     """End of the control program and of its process when the arm is closed."""
     braking_s: float = 0.5
@@ -57,7 +57,7 @@ class UrTiming:
     stop_s: float = 0.4
     """A stop through the dashboard server, which takes 0.02 s; it continues in the background afterwards."""
     stop_silent_s: float = 0.15
-    """The same when no sample has arrived for `stale_s`."""
+    """Such a stop when no sample has arrived for `stale_s`."""
     reach_s: float = 1.5
     """How long the attempt in the background tries to connect: one retransmission of TCP."""
     unwatched_s: float = 0.5
@@ -65,7 +65,7 @@ class UrTiming:
     child_starting_s: float = 9.0
     """The control process ends itself when ur_rtde, which gives up after 5 s, has not connected by then."""
     child_leaving_s: float = 3.0
-    """The same for its exit after the parent has gone."""
+    """The control process ends itself if its exit takes longer after the parent has gone."""
 
     @classmethod
     def emulated(cls) -> Self:
