@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     from ftdrive.recording.files import read_recording, write_recording
     from ftdrive.runs.run import Run
     from ftdrive.runs.source import read_calibration, read_dataset
-    from ftdrivers.interfaces import ArmState, DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
-    from ftdrivers.read_only_arm import ReadOnlyArm
+    from ftdrivers.interfaces import ArmState, DeviceInfo, ForceTorqueSensor, FtSamples, ReadOnlyArm, RobotArm
     from ftdrivers.streaming.sensor import StreamingSensor
 
 __version__ = "0.1.0"
@@ -103,7 +102,7 @@ _MODULES = {
     "ftdrive.runs.run": ("Run",),
     "ftdrive.runs.source": ("read_calibration", "read_dataset"),
     "ftdrivers.interfaces": ("ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "RobotArm"),
-    "ftdrivers.read_only_arm": ("ReadOnlyArm",),
+    "ftdrivers.interfaces": ("ReadOnlyArm",),
     "ftdrivers.streaming.sensor": ("StreamingSensor",),
 }
 

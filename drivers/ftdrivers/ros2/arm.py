@@ -17,8 +17,7 @@ import numpy as np
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import BadUrl, ConnectError, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.follow import Follow, Unread
-from ftdrivers.interfaces import NOT_REPORTED, ArmState, ArmStates, DeviceInfo, Diagnosis, Fact
-from ftdrivers.read_only_arm import ReadOnlyArm
+from ftdrivers.interfaces import NOT_REPORTED, ArmState, ArmStates, DeviceInfo, Diagnosis, Fact, ReadOnlyArm
 from ftdrivers.registry import Options, split_url
 from ftdrivers.ros2.middleware import Node, OnePublisher, Received, clock_diagnosis, subscribe, subscribe_to_tf
 from ftdrivers.ros2.poses import Chain, Joints, PoseReader, Poses, StampedPose, Transforms

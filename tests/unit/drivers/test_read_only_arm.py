@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ftdrivers.errors import ConnectError, DeviceFault
-from ftdrivers.interfaces import ArmState, DeviceInfo
-from ftdrivers.read_only_arm import ReadOnlyArm
+from ftdrivers.interfaces import ArmState, DeviceInfo, ReadOnlyArm
 
 
 class Fixed(ReadOnlyArm):

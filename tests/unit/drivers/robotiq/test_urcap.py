@@ -11,8 +11,7 @@ from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import Fact
 from ftdrivers.registry import sensor_from_url
-from ftdrivers.robotiq.sensor import RobotiqFt300
-from ftdrivers.robotiq.urcap import Readings, RobotiqUrcap
+from ftdrivers.robotiq.sensor import Readings, RobotiqFt300, RobotiqUrcap
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.in_one_thread import InOneThread
 
