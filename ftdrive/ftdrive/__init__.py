@@ -101,8 +101,7 @@ _MODULES = {
     "ftdrive.recording.files": ("read_recording", "write_recording"),
     "ftdrive.runs.run": ("Run",),
     "ftdrive.runs.source": ("read_calibration", "read_dataset"),
-    "ftdrivers.interfaces": ("ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "RobotArm"),
-    "ftdrivers.interfaces": ("ReadOnlyArm",),
+    "ftdrivers.interfaces": ("ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "ReadOnlyArm", "RobotArm"),
     "ftdrivers.streaming.sensor": ("StreamingSensor",),
 }
 

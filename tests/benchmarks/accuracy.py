@@ -4,7 +4,7 @@
 
 Prints one row per figure: name, figure, target, pass or FAIL, number of runs; the exit code is the number of rows that
 failed. Quick runs have few samples, so their targets are wider by the sampling error. The table of the README is that
-of `side_by_side`. Terms: docs/reference/figures/calibration.md.
+of `side_by_side`. Terms: docs/contributing/figures/calibration.md.
 """
 
 import os

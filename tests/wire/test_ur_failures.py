@@ -3,7 +3,7 @@
 Required of every row: reported as below, with a fix; the arm stopped, or known to be finishing the one move it was
 given; no crash; after the operator has cleared it, `open(control=True)` on the same object moves the arm again. We
 never unlock and never play. The limits themselves are proved in `tests/unit/drivers/ur`; times, also
-of processes of ours that are killed or suspended, stand in docs/reference/figures/devices.md.
+of processes of ours that are killed or suspended, stand in docs/contributing/figures/devices.md.
 
 ======================  ================  =============================  ==========================================
 event                   what is raised    arm                            test of this file

@@ -32,7 +32,7 @@ DAILY = np.arange(90.0) + 0.3
 
 @pytest.mark.parametrize("a_week", [1.0, -3.0])
 def test_a_drift_is_found_within_three_weeks_with_its_rate_and_onset(a_week: float) -> None:
-    """1 sigma a week in 19 of 20 series; docs/reference/figures/fleet.md has the figures."""
+    """1 sigma a week in 19 of 20 series; docs/contributing/figures/fleet.md has the figures."""
     missed = 0
     for seed in range(20):
         d = series(DAILY, seed)
