@@ -203,7 +203,7 @@ def table_iii(
 def _described(
     method: Method, parameters: Parameters, dataset: CalibrationDataset, reference: Parameters, g_m_s2: float
 ) -> Compared:
-    mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
+    mass_kg = parameters.weight_N / g_m_s2
     angle_rad = float(angle_between(parameters.R_flange_sensor, reference.R_flange_sensor))
     residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
     return Compared(method, None, parameters, mass_kg, angle_rad, *_rms(residuals))
@@ -213,7 +213,7 @@ def _tested(compared: Compared, parameters: Parameters, test: CalibrationDataset
     """Add the columns of Table III."""
     force, torque = np.split(test.wrench - predict(parameters, test.R_base_flange), 2, axis=1)
     largest = [np.abs(np.column_stack([part, np.linalg.norm(part, axis=1)])).max(axis=0) for part in (force, torque)]
-    weight_N, true_N = (float(np.linalg.norm(p.gravity_force_base_N)) for p in (parameters, truth))
+    weight_N, true_N = parameters.weight_N, truth.weight_N
     off_m = float(np.linalg.norm(parameters.p_sensor_com_m - truth.p_sensor_com_m))
     return replace(
         compared,

@@ -69,6 +69,16 @@ class Parameters:
             object.__setattr__(self, name, value)
 
     @property
+    def weight_N(self) -> float:
+        """Size of the gravity force."""
+        return float(np.linalg.norm(self.gravity_force_base_N))
+
+    @property
+    def down(self) -> Array:
+        """(3,) direction of the gravity force in base; zero without a weight."""
+        return np.asarray(self.gravity_force_base_N / (self.weight_N or 1.0))
+
+    @property
     def bias(self) -> Array:
         """(6,) of force and torque, N and N·m."""
         return np.concatenate([self.force_bias_N, self.torque_bias_Nm])

@@ -18,7 +18,7 @@ from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, is_changed, read_object, write_object
 from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.judge.verdict import SURE, expected_error
-from ftcalib.likelihood.response import COMMON_GAIN, Response, hidden_covariance, predicted_covariance
+from ftcalib.likelihood.response import COMMON_GAIN, Response, hidden_covariance, joint_covariance, predicted_covariance
 from ftcalib.model import PARAMETER_NAMES, Array, Parameters, Rotations, is_rotation, read_only
 from ftcalib.published.yu import weight_and_tilt
 
@@ -203,8 +203,7 @@ class CalibrationResult:
         if isinstance(self.response, Mapping):
             given = self.response
             object.__setattr__(self, "response", Response(given["coefficients"], given["covariance"]))
-        joint = self.covariance if self.response is None else self.response.covariance
-        require_positive_definite(joint)
+        require_positive_definite(joint_covariance(self.covariance, self.response))
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
         found = (one if isinstance(one, Finding) else Finding.from_dict(one) for one in self.findings)
         object.__setattr__(self, "findings", tuple(found))

@@ -9,14 +9,15 @@ import numpy as np
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.findings import Finding, ordered
-from ftcalib.judge.cross_validation import AssessedFit, IndependentFit
+from ftcalib.judge.cross_validation import Judged
 from ftcalib.judge.described_cell import contradictions
 from ftcalib.judge.faults import faults, no_weight, other_poses
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
-from ftcalib.judge.verdict import SIGNIFICANT_SIGMAS, judge
+from ftcalib.judge.verdict import SIGNIFICANT_SIGMAS, Quality, judge
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.fit import Fit, fit
+from ftcalib.likelihood.response import joint_covariance
 from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters, predict
 from ftcalib.published.methods import BASELINES, PUBLISHED, SPECIAL, Estimator, published, require_printed_form
@@ -87,6 +88,56 @@ def solve(
     >>> contact.shape
     (24, 6)
     """
+    known, setup = _choose(dataset, method, drift, known, g_m_s2, setup, as_published=as_published)
+    estimator = None
+    if method in PUBLISHED:
+        estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, setup, as_published=as_published)
+    wrench_cov = dataset.wrench_cov
+    if wrench_cov is not None:
+        wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
+    assumed = known if estimator is None or method in BASELINES else None
+    best = _fit(dataset, wrench_cov, drift, known, assumed, g_m_s2, setup)
+    judged = Judged.of(best) if estimator is None else _estimated(method, estimator, dataset, wrench_cov, best)
+    free = _unconstrained(dataset, wrench_cov, drift) if assumed is not None else best if estimator else None
+    measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
+    quality = _judge(judged, free, dataset.t_s, measured_sigma, known, g_m_s2, setup)
+    deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
+    printed = {"as_published": True} if as_published else {}
+    return CalibrationResult(
+        parameters=judged.parameters,
+        covariance=judged.covariance,
+        residuals=judged.residuals,
+        chi2=judged.chi2 if wrench_cov is None else judged.measured_chi2,
+        dof=judged.dof,
+        noise_source="residuals" if wrench_cov is None else "measured",
+        g_m_s2=g_m_s2,
+        method=method,
+        findings=ordered([*quality.findings, *deviation]),
+        provenance={**(provenance or {}), **printed, "dataset_sha256": dataset.sha256()},
+        p_value=quality.chi2_p,
+        measured_sigma=measured_sigma,
+        weights=judged.weights,
+        components=judged.components,
+        drift=None if judged.drift is None else DriftResult(judged.drift.change, judged.drift.sigma),
+        response=judged.response,
+        gain_sigma=judged.gain_sigma,
+        cable_shift=quality.cable_shift,
+        second_basin_chi2=best.second_basin_chi2,
+        quality=quality.to_dict(),
+    )
+
+
+def _choose(
+    dataset: CalibrationDataset,
+    method: Method,
+    drift: Drift,
+    known: Known | None,
+    g_m_s2: float,
+    setup: Setup,
+    *,
+    as_published: bool,
+) -> tuple[Known | None, Setup]:
+    """Check the arguments; return what the method takes as known, and the cell that its result is compared with."""
     for name, value, choices in (("method", method, get_args(Method)), ("drift", drift, get_args(Drift))):
         if value not in choices:
             raise ValueError(f"{name} is '{value}', expected one of {', '.join(choices)}")
@@ -99,86 +150,58 @@ def solve(
     require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
     if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNRESOLVED_N:
         raise NotObservable("the force is the same in all poses: check that the sensor works and carries a load.")
+    return known, setup
 
-    estimator = None
-    if method in PUBLISHED:
-        estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, setup, as_published=as_published)
-    assumed = known if estimator is None or method in BASELINES else None
-    wrench_cov = dataset.wrench_cov
-    if wrench_cov is not None:
-        wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
 
-    # Published methods use this fit too: for observability, and for the noise if it was not measured.
+def _fit(
+    dataset: CalibrationDataset,
+    wrench_cov: Array | None,
+    drift: Drift,
+    known: Known | None,
+    assumed: Known | None,
+    g_m_s2: float,
+    setup: Setup,
+) -> Fit:
+    """Fit by maximum likelihood, with what is `assumed` of the known values.
+
+    Published methods use this fit too: for observability, and for the noise if it was not measured.
+    """
+    poses = dataset.R_base_flange, dataset.wrench, wrench_cov
     try:
-        best = fit(
-            dataset.R_base_flange,
-            dataset.wrench,
-            wrench_cov,
-            t_s=dataset.t_s,
-            drift=drift,
-            known=assumed,
-            g_m_s2=g_m_s2,
-        )
+        best = fit(*poses, t_s=dataset.t_s, drift=drift, known=assumed, g_m_s2=g_m_s2)
         _require_determined(dataset.R_base_flange, best, known)
     except NotObservable as exc:
+        # A mistake in the data often leaves the poses undetermined: name it, rather than ask for more poses.
         if named := _mistakes(dataset, wrench_cov, drift, known, g_m_s2, setup):
             raise NotObservable(f"{named[0].words}.", named[0]) from exc
         raise
-    assessed: AssessedFit = _assessed(method, estimator, dataset, wrench_cov, best) if estimator else best
+    return best
+
+
+def _judge(
+    judged: Judged,
+    free: Fit | None,
+    t_s: Array,
+    measured_sigma: Array | None,
+    known: Known | None,
+    g_m_s2: float,
+    setup: Setup,
+) -> Quality:
+    """Judge estimates; `free` is the best fit to the same poses without known values, if they used some."""
     try:
-        require_positive_definite(assessed.covariance)
-        require_positive_definite(assessed.covariance if assessed.response is None else assessed.response.covariance)
+        require_positive_definite(judged.covariance)
+        require_positive_definite(joint_covariance(judged.covariance, judged.response))
     except ValueError as exc:
         raise NotObservable(f"{exc}. Add poses with other orientations.") from exc
-    measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
-    unconstrained: Fit | None = best if estimator else None
-    if assumed is not None:
-        unconstrained = _unconstrained(dataset, wrench_cov, drift)
-    quality = judge(
-        assessed,
-        t_s=dataset.t_s,
+    unconstrained = None if free is None else Judged.of(free)
+    return judge(
+        judged,
+        t_s=t_s,
         measured_sigma=measured_sigma,
         setup=setup,
         known=known,
         unconstrained=unconstrained,
         g_m_s2=g_m_s2,
-    )
-    chi2 = assessed.chi2 if wrench_cov is None else assessed.measured_chi2
-    drifted = best.drift if estimator is None else None
-    deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
-    printed = {"as_published": True} if as_published else {}
-    return CalibrationResult(
-        parameters=assessed.parameters,
-        covariance=assessed.covariance,
-        residuals=assessed.residuals,
-        chi2=chi2,
-        dof=assessed.dof,
-        noise_source="residuals" if wrench_cov is None else "measured",
-        g_m_s2=g_m_s2,
-        method=method,
-        findings=ordered([*quality.findings, *deviation]),
-        provenance={**(provenance or {}), **printed, "dataset_sha256": dataset.sha256()},
-        p_value=quality.chi2_p,
-        measured_sigma=measured_sigma,
-        weights=assessed.weights,
-        components=assessed.components,
-        drift=None if drifted is None else DriftResult(drifted.change, drifted.sigma),
-        response=assessed.response,
-        gain_sigma=assessed.gain_sigma,
-        cable_shift=None if quality.cable is None else quality.cable.shift,
-        second_basin_chi2=best.second_basin_chi2,
-        quality={
-            "loo_force_rms_N": quality.loo_force_rms_N,
-            "loo_torque_rms_Nm": quality.loo_torque_rms_Nm,
-            "next_use_force_rms_N": quality.next_use_force_rms_N,
-            "next_use_torque_rms_Nm": quality.next_use_torque_rms_Nm,
-            "last_bias_offset": quality.ahead.offset.tolist(),
-            "bias_growth_per_min": quality.ahead.growth_per_min.tolist(),
-            "worst_pose": quality.worst_pose + 1,
-            "residual_sigma": quality.residual_sigma.tolist(),
-            "lag1": quality.lag1,
-            "correlations": [list(pair) for pair in quality.correlations],
-        },
     )
 
 
@@ -196,9 +219,9 @@ def _require_usable(method: Method, known: Known | None, as_published: bool) -> 
         raise ValueError(f"{method} cannot use a known {' or '.join(unused)}: leave it out, or use 'ml'")
 
 
-def _assessed(
+def _estimated(
     method: Method, estimator: Estimator, dataset: CalibrationDataset, wrench_cov: Array | None, best: Fit
-) -> IndependentFit:
+) -> Judged:
     """Apply a published method; `best` gives the degrees of freedom and the second solution."""
     parameters = estimator(dataset.wrench)
     noise = wrench_cov
@@ -208,15 +231,15 @@ def _assessed(
         noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))
     # Cube roots err most where a component of the gravity force is zero, which their own estimate hides.
     truth = best.parameters if method in SPECIAL else parameters
-    return IndependentFit(
+    return Judged.independent(
         parameters,
         _simulated_covariance(estimator, truth, dataset.R_base_flange, noise),
         dataset.R_base_flange,
         dataset.wrench,
         noise,
-        wrench_cov is not None,
         np.ones(len(dataset)),
-        best.second_basin_chi2,
+        measured=wrench_cov is not None,
+        second_basin_chi2=best.second_basin_chi2,
         free=best.free,
     )
 

@@ -31,7 +31,7 @@ from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.files import JSON
 from ftcalib.likelihood.descent import column_scale
-from ftcalib.likelihood.response import Response, hysteresis_columns, response_columns
+from ftcalib.likelihood.response import hysteresis_columns, joint_covariance, joint_jacobian, with_covariance
 from ftcalib.likelihood.session_noise import pose_times, summed_products
 from ftcalib.model import BIASES, Array, Parameters, jacobian, read_only
 from ftcalib.result import CalibrationResult
@@ -81,8 +81,8 @@ class Expected:
     def common(self, R_base_flange: Array) -> Array:
         """Return the covariance (6n, 6n) of the predictions: the uncertainty of the calibration, without `factor`."""
         p, response = self.calibration.parameters, self.calibration.response
-        C = self.calibration.covariance if response is None else response.covariance
-        K = _columns(p, response, R_base_flange).reshape(6 * len(R_base_flange), -1)
+        C = joint_covariance(self.calibration.covariance, response)
+        K = joint_jacobian(p, response, R_base_flange).reshape(6 * len(R_base_flange), -1)
         return np.asarray(K @ C @ K.T)
 
     def p_value(self, chi2: float, dof: int) -> float:
@@ -210,7 +210,7 @@ def _expected(
     R, D = fitted.R_base_flange[order], pooled_covariance(fitted.wrench_cov, fitted.n_samples)[order]
     e = np.asarray(Compensator(p, response=response).batch(fitted.wrench[order], R), dtype=np.float64)
     walk = _walk_columns(D) if usual[0][2] != NO_WALK else np.zeros((len(D), 6, 0))
-    J = np.concatenate([_columns(p, response, R), lag, walk], axis=2)
+    J = np.concatenate([joint_jacobian(p, response, R), lag, walk], axis=2)
     known = J.shape[2] - lag.shape[2] - walk.shape[2]
     sizes, offset = np.full(15, np.inf), np.zeros(J.shape[2])
     if response is not None:  # found coefficients: measured as zero, with the variance found
@@ -229,7 +229,7 @@ def _expected(
         likelihood.append(-0.5 * (logdet + dof * np.log(chi2)))
         factor = max(chi2 / dof, LEAST_FACTOR)
         C += np.outer(x, x) / factor  # the calibration as stored is off by what this explanation moves its estimates
-        joint = None if response is None else replace(response, covariance=C[:known, :known])
+        joint = with_covariance(response, C[:known, :known])
         noise = np.asarray(block_diag(*(wrench_cov + error_rad**2 * turn_new)))
         shares = C[known : known + 6, known : known + 6]  # the swing to the first new pose is unknown too
         noise += lag_new @ block_diag(shares, np.diag(np.diag(shares))) @ lag_new.T
@@ -277,12 +277,6 @@ def _walk_columns(D: Array) -> Array:
     return np.asarray(-before[:, None, :, None] * np.diag(sigma)[:, None]).reshape(n, 6, 6 * (n - 1))
 
 
-def _columns(p: Parameters, response: Response | None, R_base_flange: Array) -> Array:
-    """Give the derivative (n, 6, k) by the parameters, and by gain and cross-talk if there are any."""
-    J = jacobian(p, R_base_flange)
-    return J if response is None else np.concatenate([J, response_columns(p, R_base_flange)], axis=2)
-
-
 def _turns(p: Parameters, R_base_flange: Array) -> Array:
     """Give the covariance (n, 6, 6) of the readings for one rad² of variance of each orientation."""
     turn = jacobian(p, R_base_flange)[..., :3]
@@ -299,13 +293,11 @@ def _components(calibration: CalibrationResult) -> Mapping[str, float]:
 
 def _drifted(calibration: CalibrationResult, gap: Array) -> Update:
     """Add variances (6,) of the bias to the covariance of a calibration."""
-    covariance, response = calibration.covariance.copy(), calibration.response
+    covariance = calibration.covariance.copy()
+    joint = joint_covariance(calibration.covariance, calibration.response).copy()
     covariance[BIASES, BIASES] += gap
-    if response is not None:
-        joint = response.covariance.copy()
-        joint[BIASES, BIASES] += gap
-        response = replace(response, covariance=joint)
-    return Update(calibration.parameters, covariance, 0.0, 0, response=response)
+    joint[BIASES, BIASES] += gap
+    return Update(calibration.parameters, covariance, 0.0, 0, response=with_covariance(calibration.response, joint))
 
 
 # Change of the six biases since a calibration, from the readings of one verification.

@@ -18,8 +18,8 @@ from ftcalib.after.state import Update, updated
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.findings import Finding
-from ftcalib.likelihood.response import Response, response_columns
-from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_between_vectors, jacobian, predict, skew
+from ftcalib.likelihood.response import Response, joint_covariance, joint_jacobian
+from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_between_vectors, predict, skew
 from ftcalib.result import CalibrationResult
 
 FALSE_ALARMS = 1e-4
@@ -45,7 +45,7 @@ class CellPrior:
         self.earlier, gain = earlier, earlier.response
         self.coefficients = np.zeros(0) if gain is None else np.array(gain.coefficients)
         """(11,) of gain and cross-talk, or none."""
-        self._covariance = np.array(earlier.covariance if gain is None else gain.covariance)
+        self._covariance = np.array(joint_covariance(earlier.covariance, gain))
         self._across = np.linalg.svd(skew(earlier.parameters.gravity_force_base_N))[0][:, :2]  # gravity
 
     @property
@@ -74,12 +74,12 @@ class CellPrior:
         before = self._derivative(old)[rows]
         V = before @ self._covariance @ before.T
         root = np.linalg.inv(np.linalg.cholesky(V + 1e-12 * np.diag(np.diag(V)) + 1e-24 * np.eye(len(V))))
-        apart = [p.difference(old)[:3], self._across.T @ (down(old) - down(p)), self.coefficients - coefficients]
+        apart = [p.difference(old)[:3], self._across.T @ (old.down - p.down), self.coefficients - coefficients]
         return root @ self._derivative(p)[rows], root @ np.concatenate(apart)[rows]
 
     def _derivative(self, p: Parameters) -> Array:
         size = len(self._covariance)
-        F, u = float(np.linalg.norm(p.gravity_force_base_N)), down(p)
+        F, u = p.weight_N, p.down
         rows = np.zeros((len(WHOLE) + size - 15, size))
         rows[:3, :3] = np.eye(3)
         rows[3:5, 3:6] = self._across.T @ (np.eye(3) - np.outer(u, u)) / F
@@ -109,7 +109,7 @@ class CellPrior:
             if not freedom or chi2_sf(freedom, left) >= FALSE_ALARMS:
                 turned = float(angle_between(old.R_flange_sensor, new.R_flange_sensor))
                 if kept == _MOUNTING:
-                    turned = angle_between_vectors(down(old), down(new))
+                    turned = angle_between_vectors(old.down, new.down)
                 explained.append((left, f"{cause}, by {np.degrees(turned):.2g}°"))
         misfit = f"chi2 {chi2:.0f} for {dof} degrees of freedom"
         if not explained:
@@ -120,11 +120,6 @@ class CellPrior:
         explained.sort()
         found = " or ".join(text for left, text in explained if left < explained[0][0] + 10)
         return f"{found} since {self.earlier.id} ({misfit}): {alone}."
-
-
-def down(p: Parameters) -> Array:
-    """Return the direction (3,) of gravity in base."""
-    return np.asarray(p.gravity_force_base_N / np.linalg.norm(p.gravity_force_base_N))
 
 
 _MOST_STEPS = 30
@@ -187,10 +182,9 @@ def _fitted(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Arra
     new = _start(prior.earlier.parameters, R_base_flange, wrench)
     for _ in range(_MOST_STEPS):
         left = wrench - predict(new, R_base_flange)
-        J = jacobian(new, R_base_flange)
+        J = joint_jacobian(new, prior.earlier.response, R_base_flange)
         if prior.has_response:
-            T = response_columns(new, R_base_flange)
-            left, J = left - T @ coefficients, np.concatenate([J, T], axis=2)
+            left = left - np.ascontiguousarray(J[..., 15:]) @ coefficients
         A, r = prior.rows(new, coefficients, kept)
         WJ = weights @ J
         H = np.einsum("nij,nik->jk", J, WJ) + A.T @ A
@@ -204,8 +198,8 @@ def _fitted(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Arra
     else:
         raise NotObservable(f"the fit has not settled in {_MOST_STEPS} steps: check the poses, or solve alone.")
     covariance = np.linalg.inv(H)
-    weight_N = float(np.linalg.norm(new.gravity_force_base_N))
-    sigma_N = float(np.sqrt(down(new) @ covariance[3:6, 3:6] @ down(new)))
+    weight_N = new.weight_N
+    sigma_N = float(np.sqrt(new.down @ covariance[3:6, 3:6] @ new.down))
     if weight_N < _SIGNIFICANT * sigma_N:
         raise NotObservable(f"the weight of the tool is {weight_N:.2g} N, sigma {sigma_N:.2g} N: check the sensor.")
     chi2 = float(np.einsum("ni,nij,nj->", left, weights, left) + r @ r)
@@ -216,13 +210,13 @@ def _fitted(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Arra
 
 def _start(old: Parameters, R_base_flange: Array, wrench: Array) -> Parameters:
     """Take weight, centre of mass and bias by linear least squares with the earlier mounting and base."""
-    u = down(old) @ (R_base_flange @ old.R_flange_sensor)
+    u = old.down @ (R_base_flange @ old.R_flange_sensor)
     A = np.zeros((len(u), 6, 10))
     A[:, :3, 0], A[:, :3, 1:4] = u, np.eye(3)
     A[:, 3:, 4:7], A[:, 3:, 7:] = -skew(u), np.eye(3)
     x: Array = np.linalg.lstsq(A.reshape(-1, 10), wrench.ravel(), rcond=None)[0].astype(np.float64)
     weight_N = max(float(x[0]), 1e-3)
-    return Parameters(old.R_flange_sensor, weight_N * down(old), x[1:4], x[4:7] / weight_N, x[7:])
+    return Parameters(old.R_flange_sensor, weight_N * old.down, x[1:4], x[4:7] / weight_N, x[7:])
 
 
 def _kept_noise(earlier: CalibrationResult) -> dict[str, float]:

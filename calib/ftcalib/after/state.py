@@ -19,8 +19,14 @@ from ftcalib.data.dataset import finite
 from ftcalib.data.dwell_mean import is_stationary, mean_and_covariance
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.findings import Finding
-from ftcalib.likelihood.response import Response, predicted_covariance, response_columns
-from ftcalib.model import BIASES, Array, Parameters, jacobian, read_only, skew
+from ftcalib.likelihood.response import (
+    Response,
+    joint_covariance,
+    joint_jacobian,
+    predicted_covariance,
+    with_covariance,
+)
+from ftcalib.model import BIASES, Array, Parameters, read_only, skew
 from ftcalib.result import CalibrationResult
 
 SIGNIFICANT_SIGMAS = 5.0
@@ -126,15 +132,13 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     """
     n, old, response = len(wrench), calibration.parameters, calibration.response
     R_base_flange, wrench = finite("R_base_flange", R_base_flange, (n, 3, 3)), finite("wrench", wrench, (n, 6))
-    C = calibration.covariance if response is None else response.covariance
+    C = joint_covariance(calibration.covariance, response)
     if not old.gravity_force_base_N.any() and kind != "bias":
         raise NotObservable("the calibration has no weight, so the direction of gravity is unknown: calibrate first.")
     new = old
     for _ in range(MOST_STEPS):
         estimated, kept = _directions(new, BLOCKS[kind]), _kept(old, new, BLOCKS[kind], len(C))
-        J = jacobian(new, R_base_flange)
-        if response is not None:
-            J = np.concatenate([J, response_columns(new, R_base_flange)], axis=2)
+        J = joint_jacobian(new, response, R_base_flange)
         K = J.reshape(6 * n, -1) @ kept
         H = J[..., :15].reshape(6 * n, 15) @ estimated
         S = noise + K @ C @ K.T
@@ -145,7 +149,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
         left = np.asarray(Compensator(new, response=response).batch(wrench, R_base_flange), dtype=np.float64).ravel()
         x = G @ left
         if "weight" in BLOCKS[kind]:
-            weight_N, sigma_N = float(np.linalg.norm(new.gravity_force_base_N) + x[0]), float(np.sqrt(inverse[0, 0]))
+            weight_N, sigma_N = float(new.weight_N + x[0]), float(np.sqrt(inverse[0, 0]))
             if not weight_N > SIGNIFICANT_SIGMAS * sigma_N:
                 raise NotObservable(
                     f"the weight of the payload, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty "
@@ -169,7 +173,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
         6 * n - len(x),
         kind,
         left.reshape(n, 6),
-        None if response is None else Response(response.coefficients, covariance),
+        with_covariance(response, covariance),
     )
 
 
@@ -227,11 +231,11 @@ def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
 
     With a new weight the centre of mass is estimated as their product, in which the readings are linear.
     """
-    weight_N = float(np.linalg.norm(p.gravity_force_base_N))
+    weight_N = p.weight_N
     columns = []
     if "weight" in blocks:
         weight = np.zeros((15, 1))
-        weight[3:6, 0] = p.gravity_force_base_N / weight_N
+        weight[3:6, 0] = p.down
         if "centre of mass" in blocks:
             weight[9:12, 0] = -p.p_sensor_com_m / weight_N
         columns.append(weight)
@@ -269,7 +273,7 @@ def _kept(old: Parameters, new: Parameters, blocks: Sequence[Block], size: int) 
 
 def _moved(p: Parameters, estimated: Array, x: Array, blocks: Sequence[Block]) -> Parameters:
     step = estimated @ x
-    weight_N = float(np.linalg.norm(p.gravity_force_base_N))
+    weight_N = p.weight_N
     if "weight" in blocks:
         step[9:12] *= weight_N / (weight_N + x[0])
     elif "gravity direction" in blocks:  # along the sphere

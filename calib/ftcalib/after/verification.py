@@ -257,7 +257,7 @@ def _in_words(calibration: CalibrationResult, update: Update) -> str:
     old, new = calibration.parameters, update.parameters
     error = old.difference(new)
     words = []
-    before_N, after_N = (float(np.linalg.norm(p.gravity_force_base_N)) for p in (old, new))
+    before_N, after_N = old.weight_N, new.weight_N
     if before_N != after_N and update.kind != "base":
         words.append(f"the payload has changed by {1e3 * (after_N - before_N) / calibration.g_m_s2:+.0f} g")
     if error[9:12].any():

@@ -19,11 +19,16 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
-from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Calibrated
+from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Calibrated, Update
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
 from ftcalib.errors import BadDataset
-from ftcalib.likelihood.response import Response, response_columns
+from ftcalib.likelihood.response import (
+    joint_covariance,
+    joint_jacobian,
+    response_columns,
+    with_covariance,
+)
 from ftcalib.model import Array, Parameters, jacobian, read_only, skew
 
 REACH_M = 0.1
@@ -141,7 +146,7 @@ def weigh(
     R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
     wrench, noise = finite("wrench", wrench, (n, 6)), finite("noise", noise, (n, 6, 6))
     tool, response = reference.parameters, reference.response
-    weight_N = float(np.linalg.norm(tool.gravity_force_base_N))
+    weight_N = tool.weight_N
     if not weight_N > 0:
         raise BadDataset("the calibrated tool has no weight, so the direction of gravity is unknown: calibrate again.")
     left = np.asarray(Compensator(tool, response=response).batch(wrench, R_base_flange), dtype=np.float64)
@@ -222,54 +227,43 @@ def _covariance(
     """Covariance (6n, 6n) of readings minus prediction: noise, calibration and drift, with a part of weight x_N[0]."""
     tool, response = reference.parameters, reference.response
     n, held = len(noise), _part(tool, x_N)
-    J, part = jacobian(tool, R_base_flange), jacobian(held, R_base_flange)
-    across = _across(tool.gravity_force_base_N) * (x_N[0] / np.linalg.norm(tool.gravity_force_base_N))
+    J, part = joint_jacobian(tool, response, R_base_flange), jacobian(held, R_base_flange)
+    across = _across(tool.gravity_force_base_N) * (x_N[0] / tool.weight_N)
     J[..., :3] += part[..., :3]
     J[..., 3:6] += part[..., 3:6] @ across
     turn = J[..., :3]
     single = noise + orientation_sigma_rad**2 * (turn @ np.swapaxes(turn, -1, -2))
-    C = np.array(reference.covariance if response is None else response.covariance)
+    C = np.array(joint_covariance(reference.covariance, response))
     C[range(6, 9), range(6, 9)] += drift[:3] ** 2
     C[range(12, 15), range(12, 15)] += drift[3:] ** 2
     if response is not None:
-        columns = response_columns(tool, R_base_flange) + response_columns(held, R_base_flange)
-        J = np.concatenate([J, columns], axis=2)
+        J[..., 15:] += response_columns(held, R_base_flange)
     K = J.reshape(6 * n, -1)
     return np.asarray(block_diag(*single) + K @ C @ K.T)
 
 
 def _part(tool: Parameters, x_N: Array) -> Parameters:
     """Return weight (N) and moment (N·m) of a part as parameters without bias."""
-    along = tool.gravity_force_base_N / np.linalg.norm(tool.gravity_force_base_N)
     com_m = x_N[1:] / x_N[0] if x_N[0] else np.zeros(3)
-    return Parameters(tool.R_flange_sensor, x_N[0] * along, np.zeros(3), com_m, np.zeros(3))
+    return Parameters(tool.R_flange_sensor, x_N[0] * tool.down, np.zeros(3), com_m, np.zeros(3))
 
 
 def _across(v: Array) -> Array:
     return np.asarray(np.eye(3) - np.outer(v, v) / (v @ v))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Holding:
-    """A tool with a part in its gripper as one load, which compensates and can be tared like a calibration."""
-
-    parameters: Parameters
-    covariance: Array
-    response: Response | None
-
-
-def holding(empty: Calibrated, weight: Weight, g_m_s2: float) -> Holding:
-    """Join the calibrated tool and a part that was weighed.
+def holding(empty: Calibrated, weight: Weight, g_m_s2: float) -> Update:
+    """Join the calibrated tool and a part that was weighed to one load, which compensates and can be tared.
 
     The error of the weighing counts as independent of that of the calibration.
     """
     tool, response = empty.parameters, empty.response
     x, cov = weight.moment
     x_N, cov_N = x * g_m_s2, cov * g_m_s2**2
-    W_N = float(np.linalg.norm(tool.gravity_force_base_N))
-    along, total_N = tool.gravity_force_base_N / W_N, W_N + float(x_N[0])
+    W_N = tool.weight_N
+    along, total_N = tool.down, W_N + float(x_N[0])
     com_m = (W_N * tool.p_sensor_com_m + x_N[1:]) / total_N
-    C = empty.covariance if response is None else response.covariance
+    C = joint_covariance(empty.covariance, response)
     T, B = np.eye(len(C)), np.zeros((len(C), 4))
     T[3:6, 3:6] += x_N[0] / W_N * _across(along)
     T[9:12, 9:12] *= W_N / total_N
@@ -277,5 +271,4 @@ def holding(empty: Calibrated, weight: Weight, g_m_s2: float) -> Holding:
     B[3:6, 0], B[9:12, 0], B[9:12, 1:] = along, -com_m / total_N, np.eye(3) / total_N
     covariance = T @ C @ T.T + B @ cov_N @ B.T
     joined = Parameters(tool.R_flange_sensor, total_N * along, tool.force_bias_N, com_m, tool.torque_bias_Nm)
-    kept = None if response is None else Response(response.coefficients, covariance)
-    return Holding(joined, covariance[:15, :15], kept)
+    return Update(joined, covariance[:15, :15], 0.0, 0, response=with_covariance(response, covariance))

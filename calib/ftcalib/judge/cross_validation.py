@@ -1,89 +1,116 @@
-"""What can be assessed: a fit, or estimates of another method with leave-one-out cross-validation of its poses.
+"""What is judged: a fit, or estimates of another method with leave-one-out cross-validation of its poses.
 
 Cross-validation interpolates a drift, but a calibration is used after its tour: `drift_ahead` extrapolates it.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
 from ftcalib.likelihood.descent import column_scale
-from ftcalib.likelihood.fit import Fit
+from ftcalib.likelihood.fit import DriftEstimate, Fit
+from ftcalib.likelihood.response import Response
 from ftcalib.likelihood.session_noise import CHUNK, Noise, summed_products
 from ftcalib.likelihood.variance_components import FORCE, TORQUE, component, left_out
 from ftcalib.model import Array, Parameters, jacobian, predict
 
 
-@dataclass(frozen=True, eq=False)
-class IndependentFit:
-    """A fit to poses with independent noise, for methods without cross-validation of their own."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Judged:
+    """All that the judge looks at: estimates, and what they leave of each pose. Rejected poses count only in arrays."""
 
     parameters: Parameters
     covariance: Array
+    """(15, 15) of the error coordinates `PARAMETER_NAMES`."""
     R_base_flange: Array
+    """(n, 3, 3)"""
     wrench: Array
-    wrench_cov: Array
-    """(n, 6, 6)"""
-    measured: bool
-    """Whether `wrench_cov` was measured, not estimated from the residuals."""
+    """(n, 6)"""
     weights: Array
-    second_basin_chi2: float | None = None
-    components: Mapping[str, float] = field(default_factory=dict)
-    response: None = None
-    drift: None = None
+    """(n,) 1 = used, 0 = rejected."""
+    residuals: Array
+    """(n, 6) measured minus predicted."""
+    left_out_residuals: Array
+    """(n, 6) measured minus what all other poses predict."""
+    left_out_cov: Array
+    """(n, 6, 6) covariance of these."""
+    chi2: float
+    measured_chi2: float
+    """Weighted by the measured noise alone; NaN without it."""
+    dof: int
+    second_basin_chi2: float | None
+    components: Mapping[str, float]
+    response: Response | None = None
+    drift: DriftEstimate | None = None
     gain_sigma: float = 0.0
-    free: Array = field(default_factory=lambda: np.eye(15))
-    """(15, m) error coordinates that the method estimates: fewer where it assumes mounting or gravity."""
+    fit: Fit | None = None
+    """The fit by maximum likelihood that has these values; None for another method, whose noise has no model."""
 
-    @cached_property
-    def residuals(self) -> Array:
-        """(n, 6) measured minus predicted."""
-        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange))
+    @classmethod
+    def of(cls, fit: Fit) -> Self:
+        """Take a fit, which cross-validates its poses itself."""
+        own = {name: getattr(fit, name) for name in cls.__dataclass_fields__ if name != "fit"}
+        return cls(**own, fit=fit)
 
-    @cached_property
-    def chi2(self) -> float:
-        """Of the used poses."""
-        r = self.residuals[..., None]
-        return float(self.weights @ np.sum(r * np.linalg.solve(self.wrench_cov, r), axis=(1, 2)))
+    @classmethod
+    def independent(  # noqa: PLR0913 - what an estimate rests on
+        cls,
+        parameters: Parameters,
+        covariance: Array,
+        R_base_flange: Array,
+        wrench: Array,
+        wrench_cov: Array,
+        weights: Array,
+        *,
+        measured: bool,
+        second_basin_chi2: float | None = None,
+        components: Mapping[str, float] | None = None,
+        free: Array | None = None,
+    ) -> Self:
+        """Cross-validate the estimates of another method, for poses with independent noise.
 
-    @property
-    def measured_chi2(self) -> float:
-        """The same, if the noise was measured."""
-        return self.chi2 if self.measured else float("nan")
-
-    @property
-    def dof(self) -> int:
-        """Of chi2."""
-        return 6 * int(self.weights.sum()) - int(self.free.shape[1])
-
-    @property
-    def left_out_residuals(self) -> Array:
-        """(n, 6) measured minus what all other poses predict."""
-        return self._left_out[0]
-
-    @property
-    def left_out_cov(self) -> Array:
-        """(n, 6, 6) covariance of these."""
-        return self._left_out[1]
-
-    @cached_property
-    def _left_out(self) -> tuple[Array, Array]:
-        """(I - H_kk)^-1 r_k without fitting again, exact for a linear model, and its covariance."""
-        J, noise = (
-            jacobian(self.parameters, self.R_base_flange) @ self.free,
-            Noise(self.wrench_cov, kept=self.weights > 0),
-        )
+        Parameters
+        ----------
+        parameters : Parameters
+        covariance : array, shape (15, 15)
+        R_base_flange : array, shape (n, 3, 3)
+        wrench : array, shape (n, 6)
+        wrench_cov : array, shape (n, 6, 6)
+        weights : array, shape (n,)
+        measured : bool
+            Whether `wrench_cov` was measured, not estimated from the residuals.
+        second_basin_chi2 : float, optional
+        components : mapping, optional
+        free : array, shape (15, m), optional
+            Error coordinates that the method estimates: fewer where it assumes mounting or gravity.
+        """
+        free = np.eye(15) if free is None else free
+        residuals = np.asarray(wrench - predict(parameters, R_base_flange))
+        r = residuals[..., None]
+        chi2 = float(weights @ np.sum(r * np.linalg.solve(wrench_cov, r), axis=(1, 2)))
+        # Each pose is left out by (I - H_kk)^-1 r_k, without fitting again: exact for a linear model.
+        J, noise = jacobian(parameters, R_base_flange) @ free, Noise(wrench_cov, kept=weights > 0)
         WJ = noise.solve(J)
         information = summed_products(J, WJ)
+        # Radians, newtons and metres stand side by side: without the scale the smallest eigenvalues count as zero.
         scale = column_scale(information)
         C = np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)) / np.outer(scale, scale)
-        return left_out(noise, WJ, noise.solve(self.residuals[..., None])[..., 0], C)
-
-
-AssessedFit = Fit | IndependentFit
-"""Rejected poses count only in arrays with n rows."""
+        return cls(
+            parameters,
+            covariance,
+            R_base_flange,
+            wrench,
+            weights,
+            residuals,
+            *left_out(noise, WJ, noise.solve(r)[..., 0], C),
+            chi2,
+            chi2 if measured else float("nan"),
+            6 * int(weights.sum()) - int(free.shape[1]),
+            second_basin_chi2,
+            components or {},
+        )
 
 
 def standardized(residuals: Array, covariance: Array) -> Array:
@@ -122,12 +149,12 @@ class DriftAhead:
     """(6,) expected square at the next use."""
 
 
-def drift_ahead(fit: AssessedFit, t_s: Array | None = None) -> DriftAhead:
+def drift_ahead(fit: Judged, t_s: Array | None = None) -> DriftAhead:
     """Extrapolate the drift of a fit.
 
     Parameters
     ----------
-    fit : AssessedFit
+    fit : Judged
     t_s : array, shape (n,), optional
         When each pose was measured; without it, or with times that are not finite, one pose every 10 s in their order.
     """

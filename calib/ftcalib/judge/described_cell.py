@@ -61,7 +61,7 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup) -> list[
     found = []
     if 0 < inside_m <= FARTHEST_COM_M:
         found.append(Finding.of("torques_reversed", inside_mm=1e3 * inside_m))
-    along = parameters.gravity_force_base_N / np.linalg.norm(parameters.gravity_force_base_N)
+    along = parameters.down
     if setup.up_in_base is None:
         if lean.is_other_mounting:
             code = "mounting_undeclared" if lean.deg > HANGING_DEG else "gravity_tilted"
@@ -180,8 +180,8 @@ def tool(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float)
 
 
 def _mass(parameters: Parameters, covariance: Array, tool_kg: float | None, g_m_s2: float) -> list[Finding]:
-    weight_N = float(np.linalg.norm(parameters.gravity_force_base_N))
-    along, load_kg = parameters.gravity_force_base_N / (weight_N or 1.0), weight_N / g_m_s2
+    weight_N, along = parameters.weight_N, parameters.down
+    load_kg = weight_N / g_m_s2
     sigma_kg = np.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0)) / g_m_s2
     if tool_kg is None or abs(load_kg - tool_kg) <= max(TOOL_KG, TOOL_SHARE * tool_kg, _SIGNIFICANT * sigma_kg):
         return []
@@ -273,8 +273,7 @@ def contradictions(
         Where up should be.
     """
     contradicted = []
-    weight_N = float(np.linalg.norm(found.gravity_force_base_N))
-    along = found.gravity_force_base_N / (weight_N or 1.0)
+    weight_N, along = found.weight_N, found.down
     sigma_N = float(np.sqrt(along @ covariance[3:6, 3:6] @ along))
     shows_directions = weight_N > sigmas * sigma_N
     if known.mass_kg is not None:

@@ -96,7 +96,7 @@ class _Rough:
             float(np.sqrt(np.mean(np.sum(part**2, axis=1)))) + ROUNDING * float(np.abs(read).max())
             for part, read in zip(np.hsplit(e, 2), np.hsplit(wrench, 2), strict=True)
         )
-        weight_N, spread_Nm = _length(p.gravity_force_base_N), _length(torque_Nm.std(axis=0))
+        weight_N, spread_Nm = p.weight_N, _length(torque_Nm.std(axis=0))
         shares = force_rms_N / (weight_N or 1.0), torque_rms_Nm / (spread_Nm or 1.0)
         return cls(p, gravity[:, :3], force_rms_N, torque_rms_Nm, shares)
 
@@ -110,8 +110,8 @@ class _Rough:
 
         Quaternions in another order often fit as well as inverted ones, with another mounting of robot and sensor.
         """
-        F_b = self.parameters.gravity_force_base_N
-        cosine = -float(F_b @ up_in_base) / (_length(F_b) * _length(up_in_base) or 1.0)
+        p = self.parameters
+        cosine = -float(p.gravity_force_base_N @ up_in_base) / (p.weight_N * _length(up_in_base) or 1.0)
         implausible = (1 - cosine) / 2 + 0.5 * (not self.outwards)
         return float(np.log(self.force_rms_N * self.torque_rms_Nm)) + IMPLAUSIBLE * implausible
 
@@ -180,7 +180,7 @@ def no_weight(R_base_flange: Array, wrench: Array) -> list[Finding]:
     """Recognise a wrench without weight: compensated already, or zeroed at each pose."""
     rough = _Rough.of(R_base_flange, wrench)
     p = rough.parameters
-    return units.too_light(_length(p.gravity_force_base_N), _length(p.p_sensor_com_m), rough.force_rms_N)
+    return units.too_light(p.weight_N, _length(p.p_sensor_com_m), rough.force_rms_N)
 
 
 def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:

@@ -152,7 +152,7 @@ def scaled_information(
     The lever is the distance of the centre of mass, 25 mm at least. By default the noise of the forces
     is the weight and that of the torques 25 mm times it, so that the entries count poses.
     """
-    weight_N = float(np.linalg.norm(parameters.gravity_force_base_N)) or 1.0
+    weight_N = parameters.weight_N or 1.0
     lever_m = max(float(np.linalg.norm(parameters.p_sensor_com_m)), LEVER_M)
     J = jacobian(parameters, R_base_flange) * np.repeat([1, weight_N, weight_N, lever_m, weight_N * lever_m], 3)
     if wrench_cov is None:
@@ -244,7 +244,7 @@ def _ambiguities(
             f"there are only {different} different orientations: several solutions explain them exactly, and bias, "
             "weight and mounting of the sensor cannot be separated",
         )
-    weight_N = float(np.linalg.norm(parameters.gravity_force_base_N))
+    weight_N = parameters.weight_N
     gravity_flange = parameters.gravity_force_base_N @ R_base_flange / weight_N  # unit vectors
     turns = Rotation.from_matrix(np.swapaxes(R_base_flange[:1], 1, 2) @ R_base_flange).as_rotvec()
     _, spread, axes = np.linalg.svd(turns, full_matrices=False)
@@ -290,7 +290,7 @@ def _one_axis(
     """Turns about one axis only: name each change of the parameters that hardly changes a reading."""
     R, P, b = parameters.R_flange_sensor.T, parameters.p_sensor_com_m, parameters.gravity_force_base_N
     axis_base, axis_sensor = R_base_flange @ axis_flange, R @ axis_flange
-    weight_N, zero = float(np.linalg.norm(b)), np.zeros(3)
+    weight_N, zero = parameters.weight_N, np.zeros(3)
     lever_m = max(float(np.linalg.norm(P)), LEVER_M)
     scale = np.repeat([1, weight_N, weight_N, lever_m, weight_N * lever_m], 3)
 
@@ -366,5 +366,5 @@ def _worth(R_base_flange: Array, parameters: Parameters) -> float:
     information = scaled_information(R_base_flange, parameters)
     gravity_flange = parameters.gravity_force_base_N @ R_base_flange
     spread = np.linalg.svd(gravity_flange - gravity_flange.mean(axis=0), compute_uv=False)
-    spread = spread / float(np.linalg.norm(parameters.gravity_force_base_N))
+    spread = spread / parameters.weight_N
     return float(np.log(np.maximum(np.linalg.eigvalsh(information), 0) + 1e-3).sum() + 4 * np.log(spread + 1e-3).sum())

@@ -119,7 +119,7 @@ def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma
 
 def _is_likelier(change: Change, R: Array, wrench: Array, cov: Array | None, t_s: Array | None) -> bool:
     without = fit(R, change.corrected, cov, t_s=t_s)
-    weight_N = _length(without.parameters.gravity_force_base_N)
+    weight_N = without.parameters.weight_N
     if np.sqrt(np.mean(np.sum(without.residuals[without.weights > 0.5, :3] ** 2, axis=1))) > CORRECTED * weight_N:
         return False
     as_read = fit(R, wrench, cov, t_s=t_s)
@@ -253,10 +253,9 @@ def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
 def _columns(p: Parameters, R: Array) -> Array:
     """(n, 6, 13) derivative by a turn of the sensor, both biases, weight and centre of mass."""
     J, g = jacobian(p, R), gravity_wrench(p, R)
-    down = p.gravity_force_base_N / (_length(p.gravity_force_base_N) or 1.0)
     turn = -np.concatenate([skew(g[:, :3]), skew(g[:, 3:])], axis=1)
     bias = np.broadcast_to(np.eye(6), (len(R), 6, 6))
-    return np.concatenate([turn, bias, (J[..., 3:6] @ down)[..., None], J[..., 9:12]], axis=2)
+    return np.concatenate([turn, bias, (J[..., 3:6] @ p.down)[..., None], J[..., 9:12]], axis=2)
 
 
 def _turned(wrench: Array, turn: Array) -> Array:

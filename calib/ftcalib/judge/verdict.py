@@ -10,15 +10,16 @@ from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtr as normal_cdf
 
 from ftcalib.data.dwell_mean import RESOLUTION
+from ftcalib.files import JSON
 from ftcalib.findings import Finding, Severity, Verdict, ordered, verdict_of
 from ftcalib.judge import described_cell, units
-from ftcalib.judge.cross_validation import AssessedFit, DriftAhead, drift_ahead, standardized
+from ftcalib.judge.cross_validation import DriftAhead, Judged, drift_ahead, standardized
 from ftcalib.judge.described_cell import contradictions
 from ftcalib.judge.faults import COLLAPSE, ROUNDING, broken_channels, constant_weight, faults, other_poses
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
 from ftcalib.judge.session_change import Cable, cable_of, session_change
 from ftcalib.known import NOTHING, Known, Setup
-from ftcalib.likelihood.fit import DriftEstimate, Fit
+from ftcalib.likelihood.fit import DriftEstimate
 from ftcalib.likelihood.response import Response, predicted_covariance
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters
 from ftcalib.published.yu import SPECIAL_R_flange_base
@@ -42,49 +43,89 @@ SURE = 1e-3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quality:
-    """The judgement on a fit."""
+    """The judgement on a fit, and the numbers that it rests on."""
 
-    findings: tuple[Finding, ...]
-    """The first one to be fixed first; notes come last."""
-    chi2_p: float | None
-    """Probability of a larger chi2 if there is only the measured noise; None if the noise was not measured."""
-    noise_factor: float | None
-    """Residuals over measured noise; None if the noise was not measured."""
+    used: NDArray[np.bool_]
+    """(n,)"""
+    is_exact: bool
+    """Whether no sensor resolves the residuals, as in simulated data. Equal readings are no copies then."""
+    residual_sigma: Array
+    """(n,) cross-validated residual of each pose in sigma, root mean square over the channels: 1 expected."""
+    worst_pose: int
+    """Row of the used pose with the largest cross-validated residual."""
+    lag1: float
+    """Correlation of the residuals of successive used poses; near 0 without drift."""
+    lag1_p: float
+    """Probability of a larger correlation by chance."""
+    largest_share: float
+    """Largest error relative to the weight."""
+    errors: list[Finding]
+    """Errors of force and torque that are too large."""
     loo_force_rms_N: float
     """Cross-validated: root mean square error of predicting each used pose from all others."""
     loo_torque_rms_Nm: float
-    next_use_force_rms_N: float
-    """Of compensating a free tool a minute after the last pose: from noise alone if it explains the residuals, else
-    cross-validated; and the drift from the mean of the tour to then."""
-    next_use_torque_rms_Nm: float
+    expected_rms: Array
+    """(2,) from noise alone, over all orientations."""
     ahead: DriftAhead
-    """That drift."""
-    worst_pose: int
-    """Row of the used pose with the largest cross-validated residual."""
-    residual_sigma: Array
-    """(n,) cross-validated residual of each pose in sigma, root mean square over the channels: 1 expected."""
-    lag1: float
-    """Correlation of the residuals of successive used poses; near 0 without drift."""
+    """The drift from the mean of the tour to the next use."""
+    noise_factor: float | None
+    """Residuals over measured noise; None if the noise was not measured."""
+    chi2_p: float | None
+    """Probability of a larger chi2 if there is only the measured noise; None if the noise was not measured."""
     correlations: tuple[tuple[str, str, float], ...]
     """Pairs of parameters that are correlated by more than 0.9, strongest first."""
-    cable: Cable | None
-    """None: the readings show none."""
+    findings: tuple[Finding, ...] = ()
+    """The first one to be fixed first; notes come last."""
+    cable_shift: Array | None = None
+    """(15,) by which a cable may have moved the estimates; None: the readings show none."""
 
     @property
     def verdict(self) -> Verdict:
         """That of the worst finding."""
         return verdict_of(self.findings)
 
+    @property
+    def fits_measured_noise(self) -> bool:
+        """Whether the measured noise explains the residuals."""
+        return self.chi2_p is not None and self.chi2_p >= SURE
+
+    @property
+    def next_use_rms(self) -> Array:
+        """(2,) N, N·m: error of compensating a free tool a minute after the last pose.
+
+        It is that of noise alone if this explains the residuals, else the cross-validated one, with the drift until
+        then.
+        """
+        left_out = np.array([self.loo_force_rms_N, self.loo_torque_rms_Nm])
+        error = self.expected_rms if self.fits_measured_noise else left_out
+        return np.asarray(np.sqrt(error**2 + self.ahead.square.reshape(2, 3).sum(axis=1)))
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the statistics that a result keeps as its `quality`."""
+        return {
+            "loo_force_rms_N": self.loo_force_rms_N,
+            "loo_torque_rms_Nm": self.loo_torque_rms_Nm,
+            "next_use_force_rms_N": float(self.next_use_rms[0]),
+            "next_use_torque_rms_Nm": float(self.next_use_rms[1]),
+            "last_bias_offset": self.ahead.offset.tolist(),
+            "bias_growth_per_min": self.ahead.growth_per_min.tolist(),
+            "worst_pose": self.worst_pose + 1,
+            "residual_sigma": self.residual_sigma.tolist(),
+            "lag1": self.lag1,
+            "correlations": [list(pair) for pair in self.correlations],
+        }
+
 
 def judge(
-    fit: AssessedFit,
+    fit: Judged,
     *,
     t_s: Array | None = None,
     measured_sigma: Array | None = None,
     setup: Setup = NOTHING,
     known: Known | None = None,
-    unconstrained: AssessedFit | None = None,
+    unconstrained: Judged | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
+    single_poses: bool = True,
 ) -> Quality:
     """Judge a fit.
 
@@ -94,7 +135,7 @@ def judge(
 
     Parameters
     ----------
-    fit : AssessedFit
+    fit : Judged
     t_s : array, shape (n,), optional
         When each pose was measured; the order of rows counts if it is missing or not finite.
     measured_sigma : array, shape (6,), optional
@@ -103,12 +144,14 @@ def judge(
         The described cell.
     known : Known, optional
         That `fit` used.
-    unconstrained : AssessedFit, optional
+    unconstrained : Judged, optional
         The best fit to the same poses without known values, if `fit` used some.
     g_m_s2 : float
+    single_poses : bool
+        Whether each row is a pose of its own, with findings about single poses; rows of a motion are not.
     """
     at = _statistics(fit, t_s)
-    parameters, weight_N = fit.parameters, at.weight_N
+    parameters, weight_N = fit.parameters, fit.parameters.weight_N
     few_rejected = at.used.sum() >= (1 - FEW_LEFT_OUT) * len(at.used)
     suspect = at.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
     broken = [] if at.is_exact else broken_channels(fit.wrench, fit.R_base_flange)
@@ -117,7 +160,7 @@ def judge(
     if suspect and not (mistakes or changed):
         mistakes = _other_poses(fit, at.used, t_s)
     explained = at.is_exact or at.fits_measured_noise or mistakes or changed
-    cable = cable_of(fit) if isinstance(fit, Fit) and not explained else None
+    cable = None if fit.fit is None or explained else cable_of(fit.fit)
     contradicted: list[Finding] = []
     if known is not None and unconstrained is not None:
         at_its_best = unconstrained.parameters, unconstrained.covariance
@@ -132,8 +175,8 @@ def judge(
         *_second_solution(fit),
         *units.implausible(parameters, _rms(fit.residuals[at.used, :3]), described=bool(setup.cylinders_m)),
         *([] if contradicted or at.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
-        *_noise(fit, at),
-        *_poses(fit, at, "note" if few_rejected else "limit"),
+        *(_noise(fit, at) if single_poses else []),
+        *(_poses(fit, at, "note" if few_rejected else "limit") if single_poses else []),
         *_drift(fit.drift, at.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
         *_response(fit.response, weight_N),
         *_cable(cable),
@@ -148,72 +191,20 @@ def judge(
     if not (broken or mistakes or at.fits_measured_noise):
         harmless = verdict_of(found) == "good"
         found += [replace(one, severity="note") if harmless else one for one in contradicted]
-    return Quality(
-        findings=ordered(found),
-        chi2_p=at.chi2_p,
-        noise_factor=at.noise_factor,
-        loo_force_rms_N=at.loo_force_rms_N,
-        loo_torque_rms_Nm=at.loo_torque_rms_Nm,
-        next_use_force_rms_N=float(at.next_use_rms[0]),
-        next_use_torque_rms_Nm=float(at.next_use_rms[1]),
-        ahead=at.ahead,
-        worst_pose=at.worst_pose,
-        residual_sigma=at.residual_sigma,
-        lag1=at.lag1,
-        correlations=strong_correlations(fit.covariance),
-        cable=cable,
-    )
+    return replace(at, findings=ordered(found), cable_shift=None if cable is None else cable.shift)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Statistics:
-    """The numbers that the findings rest on; those with the names of `Quality` have its meaning."""
-
-    used: NDArray[np.bool_]
-    is_exact: bool
-    """Whether no sensor resolves the residuals, as in simulated data. Equal readings are no copies then."""
-    weight_N: float
-    residual_sigma: Array
-    worst_pose: int
-    lag1: float
-    lag1_p: float
-    """Probability of a larger correlation by chance."""
-    largest_share: float
-    """Largest error relative to the weight."""
-    errors: list[Finding]
-    """Of force and torque, if they are too large."""
-    loo_force_rms_N: float
-    loo_torque_rms_Nm: float
-    expected_rms: Array
-    """(2,) from noise alone, over all orientations."""
-    ahead: DriftAhead
-    noise_factor: float | None
-    chi2_p: float | None
-
-    @property
-    def fits_measured_noise(self) -> bool:
-        return self.chi2_p is not None and self.chi2_p >= SURE
-
-    @property
-    def next_use_rms(self) -> Array:
-        """(2,) N, N·m."""
-        left_out = np.array([self.loo_force_rms_N, self.loo_torque_rms_Nm])
-        error = self.expected_rms if self.fits_measured_noise else left_out
-        return np.asarray(np.sqrt(error**2 + self.ahead.square.reshape(2, 3).sum(axis=1)))
-
-
-def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
+def _statistics(fit: Judged, t_s: Array | None) -> Quality:
     used = fit.weights > 0.5
-    weight_N = float(np.linalg.norm(fit.parameters.gravity_force_base_N))
+    weight_N = fit.parameters.weight_N
     residuals = standardized(fit.left_out_residuals, fit.left_out_cov)
     residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
     largest_share, errors, left_out_rms = _errors(fit, used, weight_N)
     measured = bool(np.isfinite(fit.measured_chi2))
     rest, largest = (np.abs(x[used]).max(axis=0) for x in (fit.residuals, fit.wrench))
-    return _Statistics(
+    return Quality(
         used,
         bool((rest <= np.maximum(RESOLUTION, ROUNDING * np.repeat(largest.reshape(2, 3).max(axis=1), 3))).all()),
-        weight_N,
         residual_sigma,
         int(np.argmax(np.where(used, residual_sigma, -1.0))),
         *successive_correlation(residuals[used], None if t_s is None else t_s[used]),
@@ -224,10 +215,11 @@ def _statistics(fit: AssessedFit, t_s: Array | None) -> _Statistics:
         drift_ahead(fit, t_s),
         noise_factor=float(np.sqrt(fit.measured_chi2 / fit.dof)) if measured else None,
         chi2_p=float(chi2_sf(fit.dof, fit.measured_chi2)) if measured else None,
+        correlations=strong_correlations(fit.covariance),
     )
 
 
-def _mistakes(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, setup: Setup) -> list[Finding]:
+def _mistakes(fit: Judged, used: NDArray[np.bool_], t_s: Array | None, setup: Setup) -> list[Finding]:
     """Look for mistakes in all poses, or of many in evenly spread runs, and if there are none, in the used poses.
 
     A wrong pose or two were rejected; only the used poses show whether most of them are wrong.
@@ -240,7 +232,7 @@ def _mistakes(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None, setu
     return found
 
 
-def _other_poses(fit: AssessedFit, used: NDArray[np.bool_], t_s: Array | None) -> list[Finding]:
+def _other_poses(fit: Judged, used: NDArray[np.bool_], t_s: Array | None) -> list[Finding]:
     order = _some_runs(t_s, len(used))
     order = order[used[order]]
     return other_poses(fit.R_base_flange[order], fit.wrench[order])
@@ -289,9 +281,7 @@ def expected_error(parameters: Parameters, covariance: Array, response: Response
     return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
-def _errors(
-    fit: AssessedFit, used: NDArray[np.bool_], weight_N: float
-) -> tuple[float, list[Finding], tuple[float, float]]:
+def _errors(fit: Judged, used: NDArray[np.bool_], weight_N: float) -> tuple[float, list[Finding], tuple[float, float]]:
     """Return the largest error relative to the weight, errors that are too large, and the cross-validated rms.
 
     Of residual, cross-validated and expected error the first is named that exceeds the highest limit.
@@ -319,8 +309,8 @@ def _errors(
     return largest, found, left_out
 
 
-def _weight(fit: AssessedFit, weight_N: float, setup: Setup) -> list[Finding]:
-    along = fit.parameters.gravity_force_base_N / (weight_N or 1.0)
+def _weight(fit: Judged, weight_N: float, setup: Setup) -> list[Finding]:
+    along = fit.parameters.down
     variance = float(along @ fit.covariance[3:6, 3:6] @ along)
     sigma_N = np.sqrt(max(variance, 0.0))  # below 0 only by rounding, if the weight is exactly known
     if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
@@ -331,7 +321,7 @@ def _weight(fit: AssessedFit, weight_N: float, setup: Setup) -> list[Finding]:
     return [Finding.of("weight_insignificant", **values)]
 
 
-def _second_solution(fit: AssessedFit) -> list[Finding]:
+def _second_solution(fit: Judged) -> list[Finding]:
     if fit.second_basin_chi2 is None:
         return []
     delta = fit.second_basin_chi2 / max(1.0, fit.chi2 / fit.dof)
@@ -340,7 +330,7 @@ def _second_solution(fit: AssessedFit) -> list[Finding]:
     return [Finding.of("second_solution", probability_percent=100 * wrong_basin_probability(max(delta, 0.0)))]
 
 
-def _misfit_of_known_values(fit: AssessedFit, unconstrained: AssessedFit | None) -> list[Finding]:
+def _misfit_of_known_values(fit: Judged, unconstrained: Judged | None) -> list[Finding]:
     if unconstrained is None:
         return []
     used = unconstrained.weights > 0.5
@@ -352,7 +342,7 @@ def _misfit_of_known_values(fit: AssessedFit, unconstrained: AssessedFit | None)
     ][:1]
 
 
-def _noise(fit: AssessedFit, at: _Statistics) -> list[Finding]:
+def _noise(fit: Judged, at: Quality) -> list[Finding]:
     if at.chi2_p is None or at.noise_factor is None:
         return [Finding.of("noise_unknown")]
     if at.fits_measured_noise:
@@ -362,7 +352,7 @@ def _noise(fit: AssessedFit, at: _Statistics) -> list[Finding]:
     return [Finding.of("noise_exceeded", "note" if minor else "limit", factor=at.noise_factor, components=components)]
 
 
-def _poses(fit: AssessedFit, at: _Statistics, severity_of_rejected: Severity) -> list[Finding]:
+def _poses(fit: Judged, at: Quality, severity_of_rejected: Severity) -> list[Finding]:
     """Name poses that were rejected, that nothing checks, or that deviate most, and drift from pose to pose."""
     found, n = list[Finding](), int(at.used.sum())
     if not at.used.all():
@@ -371,7 +361,7 @@ def _poses(fit: AssessedFit, at: _Statistics, severity_of_rejected: Severity) ->
         found.append(Finding.of("poses_rejected", severity_of_rejected, **values))
     if n < RECOMMENDED_POSES:
         found.append(Finding.of("few_poses", n_poses=n, recommended=RECOMMENDED_POSES))
-    uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > at.weight_N**2
+    uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > fit.parameters.weight_N**2
     rows = np.flatnonzero(uncertain & at.used) + 1
     if 0 < rows.size <= n / 2:
         found.append(Finding.of("poses_unchecked", poses=rows))
@@ -437,15 +427,15 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
     return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
 
 
-def _change(fit: AssessedFit, at: _Statistics, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
+def _change(fit: Judged, at: Quality, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
     """Name a lasting change, where the fit needs what could hide one: drift, more noise, or poses left out."""
     kinds = ("walk", "slope") if at.chi2_p is None else ("walk", "slope", "white")
     hides = any(name.startswith(kinds) for name in fit.components)
-    if not isinstance(fit, Fit) or not (at.errors or hides or not at.used.all()):
+    if fit.fit is None or not (at.errors or hides or not at.used.all()):
         return []
     if t_s is None or not np.isfinite(t_s).all():
         t_s = np.arange(len(fit.wrench), dtype=np.float64)
-    return session_change(fit, np.argsort(t_s, kind="stable"), t_s, measured_sigma)
+    return session_change(fit.fit, np.argsort(t_s, kind="stable"), t_s, measured_sigma)
 
 
 def _rms(vectors: Array) -> float:

@@ -180,7 +180,7 @@ def fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2:
     """Put together what follows from an explanation; arguments as `explain` returns them."""
     best = minima[0]
     if not best.settled:
-        weight_N = np.linalg.norm(best.parameters.gravity_force_base_N)
+        weight_N = best.parameters.weight_N
         raise NotObservable(
             f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
             "hang something heavier on the sensor, or add poses with other orientations."

@@ -115,6 +115,22 @@ class Response:
         }
 
 
+def joint_covariance(covariance: Array, response: Response | None) -> Array:
+    """(15, 15) of the parameters, or (26, 26) with gain and cross-talk where they were found."""
+    return covariance if response is None else response.covariance
+
+
+def joint_jacobian(parameters: Parameters, response: Response | None, R_base_flange: Array) -> Array:
+    """Derivative (..., 6, 15 or 26) of the wrench by what `joint_covariance` has."""
+    J = jacobian(parameters, R_base_flange)
+    return J if response is None else np.concatenate([J, response_columns(parameters, R_base_flange)], axis=-1)
+
+
+def with_covariance(response: Response | None, joint: Array) -> Response | None:
+    """Keep gain and cross-talk, if there are any, with another joint covariance."""
+    return None if response is None else Response(response.coefficients, joint)
+
+
 def hidden_covariance(parameters: Parameters, gain_sigma: float, cross_talk_sigma_m: float) -> Array:
     """Covariance (15, 15) of what gain and cross-talk hide in mounting, weight and centre of mass.
 
@@ -147,10 +163,8 @@ def predicted_covariance(
     response : Response or None
     R_base_flange : array, shape (..., 3, 3)
     """
-    J = jacobian(parameters, R_base_flange)
-    if response is not None:
-        J, covariance = np.concatenate([J, response_columns(parameters, R_base_flange)], axis=-1), response.covariance
-    return np.asarray(J @ covariance @ np.swapaxes(J, -1, -2))
+    J = joint_jacobian(parameters, response, R_base_flange)
+    return np.asarray(J @ joint_covariance(covariance, response) @ np.swapaxes(J, -1, -2))
 
 
 # How a sensor with hysteresis reads: each axis lags behind by a share of its last swing.

@@ -73,7 +73,7 @@ class Load:
     @property
     def mass_kg(self) -> float:
         """Weight divided by gravity."""
-        return float(np.linalg.norm(self.static.gravity_force_base_N)) / self.g_m_s2
+        return self.static.weight_N / self.g_m_s2
 
     @property
     def inertia_kg_m2(self) -> Array:
@@ -111,7 +111,7 @@ def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:
     R, Omega = motion.R_base_flange, motion.Omega_rad2_s2
     accelerated = motion.acceleration_m_s2 + Omega @ lever
     u = force @ Q
-    direction = F_b / max(float(np.linalg.norm(F_b)), 1e-12) / load.g_m_s2
+    direction = F_b / max(static.weight_N, 1e-12) / load.g_m_s2
 
     J = np.zeros((len(R), 6, SIZE))
     dU, dT = J[:, :3], J[:, 3:]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ftcalib.after.new_tool import CellPrior
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.findings import Finding, Severity, ordered, verdict_of
-from ftcalib.judge.cross_validation import IndependentFit
+from ftcalib.judge.cross_validation import Judged
 from ftcalib.judge.observability import assess
 from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, expected_error, judge
 from ftcalib.known import NOTHING, Known, Setup
@@ -47,8 +47,8 @@ _MISTAKES = frozenset(
 _COMPENSATED = 0.5
 """Of the inertial mass: less weight than this was subtracted."""
 _JUDGED_ROWS = 300
-_OF_POSES = frozenset(("noise_unknown", "poses_unchecked", "pose_deviates", "residuals_alike", "few_poses"))
-"""Findings about single poses, which rows in motion are not."""
+# A recording has no last pose from which a bias could go on, so its next use has the error expected from noise alone.
+_KEPT = ("loo_force_rms_N", "loo_torque_rms_Nm", "worst_pose", "residual_sigma", "lag1", "correlations")
 
 
 def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
@@ -125,9 +125,9 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         contacts,
     )
     quality, judged = _judged(used, best, setup, known, g_m_s2)
-    found = [one for one in quality.findings if one.code not in _OF_POSES]
-    mistakes = _mistakes(used, best, found)
-    found += mistakes + _narrow(used, best, explained=verdict_of(mistakes + found) == "rejected")
+    mistakes = _mistakes(used, best, quality.findings)
+    found = [*quality.findings, *mistakes]
+    found += _narrow(used, best, explained=verdict_of(found) == "rejected")
     found += _findings(rows, used, best, motion, height_m, positions=positions)
     found += [] if earlier is None else [Finding.of("earlier_cell", parent=earlier.id)]
     responding = best.components.keys() & {"gain", "cross_talk"} or (prior is not None and prior.has_response)
@@ -153,12 +153,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         quality={
             "next_use_force_rms_N": error[0],
             "next_use_torque_rms_Nm": error[1],
-            "loo_force_rms_N": quality.loo_force_rms_N,
-            "loo_torque_rms_Nm": quality.loo_torque_rms_Nm,
-            "worst_pose": quality.worst_pose + 1,
-            "residual_sigma": quality.residual_sigma.tolist(),
-            "lag1": quality.lag1,
-            "correlations": [list(pair) for pair in quality.correlations],
+            **{name: value for name, value in quality.to_dict().items() if name in _KEPT},
         },
         motion=motion,
     )
@@ -202,7 +197,7 @@ def _used(rows: Rows, positions: bool) -> Rows:
 def _require_determined(rows: Rows, best: MotionFit, known: Known | None) -> None:
     """Raise `NotObservable` where the error over all orientations would be as large as the weight."""
     mounting_rad = float(np.sqrt(np.diag(best.covariance)[:3].max()))
-    weight_N = float(np.linalg.norm(best.load.static.gravity_force_base_N))
+    weight_N = best.load.static.weight_N
     sigma_N = float(np.sqrt(np.diag(best.covariance)[3:6].max()))
     if mounting_rad < 0.3 and sigma_N < 0.5 * weight_N:
         return
@@ -244,18 +239,19 @@ def _judged(
     places = places[:: max(1, len(places) // _JUDGED_ROWS)]
     second = round(1 / rows.row_s / 2) * 2 + 1
     best = replace(best, residuals=_means(best, second), sigma=best.sigma / np.sqrt(second))
-    weight_N = float(np.linalg.norm(best.load.static.gravity_force_base_N))
-    poses = IndependentFit(
+    weight_N = best.load.static.weight_N
+    judged = Judged.independent(
         best.load.static,
         best.covariance[:15, :15],
         nearest_rotation(rows.motion.R_base_flange[places]),
         _static_wrench(rows, best, weight_N)[places],
         best.sigma[places, :, None] ** 2 * np.eye(6),
-        False,
         np.ones(len(places)),
-        best.second_basin_chi2,
+        measured=False,
+        second_basin_chi2=best.second_basin_chi2,
     )
-    return judge(poses, t_s=rows.t_s[places], setup=setup, known=known, g_m_s2=g_m_s2), places
+    quality = judge(judged, t_s=rows.t_s[places], setup=setup, known=known, g_m_s2=g_m_s2, single_poses=False)
+    return quality, places
 
 
 def _means(best: MotionFit, rows: int) -> Array:
@@ -313,7 +309,7 @@ def _mistakes(rows: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Fin
 def _narrow(rows: Rows, best: MotionFit, *, explained: bool) -> list[Finding]:
     """Name too little motion: by its range, or where nothing else explains a large uncertainty."""
     sigma, range_deg = np.sqrt(np.diag(best.covariance)), _range_deg(rows)
-    weight_N = float(np.linalg.norm(best.load.static.gravity_force_base_N))
+    weight_N = best.load.static.weight_N
     error = expected_error(best.load.static, best.covariance[:15, :15])[0] / max(weight_N, 1e-9)
     if range_deg >= NARROW_DEG and (explained or error < USABLE_SHARE):
         return []

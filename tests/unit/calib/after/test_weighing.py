@@ -1,5 +1,6 @@
 """Weighing: sigmas that hold, faults that are named, and a tool with a part as one load."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -140,7 +141,7 @@ def test_a_gain_that_was_found_acts_on_the_part() -> None:
     response = Response(coefficients, covariance)
     gripper = Gripper(3)
     reference = holding(calibrated(), Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1), G)
-    with_gain = type(reference)(TRUTH, reference.covariance, response)
+    with_gain = replace(reference, parameters=TRUTH, response=response)
     R = np.array([gripper.turn() for _ in range(3)])
     part = Parameters(
         TRUTH.R_flange_sensor,
@@ -272,7 +273,7 @@ def test_a_tool_without_weight_has_no_direction_of_gravity() -> None:
     nothing = Parameters(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
     reference = holding(calibrated(), Weight(0, 0, 0, np.zeros(3), np.eye(3), None, None, 0, 0, 1), G)
     with pytest.raises(BadDataset, match="no weight"):
-        Gripper(0).weigh(type(reference)(nothing, reference.covariance, None), np.eye(3))
+        Gripper(0).weigh(replace(reference, parameters=nothing), np.eye(3))
 
 
 def test_drift_grows_and_ends() -> None:

@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Parameters, Setup, solve
 from ftcalib.data.dataset import read_csv
-from ftcalib.judge.cross_validation import DriftAhead, IndependentFit, standardized
+from ftcalib.judge.cross_validation import DriftAhead, Judged, standardized
 from ftcalib.judge.faults import faults
 from ftcalib.judge.verdict import (
     Quality,
@@ -24,7 +24,6 @@ from ftcalib.judge.verdict import (
     _response,
     _second_solution,
     _some_runs,
-    _Statistics,
     _weight,
     expected_error,
     judge,
@@ -71,7 +70,7 @@ def fit(
     second: float | None = None,
     weights: Array | None = None,
     components: Mapping[str, float] | None = None,
-) -> IndependentFit:
+) -> Judged:
     n, noise = len(R), white(len(R)) if cov is None else cov
     weights = np.ones(n) if weights is None else weights
     used = weights > 0
@@ -81,7 +80,26 @@ def fit(
     J = jacobian(parameters, R[used])
     information = np.einsum("nki,nkl,nlj->ij", J, np.linalg.inv(noise[used]), J)
     covariance = np.asarray(np.linalg.inv(information))
-    return IndependentFit(parameters, covariance, R, wrench, noise, cov is not None, weights, second, components or {})
+    return Judged.independent(
+        parameters,
+        covariance,
+        R,
+        wrench,
+        noise,
+        weights,
+        measured=cov is not None,
+        second_basin_chi2=second,
+        components=components,
+    )
+
+
+def with_wrench(fitted: Judged, wrench: Array) -> Judged:
+    """The same estimates, from 24 poses with measured noise, beside other readings."""
+    p, R = fitted.parameters, fitted.R_base_flange
+    noise, second = white(24), fitted.second_basin_chi2
+    return Judged.independent(
+        p, fitted.covariance, R, wrench, noise, fitted.weights, measured=True, second_basin_chi2=second
+    )
 
 
 def noisy(rng: np.random.Generator, R: Array, truth: Parameters = TRUTH, sigma: Array = SIGMA) -> Array:
@@ -108,7 +126,7 @@ def test_left_out_residuals_are_those_of_real_refits() -> None:
     cov = SIGMA[:, None] * SIGMA * (A @ np.swapaxes(A, 1, 2)) / 9e4  # correlated, uneven, small: the model is linear
     wrench = predict(TRUTH, R) + (np.linalg.cholesky(cov) @ rng.normal(size=(8, 6, 1)))[..., 0]
     best = gauss_newton(R, wrench, cov)
-    fitted = IndependentFit(best, np.eye(15), R, wrench, cov, True, np.ones(8))
+    fitted = Judged.independent(best, np.eye(15), R, wrench, cov, np.ones(8), measured=True)
     left_out, left_out_cov = fitted.left_out_residuals, fitted.left_out_cov
     for k in range(8):
         others = np.arange(8) != k
@@ -299,7 +317,7 @@ def test_what_is_known_is_doubted_where_the_data_fit_without_it(channel: int) ->
     wrench = noisy(np.random.default_rng(24), R24)
     free = fit(R24, wrench, white(24))
     off = 3.0 if channel < 3 else 0.2  # N or N·m of every pose, as from a constraint that is wrong
-    constrained = replace(free, wrench=wrench + off * np.eye(6)[channel])
+    constrained = with_wrench(free, wrench + off * np.eye(6)[channel])
     kind, unit = ("force", "N") if channel < 3 else ("torque", "Nm")
     finding = the(f"known_values_misfit_{kind}", judge(constrained, unconstrained=free))
     assert finding.values[f"residual_{unit}"] == pytest.approx(off, rel=0.02)
@@ -434,29 +452,28 @@ def test_wrong_units_of_torque_are_detected(
 
 
 FITTED = fit(R24, noisy(np.random.default_rng(30), R24), white(24))
-WEIGHT_N = float(np.linalg.norm(FITTED.parameters.gravity_force_base_N))
+WEIGHT_N = FITTED.parameters.weight_N
 
 
-def statistics(**values: Any) -> _Statistics:
+def statistics(**values: Any) -> Quality:
     """Of 24 good poses, except for these values."""
     usual = {
         "used": np.ones(24, bool),
         "is_exact": False,
-        "weight_N": WEIGHT_N,
         "residual_sigma": np.ones(24),
         "worst_pose": 3,
     }
     usual |= {"lag1": 0.3, "lag1_p": 0.5, "largest_share": 0.001, "noise_factor": 1.0, "chi2_p": 0.5}
     one = SimpleNamespace(**usual | values)
     one.fits_measured_noise = one.chi2_p is not None and one.chi2_p >= 1e-3
-    return cast(_Statistics, one)
+    return cast(Quality, one)
 
 
 @pytest.mark.parametrize(("delta", "found"), [(11.9, True), (12.1, False)])
 @pytest.mark.parametrize("noise_factor", [0.5, 2.0])
 def test_a_second_solution_counts_in_noise_as_it_is(delta: float, noise_factor: float, found: bool) -> None:
     scale = FITTED.chi2 / FITTED.dof / noise_factor**2
-    noisier = replace(FITTED, wrench_cov=FITTED.wrench_cov * scale, second_basin_chi2=delta * max(1, noise_factor**2))
+    noisier = replace(FITTED, chi2=FITTED.chi2 / scale, second_basin_chi2=delta * max(1, noise_factor**2))
     assert [one.code for one in _second_solution(noisier)] == ["second_solution"] * found
     (close,) = _second_solution(replace(FITTED, second_basin_chi2=-1.0))
     assert close.values["probability_percent"] == 50
@@ -470,7 +487,7 @@ def test_of_a_rejected_result_only_units_are_suspected_of_the_payload() -> None:
         setup = Setup(payload_kg=payload_kg, sensor_mass_kg=0.0)
         assert (code in codes(judge(rejected, setup=setup))) == (code == "payload_units")
         assert code in codes(judge(FITTED, setup=setup))
-        assert code not in codes(judge(replace(rejected, wrench=broken), setup=setup))
+        assert code not in codes(judge(with_wrench(rejected, broken), setup=setup))
 
 
 @pytest.mark.parametrize(("sigmas", "significant"), [(4.9, False), (5.1, True)])
@@ -498,7 +515,7 @@ def test_more_noise_than_measured_is_minor_up_to_three_times_and_one_percent(
 
 
 def test_poses_are_pointed_at_beyond_their_limits() -> None:
-    def found(fitted: IndependentFit = FITTED, **values: Any) -> list[str]:
+    def found(fitted: Judged = FITTED, **values: Any) -> list[str]:
         return [one.code for one in _poses(fitted, statistics(**values), "note")]
 
     assert found() == []
@@ -518,9 +535,10 @@ def test_poses_are_pointed_at_beyond_their_limits() -> None:
     cov = np.zeros((24, 6, 6))
     for rows, unchecked in ((12, ["poses_unchecked"]), (13, []), (0, [])):
         cov[:, 1, 1] = np.where(np.arange(24) < rows, 1.01, 0.99) * WEIGHT_N**2
-        uncertain = cast(IndependentFit, SimpleNamespace(left_out_cov=cov))
+        uncertain = replace(FITTED, left_out_cov=cov)
         assert found(uncertain) == unchecked
-    assert found(uncertain, weight_N=0.9 * WEIGHT_N, used=np.arange(24) < 6) == ["poses_rejected"]
+    lighter = replace(FITTED.parameters, gravity_force_base_N=0.9 * FITTED.parameters.gravity_force_base_N)
+    assert found(replace(uncertain, parameters=lighter), used=np.arange(24) < 6) == ["poses_rejected"]
 
 
 def test_errors_count_relative_to_the_weight_at_a_lever() -> None:
@@ -547,9 +565,9 @@ def test_the_next_use_has_the_noise_that_explains_the_residuals_or_else_those_of
     measured, unknown = fit(R24, wrench, white(24)), fit(R24, wrench)
     expected = expected_error(measured.parameters, measured.covariance)
     quality, other = judge(measured), judge(unknown)
-    assert (quality.next_use_force_rms_N, quality.next_use_torque_rms_Nm) == pytest.approx(expected)
+    assert (*quality.next_use_rms,) == pytest.approx(expected)
     left_out = other.loo_force_rms_N, other.loo_torque_rms_Nm
-    assert (other.next_use_force_rms_N, other.next_use_torque_rms_Nm) == pytest.approx(left_out)
+    assert (*other.next_use_rms,) == pytest.approx(left_out)
 
 
 def test_many_poses_are_looked_at_in_runs() -> None:
@@ -601,9 +619,9 @@ def test_known_values_are_doubted_where_the_data_leave_less_than_four_tenths_wit
     free = fit(R24, noisy(np.random.default_rng(33), R24), white(24))
     rms = np.sqrt(np.mean(np.sum(free.residuals[:, :3] ** 2, axis=1)))
     scale = 0.5 / rms  # so large that the misfit matters
-    free = replace(free, wrench=predict(free.parameters, R24) + scale * free.residuals)
+    free = with_wrench(free, predict(free.parameters, R24) + scale * free.residuals)
     off = 0.5 * np.sqrt(1 / share**2 - 1)
-    constrained = replace(free, wrench=free.wrench + off * np.eye(6)[2])
+    constrained = with_wrench(free, free.wrench + off * np.eye(6)[2])
     assert ("known_values_misfit_force" in codes(judge(constrained, unconstrained=free))) == doubted
 
 
