@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from ftcalib.judge.observability import second_minimum
 from ftcalib.likelihood.fit import Fit, fit
-from ftcalib.likelihood.rotation_minima import Minimum
+from ftcalib.likelihood.rotation_minima import RotationMinimum
 from ftcalib.model import Parameters
 
 Array = NDArray[np.float64]
 
 _fits: dict[tuple[object, ...], Fit] = {}
-_second_minima: dict[bytes, tuple[float, Minimum | None]] = {}
+_second_minima: dict[bytes, tuple[float, RotationMinimum | None]] = {}
 
 
 def fit_once(*arrays: Array | None, t_s: Array | None = None, **how: Any) -> Fit:
@@ -28,7 +28,7 @@ def fit_once(*arrays: Array | None, t_s: Array | None = None, **how: Any) -> Fit
     return _fits[key]
 
 
-def second_minimum_once(R_base_flange: Array, parameters: Parameters) -> tuple[float, Minimum | None]:
+def second_minimum_once(R_base_flange: Array, parameters: Parameters) -> tuple[float, RotationMinimum | None]:
     """As `second_minimum`: the tours of most tests have the same poses."""
     key = R_base_flange.tobytes() + b"".join(value.tobytes() for value in astuple(parameters))
     if key not in _second_minima:

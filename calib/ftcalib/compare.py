@@ -24,7 +24,7 @@ _MOST_FOLDS = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Compared:
+class MethodResult:
     """Result of one method, or the reason why it has none."""
 
     method: Method
@@ -87,7 +87,7 @@ def compare(  # noqa: PLR0913 - one for each thing that may be known
     as_published: bool = False,
     test: CalibrationDataset | None = None,
     truth: Parameters | None = None,
-) -> list[Compared]:
+) -> list[MethodResult]:
     """Run all methods; a method that cannot use these data gives a reason instead.
 
     Parameters
@@ -122,20 +122,20 @@ def compare(  # noqa: PLR0913 - one for each thing that may be known
     for method in get_args(Method):
         try:
             if method == "ml":
-                found = _fitted(default)
+                found = _estimates_of(default)
             elif method in PUBLISHED:
-                found = _published(
+                found = _cross_validate(
                     dataset, method, known, g_m_s2, setup, as_published=as_published and method in CARLSON
                 )
             else:
-                found = _fitted(solve(dataset, method, drift=drift, known=known, g_m_s2=g_m_s2, setup=setup))
+                found = _estimates_of(solve(dataset, method, drift=drift, known=known, g_m_s2=g_m_s2, setup=setup))
         except (NotObservable, BadDataset) as error:
-            compared.append(Compared(method, str(error)))
+            compared.append(MethodResult(method, str(error)))
             continue
         parameters, cv_force, cv_torque = found
-        one = _described(method, parameters, dataset, default.parameters, g_m_s2)
+        one = _describe(method, parameters, dataset, default.parameters, g_m_s2)
         one = replace(one, cv_force_rms_N=cv_force, cv_torque_rms_Nm=cv_torque)
-        compared.append(one if test is None else _tested(one, parameters, test, truth or default.parameters))
+        compared.append(one if test is None else _add_test(one, parameters, test, truth or default.parameters))
     return compared
 
 
@@ -154,7 +154,7 @@ def table_iii(
     truth: Parameters | None = None,
     *,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
-) -> list[tuple[int, str, str, Compared]]:
+) -> list[tuple[int, str, str, MethodResult]]:
     """Repeat the eleven cases of Yu's Table III.
 
     Parameters
@@ -195,21 +195,23 @@ def table_iii(
     for number, method, data, test in CASES:
         found = part(data)
         parameters = published(method, found.R_base_flange, gravity_direction_base=-UP_IN_BASE)(found.wrench)
-        one = _described(method, parameters, found, truth, g_m_s2)
-        rows.append((number, data, test, _tested(one, parameters, part(test), truth)))
+        one = _describe(method, parameters, found, truth, g_m_s2)
+        rows.append((number, data, test, _add_test(one, parameters, part(test), truth)))
     return rows
 
 
-def _described(
+def _describe(
     method: Method, parameters: Parameters, dataset: CalibrationDataset, reference: Parameters, g_m_s2: float
-) -> Compared:
+) -> MethodResult:
     mass_kg = parameters.weight_N / g_m_s2
     angle_rad = float(angle_between(parameters.R_flange_sensor, reference.R_flange_sensor))
     residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
-    return Compared(method, None, parameters, mass_kg, angle_rad, *_rms(residuals))
+    return MethodResult(method, None, parameters, mass_kg, angle_rad, *_rms(residuals))
 
 
-def _tested(compared: Compared, parameters: Parameters, test: CalibrationDataset, truth: Parameters) -> Compared:
+def _add_test(
+    compared: MethodResult, parameters: Parameters, test: CalibrationDataset, truth: Parameters
+) -> MethodResult:
     """Add the columns of Table III."""
     force, torque = np.split(test.wrench - predict(parameters, test.R_base_flange), 2, axis=1)
     largest = [np.abs(np.column_stack([part, np.linalg.norm(part, axis=1)])).max(axis=0) for part in (force, torque)]
@@ -231,11 +233,11 @@ def _or_none(value: float) -> float | None:
     return None if np.isnan(value) else value
 
 
-def _fitted(result: CalibrationResult) -> tuple[Parameters, float, float]:
+def _estimates_of(result: CalibrationResult) -> tuple[Parameters, float, float]:
     return result.parameters, result.quality["loo_force_rms_N"], result.quality["loo_torque_rms_Nm"]
 
 
-def _published(
+def _cross_validate(
     dataset: CalibrationDataset, method: Method, known: Known | None, g_m_s2: float, setup: Setup, *, as_published: bool
 ) -> tuple[Parameters, float, float]:
     R_base_flange, wrench = dataset.R_base_flange, dataset.wrench

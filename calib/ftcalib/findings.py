@@ -95,13 +95,13 @@ class Finding:
     def found(self) -> str:
         """What was found, in words."""
         if self.code in CODES:
-            return _written(CODES[self.code].found, self.values)
+            return _write(CODES[self.code].found, self.values)
         return f"{self.code} ({json.dumps(dict(self.values), ensure_ascii=False)}), which this version does not know"
 
     @property
     def fix(self) -> str:
         """What to do about it, in words; empty if nothing."""
-        return _written(CODES[self.code].fix, self.values) if self.code in CODES else ""
+        return _write(CODES[self.code].fix, self.values) if self.code in CODES else ""
 
     @property
     def words(self) -> str:
@@ -138,7 +138,7 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
 # --------------------------------------------------------------------------------------------------------------- words
 
 
-def _written(template: str, values: Mapping[str, Any]) -> str:
+def _write(template: str, values: Mapping[str, Any]) -> str:
     def at(place: re.Match[str]) -> str:
         name, form = place[1], place[2] or ""
         if form[:1] == "~" and None not in (values[name], sigma := values[form[1:]]):

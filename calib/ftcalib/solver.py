@@ -97,8 +97,8 @@ def solve(
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
     assumed = known if estimator is None or method in BASELINES else None
     best = _fit(dataset, wrench_cov, drift, known, assumed, g_m_s2, setup)
-    judged = Judged.of(best) if estimator is None else _estimated(method, estimator, dataset, wrench_cov, best)
-    free = _unconstrained(dataset, wrench_cov, drift) if assumed is not None else best if estimator else None
+    judged = Judged.of(best) if estimator is None else _estimate(method, estimator, dataset, wrench_cov, best)
+    free = _fit_freely(dataset, wrench_cov, drift) if assumed is not None else best if estimator else None
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
     quality = _judge(judged, free, dataset.t_s, measured_sigma, known, g_m_s2, setup)
     deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
@@ -146,7 +146,7 @@ def _choose(
     _require_usable(method, known, as_published)
     if setup.up_in_base is None and known is not None and known.gravity_direction_base is not None:
         setup = replace(setup, up_in_base=(-np.asarray(known.gravity_direction_base)).tolist())
-    known = _constrained(method, known, setup)
+    known = _constrain(method, known, setup)
     require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
     if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNRESOLVED_N:
         raise NotObservable("the force is the same in all poses: check that the sensor works and carries a load.")
@@ -219,7 +219,7 @@ def _require_usable(method: Method, known: Known | None, as_published: bool) -> 
         raise ValueError(f"{method} cannot use a known {' or '.join(unused)}: leave it out, or use 'ml'")
 
 
-def _estimated(
+def _estimate(
     method: Method, estimator: Estimator, dataset: CalibrationDataset, wrench_cov: Array | None, best: Fit
 ) -> Judged:
     """Apply a published method; `best` gives the degrees of freedom and the second solution."""
@@ -244,7 +244,7 @@ def _estimated(
     )
 
 
-def _constrained(method: Method, known: Known | None, setup: Setup) -> Known | None:
+def _constrain(method: Method, known: Known | None, setup: Setup) -> Known | None:
     """Known values with those that the method assumes."""
     if method in ("known-rotation", "vougioukas", "wang") and (known is None or known.R_flange_sensor is None):
         known = replace(known or Known(), R_flange_sensor=np.eye(3))
@@ -262,7 +262,7 @@ def _constrained(method: Method, known: Known | None, setup: Setup) -> Known | N
     return known
 
 
-def _unconstrained(dataset: CalibrationDataset, wrench_cov: Array | None, drift: Drift) -> Fit | None:
+def _fit_freely(dataset: CalibrationDataset, wrench_cov: Array | None, drift: Drift) -> Fit | None:
     """Fit without known values; None if the poses do not determine all parameters."""
     try:
         require_orientations(dataset.R_base_flange, 4)
@@ -284,7 +284,7 @@ def _mistakes(
     """Find what explains that poses do not determine the parameters: wrong known values can leave no weight."""
     poses = dataset.R_base_flange, dataset.wrench
     found = faults(*poses, setup.up) or other_poses(*poses) or no_weight(*poses)
-    if not found and known is not None and (free := _unconstrained(dataset, wrench_cov, drift)) is not None:
+    if not found and known is not None and (free := _fit_freely(dataset, wrench_cov, drift)) is not None:
         found = contradictions(known, free.parameters, free.covariance, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
     return found
 

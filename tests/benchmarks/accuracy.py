@@ -75,7 +75,7 @@ def fit_run(seed: int, name: str, snr: float, starts: int = 0) -> dict[str, obje
     R_test = Rotation.random(25, rng=rng).as_matrix()
     free = sim.readings(truth, R_test) + s * rng.normal(size=(25, 6))
     total = np.diag(s**2) + predicted_covariance(fit.parameters, C, None, R_test)
-    distance = (standardized(free - predict(fit.parameters, R_test), total) ** 2).sum(axis=1)
+    distance = (standardize(free - predict(fit.parameters, R_test), total) ** 2).sum(axis=1)
     record: dict[str, object] = {
         "square": sim.blocks(e**2),
         "bound": sim.blocks(np.diag(sim.bound(truth, R, np.diag(s**2)))),

@@ -138,11 +138,11 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
     noise = total - np.kron(np.ones((n, n)), np.diag(gap))
     if not (parts or calibration.components) and calibration.noise_source == "measured":
         factor = max(calibration.chi2 / calibration.dof, LEAST_FACTOR)
-        return Expected(_drifted(calibration, gap), noise, calibration.dof, factor)
+        return Expected(_add_drift(calibration, gap), noise, calibration.dof, factor)
     # Satterthwaite: the variances of independent estimates add up, each by its share of the noise
     inverse = np.linalg.inv(total)
     spread = sum((float(np.vdot(inverse, part)) / (6 * n)) ** 2 / freedom for part, freedom in parts)
-    return Expected(_drifted(calibration, gap), noise, 1 / spread if spread else np.inf)
+    return Expected(_add_drift(calibration, gap), noise, 1 / spread if spread else np.inf)
 
 
 def expected_with_inexact_orientations(
@@ -166,7 +166,7 @@ def expected_with_inexact_orientations(
     """
     share = calibration.components.get("hysteresis", 0.0)
     usual = [(error_rad, share, NO_WALK) for error_rad in USUAL_ERRORS_RAD]
-    return _expected(calibration, fitted, R_base_flange, wrench_cov, usual)
+    return _weigh_explanations(calibration, fitted, R_base_flange, wrench_cov, usual)
 
 
 def expected_with_hysteresis(
@@ -174,7 +174,7 @@ def expected_with_hysteresis(
 ) -> list[Expected]:
     """Explain the fit by scaled measured noise and hysteresis; all else as `expected_with_inexact_orientations`."""
     usual = [(0.0, share, NO_WALK) for share in USUAL_SHARES]
-    return _expected(calibration, fitted, R_base_flange, wrench_cov, usual)
+    return _weigh_explanations(calibration, fitted, R_base_flange, wrench_cov, usual)
 
 
 def expected_with_walk(
@@ -189,10 +189,10 @@ def expected_with_walk(
         return []
     share = calibration.components.get("hysteresis", 0.0)
     usual = [(0.0, share, walk) for walk in product(USUAL_WALKS, repeat=2)]
-    return _expected(calibration, fitted, R_base_flange, wrench_cov, usual)
+    return _weigh_explanations(calibration, fitted, R_base_flange, wrench_cov, usual)
 
 
-def _expected(
+def _weigh_explanations(
     calibration: CalibrationResult,
     fitted: CalibrationDataset,
     R_base_flange: Array,
@@ -291,7 +291,7 @@ def _components(calibration: CalibrationResult) -> Mapping[str, float]:
     return found
 
 
-def _drifted(calibration: CalibrationResult, gap: Array) -> Update:
+def _add_drift(calibration: CalibrationResult, gap: Array) -> Update:
     """Add variances (6,) of the bias to the covariance of a calibration."""
     covariance = calibration.covariance.copy()
     joint = joint_covariance(calibration.covariance, calibration.response).copy()

@@ -18,7 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ftcalib.model import Array, skew
 
 
-class Motion(NamedTuple):
+class SensorMotion(NamedTuple):
     """Motion of the flange and the sensor against the base, n samples."""
 
     t_s: Array
@@ -41,7 +41,7 @@ def motion_of_poses(
     R_flange_sensor: Array,
     p_flange_sensor_m: Array,
     reach: int,
-) -> Motion:
+) -> SensorMotion:
     """Differentiate n poses twice: at each, a quadratic is fitted to position and rotation vector of its neighbours.
 
     Parameters
@@ -79,11 +79,11 @@ def motion_of_poses(
     omega, alpha, acceleration = fit[:, 1, :3], fit[:, 2, :3], fit[:, 2, 3:]
     W = skew(omega)
     acceleration = acceleration + (skew(alpha) + W @ W) @ p_flange_sensor_m
-    return Motion(t, R, omega @ R_flange_sensor, alpha @ R_flange_sensor, acceleration @ R_flange_sensor)
+    return SensorMotion(t, R, omega @ R_flange_sensor, alpha @ R_flange_sensor, acceleration @ R_flange_sensor)
 
 
 def inertial_wrench(
-    mass_kg: float, p_sensor_com_m: Array, motion: Motion, inertia_com_kg_m2: Array | None = None
+    mass_kg: float, p_sensor_com_m: Array, motion: SensorMotion, inertia_com_kg_m2: Array | None = None
 ) -> Array:
     """Wrench (n, 6) that the motion of a load exerts on the sensor beside its weight, N and N·m, in the sensor frame.
 

@@ -163,10 +163,10 @@ def new_tool(
     weights: Array = np.linalg.inv(cov).astype(np.float64)
     poses = dataset.R_base_flange, dataset.wrench, weights
     prior = CellPrior(earlier)
-    found = _fitted(prior, *poses, WHOLE)
+    found = _fit_tool(prior, *poses, WHOLE)
 
     def refit(kept: Sequence[int]) -> tuple[float, int, Parameters]:
-        again = _fitted(prior, *poses, kept)
+        again = _fit_tool(prior, *poses, kept)
         return again.chi2, again.dof, again.parameters
 
     alone = "calibrate this tool alone, from 12 poses or more"
@@ -176,7 +176,7 @@ def new_tool(
     return replace(result, quality={}, weights=None, components=_kept_noise(earlier))
 
 
-def _fitted(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Array, kept: Sequence[int]) -> Update:
+def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Array, kept: Sequence[int]) -> Update:
     """Fit all parameters; `kept` as of `CellPrior.rows`."""
     n, coefficients = len(wrench), prior.coefficients
     new = _start(prior.earlier.parameters, R_base_flange, wrench)

@@ -306,7 +306,6 @@ def trend(t: Array, values: Array, covariance: Array) -> Trend:
     return Trend(slope / scale, sigma / scale, float(max(special.chdtrc(k, chi2), against_scatter)), n)
 
 
-"""Runs."""
 # Bias of a sensor against its temperature, over calibrations and verifications, and whether that predicts anything.
 #
 # A component of the bias is y = a + c (T - T0) + s + w(t): s scatters from run to run, w walks with the time. Both are
@@ -359,6 +358,11 @@ class BiasTemperature:
         return np.where(used, self.slope * step_K, 0.0), np.where(used, self.sigma * abs(step_K), 0.0)
 
 
+def spans_temperature(temperature_C: Array, fewest: int) -> bool:
+    """Whether so many runs, over `LEAST_K` at least, can show a change with the temperature."""
+    return len(temperature_C) >= fewest and bool(np.ptp(temperature_C) >= LEAST_K)
+
+
 def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Array) -> BiasTemperature | None:
     """Fit the bias of one sensor, in one mounting, against its temperature.
 
@@ -379,7 +383,7 @@ def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Ar
     """
     t_days, T, y, sigma = (np.asarray(one, dtype=np.float64)[-_MOST:] for one in (t_days, temperature_C, bias, sigma))
     n = len(T)
-    if n < FEWEST or np.ptp(T) < LEAST_K:
+    if not spans_temperature(T, FEWEST):
         return None
     alone = np.ones((n, 1))
     line = np.column_stack([alone, T - T.mean()])
@@ -387,7 +391,7 @@ def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Ar
     slope, error, errors, p_values = np.zeros((2, 6)), np.zeros(2), np.zeros(2), np.ones(2)
     for k, group in enumerate((slice(0, 3), slice(3, 6))):
         noise = np.mean(np.square(sigma[:, group]), axis=1)
-        with_T, without = (_fitted(X, walk, y[:, group], noise) for X in (line, alone))
+        with_T, without = (_fit_columns(X, walk, y[:, group], noise) for X in (line, alone))
         slope[0, group], slope[1, group] = with_T.x[1], with_T.sigma
         error[k], errors[k] = with_T.left_out, without.left_out
         p_values[k] = scipy.special.fdtrc(3, 3 * (n - 2), float(np.mean(np.square(with_T.x[1] / with_T.sigma))))
@@ -403,7 +407,7 @@ class _Fit(NamedTuple):
     """Rms of what each run differs from its prediction by the others."""
 
 
-def _fitted(X: Array, walk: Array, y: Array, noise: Array) -> _Fit:
+def _fit_columns(X: Array, walk: Array, y: Array, noise: Array) -> _Fit:
     """Fit columns X (n, k) to the components y (n, 3); each scatter and walk counts by its likelihood."""
     spread = float(np.mean(np.square(y - X @ np.linalg.lstsq(X, y, rcond=None)[0])))
     tried, likelihood = list[tuple[Array, float, Array]](), list[float]()

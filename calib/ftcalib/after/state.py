@@ -157,7 +157,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
                 )
         if float(x @ information @ x) < SETTLED * max(1.0, float(left @ np.linalg.solve(S, left))):
             break
-        new = _moved(new, estimated, x, BLOCKS[kind])
+        new = _move(new, estimated, x, BLOCKS[kind])
     else:
         raise NotObservable(f"the new {kind} has not settled in {MOST_STEPS} steps: calibrate again.")
     estimated_15 = np.zeros((len(C), len(x)))
@@ -271,7 +271,7 @@ def _kept(old: Parameters, new: Parameters, blocks: Sequence[Block], size: int) 
     return kept
 
 
-def _moved(p: Parameters, estimated: Array, x: Array, blocks: Sequence[Block]) -> Parameters:
+def _move(p: Parameters, estimated: Array, x: Array, blocks: Sequence[Block]) -> Parameters:
     step = estimated @ x
     weight_N = p.weight_N
     if "weight" in blocks:
@@ -303,7 +303,7 @@ FALSE_ALARMS = 1e-3  # share of good tares that are rejected
 USUAL_DRIFT_N, USUAL_DRIFT_NM = 1.0, 0.03  # a wrist sensor over hours: temperature, mounting, wear
 
 
-def bias_change(
+def compare_with_prediction(
     calibration: Calibrated, R_base_flange: Array, wrench: Array, wrench_cov: Array, drift_N: float, drift_Nm: float
 ) -> tuple[Array, Array]:
     """Compare readings of a free tool with the prediction.
@@ -373,7 +373,7 @@ def tare(
     means = [mean_and_covariance(dwell) for dwell in dwells]
     wrench, wrench_cov = np.array([m.mean for m in means]), np.array([m.covariance for m in means])
     R_base_flange = finite("R_base_flange", R_base_flange, (len(means), 3, 3))
-    change, sigmas = bias_change(calibration, R_base_flange, wrench, wrench_cov, drift_N, drift_Nm)
+    change, sigmas = compare_with_prediction(calibration, R_base_flange, wrench, wrench_cov, drift_N, drift_Nm)
     limit = float(chi2_isf(6, FALSE_ALARMS))
     for i in np.flatnonzero(sigmas**2 > limit).tolist():
         raise BadDataset(

@@ -157,14 +157,14 @@ def verify(
     likeliest = [max(kind, key=lambda one: one.weight) for kind in explanations]
     p_value = max(p_values)
     if p_value >= false_alarms:
-        return _compared(likeliest[p_values.index(p_value)], p_value, R_base_flange, wrench, passed=True)
+        return _compare(likeliest[p_values.index(p_value)], p_value, R_base_flange, wrench, passed=True)
     changes = [_changes(calibration, one, R_base_flange, wrench) for one in likeliest]
     best = min(range(len(changes)), key=lambda k: min((cost for cost, _ in changes[k].values()), default=np.inf))
-    alarm = _compared(likeliest[best], p_value, R_base_flange, wrench, passed=False)
-    return _explained(alarm, calibration, changes[best])
+    alarm = _compare(likeliest[best], p_value, R_base_flange, wrench, passed=False)
+    return _explain(alarm, calibration, changes[best])
 
 
-def _compared(expected: Expected, p_value: float, R_base_flange: Array, wrench: Array, *, passed: bool) -> Verification:
+def _compare(expected: Expected, p_value: float, R_base_flange: Array, wrench: Array, *, passed: bool) -> Verification:
     """Compare the readings with what is expected of an unchanged cell."""
     residual, sigma, chi2 = expected.distance(R_base_flange, wrench)
     n = len(wrench)
@@ -204,7 +204,7 @@ def _changes(
     return found
 
 
-def _explained(
+def _explain(
     alarm: Verification, calibration: CalibrationResult, found: Mapping[str, tuple[float, Update]]
 ) -> Verification:
     """Name the change, with the update that makes up for it."""

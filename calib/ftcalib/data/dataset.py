@@ -76,19 +76,19 @@ class CalibrationDataset:
         n = len(np.atleast_1d(np.asarray(self.R_base_flange)))
         if n == 0:
             raise BadDataset("the dataset has no pose: record at least four.")
-        wrench = _measured("wrench", self.wrench, (n, 6))
-        R_base_flange = _rotations(_measured("R_base_flange", self.R_base_flange, (n, 3, 3)))
-        t_s = _shaped("t_s", self.t_s, (n,))
+        wrench = _require_measured("wrench", self.wrench, (n, 6))
+        R_base_flange = _rotations(_require_measured("R_base_flange", self.R_base_flange, (n, 3, 3)))
+        t_s = _require_shape("t_s", self.t_s, (n,))
         for i in np.flatnonzero(np.isinf(t_s)):
             raise BadDataset(f"row {i + 1}: t_s is {t_s[i]}, expected seconds or NaN for unknown.")
-        n_samples = _shaped("n_samples", self.n_samples, (n,))
+        n_samples = _require_shape("n_samples", self.n_samples, (n,))
         for i in np.flatnonzero(~((n_samples >= 0) & (n_samples == np.floor(n_samples)))):
             raise BadDataset(f"row {i + 1}: n_samples is {n_samples[i]:g}, expected a whole number, 0 for unknown.")
         n_samples = n_samples.astype(np.int64)
         n_samples.setflags(write=False)
         arrays = {"R_base_flange": R_base_flange, "wrench": wrench, "t_s": t_s}
         if self.wrench_cov is not None:
-            arrays["wrench_cov"] = _covariances(_measured("wrench_cov", self.wrench_cov, (n, 6, 6)))
+            arrays["wrench_cov"] = _covariances(_require_measured("wrench_cov", self.wrench_cov, (n, 6, 6)))
         try:
             meta = json.loads(json.dumps(dict(self.meta), allow_nan=False))
         except (TypeError, ValueError) as exc:
@@ -318,12 +318,12 @@ def _table(path: Path) -> list[list[str]]:
 
 def finite(name: str, value: object, shape: tuple[int, ...]) -> Array:
     """Convert to an array of this shape, one row per pose; raises `BadDataset` naming the row that is not finite."""
-    array = _shaped(name, value, shape)
+    array = _require_shape(name, value, shape)
     _reject(name, array, ~np.isfinite(array), "not a finite number.")
     return array
 
 
-def _shaped(name: str, value: object, shape: tuple[int, ...]) -> Array:
+def _require_shape(name: str, value: object, shape: tuple[int, ...]) -> Array:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as exc:
@@ -333,7 +333,7 @@ def _shaped(name: str, value: object, shape: tuple[int, ...]) -> Array:
     return array
 
 
-def _measured(name: str, value: object, shape: tuple[int, ...]) -> Array:
+def _require_measured(name: str, value: object, shape: tuple[int, ...]) -> Array:
     array = finite(name, value, shape)
     _reject(name, array, np.abs(array) > LARGEST, f"more than any sensor measures ({LARGEST:g}): check the units.")
     return array

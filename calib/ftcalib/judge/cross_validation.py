@@ -113,7 +113,7 @@ class Judged:
         )
 
 
-def standardized(residuals: Array, covariance: Array) -> Array:
+def standardize(residuals: Array, covariance: Array) -> Array:
     """Divide residuals (n, 6) by a root of their covariance (n, 6, 6): independent, of unit variance."""
     unit = np.empty_like(residuals)
     for first in range(0, len(residuals), CHUNK):

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import NotObservable
-from ftcalib.likelihood.rotation_minima import Minimum, force_cost, minima
+from ftcalib.likelihood.rotation_minima import RotationMinimum, force_cost, minima
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, gravity_wrench, jacobian
 
 LEAST_POSES = 4
@@ -163,7 +163,7 @@ def scaled_information(
     return np.asarray(J.T @ J)
 
 
-def second_minimum(R_base_flange: Array, parameters: Parameters = NOMINAL) -> tuple[float, Minimum | None]:
+def second_minimum(R_base_flange: Array, parameters: Parameters = NOMINAL) -> tuple[float, RotationMinimum | None]:
     """Mean squared force residual, over the squared weight, of the best solution with another mounting; also that one.
 
     Without noise and from forces alone, because torques rarely decide. With white force noise sigma the wrong solution

@@ -60,7 +60,7 @@ KINDS = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Change:
+class SessionChange:
     """A change of some rows, relative to the others."""
 
     code: str
@@ -117,7 +117,7 @@ def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma
     return [Finding.of(code, severity, **{name: value for name, value in values.items() if name in needed})]
 
 
-def _is_likelier(change: Change, R: Array, wrench: Array, cov: Array | None, t_s: Array | None) -> bool:
+def _is_likelier(change: SessionChange, R: Array, wrench: Array, cov: Array | None, t_s: Array | None) -> bool:
     without = fit(R, change.corrected, cov, t_s=t_s)
     weight_N = without.parameters.weight_N
     if np.sqrt(np.mean(np.sum(without.residuals[without.weights > 0.5, :3] ** 2, axis=1))) > CORRECTED * weight_N:
@@ -140,7 +140,9 @@ def minus_two_log_likelihood(found: Fit) -> float:
     return value
 
 
-def likeliest_change(parameters: Parameters, R: Array, wrench: Array, sigma: Array | None = None) -> Change | None:
+def likeliest_change(
+    parameters: Parameters, R: Array, wrench: Array, sigma: Array | None = None
+) -> SessionChange | None:
     """Find the change that leaves the least; None if it does not leave much less than none, or a steady drift.
 
     Parameters
@@ -167,7 +169,7 @@ def likeliest_change(parameters: Parameters, R: Array, wrench: Array, sigma: Arr
             k = int(np.argmin(misfits))
             if code not in best or misfits[k] < best[code][0]:
                 best[code] = misfits[k], start, groups[k]
-    changes = [_refined(code, start, R, wrench, scale, rows) for code, (_, start, rows) in best.items()]
+    changes = [_refine(code, start, R, wrench, scale, rows) for code, (_, start, rows) in best.items()]
     change = min(changes, key=lambda one: one.criterion)
     return change if change.misfit < CLEARLY * without else None
 
@@ -213,7 +215,7 @@ def _misfits(p: Parameters, R: Array, wrench: Array, scale: Array, groups: NDArr
     }
 
 
-def _refined(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, rows: Rows) -> Change:
+def _refine(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, rows: Rows) -> SessionChange:
     """Undo the change of some rows, and improve it together with all parameters by linear least squares."""
     y, g, own = wrench - p.bias, gravity_wrench(p, R), KINDS[code]
     undone, turn, step = y.copy(), np.eye(3), np.zeros(6)
@@ -221,8 +223,8 @@ def _refined(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, ro
         mean_y, mean_g = (x[rows].mean(axis=0) if code == "sensor_changed" else np.zeros(6) for x in (y, g))
         parts = (((x[rows] - mean) / scale).reshape(-1, 2, 3) for x, mean in ((y, mean_y), (g, mean_g)))
         turn = nearest_rotation(np.einsum("npi,npj->ij", *parts))
-        step = mean_y - _turned(mean_g, turn)[0]
-        undone[rows] = _turned(y[rows] - step, turn.T)
+        step = mean_y - _turn(mean_g, turn)[0]
+        undone[rows] = _turn(y[rows] - step, turn.T)
     C = _columns(p, R)[..., own] * rows[:, None, None]
     misfit, x = _least(np.concatenate([C, jacobian(p, R), response_columns(p, R)], axis=2), undone - g, scale)
     moved = np.zeros(13)
@@ -236,7 +238,7 @@ def _refined(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, ro
         "shift_mm": 1e3 * _length(moved[COM]),
     }
     criterion = wrench.size * np.log(max(misfit, 1e-300)) + len(own) * np.log(wrench.size)
-    return Change(code, rows, values, undone - C @ x[: len(own)] + p.bias, misfit, float(criterion))
+    return SessionChange(code, rows, values, undone - C @ x[: len(own)] + p.bias, misfit, float(criterion))
 
 
 def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
@@ -258,7 +260,7 @@ def _columns(p: Parameters, R: Array) -> Array:
     return np.concatenate([turn, bias, (J[..., 3:6] @ p.down)[..., None], J[..., 9:12]], axis=2)
 
 
-def _turned(wrench: Array, turn: Array) -> Array:
+def _turn(wrench: Array, turn: Array) -> Array:
     return np.asarray((wrench.reshape(-1, 2, 3) @ turn.T).reshape(-1, 6))
 
 

@@ -13,7 +13,7 @@ from ftcalib.data.dwell_mean import RESOLUTION
 from ftcalib.files import JSON
 from ftcalib.findings import Finding, Severity, Verdict, ordered, verdict_of
 from ftcalib.judge import described_cell, units
-from ftcalib.judge.cross_validation import DriftAhead, Judged, drift_ahead, standardized
+from ftcalib.judge.cross_validation import DriftAhead, Judged, drift_ahead, standardize
 from ftcalib.judge.described_cell import contradictions
 from ftcalib.judge.faults import COLLAPSE, ROUNDING, broken_channels, constant_weight, faults, other_poses
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
@@ -197,7 +197,7 @@ def judge(
 def _statistics(fit: Judged, t_s: Array | None) -> Quality:
     used = fit.weights > 0.5
     weight_N = fit.parameters.weight_N
-    residuals = standardized(fit.left_out_residuals, fit.left_out_cov)
+    residuals = standardize(fit.left_out_residuals, fit.left_out_cov)
     residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
     largest_share, errors, left_out_rms = _errors(fit, used, weight_N)
     measured = bool(np.isfinite(fit.measured_chi2))

@@ -255,7 +255,7 @@ class Descent:
             Z = self.constraints.free(p) if self.constraints.any else None
             Hz, gz = (H, g) if Z is None else (Z.T @ H @ Z, Z.T @ g)
             scale = column_scale(Hz)
-            step = np.asarray(_solved(Hz / (scale[:, None] * scale), gz / scale, damping) / scale)
+            step = np.asarray(_solve(Hz / (scale[:, None] * scale), gz / scale, damping) / scale)
             moved = float(np.sqrt(max(float(step @ Hz @ step), 0.0)))  # in standard deviations of the noise
             trial = p.moved(step if Z is None else Z @ step)
             if Z is not None:
@@ -274,7 +274,7 @@ class Descent:
         return Minimum(p, cost, H, settled or moved < SMALL_STEP)
 
 
-def _solved(H: Array, g: Array, damping: float) -> Array:
+def _solve(H: Array, g: Array, damping: float) -> Array:
     """Solve `(H + damping) x = g`; where the matrix lacks rank, the shortest such step."""
     _, x, failed = dposv(H + damping * np.eye(len(H)) if damping else H, g)
     if failed:

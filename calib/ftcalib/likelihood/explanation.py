@@ -74,7 +74,7 @@ def select(
         How many of the components, the first, are part of the model; by default all.
     """
     needed = len(components) if needed is None else needed
-    best = _pruned(problem, maximise(problem, components, theta), needed)
+    best = _prune(problem, maximise(problem, components, theta), needed)
     waiting = [c for c in candidates if c not in best.components]
     while waiting:
         gains, start = predicted_gains(problem, best, waiting)
@@ -91,7 +91,7 @@ def select(
         if trial.loglik > wanted and not trial.too_large:
             best = trial
         waiting = [c for i, c in enumerate(waiting) if i not in together]
-    return best if len(best.components) - needed <= 1 else _pruned(problem, best, needed)
+    return best if len(best.components) - needed <= 1 else _prune(problem, best, needed)
 
 
 def with_response_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
@@ -148,18 +148,18 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
     ]
     components = [*(best.components[k] for k in rest), *slopes]
     trial = maximise(problem, components, np.append(noise, start), best.loglik)
-    return _pruned(problem, trial, needed) if trial.loglik > best.loglik else best
+    return _prune(problem, trial, needed) if trial.loglik > best.loglik else best
 
 
 def _better(problem: Linearised, best: Point, components: Sequence[Component], theta: Array, needed: int) -> Point:
     """Try other components; keep what is worth more."""
     trial = maximise(problem, components, theta, best.worth)
     if trial.loglik > best.worth:
-        trial = _pruned(problem, trial, needed)
+        trial = _prune(problem, trial, needed)
     return trial if trial.worth > best.worth and not trial.too_large else best
 
 
-def _pruned(problem: Linearised, best: Point, needed: int) -> Point:
+def _prune(problem: Linearised, best: Point, needed: int) -> Point:
     """Drop components that raise the likelihood too little: those without effect at once, then one at a time."""
     if best.components:
         seen = best.theta >= NEGLIGIBLE * units(problem, best, best.components)
@@ -297,7 +297,7 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
         found = with_all_minima(session, chosen, static)
         if session.descent.same(found[0].parameters, chosen.parameters):
             break
-        other = _explained(session, found[0].parameters, chosen.kept)
+        other = _improve(session, found[0].parameters, chosen.kept)
         if other.criterion > chosen.criterion:
             break
         chosen = other if session.measured else _with_expected_noise(session, other)
@@ -330,7 +330,7 @@ def _is_quiet(session: Session, best: Minimum) -> bool:
 def _explanations(session: Session, minima: list[Minimum], weights: Array) -> list[Explanation]:
     """Explain the data with all poses; and, where these may hide bumped ones, with those that agree."""
     p = minima[0].parameters
-    found = [_explained(session, p, session.everything)]
+    found = [_improve(session, p, session.everything)]
     if found[0].noticed:
         starts = [m.parameters for m in minima]
         problem, always = session.linearised(p, session.everything), session.always()
@@ -340,15 +340,15 @@ def _explanations(session: Session, minima: list[Minimum], weights: Array) -> li
         distances = squared_length(*at.left_out())
         tried = [(p, session.everything), (found[0].parameters, found[0].kept)]
         for scaled in (False, True):
-            robust = _agreeing(session, weights, starts, distances, scaled=scaled)
+            robust = _find_agreeing(session, weights, starts, distances, scaled=scaled)
             if robust is None or any(session.descent.same(robust[0], q) and (robust[1] == k).all() for q, k in tried):
                 continue
-            found.append(_explained(session, *robust))
+            found.append(_improve(session, *robust))
             tried += [robust, (found[-1].parameters, found[-1].kept)]
     return found
 
 
-def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
+def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
     """Improve parameters, variances, components and rejected poses in turn, until nothing changes."""
     always, candidates = session.always(), session.candidates()
     problem = session.linearised(p, kept)
@@ -360,7 +360,7 @@ def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
         if session.drift == "auto":
             at = with_walks_instead(problem, at, candidates, len(always))
             at = with_slopes_instead(problem, at, len(always))
-        p, problem, at = _settled(session, p, kept, problem, at)
+        p, problem, at = _settle(session, p, kept, problem, at)
         distances = squared_length(*at.left_out())
         criterion = _criterion(session, at, distances)
         if criterion < best.criterion - 1e-3:
@@ -383,7 +383,7 @@ def _explained(session: Session, p: Parameters, kept: Kept) -> Explanation:
     return best
 
 
-def _settled(
+def _settle(
     session: Session, p: Parameters, kept: Kept, problem: Linearised, at: Point
 ) -> tuple[Parameters, Linearised, Point]:
     """Go down with the noise as it is and estimate it again, until they agree."""
@@ -467,7 +467,7 @@ def _stand_out(session: Session, distances: Array) -> bool:
     return bool(distances.max() > chi2_isf(6, 2 * SUSPICIOUS / session.n)) or tail < LIGHT_TAIL
 
 
-def _agreeing(
+def _find_agreeing(
     session: Session, weights: Array, starts: list[Parameters], distances: Array, *, scaled: bool
 ) -> tuple[Parameters, Kept] | None:
     """Find poses that agree within the noise, or within one that fits half of all poses."""

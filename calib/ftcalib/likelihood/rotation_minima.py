@@ -22,7 +22,7 @@ _FLAT = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Minimum:
+class RotationMinimum:
     """One local minimum of the cost over the rotations."""
 
     R: Array
@@ -98,7 +98,7 @@ def given_rotation(R_sensor_flange: Array, R_base_flange: Array, force_N: Array,
     return gravity_N, mean[:3] - R_sensor_flange @ mean[3:].reshape(3, 3).T @ gravity_N
 
 
-def minima(Q: Array) -> list[Minimum]:
+def minima(Q: Array) -> list[RotationMinimum]:
     """Find all local minima of `r.T @ Q @ r` over the rotations.
 
     Parameters
@@ -128,7 +128,7 @@ def minima(Q: Array) -> list[Minimum]:
         if not same.any():
             kept.append(int(i))
     r = _squares(q[kept]) @ _R_OF_Q.T
-    found = [Minimum(R.reshape(3, 3), float(R @ Q @ R)) for R in r]
+    found = [RotationMinimum(R.reshape(3, 3), float(R @ Q @ R)) for R in r]
     return sorted(found, key=lambda minimum: minimum.cost)
 
 

@@ -22,7 +22,7 @@ from ftcalib.motion.model import (
     INERTIA,
     SIZE,
     Load,
-    Noise,
+    RowNoise,
     jacobian,
     runs,
     states,
@@ -178,7 +178,7 @@ class _Problem:
         return load, float(np.log(scale).sum())
 
     def sums(
-        self, load: Load, drift: Array, noise: Noise, kept: NDArray[np.bool_], state: NDArray[np.intp]
+        self, load: Load, drift: Array, noise: RowNoise, kept: NDArray[np.bool_], state: NDArray[np.intp]
     ) -> tuple[Array, Array, float]:
         """Information, gradient and chi2 of load and drift, over kept rows as the noise weighs them."""
         rows, order = self.rows[kept], noise.filters.shape[0] - 1
@@ -333,15 +333,15 @@ def fit(
         state = states(rows.speed_rad_s, kept)
         r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
         absorbed = problem.absorbed(load, rows[kept], solved)
-        noise = Noise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept], rows.row_s))
+        noise = RowNoise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept], rows.row_s))
         if guarded:
             local = _local(r / noise.scale[state], kept)[:, None]
             place = runs(rows.t_s[kept], rows.row_s)
-            noise = Noise.of((r / local)[kept], absorbed / local[kept][:, :, None], state[kept], place, bursts=True)
+            noise = RowNoise.of((r / local)[kept], absorbed / local[kept][:, :, None], state[kept], place, bursts=True)
             noise, state = replace(noise, scale=noise.scale[state] * local), np.arange(len(rows))
         sums = problem.sums(load, drift, noise, kept, state)
         if stage in _CHOICES:
-            sizes = _chosen(problem, sizes, sums, load, drift)
+            sizes = _choose_sizes(problem, sizes, sums, load, drift)
         solved = problem.solved(sizes, sums, load, drift)
         load = load.moved(solved.step[:SIZE])
         drift = drift + (problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
@@ -352,9 +352,7 @@ def fit(
     if prior is not None:
         if prior.has_response:
             sizes |= {"gain": np.inf, "cross_talk": np.inf}
-        joined = _Joined(problem, prior, sizes, (load, drift), (noise, kept, state))
-        load, drift, solved = joined.fitted(WHOLE)
-        contradiction = joined.contradiction(solved.cost)
+        load, drift, solved, contradiction = _join(problem, prior, sizes, (load, drift), (noise, kept, state))
         r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
     chi2, others = problem.sums(load, drift, noise, kept, state)[2], []
@@ -370,58 +368,57 @@ def fit(
         ends = ends @ block_diag(np.eye(SIZE), problem.centred)
         change = drift[-1] - drift[0], np.sqrt(np.einsum("ij,jk,ik->i", ends, solved.covariance, ends))
     return MotionFit(
-        load,
-        solved.covariance[:SIZE, :SIZE],
-        kept,
-        r,
-        noise.scale[state],
-        distance,
-        problem.hats(rows.t_s) @ drift,
-        change,
-        {name: size for name, size in sizes.items() if 0 < size < np.inf},
-        max(min(others), 0.0) if others else None,
-        chi2,
-        contradiction,
+        load=load,
+        covariance=solved.covariance[:SIZE, :SIZE],
+        kept=kept,
+        residuals=r,
+        sigma=noise.scale[state],
+        distance=distance,
+        drift=problem.hats(rows.t_s) @ drift,
+        drift_change=change,
+        components={name: size for name, size in sizes.items() if 0 < size < np.inf},
+        second_basin_chi2=max(min(others), 0.0) if others else None,
+        chi2=chi2,
+        contradiction=contradiction,
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Joined:
-    """Rows, with noise and contact as they show alone, and a prior."""
+def _join(
+    problem: _Problem,
+    prior: CellPrior,
+    sizes: Mapping[str, float],
+    start: tuple[Load, Array],
+    weighed: tuple[RowNoise, NDArray[np.bool_], NDArray[np.intp]],
+) -> tuple[Load, Array, _Step, str]:
+    """Fit rows and a prior from the load and drift of the rows alone, and name what they contradict in the prior.
 
-    problem: _Problem
-    prior: CellPrior
-    sizes: Mapping[str, float]
-    start: tuple[Load, Array]
-    """The fit of the rows alone, and its drift."""
-    weighed: tuple[Noise, NDArray[np.bool_], NDArray[np.intp]]
+    `weighed` is the noise, with the rows that count and their states, as the rows show it alone.
+    """
 
-    def fitted(self, kept: Sequence[int]) -> tuple[Load, Array, _Step]:
+    def fitted(kept: Sequence[int]) -> tuple[Load, Array, _Step]:
         """Fit; `kept` as of `CellPrior.rows`."""
-        (load, drift), before = self.start, np.inf
+        (load, drift), before = start, np.inf
         for _ in range(_PRIOR_STEPS):
-            sums = self.problem.sums(load, drift, *self.weighed)
-            known = self.prior.rows(load.static, load.response[: 11 * self.prior.has_response], kept)
-            solved = self.problem.solved(self.sizes, sums, load, drift, known)
+            sums = problem.sums(load, drift, *weighed)
+            known = prior.rows(load.static, load.response[: 11 * prior.has_response], kept)
+            solved = problem.solved(sizes, sums, load, drift, known)
             load = load.moved(solved.step[:SIZE])
-            drift = drift + (self.problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
+            drift = drift + (problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
             if abs(before - solved.cost) < _SETTLED:
                 break
             before = solved.cost
         return load, drift, solved
 
-    def contradiction(self, cost: float) -> str:
-        """Name what the rows contradict in the prior, with which the fit has this cost; empty if they do not."""
-        alone = self.fitted(())[2].cost
+    load, drift, solved = fitted(WHOLE)
+    alone = fitted(())[2].cost
 
-        def refit(kept: Sequence[int]) -> tuple[float, int, Parameters]:
-            load, _, solved = self.fitted(kept)
-            return solved.cost - alone, self.prior.count(kept), load.static
+    def refit(kept: Sequence[int]) -> tuple[float, int, Parameters]:
+        load, _, solved = fitted(kept)
+        return solved.cost - alone, prior.count(kept), load.static
 
-        words = "calibrate this tool alone, without --from"
-        return self.prior.contradiction(
-            cost - alone, self.prior.count(WHOLE), refit, "the rows of the recording", words
-        )
+    misfit, words = solved.cost - alone, "calibrate this tool alone, without --from"
+    contradiction = prior.contradiction(misfit, prior.count(WHOLE), refit, "the rows of the recording", words)
+    return load, drift, solved, contradiction
 
 
 def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
@@ -462,7 +459,7 @@ def _without_contact(distance: Array) -> NDArray[np.bool_]:
     return ~near if near.mean() < MOST_CONTACT else np.ones(len(near), bool)  # nothing fits: all is of no use alike
 
 
-def _chosen(
+def _choose_sizes(
     problem: _Problem, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: Load, drift: Array
 ) -> dict[str, float]:
     """Choose the sizes of the components by restricted likelihood, one after the other."""

@@ -180,7 +180,7 @@ def runs(t_s: Array, row_s: float) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Noise:
+class RowNoise:
     """A model of the noise that makes rows independent and of unit variance."""
 
     scale: Array

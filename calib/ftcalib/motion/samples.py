@@ -39,30 +39,22 @@ _LEVER_M = 0.5
 """Translation counts as a rotation about a point this far away."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Band:
-    """A zero-phase filter of means over 10 ms, and the rows that it leaves. White noise is white in them."""
-
-    row_s: float
-    """From row to row, a multiple of `MEAN_S`."""
-
-    @property
-    def step(self) -> int:
-        """Means from row to row."""
-        return round(self.row_s / MEAN_S)
-
-    @property
-    def kernel(self) -> Array:
-        """(2 k + 1,) of unit sum; half the amplitude is left at .56 of the rate of the rows."""
-        half = round(3.36 * self.step)
-        kernel = np.sinc(1.12 / self.step * np.arange(-half, half + 1)) * np.kaiser(2 * half + 1, 6.0)
-        return np.asarray(kernel / kernel.sum())
+# Seconds from row to row, multiples of `MEAN_S`. To 4.7 Hz: below the ripple of gears and the vibration of an arm,
+# above its motion. A contact is short in such rows.
+WIDE_S = 0.12
+# To 2 Hz: gears of joints that turn slowly shake the tool at 2 to 5 Hz.
+NARROW_S = 0.28
 
 
-WIDE = Band(0.12)
-"""To 4.7 Hz: below the ripple of gears and the vibration of an arm, above its motion. A contact is short in it."""
-NARROW = Band(0.28)
-"""To 2 Hz: gears of joints that turn slowly shake the tool at 2 to 5 Hz."""
+def row_filter(row_s: float) -> Array:
+    """Zero-phase filter (2 k + 1,) of means over 10 ms, of unit sum, in whose rows white noise is white.
+
+    Half the amplitude is left at .56 of the rate of the rows.
+    """
+    step = round(row_s / MEAN_S)
+    half = round(3.36 * step)
+    kernel = np.sinc(1.12 / step * np.arange(-half, half + 1)) * np.kaiser(2 * half + 1, 6.0)
+    return np.asarray(kernel / kernel.sum())
 
 
 class Means:
@@ -115,20 +107,20 @@ class Means:
         after_sums = np.add.reduceat(rows * share, first)
         sums = np.concatenate([np.add.reduceat(rows, first) - after_sums, after_sums])
         cell = before[first].astype(np.int64)
-        self._parts.append(_summed(np.concatenate([cell, cell + 1]), sums))
+        self._parts.append(_sum_cells(np.concatenate([cell, cell + 1]), sums))
 
     def result(self) -> tuple[Array, Array]:
         """Return the mean time (m,) and the means (m, k) around each 10 ms that have samples."""
         if not self._parts:
             raise BadDataset("there are no samples")
-        _, sums = _summed(*(np.concatenate(each) for each in zip(*self._parts, strict=True)))
+        _, sums = _sum_cells(*(np.concatenate(each) for each in zip(*self._parts, strict=True)))
         sums = sums[sums[:, 0] > _LEAST_WEIGHT]
         t_s = sums[:, 1] / sums[:, 0]
         own = np.diff(t_s, prepend=-np.inf) > MEAN_S / 10  # a sample of a slow stream is alone in two means
         return t_s[own], sums[own, 2:] / sums[own, :1]
 
 
-def _summed(cell: NDArray[np.int64], sums: Array) -> tuple[NDArray[np.int64], Array]:
+def _sum_cells(cell: NDArray[np.int64], sums: Array) -> tuple[NDArray[np.int64], Array]:
     """Add the sums of equal cells; return both in the order of the cells."""
     order = np.argsort(cell, kind="stable")
     cell = cell[order]
@@ -196,7 +188,9 @@ class Rows:
         return type(self)(*parts, self.delay_s, self.row_s)
 
 
-def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: float = 0.0, band: Band = WIDE) -> Rows:
+def rows_of(
+    wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: float = 0.0, row_s: float = WIDE_S
+) -> Rows:
     """Put wrench and poses on one clock.
 
     Parameters
@@ -208,8 +202,8 @@ def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: fl
         counts as 0.
     delay_s : float
         Of the wrench after the pose at which it arose.
-    band : Band
-        Of the rows.
+    row_s : float
+        From row to row.
 
     Raises
     ------
@@ -218,7 +212,8 @@ def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: fl
     """
     t_w, t_p = wrench[0], poses[0] + delay_s
     first, last = MEAN_S * np.ceil(max(t_w[0], t_p[0]) / MEAN_S), min(t_w[-1], t_p[-1])  # where the means are
-    reach = len(band.kernel) // 2 + 1 + len(_FIT) // 2
+    kernel, step = row_filter(row_s), round(row_s / MEAN_S)
+    reach = len(kernel) // 2 + 1 + len(_FIT) // 2
     count = int((last - first) / MEAN_S) - 2 * reach
     if count < 1 / MEAN_S:
         raise BadDataset(
@@ -229,16 +224,13 @@ def rows_of(wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: fl
     quaternion[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
     poses = t_p, np.hstack([quaternion, poses[1][:, 9:]])
     parts = [
-        _chunk(
-            (t_w, wrench[1]), poses, first + MEAN_S * np.arange(start * band.step, end * band.step + 2 * reach), band
-        )
-        for start in range(0, count // band.step, _CHUNK)
-        for end in [min(start + _CHUNK, count // band.step)]
-        if start == 0
-        or _has_samples(t_w, first + MEAN_S * start * band.step, first + MEAN_S * (end * band.step + 2 * reach))
+        _chunk((t_w, wrench[1]), poses, first + MEAN_S * np.arange(start * step, end * step + 2 * reach), kernel, step)
+        for start in range(0, count // step, _CHUNK)
+        for end in [min(start + _CHUNK, count // step)]
+        if start == 0 or _has_samples(t_w, first + MEAN_S * start * step, first + MEAN_S * (end * step + 2 * reach))
     ]
     t, y, columns, rates, speed = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return Rows(t, y, Motion.of_columns(columns), Motion.of_columns(rates), speed, delay_s, band.row_s)
+    return Rows(t, y, Motion.of_columns(columns), Motion.of_columns(rates), speed, delay_s, row_s)
 
 
 def _has_samples(t_s: Array, start_s: float, end_s: float) -> bool:
@@ -247,10 +239,12 @@ def _has_samples(t_s: Array, start_s: float, end_s: float) -> bool:
     return bool(after > before)
 
 
-def _chunk(wrench: tuple[Array, Array], poses: tuple[Array, Array], grid: Array, band: Band) -> tuple[Array, ...]:
+def _chunk(
+    wrench: tuple[Array, Array], poses: tuple[Array, Array], grid: Array, kernel: Array, step: int
+) -> tuple[Array, ...]:
     """Return time, wrench, columns of the motion, their rates and the speed, where no gap is near."""
-    rate_kernel = np.convolve(band.kernel, [-0.5 / MEAN_S, 0.0, 0.5 / MEAN_S])  # filters and differentiates
-    kernel, step = np.pad(band.kernel, 1), band.step
+    rate_kernel = np.convolve(kernel, [-0.5 / MEAN_S, 0.0, 0.5 / MEAN_S])  # filters and differentiates
+    kernel = np.pad(kernel, 1)
     (y, whole_w), (pose, whole_p) = _at(grid, *wrench), _at(grid, *poses)
     fits = np.einsum("nkw,wd->dnk", sliding_window_view(pose, len(_FIT), axis=0), _FIT)
     length = np.linalg.norm(fits[0, :, :4], axis=1, keepdims=True)

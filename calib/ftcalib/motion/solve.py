@@ -19,7 +19,7 @@ from ftcalib.likelihood.response import Response
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, rough_delay
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
-from ftcalib.motion.samples import NARROW, WIDE, Means, Rows, rows_of
+from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, rows_of
 from ftcalib.result import CalibrationResult, DriftResult, MotionResult
 
 LEAST_S = 5.0
@@ -101,12 +101,12 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     prior = None if earlier is None else CellPrior(earlier)
     data = wrench.result(), poses.result()
     positions = data[1][1].shape[1] == 12
-    delay_s, band = _coarse_delay(rows_of(*data)), NARROW if guarded else WIDE
-    rows = rows_of(*data, delay_s, band)
-    delay_s += rough_delay(_used(rows, positions), known, g_m_s2)
+    delay_s, row_s = _coarse_delay(rows_of(*data)), NARROW_S if guarded else WIDE_S
+    rows = rows_of(*data, delay_s, row_s)
+    delay_s += rough_delay(_select_rows(rows, positions), known, g_m_s2)
     for _ in range(3):
-        rows = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), band)
-        used = _used(rows, positions)
+        rows = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), row_s)
+        used = _select_rows(rows, positions)
         best = fit(used, known, g_m_s2, prior=prior, point_mass=point_mass or not positions, guarded=guarded)
         delay_s = rows.delay_s + best.load.delay_s
         if abs(best.load.delay_s) < LINEAR_S:
@@ -124,7 +124,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         min(best.kept.sum() * rows.row_s / duration_s, 1.0),
         contacts,
     )
-    quality, judged = _judged(used, best, setup, known, g_m_s2)
+    quality, judged = _judge(used, best, setup, known, g_m_s2)
     mistakes = _mistakes(used, best, quality.findings)
     found = [*quality.findings, *mistakes]
     found += _narrow(used, best, explained=verdict_of(found) == "rejected")
@@ -181,7 +181,7 @@ def _coarse_delay(rows: Rows) -> float:
     return rows.delay_s + best * rows.row_s if left and left[best] < 0.8 * left[0] else rows.delay_s
 
 
-def _used(rows: Rows, positions: bool) -> Rows:
+def _select_rows(rows: Rows, positions: bool) -> Rows:
     """Return the rows that count: without positions the slow ones."""
     if positions:
         return rows
@@ -228,7 +228,7 @@ def _static_wrench(rows: Rows, best: MotionFit, weight_N: float) -> Array:
     return np.asarray(rows.wrench - X[:, 10:] @ linear[10:])
 
 
-def _judged(
+def _judge(
     rows: Rows, best: MotionFit, setup: Setup, known: Known | None, g_m_s2: float
 ) -> tuple[Quality, NDArray[np.intp]]:
     """Judge some kept rows as if they were poses; also return their places.
@@ -284,7 +284,7 @@ def _findings(
     weak = best.prior_share > MEASURED
     weak[:6] &= sigma[INERTIA] > 0
     if positions and weak.any():
-        found.append(Finding.of("motion_slow", names=_named([NAMES[k] for k in np.flatnonzero(weak)])))
+        found.append(Finding.of("motion_slow", names=_list_names([NAMES[k] for k in np.flatnonzero(weak)])))
     return found
 
 
@@ -348,7 +348,7 @@ def _contacts(rows: Rows, best: MotionFit, first_s: float) -> tuple[Mapping[str,
     return tuple(found)
 
 
-def _named(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     axes = [name.partition(".")[2] for name in names if name.startswith("inertia")]
     rest = [name.removesuffix("_m").removesuffix("_s") for name in names if not name.startswith("inertia")]
     return ", ".join(([f"the inertia ({', '.join(axes)})"] if axes else []) + [f"the {name}" for name in rest])

@@ -217,12 +217,12 @@ class _Match:
             return "SROM needs its 24 orientations, and no pose has one of them: use LROM or ML."
         problems = []
         if self.seen < 24:
-            problems.append(f"missing {_listed(np.flatnonzero(self.times_seen == 0))}")
+            problems.append(f"missing {_list(np.flatnonzero(self.times_seen == 0))}")
         if self.times_seen.max() > 1:
-            problems.append(f"repeated {_listed(np.flatnonzero(self.times_seen > 1))}")
+            problems.append(f"repeated {_list(np.flatnonzero(self.times_seen > 1))}")
         strays = np.flatnonzero(self.number < 0)
         if strays.size:
-            problems.append(f"row {_listed(strays)} not among them ({self._worst(strays)})")
+            problems.append(f"row {_list(strays)} not among them ({self._worst(strays)})")
         advice = "Use LROM or ML" if self.seen < 24 else "Use mixed, which takes further poses, LROM or ML"
         return f"SROM needs its 24 orientations once each: {'; '.join(problems)}. {advice} instead."
 
@@ -231,7 +231,7 @@ class _Match:
         near = np.flatnonzero((self.number < 0) & np.isin(self.nearest, missing) & (self.angle_rad < np.deg2rad(10)))
         off = f" ({self._worst(near)})" if near.size else ""
         return (
-            f"mixed needs each of the 24 orientations of SROM at least once: missing {_listed(missing)}{off}. "
+            f"mixed needs each of the 24 orientations of SROM at least once: missing {_list(missing)}{off}. "
             "Record these orientations, or use LROM or ML."
         )
 
@@ -284,7 +284,7 @@ def _common_rotation(R_base_flange: Array, seed: Array) -> Array:
     return np.asarray(equivalents[smallest])
 
 
-def _listed(indices: Indices, most: int = 6) -> str:
+def _list(indices: Indices, most: int = 6) -> str:
     shown = ", ".join(str(i + 1) for i in indices[:most].tolist())
     return shown if len(indices) <= most else f"{shown} and {len(indices) - most} more"
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import fdtrc as f_sf
 
+from ftcalib.after.series import spans_temperature
 from ftcalib.model import Array, angle_between_vectors, skew
 from ftdrive.fleet.cells import BiasChanges, Observed, when
 from ftdrive.fleet.state import CellState, FleetFinding, listed
@@ -232,8 +233,6 @@ SURE_OF_TEMPERATURE: Final = 1e-5
 needed."""
 FEWEST: Final = 8
 """Verifications of a calibration."""
-LEAST_K: Final = 3.0
-"""Between the coldest and the warmest verification of a calibration."""
 _UNITS = ("N", "N·m")
 
 
@@ -263,7 +262,7 @@ def _temperature_findings(observed: Observed) -> Iterator[FleetFinding]:
 def _add(sensors: dict[str, _Sums], serial: str, cell: str, changes: BiasChanges) -> None:
     known = np.isfinite(changes.temperature_C)
     T = changes.temperature_C[known]
-    if len(T) < FEWEST or np.ptp(T) < LEAST_K:
+    if not spans_temperature(T, FEWEST):
         return
     found = sensors.setdefault(serial, _Sums(set(), np.zeros(6), np.zeros(6), np.zeros(6)))
     found.cells.add(cell)

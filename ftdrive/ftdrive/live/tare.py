@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ftcalib.after.state import Calibrated, Update, bias_change, tare
+from ftcalib.after.state import Calibrated, Update, compare_with_prediction, tare
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON
@@ -47,7 +47,7 @@ def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Map
     if not is_still(rows):
         return None, f"tare refused: the arm moves; {again}", {}
     dwell = mean_and_covariance(rows.raw)
-    (change,), (sigmas,) = bias_change(
+    (change,), (sigmas,) = compare_with_prediction(
         current, R, dwell.mean[None], dwell.covariance[None], TARE_DRIFT_N, TARE_DRIFT_NM
     )
     force_N, torque_Nm = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))

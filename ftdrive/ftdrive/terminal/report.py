@@ -10,7 +10,7 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
-from ftcalib.compare import Compared
+from ftcalib.compare import MethodResult
 from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftdrive.runs.pose_hints import hints, moved, names_of
@@ -275,7 +275,7 @@ def _rms(vectors: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
-def print_comparison(compared: Sequence[Compared]) -> None:
+def print_comparison(compared: Sequence[MethodResult]) -> None:
     """Print all methods side by side without cutting a number: a narrow terminal gets no vectors, a pipe long lines."""
     table = _comparison(compared, vectors=True)
     if answer.is_terminal and table.width is not None and table.width > answer.width:
@@ -286,7 +286,7 @@ def print_comparison(compared: Sequence[Compared]) -> None:
             answer.print(hanging(f" {one.method}: ", one.reason, answer))
 
 
-def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], Compared]], heading: str) -> None:
+def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], MethodResult]], heading: str) -> None:
     """Print the columns of Yu's Table III: the largest errors on a test set, and those of weight and centre of mass.
 
     Parameters
@@ -312,7 +312,7 @@ def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], Compa
     answer.print(table, soft_wrap=True)
 
 
-def print_cases(cases: Sequence[tuple[int, str, str, Compared]], *, known: bool) -> None:
+def print_cases(cases: Sequence[tuple[int, str, str, MethodResult]], *, known: bool) -> None:
     """Print Yu's Table III; `known` says that the errors of weight and centre are those from an emulated truth."""
     reference = "the truth of the emulated cell" if known else "ml with all poses but those of D"
     heading = f"Table III of Yu et al. 2021: largest errors on the test set; mg and centre against {reference}:"
@@ -328,7 +328,7 @@ def _to_digits(value: float) -> str:
     return f"{value:.{0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3}f}"
 
 
-def _comparison(compared: Sequence[Compared], *, vectors: bool) -> Table:
+def _comparison(compared: Sequence[MethodResult], *, vectors: bool) -> Table:
     table = Table(box=None, padding=(0, 1))
     for title, shown in (
         *(("method", True), ("mass\nkg", True)),

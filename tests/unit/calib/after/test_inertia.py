@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import Parameters
-from ftcalib.after.inertia import Motion, inertial_wrench, motion_of_poses
+from ftcalib.after.inertia import SensorMotion, inertial_wrench, motion_of_poses
 from ftcalib.model import Array, predict
 
 G = 9.80665
@@ -30,7 +30,7 @@ def multisine(t_s: Array, seed: int, amplitude: float, derivative: int = 0) -> A
     return value
 
 
-def motion(t_s: Array, turn: tuple[float, float, float] = (0.25, 0.25, 0.25), shift_m: float = 0.05) -> Motion:
+def motion(t_s: Array, turn: tuple[float, float, float] = (0.25, 0.25, 0.25), shift_m: float = 0.05) -> SensorMotion:
     """Euler angles about x, y, z of the sensor and positions in base that are multi-sines."""
 
     def R_base_sensor(t_s: Array) -> Array:
@@ -53,7 +53,7 @@ def motion(t_s: Array, turn: tuple[float, float, float] = (0.25, 0.25, 0.25), sh
     h = 1e-5
     R = R_base_sensor(t_s)
     acceleration_base = np.stack([multisine(t_s, 10 + k, shift_m, 2) for k in range(3)], axis=1)
-    return Motion(
+    return SensorMotion(
         t_s,
         R @ PARAMETERS.R_flange_sensor.T,
         omega(t_s),
@@ -62,7 +62,7 @@ def motion(t_s: Array, turn: tuple[float, float, float] = (0.25, 0.25, 0.25), sh
     )
 
 
-def reading(at: Motion) -> Array:
+def reading(at: SensorMotion) -> Array:
     """Newton and Euler for a rigid body, about its centre of mass, with weight and bias."""
     gravity = (PARAMETERS.gravity_force_base_N / MASS_KG) @ (at.R_base_flange @ PARAMETERS.R_flange_sensor)
     omega, alpha = at.angular_velocity_rad_s, at.angular_acceleration_rad_s2

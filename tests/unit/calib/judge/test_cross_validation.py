@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from ftcalib.judge.cross_validation import Judged, drift_ahead, standardized
+from ftcalib.judge.cross_validation import Judged, drift_ahead, standardize
 from ftcalib.likelihood.fit import DriftEstimate
 from ftcalib.model import Array
 
@@ -19,7 +19,7 @@ def test_a_covariance_that_rounding_made_indefinite_still_scales_residuals() -> 
     exact = np.linalg.solve(covariance, e[..., None])[..., 0]
     value, vector = np.linalg.eigh(covariance[1])
     covariance[1] = vector @ np.diag([-1e-18, *value[1:]]) @ vector.T
-    z = standardized(e, covariance)
+    z = standardize(e, covariance)
     assert np.isfinite(z).all()
     np.testing.assert_allclose(np.sum(z**2, axis=1)[[0, 2]], np.sum(e * exact, axis=1)[[0, 2]])
 

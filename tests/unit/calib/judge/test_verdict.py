@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Parameters, Setup, solve
 from ftcalib.data.dataset import read_csv
-from ftcalib.judge.cross_validation import DriftAhead, Judged, standardized
+from ftcalib.judge.cross_validation import DriftAhead, Judged, standardize
 from ftcalib.judge.faults import faults
 from ftcalib.judge.verdict import (
     Quality,
@@ -151,7 +151,7 @@ def test_poses_that_were_not_used_are_predicted_like_new_ones() -> None:
     for _ in range(50):
         f = fit(R24, noisy(rng, R24), white(24), weights=weights)
         np.testing.assert_allclose(f.left_out_residuals[:8], f.residuals[:8], atol=1e-12)
-        squares.append(standardized(f.left_out_residuals, f.left_out_cov)[:8] ** 2)
+        squares.append(standardize(f.left_out_residuals, f.left_out_cov)[:8] ** 2)
     assert np.mean(squares) == pytest.approx(1, abs=0.1)
 
 
@@ -255,7 +255,7 @@ def test_readings_of_a_free_tool_scatter_by_noise_and_calibration(n: int, alone:
             (noise_only, residual, noise),
             (seen, residual + push, total),
         ):
-            found_by.append((standardized(e, cov) ** 2).sum(axis=1) > chi2.isf(0.01, 6))
+            found_by.append((standardize(e, cov) ** 2).sum(axis=1) > chi2.isf(0.01, 6))
     assert 0.007 < np.mean(alarms) < 0.014
     assert np.mean(noise_only) > alone
     assert np.mean(seen) > 0.95

@@ -49,7 +49,7 @@ def angle(R: Array, other: Array) -> float:
     return float(np.linalg.norm(Rotation.from_matrix(R.T @ other).as_rotvec()))
 
 
-def nearest(found: list[rotation_minima.Minimum], R: Array) -> float:
+def nearest(found: list[rotation_minima.RotationMinimum], R: Array) -> float:
     return min(angle(minimum.R, R) for minimum in found)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from ftcalib.likelihood.explanation import _pruned, rivals, select, with_slopes_instead
+from ftcalib.likelihood.explanation import _prune, rivals, select, with_slopes_instead
 from ftcalib.likelihood.session_noise import Noise, centred, walk_times
 from ftcalib.likelihood.variance_components import (
     FORCE,
@@ -211,15 +211,15 @@ def test_what_others_make_needless_is_dropped(walk_first: bool) -> None:
     ):
         p = problem(rng, 40, really, np.full(len(really), 0.3))
         at = maximise(p, both, np.full(2, 0.1))
-        assert _pruned(p, at, needed).components == kept
+        assert _prune(p, at, needed).components == kept
 
 
 def test_what_is_always_needed_is_not_dropped() -> None:
     three = (component("walk", FORCE), *ALL[:2])
     p = problem(np.random.default_rng(8), 40, ALL[:2], np.full(2, 0.3))
     at = maximise(p, three, np.full(3, 0.1))
-    assert _pruned(p, at, 1).components == three
-    assert _pruned(p, at, 0).components == ALL[:2]
+    assert _prune(p, at, 1).components == three
+    assert _prune(p, at, 0).components == ALL[:2]
 
 
 def test_a_component_that_brings_little_is_not_dropped_with_one_that_brings_nothing() -> None:
@@ -228,7 +228,7 @@ def test_a_component_that_brings_little_is_not_dropped_with_one_that_brings_noth
     alone = maximise(p, (ROTATION,), small)
     assert 2 < alone.loglik - point(p, (), np.zeros(0)).loglik < 4  # enough for itself, not for two
     both = point(p, (ROTATION, ALL[1]), np.append(alone.theta, 1e-12))
-    assert _pruned(p, both, 0).components == (ROTATION,)
+    assert _prune(p, both, 0).components == (ROTATION,)
 
 
 def test_a_turn_of_the_flange_is_distinguished_from_white_noise() -> None:

@@ -23,7 +23,7 @@ from ftcalib.motion.estimate import (
     fit,
     rough_delay,
 )
-from ftcalib.motion.model import CROSS_TALK, DELAY, GAINS, HEIGHT, INERTIA, SIZE, Load, Noise, jacobian, wrench_of
+from ftcalib.motion.model import CROSS_TALK, DELAY, GAINS, HEIGHT, INERTIA, SIZE, Load, RowNoise, jacobian, wrench_of
 from ftcalib.motion.samples import Motion, Rows
 from tests.moving_load import Truth
 from tests.unit.calib.motion.test_motion import load_of
@@ -56,7 +56,7 @@ def all_kept(rows: Rows) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     return np.ones(len(rows), np.bool_)
 
 
-WHITE = Noise(SIGMA[None], np.ones((1, 6, 1)), np.eye(6))
+WHITE = RowNoise(SIGMA[None], np.ones((1, 6, 1)), np.eye(6))
 
 
 class Dense:
@@ -168,7 +168,7 @@ def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[_Problem, Load,
     kept[990:995] = False
     filters = np.zeros((2, 6, 2))
     filters[0, :, 0], filters[1] = 1.0, [1.25, -0.75]
-    noise = Noise(SIGMA[None] * np.array([[1.0], [3.0]]), filters, np.eye(6))
+    noise = RowNoise(SIGMA[None] * np.array([[1.0], [3.0]]), filters, np.eye(6))
     state = np.arange(1010, dtype=np.intp) % 2
     H, b, chi2 = wide.sums(load, drift, noise, kept, state)
     unit = (rows.wrench - wide.predicted(load, rows)) / noise.scale[state]

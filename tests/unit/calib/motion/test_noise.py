@@ -7,7 +7,7 @@ from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
 from ftcalib.model import Array
-from ftcalib.motion.model import FEWEST, ORDER, Noise, _filters, _of_equal_order, runs, states
+from ftcalib.motion.model import FEWEST, ORDER, RowNoise, _filters, _of_equal_order, runs, states
 
 REST, SLOW, QUICK = np.zeros(100), np.linspace(0.1, 0.5, 150), np.linspace(0.6, 2.0, 150)
 
@@ -102,7 +102,7 @@ def noisy(n: int = 1200) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
 
 def test_rows_become_independent_and_of_unit_variance() -> None:
     r, state, place = noisy()
-    noise = Noise.of(r, np.zeros((len(r), 6, 0)), state, place)
+    noise = RowNoise.of(r, np.zeros((len(r), 6, 0)), state, place)
     white = noise.whitened(r[:, :, None], state, place)[:, :, 0]
     np.testing.assert_allclose(white.T @ white / len(r), np.eye(6), atol=1e-8)
     assert np.abs(white[1:].T @ white[:-1] / len(r)).max() < 0.15
@@ -116,7 +116,7 @@ def test_rows_become_independent_and_of_unit_variance() -> None:
 
 def test_a_row_is_predicted_from_those_before_it_in_its_run() -> None:
     r, state, place = noisy()
-    noise = Noise.of(r, np.zeros((len(r), 6, 0)), state, place)
+    noise = RowNoise.of(r, np.zeros((len(r), 6, 0)), state, place)
     X = np.stack([r, 2 * r], axis=2)
     white = noise.whitened(X, state, place)
     order = len(noise.filters) - 1
@@ -132,7 +132,7 @@ def test_what_a_fit_has_taken_from_the_residuals_counts() -> None:
     """A root of the covariance of the prediction acts as so many more samples of each row."""
     r, state, place = noisy()
     taken = np.stack([0.5 * r, 0.2 * r], axis=2)
-    plain, noise = (Noise.of(r, some, state, place) for some in (np.zeros((len(r), 6, 0)), taken))
+    plain, noise = (RowNoise.of(r, some, state, place) for some in (np.zeros((len(r), 6, 0)), taken))
     np.testing.assert_allclose(noise.scale, np.sqrt(1 + 0.5**2 + 0.2**2) * plain.scale)
     white = noise.whitened(r[:, :, None], state, place)[:, :, 0]
     np.testing.assert_allclose(white.T @ white / len(r), np.eye(6) / (1 + 0.5**2 + 0.2**2), atol=1e-8)
@@ -141,5 +141,5 @@ def test_what_a_fit_has_taken_from_the_residuals_counts() -> None:
 @pytest.mark.parametrize("n", [40, 60])
 def test_few_rows_are_enough(n: int) -> None:
     r = np.random.default_rng(5).normal(size=(n, 6))
-    noise = Noise.of(r, np.zeros((n, 6, 0)), np.zeros(n, np.intp), np.arange(n))
+    noise = RowNoise.of(r, np.zeros((n, 6, 0)), np.zeros(n, np.intp), np.arange(n))
     assert np.isfinite(noise.whitened(r[:, :, None], np.zeros(n, np.intp), np.arange(n))).all()

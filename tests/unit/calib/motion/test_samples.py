@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array, skew
 from ftcalib.motion import samples
-from ftcalib.motion.samples import MEAN_S, NARROW, WIDE, Band, Means, rows_of
+from ftcalib.motion.samples import MEAN_S, NARROW_S, WIDE_S, Means, row_filter, rows_of
 
 AXIS = np.array([0.36, 0.48, 0.8])
 TURN_RAD, TURN_HZ, SWING_HZ = 3.5, 0.05, np.array([0.11, 0.07, 0.09])
@@ -48,41 +48,41 @@ def streams(seconds: float, delay_s: float = 0.0) -> tuple[tuple[Array, Array], 
     return (t, np.hstack([motion, derivative(columns, happened)])), (t, np.hstack([R, place(t)]))
 
 
-def reach_s(band: Band) -> float:
+def reach_s(row_s: float) -> float:
     """From the ends of the streams to the first and last row: the filter, its derivative, and that of the poses."""
-    return MEAN_S * (len(band.kernel) // 2 + 1 + 5)
+    return MEAN_S * (len(row_filter(row_s)) // 2 + 1 + 5)
 
 
-def around(band: Band) -> Array:
+def around(row_s: float) -> Array:
     """Times of the means that a row sees."""
-    half = len(band.kernel) // 2 + 1
+    half = len(row_filter(row_s)) // 2 + 1
     return np.asarray(MEAN_S * np.arange(-half, half + 1))
 
 
-def mean_speed(t: Array, band: Band, swing_rad_s: Array | float) -> Array:
-    times = (t[:, None] + around(band)).ravel()
+def mean_speed(t: Array, row_s: float, swing_rad_s: Array | float) -> Array:
+    times = (t[:, None] + around(row_s)).ravel()
     return np.asarray((np.abs(derivative(angle, times)) + swing_rad_s).reshape(len(t), -1).mean(axis=1))
 
 
-@pytest.mark.parametrize(("band", "seconds", "delay_s"), [(NARROW, 20.0, 0.0), (WIDE, 75.5, 0.03)])
-def test_motion_and_wrench_are_differentiated_and_filtered_alike(band: Band, seconds: float, delay_s: float) -> None:
+@pytest.mark.parametrize(("row_s", "seconds", "delay_s"), [(NARROW_S, 20.0, 0.0), (WIDE_S, 75.5, 0.03)])
+def test_motion_and_wrench_are_differentiated_and_filtered_alike(row_s: float, seconds: float, delay_s: float) -> None:
     wrench, poses = streams(seconds, delay_s)  # of 75 s are more rows than are filtered at once
-    rows = rows_of(wrench, poses, delay_s, band)
-    assert len(rows) == int((seconds - MEAN_S - delay_s - 2 * reach_s(band)) / band.row_s)
-    np.testing.assert_allclose(np.diff(rows.t_s), band.row_s)
+    rows = rows_of(wrench, poses, delay_s, row_s)
+    assert len(rows) == int((seconds - MEAN_S - delay_s - 2 * reach_s(row_s)) / row_s)
+    np.testing.assert_allclose(np.diff(rows.t_s), row_s)
     np.testing.assert_allclose(rows.t_s / MEAN_S, np.round(rows.t_s / MEAN_S), atol=1e-6)
-    assert (rows.row_s, rows.delay_s) == (band.row_s, delay_s)
+    assert (rows.row_s, rows.delay_s) == (row_s, delay_s)
     np.testing.assert_allclose(rows.motion.columns(), rows.wrench[:, :21], atol=1e-6)
     np.testing.assert_allclose(rows.rate.columns(), rows.wrench[:, 21:], atol=5e-5)
     happened = rows.t_s - delay_s
     np.testing.assert_allclose(rows.wrench[:, :9], columns(happened)[:, :9], atol=5e-4)  # no phase
-    swing = np.linalg.norm(derivative(place, (happened[:, None] + around(band)).ravel()), axis=1)
-    np.testing.assert_allclose(rows.speed_rad_s, mean_speed(happened, band, swing / 0.5), atol=1e-4)
+    swing = np.linalg.norm(derivative(place, (happened[:, None] + around(row_s)).ravel()), axis=1)
+    np.testing.assert_allclose(rows.speed_rad_s, mean_speed(happened, row_s, swing / 0.5), atol=1e-4)
 
 
 def test_a_band_passes_motion_and_stops_vibration() -> None:
-    for band, passed_Hz, stopped_Hz in ((WIDE, 1.0, 8.5), (NARROW, 0.43, 3.7)):
-        kernel = band.kernel
+    for row_s, passed_Hz, stopped_Hz in ((WIDE_S, 1.0, 8.5), (NARROW_S, 0.43, 3.7)):
+        kernel = row_filter(row_s)
         half = len(kernel) // 2
         assert kernel.sum() == pytest.approx(1)
         np.testing.assert_allclose(kernel, kernel[::-1])
@@ -91,14 +91,15 @@ def test_a_band_passes_motion_and_stops_vibration() -> None:
             return float(kernel @ np.cos(2 * np.pi * hz * MEAN_S * np.arange(-half, half + 1)))
 
         assert left(passed_Hz) == pytest.approx(1, abs=2e-3)
-        assert left(0.56 / band.row_s) == pytest.approx(0.5, abs=5e-3)
+        assert left(0.56 / row_s) == pytest.approx(0.5, abs=5e-3)
         assert abs(left(stopped_Hz)) < 2e-3
-        assert abs(kernel[band.step :] @ kernel[: -band.step]) < 0.05 * (kernel @ kernel)  # white noise stays white
+        step = round(row_s / MEAN_S)
+        assert abs(kernel[step:] @ kernel[:-step]) < 0.05 * (kernel @ kernel)  # white noise stays white
 
 
 def test_rows_near_a_gap_are_left_out() -> None:
     (t, values), poses = streams(12.0)
-    reach = around(WIDE)[-1]
+    reach = around(WIDE_S)[-1]
     whole = rows_of((t, values), poses).t_s
     for gap, missing in ((0.05, False), (0.08, True)):
         beside = (t < 6.0) | (t >= 6.0 + gap - MEAN_S / 2)
@@ -111,9 +112,9 @@ def test_rows_near_a_gap_are_left_out() -> None:
                 np.testing.assert_allclose(some.motion.columns(), some.wrench[:, :21], atol=1e-3)
                 continue
             before, after = some.t_s[some.t_s < 6.0].max(), some.t_s[some.t_s > 6.0].min()
-            assert len(whole) - len(some) == round((after - before) / WIDE.row_s) - 1
-            assert 0 <= 6.0 - MEAN_S - before - reach < WIDE.row_s + MEAN_S / 2
-            assert 0 <= after - 6.0 - gap - reach < WIDE.row_s + MEAN_S / 2
+            assert len(whole) - len(some) == round((after - before) / WIDE_S) - 1
+            assert 0 <= 6.0 - MEAN_S - before - reach < WIDE_S + MEAN_S / 2
+            assert 0 <= after - 6.0 - gap - reach < WIDE_S + MEAN_S / 2
 
 
 def test_a_gap_of_hours_costs_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,8 +140,8 @@ def test_a_slow_stream_has_longer_gaps() -> None:
 def test_the_ends_that_both_streams_have_count() -> None:
     (t, values), (t_pose, poses) = streams(12.0)
     rows = rows_of((t[150:], values[150:]), (t_pose[:1000], poses[:1000]), 0.02)
-    assert rows.t_s[0] == pytest.approx(1.5 + reach_s(WIDE))
-    assert 0 <= 9.99 + 0.02 - reach_s(WIDE) - rows.t_s[-1] < WIDE.row_s + 3 * MEAN_S
+    assert rows.t_s[0] == pytest.approx(1.5 + reach_s(WIDE_S))
+    assert 0 <= 9.99 + 0.02 - reach_s(WIDE_S) - rows.t_s[-1] < WIDE_S + 3 * MEAN_S
     few = rows_of((t[:195], values[:195]), (t_pose, poses))
     assert len(few) == 8
     with pytest.raises(BadDataset, match=r"have 1\.9 s in common"):
@@ -152,7 +153,7 @@ def test_without_positions_the_acceleration_is_unknown() -> None:
     with_positions, without = (rows_of(wrench, (t, some)) for some in (poses, poses[:, :9]))
     assert not without.motion.acceleration_m_s2.any()
     np.testing.assert_array_equal(without.motion.R_base_flange, with_positions.motion.R_base_flange)
-    np.testing.assert_allclose(without.speed_rad_s, mean_speed(without.t_s, WIDE, 0.0), atol=1e-4)
+    np.testing.assert_allclose(without.speed_rad_s, mean_speed(without.t_s, WIDE_S, 0.0), atol=1e-4)
 
 
 def test_means_weigh_samples_by_their_distance() -> None:

@@ -21,7 +21,7 @@ from ftcalib.motion.solve import (
     _mistakes,
     _narrow,
     _require_determined,
-    _used,
+    _select_rows,
 )
 from ftcalib.result import MotionResult
 from tests.moving_load import Truth
@@ -58,10 +58,10 @@ def test_a_delay_that_explains_little_more_is_none() -> None:
 def test_without_positions_slow_rows_count() -> None:
     rows = rows_of(100, TRUTH)
     rows = replace(rows, speed_rad_s=np.where(np.arange(100) < 42, 0.14, 0.16))
-    assert _used(rows, True) is rows
-    assert len(_used(rows, False)) == 42
+    assert _select_rows(rows, True) is rows
+    assert len(_select_rows(rows, False)) == 42
     with pytest.raises(BadDataset, match=r"these are 4\.9 s long"):
-        _used(rows[1:], False)
+        _select_rows(rows[1:], False)
 
 
 def best_of(**values: Any) -> Any:

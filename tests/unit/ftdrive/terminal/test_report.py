@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Known, Parameters, Setup, solve
-from ftcalib.compare import Compared, compare
+from ftcalib.compare import MethodResult, compare
 from ftcalib.errors import NotObservable
 from ftcalib.model import predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
@@ -262,18 +262,18 @@ def test_what_was_taken_as_known_is_called_fixed(
     assert not any(" 0.0000000" in line for line in lines)
 
 
-def shown(compared: list[Compared], capsys: pytest.CaptureFixture[str]) -> list[str]:
+def shown(compared: list[MethodResult], capsys: pytest.CaptureFixture[str]) -> list[str]:
     print_comparison(compared)
     return capsys.readouterr().out.splitlines()
 
 
 @pytest.fixture(scope="module")
-def compared() -> list[Compared]:
+def compared() -> list[MethodResult]:
     return compare(tilted(), known=Known(mass_kg=0.5))
 
 
 def test_a_pipe_gets_every_number_of_every_method_on_a_line(
-    compared: list[Compared], capsys: pytest.CaptureFixture[str]
+    compared: list[MethodResult], capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = shown(compared, capsys)
     assert "…" not in "".join(lines)
@@ -288,7 +288,7 @@ def test_a_pipe_gets_every_number_of_every_method_on_a_line(
 def test_a_narrow_terminal_gets_no_vectors_and_nothing_is_cut(
     width: int,
     vectors: bool,
-    compared: list[Compared],
+    compared: list[MethodResult],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -303,7 +303,7 @@ def test_a_narrow_terminal_gets_no_vectors_and_nothing_is_cut(
 
 
 def test_the_columns_of_table_iii_fit_80_columns_with_three_digits(
-    compared: list[Compared], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    compared: list[MethodResult], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     terminal(monkeypatch, 80)
     errors = np.array([1.591, 0.1235, 0.0171, 1.854, 0.0084, 0.1051, 0.00044, 0.1092])
