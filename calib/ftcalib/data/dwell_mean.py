@@ -56,7 +56,7 @@ def mean_and_covariance(wrench: Array) -> PoseMean:
     BadDataset
         Too few samples, or a value that is not finite.
     """
-    wrench = require_samples(wrench)
+    wrench = _require_samples(wrench)
     N = len(wrench)
     mean = wrench.mean(axis=0)
     noise = wrench - mean
@@ -64,7 +64,7 @@ def mean_and_covariance(wrench: Array) -> PoseMean:
     S = noise.T @ noise / (N - 1)
     std = np.sqrt(np.diag(S))
     tau = _autocorrelation_time(noise)
-    variance = tau * std**2 / N + quantisation_variance(wrench, std)
+    variance = tau * std**2 / N + _quantisation_variance(wrench, std)
     for kind in (slice(0, 3), slice(3, 6)):  # a channel without noise gets the variance of its noisiest neighbour
         silent = variance[kind] == 0
         variance[kind][silent] = variance[kind].max() or RESOLUTION[kind][silent] ** 2
@@ -93,7 +93,7 @@ def is_stationary(wrench: Array) -> bool:
     BadDataset
         Too few samples, or a value that is not finite.
     """
-    wrench = require_samples(wrench)
+    wrench = _require_samples(wrench)
     size = len(wrench) // 20
     batches = wrench[: 20 * size].reshape(2, 10, size, 6).mean(axis=2)
     difference = np.abs(np.diff(batches.mean(axis=1), axis=0)[0])
@@ -117,7 +117,7 @@ def noise_level(wrench: Array, window: int) -> Array:
     BadDataset
         Too few samples, or a value that is not finite.
     """
-    wrench = require_samples(wrench)
+    wrench = _require_samples(wrench)
     if not LEAST_SAMPLES <= window <= len(wrench):
         raise BadDataset(f"a window of {window} samples does not fit a record of {len(wrench)}: choose 20 or more.")
     windows = wrench[: len(wrench) // window * window].reshape(-1, window, 6)
@@ -148,12 +148,12 @@ def is_quiet(wrench: Array, level: Array) -> bool:
 
 def restless_channels(wrench: Array, level: Array) -> NDArray[np.bool_]:
     """Find the channels (6,) of a dwell that scatter more than twice as much as the untouched sensor."""
-    wrench = require_samples(wrench)
+    wrench = _require_samples(wrench)
     flicker = _step(wrench) / 2  # between two neighbouring values, normal for a sensor with coarse steps
     return np.asarray(wrench.std(axis=0, ddof=1) > RESTLESS * level + flicker + ROUNDING * np.abs(wrench).max(axis=0))
 
 
-def require_samples(wrench: Array) -> Array:
+def _require_samples(wrench: Array) -> Array:
     """Check (N, 6) samples: N >= 20 and all finite. Raises `BadDataset`."""
     wrench = np.asarray(wrench, dtype=np.float64)
     if wrench.ndim != 2 or wrench.shape[1] != 6 or len(wrench) < LEAST_SAMPLES:
@@ -179,7 +179,7 @@ def _autocorrelation_time(noise: Array) -> Array:
     return np.maximum(tau, 0.1)
 
 
-def quantisation_variance(wrench: Array, std: Array) -> Array:
+def _quantisation_variance(wrench: Array, std: Array) -> Array:
     """Variance (6,) of the rounding error in a mean: q²/12 without noise, zero with enough noise.
 
     Gaussian noise of sigma dithers the error away by exp(-4 pi² sigma² / q²) (Widrow, Kollar, Quantization Noise,
@@ -256,7 +256,7 @@ def allan_deviation(wrench: Array, lengths: Array | list[int]) -> Array:
     ----------
     Riley, Handbook of Frequency Stability Analysis, NIST SP 1065 (2008), eq. 11.
     """
-    wrench = require_samples(wrench)
+    wrench = _require_samples(wrench)
     N = len(wrench)
     for m in lengths:
         if not 1 <= m <= N // 2:
@@ -297,7 +297,7 @@ def averaging_time(wrench: Array, rate_Hz: float, *, target_force_N: float, targ
     """
     if not (target_force_N > 0 and target_torque_Nm > 0):
         raise ValueError(f"targets are {target_force_N} N and {target_torque_Nm} N·m: choose positive values.")
-    wrench = require_samples(wrench)
+    wrench = _require_samples(wrench)
     if not rate_Hz > 0 or len(wrench) / rate_Hz < (1 - 1e-3) * AVERAGES_IN_RECORD * SHORTEST_S:
         raise BadDataset(
             f"a record of {len(wrench)} samples at {rate_Hz:g} Hz is too short for choosing an averaging time: "
@@ -308,7 +308,7 @@ def averaging_time(wrench: Array, rate_Hz: float, *, target_force_N: float, targ
     longest_s = min(LONGEST_S, len(wrench) / rate_Hz / AVERAGES_IN_RECORD)
     times_s = np.arange(round(SHORTEST_S / STEP_S), int(longest_s / STEP_S + 1e-2) + 1) * STEP_S
     lengths = np.maximum(1, np.round(times_s * rate_Hz / size).astype(int))
-    rounding = quantisation_variance(wrench, wrench.std(axis=0, ddof=1))
+    rounding = _quantisation_variance(wrench, wrench.std(axis=0, ddof=1))
     sigma = np.sqrt(allan_deviation(blocks, lengths) ** 2 + rounding)
     target = np.repeat([target_force_N, target_torque_Nm], 3)
     excess = (sigma / target).max(axis=1)

@@ -65,17 +65,17 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup) -> list[
     if setup.up_in_base is None:
         if lean.is_other_mounting:
             code = "mounting_undeclared" if lean.deg > HANGING_DEG else "gravity_tilted"
-            values = {"orders": other_orders(along, setup.up)} if code == "mounting_undeclared" else {}
+            values = {"orders": _other_orders(along, setup.up)} if code == "mounting_undeclared" else {}
             found.append(Finding.of(code, off_deg=lean.deg, direction=along, **values))
     elif lean.is_other_mounting:
-        orders = other_orders(along, setup.up)
+        orders = _other_orders(along, setup.up)
         found.append(Finding.of("gravity_off_mounting", off_deg=lean.deg, direction=along, orders=orders))
     elif lean.is_significant:
         found.append(Finding.of("base_leans", lean_deg=lean.deg, sigma_deg=lean.sigma_deg, side=lean.side))
     return found
 
 
-def other_orders(gravity_direction_base: Array, up: Array) -> list[str]:
+def _other_orders(gravity_direction_base: Array, up: Array) -> list[str]:
     """Return the orders of quaternions with which gravity points down, had they been read inverted and in another.
 
     Such orientations are `U R V` of the true ones with fixed rotations U and V, so they fit as well.

@@ -77,7 +77,7 @@ def select(
     best = _prune(problem, maximise(problem, components, theta), needed)
     waiting = [c for c in candidates if c not in best.components]
     while waiting:
-        gains, start = predicted_gains(problem, best, waiting)
+        gains, start = _predicted_gains(problem, best, waiting)
         k = int(np.argmax(gains))
         if gains[k] < WORTH_A_TRY:
             break
@@ -94,7 +94,7 @@ def select(
     return best if len(best.components) - needed <= 1 else _prune(problem, best, needed)
 
 
-def with_response_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
+def _with_response_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
     """Try gain and cross-talk together in place of white noise as large as a small gain.
 
     A mounting that fits the torques alone makes the forces look noisy, and the gain that would explain them useless.
@@ -181,7 +181,7 @@ def _prune(problem: Linearised, best: Point, needed: int) -> Point:
     return best
 
 
-def predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
+def _predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
     """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
     start = units(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * start])
@@ -324,7 +324,7 @@ def _is_quiet(session: Session, best: Minimum) -> bool:
     at = maximise(problem, (), np.zeros(0))
     if _stand_out(session, squared_length(*at.left_out())):
         return False
-    return not candidates or bool(predicted_gains(problem, at, candidates)[0].max() < WORTH_A_TRY)
+    return not candidates or bool(_predicted_gains(problem, at, candidates)[0].max() < WORTH_A_TRY)
 
 
 def _explanations(session: Session, minima: list[Minimum], weights: Array) -> list[Explanation]:
@@ -356,7 +356,7 @@ def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
     best = Explanation(p, kept)
     for _ in range(ROUNDS):
         chosen = set(at.components)
-        at = with_response_instead(problem, at, candidates, len(always))
+        at = _with_response_instead(problem, at, candidates, len(always))
         if session.drift == "auto":
             at = with_walks_instead(problem, at, candidates, len(always))
             at = with_slopes_instead(problem, at, len(always))

@@ -229,7 +229,7 @@ def point(problem: Linearised, components: Sequence[Component], theta: Array, ne
         else:
             effects.append((columns, value))
     if near is None or near.problem is not problem or near.of_poses != of_poses:
-        own = own_noise_of(problem, of_poses)
+        own = _own_noise_of(problem, of_poses)
         WX = own.solve(problem.X)
         G = summed_products(problem.X, WX)
     else:
@@ -244,13 +244,13 @@ def point(problem: Linearised, components: Sequence[Component], theta: Array, ne
         H[own_rows, own_rows] += 1 / value
         logdet += len(columns) * float(np.log(value))
         at += len(columns)
-    C, logdet_H = inverse_and_logdet(H)
+    C, logdet_H = _inverse_and_logdet(H)
     x = C @ g
     loglik = -0.5 * (logdet + logdet_H + float(G[-1, -1] - g @ x))
     return Point(problem, tuple(components), theta, of_poses, own, WX, G, unknown, C, x, loglik)
 
 
-def inverse_and_logdet(H: Array) -> tuple[Array, float]:
+def _inverse_and_logdet(H: Array) -> tuple[Array, float]:
     """Invert an information matrix; what it leaves open gets a large variance."""
     scale = column_scale(H)
     scaled = H / np.outer(scale, scale)
@@ -264,7 +264,7 @@ def inverse_and_logdet(H: Array) -> tuple[Array, float]:
     return np.asarray(root @ root.T), float(np.log(value).sum() + 2 * np.log(scale).sum())
 
 
-def own_noise_of(problem: Linearised, of_poses: Sequence[tuple[Component, float]]) -> Noise:
+def _own_noise_of(problem: Linearised, of_poses: Sequence[tuple[Component, float]]) -> Noise:
     """Give the covariance with these variances, of what acts on each pose by itself and of walks."""
     D, walk, white = problem.D, np.zeros(6), np.zeros(6)
     for c, value in of_poses:
@@ -282,7 +282,7 @@ def own_noise_of(problem: Linearised, of_poses: Sequence[tuple[Component, float]
 def noise_of(problem: Linearised, components: Sequence[Component], theta: Array) -> Noise:
     """Give the whole covariance with these variances."""
     pairs = list(zip(components, theta, strict=True))
-    own = own_noise_of(problem, [pair for pair in pairs if problem.columns(pair[0]) is None])
+    own = _own_noise_of(problem, [pair for pair in pairs if problem.columns(pair[0]) is None])
     found = [(columns, value) for c, value in pairs if (columns := problem.columns(c)) is not None]
     if problem.slope:
         m = problem.J.shape[2]
