@@ -5,7 +5,8 @@ The names are imported at their first use, so that `import ftcalib.errors` needs
 
 from importlib import import_module
 
-TYPE_CHECKING = False  # type checkers take it for that of `typing`
+# Type checkers take it for that of `typing`.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ftcalib.data.dataset import CalibrationDataset, read_csv
     from ftcalib.data.dwell_mean import PoseMean, is_stationary, mean_and_covariance

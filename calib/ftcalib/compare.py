@@ -19,8 +19,8 @@ from ftcalib.published.methods import CARLSON, PUBLISHED, published
 from ftcalib.result import CalibrationResult, Method
 from ftcalib.solver import estimator_of, solve
 
+# Largest number of folds: more poses are left out in groups.
 _MOST_FOLDS = 50
-"""Largest number of folds: more poses are left out in groups."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -140,12 +140,12 @@ def compare(  # noqa: PLR0913 - one for each thing that may be known
 
 
 _ALL = "A+B+C+E+F+G"  # but D, on which they are tested; H is inside E
+# Yu, Table III: number, method, sets of the estimate, set of the test (`ftcalib.poses.selection`).
 CASES: tuple[tuple[int, Method, str, str], ...] = (
     *((1, "srom", "A", "D"), (2, "lrom", "A", "D"), (3, "lrom", "B", "D"), (4, "lrom", "B+C", "D")),
     *((5, "lrom", "H", "D"), (6, "lrom", "E", "D"), (7, "lrom", "E+F", "D"), (8, "mixed", "A+E", "D")),
     *((9, "lrom", "A+E", "D"), (10, "lrom", _ALL, "D"), (11, "lrom", "E", "G")),
 )
-"""Yu, Table III: number, method, sets of the estimate, set of the test (`ftcalib.poses.selection`)."""
 
 
 def table_iii(

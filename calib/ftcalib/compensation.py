@@ -18,8 +18,8 @@ from ftcalib.model import Parameters, Rotations, matrices_of, skew
 Reals = NDArray[np.floating[Any]]
 
 
+# Rows per matrix product: small enough that input and output stay in the cache.
 CHUNK_ROWS = 8192
-"""Rows per matrix product: small enough that input and output stay in the cache."""
 
 
 class Compensator:

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeAlias
 
+# What `json` can write: numbers, strings, None, and lists and dicts of them.
 JSON: TypeAlias = Any
-"""What `json` can write: numbers, strings, None, and lists and dicts of them."""
+# Of a text that is read whole: 200,000 poses with their covariances.
 MOST_BYTES: Final = 200_000_000
-"""Of a text that is read whole: 200,000 poses with their covariances."""
 
 
 def write_new(path: str | Path, content: str | bytes) -> None:

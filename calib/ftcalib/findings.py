@@ -15,14 +15,14 @@ from typing import Any, Final, Literal, Self
 
 from ftcalib.rounding import decimals
 
+# Of a finding: the result is rejected, usable at best, or not worse for it.
 Severity = Literal["reject", "limit", "note"]
-"""Of a finding: the result is rejected, usable at best, or not worse for it."""
 Verdict = Literal["good", "usable", "rejected"]
 
+# The worst first.
 _VERDICTS: Final[Mapping[Severity, Verdict]] = {"reject": "rejected", "limit": "usable", "note": "good"}
-"""The worst first."""
+# Of a value in a template, with its form.
 _PLACE: Final = re.compile(r"\{(\w+)(?::([^}]*))?\}")
-"""Of a value in a template, with its form."""
 _UNITS: Final = {
     "N": " N", "Nm": " N·m", "mNm": " mN·m", "kg": " kg", "m": " m", "s": " s", "mm": " mm", "deg": "°",
     "percent": " %",

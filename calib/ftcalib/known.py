@@ -230,5 +230,5 @@ class Setup:
         return np.asarray(up / np.linalg.norm(up))
 
 
+# Nothing is described.
 NOTHING: Final = Setup()
-"""Nothing is described."""

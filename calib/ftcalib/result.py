@@ -24,11 +24,11 @@ from ftcalib.published.yu import weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
 
+# Sigma of the gain common to all axes, where no gain was found: no orientation shows it, and no sensor is better.
 LEAST_COMMON_GAIN = 0.002
-"""Sigma of the gain common to all axes, where no gain was found: no orientation shows it, and no sensor is better."""
 
+# Eigenvalues of a correlation matrix below this are no rounding.
 INDEFINITE = -1e-6
-"""Eigenvalues of a correlation matrix below this are no rounding."""
 
 Method = Literal[
     "ml",

@@ -4,8 +4,8 @@ import math
 from typing import Final, SupportsFloat
 
 MOST_DECIMALS: Final = 9
+# Decimals of a value whose sigma is zero or not known.
 _UNKNOWN: Final = 4
-"""Decimals of a value whose sigma is zero or not known."""
 
 
 def decimals(sigma: float) -> int:

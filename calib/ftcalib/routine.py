@@ -86,11 +86,11 @@ class Arm(Protocol):
 
 Stage = Literal["settle", "sample"]
 
+# Largest turn of the flange during a dwell: a tenth of the noise of a good sensor at 1 kg.
 MOVED_RAD = float(np.radians(0.05))
-"""Largest turn of the flange during a dwell: a tenth of the noise of a good sensor at 1 kg."""
 
+# Factors on the averaging time, tried in turn until there are enough samples: polled sensors may be slow.
 LONGER = (1, 2, 4)
-"""Factors on the averaging time, tried in turn until there are enough samples: polled sensors may be slow."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -25,11 +25,11 @@ from ftcalib.published.yu import ROUNDING_RAD, special_deviation_rad, special_nu
 from ftcalib.result import CalibrationResult, DriftResult, Method, require_positive_definite
 
 SIMULATIONS = 400
+# No sensor resolves smaller differences of force.
 UNRESOLVED_N = 1e-12
-"""No sensor resolves smaller differences of force."""
 
+# Published methods that need the direction of gravity, or the weight.
 _NEED_GRAVITY = ("carlson-relaxation", "carlson-cayley")
-"""Published methods that need the direction of gravity, or the weight."""
 
 
 def solve(

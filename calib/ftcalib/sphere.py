@@ -4,10 +4,10 @@ import numpy as np
 
 from ftcalib.model import Array
 
+# Neighbours are about 3° apart.
 _POINTS = 4000
-"""Neighbours are about 3° apart."""
+# Directions that are compared with all points at once, to save memory.
 _PART = 500
-"""Directions that are compared with all points at once, to save memory."""
 _ALIGNED = np.sin(np.radians(22.5))
 
 

@@ -36,18 +36,18 @@ from ftcalib.likelihood.session_noise import pose_times, summed_products
 from ftcalib.model import BIASES, Array, Parameters, jacobian, read_only
 from ftcalib.result import CalibrationResult
 
+# Errors of an arm's orientations over which the average is taken. Before the fit, each is as likely as any other.
 USUAL_ERRORS_RAD = np.deg2rad(np.geomspace(0.005, 0.5, 20))
-"""Errors of an arm's orientations over which the average is taken. Before the fit, each is as likely as any other."""
+# Of the last change of load, over which the average is taken. Before the fit, each is as likely as any other.
 USUAL_SHARES = np.geomspace(1e-4, 5e-3, 9)
-"""Of the last change of load, over which the average is taken. Before the fit, each is as likely as any other."""
+# Steps of the bias from pose to pose, in sigma of the measured noise, over which the average is taken: of the forces,
+# and of the torques. Before the fit, each pair is as likely as any other.
 USUAL_WALKS = np.geomspace(0.3, 30, 5)
-"""Steps of the bias from pose to pose, in sigma of the measured noise, over which the average is taken: of the forces,
-and of the torques. Before the fit, each pair is as likely as any other."""
 MANY_POSES = 1000
+# From more, the fit finds a walk in all channels that have one.
 FEW_POSES = 24
-"""From more, the fit finds a walk in all channels that have one."""
+# Of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck.
 LEAST_FACTOR = 0.1
-"""Of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck."""
 
 NO_WALK = (0.0, 0.0)
 

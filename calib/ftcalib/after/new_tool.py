@@ -22,14 +22,14 @@ from ftcalib.likelihood.response import Response, joint_covariance, joint_jacobi
 from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_between_vectors, predict, skew
 from ftcalib.result import CalibrationResult
 
+# Share of good runs that the test of what was kept rejects.
 FALSE_ALARMS = 1e-4
-"""Share of good runs that the test of what was kept rejects."""
+# Rows of a prior: three of the mounting, two of the base.
 WHOLE = (0, 1, 2, 3, 4)
-"""Rows of a prior: three of the mounting, two of the base."""
 _MOUNTING, _BASE = WHOLE[:3], WHOLE[3:]
 
+# From the rows of the prior that count to the misfit, its degrees of freedom, and the parameters.
 Refit = Callable[[Sequence[int]], tuple[float, int, Parameters]]
-"""From the rows of the prior that count to the misfit, its degrees of freedom, and the parameters."""
 
 
 class CellPrior:
@@ -123,12 +123,12 @@ class CellPrior:
 
 
 _MOST_STEPS = 30
+# Squared step in standard deviations.
 _SETTLED = 1e-12
-"""Squared step in standard deviations."""
 _SINGULAR = 1e12
 _SIGNIFICANT = 5.0
+# Rows of the error coordinates that runs of one tool share.
 _SHARED = np.array([0, 1, 2, 3, 4, 5, 9, 10, 11])
-"""Rows of the error coordinates that runs of one tool share."""
 
 
 def new_tool(

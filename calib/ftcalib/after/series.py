@@ -12,12 +12,12 @@ from ftcalib.model import Array, Parameters, read_only
 
 # The difference of two calibrations, in standard deviations and tested jointly.
 
+# A standard deviation below this share of the largest is one of rounding: the value was taken as known.
 KNOWN = 1e-9
-"""A standard deviation below this share of the largest is one of rounding: the value was taken as known."""
+# Likewise an eigenvalue of a correlation matrix.
 _SINGULAR = 1e-10
-"""Likewise an eigenvalue of a correlation matrix."""
+# A difference in a direction that both calibrations take as known counts from here on.
 _ROUNDING_SIGMAS = 1e-3
-"""A difference in a direction that both calibrations take as known counts from here on."""
 
 
 class Estimated(Protocol):
@@ -130,17 +130,17 @@ def _test(change: Array, covariance: Array, rows: NDArray[np.intp]) -> ChiSquare
 #
 # Where a step is significant and fits better than any onset, the series begins again at t1 with a free c.
 
+# Verifications: fewer do not show their scatter.
 FEWEST = 6
-"""Verifications: fewer do not show their scatter."""
+# Largest p-value of an onset that counts, in one component at one look. It allows for the search over onsets, six
+# components and 365 looks a year: false alarms and delays in simulation are in docs/contributing/figures/fleet.md.
 SIGNIFICANT = 1e-5
-"""Largest p-value of an onset that counts, in one component at one look. It allows for the search over onsets, six
-components and 365 looks a year: false alarms and delays in simulation are in docs/contributing/figures/fleet.md."""
+# A drift has gone on for so long: a sudden change of the last days is no drift yet.
 LEAST_DAYS = 7.0
-"""A drift has gone on for so long: a sudden change of the last days is no drift yet."""
+# If the series begins later, the error of the calibration limits its level no more, because more may have changed.
 NEAR_DAYS = 14.0
-"""If the series begins later, the error of the calibration limits its level no more, because more may have changed."""
+# A step fits better than an onset if its chi2 is larger by this: odds of 20 to 1.
 CLEARLY = 6.0
-"""A step fits better than an onset if its chi2 is larger by this: odds of 20 to 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -246,8 +246,8 @@ def _p_value(chi2: Array, total: Array, dof: int) -> Array:
 
 # Linear change of an estimate from calibration to calibration, and whether it is significant.
 
+# Two points have a line without any scatter about it.
 FEWEST_ESTIMATES = 3
-"""Two points have a line without any scatter about it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -313,14 +313,14 @@ def trend(t: Array, values: Array, covariance: Array) -> Trend:
 # like a temperature by chance widens the sigma of c. What a fit predicts of a run that it lacks has a closed form. A
 # temperature that does not predict such runs better than the other runs alone is of no use, however steep its slope.
 
+# Between the coldest and the warmest run.
 LEAST_K = 3.0
-"""Between the coldest and the warmest run."""
+# Largest p-value of a slope that is used.
 SURE = 1e-3
-"""Largest p-value of a slope that is used."""
+# Older runs do not count: their walk says little about today.
 _MOST = 100
-"""Older runs do not count: their walk says little about today."""
+# Tried for scatter and walk, in standard deviations of the runs about their line.
 _SHARES = np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.5])
-"""Tried for scatter and walk, in standard deviations of the runs about their line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

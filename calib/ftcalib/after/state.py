@@ -30,11 +30,14 @@ from ftcalib.model import BIASES, Array, Parameters, read_only, skew
 from ftcalib.result import CalibrationResult
 
 SIGNIFICANT_SIGMAS = 5.0
-SETTLED = 1e-20  # squared step in standard deviations at which the iteration ends
+# Squared step in standard deviations at which the iteration ends.
+SETTLED = 1e-20
 MOST_STEPS = 30
-UNDETERMINED = 1e-6  # smallest singular value of the scaled equations over the largest
+# Smallest singular value of the scaled equations over the largest.
+UNDETERMINED = 1e-6
 
 Block = Literal["weight", "centre of mass", "bias", "gravity direction", "mounting"]
+# Kinds of update, and what each estimates.
 BLOCKS: Mapping[str, tuple[Block, ...]] = {
     "bias": ("bias",),
     "weight": ("weight",),
@@ -45,7 +48,6 @@ BLOCKS: Mapping[str, tuple[Block, ...]] = {
     "bias and payload": ("weight", "centre of mass", "bias"),
     "all": ("weight", "centre of mass", "bias", "gravity direction", "mounting"),
 }
-"""Kinds of update, and what each estimates."""
 
 
 class Calibrated(Estimated, Protocol):
@@ -299,8 +301,10 @@ def _inverse(information: Array, kind: str, n: int) -> Array:
 
 # Tare: the biases again, from a few seconds of a free tool.
 
-FALSE_ALARMS = 1e-3  # share of good tares that are rejected
-USUAL_DRIFT_N, USUAL_DRIFT_NM = 1.0, 0.03  # a wrist sensor over hours: temperature, mounting, wear
+# Share of good tares that are rejected.
+FALSE_ALARMS = 1e-3
+# A wrist sensor over hours: temperature, mounting, wear.
+USUAL_DRIFT_N, USUAL_DRIFT_NM = 1.0, 0.03
 
 
 def compare_with_prediction(

@@ -32,6 +32,7 @@ from ftcalib.result import CalibrationResult
 
 Change = Literal["bias", "payload", "centre of mass", "mounting", "base", "several"]
 
+# Kind of update that makes up for each change.
 SINGLE: Mapping[str, Change] = {
     "bias": "bias",
     "weight": "payload",
@@ -40,14 +41,13 @@ SINGLE: Mapping[str, Change] = {
     "mounting": "mounting",
     "base": "base",
 }
-"""Kind of update that makes up for each change."""
 SEVERAL = ("bias and payload", "all")
+# Each parameter must lower chi2 by more than this: one in 200 does by chance.
 COST = 8.0
-"""Each parameter must lower chi2 by more than this: one in 200 does by chance."""
+# Probability of the remaining misfit below which a change does not explain the readings.
 UNEXPLAINED = 1e-3
-"""Probability of the remaining misfit below which a change does not explain the readings."""
+# Two changes whose chi2 differ by less are not distinguished: odds of 100 to 1.
 INDISTINCT = 9.2
-"""Two changes whose chi2 differ by less are not distinguished: odds of 100 to 1."""
 FEWEST = 2
 
 

@@ -31,21 +31,21 @@ from ftcalib.likelihood.response import (
 )
 from ftcalib.model import Array, Parameters, jacobian, read_only, skew
 
+# A part is held so near to the given point, one standard deviation an axis.
 REACH_M = 0.1
-"""A part is held so near to the given point, one standard deviation an axis."""
+# Share of clean weights that a test takes for a fault.
 FALSE_ALARMS = 1e-5
-"""Share of clean weights that a test takes for a fault."""
+# A mass of so many sigmas differs from zero.
 LEAST_SIGMAS = 4.0
-"""A mass of so many sigmas differs from zero."""
+# Usual drift of a bias, one standard deviation, N/h and N·m/h: warm sensors drift less.
 DRIFT_PER_H = np.repeat([5.0, 0.15], 3)
-"""Usual drift of a bias, one standard deviation, N/h and N·m/h: warm sensors drift less."""
+# Usual change of a bias within days, one standard deviation, N and N·m.
 USUAL_DRIFT = np.repeat([USUAL_DRIFT_N, USUAL_DRIFT_NM], 3)
-"""Usual change of a bias within days, one standard deviation, N and N·m."""
 _PASSES = 4
 
+# Why force and torque do not belong to one weight: "contact", a force across gravity; "cable", a torque that no weight
+# near the gripper exerts; "changed", each pose has a weight, but not the same; "lifted", less than the tool alone.
 Fault = Literal["contact", "cable", "changed", "lifted"]
-"""Why force and torque do not belong to one weight: "contact", a force across gravity; "cable", a torque that no weight
-near the gripper exerts; "changed", each pose has a weight, but not the same; "lifted", less than the tool alone."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,21 +21,23 @@ from ftcalib.model import ROUNDING, Array, Rotations, matrices_of, nearest_rotat
 
 FORMAT = "ftdrive.dataset/1"
 
+# Whether rotations map flange to base coordinates, like a robot pose, or base to flange coordinates, like e_bR in the
+# papers.
 Orientation = Literal["R_base_flange", "R_flange_base"]
-"""Whether rotations map flange to base coordinates, like a robot pose, or base to flange coordinates, like e_bR in the
-papers."""
 
-LARGEST = 1e9  # N, N·m or their squares: no sensor measures more, and powers of it must not overflow
-LEAST_VARIANCE = 1e-18  # N² or (N·m)²: sigma 1 nN; with much less, products of inverses lose all digits
+# N, N·m or their squares: no sensor measures more, and powers of it must not overflow.
+LARGEST = 1e9
+# N² or (N·m)²: sigma 1 nN; with much less, products of inverses lose all digits.
+LEAST_VARIANCE = 1e-18
 SIGMA_COLUMNS = tuple(f"sigma_{name}" for name in CHANNELS)
 MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 VECTOR_COLUMNS = ("rx", "ry", "rz")
+# What a table may hold: rotation matrix row by row, quaternion, rotation vector in rad.
 ORIENTATION_FORMS = "r11..r33, qx, qy, qz, qw or rx, ry, rz"
-"""What a table may hold: rotation matrix row by row, quaternion, rotation vector in rad."""
 _LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
+# Of a quaternion: it differs from 1 by no more.
 _ROUNDED_LENGTH = 0.01
-"""Of a quaternion: it differs from 1 by no more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -386,12 +388,12 @@ def _covariance_problem(C: Array) -> str | None:
 
 # Covariances of pose means that come from few samples each.
 
+# With this many independent samples, the covariance of a pose counts as much as the common shape.
 TRUSTED_SAMPLES = 100.0
-"""With this many independent samples, the covariance of a pose counts as much as the common shape."""
-MEDIAN_SCATTER = 0.8702920382191053  # chdtri(5, 0.5) / 5
-"""Median of the variance of six Gaussian values, relative to its mean."""
+# Median of the variance of six Gaussian values, relative to its mean: that of chi-square with 5 degrees, over 5.
+MEDIAN_SCATTER = 0.8702920382191053
+# A pose whose variances scatter more than this, relative to their freedom, has a shape of its own: 1 % by chance.
 UNLIKE = 3.0
-"""A pose whose variances scatter more than this, relative to their freedom, has a shape of its own: 1 % by chance."""
 
 
 def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:

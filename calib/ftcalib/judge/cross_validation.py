@@ -131,10 +131,10 @@ def _root(covariance: Array) -> Array:
         return np.asarray(vector * np.sqrt(np.maximum(value, 1e-12 * value[:, -1:]))[:, None])
 
 
+# From pose to pose, if their times are not known.
 USUAL_INTERVAL_S = 10.0
-"""From pose to pose, if their times are not known."""
+# From the last pose to the next use.
 NEXT_USE_S = 60.0
-"""From the last pose to the next use."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

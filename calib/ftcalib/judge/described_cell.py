@@ -17,31 +17,31 @@ from ftcalib.model import UP_IN_BASE, Array, Parameters
 from ftcalib.rounding import decimals
 from ftcalib.sphere import axes_along, evenly_spread
 
+# A centre of mass may lie this far on the robot's side of the sensor origin, because adapter plates do.
 INSIDE_M = 0.01
-"""A centre of mass may lie this far on the robot's side of the sensor origin, because adapter plates do."""
 REVERSED_TILT_DEG = 135.0
+# A robot that leans more hangs on a wall.
 HANGING_DEG = 60.0
-"""A robot that leans more hangs on a wall."""
+# A larger angle is another mounting, not a lean.
 OTHER_MOUNTING_DEG: Final = 10.0
-"""A larger angle is another mounting, not a lean."""
+# About the accuracy of an arm's own orientation.
 LEAN_DEG: Final = 0.2
-"""About the accuracy of an arm's own orientation."""
+# Cables and screws may reach this far out of the described cylinders.
 COM_MARGIN_M = 0.01
-"""Cables and screws may reach this far out of the described cylinders."""
+# A centre of mass farther outside than this is wrong; nearer, the description may be.
 SURELY_OUTSIDE_M = 0.1
-"""A centre of mass farther outside than this is wrong; nearer, the description may be."""
+# Units are suspected where the centre of mass is outside and farther from the sensor than this.
 FAR_COM_M = 0.1
-"""Units are suspected where the centre of mass is outside and farther from the sensor than this."""
+# Less than this share of the described mass is a remainder, not a tool.
 NO_TOOL_SHARE = 0.1
-"""Less than this share of the described mass is a remainder, not a tool."""
+# The mass of a tool is known to about the larger of this mass and this share.
 TOOL_KG, TOOL_SHARE = 0.1, 0.3
-"""The mass of a tool is known to about the larger of this mass and this share."""
+# A payload may differ by the larger of this mass and this share of the expected one.
 PAYLOAD_KG, PAYLOAD_SHARE = 0.5, 0.3
-"""A payload may differ by the larger of this mass and this share of the expected one."""
+# A payload may be larger by this where the mass of sensor and adapter is unknown.
 SENSOR_KG: Final = 0.3
-"""A payload may be larger by this where the mass of sensor and adapter is unknown."""
+# Units are suspected where the payload differs by more than this, and agrees within this share in another unit.
 UNIT_KG, UNIT_SHARE = 0.8, 0.3
-"""Units are suspected where the payload differs by more than this, and agrees within this share in another unit."""
 _SIGNIFICANT: Final = 4.0
 
 
@@ -84,11 +84,11 @@ def _other_orders(gravity_direction_base: Array, up: Array) -> list[str]:
     return [order for order, cosine in along.items() if cosine > np.cos(np.radians(OTHER_MOUNTING_DEG))]
 
 
+# From base axes as read to those in which the arm stands, for quaternions that are truly in this order.
 _OTHER_ORDERS: Final = {
     "w, x, y, z": np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]),
     "x, y, z, w": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
 }
-"""From base axes as read to those in which the arm stands, for quaternions that are truly in this order."""
 
 
 def _inside_m(parameters: Parameters, covariance: Array) -> float:
@@ -227,8 +227,8 @@ def _centre_of_mass(parameters: Parameters, covariance: Array, setup: Setup) -> 
     ]
 
 
+# Neighbours are about 4° apart, so the distance is exact to 0.1 %.
 _DIRECTIONS = np.vstack([evenly_spread(2000), np.eye(3), -np.eye(3)])
-"""Neighbours are about 4° apart, so the distance is exact to 0.1 %."""
 
 
 def _reach_m(cylinders_m: Sequence[Sequence[float]]) -> Array:
@@ -243,10 +243,10 @@ def _reach_m(cylinders_m: Sequence[Sequence[float]]) -> Array:
 
 # Known values that the data contradict.
 
+# A ratio this close to that of two units is one.
 SAME_UNIT = 0.04
-"""A ratio this close to that of two units is one."""
+# Entries of a rotation this close to -1, 0 and 1 permute the axes.
 SAME_AXES = 0.1
-"""Entries of a rotation this close to -1, 0 and 1 permute the axes."""
 
 
 def contradictions(

@@ -17,46 +17,46 @@ from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minim
 from ftcalib.model import UP_IN_BASE, Array, Parameters, gravity_wrench, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
+# Of readings, relative to the largest: what is left at least.
 ROUNDING = 1e-9
-"""Of readings, relative to the largest: what is left at least."""
 READINGS = {
     "orientations_inverted": "inverted orientations",
     "quaternion_order": "quaternions in the order ({order})",
     "euler_angles": "{order} Euler angles",
 }
+# Scores that differ by less do not decide between two readings of the orientations.
 EQUAL = 0.1
-"""Scores that differ by less do not decide between two readings of the orientations."""
+# Accept a hypothesis if it reduces the residual to this share.
 COLLAPSE = 0.4
-"""Accept a hypothesis if it reduces the residual to this share."""
+# The other residual may grow by this factor.
 NO_WORSE = 1.2
-"""The other residual may grow by this factor."""
+# Forces that a mistake explains leave no more than this share of the weight.
 CORRECTED = 0.1
-"""Forces that a mistake explains leave no more than this share of the weight."""
+# Penalty of a weight that pulls sideways, and of a tool inside the flange, in the logarithm of the residuals.
 IMPLAUSIBLE = 1.0
-"""Penalty of a weight that pulls sideways, and of a tool inside the flange, in the logarithm of the residuals."""
+# Residuals that differ by less than this factor are equal: the simpler explanation is taken.
 TIED = 1.3
-"""Residuals that differ by less than this factor are equal: the simpler explanation is taken."""
+# Forces of a weight in other poses than given: large residuals, in shares of the weight, and little of them radial.
 OTHER_POSES, OF_A_WEIGHT = 0.03, 0.1
-"""Forces of a weight in other poses than given: large residuals, in shares of the weight, and little of them radial."""
+# A constant force that points down this exactly is a weight in base axes.
 IN_BASE_RAD = np.deg2rad(10.0)
-"""A constant force that points down this exactly is a weight in base axes."""
+# A force that varies by less than this share of it is constant.
 STEADY = 0.05
-"""A force that varies by less than this share of it is constant."""
+# Poses with the same extreme reading of a channel.
 FEWEST_SATURATED = 3
-"""Poses with the same extreme reading of a channel."""
+# Degrees of freedom of a regression that predicts readings with a noise of its own.
 FEWEST_TO_PREDICT = 4
-"""Degrees of freedom of a regression that predicts readings with a noise of its own."""
+# With fewer poses, readings whose fit differs by more than this share of the spread should not be equal.
 UNEQUAL = 0.05
-"""With fewer poses, readings whose fit differs by more than this share of the spread should not be equal."""
+# Probability, per reading, of one that is farther from its prediction.
 BY_CHANCE = 1e-6
-"""Probability, per reading, of one that is farther from its prediction."""
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
+# Poses that show steps of the readings.
 FOR_STEPS = 1000
-"""Poses that show steps of the readings."""
+# Different readings of a channel that show steps: a weight along each axis reads as -weight, 0 and +weight.
 FEWEST_STEPS = 4
-"""Different readings of a channel that show steps: a weight along each axis reads as -weight, 0 and +weight."""
+# Rounding matters if its standard deviation exceeds this share of the spread.
 COARSE = 0.005
-"""Rounding matters if its standard deviation exceeds this share of the spread."""
 
 
 def rough_fit(R_base_flange: Array, wrench: Array) -> Parameters:

@@ -13,29 +13,29 @@ from ftcalib.errors import NotObservable
 from ftcalib.likelihood.rotation_minima import RotationMinimum, force_cost, minima
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, gravity_wrench, jacobian
 
+# Three different orientations have 4 or 8 exact solutions, although their Fisher information has full rank.
 LEAST_POSES = 4
-"""Three different orientations have 4 or 8 exact solutions, although their Fisher information has full rank."""
 RECOMMENDED_POSES = 6
 RANK_TOLERANCE = 1e-9
 POOR_CONDITION = 1e4
+# Eight poses distinguish the two solutions even if the tool weighs only ten times the noise.
 WEAK_GAP = 0.02
-"""Eight poses distinguish the two solutions even if the tool weighs only ten times the noise."""
 AMBIGUOUS_GAP = 1e-6
+# In 7361 simulated calibrations, a second solution with chi2 larger by this was never the right one.
 ACCEPTED_DELTA_CHI2 = 12.0
-"""In 7361 simulated calibrations, a second solution with chi2 larger by this was never the right one."""
 SAME_ORIENTATION_RAD = np.deg2rad(0.5)
+# Usual ratio of torque noise to force noise.
 LEVER_M = 0.025
-"""Usual ratio of torque noise to force noise."""
 MOST_ADVISED = 5
 
+# Tool before any data: 1 kg, 80 mm from a sensor on an upright robot. Rank and gap hardly depend on it.
 NOMINAL = Parameters(np.eye(3), -STANDARD_GRAVITY_M_S2 * UP_IN_BASE, np.zeros(3), np.array([0, 0, 0.08]), np.zeros(3))
-"""Tool before any data: 1 kg, 80 mm from a sensor on an upright robot. Rank and gap hardly depend on it."""
 
 _SAME_MINIMUM_RAD = np.deg2rad(1.0)
 _ALIGNED = np.cos(np.deg2rad(5.0))
 _NARROW_DEG = 30.0
+# Smaller spreads of unit vectors count as zero: about one degree.
 _THIN = 0.02
-"""Smaller spreads of unit vectors count as zero: about one degree."""
 _GROUPS = ("the mounting of the sensor", "gravity", "force bias", "centre of mass", "torque bias")
 
 

@@ -35,20 +35,21 @@ from ftcalib.model import (
     skew,
 )
 
+# Fewer do not show a change beside 15 parameters.
 FEWEST_POSES = 10
-"""Fewer do not show a change beside 15 parameters."""
+# Poses before and after.
 FEWEST_ON_A_SIDE = 3
-"""Poses before and after."""
+# Of longer sessions every second, third, ... pose is looked at.
 MOST_POSES = 300
-"""Of longer sessions every second, third, ... pose is looked at."""
+# A change must bring the mean square misfit below this share before the likelihood is asked.
 CLEARLY = 0.5
-"""A change must bring the mean square misfit below this share before the likelihood is asked."""
+# By which twice the log-likelihood must rise, beside log(6 n) for each number of the change.
 MARGIN = 20.0
-"""By which twice the log-likelihood must rise, beside log(6 n) for each number of the change."""
 Rows = NDArray[np.bool_]
 
+# Columns of `_columns`.
 TURN, BIAS, COM, LOAD = range(3), range(3, 9), range(10, 13), range(9, 13)
-"""Columns of `_columns`."""
+# What changes, by code.
 KINDS = {
     "bias_stepped": [*BIAS],
     "com_shifted": [*COM],
@@ -56,7 +57,6 @@ KINDS = {
     "sensor_turned": [*TURN],
     "sensor_changed": [*TURN, *BIAS],
 }
-"""What changes, by code."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -277,14 +277,14 @@ def _length(vector: Array) -> float:
 # omitted variable), and their reported sigma allows for this. Compensation does not need it: the cable pulls in the
 # next use too.
 
+# Probability of a chance finding: slack at the mean orientation, and at the best of about 70.
 FALSE = 1e-3, 1e-4
-"""Probability of a chance finding: slack at the mean orientation, and at the best of about 70."""
+# The same where the torques have more noise than was measured: its cause is unknown, and a cable is a usual one.
 FALSE_IN_NOISE = 0.05
-"""The same where the torques have more noise than was measured: its cause is unknown, and a cable is a usual one."""
+# Poses: fewer leave nothing for a test. More are seldom of a tour.
 FEWEST, MOST = 8, 1000
-"""Poses: fewer leave nothing for a test. More are seldom of a tour."""
+# Numbers that are estimated.
 STIFFNESS, SLACK = 9, 3
-"""Numbers that are estimated."""
 STARTS = 24
 STEPS_RAD = np.deg2rad([40.0, 20.0, 10.0])
 _AROUND = np.array([v for v in product((-1.0, 0.0, 1.0), repeat=3) if np.abs(v).sum() in (1, 3)])

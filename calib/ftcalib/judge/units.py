@@ -8,13 +8,13 @@ from ftcalib.findings import Finding, Severity
 from ftcalib.model import Parameters
 
 USUAL_COM_M = (0.02, 0.2)
+# A centre of mass farther than the first must be described; farther than the second is wrong otherwise.
 FAR_COM_M, FARTHEST_COM_M = 0.25, 0.5
-"""A centre of mass farther than the first must be described; farther than the second is wrong otherwise."""
 NEAREST_COM_M = 5e-4
+# Weights beyond these look like forces in another unit: 30 g, and more than any UR arm carries.
 LIGHTEST_N, HEAVIEST_N, IMPOSSIBLE_N = 0.3, 500.0, 2000.0
-"""Weights beyond these look like forces in another unit: 30 g, and more than any UR arm carries."""
+# Forces in another unit leave less than this share of the weight.
 NOISY = 0.03
-"""Forces in another unit leave less than this share of the weight."""
 FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665, "gf": 9.80665e-3, "mN": 1e-3, "kN": 1e3}
 TORQUE_UNITS_NM = {
     "N·m": 1.0,
@@ -25,14 +25,14 @@ TORQUE_UNITS_NM = {
     "kgf·m": 9.80665,
     "kN·m": 1e3,
 }
+# The simplest mistake first.
 UNITS = (
     *(("N", "N·mm"), ("N", "lbf·in"), ("lbf", "N·m"), ("kgf", "N·m"), ("gf", "N·m"), ("mN", "N·m"), ("kN", "N·m")),
     *(("lbf", "lbf·in"), ("lbf", "lbf·ft"), ("kgf", "kgf·cm"), ("kgf", "kgf·m"), ("mN", "N·mm"), ("kN", "kN·m")),
 )
-"""The simplest mistake first."""
 
+# Pairs of a unit of force and one of torque.
 Suspects = list[tuple[str, str]]
-"""Pairs of a unit of force and one of torque."""
 
 
 def by_com(com_m: float, forces: Collection[str] = tuple(FORCE_UNITS_N)) -> Suspects:

@@ -27,18 +27,18 @@ from ftcalib.published.yu import SPECIAL_R_flange_base
 SIGNIFICANT_SIGMAS = 5.0
 NOISE_FACTOR = 3.0
 USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
+# If residuals reach half the weight, neither gravity nor centre of mass mean anything.
 SENSELESS_SHARE = 0.5
-"""If residuals reach half the weight, neither gravity nor centre of mass mean anything."""
+# Largest error of a good result whose residuals exceed the measured noise.
 NOISY_SHARE = 0.01
-"""Largest error of a good result whose residuals exceed the measured noise."""
+# Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther.
 USUAL_LEVER_M = 0.1
-"""Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther."""
 CORRELATED = 0.9
 FEW_LEFT_OUT = 0.1
+# Poses that show a fault as clearly as all of them, in runs long enough to show a wrong pairing.
 ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
-"""Poses that show a fault as clearly as all of them, in runs long enough to show a wrong pairing."""
+# Probability of a false reason.
 SURE = 1e-3
-"""Probability of a false reason."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

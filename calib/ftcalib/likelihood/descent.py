@@ -26,8 +26,8 @@ from ftcalib.model import Array, Parameters, angle_between, skew
 # so the weighted squares of a million poses are one 60 x 60 matrix, and a Gauss-Newton step costs the same for any
 # number of them.
 
+# Rows of 100 products per matrix product, so that they stay in the cache.
 FEW = 256
-"""Rows of 100 products per matrix product, so that they stay in the cache."""
 
 _CROSS = skew(np.eye(3))
 _CONSTANT = np.zeros((15, 6, 10))
@@ -157,7 +157,8 @@ def wrench_gram(R_base_flange: Array, wrench: Array, reference: Array) -> Array:
 
 
 MAX_STEPS = 100
-SMALL_STEP = 1e-4  # in standard deviations of the noise: a descent that ends with one is slow, not lost
+# In standard deviations of the noise: a descent that ends with one is slow, not lost.
+SMALL_STEP = 1e-4
 MOST_MINIMA = 6
 SAME_ROTATION_RAD = np.deg2rad(1.0)
 
@@ -319,12 +320,12 @@ def _linear_start(statistics: Statistics, R_flange_sensor: Array) -> Parameters:
 
 Kept = NDArray[np.bool_]
 
+# Share of good poses that are rejected.
 FALSE_REJECTION = 1e-3
-"""Share of good poses that are rejected."""
+# Squared distance, in noise, beyond which a pose is rejected: 22.5.
 FARTHEST = float(chi2_isf(6, FALSE_REJECTION))
-"""Squared distance, in noise, beyond which a pose is rejected: 22.5."""
+# With fewer poses, one that disagrees with the others and others that disagree with it look alike.
 FEWEST_TO_REJECT_FROM = 8
-"""With fewer poses, one that disagrees with the others and others that disagree with it look alike."""
 ANNEALING = 1.6
 
 

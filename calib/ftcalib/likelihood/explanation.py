@@ -47,10 +47,13 @@ from ftcalib.model import Array, Parameters, predict
 
 # Which components of the noise the data show: added, dropped and exchanged by restricted likelihood.
 
-SURE = 20.0  # a gain or loss that no other component can regain
-WORTH_A_TRY = 1.0  # gain predicted from slope and curvature at zero
+# A gain or loss that no other component can regain.
+SURE = 20.0
+# Gain predicted from slope and curvature at zero.
+WORTH_A_TRY = 1.0
 USUAL_HYSTERESIS = 0.001
-SMALL_RESPONSE, USUAL_RESPONSE = 0.005, 0.02  # gain and cross-talk of real sensors
+# Gain and cross-talk of real sensors.
+SMALL_RESPONSE, USUAL_RESPONSE = 0.005, 0.02
 
 
 def select(
@@ -242,13 +245,20 @@ def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) ->
     return point(problem, [*best.components, *chosen], np.append(best.theta, variances))
 
 
-MANY_POSES = 20_000  # from here on single poses are looked at only when chi2 or `drift` asks for it
-POSES_FOR_THE_SHAPE = 500  # fewer do not show that poses are bumped by the shape of the distribution
-SUSPICIOUS = 0.01  # p-value below which more than the measured noise is looked for
-LIGHT_TAIL = 0.6  # the median of squared distances relative to their mean, in units of what Gaussian noise has
-ROUNDS = 20  # of the outer loop; it ends after a few
-SETTLED = 1e-4  # squared step, in standard deviations of the estimates
-FAR = 1000.0  # a minimum with chi2 higher by this is not the answer under any noise
+# From here on single poses are looked at only when chi2 or `drift` asks for it.
+MANY_POSES = 20_000
+# Fewer do not show that poses are bumped by the shape of the distribution.
+POSES_FOR_THE_SHAPE = 500
+# P-value below which more than the measured noise is looked for.
+SUSPICIOUS = 0.01
+# The median of squared distances relative to their mean, in units of what Gaussian noise has.
+LIGHT_TAIL = 0.6
+# Of the outer loop; it ends after a few.
+ROUNDS = 20
+# Squared step, in standard deviations of the estimates.
+SETTLED = 1e-4
+# A minimum with chi2 higher by this is not the answer under any noise.
+FAR = 1000.0
 MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
 
 

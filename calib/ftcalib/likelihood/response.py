@@ -14,8 +14,8 @@ import numpy as np
 from ftcalib.files import JSON
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, read_only
 
+# Cross-talk counts relative to a force at this lever.
 LEVER_M = 0.05
-"""Cross-talk counts relative to a force at this lever."""
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
@@ -27,19 +27,19 @@ def _symmetric(i: int, j: int) -> Array:
 
 
 _MIXED = [_symmetric(i, j) for i, j in _PAIRS]
+# (5, 3, 3) basis of the gain: equal and independent coefficients make the entries so.
 GAIN = np.array([np.diag([1.0, -1, 0]) / np.sqrt(2), np.diag([1.0, 1, -2]) / np.sqrt(6), *_MIXED])
-"""(5, 3, 3) basis of the gain: equal and independent coefficients make the entries so."""
+# (6, 3, 3) basis of the cross-talk, m.
 CROSS_TALK_M = LEVER_M * np.array([*(_symmetric(i, i) for i in range(3)), *_MIXED])
-"""(6, 3, 3) basis of the cross-talk, m."""
 SIZE = len(GAIN) + len(CROSS_TALK_M)
 
+# Weights of the squared coefficients whose sum is the variance of one entry, if all nine are independent: the symmetric
+# part of two entries has half their variance.
 _ENTRIES = np.array([1, 1, 2, 2, 2]) / 5, np.array([1, 1, 1, 2, 2, 2]) / 6
-"""Weights of the squared coefficients whose sum is the variance of one entry, if all nine are independent: the
-symmetric part of two entries has half their variance."""
+# By which a variance that five or six numbers determine is too small: that of Student's distribution.
 _FROM_5, _FROM_6 = 5 / 3, 6 / 4
-"""By which a variance that five or six numbers determine is too small: that of Student's distribution."""
+# Sigma of the mean of three gains over that of one.
 COMMON_GAIN = float(np.sqrt(_FROM_5 / 3))
-"""Sigma of the mean of three gains over that of one."""
 
 
 def response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
@@ -173,8 +173,8 @@ def predicted_covariance(
 # Six shares, one for each axis, have one variance. Where the arm came from before the first pose is unknown, so that
 # pose is off by a share of a usual swing. Compensation knows no swing: hysteresis is part of the noise of a reading.
 
+# More poses need no allowance for the first.
 FEW = 1000
-"""More poses need no allowance for the first."""
 
 
 def hysteresis_columns(parameters: Parameters, R_base_flange: Array) -> Array:

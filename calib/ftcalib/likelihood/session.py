@@ -26,15 +26,24 @@ from ftcalib.model import Array, Parameters, jacobian, predict
 Drift = Literal["auto", "none", "linear", "random-walk"]
 
 RANK_TOLERANCE = 1e-9
-LEVER_M = 0.025  # usual ratio of torque noise to force noise
-FEW_POSES = 6  # fewer cannot separate force noise from torque noise: the usual ratio is taken
-FEW_POSES_FOR_RESPONSE = 7  # fewer cannot separate gain and cross-talk from noise
-FEW_POSES_WITHOUT_NOISE = 12  # fewer cannot separate drift from unknown noise
-FEW_POSES_FOR_HYSTERESIS = 12  # fewer cannot separate it from gain and noise
-POSES_FOR_EACH_AXIS = 50  # fewer cannot separate the drifts of the axes of a group
-EXACT = 100  # times the rounding of the data: what a fit to data without noise leaves
-UNEQUAL = 0.01  # residuals of one kind, relative to the other at the usual ratio, are no less
-FLOOR = 1e-3  # of the residuals: the least white noise where it was not measured
+# Usual ratio of torque noise to force noise.
+LEVER_M = 0.025
+# Fewer cannot separate force noise from torque noise: the usual ratio is taken.
+FEW_POSES = 6
+# Fewer cannot separate gain and cross-talk from noise.
+FEW_POSES_FOR_RESPONSE = 7
+# Fewer cannot separate drift from unknown noise.
+FEW_POSES_WITHOUT_NOISE = 12
+# Fewer cannot separate it from gain and noise.
+FEW_POSES_FOR_HYSTERESIS = 12
+# Fewer cannot separate the drifts of the axes of a group.
+POSES_FOR_EACH_AXIS = 50
+# Times the rounding of the data: what a fit to data without noise leaves.
+EXACT = 100
+# Residuals of one kind, relative to the other at the usual ratio, are no less.
+UNEQUAL = 0.01
+# Of the residuals: the least white noise where it was not measured.
+FLOOR = 1e-3
 
 
 def _rounding(wrench: Array) -> Array:

@@ -16,10 +16,12 @@ from scipy.linalg.lapack import dpbtrf, dpbtrs
 
 from ftcalib.model import Array
 
+# Rows per matrix product, so that a chunk stays in the cache.
 CHUNK = 4096
-"""Rows per matrix product, so that a chunk stays in the cache."""
-SHORTEST_STEP = 1e-3  # in mean intervals: two poses at the same time have nearly the same bias
-FAINT = 1e-9  # weight of a rejected pose: too little to count, enough for the others to predict it
+# In mean intervals: two poses at the same time have nearly the same bias.
+SHORTEST_STEP = 1e-3
+# Weight of a rejected pose: too little to count, enough for the others to predict it.
+FAINT = 1e-9
 
 
 class Noise:

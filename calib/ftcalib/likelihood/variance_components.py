@@ -17,17 +17,22 @@ from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.session_noise import Noise, centred, summed_products, walk_times
 from ftcalib.model import Array
 
+# A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance.
 GAIN = 2.0
-"""A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance."""
+# The same for gain, cross-talk and hysteresis, whose 5 and 6 numbers come in by chance in 0.4 %.
 GAIN_OF_RESPONSE = 3.0
-"""The same for gain, cross-talk and hysteresis, whose 5 and 6 numbers come in by chance in 0.4 %."""
-SETTLED = 1e-2  # squared distance from the best variances, in their standard deviations
-CAREFUL = 0.3  # damping that shortens a step; less hardly does
-HOPE = 10.0  # a climb gains no more than this many times what slope and curvature promise
-NEGLIGIBLE = 1e-4  # of the white noise: where slope and curvature "at zero" are taken
+# Squared distance from the best variances, in their standard deviations.
+SETTLED = 1e-2
+# Damping that shortens a step; less hardly does.
+CAREFUL = 0.3
+# A climb gains no more than this many times what slope and curvature promise.
+HOPE = 10.0
+# Of the white noise: where slope and curvature "at zero" are taken.
+NEGLIGIBLE = 1e-4
+# Variances that no arm or sensor in working order exceeds. A larger one has another cause.
 LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2, "hysteresis": 0.03**2}
-"""Variances that no arm or sensor in working order exceeds. A larger one has another cause."""
-POSES_THAT_SHOW_THE_NOISE = 1000  # fewer leave its size uncertain enough to matter
+# Fewer leave its size uncertain enough to matter.
+POSES_THAT_SHOW_THE_NOISE = 1000
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
 Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk", "hysteresis"]

@@ -31,47 +31,47 @@ from ftcalib.motion.model import (
 from ftcalib.motion.samples import Rows
 from ftcalib.published.yu import com_and_torque_bias
 
+# What is expected of a tool before any data, one sigma: radius of gyration, sensor height, delay beyond the rows.
 GYRATION_M, HEIGHT_M, DELAY_S = 0.15, 0.3, 0.3
-"""What is expected of a tool before any data, one sigma: radius of gyration, sensor height, delay beyond the rows."""
+# Squared distance of a row in contact.
 CONTACT = float(chi2_isf(6, 1e-7))
-"""Squared distance of a row in contact."""
+# Of a row in contact, in a motion that a guard has watched.
 TOUCH_N, TOUCH_NM = 2.0, 0.2
-"""Of a row in contact, in a motion that a guard has watched."""
+# Share of the rows of a state that is free of contact.
 QUIET = 0.4
-"""Share of the rows of a state that is free of contact."""
+# Share of rows; beyond it the model does not fit at all.
 MOST_CONTACT = 0.8
-"""Share of rows; beyond it the model does not fit at all."""
+# Rows left out on both sides of a contact, which the filter spreads.
 MARGIN = 2
-"""Rows left out on both sides of a contact, which the filter spreads."""
+# Distance and number of the knots of the bias.
 KNOT_S, MOST_KNOTS = 5.0, 25
-"""Distance and number of the knots of the bias."""
+# Keeps what is not determined finite: its sigma becomes a million times as large as its scale.
 RIDGE = 1e-12
-"""Keeps what is not determined finite: its sigma becomes a million times as large as its scale."""
+# A component is kept if it lowers -2 log restricted likelihood by this.
 WORTH = 4.0
-"""A component is kept if it lowers -2 log restricted likelihood by this."""
 
+# Sizes of components at first.
 ROUGH: Mapping[str, float] = {"gain": 0.02, "cross_talk": 0.02}
-"""Sizes of components at first."""
 _ROUGH_ROWS = 600
+# Places of the coordinates of a result at rest, gain and cross-talk last.
 _RESPONDING = np.r_[0:15, GAINS.start : SIZE]
-"""Places of the coordinates of a result at rest, gain and cross-talk last."""
 _CHUNK = 1000
+# Rows beside which what the fit absorbs is small.
 _MANY = 1000
-"""Rows beside which what the fit absorbs is small."""
 _SAME_RAD = 0.2
+# Rows that show the noise of the one in their middle, and how many of its state count with them.
 _AROUND, _PRIOR_ROWS = 3, 1.0
-"""Rows that show the noise of the one in their middle, and how many of its state count with them."""
+# Of the fit with a prior, and the change of its cost that ends it.
 _PRIOR_STEPS, _SETTLED = 20, 1e-4
-"""Of the fit with a prior, and the change of its cost that ends it."""
+# Solutions, each with the noise and the contacts of the one before, and those before which components are chosen.
 _STAGES, _CHOICES = 6, (1, 2, 4)
-"""Solutions, each with the noise and the contacts of the one before, and those before which components are chosen."""
+# That are tried: of the entries of gain and cross-talk, and of the walk of the bias in a second.
 _SIZES: Mapping[str, Array] = {
     "gain": np.geomspace(5e-4, 5e-2, 9),
     "cross_talk": np.geomspace(5e-4, 2e-1, 11),
     "walk_N": np.geomspace(3e-4, 3e-1, 10),
     "walk_Nm": np.geomspace(6e-6, 6e-3, 10),
 }
-"""That are tried: of the entries of gain and cross-talk, and of the walk of the bias in a second."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,10 +23,10 @@ from ftcalib.model import Array, Parameters, cross, skew
 from ftcalib.motion.samples import Motion
 
 INERTIA_NAMES = ("xx", "yy", "zz", "xy", "xz", "yz")
+# Of what motion adds to the 15 static coordinates.
 NAMES = (*(f"inertia_kg_m2.{axes}" for axes in INERTIA_NAMES), "height_m", "delay_s")
-"""Of what motion adds to the 15 static coordinates."""
+# Places in an error vector.
 INERTIA, HEIGHT, DELAY, GAINS, CROSS_TALK = slice(15, 21), 21, 22, slice(23, 28), slice(28, 34)
-"""Places in an error vector."""
 SIZE = 34
 
 _PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -35,8 +35,8 @@ for _k, (_i, _j) in enumerate(_PLACES):
     _BASIS[_k, _i, _j] = _BASIS[_k, _j, _i] = 1.0
 _SECOND_MOMENTS = np.trace(_BASIS, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - _BASIS
 _TURNS = skew(np.eye(3))
+# Each entry of Omega as 1: what is linear in it is a product with what these give, instead of one for each row.
 _UNITS = np.eye(9).reshape(9, 3, 3)
-"""Each entry of Omega as 1: what is linear in it is a product with what these give, instead of one for each row."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,15 +149,15 @@ def _vee(M: Array) -> Array:
 # Noise of the rows, from their residuals: by state of motion, correlated between channels and in time.
 
 REST_RAD_S = 0.02
+# Of speed, beside rest.
 CLASSES = 3
-"""Of speed, beside rest."""
+# Rows that show the noise of a state; fewer count with the next faster one.
 FEWEST = 40
-"""Rows that show the noise of a state; fewer count with the next faster one."""
+# Of the autoregression, in rows.
 ORDER = 6
-"""Of the autoregression, in rows."""
 _ROWS_PER_ORDER = 25
+# Of a partial correlation.
 _MOST = 0.98
-"""Of a partial correlation."""
 
 
 def states(speed_rad_s: Array, kept: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -21,22 +21,22 @@ from ftcalib.errors import BadDataset
 from ftcalib.model import Array, skew
 
 MEAN_S = 0.01
+# Rows whose filter spans a longer gap, or one of three periods of a slower stream, are left out.
 GAP_S = 0.06
-"""Rows whose filter spans a longer gap, or one of three periods of a slower stream, are left out."""
 
+# Longer ones are refused: the times are of two recordings, or wrong.
 LONGEST_GAP_S = 86400.0
-"""Longer ones are refused: the times are of two recordings, or wrong."""
+# Times count in units of 10 ms, which 64 bits must hold.
 LATEST_S = 1e11
-"""Times count in units of 10 ms, which 64 bits must hold."""
 
+# (11, 3) value and two derivatives of a quartic through 110 ms: flat over the band.
 _FIT = np.linalg.pinv(np.vander(MEAN_S * np.arange(-5, 6), 5, increasing=True))[:3].T * [1.0, 1.0, 2.0]
-"""(11, 3) value and two derivatives of a quartic through 110 ms: flat over the band."""
+# Of the samples of a mean.
 _LEAST_WEIGHT = 1e-3
-"""Of the samples of a mean."""
+# Rows that are filtered at once.
 _CHUNK = 600
-"""Rows that are filtered at once."""
+# Translation counts as a rotation about a point this far away.
 _LEVER_M = 0.5
-"""Translation counts as a rotation about a point this far away."""
 
 
 # Seconds from row to row, multiples of `MEAN_S`. To 4.7 Hz: below the ripple of gears and the vibration of an arm,

@@ -23,29 +23,29 @@ from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, rows_of
 from ftcalib.result import CalibrationResult, DriftResult, MotionResult
 
 LEAST_S = 5.0
+# Largest delay that is found.
 FARTHEST_S = 1.5
-"""Largest delay that is found."""
+# A longer delay is a mistake of a clock.
 OFFSET_S = 0.1
-"""A longer delay is a mistake of a clock."""
+# So far from the delay of the rows the model is linear in it.
 LINEAR_S = 2e-3
-"""So far from the delay of the rows the model is linear in it."""
+# Of the parts that count without positions.
 SLOW_RAD_S = 0.15
-"""Of the parts that count without positions."""
+# Radius at which an arm swings the flange: bounds the acceleration that is unknown without positions.
 REACH_M = 1.0
-"""Radius at which an arm swings the flange: bounds the acceleration that is unknown without positions."""
 NARROW_DEG = 45.0
+# A parameter is determined if its sigma is below this share of what is expected of any tool.
 MEASURED = 0.3
-"""A parameter is determined if its sigma is below this share of what is expected of any tool."""
 WRONG_HEIGHT_M = 3e-3
+# Share of contact that limits a result.
 MOSTLY = 0.5
-"""Share of contact that limits a result."""
+# Share of the change of the force that a wrong recording leaves.
 _UNEXPLAINED = 0.3
-"""Share of the change of the force that a wrong recording leaves."""
 _MISTAKES = frozenset(
     ("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree")
 )
+# Of the inertial mass: less weight than this was subtracted.
 _COMPENSATED = 0.5
-"""Of the inertial mass: less weight than this was subtracted."""
 _JUDGED_ROWS = 300
 # A recording has no last pose from which a bias could go on, so its next use has the error expected from noise alone.
 _KEPT = ("loo_force_rms_N", "loo_torque_rms_Nm", "worst_pose", "residual_sigma", "lag1", "correlations")

@@ -16,15 +16,15 @@ from ftcalib.likelihood.rotation_minima import given_rotation
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
 from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
+# Smaller eigenvalues of the scaled information, as a share of the largest, count as zero.
 OBSERVABLE = 1e-9
-"""Smaller eigenvalues of the scaled information, as a share of the largest, count as zero."""
 
 TOOL_DOWN_R_base_flange = np.diag([1.0, -1.0, -1.0])
 
+# Numbers of the tetrahedral subgroup of the paper's 24 orientations: per pose as good as all 24, for every tool.
 T12 = (1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22)
-"""Numbers of the tetrahedral subgroup of the paper's 24 orientations: per pose as good as all 24, for every tool."""
+# Nearly the best six of the 24 that have one solution, second-basin gap 0.28.
 SUBSET_6 = (9, 10, 16, 19, 21, 22)
-"""Nearly the best six of the 24 that have one solution, second-basin gap 0.28."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

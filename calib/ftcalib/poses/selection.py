@@ -24,14 +24,14 @@ from ftcalib.poses.information import (
 
 Indices = NDArray[np.intp]
 
+# Information about every parameter before the first pose, in the units of `Guess.scale`: almost none.
 PRIOR = 1e-4
-"""Information about every parameter before the first pose, in the units of `Guess.scale`: almost none."""
+# Weight of the second term of the criterion, against gravity directions in one plane.
 WEIGHT_OF_PLANE = 0.3
-"""Weight of the second term of the criterion, against gravity directions in one plane."""
+# Smallest number of poses that determines all parameters.
 FEWEST = 4
-"""Smallest number of poses that determines all parameters."""
+# To the second solution (`second_basin`); above it, that solution does not matter.
 LEAST_GAP = 0.05
-"""To the second solution (`second_basin`); above it, that solution does not matter."""
 MOST_SWEEPS = 20
 LEAST_GAIN = 1e-6
 CLEARLY_WIDER = 1.1
@@ -217,15 +217,15 @@ def _inverse(information: Array) -> Array:
 # Selection of poses that verify a calibration: far from those of the fit, and able to name what has changed.
 
 FEWEST_TO_VERIFY = 2
+# Share of the candidates, the farthest from the fit, among which the poses are chosen.
 FARTHER_SHARE = 0.5
-"""Share of the candidates, the farthest from the fit, among which the poses are chosen."""
+# The choice hardly depends on the tool.
 TOOL = Guess(mass_kg=1.0, sigma_force_N=0.02, sigma_torque_Nm=0.001)
-"""The choice hardly depends on the tool."""
+# (15,) of mounting, gravity force, force bias, centre of mass and torque bias.
 USUAL_CHANGE = np.repeat([np.deg2rad(1.0), TOOL.weight_N * np.deg2rad(0.5), 0.5, 3e-3, 0.02], 3)
-"""(15,) of mounting, gravity force, force bias, centre of mass and torque bias."""
 
+# Error coordinates of mounting, gravity force (base or payload), centre of mass, and bias.
 CAUSES = (range(3), range(3, 6), range(9, 12), BIASES)
-"""Error coordinates of mounting, gravity force (base or payload), centre of mass, and bias."""
 
 
 def choose_verification_poses(
@@ -283,10 +283,10 @@ def choose_verification_poses(
 # limited workspace of E is that of a tool that points forwards and down: its axis (flange z) within 60° of the
 # direction halfway between straight down and forwards. F is on the opposite side, backwards and down.
 
+# Orientations of each set. H is the first half of E.
 COUNTS: Mapping[str, int] = {"A": 24, "B": 12, "C": 12, "D": 150, "E": 24, "F": 24, "G": 48, "H": 12}
-"""Orientations of each set. H is the first half of E."""
+# What Table III needs.
 EVERY_SET = "A+B+C+D+E+F+G"
-"""What Table III needs."""
 _HALF_ANGLE_RAD = np.pi / 3
 _SIDES = {"E": 1.0, "F": -1.0, "G": 1.0, "H": 1.0}
 

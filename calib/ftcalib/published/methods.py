@@ -175,8 +175,8 @@ def _best_yaw(M: Array, size: float, dof: int) -> float:
     return best
 
 
+# Takes the mean wrenches (n, 6) of fixed poses, returns the parameters.
 Estimator = Callable[[Array], Parameters]
-"""Takes the mean wrenches (n, 6) of fixed poses, returns the parameters."""
 
 _GRAVITY_UNKNOWN: Mapping[str, Callable[..., ForceFit]] = {
     "carlson-eigen": carlson.eigen,
@@ -186,8 +186,8 @@ _GRAVITY_UNKNOWN: Mapping[str, Callable[..., ForceFit]] = {
 }
 
 CARLSON = ("carlson-relaxation", "carlson-cayley", *_GRAVITY_UNKNOWN)
+# Those that take the gravity force from the 24 special orientations.
 SPECIAL = ("srom", "mixed")
-"""Those that take the gravity force from the 24 special orientations."""
 BASELINES = ("vougioukas", "wang", "yang")
 PUBLISHED = (*SPECIAL, "lrom", *CARLSON, *BASELINES)
 

@@ -27,16 +27,18 @@ _ROWS = (
 
 
 _AXES = dict(zip("xyz", np.eye(3), strict=True))
+# (24, 3, 3) the paper's e_bR_1 … e_bR_24 (Fig. 3, Table of special orientations): the rotation group of the cube.
 SPECIAL_R_flange_base = np.array([[float(row[0] + "1") * _AXES[row[1]] for row in rows.split()] for rows in _ROWS])
-"""(24, 3, 3) the paper's e_bR_1 … e_bR_24 (Fig. 3, Table of special orientations): the rotation group of the cube."""
 
+# Deviation from one of the 24 that is always accepted: more than an arm with calibrated kinematics misses by.
 TOLERANCE_RAD = np.deg2rad(1.0)
-"""Deviation from one of the 24 that is always accepted: more than an arm with calibrated kinematics misses by."""
+# Deviation that rounded poses have. A larger one is worth a note.
 ROUNDING_RAD = np.deg2rad(0.05)
-"""Deviation that rounded poses have. A larger one is worth a note."""
 
-_RECOGNISED_RAD = 1.3 * TOLERANCE_RAD  # the mean turn of the base is itself uncertain if all poses deviate
-_NEIGHBOURS = 0.065  # distance of the sums of `_likely_members` of poses 2° apart
+# The mean turn of the base is itself uncertain if all poses deviate.
+_RECOGNISED_RAD = 1.3 * TOLERANCE_RAD
+# Distance of the sums of `_likely_members` of poses 2° apart.
+_NEIGHBOURS = 0.065
 
 # Numbers of the orientations whose forces are added and subtracted: p_kj for k, j = 1, 2, 3 (eqs 17-23).
 _SUMS = (
