@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, Final, TypeAlias
 
 # What `json` can write: numbers, strings, None, and lists and dicts of them.
 JSON: TypeAlias = Any
-# Of a text that is read whole: 200,000 poses with their covariances.
+# Largest text that is read whole: 200,000 poses with their covariances.
 MOST_BYTES: Final = 200_000_000
 
 

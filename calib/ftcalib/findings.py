@@ -15,13 +15,13 @@ from typing import Any, Final, Literal, Self
 
 from ftcalib.rounding import decimals
 
-# Of a finding: the result is rejected, usable at best, or not worse for it.
+# What a finding does to the result: rejected, usable at best, or not worse for it.
 Severity = Literal["reject", "limit", "note"]
 Verdict = Literal["good", "usable", "rejected"]
 
 # The worst first.
 _VERDICTS: Final[Mapping[Severity, Verdict]] = {"reject": "rejected", "limit": "usable", "note": "good"}
-# Of a value in a template, with its form.
+# The place of a value in a template, with its form.
 _PLACE: Final = re.compile(r"\{(\w+)(?::([^}]*))?\}")
 _UNITS: Final = {
     "N": " N", "Nm": " N·m", "mNm": " mN·m", "kg": " kg", "m": " m", "s": " s", "mm": " mm", "deg": "°",
@@ -34,7 +34,7 @@ class Code:
     """What a code means."""
 
     severities: Sequence[Severity]
-    """Those that a finding can have. With several, its size decides."""
+    """Severities that a finding can have. With several, its size decides."""
     found: str
     """What was found: a template."""
     fix: str = ""

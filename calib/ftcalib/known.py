@@ -33,15 +33,15 @@ class Known:
     R_flange_sensor: ArrayLike | None = None
     """(3, 3) mounting of the sensor; with `yaw_only` except for a turn about flange z, default the identity."""
     R_tolerance_rad: float = 0.0
-    """Of each of the three angles; with `yaw_only` of the two tilts."""
+    """Tolerance of each of the three angles; with `yaw_only` of the two tilts."""
     yaw_only: bool = False
     """The sensor is mounted flat: only its turn about the flange z axis is unknown."""
     gravity_direction_base: ArrayLike | None = None
     """(3,) down, of any length: (0, 0, -1) for a level robot."""
     direction_tolerance_rad: float = 0.0
-    """Of each of the two tilt angles."""
+    """Tolerance of each of the two tilt angles."""
     mass_kg: float | None = None
-    """Of the load on the sensor."""
+    """Mass of the load on the sensor."""
     mass_tolerance_kg: float = 0.0
 
     def __post_init__(self) -> None:
@@ -203,15 +203,15 @@ class Setup:
     """(3,) declared up direction in base, of any length: (0, 0, 1) for a robot on a floor. If it is not declared, a
     robot that would have to hang on a wall or a ceiling is not good, because wrong rotations look like that too."""
     tool_mass_kg: float | None = None
-    """Of what hangs on the sensor, about."""
+    """About the mass that hangs on the sensor."""
     cylinders_m: Sequence[Sequence[float]] = ()
     """Tool and sensor as cylinders along flange z: from, to, diameter, and optionally x and y of the axis."""
     sensor_height_m: float | None = None
-    """Of the sensor's origin above the flange face."""
+    """Height of the sensor's origin above the flange face."""
     sensor_mass_kg: float | None = None
-    """Of sensor and adapter, which the sensor cannot weigh."""
+    """Mass of sensor and adapter, which the sensor cannot weigh."""
     payload_kg: float | None = None
-    """As set in the controller: of all that hangs on the flange."""
+    """Payload as set in the controller: all that hangs on the flange."""
 
     def __post_init__(self) -> None:
         if self.up_in_base is not None:

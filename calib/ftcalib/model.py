@@ -232,6 +232,7 @@ def rotation_of(vector: Array) -> Array:
 
 def angle_between(R1: Array, R2: Array) -> Array:
     """Angle in rad, shape (...), between rotations of shape (..., 3, 3) each; accurate for small angles too."""
+    # The chord keeps the digits of small angles, of which the trace loses half.
     chord = np.linalg.norm(np.asarray(R1) - R2, axis=(-2, -1)) / math.sqrt(8)
     return np.asarray(2 * np.arcsin(np.minimum(chord, 1.0)))
 

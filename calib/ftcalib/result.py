@@ -74,13 +74,13 @@ class MotionResult:
     inertia_kg_m2: Array
     """(3, 3) of the load about its centre of mass, in sensor axes."""
     delay_s: float
-    """Of the wrench after the poses."""
+    """Delay of the wrench after the poses."""
     height_m: float
-    """Of the sensor origin above the flange face."""
+    """Height of the sensor origin above the flange face."""
     covariance: Array
     """(23, 23) of the 15 error coordinates, ixx, iyy, izz, ixy, ixz, iyz, height and delay."""
     used_share: float
-    """Of the recording: the rest was contact, gaps, or too fast where the position is unknown."""
+    """Share of the recording that counts: the rest was contact, gaps, or too fast where the position is unknown."""
     contacts: tuple[Mapping[str, float], ...] = ()
     """Each with `t_s` after the first sample, `duration_s`, and the peaks `force_N` and `torque_Nm`, all filtered."""
 
@@ -177,7 +177,7 @@ class CalibrationResult:
     `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
     `correlations` (pairs of parameters above 0.9)."""
     motion: MotionResult | None = None
-    """Of a recording in motion, whose rows count as poses; None = from poses at rest."""
+    """What a recording in motion gives, whose rows count as poses; None = from poses at rest."""
 
     def __post_init__(self) -> None:
         for each in fields(Parameters):
@@ -239,7 +239,7 @@ class CalibrationResult:
 
     @property
     def verdict(self) -> Verdict:
-        """That of the worst finding."""
+        """Verdict of the worst finding."""
         return verdict_of(self.findings)
 
     @property
@@ -324,6 +324,7 @@ class CalibrationResult:
             hidden += hidden_covariance(self.parameters, self.gain_sigma, self.response.cross_talk_sigma_m)
         if self.cable_shift is not None:
             hidden += np.outer(self.cable_shift, self.cable_shift)
+        # A value that was given exactly hides nothing.
         known = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)) < 1e-12
         hidden[known], hidden[:, known] = 0.0, 0.0
         return np.asarray(self.covariance + hidden)

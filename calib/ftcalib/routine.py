@@ -98,7 +98,7 @@ class TourPose:
     """One stop of a tour."""
 
     number: int
-    """Of the orientation: 1 to 24 as in Yu et al., Fig. 3; above 100 for all others."""
+    """Number of the orientation: 1 to 24 as in Yu et al., Fig. 3; above 100 for all others."""
     q_rad: Array
     """(6,) joint angles."""
 
@@ -193,6 +193,7 @@ def take_pose(
         if steady:
             wrench = samples.wrench
             steady = is_stationary(wrench) if quiet_std is None else is_quiet(wrench, quiet_std)
+        # The last attempt is kept even if it is noisy: its covariance says so, and a tour needs its pose.
         record = PoseRecord(stop, pose, before, after, samples, steady, attempt)
         if steady:
             break

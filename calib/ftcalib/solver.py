@@ -95,6 +95,7 @@ def solve(
     wrench_cov = dataset.wrench_cov
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
+    # Yu's and Carlson's methods assume nothing of the mounting, so the fit beside them does not either.
     assumed = known if estimator is None or method in BASELINES else None
     best = _fit(dataset, wrench_cov, drift, known, assumed, g_m_s2, setup)
     judged = Judged.of(best) if estimator is None else _estimate(method, estimator, dataset, wrench_cov, best)
@@ -147,6 +148,7 @@ def _choose(
     if setup.up_in_base is None and known is not None and known.gravity_direction_base is not None:
         setup = replace(setup, up_in_base=(-np.asarray(known.gravity_direction_base)).tolist())
     known = _constrain(method, known, setup)
+    # Three orientations have 4 or 8 exact solutions: only known values, or a fourth, leave one.
     require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
     if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNRESOLVED_N:
         raise NotObservable("the force is the same in all poses: check that the sensor works and carries a load.")
@@ -329,6 +331,7 @@ def _require_determined(R_base_flange: Array, best: Fit, known: Known | None) ->
     information = Z.T @ best.information @ Z
     scale = column_scale(information)
     eigenvalues, V = np.linalg.eigh(information / np.outer(scale, scale))
+    # Scaled to a unit diagonal, the eigenvalues do not depend on units.
     free = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
     ambiguous = best.second_basin_chi2 is not None and best.second_basin_chi2 < ACCEPTED_DELTA_CHI2
     if known is None and (free.any() or ambiguous):

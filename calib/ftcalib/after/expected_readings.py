@@ -38,7 +38,7 @@ from ftcalib.result import CalibrationResult
 
 # Errors of an arm's orientations over which the average is taken. Before the fit, each is as likely as any other.
 USUAL_ERRORS_RAD = np.deg2rad(np.geomspace(0.005, 0.5, 20))
-# Of the last change of load, over which the average is taken. Before the fit, each is as likely as any other.
+# Shares of the last change of load over which the average is taken. Before the fit, each is as likely as any other.
 USUAL_SHARES = np.geomspace(1e-4, 5e-3, 9)
 # Steps of the bias from pose to pose, in sigma of the measured noise, over which the average is taken: of the forces,
 # and of the torques. Before the fit, each pair is as likely as any other.
@@ -46,7 +46,7 @@ USUAL_WALKS = np.geomspace(0.3, 30, 5)
 MANY_POSES = 1000
 # From more, the fit finds a walk in all channels that have one.
 FEW_POSES = 24
-# Of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck.
+# Least share of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck.
 LEAST_FACTOR = 0.1
 
 NO_WALK = (0.0, 0.0)
@@ -226,6 +226,7 @@ def _weigh_explanations(
         each = np.repeat(steps, 3)
         sigma = np.concatenate([sizes, np.full(lag.shape[2], share), np.tile(each, walk.shape[2] // 6)])
         x, C, chi2, logdet = _posterior(J, D + error_rad**2 * turn, sigma, e, offset)
+        # Restricted likelihood with the factor of the noise at its best, chi2 / dof.
         likelihood.append(-0.5 * (logdet + dof * np.log(chi2)))
         factor = max(chi2 / dof, LEAST_FACTOR)
         C += np.outer(x, x) / factor  # the calibration as stored is off by what this explanation moves its estimates

@@ -73,6 +73,7 @@ class CellPrior:
         old = self.earlier.parameters
         before = self._derivative(old)[rows]
         V = before @ self._covariance @ before.T
+        # Exactly known values have no variance: the ridge keeps the root finite.
         root = np.linalg.inv(np.linalg.cholesky(V + 1e-12 * np.diag(np.diag(V)) + 1e-24 * np.eye(len(V))))
         apart = [p.difference(old)[:3], self._across.T @ (old.down - p.down), self.coefficients - coefficients]
         return root @ self._derivative(p)[rows], root @ np.concatenate(apart)[rows]
@@ -268,6 +269,7 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
             "`ftdrive diff` shows in what; tool, sensor or base has changed."
         )
     shared, own = np.ix_(_SHARED, _SHARED), np.arange(15)[BIASES]
+    # The bias belongs to the last run: it moves as far as the shared values correlate with it.
     G = last.covariance[np.ix_(own, _SHARED)] @ np.linalg.inv(last.covariance[shared])
     step = np.zeros(15)
     step[_SHARED], step[own] = x, G @ x

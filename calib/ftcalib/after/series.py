@@ -14,7 +14,7 @@ from ftcalib.model import Array, Parameters, read_only
 
 # A standard deviation below this share of the largest is one of rounding: the value was taken as known.
 KNOWN = 1e-9
-# Likewise an eigenvalue of a correlation matrix.
+# An eigenvalue of a correlation matrix below this is one of rounding too.
 _SINGULAR = 1e-10
 # A difference in a direction that both calibrations take as known counts from here on.
 _ROUNDING_SIGMAS = 1e-3
@@ -51,9 +51,9 @@ class Difference:
     sigma: Array
     """(15,) one standard deviation of that; 0 where both calibrations share the value or take it as known."""
     joint: ChiSquare
-    """Of all parameters that the calibrations do not share."""
+    """Test of all parameters that the calibrations do not share."""
     groups: Mapping[str, ChiSquare]
-    """Of each field of `Parameters`."""
+    """Test of each field of `Parameters`."""
 
     @property
     def in_sigmas(self) -> Array:
@@ -156,7 +156,7 @@ class DriftOnset:
     sigma: Array
     """One standard deviation of that, by the stated sigmas or by the scatter if that is larger."""
     p_value: Array
-    """Of the slope, for one onset and one component."""
+    """p-value of the slope, for one onset and one component."""
 
     def __post_init__(self) -> None:
         for name in ("t0_days", "slope", "sigma", "p_value"):

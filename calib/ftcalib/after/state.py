@@ -166,6 +166,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     estimated_15[:15] = estimated
     gain = estimated_15 @ G
     mixed = kept - gain @ K
+    # The old error of a kept parameter goes into the new ones, so both are correlated.
     covariance = gain @ noise @ gain.T + mixed @ C @ mixed.T
     covariance = (covariance + covariance.T) / 2
     return Update(
@@ -242,6 +243,7 @@ def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
             weight[9:12, 0] = -p.p_sensor_com_m / weight_N
         columns.append(weight)
     if "centre of mass" in blocks:
+        # The product of weight and centre of mass is estimated: readings are linear in it.
         columns.append(np.eye(15)[:, 9:12] / weight_N)
     if "bias" in blocks:
         columns.append(np.eye(15)[:, BIASES])
@@ -371,6 +373,7 @@ def tare(
     """
     if len(dwells) == 0:
         raise BadDataset("there is no dwell: record at least one pose.")
+    # The covariance of a mean holds only for a reading at rest.
     for i, dwell in enumerate(dwells):
         if not is_stationary(dwell):
             raise BadDataset(f"pose {i + 1}: the reading changes during the dwell: keep arm and tool still.")

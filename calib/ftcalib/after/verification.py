@@ -60,7 +60,7 @@ class Verification:
     predicted_sigma: Array
     """(n, 6) standard deviation of that: noise, drift and uncertainty of the calibration."""
     chi2: float
-    """Of all residuals together."""
+    """Chi2 of all residuals together."""
     dof: int
     p_value: float
     """Probability of a larger chi2 if nothing has changed."""
@@ -155,6 +155,7 @@ def verify(
         for kind in explanations
     ]
     likeliest = [max(kind, key=lambda one: one.weight) for kind in explanations]
+    # An alarm needs all explanations to fail: the sensor that passes under one of them may be unchanged.
     p_value = max(p_values)
     if p_value >= false_alarms:
         return _compare(likeliest[p_values.index(p_value)], p_value, R_base_flange, wrench, passed=True)
@@ -214,6 +215,7 @@ def _explain(
         least, update = found[single[0]]
         change = SINGLE[single[0]]
         blocks = set(BLOCKS[single[0]])
+        # A payload includes its weight: such a pair is no alternative, but more of the same.
         apart = [kind for kind in single if not (blocks <= set(BLOCKS[kind]) or blocks >= set(BLOCKS[kind]))]
         near = [SINGLE[kind] for kind in apart if found[kind][0] < least + INDISTINCT]
         others = tuple(dict.fromkeys(near))

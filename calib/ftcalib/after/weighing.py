@@ -166,6 +166,7 @@ def weigh(
             x[1:], sigma_kg = x[0] * p_sensor_near_m, float(1 / np.sqrt(a @ W @ a))
             continue
         W = np.linalg.inv(S)
+        # In moments (m p) the prior of the place scales with the mass, of which at least one sigma counts.
         near = np.column_stack([-p_sensor_near_m, np.eye(3)]) / (REACH_M * max(abs(x[0]), sigma_kg))
         H = A.reshape(6 * n, 4)
         covariance = np.linalg.inv(H.T @ W @ H + near.T @ near)

@@ -36,7 +36,7 @@ VECTOR_COLUMNS = ("rx", "ry", "rz")
 # What a table may hold: rotation matrix row by row, quaternion, rotation vector in rad.
 ORIENTATION_FORMS = "r11..r33, qx, qy, qz, qw or rx, ry, rz"
 _LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
-# Of a quaternion: it differs from 1 by no more.
+# A quaternion rounded to two decimals differs from length 1 by no more.
 _ROUNDED_LENGTH = 0.01
 
 

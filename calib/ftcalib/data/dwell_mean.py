@@ -176,6 +176,7 @@ def _autocorrelation_time(noise: Array) -> Array:
         m = int(negative[0]) if negative.size else len(pairs)
         monotone = np.minimum.accumulate(pairs[:m, c])
         tau[c] = (2 * monotone.sum() / gamma[0, c] - 1) * (1 + (4 * m - 1) / N)
+    # Anticorrelated noise shortens the autocorrelation time, but a mean is never that certain.
     return np.maximum(tau, 0.1)
 
 
@@ -230,7 +231,7 @@ class AveragingTime:
     reached: bool
     """Whether every channel meets its target."""
     words: str
-    """The same in a sentence, with the reason if a target is not reached."""
+    """Time and sigma in a sentence, with the reason if a target is not reached."""
 
 
 def allan_deviation(wrench: Array, lengths: Array | list[int]) -> Array:

@@ -169,6 +169,7 @@ def drift_ahead(fit: Judged, t_s: Array | None = None) -> DriftAhead:
     intervals = NEXT_USE_S * (n - 1) / np.ptp(time)
     walk = np.zeros(6)
     for channels in (FORCE, TORQUE, *([c] for c in range(6))):
+        # A random walk has no direction: only its variance grows until the next use.
         walk[channels] += intervals * fit.components.get(component("walk", channels).name, 0.0) ** 2
     linear = np.where(walk > 0, 0.0, fit.drift.change * NEXT_USE_S / (time[last] - time[first]))
     # The change from the first pose to the last has the errors of both ends.

@@ -17,7 +17,7 @@ from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minim
 from ftcalib.model import UP_IN_BASE, Array, Parameters, gravity_wrench, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
 
-# Of readings, relative to the largest: what is left at least.
+# Rounding of readings, relative to the largest: no fit leaves less.
 ROUNDING = 1e-9
 READINGS = {
     "orientations_inverted": "inverted orientations",
@@ -137,6 +137,7 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
     as_read = _Rough.of(R_base_flange, wrench)
     found = []
     for code, values, R, y in _readings(R_base_flange, wrench):
+        # No rotation does better than any matrix of its size: this bound spares the search over rotations.
         if code != "columns_swapped" and least_rms(R, y[:, :3]) > COLLAPSE * as_read.force_rms_N:
             continue
         trial = _Rough.of(R, y)
@@ -261,6 +262,7 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
     found = [Finding.of("stuck_channels", channels=stuck)] if stuck else []
     coarse = [_coarse_step(part[:FOR_STEPS]) for part in np.hsplit(wrench, 2)]
     if any(coarse):
+        # Coarse steps make equal readings by themselves: no copy or saturation is looked for.
         return [*found, Finding.of("quantised", step_N=coarse[0], step_Nm=coarse[1])]
     distinct = len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench)
     copied = [] if distinct else _copies(wrench)

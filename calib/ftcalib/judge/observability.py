@@ -188,6 +188,7 @@ def wrong_basin_probability(delta_chi2: float) -> float:
 
 def different_orientations(R_base_flange: Array) -> int:
     """Count orientations that differ by more than half a degree; stops counting at 24."""
+    # The first 24 of a usual tour all differ: one comparison of all pairs answers for it.
     kept, rest = R_base_flange[:24], R_base_flange[24:]
     pairs = np.triu_indices(len(kept), 1)
     if np.any(angle_between(kept[pairs[0]], kept[pairs[1]]) <= SAME_ORIENTATION_RAD):

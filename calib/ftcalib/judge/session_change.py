@@ -39,7 +39,7 @@ from ftcalib.model import (
 FEWEST_POSES = 10
 # Poses before and after.
 FEWEST_ON_A_SIDE = 3
-# Of longer sessions every second, third, ... pose is looked at.
+# Of longer sessions only every second, third, ... pose is looked at.
 MOST_POSES = 300
 # A change must bring the mean square misfit below this share before the likelihood is asked.
 CLEARLY = 0.5
@@ -67,7 +67,7 @@ class SessionChange:
     rows: Rows
     """(n,) in the order of time."""
     values: Mapping[str, float]
-    """Of its finding."""
+    """Values of its finding."""
     corrected: Array
     """(n, 6) wrench without it."""
     misfit: float
@@ -98,6 +98,7 @@ def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma
     sigma : array, shape (6,), optional
         Measured noise of a pose.
     """
+    # Negative floor division rounds the step up.
     order = order[:: -(-len(order) // MOST_POSES)]
     n, R, wrench = len(order), found.R_base_flange[order], found.wrench[order]
     if n < FEWEST_POSES:
@@ -160,6 +161,7 @@ def likeliest_change(
     ramp = np.linspace(-1, 1, n)[:, None, None] * np.eye(6)
     J = np.concatenate([jacobian(parameters, R), response_columns(parameters, R)], axis=2)
     residuals = wrench - predict(parameters, R)
+    # A steady drift is no change: what remains beside it is the measure.
     without = min(_least(J, residuals, scale)[0], _least(np.concatenate([J, ramp], axis=2), residuals, scale)[0])
 
     best: dict[str, tuple[float, Parameters, Rows]] = {}
@@ -237,6 +239,7 @@ def _refine(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, row
         "change_N": float(moved[9] if rows[-1] else -moved[9]),
         "shift_mm": 1e3 * _length(moved[COM]),
     }
+    # BIC: kinds of change with more numbers must explain more.
     criterion = wrench.size * np.log(max(misfit, 1e-300)) + len(own) * np.log(wrench.size)
     return SessionChange(code, rows, values, undone - C @ x[: len(own)] + p.bias, misfit, float(criterion))
 
@@ -279,7 +282,8 @@ def _length(vector: Array) -> float:
 
 # Probability of a chance finding: slack at the mean orientation, and at the best of about 70.
 FALSE = 1e-3, 1e-4
-# The same where the torques have more noise than was measured: its cause is unknown, and a cable is a usual one.
+# Probability of a chance finding where the torques have more noise than was measured: its cause is unknown, and a
+# cable is a usual one.
 FALSE_IN_NOISE = 0.05
 # Poses: fewer leave nothing for a test. More are seldom of a tour.
 FEWEST, MOST = 8, 1000
@@ -315,7 +319,7 @@ def cable_of(fit: Fit) -> Cable | None:
     chi2 = float(np.vdot(r, u))
 
     def best_of(slack: Array) -> tuple[float, Array, Array, Array]:
-        """Of orientations (k, 3, 3) with a slack cable: what chi2 falls by, orientation, torques, moved parameters."""
+        """Find the best slack orientation of (k, 3, 3): fall of chi2, orientation, torques, moved parameters."""
         k = len(slack)
         v = Rotation.from_matrix((np.swapaxes(slack, 1, 2)[:, None] @ R).reshape(-1, 3, 3)).as_rotvec()
         each = np.zeros((n, 6, k, 3, 3))

@@ -81,7 +81,7 @@ class Quality:
 
     @property
     def verdict(self) -> Verdict:
-        """That of the worst finding."""
+        """Verdict of the worst finding."""
         return verdict_of(self.findings)
 
     @property
@@ -154,8 +154,10 @@ def judge(
     parameters, weight_N = fit.parameters, fit.parameters.weight_N
     few_rejected = at.used.sum() >= (1 - FEW_LEFT_OUT) * len(at.used)
     suspect = at.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
+    # Simulated readings without noise repeat themselves by right.
     broken = [] if at.is_exact else broken_channels(fit.wrench, fit.R_base_flange)
     mistakes = _mistakes(fit, at.used, t_s, setup) if suspect else []
+    # Known values that are wrong would look like a change: the fit without them is searched.
     changed = [] if mistakes else _change(unconstrained or fit, at, measured_sigma, t_s)
     if suspect and not (mistakes or changed):
         mistakes = _other_poses(fit, at.used, t_s)
@@ -182,12 +184,14 @@ def judge(
         *_cable(cable),
     ]
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
+    # Signs and mounting follow from the estimates, which mean nothing beside a mistake or such errors.
     if not mistakes and at.largest_share < SENSELESS_SHARE:
         found += described_cell.directions(parameters, fit.covariance, setup)
         found += [one for one in payload if one.code == "payload_units" and not broken]
     if verdict_of(found) != "rejected":  # its contradictions would be consequences
         found += [one for one in payload if one not in found]
         found += described_cell.tool(parameters, fit.covariance, setup, g_m_s2)
+    # Data with a mistake, or that fit as they are, say nothing against a known value.
     if not (broken or mistakes or at.fits_measured_noise):
         harmless = verdict_of(found) == "good"
         found += [replace(one, severity="note") if harmless else one for one in contradicted]
@@ -296,6 +300,7 @@ def _errors(fit: Judged, used: NDArray[np.bool_], weight_N: float) -> tuple[floa
             ("cross-validation", left_out[k]),
             ("uncertainty over all orientations", expected[k]),
         )
+        # The largest number of limits; of equal ones the first, so residual before cross-validated before expected error.
         limits = [sum(error > limit * scale for limit in (USABLE_SHARE, REJECTED_SHARE)) for _, error in errors]
         source, error = errors[int(np.argmax(limits))] if max(limits) else max(errors, key=lambda pair: pair[1])
         share = error / scale if scale else float("inf")

@@ -202,6 +202,7 @@ class Descent:
         common = len(weights) == 1 or weights.strides[0] == 0
         separate = _without_correlation(weights[:1] if common else weights)
         if common and n > CHUNK:
+            # Sums about a mean keep the digits that a large bias would take.
             reference[:, 9] = self.wrench[:CHUNK].mean(axis=0)
             gram = wrench_gram(self.R, self.wrench, reference)
             rows = [0, 1, 2, *range(6, 16)]
@@ -365,6 +366,7 @@ def agreeing_poses(descent: Descent, weights: Array, starts: Sequence[Parameters
     for start in starts:
         p = start
         d2 = squared_distances(p)
+        # So soft at first that the cost is convex; then poses that do not fit lose their weight.
         softness = max(1.0, 2 * float(d2.max()) / FARTHEST)
         while softness > 1:
             soft = softness * FARTHEST

@@ -253,7 +253,7 @@ POSES_FOR_THE_SHAPE = 500
 SUSPICIOUS = 0.01
 # The median of squared distances relative to their mean, in units of what Gaussian noise has.
 LIGHT_TAIL = 0.6
-# Of the outer loop; it ends after a few.
+# Rounds of the outer loop, which ends after a few.
 ROUNDS = 20
 # Squared step, in standard deviations of the estimates.
 SETTLED = 1e-4
@@ -374,6 +374,7 @@ def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
         distances = squared_length(*at.left_out())
         criterion = _criterion(session, at, distances)
         if criterion < best.criterion - 1e-3:
+            # Many poses distributed as the noise would have them hide no bumped one.
             if kept.all() and _are_gaussian(session, distances):
                 return Explanation(p, kept, at.components, at.theta, criterion, noise=at.noise)
             noise_found = {"white", "rotation"} & {c.kind for c in at.components[len(always) :]}
@@ -411,6 +412,7 @@ def _settle(
 def _membership(session: Session, kept: Kept, distances: Array, at: Point) -> Kept:
     """Reject the poses that stand out, the worst first; take back those that do not any more."""
     limit = _limit(session, at)
+    # The worst first: a bumped pose bends the fit, and good poses beside it look wrong.
     out = kept & (distances > max(limit, float(distances[kept].max()) / 4))
     after = (kept & ~out) | (~kept & (distances < limit))
     return after if after.sum() >= fewest_kept(session.n) else kept

@@ -56,7 +56,7 @@ class Fit:
     """Under the noise model: measured or estimated white noise plus `components`. About dof by construction."""
     dof: int
     measured_chi2: float
-    """The same poses, best fit without drift, weighted by the measured noise alone; NaN without it."""
+    """Chi2 of the same poses, best fit without drift, weighted by the measured noise alone; NaN without it."""
     weights: Array
     """(n,) 1 = used, 0 = rejected because it does not fit the others."""
     components: Mapping[str, float]
@@ -194,6 +194,7 @@ def fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2:
     Z = session.constraints.free(best.parameters)
     given_noise = covariance = np.asarray(Z @ _inverse(Z.T @ best.information @ Z) @ Z.T)
     response = lag = None
+    # Many poses show the variances so well that their uncertainty does not widen that of the estimates.
     if found.keys() & {*RESPONSE, HYSTERESIS} or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
         problem = session.linearised(best.parameters, e.kept)
         at = point(problem, e.components, e.theta)

@@ -93,7 +93,7 @@ class Response:
 
     @property
     def cross_talk_sigma_m(self) -> float:
-        """The same of the cross-talk, N·m/N."""
+        """Standard deviation of the entries of the whole cross-talk, N·m/N."""
         return LEVER_M * float(np.sqrt(_ENTRIES[1] @ self._squares[5:]))
 
     @property
@@ -146,6 +146,7 @@ def hidden_covariance(parameters: Parameters, gain_sigma: float, cross_talk_sigm
     """
     hidden, common = np.zeros((15, 15)), np.zeros(15)
     common[3:6], common[9:12] = parameters.gravity_force_base_N, -parameters.p_sensor_com_m
+    # An antisymmetric entry has half the variance of an entry.
     hidden[range(3), range(3)] = _FROM_5 * gain_sigma**2 / 2
     hidden[range(9, 12), range(9, 12)] = _FROM_6 * cross_talk_sigma_m**2 / 2
     return np.asarray(hidden + (COMMON_GAIN * gain_sigma) ** 2 * np.outer(common, common))

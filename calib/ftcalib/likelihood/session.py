@@ -42,7 +42,7 @@ POSES_FOR_EACH_AXIS = 50
 EXACT = 100
 # Residuals of one kind, relative to the other at the usual ratio, are no less.
 UNEQUAL = 0.01
-# Of the residuals: the least white noise where it was not measured.
+# Least white noise where it was not measured, as a share of the residuals.
 FLOOR = 1e-3
 
 
@@ -80,7 +80,7 @@ class Session:
         self.everything = np.ones(self.n, bool)
 
     def dof(self, kept: Kept) -> int:
-        """Of chi2, from the poses that count."""
+        """Degrees of freedom of chi2, from the poses that count."""
         return 6 * int(kept.sum()) - 15 + self.constraints.dof - (6 if self.drift == "linear" else 0)
 
     def lacks_rank(self, minimum: Minimum) -> bool:

@@ -107,6 +107,7 @@ class Noise:
         Q = self.W[:, :, self._walking] @ (s[:, None] * M_ones)
         self._low_rank.append((Q, np.linalg.inv(mean)))
         self._logdet += 2 * float(np.log(self._cholesky[-1]).sum()) + float(np.linalg.slogdet(mean)[1])
+        # The pseudo-determinant of the path: its mean is removed.
         self._logdet += k * (float(np.log(dt).sum()) - 2 * float(np.log(n)))
 
     def add_effects(self, T: Array, variance: Array) -> None:

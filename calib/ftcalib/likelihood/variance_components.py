@@ -19,7 +19,7 @@ from ftcalib.model import Array
 
 # A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance.
 GAIN = 2.0
-# The same for gain, cross-talk and hysteresis, whose 5 and 6 numbers come in by chance in 0.4 %.
+# The gain in likelihood for gain, cross-talk and hysteresis, whose 5 and 6 numbers come in by chance in 0.4 %.
 GAIN_OF_RESPONSE = 3.0
 # Squared distance from the best variances, in their standard deviations.
 SETTLED = 1e-2
@@ -27,7 +27,7 @@ SETTLED = 1e-2
 CAREFUL = 0.3
 # A climb gains no more than this many times what slope and curvature promise.
 HOPE = 10.0
-# Of the white noise: where slope and curvature "at zero" are taken.
+# Share of the white noise at which slope and curvature "at zero" are taken.
 NEGLIGIBLE = 1e-4
 # Variances that no arm or sensor in working order exceeds. A larger one has another cause.
 LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2, "hysteresis": 0.03**2}
@@ -364,6 +364,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array,
             break
         gained = 0.0
         while caution < 1e6:
+            # Levenberg-Marquardt: average information is the curvature only near the best variances.
             damped = information + np.diag(caution * (np.diag(information) + 1e-3))
             step = np.clip(np.linalg.solve(damped, slope), -2.5, 2.5)
             if caution < CAREFUL:  # far below the best variance a step of expectation and maximisation is longer

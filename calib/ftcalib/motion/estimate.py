@@ -35,7 +35,7 @@ from ftcalib.published.yu import com_and_torque_bias
 GYRATION_M, HEIGHT_M, DELAY_S = 0.15, 0.3, 0.3
 # Squared distance of a row in contact.
 CONTACT = float(chi2_isf(6, 1e-7))
-# Of a row in contact, in a motion that a guard has watched.
+# Least residual of a row in contact, in a motion that a guard has watched.
 TOUCH_N, TOUCH_NM = 2.0, 0.2
 # Share of the rows of a state that is free of contact.
 QUIET = 0.4
@@ -61,11 +61,11 @@ _MANY = 1000
 _SAME_RAD = 0.2
 # Rows that show the noise of the one in their middle, and how many of its state count with them.
 _AROUND, _PRIOR_ROWS = 3, 1.0
-# Of the fit with a prior, and the change of its cost that ends it.
+# Steps of the fit with a prior, and the change of its cost that ends it.
 _PRIOR_STEPS, _SETTLED = 20, 1e-4
 # Solutions, each with the noise and the contacts of the one before, and those before which components are chosen.
 _STAGES, _CHOICES = 6, (1, 2, 4)
-# That are tried: of the entries of gain and cross-talk, and of the walk of the bias in a second.
+# Sizes that are tried: of the entries of gain and cross-talk, and of the walk of the bias in a second.
 _SIZES: Mapping[str, Array] = {
     "gain": np.geomspace(5e-4, 5e-2, 9),
     "cross_talk": np.geomspace(5e-4, 2e-1, 11),
@@ -96,9 +96,9 @@ class MotionFit:
     components: Mapping[str, float] = field(default_factory=dict)
     second_basin_chi2: float | None = None
     chi2: float = 0.0
-    """Of the kept rows, made independent: about 6 a row."""
+    """Chi2 of the kept rows, made independent: about 6 a row."""
     contradiction: str = ""
-    """Of rows and prior."""
+    """What rows and prior contradict each other in; empty where they agree."""
 
     @property
     def prior_share(self) -> Array:
@@ -323,6 +323,7 @@ def fit(
         are no contact: only rows above `TOUCH_N` or `TOUCH_NM` are, and each row has the noise of its surroundings.
     """
     problem = _Problem(rows, known, g_m_s2, point_mass=point_mass)
+    # Forces alone allow several mountings: the residuals of a robust fit, with the torques, decide.
     roughs = sorted((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])
     load, _ = roughs[0]
     r = rows.wrench - problem.predicted(load, rows)
@@ -359,6 +360,7 @@ def fit(
     for other, _ in roughs[1:] if prior is None else ():
         if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
             there = problem.sums(other, drift, noise, kept, state)
+            # What one linear step would leave at the other mounting, less the chi2 of this one.
             others.append(there[2] - float(there[1] @ problem.solved(sizes, there, other, drift).step) - chi2)
     change = None
     if sizes.get("walk_N") or sizes.get("walk_Nm"):

@@ -23,7 +23,7 @@ from ftcalib.model import Array, Parameters, cross, skew
 from ftcalib.motion.samples import Motion
 
 INERTIA_NAMES = ("xx", "yy", "zz", "xy", "xz", "yz")
-# Of what motion adds to the 15 static coordinates.
+# Names of what motion adds to the 15 static coordinates.
 NAMES = (*(f"inertia_kg_m2.{axes}" for axes in INERTIA_NAMES), "height_m", "delay_s")
 # Places in an error vector.
 INERTIA, HEIGHT, DELAY, GAINS, CROSS_TALK = slice(15, 21), 21, 22, slice(23, 28), slice(28, 34)
@@ -48,9 +48,9 @@ class Load:
     inertia: Array = field(default_factory=lambda: np.zeros(6))
     """(6,) in the order of `INERTIA_NAMES`, about the centre of mass, in sensor axes."""
     height_m: float = 0.0
-    """Of the sensor origin above the flange face."""
+    """Height of the sensor origin above the flange face."""
     delay_s: float = 0.0
-    """Of the wrench, beyond that of the rows."""
+    """Delay of the wrench beyond that of the rows."""
     response: Array = field(default_factory=lambda: np.zeros(11))
     """Coefficients of gain and cross-talk."""
 
@@ -149,14 +149,14 @@ def _vee(M: Array) -> Array:
 # Noise of the rows, from their residuals: by state of motion, correlated between channels and in time.
 
 REST_RAD_S = 0.02
-# Of speed, beside rest.
+# Classes of speed, beside rest.
 CLASSES = 3
 # Rows that show the noise of a state; fewer count with the next faster one.
 FEWEST = 40
-# Of the autoregression, in rows.
+# Order of the autoregression, in rows.
 ORDER = 6
 _ROWS_PER_ORDER = 25
-# Of a partial correlation.
+# Largest partial correlation: a larger one would predict a row from the one before alone.
 _MOST = 0.98
 
 

@@ -31,7 +31,7 @@ LATEST_S = 1e11
 
 # (11, 3) value and two derivatives of a quartic through 110 ms: flat over the band.
 _FIT = np.linalg.pinv(np.vander(MEAN_S * np.arange(-5, 6), 5, increasing=True))[:3].T * [1.0, 1.0, 2.0]
-# Of the samples of a mean.
+# A mean with less weight of samples than this is none.
 _LEAST_WEIGHT = 1e-3
 # Rows that are filtered at once.
 _CHUNK = 600
@@ -114,6 +114,7 @@ class Means:
         if not self._parts:
             raise BadDataset("there are no samples")
         _, sums = _sum_cells(*(np.concatenate(each) for each in zip(*self._parts, strict=True)))
+        # Weights fall to 0 at the ends of a mean: one with almost none says nothing.
         sums = sums[sums[:, 0] > _LEAST_WEIGHT]
         t_s = sums[:, 1] / sums[:, 0]
         own = np.diff(t_s, prepend=-np.inf) > MEAN_S / 10  # a sample of a slow stream is alone in two means
@@ -171,7 +172,7 @@ class Rows:
     """(n, 6)"""
     motion: Motion
     rate: Motion
-    """Of change, per second."""
+    """Rate of change of the motion, per second."""
     speed_rad_s: Array
     """(n,) angular speed, plus that of the flange origin at 0.5 m: the state of motion."""
     delay_s: float
@@ -221,6 +222,7 @@ def rows_of(
         )
     quaternion = Rotation.from_matrix(poses[1][:, :9].reshape(-1, 3, 3)).as_quat()
     turned = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
+    # q and -q are one rotation: interpolation needs neighbours of equal sign.
     quaternion[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
     poses = t_p, np.hstack([quaternion, poses[1][:, 9:]])
     parts = [

@@ -29,7 +29,7 @@ FARTHEST_S = 1.5
 OFFSET_S = 0.1
 # So far from the delay of the rows the model is linear in it.
 LINEAR_S = 2e-3
-# Of the parts that count without positions.
+# Fastest parts that count without positions, because their acceleration is unknown.
 SLOW_RAD_S = 0.15
 # Radius at which an arm swings the flange: bounds the acceleration that is unknown without positions.
 REACH_M = 1.0
@@ -44,7 +44,7 @@ _UNEXPLAINED = 0.3
 _MISTAKES = frozenset(
     ("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree")
 )
-# Of the inertial mass: less weight than this was subtracted.
+# A weight below this share of the inertial mass was subtracted before.
 _COMPENSATED = 0.5
 _JUDGED_ROWS = 300
 # A recording has no last pose from which a bias could go on, so its next use has the error expected from noise alone.
@@ -104,6 +104,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     delay_s, row_s = _coarse_delay(rows_of(*data)), NARROW_S if guarded else WIDE_S
     rows = rows_of(*data, delay_s, row_s)
     delay_s += rough_delay(_select_rows(rows, positions), known, g_m_s2)
+    # The model is linear in the delay only near that of the rows: far from it they are filtered again.
     for _ in range(3):
         rows = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), row_s)
         used = _select_rows(rows, positions)
@@ -237,6 +238,7 @@ def _judge(
     """
     places = np.flatnonzero(best.kept)
     places = places[:: max(1, len(places) // _JUDGED_ROWS)]
+    # An odd number of rows, so that the mean lies on its row.
     second = round(1 / rows.row_s / 2) * 2 + 1
     best = replace(best, residuals=_means(best, second), sigma=best.sigma / np.sqrt(second))
     weight_N = best.load.static.weight_N

@@ -32,7 +32,7 @@ class Guess:
     """Expected tool, noise and base. Angles and offsets as in a calibration file."""
 
     mass_kg: float
-    """Of the load on the measuring side."""
+    """Mass of the load on the measuring side."""
     sigma_force_N: float
     """Standard deviation of one axis in the mean of one pose."""
     sigma_torque_Nm: float

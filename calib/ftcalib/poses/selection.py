@@ -122,6 +122,7 @@ def choose(R_candidates: Array, n: int, guess: Guess) -> Indices:
         contradiction = _contradiction(R_candidates, guess, other)
         strong = [int(i) for i in chosen if contradiction[i] > contradiction.max() / 2]
         contradiction[chosen] = -1.0
+        # Pinned poses stay, or the exchange would take the contradiction out again.
         pinned = [*dict.fromkeys([*pinned, *strong, int(contradiction.argmax())])]
     return best
 

@@ -186,7 +186,7 @@ _GRAVITY_UNKNOWN: Mapping[str, Callable[..., ForceFit]] = {
 }
 
 CARLSON = ("carlson-relaxation", "carlson-cayley", *_GRAVITY_UNKNOWN)
-# Those that take the gravity force from the 24 special orientations.
+# Methods that take the gravity force from the 24 special orientations.
 SPECIAL = ("srom", "mixed")
 BASELINES = ("vougioukas", "wang", "yang")
 PUBLISHED = (*SPECIAL, "lrom", *CARLSON, *BASELINES)
