@@ -162,7 +162,7 @@ def table_iii(
     dataset : CalibrationDataset
         The sets A to G in any order, in one session.
     numbers : sequence of int
-        Of each pose, as `ftcalib.poses.selection.numbers_of` gives them.
+        Number of each pose, as `ftcalib.poses.selection.numbers_of` gives them.
     truth : Parameters, optional
         Reference of mass, centre of mass and mounting; default: the maximum likelihood estimate of all poses but
         those of D.

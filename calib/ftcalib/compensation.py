@@ -29,7 +29,7 @@ class Compensator:
     ----------
     parameters : Parameters
     dtype : float64 (default) or float32
-        Of the arithmetic and of the result. float32 halves the memory traffic and costs about 1e-7 of the wrench.
+        Type of the arithmetic and of the result. float32 halves the memory traffic and costs about 1e-7 of the wrench.
     response : Response, optional
         Gain and cross-talk of the sensor.
 

@@ -128,7 +128,7 @@ def object_of(content: bytes, error: type[Exception], *, accept_changed: bool = 
     Parameters
     ----------
     content : bytes
-        Of the file. A document without a checksum, as people write it, is accepted.
+        Content of the file. A document without a checksum, as people write it, is accepted.
     error : type
     accept_changed : bool
         Accept a document that its checksum does not fit.

@@ -162,7 +162,7 @@ def expected_with_inexact_orientations(
     R_base_flange : array, shape (n, 3, 3)
         New poses, in the order of measuring.
     wrench_cov : array, shape (n, 6, 6)
-        Of the new readings.
+        Covariance of the new readings.
     """
     share = calibration.components.get("hysteresis", 0.0)
     usual = [(error_rad, share, NO_WALK) for error_rad in USUAL_ERRORS_RAD]

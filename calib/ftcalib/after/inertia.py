@@ -59,7 +59,7 @@ def motion_of_poses(
     Returns
     -------
     Motion
-        Of n - 2 reach poses.
+        Motion of n - 2 reach poses.
     """
     size, inner = 2 * reach + 1, slice(reach, len(t_s) - reach)
 

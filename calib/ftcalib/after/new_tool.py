@@ -38,7 +38,7 @@ class CellPrior:
     Parameters
     ----------
     earlier : CalibrationResult
-        Of the same sensor, mounting and base, with any tool.
+        A result of the same sensor, mounting and base, with any tool.
     """
 
     def __init__(self, earlier: CalibrationResult) -> None:
@@ -65,7 +65,7 @@ class CellPrior:
         p : Parameters
             The present ones.
         coefficients : array, shape (11,) or (0,)
-            Of gain and cross-talk.
+            Coefficients of gain and cross-talk.
         kept : sequence of int
             Which count: 0 to 2 mounting, 3 and 4 base. Gain and cross-talk do unless it is empty.
         """
@@ -144,7 +144,7 @@ def new_tool(
     dataset : CalibrationDataset
         3 poses or more whose noise was measured; 4 for a test worth its name.
     provenance : mapping, optional
-        Of the dataset.
+        Where the dataset comes from.
 
     Returns
     -------
@@ -239,7 +239,7 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
     Parameters
     ----------
     results : sequence of CalibrationResult
-        Of runs that were solved by themselves, the oldest first.
+        Results of runs that were solved by themselves, the oldest first.
     provenance : mapping, optional
 
     Returns

@@ -171,11 +171,11 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
     t_days : array, shape (n,)
         Since the calibration, in ascending order; any spacing.
     change : array, shape (n, k)
-        Of the bias since the calibration, as `ftcalib.after.expected_readings` estimates it.
+        Change of the bias since the calibration, as `ftcalib.after.expected_readings` estimates it.
     sigma : array, shape (n, k)
-        Of the readings of each verification, positive.
+        One standard deviation from the readings of each verification, positive.
     calibration_sigma : array, shape (k,)
-        Of the calibration, common to all.
+        One standard deviation from the calibration, common to all.
     """
     if len(t_days) < FEWEST:
         return None
@@ -276,7 +276,7 @@ def trend(t: Array, values: Array, covariance: Array) -> Trend:
         n >= 3, not all equal.
     values : array, shape (n, k)
     covariance : array, shape (n, k, k)
-        Of each row, positive definite; the rows are independent.
+        Covariance of each row, positive definite; the rows are independent.
 
     Raises
     ------

@@ -194,7 +194,8 @@ def updated(
         That the update was made from.
     update : Update
     provenance : mapping, optional
-        Of the new readings. The id of the old calibration is added to its `parent`, and the kind of update as `update`.
+        Where the new readings come from. The id of the old calibration is added to its `parent`, and the kind of update
+        as `update`.
 
     Raises
     ------
@@ -321,7 +322,7 @@ def compare_with_prediction(
     wrench : array, shape (n, 6)
         Means, N and N·m, in the sensor frame.
     wrench_cov : array, shape (n, 6, 6)
-        Of those means.
+        Covariance of those means.
     drift_N, drift_Nm : float
         Expected drift of the biases, one standard deviation an axis.
 

@@ -131,7 +131,7 @@ def weigh(
     drift : array, shape (6,)
         One standard deviation of the change of the bias since the reference, see `drift_since`.
     g_m_s2 : float
-        Of the calibration.
+        Gravity of the calibration.
     p_sensor_near_m : array, shape (3,)
         Where the gripper holds parts, sensor frame.
     orientation_sigma_rad : float

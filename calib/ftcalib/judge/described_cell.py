@@ -58,21 +58,21 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup) -> list[
     inside_m = _inside_m(parameters, covariance)
     if lean.deg >= REVERSED_TILT_DEG:
         return [Finding.of("forces_reversed" if inside_m else "weight_upwards", off_deg=lean.deg)]
-    found = []
+    findings = []
     if 0 < inside_m <= FARTHEST_COM_M:
-        found.append(Finding.of("torques_reversed", inside_mm=1e3 * inside_m))
+        findings.append(Finding.of("torques_reversed", inside_mm=1e3 * inside_m))
     along = parameters.down
     if setup.up_in_base is None:
         if lean.is_other_mounting:
             code = "mounting_undeclared" if lean.deg > HANGING_DEG else "gravity_tilted"
             values = {"orders": _other_orders(along, setup.up)} if code == "mounting_undeclared" else {}
-            found.append(Finding.of(code, off_deg=lean.deg, direction=along, **values))
+            findings.append(Finding.of(code, off_deg=lean.deg, direction=along, **values))
     elif lean.is_other_mounting:
         orders = _other_orders(along, setup.up)
-        found.append(Finding.of("gravity_off_mounting", off_deg=lean.deg, direction=along, orders=orders))
+        findings.append(Finding.of("gravity_off_mounting", off_deg=lean.deg, direction=along, orders=orders))
     elif lean.is_significant:
-        found.append(Finding.of("base_leans", lean_deg=lean.deg, sigma_deg=lean.sigma_deg, side=lean.side))
-    return found
+        findings.append(Finding.of("base_leans", lean_deg=lean.deg, sigma_deg=lean.sigma_deg, side=lean.side))
+    return findings
 
 
 def _other_orders(gravity_direction_base: Array, up: Array) -> list[str]:
@@ -154,7 +154,7 @@ def payload(
     payload_kg : float, optional
         As set in the controller.
     load_kg : float
-        Of the sensor, which cannot weigh itself.
+        Load on the sensor, which cannot weigh itself.
     sensor_kg : float, optional
         Mass of sensor and adapter. Where it is unknown the payload may be larger by `SENSOR_KG`.
     parameters : Parameters, optional
@@ -251,7 +251,7 @@ SAME_AXES = 0.1
 
 def contradictions(
     known: Known,
-    found: Parameters,
+    estimate: Parameters,
     covariance: Array,
     g_m_s2: float,
     sigmas: float,
@@ -262,10 +262,10 @@ def contradictions(
     Parameters
     ----------
     known : Known
-    found : Parameters
+    estimate : Parameters
         From a fit without known values.
     covariance : array, shape (15, 15)
-        Of that fit.
+        Covariance of that fit.
     g_m_s2 : float
     sigmas : float
         Smallest difference to name, in standard deviations.
@@ -273,32 +273,32 @@ def contradictions(
         Where up should be.
     """
     contradicted = []
-    weight_N, along = found.weight_N, found.down
+    weight_N, along = estimate.weight_N, estimate.down
     sigma_N = float(np.sqrt(along @ covariance[3:6, 3:6] @ along))
     shows_directions = weight_N > sigmas * sigma_N
     if known.mass_kg is not None:
         mass_kg, sigma_kg = weight_N / g_m_s2, sigma_N / g_m_s2
         if abs(mass_kg - known.mass_kg) > sigmas * np.hypot(sigma_kg, known.mass_tolerance_kg):
-            suspects = units.suspects(found, units.by_mass(mass_kg, known.mass_kg, SAME_UNIT))
+            suspects = units.suspects(estimate, units.by_mass(mass_kg, known.mass_kg, SAME_UNIT))
             values = {"known_kg": known.mass_kg, "mass_kg": mass_kg, "sigma_kg": sigma_kg, "units": suspects}
             contradicted.append(Finding.of("known_mass", "limit", **values))
     if known.gravity_direction_base is not None and shows_directions:
         direction = np.asarray(known.gravity_direction_base)
-        turn = turn_between(direction, unit_vector(found.gravity_force_base_N))
+        turn = turn_between(direction, unit_vector(estimate.gravity_force_base_N))
         across = np.cross(unit_vector(turn), direction)
-        sigma = float(np.sqrt(across @ covariance[3:6, 3:6] @ across / np.sum(found.gravity_force_base_N**2)))
+        sigma = float(np.sqrt(across @ covariance[3:6, 3:6] @ across / np.sum(estimate.gravity_force_base_N**2)))
         if np.linalg.norm(turn) > sigmas * np.hypot(sigma, known.direction_tolerance_rad):
             contradicted.append(Finding.of("known_gravity_direction", "limit", **_off(turn, sigma)))
     if known.R_flange_sensor is not None and shows_directions:
-        turn = Rotation.from_matrix(found.R_flange_sensor @ np.asarray(known.R_flange_sensor).T).as_rotvec()
+        turn = Rotation.from_matrix(estimate.R_flange_sensor @ np.asarray(known.R_flange_sensor).T).as_rotvec()
         if known.yaw_only:
             z = np.array([0.0, 0.0, 1.0])
             turn = turn_between(z, Rotation.from_rotvec(turn).apply(z))
         axis = unit_vector(turn)
         sigma = float(np.sqrt(axis @ covariance[:3, :3] @ axis))
         if np.linalg.norm(turn) > sigmas * np.hypot(sigma, known.R_tolerance_rad):
-            upwards = float(found.gravity_force_base_N @ np.asarray(up_in_base)) > 0  # as mirrored axes read
-            Q = np.asarray(known.R_flange_sensor).T @ found.R_flange_sensor * (-1 if upwards else 1)
+            upwards = float(estimate.gravity_force_base_N @ np.asarray(up_in_base)) > 0  # as mirrored axes read
+            Q = np.asarray(known.R_flange_sensor).T @ estimate.R_flange_sensor * (-1 if upwards else 1)
             order = np.round(Q)
             permuted = np.abs(Q - order).max() <= SAME_AXES and not (order == np.eye(3)).all()
             corrections = [("wrench", channels(order))] if permuted and not known.yaw_only else []

@@ -53,29 +53,29 @@ def by_mass(mass_kg: float, true_kg: float, tolerance: float) -> list[str]:
     return [unit for unit, share in off.items() if share < tolerance]
 
 
-def suspects(found: Parameters, forces: Collection[str]) -> Suspects:
+def suspects(estimate: Parameters, forces: Collection[str]) -> Suspects:
     """Return these units of force, with those of torque that give a usual centre of mass."""
-    com_m = float(np.linalg.norm(found.p_sensor_com_m))
+    com_m = float(np.linalg.norm(estimate.p_sensor_com_m))
     return by_com(com_m, forces) or [(force, "N·m") for force in forces]
 
 
-def implausible(found: Parameters, residual_N: float, *, described: bool) -> list[Finding]:
+def implausible(estimate: Parameters, residual_N: float, *, described: bool) -> list[Finding]:
     """Find a weight or a centre of mass that no tool has, with the units that make it usual.
 
     Parameters
     ----------
-    found : Parameters
+    estimate : Parameters
     residual_N : float
         Root mean square of the forces.
     described : bool
         Whether the shape of the tool is, which alone limits how far its centre of mass may be.
     """
-    weight_N, com_m = (float(np.linalg.norm(x)) for x in (found.gravity_force_base_N, found.p_sensor_com_m))
+    weight_N, com_m = (float(np.linalg.norm(x)) for x in (estimate.gravity_force_base_N, estimate.p_sensor_com_m))
     findings = too_light(weight_N, com_m, residual_N)
     if weight_N > HEAVIEST_N:
         severity: Severity = "reject" if weight_N > IMPOSSIBLE_N else "limit"
         names = [unit for unit in ("gf", "mN") if LIGHTEST_N < weight_N * FORCE_UNITS_N[unit] <= HEAVIEST_N]
-        findings.append(Finding.of("weight_implausible", severity, weight_N=weight_N, units=suspects(found, names)))
+        findings.append(Finding.of("weight_implausible", severity, weight_N=weight_N, units=suspects(estimate, names)))
     if com_m > FAR_COM_M and not described:
         values = {"distance_m": com_m, "most_m": FARTHEST_COM_M if com_m > FARTHEST_COM_M else FAR_COM_M}
         severity = "reject" if com_m > FARTHEST_COM_M else "limit"

@@ -150,52 +150,52 @@ def judge(
     single_poses : bool
         Whether each row is a pose of its own, with findings about single poses; rows of a motion are not.
     """
-    at = _statistics(fit, t_s)
+    quality = _statistics(fit, t_s)
     parameters, weight_N = fit.parameters, fit.parameters.weight_N
-    few_rejected = at.used.sum() >= (1 - FEW_LEFT_OUT) * len(at.used)
-    suspect = at.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
+    few_rejected = quality.used.sum() >= (1 - FEW_LEFT_OUT) * len(quality.used)
+    suspect = quality.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
     # Simulated readings without noise repeat themselves by right.
-    broken = [] if at.is_exact else broken_channels(fit.wrench, fit.R_base_flange)
-    mistakes = _mistakes(fit, at.used, t_s, setup) if suspect else []
+    broken = [] if quality.is_exact else broken_channels(fit.wrench, fit.R_base_flange)
+    mistakes = _mistakes(fit, quality.used, t_s, setup) if suspect else []
     # Known values that are wrong would look like a change: the fit without them is searched.
-    changed = [] if mistakes else _change(unconstrained or fit, at, measured_sigma, t_s)
+    changed = [] if mistakes else _change(unconstrained or fit, quality, measured_sigma, t_s)
     if suspect and not (mistakes or changed):
-        mistakes = _other_poses(fit, at.used, t_s)
-    explained = at.is_exact or at.fits_measured_noise or mistakes or changed
+        mistakes = _other_poses(fit, quality.used, t_s)
+    explained = quality.is_exact or quality.fits_measured_noise or mistakes or changed
     cable = None if fit.fit is None or explained else cable_of(fit.fit)
     contradicted: list[Finding] = []
     if known is not None and unconstrained is not None:
         at_its_best = unconstrained.parameters, unconstrained.covariance
         contradicted = contradictions(known, *at_its_best, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
 
-    found = [
+    findings = [
         *broken,
         *mistakes,
         *changed,
-        *at.errors,
+        *quality.errors,
         *_weight(fit, weight_N, setup),
         *_second_solution(fit),
-        *units.implausible(parameters, _rms(fit.residuals[at.used, :3]), described=bool(setup.cylinders_m)),
-        *([] if contradicted or at.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
-        *(_noise(fit, at) if single_poses else []),
-        *(_poses(fit, at, "note" if few_rejected else "limit") if single_poses else []),
-        *_drift(fit.drift, at.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
+        *units.implausible(parameters, _rms(fit.residuals[quality.used, :3]), described=bool(setup.cylinders_m)),
+        *([] if contradicted or quality.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
+        *(_noise(fit, quality) if single_poses else []),
+        *(_poses(fit, quality, "note" if few_rejected else "limit") if single_poses else []),
+        *_drift(fit.drift, quality.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
         *_response(fit.response, weight_N),
         *_cable(cable),
     ]
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
     # Signs and mounting follow from the estimates, which mean nothing beside a mistake or such errors.
-    if not mistakes and at.largest_share < SENSELESS_SHARE:
-        found += described_cell.directions(parameters, fit.covariance, setup)
-        found += [one for one in payload if one.code == "payload_units" and not broken]
-    if verdict_of(found) != "rejected":  # its contradictions would be consequences
-        found += [one for one in payload if one not in found]
-        found += described_cell.tool(parameters, fit.covariance, setup, g_m_s2)
+    if not mistakes and quality.largest_share < SENSELESS_SHARE:
+        findings += described_cell.directions(parameters, fit.covariance, setup)
+        findings += [one for one in payload if one.code == "payload_units" and not broken]
+    if verdict_of(findings) != "rejected":  # its contradictions would be consequences
+        findings += [one for one in payload if one not in findings]
+        findings += described_cell.tool(parameters, fit.covariance, setup, g_m_s2)
     # Data with a mistake, or that fit as they are, say nothing against a known value.
-    if not (broken or mistakes or at.fits_measured_noise):
-        harmless = verdict_of(found) == "good"
-        found += [replace(one, severity="note") if harmless else one for one in contradicted]
-    return replace(at, findings=ordered(found), cable_shift=None if cable is None else cable.shift)
+    if not (broken or mistakes or quality.fits_measured_noise):
+        harmless = verdict_of(findings) == "good"
+        findings += [replace(one, severity="note") if harmless else one for one in contradicted]
+    return replace(quality, findings=ordered(findings), cable_shift=None if cable is None else cable.shift)
 
 
 def _statistics(fit: Judged, t_s: Array | None) -> Quality:
@@ -229,11 +229,11 @@ def _mistakes(fit: Judged, used: NDArray[np.bool_], t_s: Array | None, setup: Se
     A wrong pose or two were rejected; only the used poses show whether most of them are wrong.
     """
     order = _some_runs(t_s, len(used))
-    found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
+    findings = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
     order = order[used[order]]
-    if not found and not used.all():
-        found = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
-    return found
+    if not findings and not used.all():
+        findings = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
+    return findings
 
 
 def _other_poses(fit: Judged, used: NDArray[np.bool_], t_s: Array | None) -> list[Finding]:
@@ -293,14 +293,14 @@ def _errors(fit: Judged, used: NDArray[np.bool_], weight_N: float) -> tuple[floa
     lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
     left_out = _rms(fit.left_out_residuals[used, :3]), _rms(fit.left_out_residuals[used, 3:])
     expected = expected_error(fit.parameters, fit.covariance, fit.response)
-    largest, found = 0.0, []
+    largest, findings = 0.0, []
     for k, scale, unit in ((0, weight_N, "N"), (1, weight_N * lever_m, "Nm")):
         errors = (
             ("residuals", _rms(fit.residuals[used, 3 * k : 3 * k + 3])),
             ("cross-validation", left_out[k]),
             ("uncertainty over all orientations", expected[k]),
         )
-        # The largest number of limits; of equal ones the first, so residual before cross-validated before expected error.
+        # The largest number of limits; of equal ones the first: residual, cross-validated, then expected error.
         limits = [sum(error > limit * scale for limit in (USABLE_SHARE, REJECTED_SHARE)) for _, error in errors]
         source, error = errors[int(np.argmax(limits))] if max(limits) else max(errors, key=lambda pair: pair[1])
         share = error / scale if scale else float("inf")
@@ -310,8 +310,8 @@ def _errors(fit: Judged, used: NDArray[np.bool_], weight_N: float) -> tuple[floa
             limit_percent = 100 * (REJECTED_SHARE if severity == "reject" else USABLE_SHARE)
             values = {f"error_{unit}": error, "share_percent": 100 * share, "limit_percent": limit_percent}
             code = ("force_error", "torque_error")[k]
-            found.append(Finding.of(code, severity, source=source, **values, **({"lever_m": lever_m} if k else {})))
-    return largest, found, left_out
+            findings.append(Finding.of(code, severity, source=source, **values, **({"lever_m": lever_m} if k else {})))
+    return largest, findings, left_out
 
 
 def _weight(fit: Judged, weight_N: float, setup: Setup) -> list[Finding]:
@@ -347,37 +347,42 @@ def _misfit_of_known_values(fit: Judged, unconstrained: Judged | None) -> list[F
     ][:1]
 
 
-def _noise(fit: Judged, at: Quality) -> list[Finding]:
-    if at.chi2_p is None or at.noise_factor is None:
+def _noise(fit: Judged, quality: Quality) -> list[Finding]:
+    if quality.chi2_p is None or quality.noise_factor is None:
         return [Finding.of("noise_unknown")]
-    if at.fits_measured_noise:
+    if quality.fits_measured_noise:
         return []
-    minor = at.noise_factor <= NOISE_FACTOR and at.largest_share <= NOISY_SHARE
+    minor = quality.noise_factor <= NOISE_FACTOR and quality.largest_share <= NOISY_SHARE
     components = {name: value for name, value in fit.components.items() if value > 0}
-    return [Finding.of("noise_exceeded", "note" if minor else "limit", factor=at.noise_factor, components=components)]
+    return [
+        Finding.of("noise_exceeded", "note" if minor else "limit", factor=quality.noise_factor, components=components)
+    ]
 
 
-def _poses(fit: Judged, at: Quality, severity_of_rejected: Severity) -> list[Finding]:
+def _poses(fit: Judged, quality: Quality, severity_of_rejected: Severity) -> list[Finding]:
     """Name poses that were rejected, that nothing checks, or that deviate most, and drift from pose to pose."""
-    found, n = list[Finding](), int(at.used.sum())
-    if not at.used.all():
-        rows = np.flatnonzero(~at.used) + 1
-        values = {"count": len(rows), "n_poses": len(at.used), "poses": rows}
-        found.append(Finding.of("poses_rejected", severity_of_rejected, **values))
+    findings, n = list[Finding](), int(quality.used.sum())
+    if not quality.used.all():
+        rows = np.flatnonzero(~quality.used) + 1
+        values = {"count": len(rows), "n_poses": len(quality.used), "poses": rows}
+        findings.append(Finding.of("poses_rejected", severity_of_rejected, **values))
     if n < RECOMMENDED_POSES:
-        found.append(Finding.of("few_poses", n_poses=n, recommended=RECOMMENDED_POSES))
+        findings.append(Finding.of("few_poses", n_poses=n, recommended=RECOMMENDED_POSES))
     uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > fit.parameters.weight_N**2
-    rows = np.flatnonzero(uncertain & at.used) + 1
+    rows = np.flatnonzero(uncertain & quality.used) + 1
     if 0 < rows.size <= n / 2:
-        found.append(Finding.of("poses_unchecked", poses=rows))
-    if at.is_exact:
-        return found
-    if at.lag1_p < SURE:
-        found.append(Finding.of("residuals_alike", correlation=at.lag1))
-    worst, typical = float(at.residual_sigma[at.worst_pose]), float(np.median(at.residual_sigma[at.used] ** 2))
+        findings.append(Finding.of("poses_unchecked", poses=rows))
+    if quality.is_exact:
+        return findings
+    if quality.lag1_p < SURE:
+        findings.append(Finding.of("residuals_alike", correlation=quality.lag1))
+    worst, typical = (
+        float(quality.residual_sigma[quality.worst_pose]),
+        float(np.median(quality.residual_sigma[quality.used] ** 2)),
+    )
     if n >= RECOMMENDED_POSES and worst**2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
-        found.append(Finding.of("pose_deviates", pose=at.worst_pose + 1, sigmas=worst))
-    return found
+        findings.append(Finding.of("pose_deviates", pose=quality.worst_pose + 1, sigmas=worst))
+    return findings
 
 
 def _drift(drift: DriftEstimate | None, ahead: DriftAhead, weight_N: float, *, is_cause: bool) -> list[Finding]:
@@ -406,15 +411,17 @@ def _response(response: Response | None, weight_N: float) -> list[Finding]:
     gain, cross_talk, sigma = response.force_gain, response.cross_talk_m, response.sigma
     certain = np.abs(gain) > 3 * sigma["force_gain"]
     certain &= (sigma["force_gain"] > 0) & (np.abs(gain) * weight_N > RESOLUTION[0])
-    found = [Finding.of(f"gain_{axis}", gain_percent=100 * gain[k, k]) for k, axis in enumerate("xyz") if certain[k, k]]
-    found += [
+    findings = [
+        Finding.of(f"gain_{axis}", gain_percent=100 * gain[k, k]) for k, axis in enumerate("xyz") if certain[k, k]
+    ]
+    findings += [
         Finding.of("axes_mixed", axes=f"{'xyz'[i]} and {'xyz'[j]}", share_percent=100 * abs(gain[i, j]))
         for i, j in combinations(range(3), 2)
         if certain[i, j]
     ]
     if (np.abs(cross_talk) > 3 * sigma["cross_talk_m"]).any():
-        found.append(Finding.of("cross_talk", torque_mNm=1e3 * np.abs(cross_talk).max()))
-    return found or [Finding.of("response_small")]
+        findings.append(Finding.of("cross_talk", torque_mNm=1e3 * np.abs(cross_talk).max()))
+    return findings or [Finding.of("response_small")]
 
 
 def _cable(cable: Cable | None) -> list[Finding]:
@@ -432,11 +439,11 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
     return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
 
 
-def _change(fit: Judged, at: Quality, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
+def _change(fit: Judged, quality: Quality, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
     """Name a lasting change, where the fit needs what could hide one: drift, more noise, or poses left out."""
-    kinds = ("walk", "slope") if at.chi2_p is None else ("walk", "slope", "white")
+    kinds = ("walk", "slope") if quality.chi2_p is None else ("walk", "slope", "white")
     hides = any(name.startswith(kinds) for name in fit.components)
-    if fit.fit is None or not (at.errors or hides or not at.used.all()):
+    if fit.fit is None or not (quality.errors or hides or not quality.used.all()):
         return []
     if t_s is None or not np.isfinite(t_s).all():
         t_s = np.arange(len(fit.wrench), dtype=np.float64)

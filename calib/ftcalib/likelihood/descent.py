@@ -341,7 +341,7 @@ def agreeing_poses(descent: Descent, weights: Array, starts: Sequence[Parameters
     Parameters
     ----------
     descent : Descent
-        Of these poses.
+        Descent for these poses.
     weights : array, shape (n, 6, 6)
         Inverse noise covariances.
     starts : sequence of Parameters

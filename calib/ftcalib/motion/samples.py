@@ -202,7 +202,7 @@ def rows_of(
         Times, R_base_flange row by row, and the position of the flange where it is known. Without it the acceleration
         counts as 0.
     delay_s : float
-        Of the wrench after the pose at which it arose.
+        Delay of the wrench after the pose at which it arose.
     row_s : float
         From row to row.
 

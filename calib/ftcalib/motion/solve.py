@@ -69,7 +69,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     Parameters
     ----------
     wrench : Means
-        Of fx, fy, fz, tx, ty, tz in N and N·m, as measured, in the sensor frame.
+        Means of fx, fy, fz, tx, ty, tz in N and N·m, as measured, in the sensor frame.
     poses : Means
         Of R_base_flange row by row, and of the position of the flange in base, m, if it is known: 12 or 9 columns. Both
         on one clock, s, each at its own rate.
@@ -83,7 +83,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     guarded : bool
         As for `ftcalib.motion.estimate.fit`.
     height_m : float, optional
-        Of the sensor origin above the flange face, as configured, to be checked.
+        Height of the sensor origin above the flange face, as configured, to be checked.
     g_m_s2 : float
     setup : Setup
         The described cell, for the verdict.
