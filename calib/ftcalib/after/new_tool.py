@@ -173,8 +173,10 @@ def new_tool(
     alone = "calibrate this tool alone, from 12 poses or more"
     if changed := prior.contradiction(found.chi2, found.dof, refit, "the poses", alone):
         raise NotObservable(changed)
+    # Only the components that belong to the cell are kept: errors of the arm and of the sensor, not of one session.
+    kept = {name: value for name, value in earlier.components.items() if name in ("rotation_rad", "hysteresis")}
     result = updated(earlier, found, {**(provenance or {}), "dataset_sha256": dataset.sha256()})
-    return replace(result, quality={}, weights=None, components=_kept_noise(earlier))
+    return replace(result, quality={}, weights=None, components=kept)
 
 
 def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Array, kept: Sequence[int]) -> Update:
@@ -218,11 +220,6 @@ def _start(old: Parameters, R_base_flange: Array, wrench: Array) -> Parameters:
     x: Array = np.linalg.lstsq(A.reshape(-1, 10), wrench.ravel(), rcond=None)[0].astype(np.float64)
     weight_N = max(float(x[0]), 1e-3)
     return Parameters(old.R_flange_sensor, weight_N * old.down, x[1:4], x[4:7] / weight_N, x[7:])
-
-
-def _kept_noise(earlier: CalibrationResult) -> dict[str, float]:
-    """Return the components that belong to the cell: errors of the arm and of the sensor, not of one session."""
-    return {name: value for name, value in earlier.components.items() if name in ("rotation_rad", "hysteresis")}
 
 
 def _beyond(earlier: CalibrationResult) -> Array:

@@ -295,18 +295,16 @@ _AROUND = np.array([v for v in product((-1.0, 0.0, 1.0), repeat=3) if np.abs(v).
 _AROUND /= np.linalg.norm(_AROUND, axis=1, keepdims=True)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cable:
-    """What a cable may do to a calibration."""
+def cable_of(fit: Fit) -> tuple[Finding, Array] | None:
+    """Look for the torque of a spring in what a fit leaves; None if chance explains it.
 
-    torque_Nm: float
-    """Root mean square over the poses."""
-    shift: Array
-    """(15,) of the estimated parameters, in error coordinates; zero for the biases, which belong to the cell."""
-
-
-def cable_of(fit: Fit) -> Cable | None:
-    """Look for the torque of a spring in what a fit leaves; None if chance explains it."""
+    Returns
+    -------
+    finding : Finding
+        With the torque, root mean square over the poses, and what it may have done to the centre of mass.
+    shift : array, shape (15,)
+        By which it may have moved the estimates; zero for the biases, which belong to the cell.
+    """
     n = len(fit.order)
     dof = fit.dof - STIFFNESS - SLACK
     if not FEWEST <= n <= MOST or dof < 1:
@@ -356,4 +354,5 @@ def cable_of(fit: Fit) -> Cable | None:
         return None
     shift = best[3].copy()
     shift[BIASES] = 0.0
-    return Cable(float(np.sqrt(np.sum(best[2] ** 2) / n)), shift)
+    torque_Nm, shift_mm = float(np.sqrt(np.sum(best[2] ** 2) / n)), 1e3 * float(np.linalg.norm(shift[9:12]))
+    return Finding.of("cable_spring", torque_Nm=torque_Nm, shift_mm=shift_mm), shift

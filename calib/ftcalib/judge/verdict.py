@@ -17,7 +17,7 @@ from ftcalib.judge.cross_validation import DriftAhead, Judged, drift_ahead, stan
 from ftcalib.judge.described_cell import contradictions
 from ftcalib.judge.faults import COLLAPSE, ROUNDING, broken_channels, constant_weight, faults, other_poses
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
-from ftcalib.judge.session_change import Cable, cable_of, session_change
+from ftcalib.judge.session_change import cable_of, session_change
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.fit import DriftEstimate
 from ftcalib.likelihood.response import Response, predicted_covariance
@@ -181,7 +181,7 @@ def judge(
         *(_poses(fit, quality, "note" if few_rejected else "limit") if single_poses else []),
         *_drift(fit.drift, quality.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
         *_response(fit.response, weight_N),
-        *_cable(cable),
+        *([] if cable is None else [cable[0]]),
     ]
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
     # Signs and mounting follow from the estimates, which mean nothing beside a mistake or such errors.
@@ -195,7 +195,7 @@ def judge(
     if not (broken or mistakes or quality.fits_measured_noise):
         harmless = verdict_of(findings) == "good"
         findings += [replace(one, severity="note") if harmless else one for one in contradicted]
-    return replace(quality, findings=ordered(findings), cable_shift=None if cable is None else cable.shift)
+    return replace(quality, findings=ordered(findings), cable_shift=None if cable is None else cable[1])
 
 
 def _statistics(fit: Judged, t_s: Array | None) -> Quality:
@@ -422,14 +422,6 @@ def _response(response: Response | None, weight_N: float) -> list[Finding]:
     if (np.abs(cross_talk) > 3 * sigma["cross_talk_m"]).any():
         findings.append(Finding.of("cross_talk", torque_mNm=1e3 * np.abs(cross_talk).max()))
     return findings or [Finding.of("response_small")]
-
-
-def _cable(cable: Cable | None) -> list[Finding]:
-    """Name the torque of a cable, and what it may have done to the centre of mass."""
-    if cable is None:
-        return []
-    shift_mm = 1e3 * float(np.linalg.norm(cable.shift[9:12]))
-    return [Finding.of("cable_spring", torque_Nm=cable.torque_Nm, shift_mm=shift_mm)]
 
 
 def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:

@@ -103,9 +103,11 @@ def test_a_cable_is_found_and_moves_the_estimates_as_least_squares_with_nine_mor
         if cable is not None:
             shift = without - with_cable[:15]
             shift[BIASES] = 0.0
-            np.testing.assert_allclose(cable.shift, shift, atol=0.01 * np.abs(shift).max())
+            np.testing.assert_allclose(cable[1], shift, atol=0.01 * np.abs(shift).max())
             torque_Nm = (X @ with_cable[15:])[:, 3:]
-            assert cable.torque_Nm == pytest.approx(np.sqrt(np.mean(np.sum(torque_Nm**2, axis=1))), rel=0.01)
+            assert cable[0].values["torque_Nm"] == pytest.approx(
+                np.sqrt(np.mean(np.sum(torque_Nm**2, axis=1))), rel=0.01
+            )
     assert outcomes == {True, False}
 
 
