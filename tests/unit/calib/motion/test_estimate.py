@@ -25,7 +25,8 @@ from ftcalib.motion.estimate import (
 )
 from ftcalib.motion.model import CROSS_TALK, DELAY, GAINS, HEIGHT, INERTIA, SIZE, Load, RowNoise, jacobian, wrench_of
 from ftcalib.motion.samples import Motion, Rows
-from tests.moving_load import Truth
+from ftcalib.motion.solve import solve_motion
+from tests.moving_load import Truth, means_of, record, sweep
 from tests.unit.calib.motion.test_motion import load_of
 
 G = 9.80665
@@ -270,3 +271,18 @@ def test_another_mounting_costs_what_its_own_fit_does() -> None:
     assert len(costs) == 2
     assert found.second_basin_chi2 == pytest.approx(max(costs) - min(costs), rel=0.05)
     assert found.chi2 == pytest.approx(min(costs), rel=0.02)
+
+
+SECONDS = 15.0
+
+
+def test_bursts_of_noise_are_no_contact_and_a_touch_is() -> None:
+    bursts = {(2.0 + 1.5 * k, 2.8 + 1.5 * k): np.array([0.4, -0.3, 0.2, 0.02, 0.01, 0.0]) * (-1) ** k for k in range(8)}
+    touch = {(6.0, 6.5): np.array([0.0, 6.0, 0.0, 0.4, 0.0, 0.0])}
+    wrench, poses = means_of(record(Truth(), sweep(SECONDS), SECONDS, 3, contacts={**bursts, **touch}))
+    found = solve_motion(wrench, poses, guarded=True)
+    assert found.motion is not None
+    assert "mostly_contact" not in [one.code for one in found.findings]
+    assert [round(one["t_s"]) for one in found.motion.contacts] == [6]
+    assert found.motion.used_share > 0.7  # the filter of .9 s and the touch
+    assert abs(found.mass_kg - Truth().mass_kg) < 0.01

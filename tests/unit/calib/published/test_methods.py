@@ -1,13 +1,16 @@
 """The published methods behind one shape."""
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import NotObservable, Parameters
-from ftcalib.model import UP_IN_BASE, predict
+from ftcalib.model import UP_IN_BASE, Array, predict
 from ftcalib.published import carlson
-from ftcalib.published.methods import CARLSON, PUBLISHED, published
+from ftcalib.published.methods import BASELINES, CARLSON, PUBLISHED, published, vougioukas, wang, yang
 from ftcalib.published.yu import SPECIAL_R_flange_base
 
 TRUTH = Parameters(
@@ -79,3 +82,152 @@ def test_the_printed_form_applies_the_cayley_transform_once() -> None:
 def test_other_methods_have_one_form(method: str) -> None:
     with pytest.raises(ValueError, match=f"{method} runs as published already"):
         published(method, R_BASE_FLANGE, gravity_direction_base=-UP_IN_BASE, as_published=True)
+
+
+R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def turned(*rotation_vector_deg: float) -> Array:
+    return np.asarray(Rotation.from_rotvec(rotation_vector_deg, degrees=True).as_matrix())
+
+
+def random_truth(rng: np.random.Generator) -> Parameters:
+    return Parameters(Rotation.random(rng=rng).as_matrix(), *(rng.normal(size=(4, 3)) * [[9], [5], [0.1], [1]]))
+
+
+def mounting(method: str, truth: Parameters, yaw_deg: float) -> Array:
+    """The known mounting; for yang turned by a yaw that it must find."""
+    return turned(0, 0, yaw_deg if method == "yang" else 0.0) @ truth.R_flange_sensor
+
+
+@pytest.mark.parametrize("n", [3, 4, 8, 24])
+@pytest.mark.parametrize("method", BASELINES)
+def test_exact_if_what_is_assumed_is_true(method: str, n: int) -> None:
+    rng = np.random.default_rng(n)
+    for yaw_deg in (0.0, 7.0, 90.0, -179.9, 180.0):
+        truth = random_truth(rng)
+        R = R24 if n == 24 else Rotation.random(n, rng=rng).as_matrix()
+        estimate = published(
+            method,
+            R,
+            gravity_direction_base=3 * truth.gravity_force_base_N,
+            R_flange_sensor=mounting(method, truth, yaw_deg),
+        )
+        assert np.abs(truth.difference(estimate(predict(truth, R)))).max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("method", "turn", "lean", "axis_rms_N"),
+    [
+        ("vougioukas", (0, 0, 5), 0, 0.82),
+        ("wang", (0, 0, 5), 0, 0.82),
+        ("yang", (0, 0, 5), 0, 0),
+        ("vougioukas", (2, 0, 0), 0, 0.33),
+        ("wang", (2, 0, 0), 0, 0.33),
+        ("yang", (2, 0, 0), 0, 0.33),
+        ("vougioukas", (0, 0, 0), 2, 0.40),
+        ("wang", (0, 0, 0), 2, 0),
+        ("yang", (0, 0, 0), 2, 0),
+    ],
+)
+def test_a_wrong_assumption_costs_what_the_docstring_says(
+    method: str, turn: tuple[float, float, float], lean: float, axis_rms_N: float
+) -> None:
+    truth = Parameters(turned(*turn), turned(lean, 0, 0) @ [0, 0, -20.0], *np.full((3, 3), 0.1))
+    estimate = published(method, R24, gravity_direction_base=DOWN)(predict(truth, R24))
+    R = Rotation.random(1000, rng=1).as_matrix()
+    error_N = (predict(estimate, R) - predict(truth, R))[:, :3]
+    assert np.sqrt(np.mean(error_N**2)) == pytest.approx(axis_rms_N, rel=0.06, abs=1e-9)
+
+
+def test_vougioukas_is_the_least_squares_of_all_ten() -> None:
+    rng = np.random.default_rng(0)
+    truth, R = random_truth(rng), Rotation.random(9, rng=rng).as_matrix()
+    wrench = predict(truth, R) + rng.normal(size=(9, 6)) * 0.1
+    down = truth.gravity_force_base_N / np.linalg.norm(truth.gravity_force_base_N)
+    best = vougioukas(R, wrench, R_flange_sensor=truth.R_flange_sensor, gravity_direction_base=down)
+
+    def cost(change: Array) -> float:
+        """Of weight, force bias, centre of mass and torque bias."""
+        changed = Parameters(
+            best.R_flange_sensor,
+            best.gravity_force_base_N + change[0] * down,
+            best.force_bias_N + change[1:4],
+            best.p_sensor_com_m + change[4:7],
+            best.torque_bias_Nm + change[7:],
+        )
+        # Weight and centre of mass are free together: the torque residual depends on their product alone.
+        return float(np.sum((wrench - predict(changed, R)) ** 2))
+
+    assert all(cost(s * e) > cost(0 * e) for e in 1e-3 * np.eye(10) for s in (-1, 1))
+
+
+def test_yang_finds_the_least_of_all_yaws() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        truth, R = random_truth(rng), Rotation.random(6, rng=rng).as_matrix()
+        force_N = predict(truth, R)[:, :3] + rng.normal(size=(6, 3))
+
+        def cost(R_flange_sensor: Array, R: Array = R, force_N: Array = force_N) -> float:
+            fit = wang(R, force_N, R_flange_sensor=R_flange_sensor)
+            model_N = fit.gravity_force_base_N @ R @ fit.R_flange_sensor + fit.force_bias_N
+            return float(np.sum((force_N - model_N) ** 2))
+
+        try:
+            found = yang(R, force_N, R_flange_sensor=truth.R_flange_sensor)
+        except NotObservable:  # two yaws fit alike in so much noise
+            continue
+        others = [cost(turned(0, 0, yaw) @ truth.R_flange_sensor) for yaw in range(0, 360, 5)]
+        assert cost(found.R_flange_sensor) <= min(others) * (1 + 1e-12)
+
+
+def rim(n: int, tilt_deg: float) -> Array:
+    """Tool tilted by one angle in n directions, and turned."""
+    return np.array([turned(0, 0, 360 * k / n) @ turned(tilt_deg, 0, 0) @ turned(0, 0, 70.0 * k) for k in range(n)])
+
+
+ESTIMATES: dict[str, Callable[[Array, Array], object]] = {
+    "vougioukas": partial(vougioukas, R_flange_sensor=np.eye(3), gravity_direction_base=DOWN),
+    "wang": lambda R, wrench: wang(R, wrench[:, :3], R_flange_sensor=np.eye(3)),
+    "yang": lambda R, wrench: yang(R, wrench[:, :3], R_flange_sensor=np.eye(3)),
+}
+SPIN = np.array([turned(0, 0, 40.0 * k) for k in range(6)])
+PLANE = np.array([turned(40.0 * k, 0, 0) for k in range(6)])
+
+
+@pytest.mark.parametrize(
+    ("method", "R", "words"),
+    [
+        *((method, R24[:2], "needs 3 poses or more, got 2: record 1 more") for method in BASELINES),
+        ("vougioukas", SPIN, "only 0 of the 2 flange axes needed: add poses"),
+        ("wang", SPIN, "turn about one base axis.*: add poses"),
+        ("wang", PLANE, "turn about one base axis.*: add poses"),
+        ("yang", PLANE, "turn about one base axis.*: add poses"),
+        ("yang", rim(8, 40), "two yaws of the sensor 180 deg apart .*: add poses"),
+    ],
+)
+def test_poses_that_do_not_suffice_are_refused(method: str, R: Array, words: str) -> None:
+    truth = Parameters(np.eye(3), 20 * DOWN, *np.ones((3, 3)))
+    with pytest.raises(NotObservable, match=words):
+        ESTIMATES[method](R, predict(truth, R))
+
+
+def test_yang_is_refused_where_noise_alone_decides_between_two_yaws() -> None:
+    R, rng = rim(8, 40), np.random.default_rng(2)
+    force_N = predict(Parameters(np.eye(3), 20 * DOWN, *np.ones((3, 3))), R)[:, :3]
+    for _ in range(5):
+        with pytest.raises(NotObservable, match="two yaws of the sensor"):
+            yang(R, force_N + rng.normal(0.0, 0.1, force_N.shape), R_flange_sensor=np.eye(3))
+
+
+def test_yang_is_refused_if_the_forces_show_no_yaw() -> None:
+    along_z = predict(Parameters(np.eye(3), 20 * DOWN, *np.ones((3, 3))), R24)[:, :3] * [0, 0, 1]
+    with pytest.raises(NotObservable, match="leave the yaw of the sensor open"):
+        yang(R24, along_z, R_flange_sensor=np.eye(3))
+
+
+@pytest.mark.parametrize("method", BASELINES)
+def test_a_sensor_that_carries_nothing_is_refused(method: str) -> None:
+    with pytest.raises(NotObservable, match="no weight"):
+        ESTIMATES[method](R24, np.ones((24, 6)))
