@@ -98,7 +98,7 @@ class Constraints:
         low = (value <= np.roll(value, 1)) & (value <= np.roll(value, -1))
         return [*turned[low][np.argsort(value[low])][:4], *(minima if self.R_tolerance > 0 else [])]
 
-    def satisfied(self, p: Parameters) -> Parameters:
+    def satisfy(self, p: Parameters) -> Parameters:
         """Replace the exactly known direction and size of the gravity force."""
         b = np.array(p.gravity_force_base_N)
         if self.direction is not None and self.direction_tolerance == 0:

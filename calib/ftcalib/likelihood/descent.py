@@ -216,7 +216,7 @@ class Descent:
             statistics, start_from = (Statistics.of(phi, self.wrench, W, reference) for W in (weights, separate))
         ends = []
         for R_flange_sensor in self.constraints.rotations([m.R.T for m in rotation_minima.minima(Q)[:MOST_MINIMA]], Q):
-            start = self.constraints.satisfied(_linear_start(start_from, R_flange_sensor))
+            start = self.constraints.satisfy(_linear_start(start_from, R_flange_sensor))
             ends.append(self.down(statistics, start))
         found = self.distinct(ends)
         if n <= CHUNK:  # once more from close by: without noise every digit counts
@@ -261,7 +261,7 @@ class Descent:
             moved = float(np.sqrt(max(float(step @ Hz @ step), 0.0)))  # in standard deviations of the noise
             trial = p.moved(step if Z is None else Z @ step)
             if Z is not None:
-                trial = self.constraints.satisfied(trial)
+                trial = self.constraints.satisfy(trial)
             ahead = self.normal_equations(statistics, trial)
             improved = ahead[2] < cost
             if improved:

@@ -316,7 +316,7 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
 
 def _with_expected_noise(session: Session, e: Explanation) -> Explanation:
     """Take the white noise that is expected instead of the likeliest."""
-    problem = session.linearised(e.parameters, e.kept)
+    problem = session.linearise(e.parameters, e.kept)
     theta = expected_variances(problem, point(problem, e.components, e.theta))
     return replace(e, theta=theta, noise=None)
 
@@ -330,7 +330,7 @@ def _is_quiet(session: Session, best: Minimum) -> bool:
         return False
     if session.n > MANY_POSES and session.drift == "none":
         return True  # a pose that could do harm among so many would show in chi2
-    problem = session.linearised(best.parameters, session.everything)
+    problem = session.linearise(best.parameters, session.everything)
     at = maximise(problem, (), np.zeros(0))
     if _stand_out(session, squared_length(*at.left_out())):
         return False
@@ -343,7 +343,7 @@ def _explanations(session: Session, minima: list[Minimum], weights: Array) -> li
     found = [_improve(session, p, session.everything)]
     if found[0].noticed:
         starts = [m.parameters for m in minima]
-        problem, always = session.linearised(p, session.everything), session.always()
+        problem, always = session.linearise(p, session.everything), session.always()
         at = maximise(problem, always, session.start(problem, always))
         if not session.measured:
             weights = np.asarray(at.own.W, dtype=np.float64)
@@ -361,7 +361,7 @@ def _explanations(session: Session, minima: list[Minimum], weights: Array) -> li
 def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
     """Improve parameters, variances, components and rejected poses in turn, until nothing changes."""
     always, candidates = session.always(), session.candidates()
-    problem = session.linearised(p, kept)
+    problem = session.linearise(p, kept)
     at = select(problem, always, session.start(problem, always), candidates, len(always))
     best = Explanation(p, kept)
     for _ in range(ROUNDS):
@@ -382,7 +382,7 @@ def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
             best = Explanation(p, kept, at.components, at.theta, criterion, noticed, at.noise)
             kept = _membership(session, kept, distances, at)
             if not (kept == best.kept).all():
-                problem = session.linearised(p, kept)
+                problem = session.linearise(p, kept)
                 at = select(problem, at.components, at.theta, (), len(always))
                 continue
         if set(at.components) == chosen:  # all others have been tried
@@ -402,7 +402,7 @@ def _settle(
         if at.squared_step < SETTLED:
             break
         p = session.descent.down(session.statistics(at.noise, p), p).parameters
-        problem = session.linearised(p, kept)
+        problem = session.linearise(p, kept)
         at = maximise(problem, at.components, at.theta)
         if at.squared_step < SETTLED and not kept.all():  # drop what only rejected poses needed
             at = select(problem, at.components, at.theta, (), len(session.always()))
@@ -459,7 +459,7 @@ def noise_under(session: Session, e: Explanation, p: Parameters) -> Noise:
     """Give the noise that an explanation has at parameters."""
     if e.noise is not None and not e.noise_moves:
         return e.noise
-    return noise_of(session.linearised(p, e.kept), e.components, e.theta)
+    return noise_of(session.linearise(p, e.kept), e.components, e.theta)
 
 
 def _are_gaussian(session: Session, distances: Array) -> bool:

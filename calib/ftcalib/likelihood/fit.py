@@ -196,7 +196,7 @@ def fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2:
     response = lag = None
     # Many poses show the variances so well that their uncertainty does not widen that of the estimates.
     if found.keys() & {*RESPONSE, HYSTERESIS} or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
-        problem = session.linearised(best.parameters, e.kept)
+        problem = session.linearise(best.parameters, e.kept)
         at = point(problem, e.components, e.theta)
         x, C = estimates_of_unknown_variances(problem, at)
         if session.n < POSES_THAT_SHOW_THE_NOISE:
@@ -240,7 +240,7 @@ def _deviation(session: Session, c: Component, variance: float) -> float:
 def _drift(session: Session, best: Minimum, noise: Noise, C: Array, found: Mapping[Component, float]) -> DriftEstimate:
     """Best linear prediction of the bias at every pose, and the error of its change."""
     J, r = jacobian(best.parameters, session.R), session.wrench - predict(best.parameters, session.R)
-    problem = session.linearised(best.parameters, noise.kept)
+    problem = session.linearise(best.parameters, noise.kept)
     others = [(problem.columns(c), value) for c, value in found.items() if c in (*RESPONSE, HYSTERESIS)]
 
     def not_drift(X: Array) -> Array:

@@ -132,7 +132,7 @@ class Session:
         """Sum up under any noise, around parameters."""
         return Statistics.of_noise(features(self.R), self.wrench, noise, coefficients(p))
 
-    def linearised(self, p: Parameters, kept: Kept) -> Linearised:
+    def linearise(self, p: Parameters, kept: Kept) -> Linearised:
         """Linearise at parameters."""
         J = jacobian(p, self.R)
         turn = J[..., :3]

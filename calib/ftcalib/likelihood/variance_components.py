@@ -173,7 +173,7 @@ class Point:
         """All of it."""
         return noise_of(self.problem, self.components, self.theta)
 
-    def weighted(self) -> tuple[Array, Array]:
+    def weigh_columns(self) -> tuple[Array, Array]:
         """Inverse covariance times the unknowns' columns (n, 6, k), and times the residuals of the best ones (n, 6)."""
         WX = self.WX[..., self.unknown]
         return WX, self.WX[..., -1] - WX @ self.x
@@ -186,7 +186,7 @@ class Point:
 
     def left_out(self) -> tuple[Array, Array]:
         """Residual (n, 6) of each pose when all others predict it, and its covariance (n, 6, 6)."""
-        return left_out(self.own, *self.weighted(), self.C)
+        return left_out(self.own, *self.weigh_columns(), self.C)
 
 
 def left_out(noise: Noise, WJ: Array, u: Array, C: Array) -> tuple[Array, Array]:
@@ -304,7 +304,7 @@ def score(problem: Linearised, at: Point, components: Sequence[Component], theta
     `theta`.
     """
     noise, C, G = at.own, at.C, at.G
-    WX, u = at.weighted()
+    WX, u = at.weigh_columns()
     WXC = WX @ C
     P = noise.blocks - WXC @ np.swapaxes(WX, 1, 2)
     of_poses = [k for k, c in enumerate(components) if problem.columns(c) is None]

@@ -128,7 +128,7 @@ class _Problem:
         step = self.knots[1] - self.knots[0]
         return np.asarray(np.maximum(1 - np.abs(t_s[:, None] - self.knots) / step, 0))
 
-    def predicted(self, load: Load, rows: Rows) -> Array:
+    def predict(self, load: Load, rows: Rows) -> Array:
         return wrench_of(load, rows.motion.earlier(load.delay_s, rows.rate))
 
     def prior(self, load: Load) -> tuple[Array, Array]:
@@ -147,7 +147,7 @@ class _Problem:
         for Q in self.constraints.rotations([one.R.T for one in minima(cost)], cost)[:4]:
             F_b, bias = given_rotation(Q.T, R, force, ones)
             c, torque_bias = com_and_torque_bias(F_b @ R @ Q, rows.wrench[:, 3:])
-            start = self.constraints.satisfied(Parameters(Q, F_b, bias, c, torque_bias))
+            start = self.constraints.satisfy(Parameters(Q, F_b, bias, c, torque_bias))
             found.append(Load(start, self.g_m_s2))
         return found
 
@@ -162,7 +162,7 @@ class _Problem:
         limit, no_drift = np.inf, np.zeros((len(self.knots), 6))
         nothing = np.zeros(6 * len(self.walk))
         for _ in range(40):
-            r = rows.wrench - self.predicted(load, rows)
+            r = rows.wrench - self.predict(load, rows)
             scale = 1.4826 * np.array([np.median(np.abs(r[:, :3])), np.median(np.abs(r[:, 3:]))]) + 1e-12
             unit = r / np.repeat(scale, 3)
             distance = np.sum(unit**2, axis=1)
@@ -171,7 +171,7 @@ class _Problem:
             J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / np.repeat(scale, 3)[:, None]
             weighted = (J * weight[:, None, None]).reshape(-1, SIZE)
             H, b = block_diag(weighted.T @ J.reshape(-1, SIZE), np.diag(nothing)), weighted.T @ unit.ravel()
-            step = self.solved(ROUGH, (H, np.append(b, nothing), 0.0), load, no_drift).step
+            step = self.solve(ROUGH, (H, np.append(b, nothing), 0.0), load, no_drift).step
             load = load.moved(step[:SIZE])
             if limit == 22.0 and np.abs(step[:6]).max() < 1e-6:
                 break
@@ -189,10 +189,10 @@ class _Problem:
             part = slice(max(start - order, 0), start + _CHUNK)
             some, hats = rows[part], self.hats(rows.t_s[part])
             near = np.flatnonzero(hats.any(axis=0))
-            r = some.wrench - self.predicted(load, some) - hats @ drift
+            r = some.wrench - self.predict(load, some) - hats @ drift
             J = jacobian(load, some.motion.earlier(load.delay_s, some.rate), some.rate)
             on_knots = np.einsum("nk,ij->nikj", hats[:, near], np.eye(6)).reshape(len(some), 6, -1)
-            X = noise.whitened(np.concatenate([J, on_knots, r[:, :, None]], axis=2), state[part], place[part])
+            X = noise.whiten(np.concatenate([J, on_knots, r[:, :, None]], axis=2), state[part], place[part])
             X = X[start - part.start :].reshape(-1, X.shape[2])
             places = np.concatenate([np.arange(SIZE), SIZE + (6 * near[:, None] + np.arange(6)).ravel()])
             gram = X.T @ X
@@ -202,7 +202,7 @@ class _Problem:
         T = block_diag(np.eye(SIZE), self.centred)
         return T.T @ H @ T, T.T @ b, chi2
 
-    def absorbed(self, load: Load, rows: Rows, solved: "_Step") -> Array:
+    def absorb(self, load: Load, rows: Rows, solved: "_Step") -> Array:
         """Root (n, 6, k) of the covariance of the prediction; none before the first solution, nor for so many rows."""
         if not solved.step.size or len(rows) > _MANY:
             return np.zeros((len(rows), 6, 0))
@@ -236,7 +236,7 @@ class _Problem:
         P[:SIZE, :SIZE] += np.diag(precision)
         return P, on, log_det
 
-    def solved(
+    def solve(
         self,
         sizes: Mapping[str, float],
         sums: tuple[Array, Array, float],
@@ -326,14 +326,14 @@ def fit(
     # Forces alone allow several mountings: the residuals of a robust fit, with the torques, decide.
     roughs = sorted((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])
     load, _ = roughs[0]
-    r = rows.wrench - problem.predicted(load, rows)
+    r = rows.wrench - problem.predict(load, rows)
     kept = _untouched(r) if guarded else _first_kept(problem, load)
     drift, sizes = np.zeros((len(problem.knots), 6)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
     solved = _Step.none()
     for stage in range(_STAGES):
         state = states(rows.speed_rad_s, kept)
-        r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
-        absorbed = problem.absorbed(load, rows[kept], solved)
+        r = rows.wrench - problem.predict(load, rows) - problem.hats(rows.t_s) @ drift
+        absorbed = problem.absorb(load, rows[kept], solved)
         noise = RowNoise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept], rows.row_s))
         if guarded:
             local = _local(r / noise.scale[state], kept)[:, None]
@@ -343,10 +343,10 @@ def fit(
         sums = problem.sums(load, drift, noise, kept, state)
         if stage in _CHOICES:
             sizes = _choose_sizes(problem, sizes, sums, load, drift)
-        solved = problem.solved(sizes, sums, load, drift)
+        solved = problem.solve(sizes, sums, load, drift)
         load = load.moved(solved.step[:SIZE])
         drift = drift + (problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
-        r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
+        r = rows.wrench - problem.predict(load, rows) - problem.hats(rows.t_s) @ drift
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
         kept = _untouched(r) if guarded else _without_contact(distance)
     contradiction = ""
@@ -354,14 +354,14 @@ def fit(
         if prior.has_response:
             sizes |= {"gain": np.inf, "cross_talk": np.inf}
         load, drift, solved, contradiction = _join(problem, prior, sizes, (load, drift), (noise, kept, state))
-        r = rows.wrench - problem.predicted(load, rows) - problem.hats(rows.t_s) @ drift
+        r = rows.wrench - problem.predict(load, rows) - problem.hats(rows.t_s) @ drift
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
     chi2, others = problem.sums(load, drift, noise, kept, state)[2], []
     for other, _ in roughs[1:] if prior is None else ():
         if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
             there = problem.sums(other, drift, noise, kept, state)
             # What one linear step would leave at the other mounting, less the chi2 of this one.
-            others.append(there[2] - float(there[1] @ problem.solved(sizes, there, other, drift).step) - chi2)
+            others.append(there[2] - float(there[1] @ problem.solve(sizes, there, other, drift).step) - chi2)
     change = None
     if sizes.get("walk_N") or sizes.get("walk_Nm"):
         ends = np.zeros((6, SIZE + 6 * len(problem.knots)))
@@ -403,7 +403,7 @@ def _join(
         for _ in range(_PRIOR_STEPS):
             sums = problem.sums(load, drift, *weighed)
             known = prior.rows(load.static, load.response[: 11 * prior.has_response], kept)
-            solved = problem.solved(sizes, sums, load, drift, known)
+            solved = problem.solve(sizes, sums, load, drift, known)
             load = load.moved(solved.step[:SIZE])
             drift = drift + (problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
             if abs(before - solved.cost) < _SETTLED:
@@ -432,7 +432,7 @@ def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
 def _first_kept(problem: _Problem, load: Load) -> NDArray[np.bool_]:
     """Rows without contact, by the quiet rows of each state; at rest there is no more noise than in motion."""
     rows = problem.rows
-    r = rows.wrench - problem.predicted(load, rows)
+    r = rows.wrench - problem.predict(load, rows)
     state = states(rows.speed_rad_s, np.ones(len(rows), bool))
     size = np.abs(r).reshape(-1, 2, 3)
     quiet = np.array([np.quantile(size[state == k], QUIET, axis=(0, 2)) for k in np.unique(state)])
@@ -467,7 +467,7 @@ def _choose_sizes(
     """Choose the sizes of the components by restricted likelihood, one after the other."""
     chosen = dict(sizes)
     for name, tried in _SIZES.items():
-        values = [problem.solved({**chosen, name: size}, sums, load, drift).criterion for size in (0.0, *tried)]
+        values = [problem.solve({**chosen, name: size}, sums, load, drift).criterion for size in (0.0, *tried)]
         best = int(np.argmin(values[1:]))
         chosen[name] = float(tried[best]) if values[1 + best] < values[0] - WORTH else 0.0
     return chosen

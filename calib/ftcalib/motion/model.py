@@ -222,11 +222,11 @@ class RowNoise:
         unit = X / scale[state][:, :, None]
         channels = [_filters(channel, place, bursts=bursts) for channel in np.moveaxis(unit, 1, 0)]
         noise = cls(scale, _of_equal_order(channels), np.eye(6))
-        left = noise.whitened(X, state, place)
+        left = noise.whiten(X, state, place)
         correlation = np.einsum("nik,njk->ij", left, left) / len(left)
         return cls(scale, noise.filters, np.linalg.inv(np.linalg.cholesky(correlation + 1e-9 * np.eye(6))))
 
-    def whitened(self, X: Array, state: NDArray[np.intp], place: NDArray[np.intp]) -> Array:
+    def whiten(self, X: Array, state: NDArray[np.intp], place: NDArray[np.intp]) -> Array:
         """Return values (n, 6, k) of rows as independent ones of unit variance.
 
         A row is predicted from the rows before it in its run, as many as the order, fewer at the beginning.

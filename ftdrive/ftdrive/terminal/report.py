@@ -293,7 +293,7 @@ def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], Metho
     ----------
     titles : sequence of str
         Of the columns with the names of a row.
-    rows : sequence of (names, Compared)
+    rows : sequence of (names, MethodResult)
         The names of a row: the method, or the case, its method and its sets.
     heading : str
         What the methods were tested on, and what they are compared with.

@@ -65,7 +65,7 @@ def angle_between_directions(a: Array, b: Array) -> float:
 )
 def test_what_is_exactly_known_stays_along_free_directions(known: Known, fixed: int) -> None:
     constraints = Constraints(known, 9.8)
-    p = constraints.satisfied(TOOL)
+    p = constraints.satisfy(TOOL)
     Z = constraints.free(p)
     assert Z.shape == (15, 15 - fixed)
     assert constraints.dof == fixed
@@ -91,7 +91,7 @@ def test_what_is_exactly_known_stays_along_free_directions(known: Known, fixed: 
 def test_a_tolerance_fixes_nothing() -> None:
     soft = Constraints(Known(MOUNT, 1e-9, False, DOWN, 1e-9, 2.0, 1e-9), 9.8)
     np.testing.assert_array_equal(soft.free(TOOL), np.eye(15))
-    assert np.abs(TOOL.difference(soft.satisfied(TOOL))).max() == 0
+    assert np.abs(TOOL.difference(soft.satisfy(TOOL))).max() == 0
 
 
 def test_starts_respect_the_known_mounting() -> None:

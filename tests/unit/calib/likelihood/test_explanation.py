@@ -20,7 +20,7 @@ def tour(n: int, residuals: Array | float = 0.0) -> Session:
 
 
 def at(own: Session, kept: Kept, components: tuple[Component, ...] = (), theta: tuple[float, ...] = ()) -> Point:
-    return point(own.linearised(TOOL, kept), components, np.array(theta))
+    return point(own.linearise(TOOL, kept), components, np.array(theta))
 
 
 def usual(n: int) -> Array:

@@ -117,7 +117,7 @@ def test_white_noise_hides_no_walk_and_gain() -> None:
     p, R, wrench, _, _ = session(rng, 24, 0.01, 0.01)
     wrench += np.cumsum(rng.normal(size=(24, 6)), axis=0) * 0.07 * np.repeat([1, 0.025], 3)
     data = Session(R, wrench, WHITE, None, "auto", Constraints(Known(), 9.8))
-    problem = data.linearised(p, data.everything)
+    problem = data.linearise(p, data.everything)
     hidden = maximise(problem, [component("white", FORCE), RESPONSE[1]], np.array([0.02, 1e-4]))
     found = {c.name for c in with_walks_instead(problem, hidden, data.candidates(), 0).components}
     assert {"gain", "walk_force_N"} <= found

@@ -88,7 +88,7 @@ def test_variances_start_at_the_mean_square_of_the_used_poses_or_at_their_noise(
     residuals = np.tile([0.3, -0.3, 0.3, 0.0, 0.0, 0.0], (24, 1))
     residuals[0] = 100.0
     own = session(R24, residuals=residuals)
-    problem = own.linearised(TOOL, np.arange(24) > 0)
+    problem = own.linearise(TOOL, np.arange(24) > 0)
     np.testing.assert_array_equal(own.start(problem, []), np.zeros(0))
     groups = [component("white", FORCE), component("white", TORQUE), component("white", [4]), component("walk", FORCE)]
     np.testing.assert_allclose(own.start(problem, groups), [0.09, SIGMA_NM**2, SIGMA_NM**2, 0.09 / 240])
@@ -154,7 +154,7 @@ def test_from_fifty_poses_on_each_axis_walks_by_itself() -> None:
 
 def test_what_was_known_before_counts_beside_the_data() -> None:
     known = Constraints(Known(gravity_direction_base=(0, 0, -1), direction_tolerance_rad=0.01, mass_kg=2.0), 9.8)
-    problem = session(R24, known=known).linearised(TOOL, np.ones(24, bool))
+    problem = session(R24, known=known).linearise(TOOL, np.ones(24, bool))
     A, residual = known.measurements(TOOL)
     Z = known.free(TOOL)
     assert Z.shape == (15, 14)

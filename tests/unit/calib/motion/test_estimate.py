@@ -135,7 +135,7 @@ def test_a_step_is_that_of_generalised_least_squares(posed: tuple[_Problem, Load
     sums = problem.sums(load, drift, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
     dense = Dense(problem, load, drift)
     assert sums[2] == pytest.approx(float(dense.r @ dense.r))
-    found = problem.solved(sizes, sums, load, drift)
+    found = problem.solve(sizes, sums, load, drift)
     values, covariance, cost, criterion = dense.solution(sizes)
     step = np.concatenate([found.step[:SIZE], problem.centred @ found.step[SIZE:]])
     sigma = np.sqrt(np.diag(found.covariance))[:15]
@@ -147,11 +147,11 @@ def test_a_step_is_that_of_generalised_least_squares(posed: tuple[_Problem, Load
     )
     assert found.cost == pytest.approx(cost, rel=1e-8)
     larger = {name: 2 * size for name, size in sizes.items()}
-    other = problem.solved(larger, sums, load, drift).criterion
+    other = problem.solve(larger, sums, load, drift).criterion
     assert other - found.criterion == pytest.approx(dense.solution(larger)[3] - criterion, abs=1e-5)
-    none = problem.solved({}, sums, load, drift).criterion
+    none = problem.solve({}, sums, load, drift).criterion
     assert none - found.criterion == pytest.approx(dense.solution(dict.fromkeys(ALL_ON, 0.0))[3] - criterion, abs=1e-5)
-    taken = problem.absorbed(load, problem.rows[:20], found)
+    taken = problem.absorb(load, problem.rows[:20], found)
     T = block_diag(np.eye(SIZE), problem.centred)
     J = dense.J[:120].reshape(20, 6, -1) * SIGMA[:, None] @ T
     np.testing.assert_allclose(
@@ -172,7 +172,7 @@ def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[_Problem, Load,
     noise = RowNoise(SIGMA[None] * np.array([[1.0], [3.0]]), filters, np.eye(6))
     state = np.arange(1010, dtype=np.intp) % 2
     H, b, chi2 = wide.sums(load, drift, noise, kept, state)
-    unit = (rows.wrench - wide.predicted(load, rows)) / noise.scale[state]
+    unit = (rows.wrench - wide.predict(load, rows)) / noise.scale[state]
     J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / noise.scale[state][:, :, None]
     white, derivative = unit.copy(), J.copy()
     for k in np.flatnonzero(kept):

@@ -103,7 +103,7 @@ def noisy(n: int = 1200) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
 def test_rows_become_independent_and_of_unit_variance() -> None:
     r, state, place = noisy()
     noise = RowNoise.of(r, np.zeros((len(r), 6, 0)), state, place)
-    white = noise.whitened(r[:, :, None], state, place)[:, :, 0]
+    white = noise.whiten(r[:, :, None], state, place)[:, :, 0]
     np.testing.assert_allclose(white.T @ white / len(r), np.eye(6), atol=1e-8)
     assert np.abs(white[1:].T @ white[:-1] / len(r)).max() < 0.15
     assert np.abs(np.mean(white[1:] * white[:-1], axis=0)).max() < 0.1
@@ -118,7 +118,7 @@ def test_a_row_is_predicted_from_those_before_it_in_its_run() -> None:
     r, state, place = noisy()
     noise = RowNoise.of(r, np.zeros((len(r), 6, 0)), state, place)
     X = np.stack([r, 2 * r], axis=2)
-    white = noise.whitened(X, state, place)
+    white = noise.whiten(X, state, place)
     order = len(noise.filters) - 1
     assert order >= 1
     for row in (0, 1, 5, 600, 601, 900):
@@ -134,7 +134,7 @@ def test_what_a_fit_has_taken_from_the_residuals_counts() -> None:
     taken = np.stack([0.5 * r, 0.2 * r], axis=2)
     plain, noise = (RowNoise.of(r, some, state, place) for some in (np.zeros((len(r), 6, 0)), taken))
     np.testing.assert_allclose(noise.scale, np.sqrt(1 + 0.5**2 + 0.2**2) * plain.scale)
-    white = noise.whitened(r[:, :, None], state, place)[:, :, 0]
+    white = noise.whiten(r[:, :, None], state, place)[:, :, 0]
     np.testing.assert_allclose(white.T @ white / len(r), np.eye(6) / (1 + 0.5**2 + 0.2**2), atol=1e-8)
 
 
@@ -142,4 +142,4 @@ def test_what_a_fit_has_taken_from_the_residuals_counts() -> None:
 def test_few_rows_are_enough(n: int) -> None:
     r = np.random.default_rng(5).normal(size=(n, 6))
     noise = RowNoise.of(r, np.zeros((n, 6, 0)), np.zeros(n, np.intp), np.arange(n))
-    assert np.isfinite(noise.whitened(r[:, :, None], np.zeros(n, np.intp), np.arange(n))).all()
+    assert np.isfinite(noise.whiten(r[:, :, None], np.zeros(n, np.intp), np.arange(n))).all()
