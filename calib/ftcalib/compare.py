@@ -122,17 +122,17 @@ def compare(  # noqa: PLR0913 - one for each thing that may be known
     for method in get_args(Method):
         try:
             if method == "ml":
-                found = _estimates_of(default)
+                estimates = _estimates_of(default)
             elif method in PUBLISHED:
-                found = _cross_validate(
+                estimates = _cross_validate(
                     dataset, method, known, g_m_s2, setup, as_published=as_published and method in CARLSON
                 )
             else:
-                found = _estimates_of(solve(dataset, method, drift=drift, known=known, g_m_s2=g_m_s2, setup=setup))
+                estimates = _estimates_of(solve(dataset, method, drift=drift, known=known, g_m_s2=g_m_s2, setup=setup))
         except (NotObservable, BadDataset) as error:
             compared.append(MethodResult(method, str(error)))
             continue
-        parameters, cv_force, cv_torque = found
+        parameters, cv_force, cv_torque = estimates
         one = _describe(method, parameters, dataset, default.parameters, g_m_s2)
         one = replace(one, cv_force_rms_N=cv_force, cv_torque_rms_Nm=cv_torque)
         compared.append(one if test is None else _add_test(one, parameters, test, truth or default.parameters))
@@ -193,9 +193,9 @@ def table_iii(
     truth = truth or solve(part(_ALL)).parameters
     rows = []
     for number, method, data, test in CASES:
-        found = part(data)
-        parameters = published(method, found.R_base_flange, gravity_direction_base=-UP_IN_BASE)(found.wrench)
-        one = _describe(method, parameters, found, truth, g_m_s2)
+        fitted = part(data)
+        parameters = published(method, fitted.R_base_flange, gravity_direction_base=-UP_IN_BASE)(fitted.wrench)
+        one = _describe(method, parameters, fitted, truth, g_m_s2)
         rows.append((number, data, test, _add_test(one, parameters, part(test), truth)))
     return rows
 

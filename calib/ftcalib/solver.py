@@ -268,11 +268,11 @@ def _fit_freely(dataset: CalibrationDataset, wrench_cov: Array | None, drift: Dr
     """Fit without known values; None if the poses do not determine all parameters."""
     try:
         require_orientations(dataset.R_base_flange, 4)
-        found = fit(dataset.R_base_flange, dataset.wrench, wrench_cov, t_s=dataset.t_s, drift=drift)
-        _require_determined(dataset.R_base_flange, found, None)
+        best = fit(dataset.R_base_flange, dataset.wrench, wrench_cov, t_s=dataset.t_s, drift=drift)
+        _require_determined(dataset.R_base_flange, best, None)
     except NotObservable:
         return None
-    return found
+    return best
 
 
 def _mistakes(
@@ -285,10 +285,10 @@ def _mistakes(
 ) -> list[Finding]:
     """Find what explains that poses do not determine the parameters: wrong known values can leave no weight."""
     poses = dataset.R_base_flange, dataset.wrench
-    found = faults(*poses, setup.up) or other_poses(*poses) or no_weight(*poses)
-    if not found and known is not None and (free := _fit_freely(dataset, wrench_cov, drift)) is not None:
-        found = contradictions(known, free.parameters, free.covariance, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
-    return found
+    findings = faults(*poses, setup.up) or other_poses(*poses) or no_weight(*poses)
+    if not findings and known is not None and (free := _fit_freely(dataset, wrench_cov, drift)) is not None:
+        findings = contradictions(known, free.parameters, free.covariance, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
+    return findings
 
 
 def estimator_of(

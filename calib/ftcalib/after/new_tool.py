@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc as chi2_sf
 
-from ftcalib.after.state import Update, updated
+from ftcalib.after.state import Update, apply_update
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.findings import Finding
@@ -175,7 +175,7 @@ def new_tool(
         raise NotObservable(changed)
     # Only the components that belong to the cell are kept: errors of the arm and of the sensor, not of one session.
     kept = {name: value for name, value in earlier.components.items() if name in ("rotation_rad", "hysteresis")}
-    result = updated(earlier, found, {**(provenance or {}), "dataset_sha256": dataset.sha256()})
+    result = apply_update(earlier, found, {**(provenance or {}), "dataset_sha256": dataset.sha256()})
     return replace(result, quality={}, weights=None, components=kept)
 
 

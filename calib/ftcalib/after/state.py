@@ -180,7 +180,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     )
 
 
-def updated(
+def apply_update(
     calibration: CalibrationResult, update: Update, provenance: Mapping[str, Any] | None = None
 ) -> CalibrationResult:
     """Make a new calibration of an update.

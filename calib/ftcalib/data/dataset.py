@@ -234,11 +234,11 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
     if missing:
         raise BadDataset(
             f"missing column {', '.join(missing)}: the first row must name {ORIENTATION_FORMS}, and "
-            f"fx, fy, fz, tx, ty, tz; it names {listed(names)}."
+            f"fx, fy, fz, tx, ty, tz; it names {list_names(names)}."
         )
     repeated = [name for name in wanted if names.count(name) > 1]
     if repeated:
-        raise BadDataset(f"column {listed(repeated)} appears more than once: keep one.")
+        raise BadDataset(f"column {list_names(repeated)} appears more than once: keep one.")
     if not rows:
         raise BadDataset("the table has a header but no row: add one row per pose.")
 
@@ -271,7 +271,7 @@ def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
     )
 
 
-def listed(names: Sequence[str], most: int = 20) -> str:
+def list_names(names: Sequence[str], most: int = 20) -> str:
     """Return names for a message, and how many more there are."""
     shown = ", ".join(name if len(name) <= 40 else f"{name[:40]}…" for name in names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"

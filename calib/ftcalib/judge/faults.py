@@ -135,7 +135,7 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
         return constant
     up = np.asarray(up_in_base, dtype=np.float64)
     as_read = _Rough.of(R_base_flange, wrench)
-    found = []
+    explanations = []
     for code, values, R, y in _readings(R_base_flange, wrench):
         # No rotation does better than any matrix of its size: this bound spares the search over rotations.
         if code != "columns_swapped" and least_rms(R, y[:, :3]) > COLLAPSE * as_read.force_rms_N:
@@ -144,10 +144,10 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
         (force, torque), limit = trial.shares, min(COLLAPSE * as_read.shares[0], CORRECTED)
         smaller = trial.force_rms_N < COLLAPSE * as_read.force_rms_N or code == "columns_swapped"
         if smaller and force < limit and torque < NO_WORSE * as_read.shares[1]:
-            found.append((trial.score(up), code, values, trial.force_rms_N))
-    if found:
-        score, code, values, corrected_N = min(found, key=lambda each: each[0])
-        equal = [one for one in found if one[0] < score + EQUAL and one[1] in READINGS]
+            explanations.append((trial.score(up), code, values, trial.force_rms_N))
+    if explanations:
+        score, code, values, corrected_N = min(explanations, key=lambda each: each[0])
+        equal = [one for one in explanations if one[0] < score + EQUAL and one[1] in READINGS]
         also = [READINGS[name].format(**own) for _, name, own, _ in equal if (name, own) != (code, values)]
         if code in READINGS:
             values = {**values, "also": also}
@@ -259,11 +259,11 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
     spread = np.ptp(wrench, axis=0)
     group = np.repeat([spread[:3].max(), spread[3:].max()], 3)
     stuck = [name for name, own, all_ in zip(CHANNELS, spread, group, strict=True) if own == 0 < all_]
-    found = [Finding.of("stuck_channels", channels=stuck)] if stuck else []
+    findings = [Finding.of("stuck_channels", channels=stuck)] if stuck else []
     coarse = [_coarse_step(part[:FOR_STEPS]) for part in np.hsplit(wrench, 2)]
     if any(coarse):
         # Coarse steps make equal readings by themselves: no copy or saturation is looked for.
-        return [*found, Finding.of("quantised", step_N=coarse[0], step_Nm=coarse[1])]
+        return [*findings, Finding.of("quantised", step_N=coarse[0], step_Nm=coarse[1])]
     distinct = len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench)
     copied = [] if distinct else _copies(wrench)
     ties = [(k, tied) for k in range(len(CHANNELS)) if spread[k] for tied in _tied(wrench[:, k])]
@@ -272,13 +272,13 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
         same = bool(np.ptp(R_base_flange[rows], axis=0).max() == 0)
         if same or _unexpected(R_base_flange, wrench, rows, np.flatnonzero(spread)):
             repeated.append(rows)
-            found.append(Finding.of("repeated_poses" if same else "repeated_wrenches", poses=rows + 1))
+            findings.append(Finding.of("repeated_poses" if same else "repeated_wrenches", poses=rows + 1))
     again = [row for rows in repeated for row in rows[1:]]
     for k, tied in ties:
         once = tied[~np.isin(tied, again)]
         if len(once) >= FEWEST_SATURATED and _unexpected(R_base_flange, wrench, once, np.array([k])):
-            found.append(Finding.of("saturated", channel=CHANNELS[k], poses=once + 1))
-    return found
+            findings.append(Finding.of("saturated", channel=CHANNELS[k], poses=once + 1))
+    return findings
 
 
 def _tied(readings: Array) -> list[NDArray[np.intp]]:

@@ -91,13 +91,13 @@ def assess(
     advise : bool
         Whether to look for poses to add.
     """
-    found, information, weak = _nearby(R_base_flange, parameters, wrench_cov)
-    found = _with_second_gap(found, R_base_flange, parameters)
-    if found.sound:
-        return found
-    ambiguities = _ambiguities(R_base_flange, parameters, information, weak, found)
-    words, poses = _advice(R_base_flange, parameters) if advise else ((), found.advised_R_base_flange)
-    return replace(found, ambiguities=ambiguities, advice=words, advised_R_base_flange=poses)
+    observability, information, weak = _nearby(R_base_flange, parameters, wrench_cov)
+    observability = _with_second_gap(observability, R_base_flange, parameters)
+    if observability.sound:
+        return observability
+    ambiguities = _ambiguities(R_base_flange, parameters, information, weak, observability)
+    words, poses = _advice(R_base_flange, parameters) if advise else ((), observability.advised_R_base_flange)
+    return replace(observability, ambiguities=ambiguities, advice=words, advised_R_base_flange=poses)
 
 
 def require_orientations(R_base_flange: Array, least: int = LEAST_POSES) -> None:
@@ -139,9 +139,9 @@ def require_observable(R_base_flange: Array, parameters: Parameters, wrench_cov:
         The message names the reason and the poses to add.
     """
     require_orientations(R_base_flange)
-    found = assess(R_base_flange, parameters, wrench_cov, advise=False)
-    if found.rank < 15 or found.second_gap < AMBIGUOUS_GAP:
-        raise NotObservable(replace(found, advice=_advice(R_base_flange, parameters)[0]).sentence())
+    observability = assess(R_base_flange, parameters, wrench_cov, advise=False)
+    if observability.rank < 15 or observability.second_gap < AMBIGUOUS_GAP:
+        raise NotObservable(replace(observability, advice=_advice(R_base_flange, parameters)[0]).sentence())
 
 
 def scaled_information(
@@ -170,8 +170,8 @@ def second_minimum(R_base_flange: Array, parameters: Parameters = NOMINAL) -> tu
     of n poses is worse by n (weight / sigma)² times the gap. Infinite and None if there is no other minimum.
     """
     force_N = gravity_wrench(parameters, R_base_flange)[:, :3]
-    found = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
-    others = (m for m in found if angle_between(m.R.T, parameters.R_flange_sensor) > _SAME_MINIMUM_RAD)
+    mountings = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
+    others = (m for m in mountings if angle_between(m.R.T, parameters.R_flange_sensor) > _SAME_MINIMUM_RAD)
     if (other := next(others, None)) is None:
         return float("inf"), None
     weight_N2 = float(parameters.gravity_force_base_N @ parameters.gravity_force_base_N)
@@ -216,25 +216,25 @@ def _nearby(
     rank = 15 - int(free.sum())
     condition = float(eigenvalues[-1] / eigenvalues[0]) if rank == 15 else float("inf")
     different, none = different_orientations(R_base_flange), np.zeros((0, 3, 3))
-    found = Observability(different, rank, condition, (), (), none, float("inf"))
-    return found, information / eigenvalues[-1], V[:, free] if rank < 15 else V[:, :1]
+    observability = Observability(different, rank, condition, (), (), none, float("inf"))
+    return observability, information / eigenvalues[-1], V[:, free] if rank < 15 else V[:, :1]
 
 
 def _is_sound(R_base_flange: Array, parameters: Parameters) -> bool:
     """Give the `sound` of `assess`, and look for the second solution, which takes the longest, only if need be."""
-    found = _nearby(R_base_flange, parameters)[0]
-    return found.sound and _with_second_gap(found, R_base_flange, parameters).sound
+    observability = _nearby(R_base_flange, parameters)[0]
+    return observability.sound and _with_second_gap(observability, R_base_flange, parameters).sound
 
 
-def _with_second_gap(found: Observability, R_base_flange: Array, parameters: Parameters) -> Observability:
-    return replace(found, second_gap=second_minimum(R_base_flange, parameters)[0])
+def _with_second_gap(observability: Observability, R_base_flange: Array, parameters: Parameters) -> Observability:
+    return replace(observability, second_gap=second_minimum(R_base_flange, parameters)[0])
 
 
 def _ambiguities(
-    R_base_flange: Array, parameters: Parameters, information: Array, weak: Array, found: Observability
+    R_base_flange: Array, parameters: Parameters, information: Array, weak: Array, observability: Observability
 ) -> tuple[str, ...]:
     """Sentences: the reason, then the parameters that cannot be separated."""
-    different = found.orientations
+    different = observability.orientations
     if different == 1:
         return (
             "there is only one orientation: weight, bias, centre of mass and mounting of the sensor cannot be "
@@ -274,14 +274,15 @@ def _ambiguities(
             f"gravity stays within {widest:.0f}° of one direction in the tool: mounting of the sensor, weight and bias "
             "are hard to separate",
         )
-    if found.rank == 15 and found.condition <= POOR_CONDITION:
+    if observability.rank == 15 and observability.condition <= POOR_CONDITION:
         return (
             "a very different mounting of the sensor explains these poses almost as well if the tool is light "
-            f"(gap {found.second_gap:.2g}, {WEAK_GAP:g} is sound)",
+            f"(gap {observability.second_gap:.2g}, {WEAK_GAP:g} is sound)",
         )
     share = (weak**2).sum(axis=1).reshape(5, 3).sum(axis=1) / weak.shape[1]
     names = ", ".join(name for name, part in zip(_GROUPS, share, strict=True) if part > 0.05)
-    how = "cannot be separated" if found.rank < 15 else f"are hard to separate (condition {found.condition:.1g})"
+    hard = f"are hard to separate (condition {observability.condition:.1g})"
+    how = "cannot be separated" if observability.rank < 15 else hard
     return (f"{names} {how}",)
 
 

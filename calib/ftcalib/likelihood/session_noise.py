@@ -64,7 +64,7 @@ class Noise:
             self._add_walk(steps(time)[1:])
         if time is not None and slope is not None and slope.any():
             sloping = np.flatnonzero(slope)
-            self.add_effects(centred(time)[:, None, None] * np.eye(6)[:, sloping], slope[sloping] ** 2)
+            self.add_effects(centre(time)[:, None, None] * np.eye(6)[:, sloping], slope[sloping] ** 2)
         if effects is not None:
             self.add_effects(*effects)
 
@@ -226,6 +226,6 @@ def _following(X: Array) -> Array:
     return np.asarray(np.cumsum(X[::-1], axis=0)[::-1])
 
 
-def centred(time: Array) -> Array:
+def centre(time: Array) -> Array:
     """Shift and scale time to mean zero and unit length."""
     return np.asarray((time - time.mean()) / max(np.ptp(time), 1e-300))

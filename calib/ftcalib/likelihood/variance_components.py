@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dtrtri
 
 from ftcalib.likelihood.descent import column_scale
-from ftcalib.likelihood.session_noise import Noise, centred, summed_products, walk_times
+from ftcalib.likelihood.session_noise import Noise, centre, summed_products, walk_times
 from ftcalib.model import Array
 
 # A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance.
@@ -95,7 +95,7 @@ class Linearised:
     @cached_property
     def X(self) -> Array:
         """(n, 6, M) by parameters, slopes, gain, cross-talk, hysteresis: all that acts on all poses; then residuals."""
-        slopes = centred(self.time)[:, None, None] * np.eye(6)
+        slopes = centre(self.time)[:, None, None] * np.eye(6)
         return np.concatenate([self.J, slopes, self.response, self.hysteresis, self.r[..., None]], axis=2)
 
     def columns(self, c: Component) -> NDArray[np.intp] | None:

@@ -127,10 +127,10 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     )
     quality, judged = _judge(used, best, setup, known, g_m_s2)
     mistakes = _mistakes(used, best, quality.findings)
-    found = [*quality.findings, *mistakes]
-    found += _narrow(used, best, explained=verdict_of(found) == "rejected")
-    found += _findings(rows, used, best, motion, height_m, positions=positions)
-    found += [] if earlier is None else [Finding.of("earlier_cell", parent=earlier.id)]
+    findings = [*quality.findings, *mistakes]
+    findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
+    findings += _findings(rows, used, best, motion, height_m, positions=positions)
+    findings += [] if earlier is None else [Finding.of("earlier_cell", parent=earlier.id)]
     responding = best.components.keys() & {"gain", "cross_talk"} or (prior is not None and prior.has_response)
     places = np.r_[0:15, 23:34]
     response = Response(best.load.response, best.covariance[np.ix_(places, places)]) if responding else None
@@ -144,7 +144,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         noise_source="residuals",
         g_m_s2=g_m_s2,
         method="motion",
-        findings=ordered(found),
+        findings=ordered(findings),
         provenance={**(provenance or {}), **({} if earlier is None else {"parent": {"id": earlier.id}})},
         components=best.components,
         drift=None if best.drift_change is None else DriftResult(*best.drift_change),
@@ -204,9 +204,9 @@ def _require_determined(rows: Rows, best: MotionFit, known: Known | None) -> Non
         return
     if known is not None:
         return  # the verdict names it
-    found = assess(_orientations(rows), best.load.static)
-    if found.ambiguities:
-        reason = ": ".join(found.ambiguities[:2])
+    observability = assess(_orientations(rows), best.load.static)
+    if observability.ambiguities:
+        reason = ": ".join(observability.ambiguities[:2])
         raise NotObservable(f"{reason}; turn wrist 1 and wrist 2 by 60° or more, wrist 3 too, and record again.")
 
 
@@ -267,27 +267,27 @@ def _findings(
     rows: Rows, used: Rows, best: MotionFit, motion: MotionResult, height_m: float | None, *, positions: bool
 ) -> list[Finding]:
     """Findings that only a recording in motion has."""
-    sigma, found = np.sqrt(np.diag(best.covariance)), list[Finding]()
+    sigma, findings = np.sqrt(np.diag(best.covariance)), list[Finding]()
     if abs(motion.delay_s) > OFFSET_S:
-        found.append(Finding.of("clock_offset", delay_s=motion.delay_s))
+        findings.append(Finding.of("clock_offset", delay_s=motion.delay_s))
     if not positions:
         turned = np.linalg.norm(used.motion.Omega_rad2_s2, ord=2, axis=(1, 2))
         bound_N = best.load.mass_kg * REACH_M * float(np.sqrt(np.mean(turned**2)))
         share = len(used) / max(len(rows), 1)
-        found.append(Finding.of("positions_missing", share_percent=100 * share, force_N=bound_N))
+        findings.append(Finding.of("positions_missing", share_percent=100 * share, force_N=bound_N))
     elif height_m is not None and abs(best.load.height_m - height_m) > max(5 * sigma[HEIGHT], WRONG_HEIGHT_M):
         values = {"height_mm": 1e3 * best.load.height_m, "sigma_mm": 1e3 * sigma[HEIGHT]}
-        found.append(Finding.of("height_differs", **values, configured_mm=1e3 * height_m))
+        findings.append(Finding.of("height_differs", **values, configured_mm=1e3 * height_m))
     if motion.contacts:
         share = sum(one["duration_s"] for one in motion.contacts) / max(len(used) * used.row_s, 1e-9)
         largest_N = max(one["force_N"] for one in motion.contacts)
         values = {"count": len(motion.contacts), "share_percent": 100 * share, "force_N": largest_N}
-        found.append(Finding.of("mostly_contact" if share > MOSTLY else "contacts_left_out", **values))
+        findings.append(Finding.of("mostly_contact" if share > MOSTLY else "contacts_left_out", **values))
     weak = best.prior_share > MEASURED
     weak[:6] &= sigma[INERTIA] > 0
     if positions and weak.any():
-        found.append(Finding.of("motion_slow", names=_list_names([NAMES[k] for k in np.flatnonzero(weak)])))
-    return found
+        findings.append(Finding.of("motion_slow", names=_list_names([NAMES[k] for k in np.flatnonzero(weak)])))
+    return findings
 
 
 def _mistakes(rows: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
@@ -336,10 +336,10 @@ def _contacts(rows: Rows, best: MotionFit, first_s: float) -> tuple[Mapping[str,
     largest = (sliding_window_view(np.pad(each, half), 2 * half + 1).max(axis=1) for each in (force, torque))
     strong = [each > most / 2 for each, most in zip((force, torque), largest, strict=True)]
     touched = np.flatnonzero((strong[0] | strong[1]) & ~best.kept)
-    found = []
+    contacts = []
     for within in np.split(touched, np.flatnonzero(np.diff(touched) > 1) + 1) if len(touched) else []:
         start_s, end_s = rows.t_s[within[0]] - rows.row_s / 2, rows.t_s[within[-1]] + rows.row_s / 2
-        found.append(
+        contacts.append(
             {
                 "t_s": float(start_s - first_s),
                 "duration_s": float(end_s - start_s),
@@ -347,7 +347,7 @@ def _contacts(rows: Rows, best: MotionFit, first_s: float) -> tuple[Mapping[str,
                 "torque_Nm": float(torque[within].max()),
             }
         )
-    return tuple(found)
+    return tuple(contacts)
 
 
 def _list_names(names: Sequence[str]) -> str:

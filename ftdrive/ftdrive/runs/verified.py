@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from ftcalib import CalibrationDataset, CalibrationResult
-from ftcalib.after.state import Update, updated
+from ftcalib.after.state import Update, apply_update
 from ftcalib.after.verification import Verification, verify
 from ftcalib.data.dataset import pooled_covariance
 from ftcalib.errors import BadDataset, NotObservable
@@ -200,5 +200,5 @@ def save_update(verified: Verified) -> Path:
         "parent": {"path": str(verified.calibration_path.absolute())},
     }
     path = run.new_path("calibration")
-    updated(old, verified.update, provenance).save(path)
+    apply_update(old, verified.update, provenance).save(path)
     return path

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, solve
-from ftcalib.after.state import BLOCKS, Update, reestimate, tare, updated
+from ftcalib.after.state import BLOCKS, Update, apply_update, reestimate, tare
 from ftcalib.likelihood.response import Response, response_columns
 from ftcalib.model import Array, jacobian, predict
 from tests.first_order import assert_same, propagated
@@ -273,7 +273,7 @@ def test_an_update_makes_a_calibration_that_names_its_parent_and_survives_a_file
     new = loaded(truth())
     readings = predict(new, tilted(0, 60)) + rng.multivariate_normal(np.zeros(6), NOISE, size=2)
     update = reestimate(parent, tilted(0, 60), readings, joint(2), "payload")
-    child = updated(parent, update, {"parent": {"path": "old.json"}, "command": "verify"})
+    child = apply_update(parent, update, {"parent": {"path": "old.json"}, "command": "verify"})
     assert child.provenance["parent"] == {"path": "old.json", "id": parent.id}
     assert (child.provenance["update"], child.provenance["command"]) == ("payload", "verify")
     assert child.id != parent.id
@@ -285,7 +285,7 @@ def test_an_update_makes_a_calibration_that_names_its_parent_and_survives_a_file
     assert again.id == child.id
     one = tare(parent, R[:1], [dwell(truth(), R[0], rng)])
     with pytest.raises(NotObservable, match="use 2 poses or more"):
-        updated(parent, one)
+        apply_update(parent, one)
 
 
 def test_shapes_that_do_not_fit_are_rejected() -> None:

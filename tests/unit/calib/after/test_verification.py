@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Parameters, solve
 from ftcalib.after.expected_readings import expected_with_inexact_orientations
-from ftcalib.after.state import updated
+from ftcalib.after.state import apply_update
 from ftcalib.after.verification import Verification, verify
 from ftcalib.likelihood.response import response_columns
 from ftcalib.model import Array, predict
@@ -87,7 +87,7 @@ def test_a_change_is_named_and_the_smallest_update_makes_up_for_it(what: str, ga
     assert found.update.kind == what
     error = CHANGED[what].difference(found.update.parameters)
     assert error @ np.linalg.solve(found.update.covariance, error) < 45  # chi-square, 15 dof: one in 10 000
-    child = updated(calibrated(gain=gain), found.update)
+    child = apply_update(calibrated(gain=gain), found.update)
     wrench = readings(CHANGED[what], orientations(6, 9), 9, COEFFICIENTS if gain else None)
     assert verify(child, orientations(6, 9), wrench, noise_of(6)).passed
     json.dumps(found.to_dict(), allow_nan=False)

@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.integrate import quad
 
 from ftcalib.likelihood.explanation import _prune, rivals, select, with_slopes_instead
-from ftcalib.likelihood.session_noise import Noise, centred, walk_times
+from ftcalib.likelihood.session_noise import Noise, centre, walk_times
 from ftcalib.likelihood.variance_components import (
     FORCE,
     HYSTERESIS,
@@ -35,10 +35,10 @@ N = 15
 def dense(D: Array, time: Array, walk: Array, slope: Array) -> Array:
     n = len(D)
     tau = np.cumsum(np.diff(time, prepend=time[0] - 1))
-    centre = np.eye(n) - 1 / n
-    K = centre @ np.minimum.outer(tau, tau) @ centre
+    without_mean = np.eye(n) - 1 / n
+    K = without_mean @ np.minimum.outer(tau, tau) @ without_mean
     V = np.asarray(np.kron(K, np.diag(walk**2)), dtype=np.float64)
-    V += np.kron(np.outer(centred(time), centred(time)), np.diag(slope**2))
+    V += np.kron(np.outer(centre(time), centre(time)), np.diag(slope**2))
     for i in range(n):
         V[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += D[i]
     return np.asarray(V, dtype=np.float64)
@@ -75,7 +75,7 @@ def test_an_unknown_slope_is_one_of_infinite_variance() -> None:
     rng = np.random.default_rng(2)
     D, time = covariances(rng), np.arange(N, dtype=float)
     unknown = Noise(D, time, None, np.full(6, np.inf))
-    line = centred(time)[:, None, None] * np.eye(6)
+    line = centre(time)[:, None, None] * np.eye(6)
     np.testing.assert_allclose(unknown.solve(line), 0, atol=1e-12)
     X = rng.normal(size=(N, 6, 2))
     np.testing.assert_allclose(unknown.solve(X), Noise(D, time, None, np.full(6, 1e5)).solve(X), atol=1e-7)
@@ -242,7 +242,7 @@ def test_a_turn_of_the_flange_is_distinguished_from_white_noise() -> None:
 def test_a_linear_drift_is_preferred_where_it_fits_better() -> None:
     rng = np.random.default_rng(9)
     p = problem(rng, 30, (), np.zeros(0))
-    p.r[:, :3] += centred(p.time)[:, None] * [2.0, -1.5, 1.0]
+    p.r[:, :3] += centre(p.time)[:, None] * [2.0, -1.5, 1.0]
     at = select(p, [], np.zeros(0), [component("walk", FORCE)])
     assert [c.kind for c in with_slopes_instead(p, at, 0).components] == ["slope"]
     q = problem(rng, 30, (component("walk", FORCE),), np.array([0.2]))
@@ -290,7 +290,7 @@ def test_each_component_has_its_columns() -> None:
     np.testing.assert_array_equal(p.X[..., p.columns(GAINS)], p.response[..., :5])
     np.testing.assert_array_equal(p.X[..., p.columns(CROSS_TALK)], p.response[..., 5:])
     np.testing.assert_array_equal(p.X[..., p.columns(HYSTERESIS)], p.hysteresis)
-    slopes = centred(p.time)[:, None, None] * np.eye(6)
+    slopes = centre(p.time)[:, None, None] * np.eye(6)
     np.testing.assert_array_equal(p.X[..., p.columns(component("slope", TORQUE))], slopes[..., 3:])
     np.testing.assert_array_equal(p.X[..., -1], p.r)
     assert all(p.columns(component(kind, FORCE)) is None for kind in ("white", "walk"))
