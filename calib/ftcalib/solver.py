@@ -99,7 +99,9 @@ def solve(
     assumed = known if estimator is None or method in BASELINES else None
     best = _fit(dataset, wrench_cov, drift, known, assumed, g_m_s2, setup)
     judged = Judged.of(best) if estimator is None else _estimate(method, estimator, dataset, wrench_cov, best)
-    free = _fit_freely(dataset, wrench_cov, drift) if assumed is not None else best if estimator else None
+    free = best if estimator else None
+    if assumed is not None:
+        free = _fit_freely(dataset, wrench_cov, drift)
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
     quality = _judge(judged, free, dataset.t_s, measured_sigma, known, g_m_s2, setup)
     deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
