@@ -20,7 +20,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, NotObservable, read_csv, solve
-from ftcalib.judge.cross_validation import standardized
+from ftcalib.judge.cross_validation import standardize
 from ftcalib.likelihood import fit as likelihood
 from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import UP_IN_BASE, Array, predict

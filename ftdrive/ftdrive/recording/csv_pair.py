@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
 from ftcalib import CalibrationResult
-from ftcalib.data.dataset import ORIENTATION_FORMS, listed, orientation_columns, rotations_of
+from ftcalib.data.dataset import ORIENTATION_FORMS, list_names, orientation_columns, rotations_of
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
 from ftcalib.files import open_file
@@ -106,7 +106,7 @@ def _columns(path: Path, head: bytes, wanted: Wanted) -> tuple[list[str], Sequen
         raise BadDataset(f"{path.name}: the first row is no list of columns ({error}): give a CSV file") from error
     found = wanted.choose(names)
     if not {"t", *found} <= set(names):
-        raise BadDataset(f"{path.name}: the first row must name t and {wanted.words}; it names {listed(names)}")
+        raise BadDataset(f"{path.name}: the first row must name t and {wanted.words}; it names {list_names(names)}")
     return names, found
 
 
