@@ -107,7 +107,7 @@ WALKS = {
         ftcalib.motion.samples                    rows_of                  makes rows of both streams
         ftcalib.motion.estimate                   rough_delay              finds the delay to start from
         ftcalib.motion.estimate                   fit                      fits load, delay and inertia
-        ftcalib.motion.model                      Noise.of                 takes the noise from residuals
+        ftcalib.motion.model                      RowNoise.of              takes the noise from residuals
         ftcalib.motion.model                      wrench_of                predicts a load in motion
         ftcalib.judge.verdict                     judge                    judges rows as poses
         ftcalib.findings                          ordered                  ranks the findings
