@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, fields
 from functools import cache
-from typing import Final, Literal, Self
+from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -71,6 +71,8 @@ class Columns:
     """n consecutive samples, one array for each quantity, one row for each sample."""
 
     __slots__ = ()
+    _COMMON: ClassVar[frozenset[str]] = frozenset()
+    """Fields that are no arrays by rows: one value for all of them, and of joined blocks that of the last."""
     t_host_ns: NDArray[np.int64]
 
     def __len__(self) -> int:
@@ -82,11 +84,21 @@ class Columns:
         """Join blocks in the order given."""
         if len(blocks) == 1:
             return blocks[0]
-        return cls(*(np.concatenate([getattr(block, name) for block in blocks]) for name in cls._names()))
+        last = blocks[-1]
+        return cls(
+            *(
+                getattr(last, name)
+                if name in cls._COMMON
+                else np.concatenate([getattr(block, name) for block in blocks])
+                for name in cls._names()
+            )
+        )
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Self:
         """Select samples."""
-        return type(self)(*(getattr(self, name)[which] for name in self._names()))
+        return type(self)(
+            *(getattr(self, name) if name in self._COMMON else getattr(self, name)[which] for name in self._names())
+        )
 
     @classmethod
     @cache  # `fields` takes longer than the rest

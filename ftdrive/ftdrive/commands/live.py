@@ -26,9 +26,9 @@ from ftdrive.commands.common import (
     read_frame,
     write_json,
 )
-from ftdrive.commands.live_source import RECOVER_S, open_source
+from ftdrive.commands.live_source import open_source
 from ftdrive.errors import ConfigError
-from ftdrive.live.following import to_dict
+from ftdrive.live.loop import RECOVER_S, ProcessedStream
 from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Axes, StreamInfo, Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
@@ -38,12 +38,11 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.source import read_calibration
 from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrive.terminal.live.feed import MEAN_S, Feed, Stream
+from ftdrive.terminal.live.feed import MEAN_S, Feed
 from ftdrive.terminal.live.layout import plain as plain_lines
 from ftdrive.terminal.live.summary import Summary
 from ftdrive.terminal.live.view import View
 from ftdrive.terminal.text import echo
-from ftdrivers.clock import Clock
 from ftdrivers.interfaces import Array
 
 _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
@@ -102,9 +101,9 @@ def live(
                 push = partial(stream.station.control, do="push", wrench=_PUSH, seconds=1.0)
             recorder = partial(_recorder, stream.info, stream.cell.to_dict())
         if once or as_json or not sys.stdout.isatty():
-            _print(stream, stream.clock, once=once, as_json=as_json)
+            _print(stream, once=once, as_json=as_json)
         elif plain or not (messages.is_terminal and sys.stdin.isatty()):
-            _show_table(stream, stream.clock, checks)
+            _show_table(stream, checks)
         else:
             from ftdrive.terminal.live_screen import run_live
 
@@ -128,8 +127,8 @@ def _recorder(info: StreamInfo, configuration: dict[str, Any], path: Path) -> Re
     return Recorder([path], info, configuration)
 
 
-def _print(stream: Stream, clock: Clock, *, once: bool = False, as_json: bool = False) -> None:
-    for view in _views(stream, clock, raises=once):
+def _print(stream: ProcessedStream, *, once: bool = False, as_json: bool = False) -> None:
+    for view in _views(stream, raises=once):
         reading = _reading(view)
         if as_json:
             write_json(reading)
@@ -142,35 +141,30 @@ def _print(stream: Stream, clock: Clock, *, once: bool = False, as_json: bool = 
             break
 
 
-def _show_table(stream: Stream, clock: Clock, checks: Sequence[Check]) -> None:
+def _show_table(stream: ProcessedStream, checks: Sequence[Check]) -> None:
     shown = Group()
     with (
         Keyboard(0) if Keyboard.usable(0) else nullcontext(),  # Enter would break the screen
         Live(console=answer, refresh_per_second=10) as screen,
     ):
-        for view in _views(stream, clock, checks):
+        for view in _views(stream, checks):
             shown = Group(*(line.as_text() for line in plain_lines(view, answer.width)))
             screen.update(Group(shown, "Ctrl-C ends"))
         screen.update(Group(shown, "The recording has ended."))
 
 
-def _views(stream: Stream, clock: Clock, checks: Sequence[Check] = (), *, raises: bool = False) -> Iterator[View]:
+def _views(stream: ProcessedStream, checks: Sequence[Check] = (), *, raises: bool = False) -> Iterator[View]:
     """Yield the state each `MEAN_S` from when the noise is known; raise a failure at once or when it lasts."""
     feed = Feed(stream)
     summary = Summary(feed, checks)
     begin_ns: int | None = None
     is_known, ended = False, False
-    failing_since_s: float | None = None
     while not ended:
+        feed.reader.patience_s = RECOVER_S if is_known and not raises else 0.0
         feed.step()
-        if feed.failure is not None:
-            now_s = clock.now_s()
-            failing_since_s = now_s if failing_since_s is None else failing_since_s
-            if raises or not is_known or now_s - failing_since_s > RECOVER_S:
-                raise feed.failure
+        if feed.reader.failure is not None:
             yield summary.view()
             continue
-        failing_since_s = None
         ended = isinstance(stream, ReplayedStream) and stream.has_ended
         if feed.newest_ns is None:
             continue
@@ -211,7 +205,7 @@ def _reading(view: View) -> dict[str, Any]:
         "calibration_id": calibration.id,
         "verdict": calibration.verdict,
         "marks": list(view.info.marks),
-        "tracked": None if status.tracked is None else to_dict(status.tracked),
+        "tracked": None if status.tracked is None else status.tracked.to_dict(),
         "verification": None if verification is None else verification.to_dict(),
     }
 

@@ -17,9 +17,6 @@ from ftdrive.store.weighing_log import WeighingLog
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.screen import open_operator
 
-RECOVER_S = 10.0
-"""So long a stream with an interruption may take to deliver again; then the command ends."""
-
 
 def open_source(source: Source, frame: WrenchFrame, stack: ExitStack, track: Tracking = "off") -> CompensatedStream:
     """Open the stream of a real or an emulated cell; `stack` closes it.

@@ -16,7 +16,7 @@ from ftdrive.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from ftdrive.live.processing import ProcessedStream
+    from ftdrive.live.loop import ProcessedStream
     from ftdrive.live.samples import Axes, Tracking
     from ftdrive.live.stream import CompensatedStream
     from ftdrive.servers.foxglove import FoxgloveServer
@@ -77,26 +77,13 @@ def stream(
 
 def serve(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
     """Send blocks and events until Ctrl-C is pressed, or a device is silent for `RECOVER_S`."""
-    from ftdrive.commands.live_source import RECOVER_S
+    from ftdrive.live.loop import RECOVER_S, BlockReader
     from ftdrive.terminal.console import messages
-    from ftdrivers.errors import DeviceError
 
-    silent_since_s: float | None = None
+    meanwhile = f"Viewers stay connected for {RECOVER_S:g} s."
     try:
-        while True:
-            try:
-                block = source.read()
-            except DeviceError as error:
-                now_s = source.clock.now_s()
-                if silent_since_s is None:
-                    silent_since_s = now_s
-                    messages.print(f"{error}. Viewers stay connected for {RECOVER_S:g} s.")
-                elif now_s - silent_since_s > RECOVER_S:
-                    raise
-            else:
-                if silent_since_s is not None:
-                    silent_since_s = None
-                    messages.print("Samples arrive again.")
+        for block in BlockReader(source, say=messages.print, meanwhile=meanwhile):
+            if block is not None:
                 for sink in sinks:
                     sink.write(block)
             _send_events(source, sinks)

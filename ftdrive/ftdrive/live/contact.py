@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
+from ftcalib.files import JSON
 from ftcalib.likelihood.response import Response, predicted_covariance
 from ftcalib.model import Array, Parameters
 from ftdrive.live.motion import READING_S, REST, accelerated, samples_in_reading
 from ftdrive.live.noise import Noise, NoiseEstimator
 from ftdrive.live.samples import Ns
-from ftdrive.live.tare import TARE_DRIFT_N, TARE_DRIFT_NM
+from ftdrive.live.stages import TARE_DRIFT_N, TARE_DRIFT_NM
 
 _TURN_RAD = 0.02
 """The covariance of a calibration is evaluated again after so much turning."""
@@ -278,6 +279,17 @@ class Contact:
         """(3,) point of the line of force nearest to the reference point, along the axes of the frame."""
         force_N = self.peak[:3]
         return np.cross(force_N, self.peak[3:]) / (float(force_N @ force_N) or np.inf)
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the values of its event, but for the frame."""
+        return {
+            "duration_s": self.duration_s,
+            "peak_N": self.peak_N,
+            "peak_wrench": self.peak.tolist(),
+            "direction": self.direction.tolist(),
+            "line_point_m": self.line_m.tolist(),
+            "line_distance_m": float(np.linalg.norm(self.line_m)),
+        }
 
 
 class ContactTracker:

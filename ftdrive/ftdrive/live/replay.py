@@ -9,7 +9,8 @@ import numpy as np
 
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
-from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME, ProcessedStream, Processor
+from ftdrive.live.loop import ProcessedStream
+from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME
 from ftdrive.live.samples import (
     Block,
     LinkStatus,
@@ -62,12 +63,11 @@ class ReplayedStream(ProcessedStream):
     ) -> None:
         if not len(rows):
             raise BadDataset("the recording has no samples: replay another one")
-        self.info = info
         self._rows = rows
         self._seconds = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
         self.clock = clock
-        self._processor = Processor(info, frame, stages, false_alarm_rate=false_alarm_rate)
-        self._processor.learn_noise([rows])
+        super().__init__(info, frame, stages, false_alarm_rate=false_alarm_rate)
+        self.learn_noise([rows])
         self._speed = speed
         self._next = 0
         """The first row that was not read."""
@@ -122,7 +122,7 @@ class ReplayedStream(ProcessedStream):
     def seek(self, t_s: float) -> None:
         """Go to a time in the recording; filters and contacts restart there."""
         self._next = int(np.searchsorted(self._seconds, min(max(t_s, 0.0), self.duration_s)))
-        self._processor.restart(elsewhere=True)
+        self.restart(elsewhere=True)
         self._set_out(float(self._seconds[self._next]))
 
     def step(self) -> Block:
@@ -153,7 +153,7 @@ class ReplayedStream(ProcessedStream):
         end = max(self._next, int(np.searchsorted(self._seconds, t_s, "right")))
         rows = self._rows.rows(slice(self._next, end))
         self._next = end
-        return self._process(rows, last=self.has_ended)
+        return self._process_read(rows, last=self.has_ended)
 
     def __iter__(self) -> Iterator[Sample]:
         while not self.has_ended:
@@ -167,7 +167,7 @@ class ReplayedStream(ProcessedStream):
         span_s = min(1.0, max(self.at_s, 1e-3))
         sensor = LinkStatus(len(self._rows.seq[recent]) / span_s, self.info.sensor_rate_Hz, lost, 0.0)
         arm = LinkStatus(self.info.arm_rate_Hz, self.info.arm_rate_Hz, 0, 0.0)
-        return self._processor.status(sensor, arm, (0.0, 0.0))
+        return self._status_of(sensor, arm, (0.0, 0.0))
 
 
 def replay_run(run: Run, calibration: CalibrationResult, name: str = "", **options: Any) -> ReplayedStream:

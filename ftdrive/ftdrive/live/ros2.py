@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ftdrive.live.quaternions import quaternions
-from ftdrive.live.samples import WrenchFrame
+from ftdrive.live.frames import quaternions
 from ftdrivers.interfaces import Array
 
 RAW, COMPENSATED, POSE, JOINTS = "/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states"
@@ -97,15 +96,6 @@ Quaternion rotation""",
     _VECTOR,
     _QUATERNION,
 )
-
-
-def frame_id(frame: WrenchFrame) -> str:
-    """Return a name of axes and point: `sensor`, `base_at_tcp` or `base_at_0_0_0.15_m` (a point from the flange)."""
-    if frame.axes == frame.about:
-        return frame.axes
-    if isinstance(frame.about, str):
-        return f"{frame.axes}_at_{frame.about}"
-    return f"{frame.axes}_at_{'_'.join(f'{x:g}' for x in frame.about)}_m"
 
 
 def pack_wrenches(t_utc_ns: NDArray[np.int64], wrench: Array, frame: str) -> Messages:

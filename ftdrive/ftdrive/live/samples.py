@@ -1,8 +1,8 @@
 """The values of a compensated stream: blocks of samples, the frame they are given in, the stages applied, events."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any, Literal, Self
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ftcalib import CalibrationResult
 from ftcalib.files import JSON
 from ftcalib.motion.model import HEIGHT
+from ftcalib.rounding import with_sigma
 from ftdrive.runs.verification_record import VerificationRecord, marks_of
 from ftdrivers.interfaces import Array, Columns, DeviceInfo
 
@@ -42,6 +43,15 @@ class WrenchFrame:
             point = "({:g}, {:g}, {:g}) mm from the flange".format(*(1e3 * x for x in self.about))
         return f"{self.axes} axes, about {point}"
 
+    @property
+    def id(self) -> str:
+        """Name in messages: `sensor`, `base_at_tcp` or `base_at_0_0_0.15_m` (a point from the flange)."""
+        if self.axes == self.about:
+            return self.axes
+        if isinstance(self.about, str):
+            return f"{self.axes}_at_{self.about}"
+        return f"{self.axes}_at_{'_'.join(f'{x:g}' for x in self.about)}_m"
+
     def to_dict(self) -> dict[str, JSON]:
         """Return the fields as JSON; a point is a list."""
         return {"axes": self.axes, "about": self.about if isinstance(self.about, str) else list(self.about)}
@@ -71,86 +81,42 @@ class Stages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Paired(Columns):
-    """n consecutive samples of the sensor, each with the pose at its time; the fields are those of `Block`."""
-
-    t_host_ns: Ns
-    """(n,) time of the measurement on the clock of the cell."""
-    t_device_s: Array
-    """(n,) NaN where the sensor has no clock."""
-    seq: Ns
-    """(n,)"""
-    status: NDArray[np.uint32]
-    """(n,)"""
-    raw: Array
-    """(n, 6) as measured, N and N·m, sensor axes, about the sensor origin."""
-    q_rad: Array
-    """(n, 6) NaN where unknown."""
-    R_base_flange: Array
-    """(n, 3, 3)"""
-    p_base_flange_m: Array
-    """(n, 3) NaN where unknown."""
-
-
-_ALIKE = ("sigma", "frame", "stages")
-"""Fields of a block that its samples share."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Block:
     """n consecutive samples of the sensor, each with the pose at its time."""
 
-    t_host_ns: NDArray[np.int64]
+    t_host_ns: Ns
     """(n,) time of the measurement on the clock of the cell: smoothed, and free of the delay between the links."""
     t_device_s: Array
     """(n,) the sensor's own clock; NaN where it has none."""
-    seq: NDArray[np.int64]
+    seq: Ns
     """(n,) the sensor's sample numbers; a missing one is a lost sample."""
     status: NDArray[np.uint32]
     """(n,) the sensor's status word."""
     raw: Array
     """(n, 6) as measured, N and N·m, sensor axes, about the sensor origin."""
+    q_rad: Array
+    """(n, 6) joint angles, interpolated; NaN where unknown."""
+    R_base_flange: Array
+    """(n, 3, 3) interpolated."""
+    p_base_flange_m: Array
+    """(n, 3) interpolated; NaN where unknown."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block(Paired):
+    """Paired samples after processing, all in one frame and with the same stages; sigma is that of the newest."""
+
     wrench: Array
     """(n, 6) after `stages`, N and N·m, in `frame`."""
     chi2: Array
     """(n,) squared Mahalanobis distance of the last 20 ms from a free tool, beyond what motion explains."""
     in_contact: NDArray[np.bool_]
     """(n,) see `Sample`."""
-    q_rad: Array
-    """(n, 6) joint angles, interpolated."""
-    R_base_flange: Array
-    """(n, 3, 3) interpolated."""
-    p_base_flange_m: Array
-    """(n, 3) interpolated."""
     sigma: Array
     """(6,) standard deviation of one sample of `wrench`: noise and calibration, N and N·m, in `frame`."""
     frame: WrenchFrame
     stages: Stages
 
-    def __len__(self) -> int:
-        """Count the samples."""
-        return len(self.t_host_ns)
-
-    def rows(self, which: slice | NDArray[np.bool_]) -> Self:
-        """Select samples."""
-        return type(self)(
-            **{
-                item.name: getattr(self, item.name) if item.name in _ALIKE else getattr(self, item.name)[which]
-                for item in fields(self)
-            }
-        )
-
-    @classmethod
-    def concatenate(cls, blocks: Sequence[Self]) -> Self:
-        """Join blocks of one frame and stages in the order given; sigma is that of the last."""
-        if len(blocks) == 1:
-            return blocks[0]
-        columns: dict[str, Any] = {
-            item.name: getattr(blocks[-1], item.name)
-            if item.name in _ALIKE
-            else np.concatenate([getattr(block, item.name) for block in blocks])
-            for item in fields(cls)
-        }
-        return cls(**columns)
+    _COMMON: ClassVar = frozenset({"sigma", "frame", "stages"})
 
     def __iter__(self) -> Iterator["Sample"]:
         force_sigma, torque_sigma = self.sigma[:3], self.sigma[3:]
@@ -256,6 +222,26 @@ class Tracked:
     events: tuple[LoadEvent, ...] = ()
     """Since the last update."""
 
+    def to_dict(self) -> dict[str, JSON]:
+        """Return what is followed as JSON; the age of the last look is None before the first."""
+        return {
+            "bias": self.bias.tolist(),
+            "sigma": self.sigma.tolist(),
+            "part_kg": self.part_kg,
+            "part_sigma_kg": self.part_sigma_kg,
+            "part_known": self.part_known,
+            "last_seen_s": self.last_seen_s if np.isfinite(self.last_seen_s) else None,
+            "walk_N": self.walk_N,
+        }
+
+    def in_words(self) -> str:
+        """Return size and sigma of the bias and the part, as one line."""
+        force_N = float(np.linalg.norm(self.bias[:3]))
+        sigma_N = float(np.linalg.norm(self.sigma[:3]) / np.sqrt(3))
+        seen = f", seen {self.last_seen_s:.0f} s ago" if self.last_seen_s >= 1 else ""
+        part = f"{with_sigma(self.part_kg, self.part_sigma_kg)} kg" if self.part_known else "not known yet"
+        return f"bias {with_sigma(force_N, sigma_N)} N{seen}, part {part}"
+
 
 EventKind = Literal[
     "contact",
@@ -360,3 +346,17 @@ class StreamStatus:
     false_alarm_rate: float
     tracked: Tracked | None = None
     """Bias and held part beside the calibration; None unless the stream follows them."""
+
+
+def find_gaps(rows: Paired, seq_before: int | None) -> list[StreamEvent]:
+    """Return an event for each gap in the sample numbers; `seq_before` is that of the sample before these."""
+    before = int(rows.seq[0]) - 1 if seq_before is None else seq_before
+    if int(rows.seq[-1]) - before == len(rows):
+        return []
+    events = []
+    missing = np.diff(rows.seq, prepend=before) - 1
+    for i in np.flatnonzero(missing > 0):
+        lost, seq = int(missing[i]), int(rows.seq[i])
+        text = f"{lost} sample{'s' if lost > 1 else ''} lost before sample {seq}"
+        events.append(StreamEvent(int(rows.t_host_ns[i]), "gap", text, {"lost": lost, "seq": seq}))
+    return events

@@ -20,9 +20,9 @@ from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
 from ftdrive.checks.devices import belonging
 from ftdrive.errors import ConfigError
-from ftdrive.live.delay import DelayEstimator
-from ftdrive.live.pairing import Pairing
-from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME, ProcessedStream, Processor
+from ftdrive.live.loop import ProcessedStream
+from ftdrive.live.pairing import DelayEstimator, Pairing
+from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME
 from ftdrive.live.samples import (
     Block,
     LinkStatus,
@@ -142,10 +142,8 @@ class CompensatedStream(ProcessedStream):
             """As configured in the controller; None where it is not reported."""
             self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, status)
             frame, stages, false_alarm_rate = self._begin
-            self._processor = Processor(
-                self.info, frame, stages, false_alarm_rate=false_alarm_rate, temperature=self._temperature
-            )
-            self.track = self._track
+            # only now are the rates known that the processing needs
+            super().__init__(self.info, frame, stages, false_alarm_rate=false_alarm_rate, temperature=self._temperature)
             delay_ms = self.cell.sensor.delay_ms
             delay = (
                 DelayEstimator(self._calibration, self.info.p_flange_sensor_m) if delay_ms is None else delay_ms / 1e3
@@ -241,32 +239,20 @@ class CompensatedStream(ProcessedStream):
             self._wanted = before
             raise
         verification, state = self._trusted()
-        self._processor.restart()  # a contact is not continued
-        self._report_contacts()
-        old, self.info = (
-            self._processor,
-            replace(
-                self.info,
-                calibration=self._calibration,
-                calibration_name=self._name,
-                tool=name,
-                verification=verification,
-                calibration_state=state,
-            ),
-        )
-        self._processor = Processor(
+        self.restart()  # a contact is not continued
+        self._call_on_contact()
+        info = replace(
             self.info,
-            old.frame,
-            old.stages,
-            false_alarm_rate=self._begin[2],
-            temperature=self._temperature,
+            calibration=self._calibration,
+            calibration_name=self._name,
+            tool=name,
+            verification=verification,
+            calibration_state=state,
         )
-        self.track = old.track
-        for event in old.take_events():
-            self._processor.note(event.kind, event.text, event.values, event.t_host_ns)
+        self._apply_calibration(info, self._temperature)
         self._pairing.use(DelayEstimator(self._calibration, self.info.p_flange_sensor_m))
         values = {"tool": name, "calibration": self._calibration.id}
-        return self._processor.note("tool", f"tool {name}, calibration {self._name}", values, self.clock.now_ns())
+        return self.note("tool", f"tool {name}, calibration {self._name}", values, self.clock.now_ns())
 
     # -------------------------------------------------------------------------------------------------------- reading
 
@@ -304,10 +290,10 @@ class CompensatedStream(ProcessedStream):
         paired = self._pairing.take()
         if paired is None:
             return None
-        self._processor.delay_sigma_s = self._pairing.delay_sigma_s
+        self.delay_sigma_s = self._pairing.delay_sigma_s
         if (temperature_C := self._sensor.temperature_C()) is not None:
-            self._processor.warm(temperature_C)
-        block = self._process(paired)
+            self.warm(temperature_C)
+        block = self._process_read(paired)
         return block if len(block) else None
 
     def _read_sensor(self, wait_s: float) -> FtSamples:
@@ -352,7 +338,7 @@ class CompensatedStream(ProcessedStream):
     def _fail(self, role: str, error: DeviceError) -> NoReturn:
         if self._silent_since_ns is None:
             self._silent_since_ns = self.clock.now_ns()
-            self._processor.note("stale", f"{role}: {error}", {"device": role}, self._silent_since_ns)
+            self.note("stale", f"{role}: {error}", {"device": role}, self._silent_since_ns)
         self._failure = role, error
         raise error
 
@@ -372,7 +358,7 @@ class CompensatedStream(ProcessedStream):
         if (arm := self._arm.identify()) != self.info.arm or self._sensor.identify() != self.info.sensor:
             raise ConfigError(f"another device answers ({arm.model} {arm.serial}): start again") from failure
         self._pairing.forget()
-        self._processor.restart()
+        self.restart()
         self._failure = None
         self._arm_newest = None
 
@@ -381,7 +367,7 @@ class CompensatedStream(ProcessedStream):
             silent_s = (self.clock.now_ns() - self._silent_since_ns) * 1e-9
             self._silent_since_ns = None
             text = f"samples arrive again after {silent_s:.1f} s"
-            self._processor.note("recovered", text, {"silent_s": silent_s}, self.clock.now_ns())
+            self.note("recovered", text, {"silent_s": silent_s}, self.clock.now_ns())
 
     def status(self) -> StreamStatus:
         """Return rates, losses, ages, delay, tare and drift."""
@@ -395,7 +381,7 @@ class CompensatedStream(ProcessedStream):
         recent = sum(n for t_ns, n in self._arrivals if t_ns > now_ns - _RATE_WINDOW_NS)
         age_s = (now_ns - newest_ns) * 1e-9
         arm = LinkStatus(float(recent), self.info.arm_rate_Hz, self._arm_lost, age_s, texts.get("arm", ""))
-        return self._processor.status(sensor, arm, (self._pairing.delay_s, self._pairing.delay_sigma_s))
+        return self._status_of(sensor, arm, (self._pairing.delay_s, self._pairing.delay_sigma_s))
 
     def _count(self, states: ArmStates) -> None:
         """Count the states of the last second, and those that are missing by the controller's clock."""

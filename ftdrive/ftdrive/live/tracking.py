@@ -1,13 +1,24 @@
 """Bias and held part, followed while a program runs: a step of the load is not drift, and a contact is neither."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from ftcalib.model import Array, skew
-from ftdrive.live.motion import REST, STATES
-from ftdrive.live.samples import LoadEvent, Tracked
+from ftcalib import CalibrationResult
+from ftcalib.after.state import Update, with_bias_change
+from ftcalib.after.weighing import LEAST_SIGMAS, Weight
+from ftcalib.compensation import Compensator
+from ftcalib.likelihood.response import predicted_covariance
+from ftcalib.model import BIASES, Array, skew
+from ftcalib.rounding import with_sigma
+from ftdrive.live.contact import GYRATION_M
+from ftdrive.live.frames import near
+from ftdrive.live.motion import READING_S, REST, STATES, MovedLoad, accelerated
+from ftdrive.live.noise import NoiseEstimator, variance_at_next_use
+from ftdrive.live.samples import LoadEvent, Paired, StreamEvent, StreamInfo, Tracked
 
 _GATE = float(chdtri(6, 1e-4))
 """Squared innovation of a window that bias and part do not explain."""
@@ -296,3 +307,192 @@ def _place(x: Array, P: Array) -> Array | None:
     """Return the centre of mass of a part (3,), if it is known well enough to be a centre of turning."""
     placed = x[6] > NOTHING_KG and float(np.trace(P[7:, 7:])) < (_PLACED_M * x[6]) ** 2
     return x[7:] / x[6] if placed else None
+
+
+WINDOW_S = 0.3
+"""Each begins in the middle of the one before. The weights, a Hann window, suppress the ringing of the links."""
+_KNOT_S, _REACH = 0.004, 5
+"""Poses of this spacing give the acceleration, with so many neighbours on each side."""
+_TENSOR = 0.5
+"""Error of a tool's inertia that was calibrated, of what it is without."""
+_LATE = 1.2
+"""A window that took so many times as long has lost samples."""
+_UNKNOWN_M_S2 = 1.0
+"""Acceleration in motion of an arm that reports no positions, one sigma."""
+_LIKE_WHITE = 1.5 * READING_S / WINDOW_S
+"""Variance of such a mean over that of a reading, if the noise is white: vibration leaves less."""
+
+
+class Windows:
+    """Collects samples of a stream to windows.
+
+    Parameters
+    ----------
+    info : StreamInfo
+    """
+
+    def __init__(self, info: StreamInfo) -> None:
+        calibration = info.calibration
+        self._calibration, self._tool = calibration, calibration.parameters
+        self._compensator = Compensator(self._tool, response=calibration.response)
+        self._inertia = None if calibration.motion is None else calibration.motion.inertia_kg_m2
+        self._beyond = np.diag(variance_at_next_use(calibration))
+        self._near_m = near(info)
+        self._load = MovedLoad(self._tool, calibration.g_m_s2, np.nan_to_num(info.p_flange_sensor_m), _REACH)
+        # the bias is what is tracked: its error in the calibration does not count
+        self._covariance = _without_bias(calibration.covariance)
+        response = calibration.response
+        self._response = response and replace(response, covariance=_without_bias(response.covariance))
+        self._size = round(WINDOW_S * info.sensor_rate_Hz)
+        self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
+        self._weights = np.hanning(self._size + 2)[1:-1] / (np.hanning(self._size + 2).sum())
+        self._unknown = accelerated(calibration.mass_kg, self._tool.p_sensor_com_m) * _UNKNOWN_M_S2
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the samples before an interruption."""
+        self._rows: list[Paired] = []
+        self._states: list[NDArray[np.int8]] = []
+
+    def add(self, rows: Paired, states: NDArray[np.int8], noise: NoiseEstimator) -> Iterator[Window]:
+        """Add samples with their states of motion; yield the windows that are complete."""
+        if len(rows):
+            self._rows.append(rows)
+            self._states.append(states)
+        margin = self._stride * _REACH
+        needed = self._size + 2 * margin
+        while sum(map(len, self._states)) >= needed:
+            buffer, all_states = Paired.concatenate(self._rows), np.concatenate(self._states)
+            window = self._window(buffer.rows(slice(0, needed)), all_states[margin : margin + self._size], noise)
+            rest = slice(self._size // 2, None)
+            self._rows, self._states = [buffer.rows(rest)], [all_states[rest]]
+            if window is not None:
+                yield window
+
+    def _window(self, rows: Paired, states: NDArray[np.int8], noise: NoiseEstimator) -> Window | None:
+        state = int(states.max())
+        known = noise.of(state)
+        t_s = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
+        knots = np.arange(0, len(rows), self._stride)
+        if known is None or t_s[-1] > _LATE * WINDOW_S * len(rows) / self._size or (np.diff(t_s[knots]) <= 0).any():
+            return None
+        tool, mass_kg = self._tool, self._calibration.mass_kg
+        motion = self._load.motion(t_s[knots], rows.R_base_flange[knots], rows.p_base_flange_m[knots])
+        margin = self._stride * _REACH
+        inner = rows.rows(slice(margin, margin + self._size))
+        weights = np.interp(motion.t_s, t_s[margin : margin + self._size], self._weights)
+        weights /= weights.sum()
+        residual = self._weights @ self._compensator.batch(inner.raw, inner.R_base_flange)
+        if state != REST:
+            residual -= weights @ self._load.wrench(motion, self._inertia)
+        R_base_sensor = np.einsum("n,nij->ij", self._weights, inner.R_base_flange) @ tool.R_flange_sensor
+        omega, alpha = motion.angular_velocity_rad_s, motion.angular_acceleration_rad_s2
+        lever = np.einsum("n,nij->ij", weights, skew(alpha) + skew(omega) @ skew(omega))
+        felt = tool.gravity_force_base_N / mass_kg @ R_base_sensor - weights @ motion.linear_acceleration_m_s2
+        covariance = _LIKE_WHITE * known.reading
+        if state != REST and not np.isfinite(rows.p_base_flange_m).all():
+            covariance = covariance + self._unknown @ self._unknown.T
+        turning = float(weights @ np.linalg.norm(alpha, axis=1))
+        R = inner.R_base_flange[self._size // 2]
+        error = predicted_covariance(tool, self._covariance, self._response, R)
+        return Window(
+            t_s=float(inner.t_host_ns[self._size // 2]) * 1e-9,
+            residual=residual,
+            felt_m_s2=felt,
+            lever_s2=lever,
+            p_sensor_near_m=self._near_m,
+            noise=covariance,
+            state=state,
+            systematic=error + self._beyond,
+            turning_rad_s2=turning,
+            tensor_Nm=(1.0 if self._inertia is None else _TENSOR) * mass_kg * GYRATION_M**2 * turning,
+            p_base_flange_m=inner.p_base_flange_m[self._size // 2],
+        )
+
+
+def _without_bias(covariance: Array) -> Array:
+    kept = np.ones(len(covariance))
+    kept[BIASES] = 0.0
+    return covariance * np.outer(kept, kept)
+
+
+_REPORT_S = 1.0
+"""From one event with the tracked values to the next."""
+_APPLIED = np.repeat([0.1, 0.003], 3)
+"""A bias that is known less well is not applied, N and N·m, one sigma."""
+
+
+class Following:
+    """Follows bias and part of a stream.
+
+    Parameters
+    ----------
+    info : StreamInfo
+    """
+
+    def __init__(self, info: StreamInfo) -> None:
+        calibration = info.calibration
+        self._windows = Windows(info)
+        self._tracker = Tracker(calibration.mass_kg, calibration.parameters.p_sensor_com_m)
+        self._reported_s = -np.inf
+        self.tracked: Tracked | None = None
+        """None before the first window."""
+
+    def restart(self) -> None:
+        """Forget the samples before an interruption."""
+        self._windows.restart()
+
+    def add(
+        self, rows: Paired, states: NDArray[np.int8], noise: NoiseEstimator
+    ) -> Iterator[tuple[Tracked, list[StreamEvent]]]:
+        """Add samples with their states of motion; yield what is known after each window, and the events."""
+        for window in self._windows.add(rows, states, noise):
+            tracked = self.tracked = self._tracker.update(window)
+            events = []
+            for event in tracked.events:
+                t_ns = round(event.t_s * 1e9)
+                if event.kind == "load":
+                    text = f"the load has changed by {with_sigma(event.size, event.sigma)} kg (1 sigma)"
+                    values = {"mass_kg": event.size, "mass_sigma_kg": event.sigma}
+                    events.append(StreamEvent(t_ns, "load-step", text, values))
+                else:
+                    values = {"peak_N": event.size, "duration_s": tracked.t_s - event.t_s}
+                    text = f"contact {event.size:.1f} N while a part is held"
+                    events.append(StreamEvent(t_ns, "contact", text, values))
+            if tracked.t_s - self._reported_s >= _REPORT_S:
+                self._reported_s = tracked.t_s
+                events.append(StreamEvent(round(tracked.t_s * 1e9), "tracked", tracked.in_words(), tracked.to_dict()))
+            yield tracked, events
+
+
+def update_by(calibration: CalibrationResult, tracked: Tracked) -> Update | None:
+    """Return the calibration with the tracked bias; None while that is not known well."""
+    if not (tracked.sigma < _APPLIED).all():
+        return None
+    return with_bias_change(calibration, tracked.bias, tracked.sigma, measured=True)
+
+
+def part_of(tracked: Tracked) -> Weight | None:
+    """Return the part as if it had been weighed; None for an empty gripper."""
+    return None if tracked.part_kg < NOTHING_KG else weight_of(tracked)
+
+
+def weight_of(tracked: Tracked) -> Weight:
+    """Return what is held, nothing included, as if it had been weighed."""
+    (x, covariance), mass_kg = tracked.moment, tracked.part_kg
+    com_m = x[1:] / (mass_kg or 1.0)
+    T = np.column_stack([-com_m, np.eye(3)]) / max(abs(mass_kg), 1e-9)
+    return Weight(
+        mass_kg=mass_kg,
+        mass_sigma_kg=tracked.part_sigma_kg,
+        least_kg=LEAST_SIGMAS * tracked.part_sigma_kg,
+        p_sensor_com_m=com_m,
+        com_covariance=T @ covariance @ T.T,
+        line=None,
+        fault=None,
+        chi2=0.0,
+        dof=0,
+        poses=0,
+        in_motion=True,
+        moment=(x, covariance),
+    )

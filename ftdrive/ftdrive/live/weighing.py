@@ -14,13 +14,14 @@ from ftcalib.errors import AcceptanceError
 from ftcalib.files import JSON
 from ftcalib.model import angle_between
 from ftdrive.errors import ConfigError
-from ftdrive.live.following import weight_of
 from ftdrive.live.frames import near
-from ftdrive.live.processing import ProcessedStream
+from ftdrive.live.loop import ProcessedStream
+from ftdrive.live.noise import unexplained_variance
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Paired, StreamEvent, StreamInfo
+from ftdrive.live.stages import TARE_S, is_still, try_tare
 from ftdrive.live.stream import CompensatedStream
-from ftdrive.live.tare import TARE_S, is_still, try_tare
+from ftdrive.live.tracking import weight_of
 from ftdrivers.clock import Clock
 from ftdrivers.interfaces import Array
 
@@ -115,7 +116,7 @@ class Scale:
             reference,
             np.array([one[0] for one in self._readings]),
             np.array([one[1].mean for one in self._readings]),
-            np.array([one[1].covariance for one in self._readings]) + np.diag(_unexplained(stream.info)),
+            np.array([one[1].covariance for one in self._readings]) + np.diag(unexplained_variance(calibration)),
             drift=drift_since(since_s),
             g_m_s2=calibration.g_m_s2,
             p_sensor_near_m=near(stream.info),
@@ -168,15 +169,6 @@ def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, PoseMean]:
         raise CannotWeigh("unsteady")
     dwell = mean_and_covariance(rows.raw)
     return rows.R_base_flange[-1], PoseMean(dwell.mean, dwell.covariance * (1 + _FEW / len(rows)))
-
-
-def _unexplained(info: StreamInfo) -> Array:
-    """Variance (6,) of a reading beyond noise and calibration, where these do not explain the residuals of the fit."""
-    calibration = info.calibration
-    if calibration.noise_explains:
-        return np.zeros(6)
-    excess = np.square(calibration.likely_error()) - np.square(calibration.predicted_error())
-    return np.repeat(np.maximum(excess, 0.0) / 3, 3)
 
 
 def weigh_in_motion(stream: ProcessedStream, since_ns: int = 0) -> Weight:

@@ -17,8 +17,7 @@ from ftcalib.data.dataset import ORIENTATION_FORMS, list_names, orientation_colu
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
 from ftcalib.files import open_file
-from ftdrive.live.delay import DelayEstimator
-from ftdrive.live.pairing import estimate_delay, paired_blocks
+from ftdrive.live.pairing import DelayEstimator, estimate_delay, paired_blocks
 from ftdrive.live.samples import Paired, Stages, StreamInfo, WrenchFrame
 from ftdrive.recording.recording import PIECE_ROWS, Header, Measured
 from ftdrive.runs.run import versions

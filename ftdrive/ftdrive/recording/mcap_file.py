@@ -25,8 +25,7 @@ from ftcalib.files import open_file, parsed_json
 from ftdrive import __version__
 from ftdrive.errors import BadRecording
 from ftdrive.live import ros2
-from ftdrive.live.frames import frames_in_flange
-from ftdrive.live.quaternions import matrices
+from ftdrive.live.frames import frames_in_flange, matrices
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.recording.recording import ROW, Header, Piece, Rows, changed
@@ -159,7 +158,7 @@ class McapFile(GrowingFile):
         size = 0
         if len(rows):
             t_ns = rows["t_host_ns"] + offset_ns
-            bodies = _bodies(rows, t_ns, ros2.frame_id(self._header.frame))
+            bodies = _bodies(rows, t_ns, self._header.frame.id)
             width = sum(_HEAD.itemsize + body.itemsize for body in bodies.values())
             samples, start = self._room(width * len(rows)).reshape(len(rows), width), 0
             for topic, body in bodies.items():

@@ -25,9 +25,8 @@ from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
 from ftdrive.http_gate import Gate, hidden_host
 from ftdrive.live import ros2
-from ftdrive.live.frames import frames_in_flange
-from ftdrive.live.processing import ProcessedStream
-from ftdrive.live.quaternions import quaternions
+from ftdrive.live.frames import frames_in_flange, quaternions
+from ftdrive.live.loop import ProcessedStream
 from ftdrive.live.samples import Block, Stages, StreamEvent, StreamInfo, WrenchFrame
 from ftdrive.servers.parameters import checked_value
 from ftdrive.servers.rates import Picked
@@ -95,7 +94,7 @@ def _arrows(block: Block, t_utc_ns: int) -> SceneUpdate:
     force_N, torque_Nm = block.wrench[-1, :3], block.wrench[-1, 3:]
     entity = SceneEntity(
         timestamp=_stamp(t_utc_ns),
-        frame_id=ros2.frame_id(block.frame),
+        frame_id=block.frame.id,
         id="wrench",
         frame_locked=True,
         arrows=[_arrow(FORCE_M_N * force_N, _ORANGE), _arrow(TORQUE_M_NM * torque_Nm, _BLUE)],
@@ -281,7 +280,7 @@ class FoxgloveServer:
     def write(self, block: Block) -> None:
         """Send a block; never waits."""
         t_ns = block.t_host_ns + self._info.utc_offset_ns
-        frame = ros2.frame_id(block.frame)
+        frame = block.frame.id
         self._send(ros2.RAW, t_ns, lambda: ros2.pack_wrenches(t_ns, block.raw, "sensor").tolist())
         self._send(ros2.COMPENSATED, t_ns, lambda: ros2.pack_wrenches(t_ns, block.wrench, frame).tolist())
         if (rows := self._arm.rows(t_ns)).any():  # the poses between are interpolated

@@ -5,6 +5,7 @@ advances with each new wrench, and stands still when there is none: a register k
 program must look at the counter and never at a number alone.
 """
 
+import math
 import threading
 from collections.abc import Callable
 from enum import IntEnum
@@ -14,6 +15,7 @@ import numpy as np
 
 from ftcalib.after.weighing import Weight
 from ftcalib.model import angle_between_vectors
+from ftdrive.live.loop import BlockReader
 from ftdrive.live.samples import Block, StreamInfo, Tracking
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.live.weighing import WEIGH_S, CannotWeigh, Scale, load_values
@@ -157,20 +159,12 @@ class ProgramService:
             self.stop()
 
     def _serve(self) -> None:
-        silent = False
-        while True:
-            try:
-                block = self._stream.read()
-            except DeviceError as error:
-                if not silent:
-                    self._say(f"{error}. The program sees a stale wrench.")
-                silent = True
-                continue
-            if silent:
-                self._say("Samples arrive again.")
-            silent = False
-            self.take(block)
-            self._stream.take_events()  # nothing records them, and they would pile up as long as the service runs
+        meanwhile = "The program sees a stale wrench."
+        for block in BlockReader(self._stream, math.inf, say=self._say, meanwhile=meanwhile):
+            if block is not None:
+                self.take(block)
+                # nothing records events, and they would pile up as long as the service runs
+                self._stream.take_events()
 
     def stop(self) -> None:
         """Write that the service has ended, and close."""

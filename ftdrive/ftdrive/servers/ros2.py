@@ -4,6 +4,7 @@ Conventions are those of REP 103, 105 and 107: SI units, a `frame_id` whose axes
 time of measurement. A fault is a missing message and a diagnostic, never an old or a zero wrench.
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -18,8 +19,10 @@ import numpy as np
 from ftdrive.errors import ConfigError
 from ftdrive.live import ros2
 from ftdrive.live.frames import frames_in_flange
-from ftdrive.live.processing import SENSOR_FRAME, ProcessedStream, stages_in_words
+from ftdrive.live.loop import BlockReader, ProcessedStream
+from ftdrive.live.processing import SENSOR_FRAME
 from ftdrive.live.samples import Block, LinkStatus, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
+from ftdrive.live.stages import stages_in_words
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.servers.parameters import Fixed, NodeParameters
 from ftdrive.servers.rates import Averaged, Picked
@@ -61,7 +64,7 @@ class Transforms:
             return axes
         if isinstance(frame.about, str):
             return f"{axes}_at_{self._names.get(frame.about, frame.about)}"
-        return ros2.frame_id(frame).replace(frame.axes, axes, 1)
+        return frame.id.replace(frame.axes, axes, 1)
 
     def use(self, info: StreamInfo) -> None:
         """Publish where sensor and tcp are, unless the height of the sensor is unknown."""
@@ -78,7 +81,7 @@ class Transforms:
             return
         R_base_flange = block.R_base_flange[-1]
         frames = frames_in_flange(block.frame, info, R_base_flange)
-        name = ros2.frame_id(block.frame)
+        name = block.frame.id
         moving = []
         if name in frames and name not in ("sensor", "tcp"):
             moving.append((self._fixed.flange_frame, self.frame_id(block.frame), *frames[name]))
@@ -298,8 +301,9 @@ class Ros2Node:
                 self._report(not_open("the devices are being opened", Level.STALE))
                 with open_stream() as stream:
                     self.begin(stream)
+                    reader = BlockReader(stream, math.inf)
                     while True:
-                        self._turn(stream)
+                        self._turn(stream, reader)
             except (ConfigError, DeviceError) as error:
                 self.end()
                 self._fail(error)
@@ -328,17 +332,16 @@ class Ros2Node:
         """Publish no stream."""
         self._stream = self._averaged = self.parameters.apply = None
 
-    def _turn(self, stream: CompensatedStream) -> None:
+    def _turn(self, stream: CompensatedStream, reader: BlockReader) -> None:
         self._ros.check()
         self._change_tool(stream)
-        try:
-            block = stream.read()
-        except DeviceError as error:
+        block = reader.read()
+        if reader.failure is not None:
             if self._averaged is not None:
                 self._averaged.restart()
-            self._fail(error)
+            self._fail(reader.failure)
             self.report()
-        else:
+        elif block is not None:
             self._failure = ""
             self.write(block)
         for event in stream.take_events():

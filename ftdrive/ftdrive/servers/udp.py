@@ -5,7 +5,6 @@ import socket
 from math import isfinite
 
 from ftdrive.errors import ConfigError
-from ftdrive.live import ros2
 from ftdrive.live.samples import Block, StreamEvent, StreamInfo
 from ftdrive.servers.rates import Picked
 
@@ -45,7 +44,7 @@ class UdpSender:
     def write(self, block: Block) -> None:
         """Send what is due of a block; never waits."""
         few = block.rows(self._picked.rows(block.t_host_ns))
-        compensated = f"compensated_{ros2.frame_id(block.frame)}"
+        compensated = f"compensated_{block.frame.id}"
         for i, t_ns in enumerate((few.t_host_ns + self._offset_ns).tolist()):
             values = {
                 "timestamp": t_ns * 1e-9,

@@ -6,12 +6,11 @@ lines, and only the lines that changed are sent to the terminal.
 
 import signal
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast, get_args
+from typing import Any, ClassVar, cast
 
 from rich.segment import Segment
 from rich.style import Style
@@ -25,23 +24,16 @@ from textual.widgets import Input
 
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_calibration
-from ftdrive.errors import ConfigError
-from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import Axes, Point, WrenchFrame
+from ftdrive.live.loop import ProcessedStream
 from ftdrive.runs.verification_record import fitted_dataset
 from ftdrive.terminal.console import messages
-from ftdrive.terminal.live.feed import Feed, Sink, Stream
+from ftdrive.terminal.live.feed import Feed, Sink, after
 from ftdrive.terminal.live.history import SPANS_S
 from ftdrive.terminal.live.layout import frame
 from ftdrive.terminal.live.summary import Summary
-from ftdrive.terminal.live.view import BAD, Line, Part
-
-T = TypeVar("T")
+from ftdrive.terminal.live.view import Line, Part
 
 _REFRESH_S = 0.1
-_SEEK_S = 5.0
-_LOWPASS_HZ = 40.0
-"""Cut-off of the low-pass that key 4 switches on."""
 _HELP = """\
  ftdrive live: the wrench on the tool, ten times a second
 
@@ -68,7 +60,7 @@ _HELP = """\
 
 
 def run_live(
-    stream: Stream,
+    stream: ProcessedStream,
     *,
     recorder: Callable[[Path], Sink] | None = None,
     push: Callable[[], object] | None = None,
@@ -106,8 +98,8 @@ def run_live(
             messages.print(f" Recorded: {path}")
     if feed.crash is not None:
         raise feed.crash
-    if feed.failure is not None:
-        raise feed.failure
+    if feed.reader.failure is not None:
+        raise feed.reader.failure
 
 
 class ClosableApp(App[None]):
@@ -250,7 +242,7 @@ class LiveApp(ClosableApp):
         """Put the entered mark into the stream."""
         event.input.remove()
         if event.value:
-            self._feed.request(partial(self._feed.stream.mark, event.value))
+            self._feed.request("b", event.value)
 
     def action_press(self, key: str) -> None:
         """Do what a key stands for."""
@@ -265,72 +257,10 @@ class LiveApp(ClosableApp):
         elif key == "p":
             self._summary.reset_peaks()
         elif key == "g":
-            self._summary.span_s = _after(self._summary.span_s, SPANS_S)[0]
+            self._summary.span_s = after(self._summary.span_s, SPANS_S)[0]
         elif key == "b":
             self.mount(entry := Input(placeholder="text of the mark, then Enter; Esc leaves"))
             entry.focus()
         else:
-            self._feed.request(partial(_press, self._feed, key))
+            self._feed.request(key)
         self.draw()
-
-
-def _press(feed: Feed, key: str) -> None:
-    """Do what a key stands for; called in the thread that reads."""
-    stream = feed.stream
-    if key == "t":
-        stream.tare()
-    elif key == "u":
-        stream.undo_tare()
-    elif key == "f" and feed.push is not None:
-        feed.push()
-        feed.note("the emulated tool is pushed")
-    elif key == "r":
-        feed.switch_recording()
-    elif key == "x":
-        _set_frame(feed, [replace(stream.frame, axes=axes) for axes in _after(stream.frame.axes, get_args(Axes))])
-    elif key == "a":
-        _set_frame(feed, [replace(stream.frame, about=point) for point in _after(stream.frame.about, get_args(Point))])
-    elif key == "1":
-        stream.stages = replace(stream.stages, bias=not stream.stages.bias)
-    elif key == "2":
-        stream.stages = replace(stream.stages, gravity=not stream.stages.gravity)
-    elif key == "3":
-        stream.stages = replace(stream.stages, inertia=not stream.stages.inertia)
-    elif key == "4":
-        highest_Hz = min(_LOWPASS_HZ, stream.info.sensor_rate_Hz / 4)
-        stream.stages = replace(stream.stages, lowpass_Hz=None if stream.stages.lowpass_Hz else highest_Hz)
-    elif isinstance(stream, ReplayedStream):
-        _press_of_replay(stream, feed, key)
-
-
-def _press_of_replay(stream: ReplayedStream, feed: Feed, key: str) -> None:
-    """Do what a key stands for in a replay."""
-    if key == "space":
-        (stream.resume if stream.is_paused else stream.pause)()
-    elif key == "left":
-        stream.seek(stream.at_s - _SEEK_S)
-    elif key == "right":
-        stream.seek(stream.at_s + _SEEK_S)
-    elif key == ".":
-        feed.take(stream.step())
-    elif key in {"+", "="}:
-        stream.speed *= 2
-    elif key == "-":
-        stream.speed /= 2
-
-
-def _set_frame(feed: Feed, frames: Iterable[WrenchFrame]) -> None:
-    """Choose the first frame that the cell has; the others say what to configure."""
-    for each in frames:
-        try:
-            feed.stream.frame = each
-        except ConfigError as error:
-            feed.note(str(error), BAD)
-        else:
-            return
-
-
-def _after(value: object, values: Sequence[T]) -> Sequence[T]:
-    """Return the values in turn, beginning after `value`."""
-    start = values.index(value) + 1 if value in values else 0
-    return [*values[start:], *values[:start]]

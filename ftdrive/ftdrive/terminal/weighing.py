@@ -7,16 +7,15 @@ from typing import TYPE_CHECKING
 from ftcalib.after.weighing import Weight
 from ftcalib.rounding import counted, with_sigma
 from ftdrive.errors import NotAccepted
+from ftdrive.live.loop import RECOVER_S, BlockReader
+from ftdrive.live.samples import Block
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.live.weighing import FAULTS, WEIGH_S, WORDS, CannotWeigh, Scale, count_of, load_values, weigh_in_motion
 from ftdrive.recording import Recorder
-from ftdrivers.errors import DeviceError
 
 if TYPE_CHECKING:
     from ftdrive.store.weighing_log import WeighingLog
 
-RECOVER_S = 10.0
-"""So long a device may be silent."""
 PATIENCE_S = 10.0
 """So long a zero, or the only weight, may take."""
 _STEP_S = 0.1
@@ -86,34 +85,34 @@ class Weighing:
     def _read_for(self, seconds: float) -> None:
         end_s = self.stream.clock.now_s() + seconds
         while self.stream.clock.now_s() < end_s:
-            block = self.stream.read()
-            if self._recorder is not None:
-                self._recorder.write(block)
-                for event in self.stream.take_events():
-                    self._recorder.event(event)
+            self._record(self.stream.read())
+
+    def _record(self, block: Block) -> None:
+        if self._recorder is not None:
+            self._recorder.write(block)
+            for event in self.stream.take_events():
+                self._recorder.event(event)
 
     def states(self, *, raises: bool = False) -> Iterator[tuple[Shown, bool]]:
         """Yield the state ten times a second, and whether it is a new weight or fault.
 
         Raises `DeviceError` if a device has failed for some seconds, or at once with `raises`.
         """
-        failing_since_s: float | None = None
+        clock, reader = self.stream.clock, BlockReader(self.stream, 0.0 if raises else RECOVER_S)
         fault_since_s = 0.0
         fault: str | None = None
-        while True:
-            try:
-                self._read_for(_STEP_S)
-            except DeviceError as error:
-                now_s = self.stream.clock.now_s()
-                failing_since_s = now_s if failing_since_s is None else failing_since_s
-                if raises or now_s - failing_since_s > RECOVER_S:
-                    raise
+        due_s = clock.now_s() + _STEP_S
+        for block in reader:
+            if block is None:
                 self._last = None
-                yield Shown(None, None, stale=str(error)), False
+                yield Shown(None, None, stale=str(reader.failure)), False
+                due_s = clock.now_s() + _STEP_S
                 continue
-            failing_since_s = None
+            self._record(block)
+            if clock.now_s() < due_s:
+                continue
             shown = self._weighed()
-            now_s = self.stream.clock.now_s()
+            now_s = clock.now_s()
             if shown.refusal != fault:
                 fault, fault_since_s = shown.refusal, now_s
             lasts = shown.refusal in (*FAULTS, "count") and now_s - fault_since_s > WEIGH_S
@@ -122,6 +121,7 @@ class Weighing:
                 if self._log is not None and shown.refusal is not None:
                     self._log.refused(shown.refusal)
             yield shown, lasts or (shown.refusal is None and self._is_new(shown))
+            due_s = clock.now_s() + _STEP_S
 
     def _weighed(self) -> Shown:
         try:

@@ -1,28 +1,35 @@
 """The thread that reads a stream for the live screen."""
 
+import math
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
-from operator import methodcaller
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Protocol
+from typing import Protocol, TypeVar, get_args
 
 import numpy as np
 
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Block, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
+from ftdrive.live.loop import BlockReader, ProcessedStream
+from ftdrive.live.replay import ReplayedStream
+from ftdrive.live.samples import Axes, Block, Point, StreamEvent, WrenchFrame
 from ftdrive.terminal.live.view import BAD, CONTACT, GOOD, STRONG, WARNING, Note
 from ftdrivers.errors import DeviceError
-from ftdrivers.interfaces import Array
+
+T = TypeVar("T")
 
 MEAN_S = 0.1
 """The screen shows means of so long."""
 _STATUS_NS = 50_000_000
 _RETRY_S = 0.05
 """A failed stream may raise at once; this long the thread waits before it reads again."""
+_SEEK_S = 5.0
+_LOWPASS_HZ = 40.0
+"""Cut-off of the low-pass that key 4 switches on."""
 _MOST_BLOCKS = 2000
 """A screen that does not draw for many seconds misses the oldest ones; a recording never does."""
 _MARKS = ("tare", "tare-undone", "stages", "gap", "mark")
@@ -37,35 +44,6 @@ _STYLES = {
     "recovered": GOOD,
     "mark": STRONG,
 }
-
-
-class Stream(Protocol):
-    """What the screen needs of a `CompensatedStream` or a `ReplayedStream`."""
-
-    info: StreamInfo
-    frame: WrenchFrame
-    stages: Stages
-
-    def read(self) -> Block:
-        """Return the next samples; none while a recording pauses."""
-
-    def take_events(self) -> list[StreamEvent]:
-        """Return the events since the last call."""
-
-    def status(self) -> StreamStatus:
-        """Return rates, ages, delay, tare and drift."""
-
-    def sigma_of_mean(self, R_base_flange: Array, duration_s: float) -> Array:
-        """Return the standard deviation (6,) of a mean of the wrench; NaN until the noise is known."""
-
-    def tare(self) -> StreamEvent:
-        """Set the bias so that a free tool reads zero."""
-
-    def undo_tare(self) -> StreamEvent:
-        """Return to the bias before the last tare."""
-
-    def mark(self, text: str) -> StreamEvent:
-        """Put a mark into the stream."""
 
 
 class Sink(Protocol):
@@ -88,7 +66,7 @@ class Feed:
 
     Parameters
     ----------
-    stream : Stream
+    stream : ProcessedStream
     recorder : callable, optional
         Opens a recording in a new file.
     push : callable, optional
@@ -101,8 +79,8 @@ class Feed:
     status : StreamStatus
     sigma : array, shape (6,)
         Of a mean over `MEAN_S`; like the status at most 50 ms of the stream older than the newest block.
-    failure : DeviceError or None
-        Why the stream gives no samples now.
+    reader : BlockReader
+        Its `failure` is why the stream gives no samples now.
     crash : BaseException or None
         What ended the thread.
     newest_ns : int or None
@@ -115,7 +93,7 @@ class Feed:
 
     def __init__(
         self,
-        stream: Stream,
+        stream: ProcessedStream,
         recorder: Callable[[Path], Sink] | None = None,
         push: Callable[[], object] | None = None,
     ) -> None:
@@ -125,7 +103,7 @@ class Feed:
         self.notes: deque[Note] = deque()
         self.status = stream.status()
         self.sigma = np.full(6, np.nan)
-        self.failure: DeviceError | None = None
+        self.reader = BlockReader(stream, math.inf)
         self.crash: BaseException | None = None
         self.newest_ns: int | None = None
         self.recording_since_ns: int | None = None
@@ -133,7 +111,7 @@ class Feed:
         self._recorder = recorder
         self._sink: Sink | None = None
         self._status_ns = 0
-        self._requests: SimpleQueue[Callable[[], object]] = SimpleQueue()
+        self._requests: SimpleQueue[tuple[str, str]] = SimpleQueue()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="live screen", daemon=True)
 
@@ -147,9 +125,9 @@ class Feed:
         self._thread.join()
         self._stop_recording()
 
-    def request(self, action: Callable[[], object]) -> None:
-        """Let the reading thread do something with the stream."""
-        self._requests.put(action)
+    def request(self, key: str, text: str = "") -> None:
+        """Let the reading thread do what a key stands for; the text is that of a mark."""
+        self._requests.put((key, text))
 
     def note(self, text: str, style: str = "") -> None:
         """Add a line to the events of the screen."""
@@ -159,12 +137,12 @@ class Feed:
         """Do what was requested, read once, and take the events."""
         while not self._requests.empty():
             try:
-                self._requests.get_nowait()()
+                self._press(*self._requests.get_nowait())
             except (ConfigError, DeviceError, OSError) as error:
                 self.note(str(error), BAD)
         self._read()
         for event in self.stream.take_events():
-            self._record(methodcaller("event", event))
+            self._record(event)
             if event.kind == "tracked":
                 continue  # the screen has a place for it
             text = f'mark "{event.text}"' if event.kind == "mark" else event.text
@@ -176,14 +154,14 @@ class Feed:
             return
         self.newest_ns = int(block.t_host_ns[-1])
         self.blocks.append(block)
-        self._record(methodcaller("write", block))
+        self._record(block)
         if abs(self.newest_ns - self._status_ns) > _STATUS_NS:
             self._status_ns = self.newest_ns
             self.status = self.stream.status()
             self.sigma = self.stream.sigma_of_mean(block.R_base_flange[-1], MEAN_S)
 
-    def switch_recording(self) -> None:
-        """Start a recording, or complete the one that runs; for `request`."""
+    def _switch_recording(self) -> None:
+        """Start a recording, or complete the one that runs."""
         if self._sink is not None:
             self._stop_recording()
         elif self._recorder is None:
@@ -207,29 +185,100 @@ class Feed:
         return self.newest_ns or 0
 
     def _read(self) -> None:
-        try:
-            block = self.stream.read()
-        except DeviceError as error:
-            self.failure, self.status = error, self.stream.status()
+        block = self.reader.read()
+        if block is None:
+            self.status = self.stream.status()
             self._ended.wait(_RETRY_S)
-            return
-        self.failure = None
-        self.take(block)
+        else:
+            self.take(block)
 
-    def _record(self, act: Callable[[Sink], object]) -> None:
-        """Let the recorder do something; its failure ends the recording, never the screen."""
+    def _record(self, item: Block | StreamEvent) -> None:
+        """Hand something to the recorder; its failure ends the recording, never the screen."""
         if self._sink is None:
             return
         try:
-            act(self._sink)
+            if isinstance(item, Block):
+                self._sink.write(item)
+            else:
+                self._sink.event(item)
         except (ConfigError, OSError) as error:
             with suppress(ConfigError, OSError):
                 self._sink.close()
-            self._sink = self.recording_since_ns = None
-            self.note(f"recording ended: {error}", BAD)
+            self._end_recording(f"recording ended: {error}", BAD)
 
     def _stop_recording(self) -> None:
-        self._record(methodcaller("close"))
-        if self._sink is not None:
-            self._sink = self.recording_since_ns = None
-            self.note("recording complete")
+        if self._sink is None:
+            return
+        try:
+            self._sink.close()
+        except (ConfigError, OSError) as error:
+            with suppress(ConfigError, OSError):
+                self._sink.close()
+            self._end_recording(f"recording ended: {error}", BAD)
+        else:
+            self._end_recording("recording complete")
+
+    def _end_recording(self, text: str, style: str = "") -> None:
+        self._sink = self.recording_since_ns = None
+        self.note(text, style)
+
+    # ------------------------------------------------------------------------------------------------------------ keys
+
+    def _press(self, key: str, text: str) -> None:
+        stream = self.stream
+        if key == "b":
+            stream.mark(text)
+        elif key == "t":
+            stream.tare()
+        elif key == "u":
+            stream.undo_tare()
+        elif key == "f" and self.push is not None:
+            self.push()
+            self.note("the emulated tool is pushed")
+        elif key == "r":
+            self._switch_recording()
+        elif key == "x":
+            self._set_frame([replace(stream.frame, axes=axes) for axes in after(stream.frame.axes, get_args(Axes))])
+        elif key == "a":
+            self._set_frame([replace(stream.frame, about=one) for one in after(stream.frame.about, get_args(Point))])
+        elif key == "1":
+            stream.stages = replace(stream.stages, bias=not stream.stages.bias)
+        elif key == "2":
+            stream.stages = replace(stream.stages, gravity=not stream.stages.gravity)
+        elif key == "3":
+            stream.stages = replace(stream.stages, inertia=not stream.stages.inertia)
+        elif key == "4":
+            highest_Hz = min(_LOWPASS_HZ, stream.info.sensor_rate_Hz / 4)
+            stream.stages = replace(stream.stages, lowpass_Hz=None if stream.stages.lowpass_Hz else highest_Hz)
+        elif isinstance(stream, ReplayedStream):
+            self._press_of_replay(stream, key)
+
+    def _press_of_replay(self, stream: ReplayedStream, key: str) -> None:
+        if key == "space":
+            (stream.resume if stream.is_paused else stream.pause)()
+        elif key == "left":
+            stream.seek(stream.at_s - _SEEK_S)
+        elif key == "right":
+            stream.seek(stream.at_s + _SEEK_S)
+        elif key == ".":
+            self.take(stream.step())
+        elif key in {"+", "="}:
+            stream.speed *= 2
+        elif key == "-":
+            stream.speed /= 2
+
+    def _set_frame(self, frames: Iterable[WrenchFrame]) -> None:
+        """Choose the first frame that the cell has; the others say what to configure."""
+        for each in frames:
+            try:
+                self.stream.frame = each
+            except ConfigError as error:
+                self.note(str(error), BAD)
+            else:
+                return
+
+
+def after(value: object, values: Sequence[T]) -> Sequence[T]:
+    """Return the values in turn, beginning after `value`."""
+    start = values.index(value) + 1 if value in values else 0
+    return [*values[start:], *values[:start]]

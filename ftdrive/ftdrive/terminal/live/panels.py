@@ -13,7 +13,6 @@ from ftcalib.sphere import axes_along
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import AXES, check_rate
 from ftdrive.errors import ConfigError
-from ftdrive.live.following import in_words
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
 from ftdrive.runs.verification_record import EMULATED, age_in_words
@@ -135,7 +134,7 @@ def state(view: View, width: int) -> Line:
     elif status.tracked is None:
         line.add("  tare ").add("none", FAINT)
     if status.tracked is not None:
-        line.add(f"  {in_words(status.tracked)}")
+        line.add(f"  {status.tracked.in_words()}")
         return line.fit(width)
     line.add(f"  drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
     return line.fit(width)

@@ -13,10 +13,11 @@ from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_noise_change
 from ftdrive.live.frames import FrameTransform
+from ftdrive.live.loop import ProcessedStream
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block
 from ftdrive.live.stream import STALE_S
-from ftdrive.terminal.live.feed import MEAN_S, Feed, Stream
+from ftdrive.terminal.live.feed import MEAN_S, Feed
 from ftdrive.terminal.live.history import SPANS_S, Columns, History
 from ftdrive.terminal.live.view import WARNING, Note, Peaks, Reading, Replay, View
 from ftdrivers.interfaces import Array
@@ -121,7 +122,7 @@ class Summary:
         for device, link in ((feed.stream.info.sensor, feed.status.sensor), (feed.stream.info.arm, feed.status.arm)):
             if link.error or link.age_s > STALE_S:
                 return f"{device.model}: {link.error or f'no sample for {link.age_s:.1f} s'}"
-        return "" if feed.failure is None else str(feed.failure)
+        return "" if feed.reader.failure is None else str(feed.reader.failure)
 
     def _reading(self) -> Reading | None:
         newest, n = self._newest, sum(each.n for each in self._recent)
@@ -201,7 +202,7 @@ class Summary:
             self._notes.appendleft(Note(None, text, WARNING))
 
 
-def _replay(stream: Stream) -> Replay | None:
+def _replay(stream: ProcessedStream) -> Replay | None:
     if not isinstance(stream, ReplayedStream):
         return None
     return Replay(stream.at_s, stream.duration_s, stream.speed, stream.is_paused, stream.has_ended)

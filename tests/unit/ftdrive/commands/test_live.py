@@ -130,7 +130,7 @@ class Quiet:
 def shown_table(monkeypatch: pytest.MonkeyPatch, stream: Any, width: int = 80) -> str:
     console = Console(width=width, file=io.StringIO(), color_system=None, force_terminal=False)
     monkeypatch.setattr(live, "answer", console)
-    live._show_table(stream, stream.clock, [Check("robot.payload", "ok", "robot 1.44 kg")])
+    live._show_table(stream, [Check("robot.payload", "ok", "robot 1.44 kg")])
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
@@ -169,7 +169,7 @@ class Interrupted:
 
 def test_a_silent_device_is_shown_and_no_old_number() -> None:
     stream: Any = Interrupted(2)
-    views = list(islice(live._views(stream, stream.clock), 12))
+    views = list(islice(live._views(stream), 12))
     readings = [live._reading(view) for view in views]
     stale = [reading for reading in readings if reading["stale"]]
     assert len(stale) == 2
@@ -190,7 +190,7 @@ def test_a_failure_that_lasts_ends_the_command(monkeypatch: pytest.MonkeyPatch) 
     for failures, raises in ((1000, False), (1, True)):
         stream: Any = Interrupted(failures)
         with pytest.raises(DeviceTimeout):
-            list(live._views(stream, stream.clock, raises=raises))
+            list(live._views(stream, raises=raises))
 
 
 def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
@@ -209,7 +209,7 @@ def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
         processor = Processor(replace(info(calibration), calibration=calibration), WrenchFrame("base"), Stages())
         rows = paired(np.tile(one, (1000, 1, 1)), noise=1e-3)
         processor.process(rows)
-        shown.append(processor.sigma(one, 0.1))
+        shown.append(processor.sigma_of_mean(one, 0.1))
     rms = np.sqrt(np.square(shown).reshape(24, 2, 3).sum(axis=2).mean(axis=0))
     np.testing.assert_allclose(rms, headline, rtol=0.01)
     assert np.min(np.array(shown)[:, :3]) > 0.5 * headline[0] / np.sqrt(3)

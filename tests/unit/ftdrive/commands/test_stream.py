@@ -10,6 +10,7 @@ from click.testing import CliRunner
 
 from ftdrive.commands import live_source, stream
 from ftdrive.errors import ConfigError, exit_code
+from ftdrive.live.loop import RECOVER_S
 from ftdrive.live.samples import Block, StreamEvent, WrenchFrame
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
@@ -89,7 +90,7 @@ def test_a_device_that_stays_silent_ends_the_stream() -> None:
     with pytest.raises(DeviceTimeout) as failure:
         serve(source, sink)
     assert exit_code(failure.value) == 4
-    assert source.clock.now_s() - 1001.0 == pytest.approx(live_source.RECOVER_S, abs=0.11)
+    assert source.clock.now_s() - 1001.0 == pytest.approx(RECOVER_S, abs=0.11)
     assert "silent at 11 s" in sink.events[-1].text
 
 

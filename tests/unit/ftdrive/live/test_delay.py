@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ftcalib.model import Array
-from ftdrive.live.delay import PERIOD_S, DelayEstimator
+from ftdrive.live.pairing import PERIOD_S, DelayEstimator
 from ftdrive.live.samples import Paired
 from tests.unit.ftdrive.live.simulated import NOISE, P_FLANGE_SENSOR_M, TRUTH, Motion, calibrated, paired
 

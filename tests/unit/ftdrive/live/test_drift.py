@@ -5,8 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array
-from ftdrive.live.drift import DriftFilter
-from ftdrive.live.noise import Noise
+from ftdrive.live.noise import DriftFilter, Noise
 
 SAMPLE = np.repeat([0.04, 0.0016], 3)
 READING = np.repeat([0.01, 0.0004], 3)

@@ -8,8 +8,15 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ftcalib.errors import BadDataset
 from ftcalib.model import angle_between
-from ftdrive.live.delay import DelayEstimator
-from ftdrive.live.pairing import RATE_TOLERANCE, Pairing, PoseTrack, Timeline, estimate_delay, paired_blocks
+from ftdrive.live.pairing import (
+    RATE_TOLERANCE,
+    DelayEstimator,
+    Pairing,
+    PoseTrack,
+    Timeline,
+    estimate_delay,
+    paired_blocks,
+)
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.moving_load import Truth, record, sweep
 from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, T0_NS, Motion, calibrated, calibrated_from

@@ -78,4 +78,4 @@ def test_no_samples_are_no_messages() -> None:
     ],
 )
 def test_the_name_of_a_frame_has_axes_and_point(axes: Axes, about: Point, name: str) -> None:
-    assert ros2.frame_id(WrenchFrame(axes, about)) == name
+    assert WrenchFrame(axes, about).id == name

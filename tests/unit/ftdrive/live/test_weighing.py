@@ -11,6 +11,7 @@ import ftdrive
 from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.model import Array
 from ftdrive.errors import ConfigError
+from ftdrive.live.noise import unexplained_variance
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Paired
 from ftdrive.live.weighing import (
@@ -18,7 +19,6 @@ from ftdrive.live.weighing import (
     CannotWeigh,
     Scale,
     _reading,
-    _unexplained,
     count_of,
     load_values,
     weigh_in_motion,
@@ -200,8 +200,7 @@ def test_a_mean_of_few_samples_counts_less() -> None:
 
 def test_what_a_fit_does_not_explain_is_in_the_reading() -> None:
     for explained, variance in ((True, np.zeros(6)), (False, np.repeat([(0.05**2 - 0.03**2) / 3, 0.0], 3))):
-        calibration = SimpleNamespace(
+        calibration: Any = SimpleNamespace(
             noise_explains=explained, likely_error=lambda: (0.05, 0.002), predicted_error=lambda: (0.03, 0.003)
         )
-        stub: Any = SimpleNamespace(calibration=calibration)
-        np.testing.assert_allclose(_unexplained(stub), variance)
+        np.testing.assert_allclose(unexplained_variance(calibration), variance)

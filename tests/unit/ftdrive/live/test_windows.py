@@ -11,8 +11,7 @@ from ftcalib.model import Array, skew
 from ftdrive.live.motion import REST
 from ftdrive.live.noise import Noise
 from ftdrive.live.samples import Paired
-from ftdrive.live.tracking import Window
-from ftdrive.live.windows import Windows
+from ftdrive.live.tracking import Window, Windows
 from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, T0_NS, TRUTH, G, Motion, calibrated, info, paired
 
 NOISE = Noise(np.eye(6), np.diag(np.arange(1.0, 7.0)), np.zeros((6, 6)), 100.0)

@@ -22,6 +22,7 @@ from ftdrive.live.samples import (
     WrenchFrame,
 )
 from ftdrive.runs.verification_record import VerificationRecord
+from ftdrivers.clock import REAL
 from ftdrivers.errors import DeviceTimeout
 from ftdrivers.interfaces import Array, DeviceInfo, Fact
 
@@ -110,12 +111,15 @@ PAST: tuple[tuple[float, EventKind, str], ...] = (
 )
 
 
+_AnyStream: Any = object
+
+
 @cache
 def transform_to(frame: WrenchFrame) -> FrameTransform:
     return FrameTransform(frame, INFO)
 
 
-class FakeStream:
+class FakeStream(_AnyStream):  # type: ignore[misc]  # of no class of the product, and accepted as any
     """Blocks of samples, as fast as they are read.
 
     Parameters
@@ -133,6 +137,7 @@ class FakeStream:
         block_s: float = 0.01,
     ) -> None:
         self.info = INFO
+        self.clock = REAL
         self.frame = WrenchFrame("base", "tcp")
         self.stages = Stages(lowpass_Hz=40.0)
         self.scenario = scenario

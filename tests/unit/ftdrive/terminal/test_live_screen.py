@@ -25,7 +25,7 @@ from ftdrive.terminal.console import messages
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.layout import frame
 from ftdrive.terminal.live.summary import Summary
-from ftdrive.terminal.live_screen import LiveApp, _press, run_live
+from ftdrive.terminal.live_screen import LiveApp, run_live
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import FREE, INFO, R_BASE_FLANGE, SIGMA, START_NS, FakeStream, Scenario
@@ -57,7 +57,7 @@ class Screen:
         self.size = size
         self.step(blocks)
         if scenario == "tare-refused":
-            self.feed.request(self.stream.tare)
+            self.feed.request("t")
         self.step(1)
 
     def step(self, blocks: int) -> None:
@@ -108,12 +108,13 @@ def test_every_size_is_filled_exactly(scenario: Scenario) -> None:
 
 @pytest.mark.parametrize(("rate_Hz", "lowpass_Hz"), [(7000.0, 40.0), (100.0, 25.0)])
 def test_the_low_pass_fits_the_rate_of_the_sensor(rate_Hz: float, lowpass_Hz: float) -> None:
-    feed = MagicMock()
-    feed.stream.info.sensor_rate_Hz, feed.stream.stages = rate_Hz, Stages()
-    _press(feed, "4")
-    assert feed.stream.stages == Stages(lowpass_Hz=lowpass_Hz)
-    _press(feed, "4")
-    assert feed.stream.stages == Stages()
+    stream = FakeStream()
+    stream.info, stream.stages = replace(INFO, sensor_rate_Hz=rate_Hz), Stages()
+    feed = Feed(stream)
+    for stages in (Stages(lowpass_Hz=lowpass_Hz), Stages()):
+        feed.request("4")
+        feed.step()
+        assert stream.stages == stages
 
 
 def test_a_stale_screen_shows_no_number_that_looks_live() -> None:
@@ -298,7 +299,7 @@ def no_app(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def run(app: LiveApp) -> None:
         for _ in range(2000):
-            if app._feed.failure is not None or app._feed.crash is not None:
+            if app._feed.reader.failure is not None or app._feed.crash is not None:
                 return
             threading.Event().wait(0.005)
 

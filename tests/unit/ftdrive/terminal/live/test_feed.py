@@ -37,12 +37,12 @@ def test_a_recording_has_all_blocks_and_events_from_key_to_key() -> None:
     tape = Tape()
     feed = Feed(FakeStream(), lambda path: tape if path.name == "live-2026-11-16T150000Z.mcap" else Tape(0))
     feed.step()
-    feed.request(feed.switch_recording)
+    feed.request("r")
     feed.step()
-    feed.request(lambda: feed.stream.mark("peg in"))
+    feed.request("b", "peg in")
     feed.step()
     assert feed.recording_since_ns is not None
-    feed.request(feed.switch_recording)
+    feed.request("r")
     feed.step()
     assert feed.notes[0].text.endswith("live-2026-11-16T150000Z.mcap")
     assert (len(tape.blocks), [event.kind for event in tape.events], tape.closed) == (2, ["mark"], 1)
@@ -52,7 +52,7 @@ def test_a_recording_has_all_blocks_and_events_from_key_to_key() -> None:
 def test_a_full_disk_ends_the_recording_and_not_the_screen() -> None:
     tape = Tape(full_after=2)
     feed = Feed(FakeStream(), lambda _: tape)
-    feed.request(feed.switch_recording)
+    feed.request("r")
     for _ in range(5):
         feed.step()
     assert len(feed.blocks) == 5
@@ -63,17 +63,18 @@ def test_a_full_disk_ends_the_recording_and_not_the_screen() -> None:
 
 def test_without_a_recorder_the_key_says_what_to_do() -> None:
     feed = Feed(FakeStream())
-    feed.request(feed.switch_recording)
+    feed.request("r")
     feed.step()
     assert "ftdrive record" in feed.notes[-1].text
 
 
 def test_a_request_that_is_refused_is_a_line_on_the_screen() -> None:
-    def refuse() -> None:
-        raise ConfigError("a torque about the tcp needs [sensor] height_mm")
+    class Refusing(FakeStream):
+        def tare(self) -> StreamEvent:
+            raise ConfigError("a torque about the tcp needs [sensor] height_mm")
 
-    feed = Feed(FakeStream())
-    feed.request(refuse)
+    feed = Feed(Refusing())
+    feed.request("t")
     feed.step()
     assert feed.notes[0].text == "a torque about the tcp needs [sensor] height_mm"
     assert len(feed.blocks) == 1
@@ -84,11 +85,11 @@ def test_a_failure_lasts_until_samples_arrive() -> None:
     feed = Feed(stream)
     for _ in range(4):
         feed.step()
-    assert isinstance(feed.failure, DeviceTimeout)
+    assert isinstance(feed.reader.failure, DeviceTimeout)
     assert feed.status.sensor.error
     stream.wake()
     feed.step()
-    assert feed.failure is None
+    assert feed.reader.failure is None
     assert len(feed.blocks) == 4
 
 
@@ -103,7 +104,7 @@ def test_the_thread_reads_until_it_is_stopped_and_completes_the_recording() -> N
             return super().read()
 
     feed = Feed(Counted(), lambda _: tape)
-    feed.request(feed.switch_recording)
+    feed.request("r")
     feed.start()
     assert enough.wait(20)
     feed.stop()

@@ -1,0 +1,397 @@
+"""The stages between raw and compensated wrench: bias, gravity, inertia, filters, deadband; and the tare.
+
+`FreeTool` has bias and gravity, `InertiaStage` what motion adds, `Filter` notch and low-pass. `Processor` runs them in
+this order for every sample, whichever are on, because contact is judged by what all of them leave.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftcalib.after.series import BiasTemperature
+from ftcalib.after.state import Calibrated, Update, bias_change, tare, with_bias_change
+from ftcalib.after.weighing import Weight, holding
+from ftcalib.compensation import Compensator
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
+from ftcalib.errors import BadDataset
+from ftcalib.files import JSON
+from ftdrive.errors import ConfigError
+from ftdrive.live.motion import REST, MotionTracker, MovedLoad
+from ftdrive.live.samples import Paired, Stages, StreamInfo
+from ftdrivers.interfaces import Array
+
+_STEP_K, _NOTED_K = 0.05, 1.0
+"""Changes of the temperature that move the bias, and that are an event."""
+_KNOT_S = 0.002
+"""Poses of this spacing give the acceleration."""
+_REACH_S = 0.015
+"""Half the time over which poses give the acceleration: longer ones lose the edges of a move, and are later."""
+LOWPASS_ORDER = 2
+"""Butterworth."""
+NOTCH_Q = 10.0
+"""Frequency over width at -3 dB."""
+TARE_S = 0.5
+TARE_DRIFT_N, TARE_DRIFT_NM = 0.5, 0.015
+"""A tare accepts this much drift of the bias since the calibration or the tare before, one standard deviation."""
+
+_STILL_RAD, _STILL_M = 5e-4, 5e-4
+"""Largest motion of the flange during a tare."""
+
+
+def standard_stages(info: StreamInfo) -> Stages:
+    """Return bias and gravity, with inertia where calibration and cell have what it needs."""
+    return Stages(inertia=info.calibration.motion is not None and bool(np.isfinite(info.p_flange_sensor_m).all()))
+
+
+def stages_in_words(stages: Stages) -> str:
+    """Return the stages that are on, in their order."""
+    words = ["raw"] + [name for name in ("bias", "gravity", "inertia") if getattr(stages, name)]
+    if stages.notch_Hz is not None:
+        words.append(f"notch {stages.notch_Hz:g} Hz (Q {NOTCH_Q:g})")
+    if stages.lowpass_Hz is not None:
+        words.append(f"low-pass {stages.lowpass_Hz:g} Hz (Butterworth, order {LOWPASS_ORDER})")
+    if stages.deadband_N or stages.deadband_Nm:
+        words.append(f"deadband {stages.deadband_N:g} N, {stages.deadband_Nm:g} N·m")
+    return ", ".join(words)
+
+
+# --------------------------------------------------------------------------------------------------- bias and gravity
+
+
+class _Reference(NamedTuple):
+    """The empty tool as calibrated, or since a tare."""
+
+    empty: Calibrated
+    t_ns: int
+    temperature_C: float
+    """Of the sensor then; NaN where it is not known."""
+
+
+class FreeTool:
+    """What a tool at rest exerts that touches nothing: bias and weight, after tares, warming and with a held part.
+
+    Parameters
+    ----------
+    info : StreamInfo
+    temperature : BiasTemperature, optional
+        Change of the bias with the temperature of the sensor.
+    """
+
+    def __init__(self, info: StreamInfo, temperature: BiasTemperature | None) -> None:
+        self._calibration, self._rate_Hz = info.calibration, info.sensor_rate_Hz
+        self._p_flange_sensor_m = info.p_flange_sensor_m
+        known_C = self._calibration.provenance.get("temperature_C")
+        # without the temperature at the calibration there is no change since then
+        self._temperature, made_C = (None, np.nan) if known_C is None else (temperature, float(known_C))
+        self._now_C = self._noted_C = made_C
+        self._references = [_Reference(self._calibration, 0, made_C)]
+        self.held: Weight | None = None
+        self.empty: Calibrated = self._calibration
+        """The newest reference at the present temperature."""
+        self.expected: Calibrated = self._calibration
+        """The same with the part that is held."""
+        self.load: Calibrated = self._calibration
+        """The tool as calibrated with the part that is held: weight and inertia do not change with the bias."""
+        self._compensator: Compensator = self._calibration.compensator
+        self._bias_change = np.zeros(6)
+
+    def predict(self, rows: Paired) -> tuple[Array, Array]:
+        """Return weight (n, 6) and bias (6,)."""
+        gravity = rows.R_base_flange.reshape(-1, 9) @ self._compensator.matrix.T
+        return gravity, np.asarray(self._compensator.offset + self._bias_change)
+
+    @property
+    def mass_kg(self) -> float:
+        """Of the load, with a part that is held."""
+        return float(np.linalg.norm(self.expected.parameters.gravity_force_base_N)) / self._calibration.g_m_s2
+
+    def motion_tracker(self) -> MotionTracker:
+        """Return a tracker of the motion of this load."""
+        return MotionTracker(self._rate_Hz, self.mass_kg, self.expected.parameters, self._p_flange_sensor_m)
+
+    def hold(self, weight: Weight | None) -> None:
+        """Count a part as part of the tool from now on; None empties the gripper."""
+        self.held = weight
+        self.load = self._with_part(self._calibration)
+        self._compensator = Compensator(self.load.parameters, response=self.load.response)
+        self.expected = self._with_part(self.empty)
+
+    def _with_part(self, empty: Calibrated) -> Calibrated:
+        return empty if self.held is None else holding(empty, self.held, self._calibration.g_m_s2)
+
+    # What follows changes the bias, and returns the change (6,).
+
+    def set_tare(self, update: Update, t_ns: int) -> Array:
+        """Take the bias of an update."""
+        return self._refer([*self._references, _Reference(update, t_ns, self._now_C)])
+
+    def undo_tare(self) -> Array:
+        """Return to the bias before the last tare."""
+        return self._refer(self._references[:-1])
+
+    def follow(self, update: Update, t_ns: int) -> Array:
+        """Take the bias of an update that replaces all tares."""
+        return self._refer([self._references[0], _Reference(update, t_ns, self._now_C)])
+
+    def warm(self, temperature_C: float) -> Array:
+        """Take the bias at a temperature of the sensor."""
+        self._now_C = temperature_C
+        return self._refer(self._references)
+
+    def _refer(self, references: list[_Reference]) -> Array:
+        """Take the newest reference, at the present temperature, as the empty tool."""
+        self._references = references
+        empty, _, then_C = references[-1]
+        if self._temperature is not None:
+            empty = with_bias_change(empty, *self._temperature.change(then_C, self._now_C))
+        before, self._bias_change = self._bias_change, empty.parameters.bias - self._calibration.parameters.bias
+        self.empty, self.expected = empty, self._with_part(empty)
+        return np.asarray(self._bias_change - before)
+
+    def is_warmed_by(self, temperature_C: float) -> bool:
+        """Whether this temperature of the sensor moves its bias."""
+        return self._temperature is not None and not abs(temperature_C - self._now_C) < _STEP_K
+
+    def warming(self) -> tuple[str, Mapping[str, JSON]] | None:
+        """Return text and values of an event, if the temperature has changed that much since the last one."""
+        if self._temperature is None or abs(self._now_C - self._noted_C) < _NOTED_K:
+            return None
+        self._noted_C = self._now_C
+        change, _ = self._temperature.change(self._references[-1].temperature_C, self._now_C)
+        text = f"sensor at {self._now_C:.1f} °C: bias corrected by {np.linalg.norm(change[:3]):.2f} N"
+        return text, {"temperature_C": self._now_C, "change": change.tolist()}
+
+    @property
+    def tare_wrench(self) -> Array | None:
+        """(6,) change of the bias by tares, N and N·m, sensor axes; None without a tare."""
+        if self.tare_t_ns is None:
+            return None
+        return self._references[-1].empty.parameters.bias - self._calibration.parameters.bias
+
+    @property
+    def tare_t_ns(self) -> int | None:
+        """Time of the last tare."""
+        return self._references[-1].t_ns if len(self._references) > 1 else None
+
+
+# ------------------------------------------------------------------------------------------------------------ inertia
+
+
+class InertiaStage:
+    """The inertial wrench of the load, from poses on both sides of a sample.
+
+    While it is on, the newest samples wait for the poses after them. They also stay as neighbours for the next ones.
+
+    Parameters
+    ----------
+    info : StreamInfo
+    """
+
+    def __init__(self, info: StreamInfo) -> None:
+        motion = info.calibration.motion
+        self._tensor = None if motion is None else motion.inertia_kg_m2
+        self._g_m_s2, self._p_flange_sensor_m = info.calibration.g_m_s2, info.p_flange_sensor_m
+        self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
+        knot_s = self._stride / info.sensor_rate_Hz
+        self._reach = max(2, round(max(_REACH_S, 2 / info.arm_rate_Hz) / knot_s))
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the samples before an interruption."""
+        self._buffer: Paired | None = None
+        self._states, self._felt = np.zeros(0, np.int8), np.zeros((0, 6))
+        self._done = 0
+        """Rows of the buffer that are processed."""
+
+    @property
+    def knows_tensor(self) -> bool:
+        """Whether the inertia of the tool was calibrated."""
+        return self._tensor is not None
+
+    def __len__(self) -> int:
+        """Count the samples that are kept."""
+        return 0 if self._buffer is None else len(self._buffer)
+
+    def add(self, rows: Paired, states: NDArray[np.int8], felt: Array) -> None:
+        """Add samples with their motion, as `MotionTracker.follow` returns it."""
+        self._buffer = rows if self._buffer is None else Paired.concatenate([self._buffer, rows])
+        self._states = np.concatenate([self._states, states])
+        self._felt = np.concatenate([self._felt, felt])
+
+    def take(
+        self, load: Calibrated, *, on: bool, last: bool
+    ) -> tuple[Paired, tuple[NDArray[np.int8], Array], Array | None]:
+        """Return the samples that are due, their motion, and the inertial wrench (n, 6) if the stage is on.
+
+        Parameters
+        ----------
+        load : CalibrationResult or Update
+        on : bool
+        last : bool
+            Whether no more poses come, so that none waits for them.
+        """
+        buffer = self._buffer
+        assert buffer is not None  # noqa: S101 - samples were added before
+        end, inertial = len(buffer), None
+        neighbours = self._reach * self._stride
+        if on and np.isfinite(buffer.p_base_flange_m[-1]).all():
+            inertial, ready = self.wrench(buffer, load)
+            end = end if last else max(ready, self._done)
+            ahead = np.minimum(np.arange(self._done, end) + neighbours, len(self._states) - 1)  # the poses after them
+            state = self._states[ahead]
+            # at rest nothing is subtracted, because that would amplify the noise of the joints
+            inertial = np.where((state == REST)[:, None], 0.0, inertial[self._done : end])
+        else:
+            state = self._states[self._done : end]
+        rows, felt = buffer.rows(slice(self._done, end)), self._felt[self._done : end]
+        keep = max(0, end - neighbours - self._stride) // self._stride * self._stride  # knots stay where they are
+        self._buffer, self._done = buffer.rows(slice(keep, None)), end - keep
+        self._states, self._felt = self._states[keep:], self._felt[keep:]
+        return rows, (state, felt), inertial
+
+    def wrench(self, rows: Paired, load: Calibrated) -> tuple[Array, int]:
+        """Return the inertial wrench of all rows, and the number of those with neighbours on both sides."""
+        knots = np.arange(0, len(rows), self._stride)
+        t_s = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
+        knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]  # a coarse clock repeats times
+        if len(knots) < 2 * self._reach + 2:
+            return np.zeros((len(rows), 6)), 0
+        moved = MovedLoad(load.parameters, self._g_m_s2, self._p_flange_sensor_m, self._reach)
+        motion = moved.motion(t_s[knots], rows.R_base_flange[knots], rows.p_base_flange_m[knots])
+        at_knots = moved.wrench(motion, self._tensor)
+        wrench = np.stack([np.interp(t_s, motion.t_s, column) for column in at_knots.T], axis=1)
+        return wrench, int(knots[-1 - self._reach]) + 1
+
+
+# ------------------------------------------------------------------------------------------------ filters and deadband
+
+
+class Filter:
+    """Notch and low-pass as second-order sections, whose state lasts from block to block.
+
+    It begins in the steady state of its first sample, so that there is no transient.
+
+    Parameters
+    ----------
+    stages : Stages
+    rate_Hz : float
+        Of the sensor.
+
+    Raises
+    ------
+    ConfigError
+        A frequency is not between 0 and half the rate.
+    """
+
+    def __init__(self, stages: Stages, rate_Hz: float) -> None:
+        self.power_gain = 1.0
+        """Variance of filtered over unfiltered white noise."""
+        self._state: Array | None = None
+        self._sections = np.empty((0, 6))
+        if stages.notch_Hz is None and stages.lowpass_Hz is None:
+            return
+        from scipy import signal
+
+        sections = []
+        for name, f_Hz in (("notch", stages.notch_Hz), ("low-pass", stages.lowpass_Hz)):
+            if f_Hz is None:
+                continue
+            if not 0 < f_Hz < rate_Hz / 2:
+                raise ConfigError(
+                    f"a {name} of {f_Hz:g} Hz is not possible at {rate_Hz:g} Hz: choose more than 0 and less than "
+                    f"{rate_Hz / 2:g} Hz"
+                )
+            if name == "notch":
+                sections.append(signal.tf2sos(*signal.iirnotch(f_Hz, NOTCH_Q, rate_Hz)))
+            else:
+                sections.append(signal.butter(LOWPASS_ORDER, f_Hz, fs=rate_Hz, output="sos"))
+        self._sections = np.concatenate(sections)
+        self._steady = signal.sosfilt_zi(self._sections)
+        self._run = signal.sosfilt
+        # the area under |H|² is exact on this grid unless the cut-off is below a thousandth of the rate
+        self.power_gain = float(np.mean(np.abs(signal.sosfreqz(self._sections, 1 << 14)[1]) ** 2))
+
+    def __call__(self, wrench: Array) -> Array:
+        """Filter the next samples (n, 6)."""
+        if not len(self._sections) or not len(wrench):
+            return wrench
+        if self._state is None:
+            self._state = self._steady[:, :, None] * wrench[0]
+        filtered, self._state = self._run(self._sections, wrench, axis=0, zi=self._state)
+        return np.asarray(filtered)
+
+
+def deadband(wrench: Array, force_N: float, torque_Nm: float) -> Array:
+    """Shorten force and torque vectors of wrenches (n, 6) by a deadband; shorter ones become zero.
+
+    The length counts and not each axis, so that a deadband is the same in all axes.
+    """
+    if not force_N and not torque_Nm:
+        return wrench
+    vectors = wrench.reshape(-1, 2, 3)
+    length = np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True), 1e-300)
+    left = np.maximum(1 - np.array([[force_N], [torque_Nm]]) / length, 0.0)
+    return np.asarray((vectors * left).reshape(-1, 6))
+
+
+# --------------------------------------------------------------------------------------------------------------- tare
+
+
+def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Mapping[str, JSON]]:
+    """Estimate the bias again, or refuse.
+
+    It is refused when arm or reading are not still, and when the reading differs from the prediction of a free tool by
+    more than noise, calibration and a usual drift explain once in a thousand tares.
+
+    Parameters
+    ----------
+    rows : Paired
+        The last `TARE_S` seconds.
+    current : CalibrationResult or Update
+        The calibration after earlier tares.
+
+    Returns
+    -------
+    update : Update or None
+        None if refused.
+    text : str
+        What was found, or why it was refused and what to do.
+    values : mapping
+        `change` of the bias (6,), its `force_N` and `torque_Nm`, and the distance from the free tool in `sigmas`.
+    """
+    again = "tare again when arm and tool have rested for half a second"
+    if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.5e9 * TARE_S:
+        return None, f"tare refused: only {len(rows)} samples; {again}", {}
+    R = rows.R_base_flange[-1:]
+    if not is_still(rows):
+        return None, f"tare refused: the arm moves; {again}", {}
+    dwell = mean_and_covariance(rows.raw)
+    (change,), (sigmas,) = bias_change(
+        current, R, dwell.mean[None], dwell.covariance[None], TARE_DRIFT_N, TARE_DRIFT_NM
+    )
+    force_N, torque_Nm = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
+    values: dict[str, JSON] = {
+        "change": change.tolist(),
+        "force_N": force_N,
+        "torque_Nm": torque_Nm,
+        "sigmas": float(sigmas),
+    }
+    found = f"{force_N:.2f} N and {torque_Nm:.3f} N·m ({sigmas:.1f} sigma)"
+    if not is_stationary(rows.raw):
+        return None, f"tare refused: the reading changes; {again}", values
+    try:
+        update = tare(current, R, [rows.raw], drift_N=TARE_DRIFT_N, drift_Nm=TARE_DRIFT_NM)
+    except BadDataset:
+        why = f"{found} from the free tool, more than drift explains"
+        return None, f"tare refused: {why}; take hand or contact away, or calibrate again", values
+    return update, f"tare: the bias has changed by {found}", values
+
+
+def is_still(rows: Paired) -> bool:
+    """Check whether the arm rests; an unknown position counts as still."""
+    R, p = rows.R_base_flange[-1:], rows.p_base_flange_m[-1]
+    return not (
+        np.abs(rows.R_base_flange - R).max() > _STILL_RAD or (np.abs(rows.p_base_flange_m - p) > _STILL_M).any()
+    )
