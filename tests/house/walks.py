@@ -70,10 +70,10 @@ WALKS = {
         ftdrive.live.samples               Block                      has what a consumer may need
         ftdrive.terminal.live.feed         Feed.take                  hands the block to screen and recorder
         ~ftdrive.terminal.live_screen      LiveApp.draw               draws ten times a second
-        ftdrive.terminal.live.summary      Summary.view               means, peaks and history so far
+        ftdrive.terminal.live.view         Summary.view               means, peaks and history so far
         ftdrive.terminal.live.layout       frame                      places the panels
         ftdrive.terminal.live.panels       table                      writes numbers with their digits
-        ftdrive.terminal.live_screen       _Canvas.show               sends the lines that changed
+        ftdrive.terminal.canvas            Canvas.show                sends the lines that changed
     """,
     "From poses to a calibration": """
         ftdrive.commands.solve                    solve                    reads the options

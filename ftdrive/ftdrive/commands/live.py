@@ -40,8 +40,7 @@ from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.live.feed import MEAN_S, Feed
 from ftdrive.terminal.live.layout import plain as plain_lines
-from ftdrive.terminal.live.summary import Summary
-from ftdrive.terminal.live.view import View
+from ftdrive.terminal.live.view import Summary, View
 from ftdrive.terminal.text import echo
 from ftdrivers.interfaces import Array
 

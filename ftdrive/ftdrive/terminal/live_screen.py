@@ -4,36 +4,25 @@
 lines, and only the lines that changed are sent to the terminal.
 """
 
-import signal
-import threading
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import ClassVar
 
-from rich.segment import Segment
-from rich.style import Style
 from textual import events
-from textual.app import App, ComposeResult
-from textual.driver import Driver
-from textual.geometry import Region
-from textual.strip import Strip
-from textual.widget import Widget
+from textual.app import ComposeResult
 from textual.widgets import Input
 
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_calibration
 from ftdrive.live.loop import ProcessedStream
 from ftdrive.runs.verification_record import fitted_dataset
+from ftdrive.terminal.canvas import REFRESH_S, Canvas, ClosableApp
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.live.feed import Feed, Sink, after
-from ftdrive.terminal.live.history import SPANS_S
 from ftdrive.terminal.live.layout import frame
-from ftdrive.terminal.live.summary import Summary
-from ftdrive.terminal.live.view import Line, Part
+from ftdrive.terminal.live.lines import Line
+from ftdrive.terminal.live.view import SPANS_S, Summary
 
-_REFRESH_S = 0.1
 _HELP = """\
  ftdrive live: the wrench on the tool, ten times a second
 
@@ -102,95 +91,6 @@ def run_live(
         raise feed.reader.failure
 
 
-class ClosableApp(App[None]):
-    """An app whose terminal may be closed: that ends it as its key to quit does, and then the command."""
-
-    def __init__(self, **options: Any) -> None:
-        super().__init__(_closable_driver(), **options)
-
-    def run_on_terminal(self) -> None:
-        """Run; after a closed terminal the signal is repeated, for its handler before."""
-        before = signal.getsignal(signal.SIGHUP)
-        closed = threading.Event()
-
-        def close(*_: object) -> None:
-            # In the loop of the app: an exception that a signal raises there can leave it waiting for ever.
-            closed.set()
-            if (loop := self._loop) is None:  # it is just starting
-                threading.Timer(_REFRESH_S, close).start()
-            elif not loop.is_closed():
-                loop.call_soon_threadsafe(self.exit)
-
-        if before not in {signal.SIG_IGN, None}:
-            signal.signal(signal.SIGHUP, close)
-        try:
-            self.run()
-        finally:
-            signal.signal(signal.SIGHUP, before)
-            if closed.is_set():
-                signal.raise_signal(signal.SIGHUP)
-
-
-def _closable_driver() -> type[Driver]:
-    """Return a driver for a terminal that may be closed: the thread that writes would end, and its queue then block."""
-    from textual.drivers.linux_driver import LinuxDriver  # needs termios, which Windows has not
-
-    class ClosableDriver(LinuxDriver):
-        def __init__(self, *arguments: Any, **options: Any) -> None:
-            super().__init__(*arguments, **options)
-            self._file = cast("Any", _UntilClosed(self._file))
-
-    return ClosableDriver
-
-
-class _UntilClosed:
-    """A file that ignores errors of writing."""
-
-    def __init__(self, file: Any) -> None:
-        self.file, self.fileno = file, file.fileno
-
-    def write(self, text: str) -> None:
-        """Write."""
-        with suppress(OSError):
-            self.file.write(text)
-
-    def flush(self) -> None:
-        """Flush."""
-        with suppress(OSError):
-            self.file.flush()
-
-
-class _Canvas(Widget):
-    """Shows lines; only those that changed are drawn again."""
-
-    DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lines: list[list[Part]] = []
-
-    def show(self, lines: Sequence[Line]) -> None:
-        """Replace the lines."""
-        new, old = [line.parts for line in lines], self.lines
-        self.lines = new
-        width = self.size.width
-        changed = [Region(0, y, width, 1) for y, parts in enumerate(new) if y >= len(old) or parts != old[y]]
-        if changed:
-            self.refresh(*changed)
-
-    def render_line(self, y: int) -> Strip:
-        """Return a line as Textual draws it."""
-        if y >= len(self.lines):
-            return Strip.blank(self.size.width)
-        return Strip([Segment(part.text, _style(part.style, part.key)) for part in self.lines[y]])
-
-
-@lru_cache
-def _style(name: str, key: str) -> Style:
-    style = Style.parse(name)
-    return style + Style.from_meta({"@click": f"app.press('{key}')"}) if key else style
-
-
 class LiveApp(ClosableApp):
     """Draws what a `Feed` knows."""
 
@@ -203,7 +103,7 @@ class LiveApp(ClosableApp):
         super().__init__(ansi_color=True)  # the terminal's own colours, light or dark
         self.theme = "ansi-dark"
         self._feed, self._summary = feed, summary
-        self._canvas = _Canvas()
+        self._canvas = Canvas()
         self._helping = False
 
     def compose(self) -> ComposeResult:
@@ -212,7 +112,7 @@ class LiveApp(ClosableApp):
 
     def on_mount(self) -> None:
         """Start to draw."""
-        self.set_interval(_REFRESH_S, self.draw)
+        self.set_interval(REFRESH_S, self.draw)
 
     def on_resize(self) -> None:
         """Draw at the new size."""

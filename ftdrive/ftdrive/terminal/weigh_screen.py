@@ -1,4 +1,4 @@
-"""The screen of `ftdrive weigh`: one large number."""
+"""The screen of `ftdrive weigh`: one large number, in the digits of Textual instead of lines on the canvas."""
 
 import threading
 from typing import ClassVar
@@ -9,10 +9,9 @@ from textual.widgets import Digits, Static
 from ftcalib.after.weighing import Weight
 from ftcalib.rounding import counted, to_place_of
 from ftdrive.errors import NotAccepted
-from ftdrive.terminal.live_screen import ClosableApp
+from ftdrive.terminal.canvas import REFRESH_S, ClosableApp
 from ftdrive.terminal.weighing import Shown, Weighing, line_of
 
-_REFRESH_S = 0.1
 _UNZEROED_KG = 0.1
 """With a larger smallest mass the drift since the calibration decides, and a zero helps."""
 
@@ -87,7 +86,7 @@ class WeighApp(ClosableApp):
     def on_mount(self) -> None:
         """Start reading."""
         self.reader.start()
-        self.set_interval(_REFRESH_S, self.draw)
+        self.set_interval(REFRESH_S, self.draw)
 
     def draw(self) -> None:
         """Show the present state."""

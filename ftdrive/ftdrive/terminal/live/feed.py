@@ -5,7 +5,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from queue import SimpleQueue
@@ -17,7 +17,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.loop import BlockReader, ProcessedStream
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Axes, Block, Point, StreamEvent, WrenchFrame
-from ftdrive.terminal.live.view import BAD, CONTACT, GOOD, STRONG, WARNING, Note
+from ftdrive.terminal.live.lines import BAD, CONTACT, GOOD, STRONG, WARNING
 from ftdrivers.errors import DeviceError
 
 T = TypeVar("T")
@@ -282,3 +282,16 @@ def after(value: object, values: Sequence[T]) -> Sequence[T]:
     """Return the values in turn, beginning after `value`."""
     start = values.index(value) + 1 if value in values else 0
     return [*values[start:], *values[:start]]
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """An event, or an answer to a key."""
+
+    t_host_ns: int | None
+    text: str
+    style: str = ""
+    is_mark: bool = False
+    """Whether the plots show its time."""
+    times: int = 1
+    """How often it came in a row."""

@@ -3,9 +3,9 @@
 import numpy as np
 
 from ftdrive.checks.devices import AXES
-from ftdrive.terminal.live import braille, panels
-from ftdrive.terminal.live.history import Columns
-from ftdrive.terminal.live.view import CONTACT, FAINT, STRONG, Line, View
+from ftdrive.terminal.live import panels
+from ftdrive.terminal.live.lines import CONTACT, FAINT, STRONG, Line, characters, envelope, level
+from ftdrive.terminal.live.view import Columns, View
 
 _WIDE = 120
 """From this width on the plots stand beside the table."""
@@ -133,14 +133,14 @@ def _plot(view: View, columns: Columns, i: int, full: float, rows: int, *, with_
     head.join(Line.of_cells(text[shown], styles[shown]))
 
     rows -= 1
-    ink = braille.characters(braille.envelope(columns.low[i], columns.high[i], rows, full))
+    ink = characters(envelope(columns.low[i], columns.high[i], rows, full))
     under = np.zeros((4 * rows, 2 * cells), np.bool_)
     if reading is not None and np.isfinite(sigma := reading.sample_sigma[i]):
         for value in (-sigma, 0.0, sigma):
-            if (dot := braille.level(value, rows, full)) is not None:
+            if (dot := level(value, rows, full)) is not None:
                 under[dot, ::4] = True
     under[::2, [2 * cell for cell in marks]] = True
-    paper = braille.characters(under)
+    paper = characters(under)
     lines = [head]
     for row in range(rows):
         label = f"{full:+g}" if row == 0 else f"{-full:+g}" if row == rows - 1 else "0" if row == rows // 2 else ""

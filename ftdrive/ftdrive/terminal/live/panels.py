@@ -14,12 +14,11 @@ from ftdrive.checks.check import Check
 from ftdrive.checks.devices import AXES, check_rate
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
+from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
 from ftdrive.runs.verification_record import EMULATED, age_in_words
-from ftdrive.terminal.live import braille
-from ftdrive.terminal.live.braille import Codes
-from ftdrive.terminal.live.history import Columns
-from ftdrive.terminal.live.view import (
+from ftdrive.terminal.live.feed import Note
+from ftdrive.terminal.live.lines import (
     BAD,
     CONTACT,
     FAINT,
@@ -27,13 +26,14 @@ from ftdrive.terminal.live.view import (
     STRONG,
     TRACE,
     WARNING,
+    Codes,
     Line,
-    Note,
     Part,
-    Reading,
-    Replay,
-    View,
+    characters,
+    envelope,
+    row_text,
 )
+from ftdrive.terminal.live.view import Columns, Reading, View
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 
 LEAST_FULL_SIGMA = 10.0
@@ -67,7 +67,7 @@ def title(view: View, width: int) -> Line:
     return line.fit(max(width - right.width - 1, 0)).add(" ").join(right).fit(width)
 
 
-def _replay(replay: Replay) -> Line:
+def _replay(replay: ReplayedStream) -> Line:
     state = "ended" if replay.has_ended else "paused" if replay.is_paused else f"x {replay.speed:g}"
     at, end = (f"{int(t_s // 60):02d}:{t_s % 60:04.1f}" for t_s in (replay.at_s, replay.duration_s))
     return Line(f"REPLAY {at} of {end}, {state}", STRONG, "space")
@@ -281,7 +281,7 @@ def _bar(view: View, i: int, full: float, cells: int) -> Line:
 
 def _trace(columns: Columns, i: int, full: float) -> Line:
     """Draw the recent past of a component in one row."""
-    ink = braille.characters(braille.envelope(columns.low[i], columns.high[i], 1, full))[0]
+    ink = characters(envelope(columns.low[i], columns.high[i], 1, full))[0]
     return layers(ink, np.zeros_like(ink), columns.contact_cells)
 
 
@@ -292,7 +292,7 @@ def layers(ink: Codes, paper: Codes, in_contact: NDArray[np.bool_]) -> Line:
     edges = [0, *(np.flatnonzero(np.diff(kind)) + 1).tolist(), len(ink)]
     for start, end in pairwise(edges):
         source = ink if kind[start] else paper
-        line.add(braille.text(source[start:end]), (FAINT, TRACE, CONTACT)[kind[start]])
+        line.add(row_text(source[start:end]), (FAINT, TRACE, CONTACT)[kind[start]])
     return line
 
 
@@ -480,7 +480,7 @@ def _rings() -> list[str]:
         y = np.round((2 * rows - 0.5) * (1 - radius * np.sin(angle)))
         x = np.round((_DISC - 0.5) * (1 + radius * np.cos(angle)))
         dots[y.astype(int), x.astype(int)] = True
-    return [braille.text(row) for row in braille.characters(dots)]
+    return [row_text(row) for row in characters(dots)]
 
 
 def _unit(vector: Array) -> Array:

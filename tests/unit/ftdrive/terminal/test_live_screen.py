@@ -24,7 +24,7 @@ from ftdrive.live.samples import Block, Paired, Stages, WrenchFrame
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.live.feed import Feed
 from ftdrive.terminal.live.layout import frame
-from ftdrive.terminal.live.summary import Summary
+from ftdrive.terminal.live.view import Summary
 from ftdrive.terminal.live_screen import LiveApp, run_live
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock

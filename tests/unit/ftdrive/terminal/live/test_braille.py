@@ -2,19 +2,19 @@
 
 import numpy as np
 
-from ftdrive.terminal.live import braille
+from ftdrive.terminal.live.lines import characters, envelope, level, row_text
 
 
 def drawn(low: list[float], high: list[float], rows: int, full: float) -> list[str]:
-    codes = braille.characters(braille.envelope(np.array(low), np.array(high), rows, full))
-    return [braille.text(row) for row in codes]
+    codes = characters(envelope(np.array(low), np.array(high), rows, full))
+    return [row_text(row) for row in codes]
 
 
 def test_the_bits_are_those_of_unicode() -> None:
     for dot, code in enumerate((0x01, 0x02, 0x04, 0x40, 0x08, 0x10, 0x20, 0x80)):  # dots 1, 2, 3, 7, 4, 5, 6, 8
         dots = np.zeros((4, 2), np.bool_)
         dots[dot % 4, dot // 4] = True
-        assert braille.characters(dots)[0, 0] == code
+        assert characters(dots)[0, 0] == code
 
 
 def test_noise_about_zero_is_one_line() -> None:
@@ -33,5 +33,5 @@ def test_a_step_is_joined_and_a_gap_is_not() -> None:
 
 
 def test_a_level_outside_is_not_drawn() -> None:
-    assert braille.level(0.0, 3, 1.0) == 6
-    assert braille.level(1.5, 3, 1.0) is None
+    assert level(0.0, 3, 1.0) == 6
+    assert level(1.5, 3, 1.0) is None

@@ -9,9 +9,11 @@ from ftcalib.model import Array
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.runs.verification_record import FOREIGN
 from ftdrive.terminal.live import panels
+from ftdrive.terminal.live.feed import Note
 from ftdrive.terminal.live.layout import frame
+from ftdrive.terminal.live.lines import BAD, GOOD, WARNING, Line
 from ftdrive.terminal.live.panels import _range, line_of_force, others, sphere
-from ftdrive.terminal.live.view import BAD, GOOD, WARNING, Line, Note, View
+from ftdrive.terminal.live.view import View
 from ftdrivers.interfaces import Fact
 from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, SIGMA, TARE, FakeStream
 from tests.unit.ftdrive.terminal.live.test_summary import Rig, reading_of

@@ -11,8 +11,7 @@ from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
 from ftdrive.live.samples import Block, WrenchFrame
 from ftdrive.terminal.live.feed import Feed
-from ftdrive.terminal.live.summary import Summary
-from ftdrive.terminal.live.view import Reading, View
+from ftdrive.terminal.live.view import Reading, Summary, View
 from tests.unit.ftdrive.terminal.fake_stream import R_BASE_FLANGE, SIGMA, FakeStream
 
 
