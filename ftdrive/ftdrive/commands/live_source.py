@@ -4,10 +4,11 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from socket import gethostname
 
+from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig
-from ftdrive.cell.emulated import Station
 from ftdrive.commands.common import Source, read_cell, store_url
 from ftdrive.errors import ConfigError
+from ftdrive.live.processing import SENSOR_FRAME
 from ftdrive.live.samples import Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.source import read_calibration
@@ -24,29 +25,50 @@ def open_source(source: Source, frame: WrenchFrame, stack: ExitStack, track: Tra
     The state of the calibration and warnings are printed. Only an emulated cell needs no calibration: it is calibrated
     first.
     """
-    path, tool, force, config, robot, sensor, simulate = source
-    calibration = None if path is None else read_calibration(path, accept_edited=force)
-    cell: CellConfig | Station
-    if simulate:
+    calibration = None if source.path is None else read_calibration(source.path, accept_edited=source.force)
+    cell = None
+    if source.simulate:
         if calibration is None:
             with open_operator() as operator:
-                calibration = short_calibration(operator, sensor)
-        cell = station_of(calibration, sensor)
-    elif calibration is None and tool is None:
-        raise ConfigError("no calibration: give --calibration PATH or --tool NAME, or --simulate")
+                calibration = short_calibration(operator, source.sensor)
+    elif calibration is None and source.tool is None:
+        raise no_calibration()
     else:
-        cell = read_cell(config, robot, sensor)
-    chosen = calibration if calibration is not None else str(tool)
-    name = "temporary calibration" if path is None else str(path)
-    opened = CompensatedStream(cell, chosen, name=name, frame=frame, force=force)
+        cell = read_cell(source.config, source.robot, source.sensor)
+    opened = build_stream(source, cell, calibration, None if calibration is not None else source.tool, frame)
     opened.track = track
     stream = stack.enter_context(opened)
-    if tool is not None:
-        messages.print(f" {tool}: {stream.info.calibration_name}")
+    if source.tool is not None:
+        messages.print(f" {source.tool}: {stream.info.calibration_name}")
     messages.print(f" {stream.info.calibration_state}")
     for words in stream.warnings:
         messages.print(f" {words}")
     return stream
+
+
+def build_stream(
+    source: Source,
+    cell: CellConfig | None,
+    calibration: CalibrationResult | None,
+    tool: str | None,
+    frame: WrenchFrame = SENSOR_FRAME,
+) -> CompensatedStream:
+    """Return the stream of a cell, not open yet, or without a cell that of an emulated one; a tool goes first.
+
+    Raises `ConfigError` without a calibration and without the name of a tool.
+    """
+    chosen = tool or calibration
+    # an emulated cell ends with its stream, so each stream has one of its own
+    place = station_of(calibration, source.sensor) if cell is None and calibration is not None else cell
+    if chosen is None or place is None:
+        raise no_calibration()
+    name = "temporary calibration" if source.path is None else str(source.path)
+    return CompensatedStream(place, chosen, name=name, frame=frame, force=source.force)
+
+
+def no_calibration() -> ConfigError:
+    """Return the error of a command that has neither a calibration nor the name of a tool."""
+    return ConfigError("no calibration: give --calibration PATH or --tool NAME, or --simulate")
 
 
 def open_log(

@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import click
 
 from ftdrive.commands.common import FRAME, SOURCE, Source, read_cell, read_frame
-from ftdrive.errors import ConfigError
 
 if TYPE_CHECKING:
     from ftdrive.live.samples import Axes
@@ -49,35 +48,27 @@ def ros2(
     from ftdrivers.ros2.middleware import ros2_module
 
     ros2_module("rclpy")  # before any work
-    from ftdrive.live.stream import CompensatedStream
+    from ftdrive.commands.live_source import build_stream, no_calibration
     from ftdrive.runs.source import read_calibration
     from ftdrive.servers.ros2 import Ros2Node
-    from ftdrive.session.rehearsal import short_calibration, station_of
+    from ftdrive.session.rehearsal import short_calibration
     from ftdrive.terminal.console import messages
     from ftdrive.terminal.screen import open_operator
 
-    path, tool, force, config, robot, sensor, simulate = source
     frame = read_frame(axes, about)
-    calibration = None if path is None else read_calibration(path, accept_edited=force)
-    cell = None if simulate else read_cell(config, robot, sensor)
+    calibration = None if source.path is None else read_calibration(source.path, accept_edited=source.force)
+    cell = None if source.simulate else read_cell(source.config, source.robot, source.sensor)
     try:
-        with closing(Ros2Node(ros_args, frame=frame, tool=tool or "")) as node:
-            if simulate and calibration is None:
+        with closing(Ros2Node(ros_args, frame=frame, tool=source.tool or "")) as node:
+            if source.simulate and calibration is None:
                 with open_operator() as operator:
-                    calibration = short_calibration(operator, sensor)
+                    calibration = short_calibration(operator, source.sensor)
             if calibration is None and not node.parameters.tool:
-                raise ConfigError("no calibration: give --calibration PATH or --tool NAME, or --simulate")
-
-            def open_stream() -> CompensatedStream:
-                place = station_of(calibration, sensor) if cell is None and calibration is not None else cell
-                name = "temporary calibration" if path is None else str(path)
-                chosen = node.parameters.tool or calibration
-                return CompensatedStream(cast(Any, place), cast(Any, chosen), name=name, force=force)
-
+                raise no_calibration()
             messages.print(
                 f"Node {node.name} publishes {node.name}/wrench in {node.parameters.frame}, at most "
                 f"{node.fixed.rate:g} Hz, {'reliable' if node.fixed.reliable else 'best effort'}. Ctrl-C ends."
             )
-            node.serve(open_stream)
+            node.serve(lambda: build_stream(source, cell, calibration, node.parameters.tool))
     except KeyboardInterrupt:
         messages.print("The node has ended.")
