@@ -63,7 +63,7 @@ def compensate(
     """
     from ftdrive.errors import ConfigError
     from ftdrive.recording.bag import as_csv_pair, is_bag, read_bag
-    from ftdrive.recording.compensation import compensated
+    from ftdrive.recording.compensation import compensate_recording
     from ftdrive.recording.files import format_of
     from ftdrive.runs.source import read_calibration
     from ftdrive.terminal.console import beside, messages, working
@@ -80,7 +80,7 @@ def compensate(
         elif wrench_topic or pose_topic:
             raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS 2: leave them out")
         source, found = _open(path, calibration, loaded, wrench, orientation_file, delay, everything=output is not None)
-        numbers, failure = compensated(source, frame, output, estimate_bias=bias == "estimate", show=show)
+        numbers, failure = compensate_recording(source, frame, output, estimate_bias=bias == "estimate", show=show)
     result = {**numbers, "delay_s": found or numbers["delay_s"], "file": None if output is None else str(output)}
     if result["cut"]:
         what = path or wrench

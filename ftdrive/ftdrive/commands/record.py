@@ -91,7 +91,7 @@ def record(
         messages.print(f" Recording, {frame}. Ctrl-C ends.")
         try:
             with working("Recording") as show:
-                record_stream(stream, recorder, duration_s, count, lambda: show(_so_far(recorder)))
+                _record_stream(stream, recorder, duration_s, count, lambda: show(_so_far(recorder)))
         finally:
             if recorder.samples:
                 _report(recorder, frame, stream.info.calibration_name, as_json=as_json)
@@ -102,7 +102,7 @@ def record(
         )
 
 
-def record_stream(
+def _record_stream(
     stream: "CompensatedStream",
     recorder: "Recorder",
     duration_s: float | None = None,

@@ -82,7 +82,7 @@ def _print_all(texts: Sequence[str]) -> None:
         messages.print(words)
 
 
-def answer_of(shown: "Shown", info: "StreamInfo") -> dict[str, Any]:
+def _answer_of(shown: "Shown", info: "StreamInfo") -> dict[str, Any]:
     """Return a state as JSON."""
     from ftdrive.live.weighing import load_values
 
@@ -106,7 +106,7 @@ def _print(weighing: "Weighing", *, once: bool, waits: bool, poses: int, as_json
         if once and waits and weight is not None and not weight.is_something:
             continue
         if as_json:
-            write_json(answer_of(shown, weighing.stream.info))
+            write_json(_answer_of(shown, weighing.stream.info))
         else:
             echo(line_of(shown))
         if once:

@@ -17,7 +17,7 @@ from ftdrive import __version__
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.fleet.workers import OtherVersion, Workers, answers, folder_of_worker, in_words, require_version
 from ftdrive.live.samples import WrenchFrame
-from ftdrive.recording.compensation import compensated, read_with_calibration
+from ftdrive.recording.compensation import compensate_recording, read_with_calibration
 from ftdrive.recording.files import ENDINGS, format_of
 from ftdrive.recording.growing_file import publish
 from ftdrive.recording.recording import frame_of
@@ -83,7 +83,7 @@ def task_of(calibration: Path | None, frame: WrenchFrame, bias: str, *, accept_e
 def compensated_file(source: Path, folder: Path, task: bytes) -> bytes:
     """Compensate a recording into a new file below a folder, in blocks; return its path and a line of JSON.
 
-    The line has the numbers of `ftdrive.recording.compensation.compensated`.
+    The line has the numbers of `ftdrive.recording.compensation.compensate_recording`.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def compensated_file(source: Path, folder: Path, task: bytes) -> bytes:
         reader = read_with_calibration(source, calibration, given["calibration_name"])
         output = Path(mkdtemp(dir=folder)) / f"result{source.suffix}"
         estimate = given["bias"] == "estimate"
-        numbers, _ = compensated(reader, frame_of(given), output, estimate_bias=estimate, overlap=False)
+        numbers, _ = compensate_recording(reader, frame_of(given), output, estimate_bias=estimate, overlap=False)
     except BadRecording as error:  # the report names the recording, which here may be a temporary file
         raise BadRecording(error.problem) from error
     return f"{output}\n{json.dumps(numbers)}".encode()

@@ -12,8 +12,8 @@ from scipy.special import chdtri, fdtri
 from ftcalib.files import JSON
 from ftcalib.likelihood.response import Response, predicted_covariance
 from ftcalib.model import Array, Parameters
-from ftdrive.live.motion import READING_S, REST, accelerated, samples_in_reading
-from ftdrive.live.noise import Noise, NoiseEstimator
+from ftdrive.live.motion import READING_S, REST, samples_in_reading, wrench_by_acceleration
+from ftdrive.live.noise import NoiseEstimator, SensorNoise
 from ftdrive.live.samples import Ns
 from ftdrive.live.stages import TARE_DRIFT_N, TARE_DRIFT_NM
 
@@ -102,7 +102,7 @@ class ContactTest:
         """Of the variance of the prediction that the offset still has."""
         self._sum, self._count, self._is_free = np.zeros(6), 0, True
         """Of the samples since the last step of the offset."""
-        self._whitening: tuple[tuple[Noise, float, Inertia | None], Array] | None = None
+        self._whitening: tuple[tuple[SensorNoise, float, Inertia | None], Array] | None = None
 
     def expect(
         self, calibration: tuple[Parameters, Array, Response | None], mass_kg: float, *, tensor_known: bool
@@ -110,7 +110,7 @@ class ContactTest:
         """Set the calibration of a free tool: parameters, covariance, response, mass, and whether it has a tensor."""
         if self._calibration is None or calibration[0] is not self._calibration[0]:
             self._R = None
-            B = accelerated(mass_kg, calibration[0].p_sensor_com_m)
+            B = wrench_by_acceleration(mass_kg, calibration[0].p_sensor_com_m)
             turned = np.diag(np.repeat([0.0, (mass_kg * GYRATION_M**2 * _UNKNOWN_RAD_S2) ** 2], 3))
             self._unknown = {
                 Inertia.UNKNOWN: _UNKNOWN_M_S2**2 * B @ B.T + turned,
@@ -204,7 +204,7 @@ class ContactTest:
         self._share = 2.0 if self._offset.any() else 1.0
         self._whitening = None
 
-    def _whiten(self, noise: Noise, state: int, inertia: Inertia) -> Array:
+    def _whiten(self, noise: SensorNoise, state: int, inertia: Inertia) -> Array:
         """Return the matrix that makes the readings of a free tool white."""
         key = noise, self._share, None if state == REST else inertia
         if self._whitening is None or self._whitening[0] != key:

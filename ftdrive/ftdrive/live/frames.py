@@ -75,7 +75,7 @@ def frames_in_flange(frame: WrenchFrame, info: StreamInfo, R_base_flange: Array)
     return found
 
 
-def near(info: StreamInfo) -> Array:
+def gripping_point(info: StreamInfo) -> Array:
     """Return where the gripper holds parts, (3,) sensor frame: the TCP, or the tool's centre of mass without one."""
     p_flange_m = info.p_flange_tcp_m - info.p_flange_sensor_m
     if np.isfinite(p_flange_m).all() and info.p_flange_tcp_m.any():

@@ -53,7 +53,7 @@ class MotionTracker:
         self._size = samples_in_reading(rate_Hz)
         self._step_s = self._size / rate_Hz
         self._hold = round(_HOLD_S * rate_Hz)
-        by_acceleration = accelerated(mass_kg, parameters.p_sensor_com_m) @ parameters.R_flange_sensor.T
+        by_acceleration = wrench_by_acceleration(mass_kg, parameters.p_sensor_com_m) @ parameters.R_flange_sensor.T
         self._felt_by_change = -by_acceleration / self._step_s**2
         """(6, 3) wrench by the change of a step of the centre of mass to the next, flange axes, m."""
         self._p_flange_com_m = np.nan_to_num(p_flange_sensor_m) + parameters.R_flange_sensor @ parameters.p_sensor_com_m
@@ -153,6 +153,6 @@ class MovedLoad:
         return inertial_wrench(self._mass_kg, self._parameters.p_sensor_com_m, motion, inertia_kg_m2)
 
 
-def accelerated(mass_kg: float, p_sensor_com_m: Array) -> Array:
+def wrench_by_acceleration(mass_kg: float, p_sensor_com_m: Array) -> Array:
     """Wrench (6, 3) of a load by the three axes of its acceleration, N and N·m per m/s², sensor axes."""
     return mass_kg * np.concatenate([np.eye(3), skew(p_sensor_com_m)])

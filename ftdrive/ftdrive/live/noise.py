@@ -31,7 +31,7 @@ _INDEPENDENT = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Noise:
+class SensorNoise:
     """Covariances of white and coloured noise alike, N and N·m, sensor axes."""
 
     sample: Array
@@ -67,10 +67,10 @@ class NoiseEstimator:
         self._mean_before: Array | None = None
         self._windows: list[deque[tuple[Array, Array, Array]]] = [deque(maxlen=_WINDOWS) for _ in range(STATES)]
         """Scatter of its readings, scatter of their samples, and step from the window before."""
-        self._known: dict[int, Noise] = {}
+        self._known: dict[int, SensorNoise] = {}
         self._first = _FIRST_M_S2**2 * accelerated @ accelerated.T
 
-    def of(self, state: int) -> Noise | None:
+    def of(self, state: int) -> SensorNoise | None:
         """Return the noise in a state, or what is assumed until a second of it; None before the first half second."""
         known, rest = self._known.get(state), self._known.get(REST)
         other = rest or next(iter(self._known.values()), None)
@@ -129,7 +129,7 @@ class NoiseEstimator:
         for state in changed:
             self._known[state] = self._estimated(state)
 
-    def _estimated(self, state: int) -> Noise:
+    def _estimated(self, state: int) -> SensorNoise:
         at_rest = state == REST
         reading, within, steps = (np.array([window[i] for window in self._windows[state]]) for i in range(3))
         floor = RESOLUTION**2 / self._size
@@ -144,7 +144,7 @@ class NoiseEstimator:
             steps = steps[(np.abs(steps) < _STEP_SIGMAS * usual).all(axis=1)]
         wander = steps.T @ steps / max(len(steps), 1)
         dof = _INDEPENDENT * (_WINDOW if at_rest else _SHORT) * float(quiet.sum())
-        return Noise(mean + within[quiet].mean(axis=0), mean, wander, dof)
+        return SensorNoise(mean + within[quiet].mean(axis=0), mean, wander, dof)
 
 
 @lru_cache
@@ -193,7 +193,7 @@ class DriftFilter:
         self._R: Array | None = None
         self._warned = False
 
-    def follow(self, t_ns: Ns, residual: Array, R_base_flange: Array, noise: Noise, uncertainty: Array) -> bool:
+    def follow(self, t_ns: Ns, residual: Array, R_base_flange: Array, noise: SensorNoise, uncertainty: Array) -> bool:
         """Add the mean of each second in which the arm rests; return whether there was one.
 
         Parameters

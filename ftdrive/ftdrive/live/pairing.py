@@ -477,7 +477,7 @@ def _paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:
     return Paired(t_ns, samples.t_device_s, samples.seq, samples.status, samples.wrench, *poses.at(t_ns))
 
 
-def paired_blocks(samples: Iterable[FtSamples], states: Iterable[ArmStates], delay_s: float) -> Iterator[Paired]:
+def pair_blocks(samples: Iterable[FtSamples], states: Iterable[ArmStates], delay_s: float) -> Iterator[Paired]:
     """Pair a recording whose times are those of measurement, in blocks; both are sorted by time.
 
     Parameters
@@ -517,6 +517,6 @@ def estimate_delay(samples: Iterable[FtSamples], states: Iterable[ArmStates], es
     for _ in range(_PASSES):
         before_s = estimator.delay_s
         # in seconds of the whole, whatever the blocks, which keep few poses in memory
-        estimator.learn([Paired.concatenate(list(paired_blocks(samples, states, before_s)))])
+        estimator.learn([Paired.concatenate(list(pair_blocks(samples, states, before_s)))])
         if abs(estimator.delay_s - before_s) < _CONVERGED_S:
             break

@@ -15,7 +15,7 @@ from ftcalib.rounding import with_sigma
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia
 from ftdrive.live.frames import FrameTransform
-from ftdrive.live.motion import READING_S, REST, accelerated
+from ftdrive.live.motion import READING_S, REST, wrench_by_acceleration
 from ftdrive.live.noise import DriftFilter, NoiseEstimator, variance_at_next_use
 from ftdrive.live.samples import (
     Block,
@@ -98,7 +98,7 @@ class Processor:
             self._inertia = InertiaStage(info)
             self._motion = self._tool.motion_tracker()
             self._noise = NoiseEstimator(
-                info.sensor_rate_Hz, accelerated(calibration.mass_kg, calibration.parameters.p_sensor_com_m)
+                info.sensor_rate_Hz, wrench_by_acceleration(calibration.mass_kg, calibration.parameters.p_sensor_com_m)
             )
             self._noise_is_learnt = False
             # the arm's own sensor feels the friction of wrist 3

@@ -15,8 +15,8 @@ from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import BIASES, Array, skew
 from ftcalib.rounding import with_sigma
 from ftdrive.live.contact import GYRATION_M
-from ftdrive.live.frames import near
-from ftdrive.live.motion import READING_S, REST, STATES, MovedLoad, accelerated
+from ftdrive.live.frames import gripping_point
+from ftdrive.live.motion import READING_S, REST, STATES, MovedLoad, wrench_by_acceleration
 from ftdrive.live.noise import NoiseEstimator, variance_at_next_use
 from ftdrive.live.samples import LoadEvent, Paired, StreamEvent, StreamInfo, Tracked
 
@@ -337,7 +337,7 @@ class Windows:
         self._compensator = Compensator(self._tool, response=calibration.response)
         self._inertia = None if calibration.motion is None else calibration.motion.inertia_kg_m2
         self._beyond = np.diag(variance_at_next_use(calibration))
-        self._near_m = near(info)
+        self._near_m = gripping_point(info)
         self._load = MovedLoad(self._tool, calibration.g_m_s2, np.nan_to_num(info.p_flange_sensor_m), _REACH)
         # the bias is what is tracked: its error in the calibration does not count
         self._covariance = _without_bias(calibration.covariance)
@@ -346,7 +346,7 @@ class Windows:
         self._size = round(WINDOW_S * info.sensor_rate_Hz)
         self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
         self._weights = np.hanning(self._size + 2)[1:-1] / (np.hanning(self._size + 2).sum())
-        self._unknown = accelerated(calibration.mass_kg, self._tool.p_sensor_com_m) * _UNKNOWN_M_S2
+        self._unknown = wrench_by_acceleration(calibration.mass_kg, self._tool.p_sensor_com_m) * _UNKNOWN_M_S2
         self.restart()
 
     def restart(self) -> None:

@@ -14,7 +14,7 @@ from ftcalib.errors import AcceptanceError
 from ftcalib.files import JSON
 from ftcalib.model import angle_between
 from ftdrive.errors import ConfigError
-from ftdrive.live.frames import near
+from ftdrive.live.frames import gripping_point
 from ftdrive.live.loop import ProcessedStream
 from ftdrive.live.noise import unexplained_variance
 from ftdrive.live.replay import ReplayedStream
@@ -119,7 +119,7 @@ class Scale:
             np.array([one[1].covariance for one in self._readings]) + np.diag(unexplained_variance(calibration)),
             drift=drift_since(since_s),
             g_m_s2=calibration.g_m_s2,
-            p_sensor_near_m=near(stream.info),
+            p_sensor_near_m=gripping_point(stream.info),
             orientation_sigma_rad=calibration.components.get("rotation_rad", 0.0),
         )
         weight = replace(weight, scale_sigma=calibration.scale_sigma)

@@ -18,7 +18,7 @@ from ftdrive.live.processing import Processor
 from ftdrive.live.samples import Block, Paired, StreamEvent, WrenchFrame
 from ftdrive.recording.files import RecordingReader
 from ftdrive.recording.recorder import Recorder
-from ftdrive.recording.recording import ROW, Header, Measured, Source, ahead, with_calibration
+from ftdrive.recording.recording import ROW, Header, Measured, Source, read_ahead, with_calibration
 from ftdrivers.interfaces import Array
 
 _NOISE_S = 30.0
@@ -71,7 +71,7 @@ def read_with_calibration(
     return reader
 
 
-def compensated(
+def compensate_recording(
     source: Source,
     frame: WrenchFrame,
     output: Path | None = None,
@@ -133,8 +133,8 @@ def compensated(
             recorder = Recorder([output], info, header.configuration)
             stack.callback(recorder.discard)
         try:
-            blocks = _processed(ahead(source.blocks()) if overlap else source.blocks(), processor)
-            with closing(ahead(blocks) if overlap else blocks) as coming:  # so that no thread processes further
+            blocks = _processed(read_ahead(source.blocks()) if overlap else source.blocks(), processor)
+            with closing(read_ahead(blocks) if overlap else blocks) as coming:  # so that no thread processes further
                 for block, old, new, share in coming:
                     found.add(block, old, new, recorder)
                     show(f"Compensating: {share:.0%}")
@@ -262,7 +262,7 @@ def estimated_bias(
     readings, orientations = [np.empty((0, 6))], [np.empty((0, 3, 3))]
     waiting: list[Paired] = []
     with suppress(BadRecording):  # the pass that follows ends there too
-        for samples, _, share in ahead(source.blocks()) if overlap else source.blocks():
+        for samples, _, share in read_ahead(source.blocks()) if overlap else source.blocks():
             show(f"Estimating the bias: {share:.0%}")
             paired = Paired.concatenate([*waiting, samples])
             whole = len(paired) // size * size

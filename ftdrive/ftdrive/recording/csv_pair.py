@@ -17,7 +17,7 @@ from ftcalib.data.dataset import ORIENTATION_FORMS, list_names, orientation_colu
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
 from ftcalib.files import open_file
-from ftdrive.live.pairing import DelayEstimator, estimate_delay, paired_blocks
+from ftdrive.live.pairing import DelayEstimator, estimate_delay, pair_blocks
 from ftdrive.live.samples import Paired, Stages, StreamInfo, WrenchFrame
 from ftdrive.recording.recording import PIECE_ROWS, Header, Measured
 from ftdrive.runs.run import versions
@@ -112,13 +112,13 @@ def _columns(path: Path, head: bytes, wanted: Wanted) -> tuple[list[str], Sequen
 def _parsed(path: Path, text: bytes, columns: int, use: Sequence[int], before: int = 0) -> Array:
     """Parse lines behind so many rows of a file."""
     try:
-        return parsed(text, columns, use)
+        return parse_numbers(text, columns, use)
     except ValueError as error:
         place = f"{path.name}, after row {before}" if before else path.name  # loadtxt counts from there
         raise BadDataset(f"{place}: {error}: correct this line") from error
 
 
-def parsed(text: bytes, columns: int, use: Sequence[int]) -> Array:
+def parse_numbers(text: bytes, columns: int, use: Sequence[int]) -> Array:
     """Return some columns (k, n) of n whole lines; raises `ValueError` as `numpy.loadtxt`.
 
     The reader of Matrix Market files in SciPy takes an eighth of the time of `loadtxt` for the same bits. It ignores
@@ -222,7 +222,7 @@ class CsvPair:
         waiting: list[Paired] = []
         failure: BadDataset | None = None
         try:
-            for paired in paired_blocks(samples(), self._states, self.delay_s):
+            for paired in pair_blocks(samples(), self._states, self.delay_s):
                 rows = Paired.concatenate([*waiting, paired])
                 if len(rows) >= PIECE_ROWS:  # as of other recordings, because the contact test goes in steps
                     yield Measured(rows.rows(slice(PIECE_ROWS)), (), share[0])

@@ -14,7 +14,7 @@ from ftcalib.files import JSON
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import Block, StreamEvent, StreamInfo
 from ftdrive.recording.files import RecordingFile, RecordingReader, format_of, require_new_recordings
-from ftdrive.recording.recording import ROW, Header, Rows, ahead, divided, rows_of
+from ftdrive.recording.recording import ROW, Header, Rows, divided, read_ahead, rows_of
 
 _FLUSH_NS = 200_000_000
 """Writing takes a few ms, in which the stream waits."""
@@ -255,7 +255,7 @@ def converted(
     with ExitStack() as stack:
         stack.callback(files.discard)
         try:
-            for piece in ahead(reader.pieces()):
+            for piece in read_ahead(reader.pieces()):
                 for rows, events in divided(piece):
                     if len(rows):
                         if not samples:

@@ -299,7 +299,7 @@ def divided(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
         )
 
 
-def ahead(items: Iterator[T]) -> Generator[T, None, None]:
+def read_ahead(items: Iterator[T]) -> Generator[T, None, None]:
     """Give items of which a thread always makes the next one; errors come in their place."""
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, items, None)

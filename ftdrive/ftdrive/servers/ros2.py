@@ -108,7 +108,7 @@ class Level(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class Diagnosis:
     """One part of the node: "stream", "sensor", "arm" or "calibration"."""
 
     part: str
@@ -129,12 +129,12 @@ class Report:
         )
 
 
-def not_open(text: str, level: Level) -> list[Report]:
+def not_open(text: str, level: Level) -> list[Diagnosis]:
     """Report a stream that is not open."""
-    return [Report("stream", level, text)]
+    return [Diagnosis("stream", level, text)]
 
 
-def reports_of(stream: ProcessedStream, warnings: tuple[str, ...], lost_before: int, sent: int) -> list[Report]:
+def reports_of(stream: ProcessedStream, warnings: tuple[str, ...], lost_before: int, sent: int) -> list[Diagnosis]:
     """Report an open stream; `lost_before` is the number of lost samples at the report before."""
     status, info = stream.status(), stream.info
     sensor = _link("sensor", status.sensor, info.sensor, status.sensor.lost - lost_before)
@@ -144,14 +144,14 @@ def reports_of(stream: ProcessedStream, warnings: tuple[str, ...], lost_before: 
     usable = calibration.verdict != "rejected"
     level = Level.ERROR if not usable else Level.WARN if doubts else Level.OK
     text = "; ".join(doubts) or info.calibration_state
-    state = Report("calibration", level, text, {"file": info.calibration_name, "verdict": calibration.verdict})
+    state = Diagnosis("calibration", level, text, {"file": info.calibration_name, "verdict": calibration.verdict})
     failed = status.sensor.error or status.arm.error
     words = failed or f"{stream.frame}; {stages_in_words(stream.stages)}"
-    whole = Report("stream", Level.ERROR if failed else Level.OK, words, _values(stream, status, sent))
+    whole = Diagnosis("stream", Level.ERROR if failed else Level.OK, words, _values(stream, status, sent))
     return [whole, sensor, arm, state]
 
 
-def _link(part: str, link: LinkStatus, device: Any, lost: int) -> Report:
+def _link(part: str, link: LinkStatus, device: Any, lost: int) -> Diagnosis:
     values = {"rate_Hz": f"{link.rate_Hz:.1f}", "lost": str(link.lost), "age_s": f"{link.age_s:.3f}"}
     if link.error:
         level, text = Level.ERROR, link.error
@@ -159,7 +159,7 @@ def _link(part: str, link: LinkStatus, device: Any, lost: int) -> Report:
         level, text = Level.WARN, f"{lost} samples lost since the report before"
     else:
         level, text = Level.OK, f"{link.rate_Hz:.0f} Hz"
-    return Report(part, level, text, values, f"{device.model} {device.serial}")
+    return Diagnosis(part, level, text, values, f"{device.model} {device.serial}")
 
 
 def _values(stream: ProcessedStream, status: StreamStatus, sent: int) -> dict[str, str]:
@@ -251,7 +251,7 @@ class Ros2Node:
         self._averaged: Averaged | None = None
         self._wanted: SimpleQueue[tuple[str, list[str], Event]] = SimpleQueue()
         """Tools that clients request: name, where the reason of a refusal goes, when it is decided."""
-        self._failure, self._reported, self._reported_s, self._lost = "", list[Report](), 0.0, 0
+        self._failure, self._reported, self._reported_s, self._lost = "", list[Diagnosis](), 0.0, 0
         self._in_contact, self._contact_s, self.sent = False, 0.0, 0
         self._ros.spin()
 
@@ -397,7 +397,7 @@ class Ros2Node:
             self._lost = self._stream.status().sensor.lost
             self._report(reports)
 
-    def _report(self, reports: list[Report]) -> None:
+    def _report(self, reports: list[Diagnosis]) -> None:
         """Publish reports, at once if a level has changed."""
         now_s = time.monotonic()
         levels, before = ([(one.part, one.level) for one in some] for some in (reports, self._reported))

@@ -5,7 +5,7 @@ import numpy as np
 from ftdrive.checks.devices import AXES
 from ftdrive.terminal.live import panels
 from ftdrive.terminal.live.lines import CONTACT, FAINT, STRONG, Line, characters, envelope, level
-from ftdrive.terminal.live.view import Columns, View
+from ftdrive.terminal.live.view import PlotColumns, View
 
 _WIDE = 120
 """From this width on the plots stand beside the table."""
@@ -102,14 +102,14 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
     return [*lines, axis.fit(width)]
 
 
-def _time_axis(columns: Columns, cells: int) -> Line:
+def _time_axis(columns: PlotColumns, cells: int) -> Line:
     span, half = f"-{panels.span(columns)}", f"-{columns.span_s / 2:.0f}"
     line = Line(" " * _GUTTER).add(span, FAINT, "g")
     line.to(_GUTTER + cells // 2 - len(half)).add(half, FAINT)
     return line.to(_GUTTER + cells - 3).add("now", FAINT)
 
 
-def _plot(view: View, columns: Columns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
+def _plot(view: View, columns: PlotColumns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
     """Draw one component: a line with contacts, marks and perhaps the value, then `rows` - 1 lines of Braille.
 
     The envelope of the samples stands before the zero line and the band of ±1 sigma of a sample about it.

@@ -33,7 +33,7 @@ from ftdrive.terminal.live.lines import (
     envelope,
     row_text,
 )
-from ftdrive.terminal.live.view import Columns, Reading, View
+from ftdrive.terminal.live.view import PlotColumns, ShownWrench, View
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 
 LEAST_FULL_SIGMA = 10.0
@@ -160,7 +160,7 @@ def _verified(view: View) -> tuple[str, str]:
     return found.in_words(now), GOOD if found.passed else BAD
 
 
-def _now(info: StreamInfo, reading: Reading) -> datetime:
+def _now(info: StreamInfo, reading: ShownWrench) -> datetime:
     return datetime.fromtimestamp((reading.t_host_ns + info.utc_offset_ns) * 1e-9, UTC)
 
 
@@ -203,18 +203,18 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
     return lines
 
 
-def span(columns: Columns) -> str:
+def span(columns: PlotColumns) -> str:
     """Return the duration of all columns in words."""
     return f"{columns.span_s:.{0 if columns.span_s > 5 else 1}f} s"
 
 
-def decimals(reading: Reading | None, first: int) -> int:
+def decimals(reading: ShownWrench | None, first: int) -> int:
     """Return how many decimals three components need to show their standard deviations."""
     usual = 3 if first else 2
     return usual if reading is None or not reading.sigma[first : first + 3].max() < 0.5 * 10**-usual else usual + 1
 
 
-def full_scale(columns: Columns, reading: Reading | None, first: int) -> float:
+def full_scale(columns: PlotColumns, reading: ShownWrench | None, first: int) -> float:
     """Return a round full scale for three components: the recent extremes fit, and noise alone stays small."""
     rows = slice(first, first + 3)
     largest = np.abs([columns.low[rows], columns.high[rows]])
@@ -279,7 +279,7 @@ def _bar(view: View, i: int, full: float, cells: int) -> Line:
     return Line(rest, FAINT).add(filled[::-1], style).add("│" + "·" * half, FAINT)
 
 
-def _trace(columns: Columns, i: int, full: float) -> Line:
+def _trace(columns: PlotColumns, i: int, full: float) -> Line:
     """Draw the recent past of a component in one row."""
     ink = characters(envelope(columns.low[i], columns.high[i], 1, full))[0]
     return layers(ink, np.zeros_like(ink), columns.contact_cells)
@@ -311,7 +311,7 @@ def _contact(view: View) -> Line:
     return Line("free  ", GOOD).add(test, FAINT)
 
 
-def line_of_force(reading: Reading | None) -> Line:
+def line_of_force(reading: ShownWrench | None) -> Line:
     """Return where the line of the contact force passes the reference point."""
     if reading is None or not reading.in_contact:
         return Line()

@@ -33,7 +33,7 @@ _MOST_NOTES = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Columns:
+class PlotColumns:
     """A span cut into columns of equal duration, oldest first."""
 
     low: Array
@@ -105,7 +105,7 @@ class History:
         slots = bins % self._size
         self._bin[slots], self._low[slots], self._high[slots], self._in_contact[slots] = bins, low, high, contact
 
-    def columns(self, end_ns: int, n: int) -> Columns:
+    def columns(self, end_ns: int, n: int) -> PlotColumns:
         """Return n columns of which the last contains `end_ns`."""
         each = max(1, round(_BINS / n))
         first = (end_ns // self._bin_ns // each - n + 1) * each
@@ -118,11 +118,11 @@ class History:
         empty = low > high
         low[empty], high[empty] = np.nan, np.nan
         contact = (self._in_contact[slots] & ~missing).reshape(n, each).any(axis=1)
-        return Columns(low, high, contact, int(first * self._bin_ns), each * self._bin_ns)
+        return PlotColumns(low, high, contact, int(first * self._bin_ns), each * self._bin_ns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reading:
+class ShownWrench:
     """The mean of the last 0.1 s of samples."""
 
     t_host_ns: int
@@ -168,7 +168,7 @@ class View:
 
     info: StreamInfo
     status: StreamStatus
-    reading: Reading | None
+    reading: ShownWrench | None
     """None before the first sample."""
     silent: str
     """Which device is silent, and what to do; empty while numbers are fresh."""
@@ -178,7 +178,7 @@ class View:
     notes: Sequence[Note]
     """Newest first."""
     checks: Sequence[Check]
-    columns: Callable[[int], Columns]
+    columns: Callable[[int], PlotColumns]
     """The recent past in that many columns."""
     recording_s: float | None
     """Duration of the recording; None without one."""
@@ -274,7 +274,7 @@ class Summary:
     def _now_ns(self) -> int:
         return 0 if self._newest is None else int(self._newest.t_host_ns[-1])
 
-    def _columns(self, n: int) -> Columns:
+    def _columns(self, n: int) -> PlotColumns:
         return self._histories[self.span_s].columns(self._now_ns, n)
 
     def _silent(self) -> str:
@@ -284,11 +284,11 @@ class Summary:
                 return f"{device.model}: {link.error or f'no sample for {link.age_s:.1f} s'}"
         return "" if feed.reader.failure is None else str(feed.reader.failure)
 
-    def _reading(self) -> Reading | None:
+    def _reading(self) -> ShownWrench | None:
         newest, n = self._newest, sum(each.n for each in self._recent)
         if newest is None:
             return None
-        return Reading(
+        return ShownWrench(
             t_host_ns=int(newest.t_host_ns[-1]),
             wrench=np.sum([each.wrench for each in self._recent], axis=0) / n,
             raw=np.sum([each.raw for each in self._recent], axis=0) / n,

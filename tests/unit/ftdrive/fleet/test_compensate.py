@@ -23,7 +23,7 @@ from ftdrive.fleet.compensate import (
 from ftdrive.fleet.workers import Answer, OtherVersion, Workers
 from ftdrive.live.samples import WrenchFrame
 from ftdrive.recording import Recorder, read_recording, write_recording
-from ftdrive.recording.compensation import compensated
+from ftdrive.recording.compensation import compensate_recording
 from tests.unit.ftdrive.recorded import block, calibration, info
 
 FRAME = WrenchFrame("base")
@@ -46,7 +46,7 @@ def at_once(function: Callable[..., list[Answer]], *arguments: Any) -> "Future[l
 @pytest.mark.parametrize("ending", [".mcap", ".csv", ".parquet"])
 def test_the_bytes_are_those_of_the_same_work_without_workers_and_come_again(ending: str, tmp_path: Path) -> None:
     source = record(tmp_path / f"a{ending}")
-    numbers, _ = compensated(read_recording(source), FRAME, tmp_path / f"b{ending}")
+    numbers, _ = compensate_recording(read_recording(source), FRAME, tmp_path / f"b{ending}")
     task = task_of(None, FRAME, "keep")
     content, _, line = compensated_bytes(source.read_bytes(), source.name, task).rpartition(b"\n")
     assert content == (tmp_path / f"b{ending}").read_bytes()

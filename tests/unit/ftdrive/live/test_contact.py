@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import Array
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia, _hotelling
-from ftdrive.live.noise import Noise
+from ftdrive.live.noise import SensorNoise
 from tests.unit.ftdrive.live.simulated import calibrated
 
 RATE_HZ, SIZE = 1000.0, 20
@@ -18,7 +18,7 @@ MASS_KG = 1.5
 BEYOND = np.repeat([1e-4, 1e-6], 3)
 RNG = np.random.default_rng(3)
 ROOT = RNG.standard_normal((6, 6)) * np.repeat([0.05, 0.002], 3)[:, None]
-NOISE = Noise(np.eye(6), ROOT @ ROOT.T, np.diag(np.repeat([1e-3, 1e-5], 3)), 300.0)
+NOISE = SensorNoise(np.eye(6), ROOT @ ROOT.T, np.diag(np.repeat([1e-3, 1e-5], 3)), 300.0)
 R = np.linalg.qr(RNG.standard_normal((3, 3)))[0]
 FRICTION_AXIS = np.array([0.0, 0.6, 0.8])
 
@@ -26,7 +26,7 @@ FRICTION_AXIS = np.array([0.0, 0.6, 0.8])
 class Known:
     """The noise of every state."""
 
-    def of(self, _: int) -> Noise:
+    def of(self, _: int) -> SensorNoise:
         return NOISE
 
 

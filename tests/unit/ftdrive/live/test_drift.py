@@ -5,13 +5,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array
-from ftdrive.live.noise import DriftFilter, Noise
+from ftdrive.live.noise import DriftFilter, SensorNoise
 
 SAMPLE = np.repeat([0.04, 0.0016], 3)
 READING = np.repeat([0.01, 0.0004], 3)
 """Variances."""
 UNCERTAINTY = np.repeat([0.02, 1e-5], 3)
-NOISE = Noise(np.diag(SAMPLE), np.diag(READING), np.zeros((6, 6)), 100.0)
+NOISE = SensorNoise(np.diag(SAMPLE), np.diag(READING), np.zeros((6, 6)), 100.0)
 TRUE_RATE = np.array([6.0, -8.0, 0.0, 0.1, 0.0, 0.0])
 """N/h and N·m/h."""
 EYE, TURNED = np.eye(3), Rotation.from_rotvec([0.0, 0.0, 0.05]).as_matrix()

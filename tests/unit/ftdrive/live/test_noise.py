@@ -5,7 +5,7 @@ import pytest
 
 from ftcalib.model import Array
 from ftdrive.live.motion import REST
-from ftdrive.live.noise import Noise, NoiseEstimator
+from ftdrive.live.noise import NoiseEstimator, SensorNoise
 
 RATE_HZ, SIZE = 1000.0, 20
 """A reading is 0.02 s."""
@@ -26,7 +26,7 @@ def learnt(residual: Array, state: int = REST, estimator: NoiseEstimator | None 
     return estimator
 
 
-def known(estimator: NoiseEstimator, state: int = REST) -> Noise:
+def known(estimator: NoiseEstimator, state: int = REST) -> SensorNoise:
     noise = estimator.of(state)
     assert noise is not None
     return noise

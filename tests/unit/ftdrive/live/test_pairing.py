@@ -15,7 +15,7 @@ from ftdrive.live.pairing import (
     PoseTrack,
     Timeline,
     estimate_delay,
-    paired_blocks,
+    pair_blocks,
 )
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.moving_load import Truth, record, sweep
@@ -199,7 +199,7 @@ def test_an_arm_at_rest_shows_no_delay() -> None:
 def test_recordings_of_different_times_are_rejected() -> None:
     samples, states = recording(0.0)
     with pytest.raises(BadDataset, match="no time in common"):
-        list(paired_blocks([samples], [states], 100.0))
+        list(pair_blocks([samples], [states], 100.0))
 
 
 def test_a_busy_computer_at_the_beginning_does_not_bend_the_line() -> None:

@@ -9,18 +9,18 @@ import pytest
 from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import Array, skew
 from ftdrive.live.motion import REST
-from ftdrive.live.noise import Noise
+from ftdrive.live.noise import SensorNoise
 from ftdrive.live.samples import Paired
 from ftdrive.live.tracking import Window, Windows
 from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, T0_NS, TRUTH, G, Motion, calibrated, info, paired
 
-NOISE = Noise(np.eye(6), np.diag(np.arange(1.0, 7.0)), np.zeros((6, 6)), 100.0)
+NOISE = SensorNoise(np.eye(6), np.diag(np.arange(1.0, 7.0)), np.zeros((6, 6)), 100.0)
 MASS_KG = float(np.linalg.norm(TRUTH.gravity_force_base_N)) / G
 H_S = 1e-3
 
 
 class Known:
-    def of(self, _: int) -> Noise:
+    def of(self, _: int) -> SensorNoise:
         return NOISE
 
 

@@ -13,7 +13,7 @@ from ftcalib.model import predict
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
 from ftdrive.recording import Header, Recording, csv_pair, read_recording
-from ftdrive.recording.compensation import compensated, estimated_bias
+from ftdrive.recording.compensation import compensate_recording, estimated_bias
 from ftdrive.recording.csv_pair import CsvPair, numbers_of, read_orientation
 from ftdrive.recording.recording import rows_of
 from ftdrivers.interfaces import Array
@@ -67,7 +67,7 @@ def recording(parameters: Parameters = TRUTH, seconds: float = 8.0) -> Recording
 
 def test_the_push_is_found_and_the_weight_is_gone(tmp_path: Path) -> None:
     source, output = recording(), tmp_path / "a.csv"
-    result, failure = compensated(source, WrenchFrame("flange", "sensor"), output)
+    result, failure = compensate_recording(source, WrenchFrame("flange", "sensor"), output)
     assert failure is None
     assert (result["samples"], result["gaps"]) == (4000, 0)
     assert result["duration_s"] == pytest.approx(7.998)
@@ -91,7 +91,7 @@ def test_the_push_is_found_and_the_weight_is_gone(tmp_path: Path) -> None:
 
 def test_a_frame_that_is_not_configured_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="height_mm"):
-        compensated(recording(seconds=1.0), WrenchFrame("base", "flange"), tmp_path / "a.csv")
+        compensate_recording(recording(seconds=1.0), WrenchFrame("base", "flange"), tmp_path / "a.csv")
     assert not list(tmp_path.iterdir())
 
 
@@ -105,8 +105,10 @@ def test_the_bias_of_a_zeroed_sensor_is_estimated_with_an_honest_sigma() -> None
     error = before + change["value"] - new
     assert (np.abs(error) < 6 * np.array(change["sigma"])).all()
     assert (np.array(change["sigma"]) < 0.03 * NOISE).all(), "about that of the mean of 4,500 samples, 0.015"
-    assert compensated(estimated, WrenchFrame()).numbers["compensated"]["force_max_N"] == pytest.approx(6, abs=0.3)
-    assert compensated(source, WrenchFrame()).numbers["compensated"]["force_max_N"] > 14
+    assert compensate_recording(estimated, WrenchFrame()).numbers["compensated"]["force_max_N"] == pytest.approx(
+        6, abs=0.3
+    )
+    assert compensate_recording(source, WrenchFrame()).numbers["compensated"]["force_max_N"] > 14
 
 
 def test_a_short_recording_shows_no_bias() -> None:
@@ -146,11 +148,11 @@ def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(tmp_path: Path)
     found = CsvPair(*files, calibration(), "c", None)
     assert found.delay_s == pytest.approx(0.012, abs=1e-3)
     assert 0 < found.delay_sigma_s < 1e-3
-    rms = compensated(found, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"]
+    rms = compensate_recording(found, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"]
     fixed = CsvPair(*files, calibration(), "c", 0.0)
     assert (fixed.delay_s, fixed.delay_sigma_s) == (0.0, 0.0)
     assert rms < 1.2 * np.sqrt(3) * 0.002
-    assert compensated(fixed, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"] > 1.5 * rms
+    assert compensate_recording(fixed, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"] > 1.5 * rms
 
 
 @pytest.mark.parametrize("damaged", ["wrench.csv", "poses.csv"])
@@ -164,7 +166,7 @@ def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
     monkeypatch.setattr(csv_pair, "_READ_BYTES", 1 << 15)
     found = CsvPair(*files, calibration(), "c", None)
     assert found.delay_s == pytest.approx(0.012, abs=2e-3)
-    numbers, failure = compensated(found, WrenchFrame(), tmp_path / "new.csv")
+    numbers, failure = compensate_recording(found, WrenchFrame(), tmp_path / "new.csv")
     assert isinstance(failure, BadDataset)
     assert f"{damaged}, after row" in numbers["cut"]
     assert 2600 < numbers["samples"] == len(read_recording(tmp_path / "new.csv").rows) <= 3400

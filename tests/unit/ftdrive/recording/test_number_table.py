@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ftcalib.errors import BadDataset
 from ftdrive.recording import csv_pair
-from ftdrive.recording.csv_pair import WRENCH, Part, mean_rate_Hz, parsed, read_table
+from ftdrive.recording.csv_pair import WRENCH, Part, mean_rate_Hz, parse_numbers, read_table
 from ftdrivers.interfaces import Array
 
 _PARTS = ["0", "1", "97", ".", "-", "e", "+", ",", "\n", "1.5", "-2.25", "1e-05", "7,8", "\r\n", " ", "#", "inf", "E"]
@@ -40,7 +40,7 @@ def test_both_readers_find_the_same_bits_or_none(text: str, columns: int) -> Non
     expected = by_numpy(text, use)
     with warnings.catch_warnings(action="ignore"):
         try:
-            found = parsed(text.encode(), columns, use)
+            found = parse_numbers(text.encode(), columns, use)
         except ValueError:
             assert expected is None
         else:
@@ -52,7 +52,7 @@ def test_both_readers_find_the_same_bits_or_none(text: str, columns: int) -> Non
 def test_decimals_need_no_slow_reader(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = by_numpy(text, [1, 0])
     monkeypatch.delattr(np, "loadtxt")
-    np.testing.assert_array_equal(parsed(text.encode(), 2, [1, 0]), expected)
+    np.testing.assert_array_equal(parse_numbers(text.encode(), 2, [1, 0]), expected)
 
 
 def test_a_long_table_is_read_in_parts_up_to_its_fault(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
 from ftdrive.live.samples import Block, WrenchFrame
 from ftdrive.terminal.live.feed import Feed
-from ftdrive.terminal.live.view import Reading, Summary, View
+from ftdrive.terminal.live.view import ShownWrench, Summary, View
 from tests.unit.ftdrive.terminal.fake_stream import R_BASE_FLANGE, SIGMA, FakeStream
 
 
@@ -29,7 +29,7 @@ class Rig:
         return self.summary.view()
 
 
-def reading_of(view: View) -> Reading:
+def reading_of(view: View) -> ShownWrench:
     assert view.reading is not None
     return view.reading
 
