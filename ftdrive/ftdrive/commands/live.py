@@ -44,8 +44,8 @@ from ftdrive.terminal.live.view import Summary, View
 from ftdrive.terminal.text import echo
 from ftdrivers.interfaces import Array
 
+# N and N·m, sensor axes, on the tool of an emulated cell.
 _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
-"""N and N·m, sensor axes, on the tool of an emulated cell."""
 
 
 @click.command()
@@ -143,7 +143,8 @@ def _print(stream: ProcessedStream, *, once: bool = False, as_json: bool = False
 def _show_table(stream: ProcessedStream, checks: Sequence[Check]) -> None:
     shown = Group()
     with (
-        Keyboard(0) if Keyboard.usable(0) else nullcontext(),  # Enter would break the screen
+        # Enter would break the screen
+        Keyboard(0) if Keyboard.usable(0) else nullcontext(),
         Live(console=answer, refresh_per_second=10) as screen,
     ):
         for view in _views(stream, checks):

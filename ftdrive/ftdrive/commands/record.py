@@ -151,7 +151,8 @@ def _so_far(recorder: "Recorder") -> str:
 def _report(recorder: "Recorder", frame: "WrenchFrame", name: str, *, as_json: bool) -> None:
     from ftdrive.terminal.console import beside
 
-    rate = f"{recorder.rate_Hz:.0f} Hz"  # of all samples: that of the first half second may differ much
+    # of all samples: that of the first half second may differ much
+    rate = f"{recorder.rate_Hz:.0f} Hz"
     for path in recorder.saved:
         samples = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, {rate}, gaps: {recorder.gaps}"
         beside(as_json).print(f" Saved {path}: {samples}")

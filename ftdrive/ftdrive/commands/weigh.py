@@ -60,7 +60,8 @@ def weigh(
             recorder = Recorder([output], stream.info, stream.cell.to_dict())
             stack.callback(recorder.close)
         on_screen = not (once or as_json) and sys.stdout.isatty()
-        later: list[str] = []  # a screen would hide it
+        # a screen would hide it
+        later: list[str] = []
         stack.callback(_print_all, later)
         log = open_log(source, stream, stack, later.append if on_screen else messages.print)
         weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg, moving=moving, log=log)

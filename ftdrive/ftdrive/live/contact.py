@@ -17,26 +17,27 @@ from ftdrive.live.noise import NoiseEstimator, SensorNoise
 from ftdrive.live.samples import Ns
 from ftdrive.live.stages import TARE_DRIFT_N, TARE_DRIFT_NM
 
+# The covariance of a calibration is evaluated again after so much turning.
 _TURN_RAD = 0.02
-"""The covariance of a calibration is evaluated again after so much turning."""
+# The offset of a free tool at rest follows after so many readings.
 _STEP = 10
-"""The offset of a free tool at rest follows after so many readings."""
+# Share of the difference that one step takes away: the offset follows within 2 s.
 _GAIN = 0.1
-"""Share of the difference that one step takes away: the offset follows within 2 s."""
+# The offset follows no farther than this beyond three sigmas of the prediction.
 _DRIFT = np.repeat([TARE_DRIFT_N, TARE_DRIFT_NM], 3)
-"""The offset follows no farther than this beyond three sigmas of the prediction."""
+# Acceleration of an arm in motion, one sigma, without positions; its error without the poses that follow; rotation.
 _UNKNOWN_M_S2, _COARSE_M_S2, _UNKNOWN_RAD_S2 = 1.0, 0.3, 2.5
-"""Acceleration of an arm in motion, one sigma, without positions; its error without the poses that follow; rotation."""
 GYRATION_M = 0.08
 """Radius of gyration of a tool, where its inertia is not known."""
+# Error of the time of a predicted wrench, beside that of the delay: accelerations are means over as long.
 _INEXACT_S = 0.005
-"""Error of the time of a predicted wrench, beside that of the delay: accelerations are means over as long."""
+# Friction of wrist 3, which the arm's own sensor feels.
 _FRICTION_NM = 0.15
-"""Of wrist 3, in the arm's own sensor."""
+# So many readings begin or end a contact.
+# Rules with one mean as long begin a contact later.
 _IN_A_ROW = 3
-"""So many readings begin or end a contact."""
+# From one of them to the next; the shorter one where inertia is subtracted, which needs the poses that follow.
 _LAG_S, _SHORT_LAG_S = READING_S, READING_S / 2
-"""From one of them to the next; the shorter one where inertia is subtracted, which needs the poses that follow."""
 
 
 class Inertia(Enum):
@@ -83,25 +84,25 @@ class ContactTest:
         if friction_axis is not None:
             self._friction[3:, 3:] = _FRICTION_NM**2 * np.outer(friction_axis, friction_axis)
         self._calibration: tuple[Parameters, Array, Response | None] | None = None
+        # Covariance of what inertia leaves.
         self._unknown = dict.fromkeys(Inertia, np.zeros((6, 6)))
-        """Covariance of what inertia leaves."""
         self.uncertainty = np.zeros((6, 6))
         """Covariance of the prediction at the newest orientation, sensor axes."""
         self.limit = float(chdtri(6, false_alarm_rate))
-        """Of the squared distance of the newest reading."""
+        """Limit of the squared distance of the newest reading."""
         self.restart()
 
     def restart(self) -> None:
         """Forget earlier samples and the offset."""
         self._earlier = np.zeros((self._size - 1, 6))
+        # The predictions of the last `READING_S` seconds.
         self._predicted: Array | None = None
-        """The predictions of the last `READING_S` seconds."""
         self._R: Array | None = None
         self._offset = np.zeros(6)
+        # Share of the variance of the prediction that the offset still has.
         self._share = 1.0
-        """Of the variance of the prediction that the offset still has."""
+        # Sum and number of the samples since the last step of the offset, and whether all were of a free tool.
         self._sum, self._count, self._is_free = np.zeros(6), 0, True
-        """Of the samples since the last step of the offset."""
         self._whitening: tuple[tuple[SensorNoise, float, Inertia | None], Array] | None = None
 
     def expect(

@@ -34,6 +34,7 @@ class ProcessedStream(Processor, ABC):
         return block
 
     def _call_on_contact(self) -> None:
+        # Outside of the lock of the processor: the function may call the stream.
         for contact in self.take_contacts():
             if self.on_contact is not None:
                 self.on_contact(contact)
@@ -103,6 +104,7 @@ class BlockReader:
                 self._failing_since_s = now_s
                 self._say(f"{error}. {self._meanwhile}")
             self.failure = error
+            # Each read has waited for the device already, so there is no pause here.
             if now_s - self._failing_since_s >= self.patience_s:
                 raise
             return None

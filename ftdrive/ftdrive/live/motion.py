@@ -20,12 +20,12 @@ SLOW = 2
 STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW
 """Rest, then the classes: the noise is learnt for each."""
 
+# Largest motion at rest, from the mean of one reading to the next: beyond joint noise of 3e-5 rad.
 _STILL_RAD, _STILL_M = 2e-4, 2e-4
-"""Largest motion at rest, from the mean of one reading to the next: beyond joint noise of 3e-5 rad."""
+# Motion of the centre of mass from which its wrench counts, which is felt before the motion is seen.
 _FELT_M = 4e-5
-"""Motion of the centre of mass from which its wrench counts, which is felt before the motion is seen."""
+# Rest begins so long after the last motion, and a state ends so long after it, because links ring behind it.
 _HOLD_S, _RINGS_S = 0.5, 0.4
-"""Rest begins so long after the last motion, and a state ends so long after it, because links ring behind it."""
 _LEVER_M = 0.5
 _SPEEDS = np.array(SPEEDS_RAD_S)
 
@@ -54,12 +54,12 @@ class MotionTracker:
         self._step_s = self._size / rate_Hz
         self._hold = round(_HOLD_S * rate_Hz)
         by_acceleration = wrench_by_acceleration(mass_kg, parameters.p_sensor_com_m) @ parameters.R_flange_sensor.T
+        # (6, 3) wrench by the change of a step of the centre of mass to the next, flange axes, m.
         self._felt_by_change = -by_acceleration / self._step_s**2
-        """(6, 3) wrench by the change of a step of the centre of mass to the next, flange axes, m."""
         self._p_flange_com_m = np.nan_to_num(p_flange_sensor_m) + parameters.R_flange_sensor @ parameters.p_sensor_com_m
         self._earlier: Array | None = None
+        # Samples since the last motion.
         self._since = self._hold
-        """Samples since the last motion."""
         self._classes = np.zeros(round(_RINGS_S * rate_Hz), np.int8)
 
     def follow(self, R_base_flange: Array, p_base_flange_m: Array) -> tuple[NDArray[np.int8], Array]:
@@ -78,12 +78,14 @@ class MotionTracker:
         p_base_com_m = np.nan_to_num(p_base_flange_m) + (R_base_flange.reshape(-1, 3) @ self._p_flange_com_m).reshape(
             n, 3
         )
-        poses = np.concatenate([R_base_flange.reshape(n, 9).T, p_base_com_m.T])  # (12, n), for sums along long rows
+        # (12, n), for sums along long rows
+        poses = np.concatenate([R_base_flange.reshape(n, 9).T, p_base_com_m.T])
         if self._earlier is None:
             self._earlier = np.repeat(poses[:, :1], 3 * k, axis=1)
         poses = np.concatenate([self._earlier, poses], axis=1)
         self._earlier = poses[:, n:].copy()
-        sums = np.cumsum(poses, axis=1) / k  # means, because joint noise in single poses looks like motion
+        # means, because joint noise in single poses looks like motion
+        sums = np.cumsum(poses, axis=1) / k
         moved = sums[:, 2 * k :] - 2 * sums[:, k:-k] + sums[:, : -2 * k]
         before, moved = moved[:, :n], moved[:, k:]
         change, far = moved - before, np.abs(moved)
@@ -92,7 +94,8 @@ class MotionTracker:
         self._since = int(n - 1 - newest[-1])
         moving = np.arange(n) - newest < self._hold
         felt = self._felt(R_base_flange, moved[9:], change[9:])
-        if not (moving.any() or self._classes.any()):  # the usual block of a live stream, in half the time
+        # the usual block of a live stream, in half the time
+        if not (moving.any() or self._classes.any()):
             return np.full(n, REST, np.int8), felt
         speed = self._rate(moved) / self._step_s
         changes = self._rate(change) / self._step_s**2 > ACCELERATION_RAD_S2 + speed**2

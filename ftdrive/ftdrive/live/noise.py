@@ -14,20 +14,20 @@ from ftdrive.live.motion import READING_S, REST, STATES, samples_in_reading
 from ftdrive.live.samples import Ns
 from ftdrivers.interfaces import Array
 
+# Successive readings of a window at rest, and of one in motion or of a short rest.
 _WINDOW, _SHORT = 25, 8
-"""Successive readings of a window at rest, and of one in motion or of a short rest."""
+# Readings before a motion is seen: they do not count for the rest before it.
 _UNSEEN = 4
-"""Readings before a motion is seen: they do not count for the rest before it."""
 _WINDOWS = 60
+# A window this many times louder than the median holds a touch or a jolt, and does not count.
 _LOUD = {True: 1.5, False: 4.0}
-"""A window this many times louder than the median holds a touch or a jolt, and does not count."""
+# A larger step between the means of two windows is the begin or the end of a contact.
 _STEP_SIGMAS = 5.0
-"""A larger step between the means of two windows is the begin or the end of a contact."""
+# Until the noise of a state of motion is known, it counts as so many times that at rest, and as an acceleration.
 _FIRST_MOTION, _FIRST_M_S2 = 10.0, 1.0
-"""Until the noise of a state of motion is known, it counts as so many times that at rest, and as an acceleration."""
 _ENOUGH_DOF = 25.0
+# Degrees of freedom per reading: low-pass filters of sensors make neighbours alike.
 _INDEPENDENT = 0.25
-"""Degrees of freedom per reading: low-pass filters of sensors make neighbours alike."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,11 +62,11 @@ class NoiseEstimator:
         self._size = samples_in_reading(rate_Hz)
         self._unread = np.empty((0, 7))
         self._at_rest = True
+        # Mean (6), scatter (6, 6) and state of the readings since the last window or change of rest and motion.
         self._open = np.empty((0, 43))
-        """Mean (6), scatter (6, 6) and state of the readings since the last window or change of rest and motion."""
         self._mean_before: Array | None = None
+        # Scatter of its readings, scatter of their samples, and step from the window before.
         self._windows: list[deque[tuple[Array, Array, Array]]] = [deque(maxlen=_WINDOWS) for _ in range(STATES)]
-        """Scatter of its readings, scatter of their samples, and step from the window before."""
         self._known: dict[int, SensorNoise] = {}
         self._first = _FIRST_M_S2**2 * accelerated @ accelerated.T
 
@@ -76,6 +76,7 @@ class NoiseEstimator:
         other = rest or next(iter(self._known.values()), None)
         if state == REST or other is None:
             return other
+        # A new class of motion counts as a loud one, for about 2 s of its motion.
         if known is None or known.dof < _ENOUGH_DOF:
             learnt = (one for k, one in sorted(self._known.items()) if k > state and one.dof >= _ENOUGH_DOF)
             if (faster := next(learnt, None)) is not None:
@@ -139,7 +140,8 @@ class NoiseEstimator:
         mean = reading[quiet].mean(axis=0) + np.diag(floor)
         steps = steps[np.isfinite(steps[:, 0])]
         if len(steps):
-            smallest = np.quantile(np.square(steps), 0.25, axis=0) / 0.1015  # the same quantile of chi²
+            # the same quantile of chi²
+            smallest = np.quantile(np.square(steps), 0.25, axis=0) / 0.1015
             usual = np.sqrt(smallest + np.diag(mean) / _WINDOW)
             steps = steps[(np.abs(steps) < _STEP_SIGMAS * usual).all(axis=1)]
         wander = steps.T @ steps / max(len(steps), 1)
@@ -155,22 +157,22 @@ def _about_line(n: int) -> Array:
 
 
 _MEAN_NS = 1_000_000_000
+# Largest motion during a mean.
 _STILL_RAD = 1e-3
-"""Largest motion during a mean."""
 
+# Usual drift, one standard deviation, N/h and N·m/h; it may change as much within an hour.
 _RATE_PER_H = np.repeat([5.0, 0.15], 3)
-"""Usual drift, one standard deviation, N/h and N·m/h; it may change as much within an hour."""
+# Usual error of the bias at the beginning, N and N·m.
 _BIAS = np.repeat([1.0, 0.03], 3)
-"""Usual error of the bias at the beginning, N and N·m."""
+# Random walk of the bias in a minute, relative to the noise of one sample.
 _WANDER = 0.1
-"""Random walk of the bias in a minute, relative to the noise of one sample."""
+# A squared innovation of six channels beyond the limit of one in a thousand is a contact and not drift.
 _GATE = 22.5
-"""A squared innovation of six channels beyond the limit of one in a thousand is a contact and not drift."""
 _WARNED_SIGMAS = 5.0
+# After so many rejected means the bias is taken as unknown again.
 _PERMANENT = 30
-"""After so many rejected means the bias is taken as unknown again."""
+# Between poses farther apart than this the error of the calibration differs.
 _TURN_RAD = 0.03
-"""Between poses farther apart than this the error of the calibration differs."""
 
 
 class DriftFilter:
@@ -244,7 +246,8 @@ class DriftFilter:
         innovation, S = residual - self._x[:, 0], self._P[:, 0, 0] + variance
         if float((innovation**2 / S).sum()) > _GATE:
             self._rejected += 1
-            if self._rejected >= _PERMANENT:  # a step of the bias, or a load that stays
+            # a step of the bias, or a load that stays
+            if self._rejected >= _PERMANENT:
                 self._P[:, 0, 0], self._rejected = _BIAS**2, 0
             return
         self._rejected = 0

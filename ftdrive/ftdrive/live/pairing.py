@@ -25,50 +25,51 @@ from ftdrivers.interfaces import ArmStates, Array, FtSamples
 _BUCKET_S, _BUCKETS = 0.25, 40
 _LEAST_SCATTER_NS = 1e4
 CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
-"""Of a device's clock, and of the nominal rate of a sensor without one."""
+"""Relative error of a device's clock, and of the nominal rate of a sensor without one, one sigma."""
 _IMPLAUSIBLE = 4.0
+# Times never jump and never run backwards: they approach a better estimate at this fraction of the time passing.
 _SLEW = 0.05
-"""Times never jump and never run backwards: they approach a better estimate at this fraction of the time passing."""
+# They approach one that is farther away faster.
 _FAR_NS, _FASTEST_SLEW = 2e8, 0.9
-"""They approach one that is farther away faster."""
+# A clock is no clock of seconds if it differs by so much over this time.
 _SCALED_S, _SCALED = 0.2, 0.05
-"""A clock is no clock of seconds if it differs by so much over this time."""
 _PASSES = 4
+# A recording is paired so often until its delay changes by less.
 _CONVERGED_S = 1e-8
-"""A recording is paired so often until its delay changes by less."""
+# If so many buckets in a row are later than this, and alike, the line before them is no longer true.
 _STEP_BUCKETS, _STEP_NS = 8, 5e6
-"""If so many buckets in a row are later than this, and alike, the line before them is no longer true."""
+# A pose is extrapolated at most so far: one interval of a CB3 controller, with some delay.
+# A wrench does not wait for the next pose: waiting delayed a block by one interval and split it.
 _MOST_AHEAD_NS = 10_000_000
-"""A pose is extrapolated at most so far: one interval of a CB3 controller, with some delay."""
+# Poses are kept so long, for samples that are late.
 _KEEP_NS = 2_000_000_000
-"""Of poses, for samples that are late."""
+# A device whose count is so far from the line has restarted.
 _LOST_S = 1.0
-"""A device whose count is so far from the line has restarted."""
 MOST_DELAY_S = 0.1
 
 PERIOD_S = 0.024
 """Samples are averaged over this time: over a shorter one, noise of the poses passes for acceleration."""
 _BATCH_S = 1.0
+# Neighbours on each side from which the acceleration comes.
 _REACH = 2
-"""Neighbours on each side from which the acceleration comes."""
+# What means of an acceleration keep of it when it comes from means of the poses: a parabola through five of them.
 _SAME = np.convolve([2, 3, 2], [1, 10, 1]) / 84
-"""What means of an acceleration keep of it when it comes from means of the poses: a parabola through five of them."""
+# The estimate is applied from this sigma on.
 _USABLE_S = 3e-3
-"""The estimate is applied from this sigma on."""
+# Slower, a tool does not show the delay.
 _SLOWEST_RAD_S = 0.02
-"""Slower, a tool does not show the delay."""
+# Sigma of the delay before the first estimate, without and with that of a calibration in motion.
 _PRIOR_S, _SAME_LINKS_S = 0.05, 0.005
-"""Of the delay before the first estimate, one sigma: without and with that of a calibration in motion."""
+# Change of the bias since the calibration, one standard deviation.
 _BIAS_N = 0.5
-"""Change of the bias since the calibration, one standard deviation."""
+# Weight of what the tool may hold, relative to its own, one standard deviation.
 _HELD = 0.05
-"""Weight of what the tool may hold, relative to its own, one standard deviation."""
+# Error of the configured origin of the sensor; without one, `_ANY_LEVER_M`.
 _LEVER_M = 0.005
-"""Error of the configured origin of the sensor; without one, `_ANY_LEVER_M`."""
 _ANY_LEVER_M = 0.1
 _FLOOR_N = 1e-3
+# After a larger change the samples of the next second are not used, because times follow it slowly.
 _NOTICED_S = 2e-4
-"""After a larger change the samples of the next second are not used, because times follow it slowly."""
 
 
 class Timeline:
@@ -108,7 +109,8 @@ class Timeline:
         behind_ns = y - self._slope * x
         k = int(np.argmin(behind_ns))
         if self._last is not None and (
-            x[0] < self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9  # the device has restarted
+            # the device has restarted
+            x[0] < self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9
         ):
             self.restart()
             return self.stamp(count, t_host_ns)
@@ -118,7 +120,8 @@ class Timeline:
             times = self._slope * (x - x[-1]) + end
         else:
             x_0, y_0 = self._last
-            if x[-1] <= x_0:  # the device's clock has coarse steps
+            # the device's clock has coarse steps
+            if x[-1] <= x_0:
                 return np.full(len(x), self._origin[1] + round(y_0), np.int64)
             due = self._slope * (x[-1] - x_0)
             slew = min(max(_SLEW, abs(end - y_0 - due) / _FAR_NS), _FASTEST_SLEW)
@@ -135,7 +138,8 @@ class Timeline:
             late = list(self._points)[-_STEP_BUCKETS - 1 : -1]
             by_ns = [b - self._slope * a - self._offset for a, b in late]
             if len(late) == _STEP_BUCKETS and min(by_ns) > max(_STEP_NS, 0.7 * max(by_ns)):
-                self._points = deque([*late, (x, y)], maxlen=_BUCKETS)  # samples were lost that nothing has counted
+                # samples were lost that nothing has counted
+                self._points = deque([*late, (x, y)], maxlen=_BUCKETS)
         elif y - self._slope * x < self._points[-1][1] - self._slope * self._points[-1][0]:
             self._points[-1] = x, y
         elif len(self._points) > 1:
@@ -153,7 +157,8 @@ class Timeline:
             error = (above_ns + _LEAST_SCATTER_NS) / ((hull[-1][0] - hull[0][0]) * self._nominal_ns)
             weight = 1 / (1 + (error / self._tolerance) ** 2)
             if abs(slope / self._nominal_ns - 1) > _IMPLAUSIBLE * self._tolerance:
-                weight = 0.0  # no drift of a clock, but a growing delay
+                # no drift of a clock, but a growing delay
+                weight = 0.0
             self._slope = weight * slope + (1 - weight) * self._nominal_ns
         self._offset = min(b - self._slope * a for a, b in self._points)
 
@@ -170,9 +175,10 @@ class PoseTrack:
 
     def __init__(self) -> None:
         self._t_ns = np.empty(0, np.int64)
+        # Both, with room for more.
         self._room = np.empty(0, np.int64), np.empty((0, 14))
-        """Both, with room for more."""
-        self._columns = np.empty((0, 14))  # unit quaternion x y z w, position, joint angles, half the angle to the next
+        # unit quaternion x y z w, position, joint angles, half the angle to the next
+        self._columns = np.empty((0, 14))
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
@@ -262,7 +268,8 @@ class DelayEstimator:
         self._calibration = calibration
         place_m = p_flange_sensor_m if known else np.array([0.0, 0.0, 0.05])
         self._load = MovedLoad(calibration.parameters, calibration.g_m_s2, place_m, _REACH)
-        self._scale = np.zeros((13, 13))  # maps 13 numbers of sigma 1 to delay, errors of the calibration, lever
+        # maps 13 numbers of sigma 1 to delay, errors of the calibration, lever
+        self._scale = np.zeros((13, 13))
         self._scale[0, 0] = _PRIOR_S
         change = np.repeat([0.0, _HELD * calibration.weight_N, _BIAS_N], 3)
         errors = calibration.covariance[:9, :9] + np.diag(change**2)
@@ -274,14 +281,15 @@ class DelayEstimator:
         self._settling = False
         motion = calibration.motion
         self.delay_s = 0.0 if motion is None else min(max(motion.delay_s, -MOST_DELAY_S), MOST_DELAY_S)
-        """That of the calibration, then the estimate as soon as it is good enough; samples are paired with it."""
+        """Delay that samples are paired with: of the calibration, then the estimate as soon as it is good enough."""
         self.sigma_s = _PRIOR_S if motion is None else _SAME_LINKS_S
         """One standard deviation of the estimate."""
 
     def add(self, paired: Paired) -> None:
         """Learn from samples that were paired with `delay_s`, and improve it."""
         pieces = self._whole_seconds(paired)
-        if pieces and self._settling:  # part of it was paired with another delay
+        # part of it was paired with another delay
+        if pieces and self._settling:
             self._settling = False
         elif sum(map(self._learn, pieces)):
             self._apply()
@@ -389,7 +397,7 @@ class Pairing:
 
     @property
     def delay_s(self) -> float:
-        """Of the wrench after the pose."""
+        """Delay of the wrench after the pose."""
         return self._estimator.delay_s if self._estimator else self._delay_s
 
     @property

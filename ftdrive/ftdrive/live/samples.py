@@ -17,8 +17,8 @@ from ftdrivers.interfaces import Array, Columns, DeviceInfo
 Axes = Literal["sensor", "flange", "base", "tcp"]
 Point = Literal["sensor", "flange", "tcp"]
 Ns = NDArray[np.int64]
+# One sigma.
 _KNOWN_HEIGHT_M = 3e-3
-"""One sigma."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +186,7 @@ class LoadEvent:
     size: float
     """Change of the mass, kg, or the largest force, N."""
     sigma: float = 0.0
-    """Of the change of the mass, kg."""
+    """One sigma of the change of the mass, kg."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -332,7 +332,7 @@ class StreamStatus:
     sensor: LinkStatus
     arm: LinkStatus
     delay_s: float
-    """Of the wrench after the pose."""
+    """Delay of the wrench after the pose."""
     delay_sigma_s: float
     """0 if the delay is configured."""
     tare: Array | None
@@ -342,7 +342,7 @@ class StreamStatus:
     """Drift of the force bias while nothing touches the tool."""
     drift_sigma_N_h: float
     contact_limit: float
-    """Of `chi2`."""
+    """Limit of `Block.chi2`."""
     false_alarm_rate: float
     tracked: Tracked | None = None
     """Bias and held part beside the calibration; None unless the stream follows them."""

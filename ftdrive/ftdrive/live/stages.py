@@ -22,12 +22,12 @@ from ftdrive.live.motion import REST, MotionTracker, MovedLoad
 from ftdrive.live.samples import Paired, Stages, StreamInfo
 from ftdrivers.interfaces import Array
 
+# Changes of the temperature that move the bias, and that are an event.
 _STEP_K, _NOTED_K = 0.05, 1.0
-"""Changes of the temperature that move the bias, and that are an event."""
+# Poses of this spacing give the acceleration.
 _KNOT_S = 0.002
-"""Poses of this spacing give the acceleration."""
+# Half the time over which poses give the acceleration: longer ones lose the edges of a move, and are later.
 _REACH_S = 0.015
-"""Half the time over which poses give the acceleration: longer ones lose the edges of a move, and are later."""
 LOWPASS_ORDER = 2
 """Butterworth."""
 NOTCH_Q = 10.0
@@ -36,8 +36,8 @@ TARE_S = 0.5
 TARE_DRIFT_N, TARE_DRIFT_NM = 0.5, 0.015
 """A tare accepts this much drift of the bias since the calibration or the tare before, one standard deviation."""
 
+# Largest motion of the flange during a tare.
 _STILL_RAD, _STILL_M = 5e-4, 5e-4
-"""Largest motion of the flange during a tare."""
 
 
 def standard_stages(info: StreamInfo) -> Stages:
@@ -65,8 +65,8 @@ class _Reference(NamedTuple):
 
     empty: Calibrated
     t_ns: int
+    # Temperature of the sensor then; NaN where it is not known.
     temperature_C: float
-    """Of the sensor then; NaN where it is not known."""
 
 
 class FreeTool:
@@ -91,7 +91,7 @@ class FreeTool:
         self.empty: Calibrated = self._calibration
         """The newest reference at the present temperature."""
         self.expected: Calibrated = self._calibration
-        """The same with the part that is held."""
+        """The empty tool with the part that is held."""
         self.load: Calibrated = self._calibration
         """The tool as calibrated with the part that is held: weight and inertia do not change with the bias."""
         self._compensator: Compensator = self._calibration.compensator
@@ -104,7 +104,7 @@ class FreeTool:
 
     @property
     def mass_kg(self) -> float:
-        """Of the load, with a part that is held."""
+        """Mass of the tool and the part that is held."""
         return float(np.linalg.norm(self.expected.parameters.gravity_force_base_N)) / self._calibration.g_m_s2
 
     def motion_tracker(self) -> MotionTracker:
@@ -202,8 +202,8 @@ class InertiaStage:
         """Forget the samples before an interruption."""
         self._buffer: Paired | None = None
         self._states, self._felt = np.zeros(0, np.int8), np.zeros((0, 6))
+        # Rows of the buffer that are processed.
         self._done = 0
-        """Rows of the buffer that are processed."""
 
     @property
     def knows_tensor(self) -> bool:
@@ -246,7 +246,8 @@ class InertiaStage:
         else:
             state = self._states[self._done : end]
         rows, felt = buffer.rows(slice(self._done, end)), self._felt[self._done : end]
-        keep = max(0, end - neighbours - self._stride) // self._stride * self._stride  # knots stay where they are
+        # knots stay where they are
+        keep = max(0, end - neighbours - self._stride) // self._stride * self._stride
         self._buffer, self._done = buffer.rows(slice(keep, None)), end - keep
         self._states, self._felt = self._states[keep:], self._felt[keep:]
         return rows, (state, felt), inertial
@@ -255,7 +256,8 @@ class InertiaStage:
         """Return the inertial wrench of all rows, and the number of those with neighbours on both sides."""
         knots = np.arange(0, len(rows), self._stride)
         t_s = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
-        knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]  # a coarse clock repeats times
+        # a coarse clock repeats times
+        knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]
         if len(knots) < 2 * self._reach + 2:
             return np.zeros((len(rows), 6)), 0
         moved = MovedLoad(load.parameters, self._g_m_s2, self._p_flange_sensor_m, self._reach)

@@ -45,10 +45,10 @@ from ftdrivers.interfaces import ArmStates, ArmStatus, DeviceInfo, ForceTorqueSe
 STALE_S = 0.3
 """Without a new sample of either device for so long, `CompensatedStream.read` raises."""
 
+# Between two attempts to reconnect.
 _RETRY_S = 0.2
-"""Between two attempts to reconnect."""
+# At the beginning both rates are measured.
 _RATE_S = 0.5
-"""At the beginning both rates are measured."""
 _RATE_WINDOW_NS = 1_000_000_000
 
 
@@ -111,8 +111,8 @@ class CompensatedStream(ProcessedStream):
         at any time: longer blocks arrive later and take less of the processor."""
         self._stack = ExitStack()
         self._follows: ExitStack | None = None
+        # The device that has failed, "sensor" or "arm", and why.
         self._failure: tuple[str, DeviceError] | None = None
-        """The device that has failed, "sensor" or "arm", and why."""
         self._silent_since_ns: int | None = None
         self._arrivals: deque[tuple[int, int]] = deque()
         self._arm_lost = 0
@@ -198,7 +198,8 @@ class CompensatedStream(ProcessedStream):
             arm=arm,
             sensor=sensor,
             tool=self._wanted if isinstance(self._wanted, str) else self.cell.tool.name,
-            utc_offset_ns=time.time_ns() - self.clock.now_ns(),  # the anchor of all times in files
+            # the anchor of all times in files
+            utc_offset_ns=time.time_ns() - self.clock.now_ns(),
             sensor_rate_Hz=sensor_rate_Hz,
             arm_rate_Hz=arm_rate_Hz,
             p_flange_sensor_m=sensor_origin_m(self.cell.sensor.height_mm, self._calibration),
@@ -239,7 +240,8 @@ class CompensatedStream(ProcessedStream):
             self._wanted = before
             raise
         verification, state = self._trusted()
-        self.restart()  # a contact is not continued
+        # a contact is not continued
+        self.restart()
         self._call_on_contact()
         info = replace(
             self.info,
@@ -301,6 +303,8 @@ class CompensatedStream(ProcessedStream):
         blocks = [self._sensor_follow.read(wait_s)]
         rows = len(blocks[0])
         wanted = self.block_s * self.info.sensor_rate_Hz
+        # A pause between reads left the newest sample waiting for up to 5 ms, so the block ends with one that just
+        # arrived.
         while 0 < rows < wanted and len(more := self._sensor_follow.read(self.block_s)):
             blocks.append(more)
             rows += len(more)

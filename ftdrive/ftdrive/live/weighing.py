@@ -27,14 +27,14 @@ from ftdrivers.interfaces import Array
 
 WEIGH_S: Final = TARE_S
 """A weighing averages so long."""
+# The variance of a mean comes from its own samples. With n of them it is raised by this over n.
 _FEW: Final = 10.0
-"""The variance of a mean comes from its own samples. With n of them it is raised by this over n."""
+# In motion the last window may be so old.
 _LATE_S: Final = 1.0
-"""In motion the last window may be so old."""
+# Poses farther apart than this show more of the centre of mass.
 _NEW_POSE_RAD: Final = 0.17
-"""Poses farther apart than this show more of the centre of mass."""
+# So far from a whole number of parts is no number of parts.
 _WHOLE: Final = 0.1
-"""So far from a whole number of parts is no number of parts."""
 
 WORDS: Final[Mapping[str, str]] = {
     "samples": "too few samples: wait half a second",
@@ -88,8 +88,8 @@ class Scale:
     def __init__(self, stream: ProcessedStream) -> None:
         self._stream = stream
         self._readings: list[tuple[Array, PoseMean]] = []
+        # Noise of a sample at rest: steps of the load make it look louder for a while.
         self._quietest = np.full(6, np.inf)
-        """Noise of a sample at rest: steps of the load make it look louder for a while."""
 
     def weigh(self, since_ns: int = 0, *, more: bool = False) -> Weight:
         """Weigh the last half second.
@@ -136,6 +136,7 @@ class Scale:
             The arm or the reading is not at rest, or too far from that of the empty tool.
         """
         self._rest(since_ns)
+        # A zero is a tare, so it is refused where a tare is: else the contact wrench would keep the old bias.
         event = self._stream.tare()
         if event.kind != "tare":
             raise CannotWeigh("not-empty")
@@ -192,7 +193,8 @@ def weigh_in_motion(stream: ProcessedStream, since_ns: int = 0) -> Weight:
         raise ConfigError('the stream does not follow the load: open it with track="show" to weigh in motion')
     rows, tracked = stream.recent(), stream.tracked
     if rows is None or tracked is None or not np.isfinite(tracked.last_seen_s):
-        raise CannotWeigh("samples")  # the first windows are no answer: an empty gripper is assumed
+        # the first windows are no answer: an empty gripper is assumed
+        raise CannotWeigh("samples")
     t_ns = round(1e9 * tracked.t_s)
     if t_ns < max(since_ns, int(rows.t_host_ns[-1]) - round(1e9 * _LATE_S)):
         raise CannotWeigh("samples")

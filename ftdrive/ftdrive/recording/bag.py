@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 _POSES: Final = "geometry_msgs/msg/PoseStamped"
 _MAGIC: Final = b"\x89MCAP0\r\n"
+# Times in ns, and numbers.
 _Column = tuple[NDArray[np.int64], Array]
-"""Times in ns, and numbers."""
 
 
 def is_bag(path: Path) -> bool:
@@ -122,6 +122,7 @@ def as_csv_pair(bag: Bag, name: str) -> Iterator[tuple[Path, Path]]:
             (files[1], bag.t_pose_s, bag.pose, ("qx", "qy", "qz", "qw", "x", "y", "z")),
         ):
             header = ",".join(("t", *names))
+            # 17 digits keep every bit of a float64.
             np.savetxt(file, np.column_stack([t_s, values]), "%.17g", ",", header=header, comments="")
         yield files
 
@@ -218,7 +219,8 @@ def _poses(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[b
         return _from_joints(reader, named, messages)
     found = [
         (pose.t_ns, pose.R_base_flange, pose.p_base_flange_m)
-        for topic in sorted(named.topics, key=lambda topic: topic != "/tf_static")  # a bag may have latched ones late
+        # a bag may have latched ones late
+        for topic in sorted(named.topics, key=lambda topic: topic != "/tf_static")
         for data in messages[topic]
         for pose in named.read(topic, reader.deserialize(data, named.topics[topic]))
     ]

@@ -21,13 +21,13 @@ from ftdrive.recording.recorder import Recorder
 from ftdrive.recording.recording import ROW, Header, Measured, Source, read_ahead, with_calibration
 from ftdrivers.interfaces import Array
 
+# The noise is that of the beginning of a recording.
 _NOISE_S = 30.0
-"""The noise is that of the beginning of a recording."""
 _OF_FORCE_AND_TORQUE = np.kron(np.eye(2), np.ones((3, 1)))
 NEEDED = ("t_host_ns", "seq", "raw", "p_base_flange_m", "quaternion_base_flange")
 """Columns without which there is no compensation."""
+# Events of a recording that hold for its compensated one too.
 _KEPT = ("mark", "delay", "stale", "recovered")
-"""Events of a recording that hold for its compensated one too."""
 _READING_S = 0.1
 _OUTLIER_SIGMAS = 4.0
 _LEAST_READINGS = 20
@@ -134,7 +134,8 @@ def compensate_recording(
             stack.callback(recorder.discard)
         try:
             blocks = _processed(read_ahead(source.blocks()) if overlap else source.blocks(), processor)
-            with closing(read_ahead(blocks) if overlap else blocks) as coming:  # so that no thread processes further
+            # so that no thread processes further
+            with closing(read_ahead(blocks) if overlap else blocks) as coming:
                 for block, old, new, share in coming:
                     found.add(block, old, new, recorder)
                     show(f"Compensating: {share:.0%}")
@@ -142,7 +143,8 @@ def compensate_recording(
             if not found.samples:
                 raise
             failure = error
-        processor.restart()  # a contact at the end is over
+        # a contact at the end is over
+        processor.restart()
         found.add(None, [], [one for one in processor.take_events() if one.t_host_ns <= found.end_ns], recorder)
         if recorder is not None:
             recorder.close()
@@ -183,7 +185,8 @@ class _Sums:
     def __init__(self) -> None:
         self.samples, self._gaps = 0, 0
         self._begin_ns, self.end_ns, self._seq = 0, 0, 0
-        self._squares, self._largest = np.zeros((2, 2)), np.zeros((2, 2))  # raw and compensated, force and torque
+        # raw and compensated, force and torque
+        self._squares, self._largest = np.zeros((2, 2)), np.zeros((2, 2))
         self._contacts: list[dict[str, Any]] = []
         self._delay: dict[str, Any] | None = None
 
@@ -261,7 +264,8 @@ def estimated_bias(
     size = max(1, round(_READING_S * info.sensor_rate_Hz))
     readings, orientations = [np.empty((0, 6))], [np.empty((0, 3, 3))]
     waiting: list[Paired] = []
-    with suppress(BadRecording):  # the pass that follows ends there too
+    # the pass that follows ends there too
+    with suppress(BadRecording):
         for samples, _, share in read_ahead(source.blocks()) if overlap else source.blocks():
             show(f"Estimating the bias: {share:.0%}")
             paired = Paired.concatenate([*waiting, samples])
@@ -269,7 +273,8 @@ def estimated_bias(
             waiting = [paired.rows(slice(whole, None))]
             left = calibration.compensate(paired.raw[:whole], paired.R_base_flange[:whole])
             readings.append(left.reshape(-1, size, 6).mean(axis=1))
-            orientations.append(paired.R_base_flange[:whole][size // 2 :: size].copy())  # a view keeps the block
+            # a view keeps the block
+            orientations.append(paired.R_base_flange[:whole][size // 2 :: size].copy())
     reading, R = np.concatenate(readings), np.concatenate(orientations)
     if len(reading) < _LEAST_READINGS:
         seconds = len(reading) * _READING_S + sum(map(len, waiting)) / info.sensor_rate_Hz
@@ -281,7 +286,8 @@ def estimated_bias(
     scatter = kept - change
     correlation = np.clip((scatter[1:] * scatter[:-1]).sum(axis=0) / (scatter**2).sum(axis=0), 0.0, 0.95)
     J = jacobian(calibration.parameters, R[free]).mean(axis=0)
-    errors = np.eye(15)  # of the new parameters by those of the old
+    # of the new parameters by those of the old
+    errors = np.eye(15)
     errors[BIASES] = -J
     errors[np.ix_(BIASES, BIASES)] = 0.0
     covariance = errors @ calibration.covariance @ errors.T

@@ -145,7 +145,8 @@ def _checked(file: IO[bytes]) -> Iterator[list[str]]:
     """Give the lines of each checksum that fits them, and the end."""
     crc, waiting = 0, list[str]()
     number = 0
-    while line := file.readline():  # an iteration would hide the place in the file
+    # an iteration would hide the place in the file
+    while line := file.readline():
         number += 1
         if not line.endswith(b"\n"):
             break

@@ -25,10 +25,10 @@ from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtS
 
 _READ_BYTES, _LONGEST_LINE = 1 << 21, 1 << 14
 _SEPARATORS = np.frombuffer(b",\n", np.uint8)
+# What may precede a sign.
 _BEFORE: Final = {
     sign: np.frombuffer(text, np.uint8) for sign, text in ((b"-", b",\ne"), (b"+", b"e"), (b"e", b"0123456789."))
 }
-"""What may precede a sign."""
 
 
 class Wanted(NamedTuple):
@@ -51,7 +51,7 @@ class Part(NamedTuple):
     numbers: Array
     """(n, k)"""
     names: Sequence[str]
-    """Of the k columns."""
+    """Names of the k columns."""
     place: int
     """Bytes of the file up to the end of these rows."""
 
@@ -114,7 +114,8 @@ def _parsed(path: Path, text: bytes, columns: int, use: Sequence[int], before: i
     try:
         return parse_numbers(text, columns, use)
     except ValueError as error:
-        place = f"{path.name}, after row {before}" if before else path.name  # loadtxt counts from there
+        # loadtxt counts from there
+        place = f"{path.name}, after row {before}" if before else path.name
         raise BadDataset(f"{place}: {error}: correct this line") from error
 
 
@@ -125,6 +126,7 @@ def parse_numbers(text: bytes, columns: int, use: Sequence[int]) -> Array:
     what follows a number in its line, so it gets only text of which nothing could be ignored.
     """
     text = (text if text.endswith(b"\n") else text + b"\n").replace(b"\r\n", b"\n")
+    # mmread has the same bits in an eighth of the time, and loadtxt has the errors that users see.
     if _is_plain(text, columns):
         from scipy.io import mmread
 
@@ -139,6 +141,7 @@ def parse_numbers(text: bytes, columns: int, use: Sequence[int]) -> Array:
 
 def _is_plain(text: bytes, columns: int) -> bool:
     """Whether each line has so many decimals as `-1.5` or `2e-05`; some may lack their digits."""
+    # mmread ignores what follows a number in its line.
     between = text.translate(None, b"0123456789-+")
     one_line = b"," * (columns - 1) + b"\n"
     if between.translate(None, b".e") != one_line * text.count(b"\n"):
@@ -156,14 +159,14 @@ def _is_plain(text: bytes, columns: int) -> bool:
 
 
 T = TypeVar("T")
+# Seconds: the delay is estimated from all of a recording.
 _WHOLE = 10**6
-"""Seconds: the delay is estimated from all of a recording."""
 _MEAN_S = 0.008
+# Samples before and after a step that show whether it is a gap.
 _NEAR = 100
-"""Samples before and after a step that show whether it is a gap."""
 _ROUNDS = 20
+# Largest distance of regular times from multiples of their period, in periods.
 _REGULAR = 0.2
-"""Largest distance of regular times from multiples of their period, in periods."""
 
 
 class CsvPair:
@@ -211,6 +214,7 @@ class CsvPair:
 
     def blocks(self) -> Iterator[Measured]:
         """Give the samples in blocks, each with its pose. Raises `BadDataset` behind the last valid one."""
+        # Each call reads from the beginning: a binary copy for a second pass would need 1.4 GB an hour.
         size = self._wrench.stat().st_size
         share = [0.0]
 
@@ -224,7 +228,8 @@ class CsvPair:
         try:
             for paired in pair_blocks(samples(), self._states, self.delay_s):
                 rows = Paired.concatenate([*waiting, paired])
-                if len(rows) >= PIECE_ROWS:  # as of other recordings, because the contact test goes in steps
+                # as of other recordings, because the contact test goes in steps
+                if len(rows) >= PIECE_ROWS:
                     yield Measured(rows.rows(slice(PIECE_ROWS)), (), share[0])
                 waiting = [rows.rows(slice(PIECE_ROWS if len(rows) >= PIECE_ROWS else 0, None))]
         except BadDataset as error:
@@ -292,7 +297,8 @@ def _read_wrench(path: Path) -> Iterator[tuple[FtSamples, int]]:
                 continue
         numbers = numbers_of(t_s)
         numbers += number - numbers[max(known - 1, 0)]
-        end = len(t_s) if part is None else len(t_s) - _NEAR  # what follows shows whether a step is a gap
+        # what follows shows whether a step is a gap
+        end = len(t_s) if part is None else len(t_s) - _NEAR
         if end > known:
             yield FtSamples.of(_ns(t_s[known:end]), numbers[known:end], wrench[known:end]), place
             number = int(numbers[end - 1])
@@ -312,7 +318,8 @@ def numbers_of(t_s: Array) -> NDArray[np.int64]:
         if steps.min() >= 1 and np.abs(steps_s / step_s - steps).max() < _REGULAR:
             return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
     number = np.arange(len(t_s))
-    for _ in range(_ROUNDS):  # the period is that of all samples, the missing ones included
+    # the period is that of all samples, the missing ones included
+    for _ in range(_ROUNDS):
         before, number = number, _with_gaps(t_s, float(t_s[-1] - t_s[0]) / int(number[-1]))
         if np.array_equal(number, before):
             break
@@ -326,10 +333,12 @@ def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
         return number
     steps = np.diff(t_s) / period_s
     late = t_s / period_s - number
-    earliest = minimum_filter1d(late, _NEAR, mode="nearest", origin=(_NEAR - 1) // 2)  # of a sample and those before
+    # of a sample and those before
+    earliest = minimum_filter1d(late, _NEAR, mode="nearest", origin=(_NEAR - 1) // 2)
     following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # and those after
     possible = np.flatnonzero((steps > 1.5) & (following[1:] - earliest[:-1] > 0.4))
-    for last in possible[np.argsort(-steps[possible])].tolist():  # where the samples beside it are less late
+    # where the samples beside it are less late
+    for last in possible[np.argsort(-steps[possible])].tolist():
         near = slice(max(last + 1 - _NEAR, 0), last + 1), slice(last + 1, last + 1 + _NEAR)
         before, after = (t_s[rows] / period_s - number[rows] for rows in near)
         missing = min(np.median(after) - np.median(before), after.min() - before.min())

@@ -181,6 +181,7 @@ def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ())
     >>> table["fz"].shape, table["raw_fz"].shape
     ((3000,), (3000,))
     """
+    # A damaged file raises, because a caller in Python would not see a message.
     reader = RecordingReader(Path(path), columns)
     pieces = list(reader.pieces())
     events = [event for piece in pieces for event in piece.events]

@@ -48,7 +48,8 @@ class GrowingFile:
 
     def complete(self) -> None:
         """Fsync the file and give it its name. Raises `OSError`."""
-        os.fsync(self._file.fileno())  # while it is locked, because it may take seconds
+        # while it is locked, because it may take seconds
+        os.fsync(self._file.fileno())
         self._file.close()
         publish(self.partial, self.path)
 

@@ -57,6 +57,7 @@ _SCHEMAS: Final[Mapping[str, ros2.Schema]] = {
 }
 _CHANNELS: Final = {topic: number for number, topic in enumerate(_SCHEMAS, 1)}
 _SAMPLE: Final = [("t_device_s", "<f8"), ("chi2", "<f8"), ("seq", "<i8"), ("status", "<u4"), ("in_contact", "?")]
+# The columns in the messages of a channel, and the number of bytes behind them.
 _COLUMNS: Final[Mapping[int, tuple[Any, int]]] = {
     _CHANNELS[ros2.RAW]: (np.dtype([("raw", "<f8", 6)]), 0),
     _CHANNELS[ros2.COMPENSATED]: (np.dtype([("wrench", "<f8", 6)]), 0),
@@ -64,20 +65,19 @@ _COLUMNS: Final[Mapping[int, tuple[Any, int]]] = {
     _CHANNELS[ros2.JOINTS]: (np.dtype([("q_rad", "<f8", 6)]), 8),
     _CHANNELS[SAMPLE]: (np.dtype(_SAMPLE), 0),
 }
-"""The columns in the messages of a channel, and the number of bytes behind them."""
 _WARNINGS: Final = ("gap", "stale", "drift", "tare-refused")
+# Between two messages on /tf: no screen shows more.
 _TRANSFORMS_STEP_NS: Final = 16_666_667
-"""Between two messages on /tf: no screen shows more."""
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 3, 4, 5, 6, 7, 9, 15
+# What precedes the body of a message.
 _HEAD: Final = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
-"""What precedes the body of a message."""
 _LARGEST: Final = 1 << 32
 LEVEL: Final = -5
-"""Of zstd: numbers with noise in their last digits hardly shrink, at any level."""
+"""Level of zstd: numbers with noise in their last digits hardly shrink, at any level."""
 _NONE: Final = np.zeros(0, np.int64)
 
 
@@ -344,7 +344,8 @@ def read_mcap(path: Path, columns: Collection[str]) -> Generator[Piece, None, st
             if content is None:
                 content = _Content(_header(documents), columns)
                 yield content.piece(0.0)
-            with suppress(ValueError):  # the last chunk of an interrupted file may lack the end of its index
+            # the last chunk of an interrupted file may lack the end of its index
+            with suppress(ValueError):
                 content.close_chunk()
             yield content.piece(1.0)
         except (MemoryError, OverflowError, TypeError, ValueError, ZstdError, struct.error) as error:
@@ -475,7 +476,8 @@ def _indexed(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDA
 
 def _require_complete(messages: bytes, places: NDArray[np.int64], ends: NDArray[np.int64]) -> None:
     """Raise `ValueError` unless there is nothing but schemas and channels between the indexed messages."""
-    order = np.argsort(places, kind="stable")  # that of each channel is in order
+    # that of each channel is in order
+    order = np.argsort(places, kind="stable")
     begins, stops = np.append(places[order], len(messages)), np.insert(ends[order], 0, 0)
     for stop, begin in zip(stops[stops != begins].tolist(), begins[stops != begins].tolist(), strict=True):
         place = stop

@@ -43,12 +43,12 @@ from ftdrive.recording.recording import (
 )
 
 LEVEL: Final = -5
-"""Of zstd: numbers with noise in their last digits hardly shrink, at any level."""
+"""Level of zstd: numbers with noise in their last digits hardly shrink, at any level."""
+# A row group is written after so long or so many samples.
 _GROUP_NS, _GROUP_ROWS = 10_000_000_000, 1 << 14
-"""A row group is written after so long or so many samples."""
 _MAGIC, _RECORD = b"PAR1", b"FTDR"
+# Types of the compact protocol of Thrift.
 _I32, _I64, _TEXT, _LIST, _STRUCT = 5, 6, 8, 9, 12
-"""Types of the compact protocol of Thrift."""
 _BOOLEAN, _INT32, _INT64, _DOUBLE = 0, 1, 2, 5
 _KINDS: Final = {"b": _BOOLEAN, "u": _INT32, "i": _INT64, "f": _DOUBLE}
 _UNSIGNED, _ZSTD, _PLAIN, _RLE = 13, 6, 0, 3
@@ -131,6 +131,7 @@ class ParquetFile(GrowingFile):
         for name in self._kinds:
             column = np.concatenate([table[name] for table in tables])
             plain = np.packbits(column, bitorder="little") if column.dtype == bool else column
+            # Each row group is readable as soon as it is written, so that a power failure costs only the last one.
             body = self._compress(plain.data)
             crc = zlib.crc32(body)
             numbers = _struct({1: (_I32, n), 2: (_I32, _PLAIN), 3: (_I32, _RLE), 4: (_I32, _RLE)})

@@ -16,8 +16,8 @@ from ftdrive.live.samples import Block, StreamEvent, StreamInfo
 from ftdrive.recording.files import RecordingFile, RecordingReader, format_of, require_new_recordings
 from ftdrive.recording.recording import ROW, Header, Rows, divided, read_ahead, rows_of
 
+# Writing takes a few ms, in which the stream waits.
 _FLUSH_NS = 200_000_000
-"""Writing takes a few ms, in which the stream waits."""
 
 
 class RecordingFiles:
@@ -82,7 +82,8 @@ class RecordingFiles:
         """
         files, self._files, failure = self._files, [], None
         with _uninterrupted():
-            for path, file in zip(self._paths, files, strict=False):  # after an error there is no file
+            # after an error there is no file
+            for path, file in zip(self._paths, files, strict=False):
                 try:
                     file.complete()
                     self.saved.append(path)
@@ -178,7 +179,8 @@ class Recorder:
         if event.kind == "gap":
             self.gaps += 1
             self.lost += int(event.values.get("lost", 0))
-        if event.kind not in ("frame", "stages"):  # `_follow` finds the first sample of each
+        # `_follow` finds the first sample of each
+        if event.kind not in ("frame", "stages"):
             self._events.append(event)
 
     def close(self) -> None:
@@ -211,7 +213,8 @@ class Recorder:
         if block.stages != self._header.stages:
             changes.append(StreamEvent(t_ns, "stages", f"The stages are {block.stages}", asdict(block.stages)))
         if changes:
-            self._flush()  # the samples of one flush are in one frame
+            # the samples of one flush are in one frame
+            self._flush()
             self._events += changes
             self._header = replace(self._header, frame=block.frame, stages=block.stages)
 

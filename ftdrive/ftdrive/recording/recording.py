@@ -51,7 +51,7 @@ ROW: Final = np.dtype(
 NUMBERS: Final = {name: names or (name,) for name, (_, names) in _GROUPS.items()}
 """The columns of the table formats, by the field of `ROW` that holds them."""
 COLUMNS: Final = np.dtype([(one, kind) for name, (kind, _) in _GROUPS.items() for one in NUMBERS[name]])
-"""The same bytes, one field a number."""
+"""Layout of the bytes of `ROW` with one field a number."""
 
 
 def table_of(rows: Rows, start_ns: int, utc_offset_ns: int) -> dict[str, NDArray[Any]]:
@@ -110,7 +110,7 @@ class Header:
     frame: WrenchFrame
     stages: Stages
     configuration: Mapping[str, JSON] = field(default_factory=dict)
-    """Of the cell, as `ftdrive config show --json` prints it."""
+    """Configuration of the cell, as `ftdrive config show --json` prints it."""
 
     @property
     def words(self) -> str:
@@ -138,7 +138,8 @@ class Header:
         """Build from the content of a file; unknown fields are ignored. Raises `BadRecording`."""
         check_format(document, FORMAT, BadRecording)
         try:
-            newer = {"foreign": False}  # fields that files of earlier versions lack
+            # fields that files of earlier versions lack
+            newer = {"foreign": False}
             values = {item.name: {**newer, **document}[item.name] for item in fields(StreamInfo)}
             values |= {name: np.array(values[name], np.float64) for name in _ARRAYS}
             values |= {"arm": _device(values["arm"]), "sensor": _device(values["sensor"])}
@@ -197,7 +198,7 @@ class Piece(NamedTuple):
     events: Sequence[StreamEvent]
     """Since the piece before."""
     share: float
-    """Of the recording up to the end of this piece, 0 to 1."""
+    """Share of the recording up to the end of this piece, 0 to 1."""
 
 
 class Measured(NamedTuple):
@@ -214,7 +215,7 @@ class Source(Protocol):
 
     @property
     def header(self) -> Header:
-        """Of the whole."""
+        """Header of the whole recording."""
 
     @property
     def cut(self) -> str:
@@ -301,6 +302,7 @@ def divided(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
 
 def read_ahead(items: Iterator[T]) -> Generator[T, None, None]:
     """Give items of which a thread always makes the next one; errors come in their place."""
+    # One thread reads and one processes, and only the main thread writes: errors and Ctrl-C keep their order.
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, items, None)
         while (item := following.result()) is not None:

@@ -165,13 +165,15 @@ TRANSFORMS, ARROWS, EVENTS, STATUS = "/tf", "/wrench_arrows", "/events", "/strea
 VIEWERS: Final = (
     "https://app.foxglove.dev",
     "https://studio.foxglove.dev",
-    "file://",  # the desktop programs; a browser sends it or null for pages of a disk
-    "http://localhost:8080",  # Lichtblick's container
+    # the desktop programs; a browser sends it or null for pages of a disk
+    "file://",
+    # Lichtblick's container
+    "http://localhost:8080",
 )
 """Origins of Foxglove and Lichtblick."""
 
 SCENE_HZ = 60.0
-"""Of frames and arrows: no screen shows more."""
+"""Rate of frames and arrows: no screen shows more."""
 STATUS_HZ = 2.0
 BACKLOG = 1 << 15
 """Messages kept for a client that falls behind: two seconds at 7 kHz. Then the oldest are dropped."""
@@ -216,7 +218,8 @@ class FoxgloveServer:
     ) -> None:
         self._stream = stream
         self._info = stream.info
-        self._context = context = Context()  # server and channels keep only weak references
+        # server and channels keep only weak references
+        self._context = context = Context()
         self._channels: dict[str, Any] = {
             topic: Channel(
                 topic,
@@ -250,7 +253,8 @@ class FoxgloveServer:
             services=[self._service("tare", stream.tare), self._service("undo_tare", stream.undo_tare)],
             server_listener=Parameters(stream, self._warn),
         )
-        self._read_only = sdk.start_server(**options)  # the SDK sees no Origin, so its rights are those of a server
+        # the SDK sees no Origin, so its rights are those of a server
+        self._read_only = sdk.start_server(**options)
         self._servers = self._control, self._read_only
         for server in self._servers:
             _send_at_once(server.port)
@@ -283,7 +287,8 @@ class FoxgloveServer:
         frame = block.frame.id
         self._send(ros2.RAW, t_ns, lambda: ros2.pack_wrenches(t_ns, block.raw, "sensor").tolist())
         self._send(ros2.COMPENSATED, t_ns, lambda: ros2.pack_wrenches(t_ns, block.wrench, frame).tolist())
-        if (rows := self._arm.rows(t_ns)).any():  # the poses between are interpolated
+        # the poses between are interpolated
+        if (rows := self._arm.rows(t_ns)).any():
             poses, t_arm_ns = block.rows(rows), t_ns[rows]
             R, p = poses.R_base_flange, poses.p_base_flange_m
             self._send(ros2.POSE, t_arm_ns, lambda: ros2.pack_poses(t_arm_ns, R, p).tolist())
@@ -365,6 +370,8 @@ def _send_at_once(port: int) -> None:
                 continue
             with socket.socket(fileno=os.dup(int(name))) as found:
                 if found.family in (socket.AF_INET, socket.AF_INET6) and found.getsockname()[1] == port:
+                    # The SDK has no option for it, and a message would wait up to 40 ms for the confirmation of the
+                    # one before.
                     found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 

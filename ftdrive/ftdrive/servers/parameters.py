@@ -119,7 +119,8 @@ class NodeParameters:
         descriptor = messages.ParameterDescriptor(
             description=description,
             read_only=name in _FIXED,
-            dynamic_typing=True,  # 20 and 20.0 are both a frequency; what cannot be used is rejected with a reason
+            # 20 and 20.0 are both a frequency; what cannot be used is rejected with a reason
+            dynamic_typing=True,
         )
         found = self._node.declare_parameter(name, value, descriptor).value
         return list(found) if isinstance(found, Sequence) and not isinstance(found, str) else found

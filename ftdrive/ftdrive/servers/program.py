@@ -45,8 +45,8 @@ PATIENCE_S: Final = 1.0
 """So long a request waits for rest before it is refused; a weighing at rest takes `WEIGH_S`."""
 _TRY_NS: Final = 20_000_000
 _WAITS: Final = ("samples", "moving", "unsteady")
+# A load differs from a push by the direction of its force, which is so near to gravity.
 _ALIKE_RAD: Final = 0.1
-"""A load differs from a push by the direction of its force, which is so near to gravity."""
 _COUNT_LIMIT: Final = 2**30
 
 
@@ -57,13 +57,13 @@ class Command(IntEnum):
 
 
 class State(IntEnum):
-    """Of the service; of the last request while `number` is its number."""
+    """State of the service, and of the last request while `number` is its number."""
 
     STOPPED, READY, BUSY, REFUSED = range(4)
 
 
 class Condition(IntEnum):
-    """Of the wrench. Whatever it is, the wrench is valid only while the live counter advances."""
+    """What the wrench is. Whatever it is, the wrench is valid only while the live counter advances."""
 
     FREE, CONTACT, UNKNOWN_LOAD, STALE = range(4)
 
@@ -84,7 +84,7 @@ CODES: Final = {
 
 
 class Registers(Protocol):
-    """Of the controller, see `ftdrivers.ur.program_registers`."""
+    """Registers of the controller, see `ftdrivers.ur.program_registers`."""
 
     @property
     def request(self) -> tuple[int, int] | None:
@@ -130,8 +130,8 @@ class ProgramService:
         self._lock = threading.Lock()
         self._live = 0
         self._answered: int | None = None
+        # Number, command and time of the request in progress.
         self._busy: tuple[int, int, int] | None = None
-        """Number, command and time of the request in progress."""
         self._tried_ns = 0
         self._state, self._code, self._condition = State.READY, 0, Condition.FREE
         self._wrench = np.zeros(6)
@@ -151,7 +151,8 @@ class ProgramService:
         watch = threading.Thread(target=self._watch, daemon=True)
         watch.start()
         try:
-            with clock.keeping_up():  # an emulated controller must not wait for a busy computer
+            # an emulated controller must not wait for a busy computer
+            with clock.keeping_up():
                 self._serve()
         finally:
             self._ends.set()
@@ -182,6 +183,7 @@ class ProgramService:
             self._wrench = block.wrench[-1]
             self._condition = self._judge(block)
             self._work(t_ns)
+            # In contact too, because a program must be able to react to a contact force.
             self._live = (self._live + 1) % _COUNT_LIMIT
             self._write()
         if self.on_block is not None:
@@ -220,6 +222,7 @@ class ProgramService:
         integers = [int(state), 0 if busy else self._code, int(self._condition), number, self._live, tracking]
         tracked = self._tracked() if tracking else []
         try:
+            # All inputs go in one package, so that a program never reads half of an answer.
             self._registers.write(integers, [*self._wrench.tolist(), *self._weight.tolist(), *tracked])
         except DeviceError as error:
             self._say(f"{error}. Trying again.")
@@ -249,9 +252,11 @@ class ProgramService:
         try:
             request = None if self._registers is None else self._registers.request
         except DeviceError:
-            request = None  # the next write finds it too
+            # the next write finds it too
+            request = None
         if request is not None and self._answered is None and self._busy is None:
-            self._answered = request[0]  # of a program before us
+            # of a program before us
+            self._answered = request[0]
             self._state, self._code = State.READY, 0
         elif request is not None and request[0] != (self._busy[0] if self._busy else self._answered):
             self._busy, self._tried_ns = (*request, t_ns), t_ns + round(WEIGH_S * 1e9)

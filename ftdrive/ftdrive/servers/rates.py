@@ -51,7 +51,8 @@ class Averaged:
     """
 
     def __init__(self, sensor_rate_Hz: float, rate_Hz: float) -> None:
-        self.count = max(1, int(np.ceil(0.99 * sensor_rate_Hz / rate_Hz)))  # a rate is known to about 0.3 %
+        # a rate is known to about 0.3 %
+        self.count = max(1, int(np.ceil(0.99 * sensor_rate_Hz / rate_Hz)))
         """Samples of one mean."""
         self._longest_ns = 2e9 * self.count / sensor_rate_Hz
         self._waiting: Block | None = None
@@ -69,7 +70,8 @@ class Averaged:
             block = Block.concatenate([waiting, block])
         interval = block.seq // self.count
         begins = np.flatnonzero(np.diff(interval, prepend=interval[0] - 1))
-        if (block.seq[-1] + 1) % self.count:  # more of the last interval are to come
+        # more of the last interval are to come
+        if (block.seq[-1] + 1) % self.count:
             last = int(begins[-1])
             self._waiting = block.rows(slice(last, None))
             block, begins = block.rows(slice(last)), begins[:-1]

@@ -184,17 +184,17 @@ def _values(stream: ProcessedStream, status: StreamStatus, sent: int) -> dict[st
 NAME: Final = "ftdrive"
 REPORT_S: Final = 0.4
 """Between two reports; a fault is reported at once."""
+# Samples of so long are processed at once: a message is that late at most, and half as many blocks are processed.
 _BLOCK_S: Final = 0.008
-"""Samples of so long are processed at once: a message is that late at most, and half as many blocks are processed."""
 _CONTACT_S: Final = 0.1
+# Until the nodes of this computer and its network are known.
 _DISCOVERY_S: Final = 1.0
-"""Until the nodes of this computer and its network are known."""
+# After a device did not open.
 _RETRY_S: Final = 2.0
-"""After a device did not open."""
+# After the calibration did not fit: a person has to calibrate, or to choose another tool.
 _RETRY_CONFIG_S: Final = 10.0
-"""After the calibration did not fit: a person has to calibrate, or to choose another tool."""
+# History of a reliable topic, because Fast DDS asks for what was lost every 3 s.
 _HISTORY_S: Final = 10.0
-"""Of a reliable topic: Fast DDS asks for what was lost every 3 s."""
 _TOOL_S: Final = 5.0
 _WARNINGS: Final = ("tare-refused", "drift", "gap", "stale")
 
@@ -249,8 +249,8 @@ class Ros2Node:
         self._transforms = Transforms(node, self.fixed)
         self._stream: CompensatedStream | None = None
         self._averaged: Averaged | None = None
+        # Tools that clients request: name, where the reason of a refusal goes, when it is decided.
         self._wanted: SimpleQueue[tuple[str, list[str], Event]] = SimpleQueue()
-        """Tools that clients request: name, where the reason of a refusal goes, when it is decided."""
         self._failure, self._reported, self._reported_s, self._lost = "", list[Diagnosis](), 0.0, 0
         self._in_contact, self._contact_s, self.sent = False, 0.0, 0
         self._ros.spin()
@@ -266,6 +266,7 @@ class Ros2Node:
     def _require_alone(self) -> None:
         """Raise `ConfigError` if another node of this name reports; one that was killed may still be listed."""
         received = Event()
+        # A killed node stays in the list of nodes for up to 20 s, so a second one is found by its reports.
         subscription = self.node.create_subscription(
             self._diagnostics.DiagnosticStatus, "~/status", lambda _: received.set(), 10
         )
@@ -371,7 +372,8 @@ class Ros2Node:
 
     def event(self, event: StreamEvent) -> None:
         """Log an event."""
-        if event.kind in _WARNINGS:  # rclpy raises ValueError if one call has two severities
+        # rclpy raises ValueError if one call has two severities
+        if event.kind in _WARNINGS:
             self._log.warning(event.text)
         else:
             self._log.info(event.text)

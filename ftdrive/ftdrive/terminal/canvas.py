@@ -54,7 +54,8 @@ class ClosableApp(App[None]):
 
 def _closable_driver() -> type[Driver]:
     """Return a driver for a terminal that may be closed: the thread that writes would end, and its queue then block."""
-    from textual.drivers.linux_driver import LinuxDriver  # needs termios, which Windows has not
+    # needs termios, which Windows has not
+    from textual.drivers.linux_driver import LinuxDriver
 
     class ClosableDriver(LinuxDriver):
         def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -81,6 +82,7 @@ class _UntilClosed:
             self.file.flush()
 
 
+# Lines instead of widgets, because one plot of textual-plotext takes 45 % of a core.
 class Canvas(Widget):
     """Shows lines; only those that changed are drawn again."""
 

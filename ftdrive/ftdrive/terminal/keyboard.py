@@ -13,13 +13,13 @@ from typing import Self
 
 from ftdrive.session.operator import Key
 
+# Arrows and function keys arrive as escape, then letters that would be read as keys.
 _ESCAPE = re.compile(rb"\x1b(\[[0-?]*[ -/]*[@-~]|O.|.)?")
-"""Arrows and function keys arrive as escape, then letters that would be read as keys."""
 _KEYS = {key.value: key for key in Key}
+# A letter within this time of another belongs to a word, such as an answer typed too late.
 _WORD_S = 0.3
-"""A letter within this time of another belongs to a word, such as an answer typed too late."""
+# Read within a word too: an unnecessary stop does no harm. What else a word contains is another key.
 _ALWAYS = {Key.PAUSE, Key.STOP}
-"""Read within a word too: an unnecessary stop does no harm. What else a word contains is another key."""
 
 
 class Keyboard:
@@ -87,8 +87,10 @@ class Keyboard:
         atexit.register(self._restore)
         tty.setcbreak(self._fd, termios.TCSANOW)
         mode = termios.tcgetattr(self._fd)
-        mode[0] &= ~termios.IXON  # Ctrl-S would freeze the screen beside a moving arm
-        for name in (termios.VSUSP, termios.VQUIT):  # Ctrl-Z would suspend the guards, and Ctrl-\ end them
+        # Ctrl-S would freeze the screen beside a moving arm
+        mode[0] &= ~termios.IXON
+        # Ctrl-Z would suspend the guards, and Ctrl-\ end them
+        for name in (termios.VSUSP, termios.VQUIT):
             mode[6][name] = b"\0"
         termios.tcsetattr(self._fd, termios.TCSANOW, mode)
         wake, self._wake = os.pipe()
@@ -108,7 +110,8 @@ class Keyboard:
             return
         import termios
 
-        with suppress(termios.error):  # a terminal that was closed needs nothing
+        # a terminal that was closed needs nothing
+        with suppress(termios.error):
             # at once: draining waits for Ctrl-Q after Ctrl-S
             termios.tcsetattr(self._fd, termios.TCSANOW, self._before)
             termios.tcflush(self._fd, termios.TCIFLUSH)
@@ -135,6 +138,7 @@ class Keyboard:
                 self._keys += found or ([] if held_down else [Key.OTHER])
                 word += letters or "\x1b"
         except OSError:
-            return  # the terminal is gone: the supervisor reports it
+            # the terminal is gone: the supervisor reports it
+            return
         finally:
             os.close(wake)

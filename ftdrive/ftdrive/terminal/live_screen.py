@@ -100,7 +100,8 @@ class LiveApp(ClosableApp):
     TITLE = "ftdrive live"
 
     def __init__(self, feed: Feed, summary: Summary) -> None:
-        super().__init__(ansi_color=True)  # the terminal's own colours, light or dark
+        # the terminal's own colours, light or dark
+        super().__init__(ansi_color=True)
         self.theme = "ansi-dark"
         self._feed, self._summary = feed, summary
         self._canvas = Canvas()

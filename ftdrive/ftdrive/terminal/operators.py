@@ -14,8 +14,8 @@ from ftdrive.terminal.session_text import SessionText, TextLine
 from ftdrive.terminal.supervisor import Supervisor
 from ftdrive.terminal.text import in_whole_words, visible
 
+# Letters and words of one meaning in every question. s and r stand for no word that moves an arm.
 _SAME: Final = {"y": "yes", "n": "no", "q": "quit", "quit": "q", "skip": "s", "redo": "r"}
-"""Letters and words of one meaning in every question. s and r stand for no word that moves an arm."""
 
 
 def match(question: Question, typed: str) -> str | None:
@@ -141,7 +141,8 @@ class PlainOperator(_Keyless):
     def show(self, event: Event) -> None:
         """Write the lines of the event."""
         if isinstance(event, Asked) and event.question == self._asked:
-            return  # the question and its answer are printed already
+            # the question and its answer are printed already
+            return
         self._write_lines(self._text.lines(event))
 
     def ask(self, question: Question) -> str:
@@ -152,17 +153,21 @@ class PlainOperator(_Keyless):
         quiet, self._quiet, withheld, self._withheld = self._quiet, False, self._withheld, []
         self._write_lines(withheld)
         self._quiet = quiet
+        # What was typed before the question could confirm a motion unread.
         if self._stdin.isatty():
-            import termios  # Windows has none: an answer typed too early must not count, so none is read there
+            # Windows has none: an answer typed too early must not count, so none is read there
+            import termios
 
-            with suppress(termios.error):  # a closed terminal: reading raises the error
+            # a closed terminal: reading raises the error
+            with suppress(termios.error):
                 termios.tcflush(self._stdin.fileno(), termios.TCIFLUSH)
         while True:
             self._write(prompt(question))
             try:
                 typed = read_line(self.supervisor, question)
             except (KeyboardInterrupt, Declined):
-                self._write("\n")  # the next message begins on a new line
+                # the next message begins on a new line
+                self._write("\n")
                 raise
             if not self._stdin.isatty():
                 self._write(typed)

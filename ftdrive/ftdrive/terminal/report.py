@@ -19,13 +19,13 @@ from ftdrive.terminal.console import answer, hanging, messages
 from ftdrivers.interfaces import Array
 
 _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
+# A standard deviation below this share of the largest one is one of rounding: its value was taken as known.
 _ROUNDED = 1e-9
-"""A standard deviation below this share of the largest one is one of rounding: its value was taken as known."""
 _NO_LIMIT = 10_000
+# Orientations over which the error of a calibration is averaged if the truth is known.
 _RANDOM = Rotation.random(1000, rng=0).as_matrix()
-"""Orientations over which the error of a calibration is averaged if the truth is known."""
+# Rows that follow from mass and tilt: printed only with -v.
 _DERIVED = {"gravity_force_base_N"}
-"""Rows that follow from mass and tilt: printed only with -v."""
 
 
 SIGMA_OF_THE_TOOL = (
@@ -227,7 +227,8 @@ def axes_of(count: int) -> Sequence[str]:
 def values_of(value: Any, key: str) -> Array:
     """Return a quantity or its sigma as numbers; a mounting as its rotation vector, rad."""
     values = np.asarray(value, dtype=np.float64)
-    if key == "R_flange_sensor" and values.ndim == 2:  # shown as a rotation vector
+    # shown as a rotation vector
+    if key == "R_flange_sensor" and values.ndim == 2:
         values = Rotation.from_matrix(values).as_rotvec()
     if key == "inertia_kg_m2":
         values = values[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
@@ -250,7 +251,8 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
         else:
             error = values_of(data[key], key) - values_of(truth[key], key)
             if key.endswith("_rad"):
-                error = np.remainder(error + np.pi, 2 * np.pi) - np.pi  # a ceiling is at both +180 and -180 degrees
+                # a ceiling is at both +180 and -180 degrees
+                error = np.remainder(error + np.pi, 2 * np.pi) - np.pi
         errors[key] = error / values_of(data["sigma"][key], key)
     return errors
 

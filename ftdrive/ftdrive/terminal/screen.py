@@ -66,8 +66,8 @@ _NUMBER_WIDTH = 9
 _TABLE_WIDTH = 53
 _NARROWEST_BAR = 8
 _OFF_SIGMA = 5.0
+# A standard deviation below this, N or N·m, comes from rounding: its value was not fitted.
 _ROUNDED = 1e-9
-"""A standard deviation below this, N or N·m, comes from rounding: its value was not fitted."""
 _ASCII = str.maketrans(
     dict(zip("┌┐└┘├┤┬┴┼─│━", "+++++++++-|=", strict=True))
     | {"±": "+-", "°": " deg", "·": ".", "…": "~", "✔": "ok", "✘": "FAIL"}
@@ -169,8 +169,10 @@ def _title(view: SessionView, now_s: float, width: int) -> Text:
     right = f"{kept} kept"
     left = view.last.stops - kept if view.last else 0
     if len(times_s) > 2 and left > 0:
-        usual_s = median(b - a for a, b in pairwise(times_s))  # a stop with questions takes longer than usual
-        rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)  # a hold does not shorten the rest
+        # a stop with questions takes longer than usual
+        usual_s = median(b - a for a, b in pairwise(times_s))
+        # a hold does not shorten the rest
+        rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)
         right += f", about {_minutes(rest_s)} left"
     name = f"ftdrive {view.command}"
     room = width - len(name) - len(right)
@@ -188,7 +190,8 @@ def _state(view: SessionView, now_s: float, width: int) -> list[Text]:
     if now is None:
         return [Text("starting")]
     if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
-        return [Text("WAITS for an answer", "bold cyan")]  # the motion before the question is over
+        # the motion before the question is over
+        return [Text("WAITS for an answer", "bold cyan")]
     line = Text()
     if now.stop is not None:
         line.append(f"pose {now.stop}/{now.stops}" if now.stops is not None else f"pose {now.stop}", "bold")
@@ -338,9 +341,11 @@ def _keys(view: SessionView) -> list[Text]:
     end = "Ctrl-C ends, poses are kept" if view.folder else "Ctrl-C ends"
     if view.keys != "live":
         return [Text(f"Enter sends the answer; {end}", "dim")] if view.keys == "asking" else []
-    useful: set[Key] = set()  # before and after the poses no key is read
+    # before and after the poses no key is read
+    useful: set[Key] = set()
     if view.now is not None and view.now.stop is not None:
-        useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}  # by hand there is no last one
+        # by hand there is no last one
+        useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}
     line = Text()
     for key, word in KEYS.items():
         if key not in useful:
@@ -422,13 +427,16 @@ class Screen:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._view.keys = "over"
-        gone = suppress(OSError) if self.supervisor.absence() else nullcontext()  # nothing is drawn any more
+        # nothing is drawn any more
+        gone = suppress(OSError) if self.supervisor.absence() else nullcontext()
         with gone, self._stack:
             self._print(self._text.pending())
-            self._live.transient = kind is None  # after an error the frame stays: it has the command to resume
+            # after an error the frame stays: it has the command to resume
+            self._live.transient = kind is None
             self._live.stop()
         if kind is None and self._view.folder:
-            kept = f"{len(self._view.taken)} averages" if self._view.taken else "everything"  # a sweep has no averages
+            # a sweep has no averages
+            kept = f"{len(self._view.taken)} averages" if self._view.taken else "everything"
             self._print([TextLine(" ✔ ", f"{kept} kept in {self._view.folder}", "green")])
 
     def show(self, event: Event) -> None:
@@ -449,7 +457,8 @@ class Screen:
             with suspended:
                 answer = self._answer(question)
         self._view.keys = "live"
-        self._live = self._new_live()  # the old one would erase the lines of its last frame
+        # the old one would erase the lines of its last frame
+        self._live = self._new_live()
         self._live.start(refresh=True)
         return answer
 
@@ -486,7 +495,8 @@ class Screen:
             try:
                 typed = read_line(self.supervisor, question)
             except (KeyboardInterrupt, Declined):
-                self._console.file.write("\n")  # the next message begins on a new line
+                # the next message begins on a new line
+                self._console.file.write("\n")
                 raise
             used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
             if (answer := match(question, typed)) is not None:

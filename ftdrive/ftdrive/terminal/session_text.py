@@ -32,7 +32,7 @@ class TextLine:
     """A mark or indent; a folded line continues below the first word after it."""
     words: str
     style: str = ""
-    """Of rich, for a terminal with colour."""
+    """Style of rich, for a terminal with colour."""
 
 
 class SessionText:

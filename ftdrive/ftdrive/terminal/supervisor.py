@@ -10,8 +10,8 @@ from typing import IO, Any, Final, Self, TextIO
 
 from ftdrive.errors import Declined, SupervisorGone
 
+# Period of the looks while an answer is awaited.
 _LOOK_MS: Final = 50
-"""Period of the looks while an answer is awaited."""
 
 
 class Supervisor:
@@ -34,7 +34,8 @@ class Supervisor:
     def __init__(self, stdin: TextIO, output: IO[str], name: str) -> None:
         self._stdin, self._input, self._output, self._name = stdin, _descriptor(stdin), _descriptor(output), name
         self._terminals = [fd for fd in (self._input, self._output) if fd is not None and os.isatty(fd)]
-        self._answers = False  # whether a writer was there when a question was asked
+        # whether a writer was there when a question was asked
+        self._answers = False
         self._hung_up = False
         self._handler_before: Any = None
 
@@ -59,6 +60,7 @@ class Supervisor:
             return "the terminal was closed"
         if self._output is not None and _is_closed(self._output):
             return f"the reader of {self._name} is gone"
+        # The end of the input counts only from a question on, because `printf 'yes' | ftdrive calibrate` ends at once.
         if self._answers and self._input is not None and _is_closed(self._input, reading=True):
             return "standard input, from which answers come, was closed"
         return None
@@ -85,6 +87,7 @@ class Supervisor:
             line = self._stdin.readline()
         else:
             self.expect_answer()
+            # Byte by byte, so that nothing behind the line is taken from the input and its end is seen.
             line = self._read_bytes(fd).decode(self._stdin.encoding or "utf-8", errors="replace")
         if not line:
             if why := self.absence():

@@ -54,10 +54,10 @@ def is_command(line: str) -> bool:
     return line.startswith(("ftdrive ", "uv run ftdrive "))
 
 
+# All but tab and the end of a line; with those that turn the direction of writing, and bytes that are no text.
 _CONTROL = re.compile(
     "[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]|\r(?!\n)"
 )
-"""All but tab and the end of a line; with those that turn the direction of writing, and bytes that are no text."""
 
 
 def visible(text: str) -> str:
@@ -99,7 +99,8 @@ def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
         width = os.get_terminal_size(file.fileno()).columns
     except (OSError, ValueError):  # no terminal; nothing of the system
         return text
-    if width == 0:  # a terminal that does not know
+    # a terminal that does not know
+    if width == 0:
         return text
     fold = textwrap.TextWrapper(
         width,
@@ -110,7 +111,8 @@ def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
     )
     return "\n".join(
         line if is_command(line.strip()) else fold.fill(line) + line[len(line.rstrip()) :]
-        for line in text.split("\n")  # a prompt ends with a space
+        # a prompt ends with a space
+        for line in text.split("\n")
     )
 
 
@@ -143,7 +145,8 @@ def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: C
     """
     rows = [[visible(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
-    beside = len(titles)  # columns; the others are on a line of their own
+    # columns; the others are on a line of their own
+    beside = len(titles)
     if sys.stdout.isatty():
         least = [
             max(len(word) for text in column for word in (text.split() if title in folding else [text]) or [""])

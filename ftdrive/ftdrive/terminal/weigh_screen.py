@@ -12,8 +12,8 @@ from ftdrive.errors import NotAccepted
 from ftdrive.terminal.canvas import REFRESH_S, ClosableApp
 from ftdrive.terminal.weighing import Shown, Weighing, line_of
 
+# With a larger smallest mass the drift since the calibration decides, and a zero helps.
 _UNZEROED_KG = 0.1
-"""With a larger smallest mass the drift since the calibration decides, and a zero helps."""
 
 
 class _Reader(threading.Thread):
@@ -37,7 +37,8 @@ class _Reader(threading.Thread):
                     return
                 if self.zero_requested:
                     self.zero_requested = False
-                    self.shown = Shown(None, "samples")  # the number of before would look live
+                    # the number of before would look live
+                    self.shown = Shown(None, "samples")
                     self.note = self._zero()
         except BaseException as error:  # the main thread raises it
             self.failure = error
@@ -90,13 +91,15 @@ class WeighApp(ClosableApp):
 
     def draw(self) -> None:
         """Show the present state."""
-        if not self.is_running:  # it closes: the widgets go before the timer
+        # it closes: the widgets go before the timer
+        if not self.is_running:
             return
         if self.reader.failure is not None:
             self.exit()
             return
         shown = self.reader.shown
-        weight = shown.weight if shown.refusal in {None, "count"} else None  # what cannot be counted has a mass
+        # what cannot be counted has a mass
+        weight = shown.weight if shown.refusal in {None, "count"} else None
         self.query_one("#mass", Digits).update(
             "- - -" if weight is None else f"{to_place_of(weight.mass_kg, weight.mass_sigma_kg, ' z')} kg"
         )

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 PATIENCE_S = 10.0
 """So long a zero, or the only weight, may take."""
+# Between two weighings, each of the last half second.
 _STEP_S = 0.1
-"""Between two weighings, each of the last half second."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,8 @@ class Weighing:
         self.joins, self.moving = joins, moving
         self._recorder = recorder
         self._scale = Scale(stream)
+        # Weight of the load that is held; None since the reading was not at rest.
         self._last: Weight | None = None
-        """Of the load that is held, or None since the reading was not at rest."""
 
     def zero(self) -> None:
         """Tare the empty gripper, within some seconds. Raises `NotAccepted`."""
@@ -128,7 +128,8 @@ class Weighing:
             weight = weigh_in_motion(self.stream) if self.moving else self._scale.weigh(more=self.joins)
             return Shown(weight, None, None if self.part_kg is None else count_of(weight, self.part_kg))
         except CannotWeigh as refusal:
-            if refusal.code not in ("unsteady", "samples"):  # then it may be the same load as before
+            # then it may be the same load as before
+            if refusal.code not in ("unsteady", "samples"):
                 self._last = None
             return Shown(refusal.weight, refusal.code)
 
@@ -152,7 +153,8 @@ class Weighing:
     def given_up(self, shown: Shown) -> CannotWeigh:
         """Return the error of the only weight that was wanted, after `PATIENCE_S`."""
         code = shown.refusal or "samples"
-        if self._log is not None and code not in (*FAULTS, "count"):  # these are kept already
+        # these are kept already
+        if self._log is not None and code not in (*FAULTS, "count"):
             self._log.refused(code)
         return CannotWeigh(code, shown.weight)
 

@@ -25,15 +25,15 @@ T = TypeVar("T")
 MEAN_S = 0.1
 """The screen shows means of so long."""
 _STATUS_NS = 50_000_000
+# A failed stream may raise at once; this long the thread waits before it reads again.
 _RETRY_S = 0.05
-"""A failed stream may raise at once; this long the thread waits before it reads again."""
 _SEEK_S = 5.0
+# Cut-off of the low-pass that key 4 switches on.
 _LOWPASS_HZ = 40.0
-"""Cut-off of the low-pass that key 4 switches on."""
+# A screen that does not draw for many seconds misses the oldest ones; a recording never does.
 _MOST_BLOCKS = 2000
-"""A screen that does not draw for many seconds misses the oldest ones; a recording never does."""
+# Events whose time the plots show; contact has a colour, and a change of frame clears them.
 _MARKS = ("tare", "tare-undone", "stages", "gap", "mark")
-"""Events whose time the plots show; contact has a colour, and a change of frame clears them."""
 _STYLES = {
     "contact": CONTACT,
     "tare": GOOD,
@@ -144,7 +144,8 @@ class Feed:
         for event in self.stream.take_events():
             self._record(event)
             if event.kind == "tracked":
-                continue  # the screen has a place for it
+                # the screen has a place for it
+                continue
             text = f'mark "{event.text}"' if event.kind == "mark" else event.text
             self.notes.append(Note(event.t_host_ns, text, _STYLES.get(event.kind, ""), event.kind in _MARKS))
 

@@ -7,11 +7,11 @@ from ftdrive.terminal.live import panels
 from ftdrive.terminal.live.lines import CONTACT, FAINT, STRONG, Line, characters, envelope, level
 from ftdrive.terminal.live.view import PlotColumns, View
 
+# From this width on the plots stand beside the table.
 _WIDE = 120
-"""From this width on the plots stand beside the table."""
 _LEFT = 78
+# Columns for the scale of a plot.
 _GUTTER = 7
-"""Columns for the scale of a plot."""
 _LEAST_PLOT_ROWS, _LEAST_EVENTS = 3, 3
 
 
@@ -55,7 +55,8 @@ def _narrow(view: View, width: int, rows: int) -> list[Line]:
         plot_rows = min(7, (rows - len(body) - 10) // 3)
         body += _plots(view, width, 3 * plot_rows, across=2)
     links = [separator, *panels.links(view, width)]
-    if rows - len(body) - len(links) - 1 >= max(1, panels.newest_rows(view, width)):  # a refusal is read to its end
+    # a refusal is read to its end
+    if rows - len(body) - len(links) - 1 >= max(1, panels.newest_rows(view, width)):
         body += links
     if rows - len(body) >= 20:
         body += [separator, *panels.identity(view, width)]

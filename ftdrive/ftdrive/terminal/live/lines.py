@@ -62,7 +62,8 @@ class Line:
             room = width - 1 - fitted.width
             if cell_len(part.text) > room:
                 text = set_cell_size(part.text, max(room, 0))
-                if not part.text.startswith(" ", len(text)):  # a whole word or none of it
+                # a whole word or none of it
+                if not part.text.startswith(" ", len(text)):
                     text = text[: text.rfind(" ") + 1]
                 fitted.add(text, part.style, part.key)
                 break
@@ -91,8 +92,8 @@ Dots = NDArray[np.bool_]
 Codes = NDArray[np.uint8]
 """Packed characters: the bits of their dots."""
 
+# Bit of each dot in a character, by row and column (Unicode block U+2800).
 _BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.uint8)
-"""Bit of each dot in a character, by row and column (Unicode block U+2800)."""
 
 
 def envelope(low: Array, high: Array, rows: int, full: float) -> Dots:

@@ -39,11 +39,11 @@ from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 LEAST_FULL_SIGMA = 10.0
 """The scale of a still tool, so that noise looks like noise."""
 _SIGNIFICANT = 4.0
+# Width of the numbers of the table.
 _NUMBERS = 37
-"""Width of the numbers of the table."""
 _ARROWS = "→↗↑↖←↙↓↘"
+# Width of a half sphere.
 _DISC = 16
-"""Width of a half sphere."""
 _FRAMES = (WrenchFrame(), WrenchFrame("flange", "flange"), WrenchFrame("base", "tcp"), WrenchFrame("tcp", "tcp"))
 _STATE = {"ok": ("✔", GOOD), "warning": ("!", WARNING), "failed": ("✘", BAD), "skipped": ("-", FAINT)}
 
@@ -317,7 +317,8 @@ def line_of_force(reading: ShownWrench | None) -> Line:
         return Line()
     force, torque = reading.wrench[:3], reading.wrench[3:]
     square = float(force @ force)
-    if not square > (_SIGNIFICANT * float(reading.sigma[:3].max())) ** 2:  # or the noise is not known
+    # or the noise is not known
+    if not square > (_SIGNIFICANT * float(reading.sigma[:3].max())) ** 2:
         return Line()
     p_m = np.cross(force, torque) / square
     distance_m = float(np.linalg.norm(p_m))
@@ -496,7 +497,8 @@ def identity(view: View, width: int) -> list[Line]:
         Line(" cal       ", FAINT).add(info.calibration_name),
     ]
     for check in view.checks:
-        if check.name == "robot.payload" and check.state == "ok":  # stands beside the links
+        # stands beside the links
+        if check.name == "robot.payload" and check.state == "ok":
             continue
         words = _checked(check).parts
         lines += _hanging(Line(f" {check.name.partition('.')[2]:<10}", FAINT).add(*words[0]), words[1:], width)

@@ -24,8 +24,8 @@ T = TypeVar("T")
 
 SPANS_S = (2, 10, 60, 600)
 """Time spans that a plot can show."""
+# Bins of one span; twice as many are kept, because whole columns of a plot can be longer than its span.
 _BINS = 1024
-"""Bins of one span; twice as many are kept, because whole columns of a plot can be longer than its span."""
 _MEAN_NS = round(MEAN_S * 1e9)
 _REST_NS = 2_000_000_000
 _STILL_RAD = 5e-4
@@ -98,7 +98,8 @@ class History:
         bins = bins[starts]
         low, high = np.minimum.reduceat(wrench, starts), np.maximum.reduceat(wrench, starts)
         contact = np.logical_or.reduceat(in_contact, starts)
-        if self._bin[at := bins[0] % self._size] == bins[0]:  # only the first bin can have samples already
+        # only the first bin can have samples already
+        if self._bin[at := bins[0] % self._size] == bins[0]:
             np.minimum(low[0], self._low[at], out=low[0])
             np.maximum(high[0], self._high[at], out=high[0])
             contact[0] |= self._in_contact[at]
@@ -137,7 +138,7 @@ class ShownWrench:
     sample_sigma: Array
     """(6,) of one sample."""
     chi2: float
-    """Of the newest sample."""
+    """Squared distance of the newest sample from a free tool."""
     in_contact: bool
     R_base_flange: Array
     frame: WrenchFrame
@@ -216,8 +217,8 @@ class Summary:
         self._feed = feed
         self._checks = list(checks)
         self._dataset = dataset
+        # Samples of the free tool, until its noise has been compared.
         self._resting: list[Array] | None = None if dataset is None else []
-        """Samples of the free tool, until its noise has been compared."""
         self._rested_since_ns, self._rested_at = 0, np.eye(3)
         self._histories = {span_s: History(span_s) for span_s in SPANS_S}
         self._recent: deque[_Sum] = deque()
