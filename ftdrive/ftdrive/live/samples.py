@@ -172,21 +172,40 @@ def sensor_origin_m(height_mm: float | None, calibration: CalibrationResult | No
     return np.full(3, np.nan) if height_mm is None else np.array([0.0, 0.0, height_mm / 1e3])
 
 
-Tracking = Literal["off", "show", "apply"]
-"""Whether bias and held part are followed beside the calibration, and whether they are applied."""
+EventKind = Literal[
+    "contact",
+    "tare",
+    "tare-refused",
+    "tare-undone",
+    "stages",
+    "frame",
+    "drift",
+    "gap",
+    "delay",
+    "stale",
+    "recovered",
+    "tool",
+    "load",
+    "load-step",
+    "tracked",
+    "temperature",
+    "mark",
+]
 
 
 @dataclass(frozen=True, slots=True)
-class LoadEvent:
-    """A grasp or a release, or a contact that is over."""
+class StreamEvent:
+    """Something that happened at one moment of a stream."""
 
-    kind: Literal["load", "contact"]
-    t_s: float
-    """When it began."""
-    size: float
-    """Change of the mass, kg, or the largest force, N."""
-    sigma: float = 0.0
-    """One sigma of the change of the mass, kg."""
+    t_host_ns: int
+    kind: EventKind
+    text: str
+    """One sentence for people."""
+    values: Mapping[str, JSON] = field(default_factory=dict)
+
+
+Tracking = Literal["off", "show", "apply"]
+"""Whether bias and held part are followed beside the calibration, and whether they are applied."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,8 +238,8 @@ class Tracked:
     """Random walk of the force bias in an hour, one sigma, as learnt."""
     moment: tuple[Array, Array]
     """Mass and mass times centre of mass of the part (4,), kg and kg m, sensor axes, and their covariance."""
-    events: tuple[LoadEvent, ...] = ()
-    """Since the last update."""
+    events: tuple[StreamEvent, ...] = ()
+    """Grasps, releases and contacts that were decided since the last update, at the time of their begin."""
 
     def to_dict(self) -> dict[str, JSON]:
         """Return what is followed as JSON; the age of the last look is None before the first."""
@@ -241,38 +260,6 @@ class Tracked:
         seen = f", seen {self.last_seen_s:.0f} s ago" if self.last_seen_s >= 1 else ""
         part = f"{with_sigma(self.part_kg, self.part_sigma_kg)} kg" if self.part_known else "not known yet"
         return f"bias {with_sigma(force_N, sigma_N)} N{seen}, part {part}"
-
-
-EventKind = Literal[
-    "contact",
-    "tare",
-    "tare-refused",
-    "tare-undone",
-    "stages",
-    "frame",
-    "drift",
-    "gap",
-    "delay",
-    "stale",
-    "recovered",
-    "tool",
-    "load",
-    "load-step",
-    "tracked",
-    "temperature",
-    "mark",
-]
-
-
-@dataclass(frozen=True, slots=True)
-class StreamEvent:
-    """Something that happened at one moment of a stream."""
-
-    t_host_ns: int
-    kind: EventKind
-    text: str
-    """One sentence for people."""
-    values: Mapping[str, JSON] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ from ftdrive.live.contact import GYRATION_M
 from ftdrive.live.frames import gripping_point
 from ftdrive.live.motion import READING_S, REST, STATES, MovedLoad, wrench_by_acceleration
 from ftdrive.live.noise import NoiseEstimator, variance_at_next_use
-from ftdrive.live.samples import LoadEvent, Paired, StreamEvent, StreamInfo, Tracked
+from ftdrive.live.samples import Paired, StreamEvent, StreamInfo, Tracked
 
 # Squared innovation of a window that bias and part do not explain.
 _GATE = float(chdtri(6, 1e-4))
@@ -122,7 +122,7 @@ class Tracker:
 
     def update(self, window: Window) -> Tracked:
         """Add the next window."""
-        events: list[LoadEvent] = []
+        events: list[StreamEvent] = []
         if self._t_s is not None:
             self._grow(self._P, window.t_s - self._t_s)
             self._likelihood *= np.exp(-(window.t_s - self._t_s) / _FORGET_S)
@@ -183,7 +183,7 @@ class Tracker:
         self._x, self._P = _corrected(self._x, self._P, window.residual, C, H)
         self._seen_s = window.t_s
 
-    def _decide(self, window: Window) -> list[LoadEvent]:
+    def _decide(self, window: Window) -> list[StreamEvent]:
         """End an interruption, if the last windows agree on a part."""
         self._run = [*self._run, window][-_LONGEST_RUN:]
         while self._agreed(self._run) is None:
@@ -217,9 +217,10 @@ class Tracker:
         self._place = _place(*self._mixed(x, P)) if len(run) > 1 else None
         return x, P
 
-    def _end(self, x: Array, P: Array) -> list[LoadEvent]:
+    def _end(self, x: Array, P: Array) -> list[StreamEvent]:
         """End an interruption with the part that the windows agree on."""
         begin_s, self._open_s = self._open_s or 0.0, None
+        t_ns = round(begin_s * 1e9)
         self._x, self._P = x, P
         self._seen_s = self._run[-_GUARD].t_s
         self._queue, self._run = self._run[-_GUARD:], []
@@ -227,8 +228,10 @@ class Tracker:
         change_kg = float(mean[6] - self._before[0][0])
         sigma_kg = float(np.sqrt(covariance[6, 6] + self._before[1][0, 0]))
         if abs(change_kg) > max(NOTHING_KG, 4 * sigma_kg):
-            return [LoadEvent("load", begin_s, change_kg, sigma_kg)]
-        return [LoadEvent("contact", begin_s, self._peak_N)]
+            text = f"the load has changed by {with_sigma(change_kg, sigma_kg)} kg (1 sigma)"
+            return [StreamEvent(t_ns, "load-step", text, {"mass_kg": change_kg, "mass_sigma_kg": sigma_kg})]
+        values = {"peak_N": self._peak_N, "duration_s": (self._t_s or begin_s) - begin_s}
+        return [StreamEvent(t_ns, "contact", f"contact {self._peak_N:.1f} N while a part is held", values)]
 
     @staticmethod
     def _moved(run: list[Window]) -> bool:
@@ -453,17 +456,7 @@ class Following:
         """Add samples with their states of motion; yield what is known after each window, and the events."""
         for window in self._windows.add(rows, states, noise):
             tracked = self.tracked = self._tracker.update(window)
-            events = []
-            for event in tracked.events:
-                t_ns = round(event.t_s * 1e9)
-                if event.kind == "load":
-                    text = f"the load has changed by {with_sigma(event.size, event.sigma)} kg (1 sigma)"
-                    values = {"mass_kg": event.size, "mass_sigma_kg": event.sigma}
-                    events.append(StreamEvent(t_ns, "load-step", text, values))
-                else:
-                    values = {"peak_N": event.size, "duration_s": tracked.t_s - event.t_s}
-                    text = f"contact {event.size:.1f} N while a part is held"
-                    events.append(StreamEvent(t_ns, "contact", text, values))
+            events = list(tracked.events)
             if tracked.t_s - self._reported_s >= _REPORT_S:
                 self._reported_s = tracked.t_s
                 events.append(StreamEvent(round(tracked.t_s * 1e9), "tracked", tracked.in_words(), tracked.to_dict()))

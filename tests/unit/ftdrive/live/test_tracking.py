@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 
 from ftcalib.model import Array
 from ftdrive.live.motion import REST
-from ftdrive.live.samples import LoadEvent, Tracked
+from ftdrive.live.samples import StreamEvent, Tracked
 from ftdrive.live.tracking import Tracker, Window, _corrected, _less, _log_likelihood, _observed, _place
 
 NOISE = np.repeat([0.08, 0.004], 3)
@@ -24,7 +24,7 @@ class Program:
     def __init__(self, seed: int) -> None:
         self.rng, self.tracker = np.random.default_rng(seed), Tracker(1.2, np.array([0.0, 0.0, 0.06]))
         self.R, self.t_s, self.part_kg, self.p_m = Rotation.identity(), 0.0, 0.0, np.array([0, 0.01, 0.12])
-        self.events: list[LoadEvent] = []
+        self.events: list[StreamEvent] = []
         self.off = list[float]()
         """Largest error of the bias in each window, in sigmas."""
         self.last: Tracked | None = None
@@ -76,7 +76,7 @@ def test_parts_and_contacts_do_not_reach_the_bias() -> None:
         program.touch(2)
         program.turn(12)
         assert program.last is not None
-        if program.events[-1].kind == "load":  # not seen if the tool turns about the vertical
+        if program.events[-1].kind == "load-step":  # not seen if the tool turns about the vertical
             assert program.last.part_kg == pytest.approx(program.part_kg, abs=5 * program.last.part_sigma_kg)
         program.touch(4)
         steps.append(-program.part_kg)
@@ -87,7 +87,7 @@ def test_parts_and_contacts_do_not_reach_the_bias() -> None:
         program.turn(6)
     assert max(program.off) < 3.5
     assert np.mean(np.array(program.off) < 3) > 0.99
-    loads = [event.size for event in program.events if event.kind == "load"]
+    loads = [event.values["mass_kg"] for event in program.events if event.kind == "load-step"]
     assert 0.9 * len(steps) <= len(loads) <= len(steps)
     assert 10 <= sum(event.kind == "contact" for event in program.events) <= 15
 
@@ -114,21 +114,23 @@ def test_a_load_and_a_contact_are_events_with_their_time_and_size() -> None:
     program.part_kg, begin_s = 0.9, program.t_s
     program.turn(16)
     (load,) = program.events
-    assert load.kind == "load"
-    assert load.t_s == pytest.approx(begin_s, abs=3.1 * WINDOW_S)
-    assert load.size == pytest.approx(0.9, abs=4 * load.sigma)
-    assert load.sigma < 0.02
+    assert load.kind == "load-step"
+    assert load.t_host_ns * 1e-9 == pytest.approx(begin_s, abs=3.1 * WINDOW_S)
+    assert load.values["mass_kg"] == pytest.approx(0.9, abs=4 * load.values["mass_sigma_kg"])
+    assert load.values["mass_sigma_kg"] < 0.02
     begin_s = program.t_s
     program._pass(5, np.zeros(3), np.array([0.0, 3.0, -4.0, 4.0, 0.0, 0.0]))
     program.turn(12)
     contact = program.events[-1]
     assert contact.kind == "contact"
-    assert contact.t_s == pytest.approx(begin_s, abs=3.1 * WINDOW_S)
-    assert contact.size == pytest.approx(5.0, abs=0.6)
+    assert contact.t_host_ns * 1e-9 == pytest.approx(begin_s, abs=3.1 * WINDOW_S)
+    assert contact.values["peak_N"] == pytest.approx(5.0, abs=0.6)
     program.part_kg = 0.0
     program.turn(16)
-    assert [event.kind for event in program.events] == ["load", "contact", "load"]
-    assert program.events[-1].size == pytest.approx(-0.9, abs=4 * program.events[-1].sigma)
+    assert [event.kind for event in program.events] == ["load-step", "contact", "load-step"]
+    assert program.events[-1].values["mass_kg"] == pytest.approx(
+        -0.9, abs=4 * program.events[-1].values["mass_sigma_kg"]
+    )
     assert max(program.off) < 3.5
 
 
