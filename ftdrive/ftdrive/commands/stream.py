@@ -98,7 +98,6 @@ def _send_events(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | 
 
 
 def _introduce(source: "ProcessedStream", server: "FoxgloveServer", host: str, udp: tuple[str, int] | None) -> None:
-    """Print what is served, and how to open it."""
     from ftdrive.http_gate import is_loopback, with_port
     from ftdrive.terminal.console import messages, print_address
 

@@ -84,7 +84,6 @@ def _print_all(texts: Sequence[str]) -> None:
 
 
 def _answer_of(shown: "Shown", info: "StreamInfo") -> dict[str, Any]:
-    """Return a state as JSON."""
     from ftdrive.live.weighing import load_values
 
     values: dict[str, Any] = {"schema_version": 1, "calibration_id": info.calibration.id, "marks": list(info.marks)}

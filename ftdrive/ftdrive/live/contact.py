@@ -187,7 +187,6 @@ class ContactTest:
         return np.asarray(share * (rows[self._size :] - rows[: -self._size]))
 
     def _parts(self, R_base_flange: Array, states: NDArray[np.int8]) -> Iterator[slice]:
-        """Yield parts of one orientation, one state of motion and one offset."""
         turned = np.sqrt(np.square(R_base_flange[1:] - R_base_flange[:-1]).sum(axis=(1, 2)) / 2)
         cell = np.concatenate([[0.0], np.floor(np.cumsum(turned) / _TURN_RAD)])
         step = (self._count + np.arange(len(states))) // (_STEP * self._size)
@@ -217,7 +216,6 @@ class ContactTest:
         return self._whitening[1]
 
     def _follow_offset(self, residual: Array, state: int, *, is_free: bool) -> None:
-        """Take samples of one step of the offset into account."""
         self._sum = self._sum + residual.sum(axis=0)
         self._count += len(residual)
         self._is_free &= is_free and state == REST

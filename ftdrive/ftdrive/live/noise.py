@@ -103,7 +103,6 @@ class NoiseEstimator:
             self._collect(run, at_rest=bool(rest[0]))
 
     def _collect(self, readings: Array, *, at_rest: bool) -> None:
-        """Add readings (n, 43), all at rest or all in motion."""
         if at_rest is not self._at_rest:
             short = self._open[: max(len(self._open) - _UNSEEN, 0)]
             if self._at_rest and len(short) >= _SHORT:

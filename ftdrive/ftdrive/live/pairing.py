@@ -219,7 +219,6 @@ class PoseTrack:
         self._t_ns, self._columns = self._t_ns[keep:], self._columns[keep:]
 
     def _make_room(self, rows: int) -> None:
-        """Move the poses to the beginning of arrays with room for as many again."""
         t_ns, columns = np.empty(2 * rows, np.int64), np.empty((2 * rows, 14))
         t_ns[: len(self._t_ns)], columns[: len(self._t_ns)] = self._t_ns, self._columns
         self._room = t_ns, columns
@@ -314,7 +313,6 @@ class DelayEstimator:
         return [rows.rows(slice(*piece)) for piece in pairwise([0, *cuts])]
 
     def _learn(self, paired: Paired) -> bool:
-        """Add the information of one second; return whether it has any."""
         if len(paired) < 2:
             return False
         seconds = (paired.t_host_ns - paired.t_host_ns[0]) * 1e-9
@@ -360,7 +358,6 @@ class DelayEstimator:
         return H.reshape(-1, 13) @ self._scale, (force - prediction).ravel()
 
     def _apply(self) -> None:
-        """Solve for the delay that is left, and apply it if it is known well enough."""
         A = sum((a for a, _ in self._seconds), np.eye(13))
         b = sum((b for _, b in self._seconds), np.zeros(13))
         covariance = np.linalg.inv(A)

@@ -194,7 +194,6 @@ class Processor:
             return self._advance(last=True)
 
     def _advance(self, last: bool) -> Block:
-        """Process the samples that wait for no pose."""
         block = self._compensate(*self._inertia.take(self._tool.load, on=self._stages.inertia, last=last))
         if last:
             self._note_contacts(self._tracker.end())

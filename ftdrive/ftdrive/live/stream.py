@@ -328,7 +328,6 @@ class CompensatedStream(ProcessedStream):
             follows.close()
 
     def _first_samples(self) -> tuple[FtSamples, ArmStates]:
-        """Read both devices until their rates are known."""
         samples, states = [], []
         for left_s in self.clock.looks(_RATE_S):
             samples.append(self._sensor_follow.read(min(left_s, 0.01)))
@@ -388,7 +387,6 @@ class CompensatedStream(ProcessedStream):
         return self._status_of(sensor, arm, (self._pairing.delay_s, self._pairing.delay_sigma_s))
 
     def _count(self, states: ArmStates) -> None:
-        """Count the states of the last second, and those that are missing by the controller's clock."""
         if not len(states):
             return
         t_ns = int(states.t_host_ns[-1])

@@ -218,7 +218,6 @@ class Tracker:
         return x, P
 
     def _end(self, x: Array, P: Array) -> list[StreamEvent]:
-        """End an interruption with the part that the windows agree on."""
         begin_s, self._open_s = self._open_s or 0.0, None
         t_ns = round(begin_s * 1e9)
         self._x, self._P = x, P
@@ -249,7 +248,6 @@ class Tracker:
         return np.asarray(weights / weights.sum())
 
     def _mixed(self, x: Array, P: Array) -> tuple[Array, Array]:
-        """Return mean and covariance over the walks."""
         weights = self._weights
         mean = weights @ x
         off = x - mean
@@ -263,7 +261,6 @@ class Tracker:
         return 1.0 + np.repeat(held, 3)
 
     def _covariance(self, window: Window, mass_kg: float, moment_kg_m: Array) -> Array:
-        """Return the covariance of a window with a part."""
         n, squares = self._noise[window.state]
         scale = self._shaken(window, mass_kg, moment_kg_m)
         C = (squares + _FIRST_WINDOWS * window.noise) / (n + _FIRST_WINDOWS) * np.outer(scale, scale)
@@ -271,7 +268,6 @@ class Tracker:
         return np.asarray(C)
 
     def _distance(self, x: Array, P: Array, window: Window, place: Array | None) -> float:
-        """Return the squared Mahalanobis distance of a window."""
         mean, covariance = self._mixed(x, P)
         H = _observed(window, place)
         left = window.residual - H @ mean
@@ -285,7 +281,6 @@ def _less(distance: float) -> float:
 
 
 def _corrected(x: Array, P: Array, y: Array, covariance: Array, H: Array) -> tuple[Array, Array]:
-    """Return states (n, 10) and covariances after an observation."""
     S = H @ P @ H.T + covariance
     K = np.swapaxes(np.linalg.solve(S, H @ P), 1, 2)
     P = P - K @ S @ np.swapaxes(K, 1, 2)

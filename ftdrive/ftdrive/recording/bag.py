@@ -151,7 +151,6 @@ def _chosen(reader: "AnyReader", kind: str, topic: str | None, option: str) -> s
 
 
 def _messages(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[bytes]]:
-    """Return the messages of each topic as bytes, in one pass."""
     chosen = [one for one in reader.connections if one.topic in topics]
     found: dict[str, list[bytes]] = {topic: [] for topic in topics}
     for connection, _, data in reader.messages(connections=chosen):

@@ -80,7 +80,6 @@ class CsvFile(GrowingFile):
         return zip(*(column.tolist() for column in whole), strict=True)
 
     def _add(self, text: str) -> None:
-        """Append lines and their checksum."""
         content = text.encode()
         crc = zlib.crc32(content, self._crc)
         line = _crc_line(crc)

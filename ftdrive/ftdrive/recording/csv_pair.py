@@ -98,7 +98,6 @@ def mean_rate_Hz(path: Path, wanted: Wanted) -> float:
 
 
 def _columns(path: Path, head: bytes, wanted: Wanted) -> tuple[list[str], Sequence[str]]:
-    """Return the names of all columns, and of the wanted ones."""
     try:
         names = [name.strip() for name in next(csv.reader([head.decode("utf-8-sig", "replace")]), [])]
     except csv.Error as error:  # such as a field of more than 131,072 characters
@@ -110,7 +109,6 @@ def _columns(path: Path, head: bytes, wanted: Wanted) -> tuple[list[str], Sequen
 
 
 def _parsed(path: Path, text: bytes, columns: int, use: Sequence[int], before: int = 0) -> Array:
-    """Parse lines behind so many rows of a file."""
     try:
         return parse_numbers(text, columns, use)
     except ValueError as error:
@@ -327,7 +325,6 @@ def numbers_of(t_s: Array) -> NDArray[np.int64]:
 
 
 def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
-    """Number samples (n,) of a known period."""
     number = np.arange(len(t_s))
     if period_s == 0:
         return number

@@ -231,7 +231,6 @@ class McapFile(GrowingFile):
 
 
 def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArray[np.void]]:
-    """Pack the messages (n,) of each topic."""
     sample = np.zeros(len(rows), [("encoding", "V4"), *_SAMPLE])
     sample["encoding"] = np.void(ros2.ENCODING)
     for name, _ in _SAMPLE:
@@ -247,7 +246,6 @@ def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArra
 
 
 def _records(channel: int, t_ns: ArrayLike, bodies: ros2.Messages) -> NDArray[np.uint8]:
-    """Return message records without a sequence number as bytes (n, size)."""
     records = np.empty((len(bodies), _HEAD.itemsize + bodies.itemsize), np.uint8)
     _fill(records, channel, t_ns, 0, bodies)
     return records
@@ -256,7 +254,6 @@ def _records(channel: int, t_ns: ArrayLike, bodies: ros2.Messages) -> NDArray[np
 def _fill(
     records: NDArray[np.uint8], channel: int, t_ns: ArrayLike, sequence: ArrayLike, bodies: ros2.Messages
 ) -> None:
-    """Write message records into bytes (n, size)."""
     fields = records.view([*_HEAD.descr, ("body", bodies.dtype)])[:, 0]
     fields["opcode"], fields["length"] = _MESSAGE, _HEAD.itemsize - 9 + bodies.itemsize
     fields["channel"], fields["sequence"] = channel, np.bitwise_and(sequence, 0xFFFFFFFF)

@@ -238,7 +238,6 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
 
 
 def _read_pages(file: IO[bytes], pages: Mapping[str, Sequence[int]], rows: Rows) -> None:
-    """Read the columns that the rows have."""
     from zstandard import ZstdDecompressor
 
     decompress = ZstdDecompressor().decompress

@@ -62,7 +62,6 @@ _HEAD_M = 0.02
 
 
 def _stamp(t_utc_ns: int) -> Timestamp:
-    """Convert nanoseconds since 1970."""
     return Timestamp(*divmod(t_utc_ns, 1_000_000_000))
 
 

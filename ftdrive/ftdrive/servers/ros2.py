@@ -163,7 +163,6 @@ def _link(part: str, link: LinkStatus, device: Any, lost: int) -> Diagnosis:
 
 
 def _values(stream: ProcessedStream, status: StreamStatus, sent: int) -> dict[str, str]:
-    """Return the state of the stream as texts, as ROS has them."""
     info = stream.info
     tare = "none" if status.tare is None else " ".join(f"{value:.6g}" for value in status.tare)
     return {
@@ -256,7 +255,6 @@ class Ros2Node:
         self._ros.spin()
 
     def _quality(self) -> Any:
-        """Return the quality of service of the wrench topics."""
         qos = ros2_module("rclpy.qos")
         if not self.fixed.reliable:
             return qos.qos_profile_sensor_data
@@ -421,7 +419,6 @@ class Ros2Node:
         return self._answer(response, lambda stream: stream.undo_tare())
 
     def _answer(self, response: Any, action: Callable[[CompensatedStream], StreamEvent]) -> Any:
-        """Do what a service requests, in the thread of the node."""
         stream = self._stream
         if stream is None or self._failure:
             why = self._failure or "the devices are being opened"

@@ -72,12 +72,10 @@ class _UntilClosed:
         self.file, self.fileno = file, file.fileno
 
     def write(self, text: str) -> None:
-        """Write."""
         with suppress(OSError):
             self.file.write(text)
 
     def flush(self) -> None:
-        """Flush."""
         with suppress(OSError):
             self.file.flush()
 

@@ -78,7 +78,6 @@ def _lean(push: Push) -> str:
 
 
 def _numbers(value: ArrayLike | None, form: str, scale: float = 1.0) -> str:
-    """Return a number, or a vector in parentheses."""
     if value is None:
         return "not reported"
     numbers = [f"{one:{form}}" for one in scale * np.atleast_1d(value)]

@@ -247,7 +247,6 @@ def _findings(view: SessionView, width: int, *, with_cube: bool) -> list[tuple[i
 
 
 def _estimates(view: SessionView, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
-    """Return the estimates, with the cube beside them or its counts in a line below."""
     fit = view.estimated
     rows = [Text(f"{'estimate':<13}{'':27}{'± 1 sigma':>12}", "dim")]
     rows += [_estimate(fit, label, factor, name) for label, factor, name, _ in _ROWS]

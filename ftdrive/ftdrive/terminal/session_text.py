@@ -170,13 +170,11 @@ def _head_and_words(event: Event) -> tuple[str, str]:
 
 
 def _motion_in_words(event: MotionRecorded) -> str:
-    """Describe what was recorded in motion."""
     words = f"recorded {event.samples} samples of the sensor, {event.states} of the arm"
     return f"{words}; {event.duration_s:.1f} s"
 
 
 def _pose_in_words(event: PoseTaken) -> str:
-    """Describe how a pose was averaged."""
     force_N, torque_Nm = rms_sigma(event)
     words = (
         f"{event.stop}/{event.stops} R{event.number:02d}: settled {event.settle_s:.1f} s, {event.samples} samples in "
@@ -188,7 +186,6 @@ def _pose_in_words(event: PoseTaken) -> str:
 
 
 def _estimate_in_words(event: Estimated) -> str:
-    """Describe coverage and running fit."""
     words = f"coverage {event.light}"
     if "mass_kg" in event.values:
         words += f", mass {with_sigma(event.values['mass_kg'], event.sigma['mass_kg'])} kg"

@@ -29,7 +29,6 @@ class _Reader(threading.Thread):
         self.ends = False
 
     def run(self) -> None:
-        """Read until `ends`."""
         try:
             for shown, _ in self._weighing.states():
                 self.shown = shown

@@ -193,35 +193,28 @@ class Feed:
         else:
             self.take(block)
 
-    def _record(self, item: Block | StreamEvent) -> None:
-        """Hand something to the recorder; its failure ends the recording, never the screen."""
+    def _record(self, item: Block | StreamEvent | None) -> None:
+        """Hand something to the recorder, None to complete it; its failure ends the recording, never the screen."""
         if self._sink is None:
             return
         try:
-            if isinstance(item, Block):
+            if item is None:
+                self._sink.close()
+            elif isinstance(item, Block):
                 self._sink.write(item)
             else:
                 self._sink.event(item)
         except (ConfigError, OSError) as error:
             with suppress(ConfigError, OSError):
                 self._sink.close()
-            self._end_recording(f"recording ended: {error}", BAD)
+            self._sink = self.recording_since_ns = None
+            self.note(f"recording ended: {error}", BAD)
 
     def _stop_recording(self) -> None:
-        if self._sink is None:
-            return
-        try:
-            self._sink.close()
-        except (ConfigError, OSError) as error:
-            with suppress(ConfigError, OSError):
-                self._sink.close()
-            self._end_recording(f"recording ended: {error}", BAD)
-        else:
-            self._end_recording("recording complete")
-
-    def _end_recording(self, text: str, style: str = "") -> None:
-        self._sink = self.recording_since_ns = None
-        self.note(text, style)
+        self._record(None)
+        if self._sink is not None:
+            self._sink = self.recording_since_ns = None
+            self.note("recording complete")
 
     # ------------------------------------------------------------------------------------------------------------ keys
 

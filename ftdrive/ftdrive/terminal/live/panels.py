@@ -152,7 +152,6 @@ def _age(view: View) -> str:
 
 
 def _verified(view: View) -> tuple[str, str]:
-    """Name the last verification, and its style."""
     found = view.info.verification
     if found is None:
         return "not verified", FAINT
@@ -280,7 +279,6 @@ def _bar(view: View, i: int, full: float, cells: int) -> Line:
 
 
 def _trace(columns: PlotColumns, i: int, full: float) -> Line:
-    """Draw the recent past of a component in one row."""
     ink = characters(envelope(columns.low[i], columns.high[i], 1, full))[0]
     return layers(ink, np.zeros_like(ink), columns.contact_cells)
 
@@ -351,7 +349,6 @@ def _dial(view: View) -> list[str]:
 
 
 def _arrow(down_flange: Array) -> list[str]:
-    """Draw the direction of gravity in the plane of the flange, and its angle to the tool axis."""
     angle_deg = float(np.degrees(np.arccos(np.clip(down_flange[2], -1, 1))))
     aside = float(np.hypot(down_flange[0], down_flange[1]))
     eighth = round(np.arctan2(down_flange[1], down_flange[0]) / (np.pi / 4)) % 8
@@ -474,7 +471,6 @@ def _half_sphere(known: Array, down: Array | None) -> list[Line]:
 
 @cache
 def _rings() -> list[str]:
-    """Draw circles at 45° and 90°."""
     rows, angle = _DISC // 2, np.linspace(0, 2 * np.pi, 200)
     dots = np.zeros((4 * rows, 2 * _DISC), np.bool_)
     for radius in (0.5, 1.0):

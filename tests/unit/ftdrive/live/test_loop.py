@@ -31,7 +31,8 @@ def reader_of(reads: str, patience_s: float, said: list[str]) -> BlockReader:
 def test_an_interruption_is_said_once_and_so_is_its_end() -> None:
     said: list[str] = []
     reader = reader_of("axxbxc", RECOVER_S, said)
-    assert [reader.read() for _ in range(6)] == ["a", None, None, "b", None, "c"]
+    blocks: list[object] = [reader.read() for _ in range(6)]
+    assert blocks == ["a", None, None, "b", None, "c"]
     assert said == ["silent. Viewers wait.", "Samples arrive again."] * 2
     assert reader.failure is None
 
@@ -39,7 +40,8 @@ def test_an_interruption_is_said_once_and_so_is_its_end() -> None:
 @pytest.mark.parametrize(("patience_s", "failures"), [(0.0, 1), (1.0, 5)])
 def test_a_failure_that_lasts_is_raised(patience_s: float, failures: int) -> None:
     reader = reader_of("a" + "x" * 50, patience_s, [])
-    assert [reader.read() for _ in range(failures)] == ["a"] + [None] * (failures - 1)
+    blocks: list[object] = [reader.read() for _ in range(failures)]
+    assert blocks == ["a"] + [None] * (failures - 1)
     with pytest.raises(DeviceTimeout):
         reader.read()
 
