@@ -17,6 +17,7 @@ from websockets.sync.connection import Connection
 
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, LinkStatus, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
+from ftdrivers.clock import REAL
 
 UTC_OFFSET_NS = 1_700_000_000_000_000_000
 RATE_HZ = 7000.0
@@ -73,6 +74,7 @@ class FakeStream:
 
     def __init__(self) -> None:
         self.info = INFO
+        self.clock: Any = REAL
         self._frame = WrenchFrame()
         self.stages = Stages()
         self.contact = False
