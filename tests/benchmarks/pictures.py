@@ -20,7 +20,7 @@ from rich.text import Text
 
 from ftdrive.checks.check import Check
 from ftdrive.terminal.live.feed import Feed
-from ftdrive.terminal.live.summary import Summary
+from ftdrive.terminal.live.view import Summary
 from ftdrive.terminal.live_screen import LiveApp
 from tests.benchmarks.common import show
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream, Scenario
@@ -115,7 +115,7 @@ async def picture(scenario: Scenario) -> str:
     for _ in range(BLOCKS):
         feed.step()
     if scenario == "tare-refused":
-        feed.request(stream.tare)
+        feed.request("t")
     feed.step()
     app = LiveApp(feed, summary)
     async with app.run_test(size=(COLUMNS, ROWS)) as pilot:

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from ftcalib.after.inertia import Motion, inertial_wrench, motion_of_poses
+from ftcalib.after.inertia import SensorMotion, inertial_wrench, motion_of_poses
 from ftcalib.model import Parameters, skew
 from ftdrivers.interfaces import Array
 
@@ -140,7 +140,7 @@ class MovedLoad:
         self._mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
         self._parameters, self._p_flange_sensor_m, self._reach = parameters, p_flange_sensor_m, reach
 
-    def motion(self, t_s: Array, R_base_flange: Array, p_base_flange_m: Array) -> Motion:
+    def motion(self, t_s: Array, R_base_flange: Array, p_base_flange_m: Array) -> SensorMotion:
         """Return the motion at n poses, but for those with too few neighbours; an unknown position does not move."""
         return motion_of_poses(
             t_s,
@@ -151,7 +151,7 @@ class MovedLoad:
             reach=self._reach,
         )
 
-    def wrench(self, motion: Motion, inertia_kg_m2: Array | None = None) -> Array:
+    def wrench(self, motion: SensorMotion, inertia_kg_m2: Array | None = None) -> Array:
         """Return the wrench (m, 6) of a motion; without the inertia the mass counts as a point."""
         return inertial_wrench(self._mass_kg, self._parameters.p_sensor_com_m, motion, inertia_kg_m2)
 

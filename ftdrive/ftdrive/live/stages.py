@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.after.series import BiasTemperature
-from ftcalib.after.state import Calibrated, Update, bias_change, tare, with_bias_change
+from ftcalib.after.state import Calibrated, Update, compare_with_prediction, tare, with_bias_change
 from ftcalib.after.weighing import Weight, holding
 from ftcalib.compensation import Compensator
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
@@ -370,7 +370,7 @@ def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Map
     if not is_still(rows):
         return None, f"tare refused: the arm moves; {again}", {}
     dwell = mean_and_covariance(rows.raw)
-    (change,), (sigmas,) = bias_change(
+    (change,), (sigmas,) = compare_with_prediction(
         current, R, dwell.mean[None], dwell.covariance[None], TARE_DRIFT_N, TARE_DRIFT_NM
     )
     force_N, torque_Nm = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
