@@ -23,7 +23,7 @@ COLOURS = {"ftdrive": "#2563a8", "ftcalib": "#9a5b13", "ftdrivers": "#2f7d4f"}
 WALKS = {
     "From a cell to the first move": """
         ftdrive.commands.calibrate         calibrate                  reads the options
-        ftdrive.commands.calibrate         Said.cell                  merges options, environment, files
+        ftdrive.commands.common            CellOptions.cell           merges options, environment, files
         ftdrive.cell.config                cell_of                    makes one configuration of them
         ftdrive.session.session            calibrate                  chooses the task by the mode
         ftdrive.session.session            take_poses                 holds the devices open
@@ -31,7 +31,7 @@ WALKS = {
         ftdrive.cell.devices               build_arm                  makes the driver of the arm
         ftdrivers.ur.arm                   UrArm.open                 connects, still without control
         ftdrive.session.session            _require_devices           compares serial numbers
-        ftdrive.session.along_plan         AlongPlan.take             goes through the stages of a session
+        ftdrive.session.along_plan         take_along_plan            goes through the stages of a session
         ftdrive.planning.cell_plan         certifier_for              describes arm, tool and surroundings
         ftdrive.session.task               Calibrating.plan           plans for the method
         ftdrive.planning.cell_plan         plan_for                   chooses the kind of plan

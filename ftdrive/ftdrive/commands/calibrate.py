@@ -1,7 +1,7 @@
 """`ftdrive calibrate`: a guided calibration."""
 
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -17,12 +17,12 @@ from ftdrive.commands.common import (
     METHOD,
     SETS,
     YES,
+    CellOptions,
     NewFile,
     Number,
     declined_aborts,
     index_run,
     require_viz,
-    rows,
     runs,
     simulate,
     stop_unless_accepted,
@@ -33,19 +33,6 @@ if TYPE_CHECKING:
     from ftdrive.cell.config import CellConfig
     from ftdrive.runs.outcome import Outcome
     from ftdrive.runs.run import Mode
-
-_LONGEST_SWEEP_S = 120
-_OF_A_PLAN = ("--quick", "--minimal", "--set", "--output", "--png", "--view")
-_EXCLUDE_ONE_ANOTHER = (
-    ("--step", "--manual", "--listen", "--sweep", "--passive"),
-    ("--quick", "--minimal", "--set", "--plan", "--resume", "--sweep", "--passive"),
-    ("--from", "--set"),
-    *(("--method", other) for other in ("--from", "--resume", "--sweep", "--passive")),
-    ("--fast", "--sweep", "--passive"),
-    ("--from", "--resume", "--passive"),
-    *((hand, option) for hand in ("--manual", "--listen", "--passive") for option in _OF_A_PLAN),
-    *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
-)
 
 
 @click.command()
@@ -99,9 +86,7 @@ _EXCLUDE_ONE_ANOTHER = (
 @runs()
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line: events, questions, the result.")
 def calibrate(
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
+    described: CellOptions,
     tool: tuple[str, ...],
     control: str | None,
     simulate: bool,
@@ -130,7 +115,7 @@ def calibrate(
     from ftdrive.commands.emulated_run import start_mover
     from ftdrive.runs.run import Run
     from ftdrive.session.options import SessionOptions, method_of_poses
-    from ftdrive.session.rehearsal import described
+    from ftdrive.session.rehearsal import describe
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import beside, messages
     from ftdrive.terminal.report import print_result
@@ -143,16 +128,18 @@ def calibrate(
     with ExitStack() as stack:
         description: dict[str, Any] = {}
         made_by = None if resume is None else Run(resume).header_to_resume().get("station")
-        simulate = simulate or bool(made_by and not (config or robot or tool))  # a resumed run keeps its cell
+        # A resumed run keeps its cell.
+        simulate = simulate or bool(made_by and not (described.config or described.robot or tool))
         if simulate:
             pace = REAL_PACE if sweep or passive else ()
-            station = stack.enter_context(Station.of(made_by, sensor, pace, control_path=control))
+            station = stack.enter_context(Station.of(made_by, described.sensor, pace, control_path=control))
             cell = station.cell
-            description = described(station)
+            description = describe(station)
         else:
-            said = Said(str(config.absolute()) if config else None, robot, sensor, tool, control)
-            description = {"said": asdict(said)}
-            cell = said.cell() if resume is None else _cell_to_resume(resume, said)
+            config = described.config and described.config.absolute()
+            described = replace(described, config=config, tool=tool, control=control)
+            description = {"said": described.to_dict()}
+            cell = described.cell() if resume is None else _cell_to_resume(resume, described)
         if earlier is not None:
             from ftdrive.runs.source import read_calibration
 
@@ -190,56 +177,16 @@ def calibrate(
 
 
 def _refuse_contradictions(context: click.Context) -> None:
-    from ftcalib.published.methods import SPECIAL
-    from ftdrive.errors import ConfigError
+    from ftdrive.session.options import refuse_contradictions
 
     named = {"earlier": "from", "sets": "set"}
-    params = {named.get(name, name): value for name, value in context.params.items()}
+    given = {f"--{named.get(name, name).replace('_', '-')}": value for name, value in context.params.items() if value}
     if context.get_parameter_source("method") is ParameterSource.DEFAULT:
-        params["method"] = None
-    given = [f"--{name.replace('_', '-')}" for name, value in params.items() if value]
-    for group in _EXCLUDE_ONE_ANOTHER:
-        both = [option for option in group if option in given]
-        if len(both) > 1:
-            raise ConfigError(f"{both[0]} and {both[1]} exclude one another: leave one of them out")
-    if params["manual"] and params["method"] in SPECIAL:
-        words = f"--manual ends before the 24 orientations that {params['method']} needs"
-        raise ConfigError(f"{words}: leave it out, or choose --method lrom")
-    seconds, sweep, passive = (context.params[name] for name in ("seconds", "sweep", "passive"))
-    if seconds is not None and (seconds > _LONGEST_SWEEP_S if sweep else not passive):
-        raise ConfigError(f"--seconds {seconds:g} goes with --passive, or up to {_LONGEST_SWEEP_S} with --sweep")
+        del given["--method"]
+    refuse_contradictions(given)
 
 
-@dataclass(frozen=True, slots=True)
-class Said:
-    """Options that describe the cell. A run keeps them, so that it is resumed with the same values."""
-
-    config: str | None = None
-    robot: str | None = None
-    sensor: str | None = None
-    tool: tuple[str, ...] = ()
-    control: str | None = None
-
-    def settings(self) -> dict[str, Any]:
-        """Return options, environment and files, in this order of precedence; see `cell.config.settings`."""
-        from ftdrive.cell.config import settings
-
-        flags = {
-            "robot.host": ("--robot", self.robot),
-            "sensor.url": ("--sensor", self.sensor),
-            "tool.cylinders_mm": ("--tool", rows("--tool", self.tool, (3, 5))),
-            "robot.control": ("--control", self.control),
-        }
-        return settings(None if self.config is None else Path(self.config), flags)
-
-    def cell(self) -> "CellConfig":
-        """Return the cell."""
-        from ftdrive.cell.config import cell_of
-
-        return cell_of(self.settings())
-
-
-def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
+def _cell_to_resume(folder: Path, described: CellOptions) -> "CellConfig":
     """Return the cell of a resumed run: options given now replace those of the run.
 
     Files and environment describe tool and surroundings as they are now; the session refuses to continue if they differ
@@ -250,17 +197,8 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
     from ftdrive.terminal.console import messages
 
     header = Run(folder).header()
-    begun: dict[str, Any] = {**asdict(Said()), **header.get("said", {})}
-    if begun["config"] is not None and not Path(begun["config"]).is_file():
-        begun["config"] = None
-    said = Said(
-        said.config or begun["config"],
-        said.robot or begun["robot"],
-        said.sensor or begun["sensor"],
-        said.tool or tuple(begun["tool"]),
-        said.control or begun["control"],
-    )
-    found, before = said.settings(), recorded_cell(header["config"])
+    described = described.or_those(header.get("said", {}))
+    found, before = described.settings(), recorded_cell(header["config"])
     undescribed = {"default", "not set", "--tool"}
     origins = {one.origin for key, one in found.items() if key.startswith(("tool.", "workcell."))} - undescribed
     if origins:
@@ -271,10 +209,11 @@ def _cell_to_resume(folder: Path, said: Said) -> "CellConfig":
         return cell_of(found)
     messages.print("No file describes tool and surroundings: the settings of the run are used.")
     cylinders_mm = found["tool.cylinders_mm"].value or before.tool.cylinders_mm
+    host, control = described.robot or before.robot.host, described.control or before.robot.control
     return replace(
         before,
-        robot=replace(before.robot, host=said.robot or before.robot.host, control=said.control or before.robot.control),
-        sensor=replace(before.sensor, url=said.sensor or before.sensor.url),
+        robot=replace(before.robot, host=host, control=control),
+        sensor=replace(before.sensor, url=described.sensor or before.sensor.url),
         tool=replace(before.tool, cylinders_mm=cylinders_mm),
     )
 

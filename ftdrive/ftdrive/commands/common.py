@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import wraps
 from os import fsdecode
 from pathlib import Path
@@ -15,7 +16,7 @@ from ftdrivers.ur.control import CONTROL_SETTINGS
 
 if TYPE_CHECKING:
     from ftcalib import CalibrationResult
-    from ftdrive.cell.config import CellConfig
+    from ftdrive.cell.config import CellConfig, Setting
     from ftdrive.live.samples import Axes, WrenchFrame
     from ftdrive.store.store import Store
 
@@ -79,11 +80,66 @@ YES = click.option(
 CONFIG = click.option("--config", type=FILE, help="TOML file that describes the cell, instead of ./ftdrive.toml.")
 
 
-def CELL(command: F) -> F:
-    """Add the options --config, --robot and --sensor, which `read_cell` takes."""
+@dataclass(frozen=True, slots=True)
+class CellOptions:
+    """Options that describe a cell. A run keeps them, so that it is resumed with the same values."""
+
+    config: Path | None = None
+    robot: str | None = None
+    sensor: str | None = None
+    tool: tuple[str, ...] = ()
+    """Cylinders."""
+    control: str | None = None
+    model: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what run.json keeps of them."""
+        kept = ("config", "robot", "sensor", "tool", "control")
+        return {name: getattr(self, name) for name in kept} | {"config": self.config and str(self.config)}
+
+    def or_those(self, begun: Mapping[str, Any]) -> "CellOptions":
+        """Return them with those of a run, from `to_dict`, where none is given; a lost file of the run is left out."""
+        config = Path(begun["config"]) if begun.get("config") else None
+        return CellOptions(
+            self.config or (config if config is not None and config.is_file() else None),
+            self.robot or begun.get("robot"),
+            self.sensor or begun.get("sensor"),
+            self.tool or tuple(begun.get("tool", ())),
+            self.control or begun.get("control"),
+        )
+
+    def settings(self) -> dict[str, "Setting"]:
+        """Return options, environment and files, in this order of precedence; see `cell.config.settings`."""
+        from ftdrive.cell.config import settings
+
+        flags = {
+            "robot.host": ("--robot", self.robot),
+            "robot.model": ("--model", self.model),
+            "sensor.url": ("--sensor", self.sensor),
+            "tool.cylinders_mm": ("--tool", rows("--tool", self.tool, (3, 5))),
+            "robot.control": ("--control", self.control),
+        }
+        return settings(self.config, flags)
+
+    def cell(self, *, sensor_alone: bool = False) -> "CellConfig":
+        """Return the cell. With `sensor_alone`, a `sensor` needs no robot: its host is empty where none is set."""
+        from ftdrive.cell.config import cell_of
+
+        values = self.settings()
+        needs_robot = not sensor_alone or self.sensor is None or values["robot.host"].value is not None
+        return cell_of(values, devices=needs_robot)
+
+
+def CELL(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options --config, --robot and --sensor, and pass them to the command as `CellOptions`."""
+
+    @wraps(command)
+    def with_cell(config: Path | None, robot: str | None, sensor: str | None, **options: Any) -> None:
+        command(described=CellOptions(config, robot, sensor), **options)
+
     sensor_help = "Address, such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0."
-    command = click.option("--sensor", metavar="URL", help=sensor_help)(command)
-    return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller, or ros2:/TOPIC.")(command))
+    found = click.option("--sensor", metavar="URL", help=sensor_help)(with_cell)
+    return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller, or ros2:/TOPIC.")(found))
 
 
 EDITED = "that was edited by hand; every output then says so"
@@ -197,16 +253,15 @@ class Source(NamedTuple):
     path: Path | None
     tool: str | None
     force: bool
-    config: Path | None
-    robot: str | None
-    sensor: str | None
+    described: CellOptions
     simulate: bool
 
     def check(self) -> None:
         """Raise `ConfigError` for options that exclude one another."""
         from ftdrive.errors import ConfigError
 
-        check_simulate(self.simulate, real={"--tool": self.tool, "--config": self.config, "--robot": self.robot})
+        real = {"--tool": self.tool, "--config": self.described.config, "--robot": self.described.robot}
+        check_simulate(self.simulate, real=real)
         if self.path is not None and self.tool is not None:
             raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
 
@@ -222,7 +277,8 @@ def SOURCE(command: Callable[..., None]) -> Callable[..., None]:
 
     force = f"Apply a calibration of another arm, sensor or mount, or one {EDITED}."
     tool = "Newest accepted calibration of this tool on this cell."
-    found = simulate("Use the emulated cell of the calibration, or one with --sensor emulated://NAME.")(with_source)
+    words = "Use the emulated cell of the calibration, or one with --sensor emulated://NAME."
+    found: Callable[..., None] = simulate(words)(with_source)
     found = click.option("--force", is_flag=True, help=force)(CELL(found))
     return CALIBRATION(click.option("--tool", metavar="NAME", help=tool)(found))
 
@@ -329,26 +385,6 @@ def store_url(config: Path | None = None) -> str | None:
 
     url: str | None = settings(config)["store.url"].value
     return url
-
-
-def read_cell(
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
-    *,
-    model: str | None = None,
-    sensor_alone: bool = False,
-) -> "CellConfig":
-    """Read the cell from options, environment and files, in this order of precedence.
-
-    With `sensor_alone`, a `sensor` needs no robot: the host of the cell is empty where none is set.
-    """
-    from ftdrive.cell.config import cell_of, settings
-
-    flags = {"robot.host": ("--robot", robot), "robot.model": ("--model", model), "sensor.url": ("--sensor", sensor)}
-    values = settings(config, flags)
-    needs_robot = not sensor_alone or sensor is None or values["robot.host"].value is not None
-    return cell_of(values, devices=needs_robot)
 
 
 def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,9 +24,9 @@ from ftdrive.commands.common import (
     FILE,
     JSON,
     MODEL,
+    CellOptions,
     Number,
     check_simulate,
-    read_cell,
     runs,
     simulate,
     write_json,
@@ -62,9 +62,7 @@ _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "
 @runs("Folder of the runs, whose disk is checked.")
 @JSON
 def doctor(
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
+    described: CellOptions,
     model: str | None,
     simulate: bool,
     path: Path | None,
@@ -79,12 +77,12 @@ def doctor(
     read, nothing moves, no program is touched. With --sensor alone, and no robot in the configuration, checks the
     sensor and skips the robot. Exit code 7 if a check fails.
     """
-    check_simulate(simulate, real={"--config": config, "--robot": robot, "--model": model})
+    check_simulate(simulate, real={"--config": described.config, "--robot": described.robot, "--model": model})
     calibration = None if path is None else CalibrationResult.load(path)
     pushed: dict[str, Any] | None = None
     with ExitStack() as stack:
-        station = stack.enter_context(Station.of(None, sensor, ["--time-scale", "1"])) if simulate else None
-        cell = read_cell(config, robot, sensor, model=model, sensor_alone=True) if station is None else station.cell
+        station = stack.enter_context(Station.of(None, described.sensor, ["--time-scale", "1"])) if simulate else None
+        cell = replace(described, model=model).cell(sensor_alone=True) if station is None else station.cell
         address = SensorAddress.of(sensor_reached(cell.sensor.url)[0])
         device = build_sensor(cell)
 

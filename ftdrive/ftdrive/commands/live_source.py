@@ -6,7 +6,7 @@ from socket import gethostname
 
 from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig
-from ftdrive.commands.common import Source, read_cell, store_url
+from ftdrive.commands.common import Source, store_url
 from ftdrive.errors import ConfigError
 from ftdrive.live.processing import SENSOR_FRAME
 from ftdrive.live.samples import Tracking, WrenchFrame
@@ -30,11 +30,11 @@ def open_source(source: Source, frame: WrenchFrame, stack: ExitStack, track: Tra
     if source.simulate:
         if calibration is None:
             with open_operator() as operator:
-                calibration = short_calibration(operator, source.sensor)
+                calibration = short_calibration(operator, source.described.sensor)
     elif calibration is None and source.tool is None:
         raise no_calibration()
     else:
-        cell = read_cell(source.config, source.robot, source.sensor)
+        cell = source.described.cell()
     opened = build_stream(source, cell, calibration, None if calibration is not None else source.tool, frame)
     opened.track = track
     stream = stack.enter_context(opened)
@@ -59,7 +59,7 @@ def build_stream(
     """
     chosen = tool or calibration
     # an emulated cell ends with its stream, so each stream has one of its own
-    place = station_of(calibration, source.sensor) if cell is None and calibration is not None else cell
+    place = station_of(calibration, source.described.sensor) if cell is None and calibration is not None else cell
     if chosen is None or place is None:
         raise no_calibration()
     name = "temporary calibration" if source.path is None else str(source.path)

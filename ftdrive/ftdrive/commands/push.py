@@ -12,7 +12,7 @@ from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.common import CELL, JSON, check_simulate, declined_aborts, read_cell, simulate, write_json
+from ftdrive.commands.common import CELL, JSON, CellOptions, check_simulate, declined_aborts, simulate, write_json
 from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, SupervisorGone
 from ftdrive.runs.push_receipt import Receipt
@@ -38,9 +38,7 @@ _PATH = click.Path(exists=True, path_type=Path)
 @JSON
 def push(
     source: Path | None,
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
+    described: CellOptions,
     payload: bool,
     gravity: bool,
     receipt: Path | None,
@@ -54,17 +52,17 @@ def push(
     receipt, push.json in the run, for --restore. The arm must be free and still, in remote control, without a program.
     A program made at the pendant sets the values of its installation again when it starts.
     """
-    check_simulate(simulate, real={"--config": config, "--robot": robot})
+    check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
     if receipt is not None and (source or payload or gravity):
         raise ConfigError("--restore takes everything from the receipt: leave RESULT, --payload and --gravity out")
     if not (source or receipt or simulate):
         raise ConfigError("nothing to push: give a calibration.json or a run folder, --restore or --simulate")
     with ExitStack() as stack:
         operator = stack.enter_context(open_operator(as_json=as_json, live=False))
-        path = source or receipt or stack.enter_context(rehearsed_run(sensor))
+        path = source or receipt or stack.enter_context(rehearsed_run(described.sensor))
         folder = path if path.is_dir() else path.parent
         of = read_calibration(path) if receipt is None else Receipt.load(path)
-        cell = _emulated_cell(of, sensor, stack) if simulate else read_cell(config, robot, sensor)
+        cell = _emulated_cell(of, described.sensor, stack) if simulate else described.cell()
         arm = stack.enter_context(closing(build_arm(cell)))
         arm.open()
         if isinstance(of, Receipt):

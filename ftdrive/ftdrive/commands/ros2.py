@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import FRAME, SOURCE, Source, read_cell, read_frame
+from ftdrive.commands.common import FRAME, SOURCE, Source, read_frame
 
 if TYPE_CHECKING:
     from ftdrive.live.samples import Axes
@@ -57,12 +57,12 @@ def ros2(
 
     frame = read_frame(axes, about)
     calibration = None if source.path is None else read_calibration(source.path, accept_edited=source.force)
-    cell = None if source.simulate else read_cell(source.config, source.robot, source.sensor)
+    cell = None if source.simulate else source.described.cell()
     try:
         with closing(Ros2Node(ros_args, frame=frame, tool=source.tool or "")) as node:
             if source.simulate and calibration is None:
                 with open_operator() as operator:
-                    calibration = short_calibration(operator, source.sensor)
+                    calibration = short_calibration(operator, source.described.sensor)
             if calibration is None and not node.parameters.tool:
                 raise no_calibration()
             messages.print(

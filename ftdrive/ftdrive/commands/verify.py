@@ -13,11 +13,11 @@ from ftdrive.commands.common import (
     CELL,
     FOLDER,
     YES,
+    CellOptions,
     Number,
     check_simulate,
     declined_aborts,
     index_run,
-    read_cell,
     runs,
     simulate,
     stop_unless_accepted,
@@ -71,9 +71,7 @@ Answer = Literal["ask", "no", "yes"]
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line: events, questions, the result.")
 def verify(
     path: Path | None,
-    config: Path | None,
-    robot: str | None,
-    sensor: str | None,
+    described: CellOptions,
     simulate: bool,
     quick: bool,
     poses: int | None,
@@ -96,7 +94,7 @@ def verify(
     from ftdrive.runs.verified import AcceptanceLimits
     from ftdrive.session.options import SessionOptions
 
-    check_simulate(simulate, real={"--config": config, "--robot": robot})
+    check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
     wanted = _wanted(path, quick, poses, AcceptanceLimits(force_N, torque_Nm), resume)
     mode: Mode = "manual" if manual else "auto"
     options = SessionOptions(
@@ -105,10 +103,10 @@ def verify(
     with ExitStack() as stack:
         station, path = None, wanted.path
         if simulate:
-            station, path = _emulated(stack, path, sensor, runs)
+            station, path = _emulated(stack, path, described.sensor, runs)
         elif path is None:
             raise ConfigError("no calibration: give --calibration PATH, or --simulate")
-        cell = read_cell(config, robot, sensor) if station is None else station.cell
+        cell = described.cell() if station is None else station.cell
         with declined_aborts():
             verified = verify_cell(cell, path, wanted, options, station, update=update, as_json=as_json)
     if not verified.passed:
@@ -134,7 +132,7 @@ def verify_cell(
     from ftdrive.runs.run import Run
     from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verified import verify_run
-    from ftdrive.session.rehearsal import described
+    from ftdrive.session.rehearsal import describe
     from ftdrive.session.session import take_poses
     from ftdrive.session.verifying import Verifying
     from ftdrive.terminal.screen import open_operator
@@ -145,7 +143,7 @@ def verify_cell(
     if wanted.quick:  # 12 s of noise would take longer than the poses
         cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
     if station is not None:
-        description |= described(station)
+        description |= describe(station)
         start_mover(station, options)
     task = Verifying(cell, calibration, path, wanted.poses, options.runs)
     with open_operator(as_json=as_json, command=task.command) as operator:

@@ -83,7 +83,7 @@ def solve_in_motion(
         known=known,
         earlier=earlier,
         point_mass=point_mass,
-        guarded=run.header().get("mode") == "sweep",
+        guarded=run.mode == "sweep",
         provenance={**made_now(), **origin},
         **circumstances,
     )

@@ -75,6 +75,8 @@ _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status
 
 Mode = Literal["auto", "step", "manual", "listen", "sweep", "passive"]
 """How a session moves from pose to pose."""
+IN_MOTION: Final = ("sweep", "passive")
+"""Modes that record in motion; such a recording is not continued."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,6 +199,12 @@ class Run:
         return str(self.header().get("command", "calibrate"))
 
     @property
+    def mode(self) -> "Mode":
+        """How its session went from pose to pose. Raises `BadDataset`."""
+        mode: Mode = self.header().get("mode", "auto")
+        return mode
+
+    @property
     def resume_command(self) -> str:
         """Command that continues the run."""
         return f"ftdrive {self.command} --resume {shlex.quote(str(self.folder))}"
@@ -204,8 +212,8 @@ class Run:
     @property
     def how_to_go_on(self) -> str:
         """What to do about a run without data for a result. Raises `BadDataset`."""
-        if (mode := self.header().get("mode")) in ("sweep", "passive"):
-            return f"start again with --{mode}, because a recording in motion is not continued"
+        if self.mode in IN_MOTION:
+            return f"start again with --{self.mode}, because a recording in motion is not continued"
         return f"continue it with {self.resume_command}"
 
     @property
@@ -293,7 +301,7 @@ class Run:
         header = self.header()
         for section, key in (("robot", "host"), ("sensor", "url")):
             header["config"][section][key]  # raises if it is missing
-        if header.get("mode", "auto") in ("auto", "step") and not self.plan_path.is_file():
+        if self.mode in ("auto", "step") and not self.plan_path.is_file():
             raise BadDataset(
                 f"{self.plan_path} is lost, and without its plan a run cannot go on: {_RESTORE}, or solve the poses "
                 f"that are there with {self.solve_command}"

@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -16,13 +16,12 @@ from ftcalib.data.dwell_mean import LEAST_SAMPLES, averaging_time, mean_and_cova
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord
 from ftcalib.sampling import Sampling
-from ftdrive.errors import ConfigError, SupervisorGone
+from ftdrive.errors import SupervisorGone
 from ftdrive.planning.approach import arm_moves, plan_approach
 from ftdrive.planning.cell_plan import certifier_for, speeds_of
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import slower
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.search.nodes import constant_tour
 from ftdrive.planning.words import point_in_words, stop_in_words, turns_in_words, way_in_words
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
@@ -31,11 +30,11 @@ from ftdrive.session.forecast import Averages, at_most, moves_s
 from ftdrive.session.live_fit import Judge
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.options import SessionOptions
-from ftdrive.session.pose_book import PoseBook
+from ftdrive.session.pose_book import PoseBook, reporting_early_end
 from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
 from ftdrive.session.recovery import GuardedCell
 from ftdrive.session.sweep import SweepTour, sweep_pace
-from ftdrive.session.task import Task
+from ftdrive.session.task import Session
 from ftdrive.session.tour import SLOW, Pace, Tour
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.interfaces import NOT_REPORTED
@@ -126,24 +125,20 @@ _NO_SERIAL: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class AlongPlan:
+def take_along_plan(session: Session) -> Run | None:
+    """Take the poses of a plan, or of one that is made where the arm stands; None after a dry run."""
+    return _AlongPlan(session).take()
+
+
+class _AlongPlan:
     """A session in which the arm goes along a plan."""
 
-    cell: OpenCell
-    task: Task
-    options: SessionOptions
-    resumed: Run | None
-    """The run that is continued."""
-    new_run: Callable[[], Run]
-    """Creates the folder of a new one."""
+    def __init__(self, session: Session) -> None:
+        self._session, self.cell, self.task, self.options = session, session.cell, session.task, session.options
 
-    def take(self, plan: Plan | None) -> Run | None:
-        """Take the poses of a plan, or of one that is made where the arm stands; None after a dry run.
-
-        A dry run never takes control of the arm.
-        """
-        cell, dry_run = self.cell, self.options.dry_run
+    def take(self) -> Run | None:
+        """As `take_along_plan`. A dry run never takes control of the arm."""
+        cell, dry_run, plan = self.cell, self.options.dry_run, self._session.plan
         certifier = self._certifier()
         if plan is None:
             plan = self._plan(certifier)
@@ -185,16 +180,11 @@ class AlongPlan:
 
     def _plan(self, certifier: Certifier) -> Plan:
         q = np.round(self.cell.arm.state().q_rad / _GRID_RAD) * _GRID_RAD
-        if self.options.mode == "sweep":
-            return self.task.plan(certifier, q, self.options.poses)
-        with suppress(ConfigError):  # the planner reports it, with what to do
-            # Joint 6 keeps its turn, which shows how the cable is wound.
-            q[3:5] = constant_tour(q, certifier.arm.kinematics)[0, 3:5]
         return self.task.plan(certifier, q, self.options.poses)
 
     def _kept(self) -> list[PoseRecord]:
         """Return the poses of the resumed run that are not taken again."""
-        records = [] if self.resumed is None else self.resumed.records()
+        records = [] if self._session.resumed is None else self._session.resumed.records()
         return [record for record in records if record.stop not in self.options.redo]
 
     def _look(self, certifier: Certifier, plan: Plan, todo: Sequence[int]) -> Before:
@@ -210,7 +200,7 @@ class AlongPlan:
             runs=options.runs,
             known=not options.real or has_completed(self._serial, plan.sha256),
             quiet=cell.listen(LISTEN_S),
-            resumed=self.resumed is not None,
+            resumed=self._session.resumed is not None,
         )
         _show_plan(before, options)
         return before
@@ -248,7 +238,8 @@ class AlongPlan:
         """Ask the safety questions, then visit every pose that is left; each is on disk before the next move."""
         cell, options, way = self.cell, self.options, before.approach.way_rad
         load = guards.RangeGuard(cell.limits, before.sensor_range, before.sensor_zero)
-        contact = self._contact_guard(pace, judge)
+        learner = self.task.learner()
+        contact = self._contact_guard(pace, judge.predict if learner is None else learner.predict)
         rows = (
             guards.SupervisorGuard(cell.journal.absence),
             guards.SafetyGuard(),
@@ -260,7 +251,7 @@ class AlongPlan:
             guards.SettingsGuard(),
             guards.StallGuard(cell.limits),
             guards.SliderGuard(),
-            *((judge,) if isinstance(judge, guards.Guard) else ()),  # it learns what the other guards let pass
+            *(() if learner is None else (learner,)),  # it learns what the other guards let pass
         )
 
         def on_trip(trip: guards.Tripped) -> None:
@@ -273,28 +264,26 @@ class AlongPlan:
         with watcher:  # sees an emergency stop at a question too
             if options.questions and todo:
                 questions.ask(way, assumed=before.known and not arm_moves(way))  # one with base or elbow is new
-            run = self.resumed or self._keep_plan(before.plan)
+            run = self._session.resumed or self._keep_plan(before.plan)
             book = PoseBook(cell, run, judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)
             tour = (SweepTour if pace.plan.sweep else Tour)(guarded, pace, book, options)
-            with book.reporting_early_end():
+            with reporting_early_end(cell.journal, run):
                 tour.run(todo)
         if todo and not before.known:
             self._judge_completed(before.plan, run, tour.undriven)
         return run
 
-    def _contact_guard(self, pace: Pace, judge: Judge) -> guards.ContactGuard:
+    def _contact_guard(self, pace: Pace, predict: Callable[[Array], Array | None]) -> guards.ContactGuard:
         arm = pace.certifier.arm
         heaviest_kg = self.task.cell.tool.mass_kg or _HEAVIEST_KG.get(arm.name, _HEAVIEST_OF_ALL_KG)
         reach_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in arm.tool)
         acceleration_rad_s2 = pace.plan.acceleration_rad_s2
-        return guards.ContactGuard(
-            self.cell.limits, heaviest_kg, reach_m, acceleration_rad_s2, pace.quiet_std, judge.predict
-        )
+        return guards.ContactGuard(self.cell.limits, heaviest_kg, reach_m, acceleration_rad_s2, pace.quiet_std, predict)
 
     def _keep_plan(self, plan: Plan) -> Run:
         """Create the run, with the plan in it."""
-        run = self.new_run()
+        run = self._session.new_run()
         plan.save(run.plan_path)
         self.cell.journal.keep_in(run)
         return run

@@ -16,10 +16,13 @@ from ftcalib.data.dwell_mean import CHANNELS, restless_channels
 from ftcalib.model import Array
 from ftcalib.routine import MOVED_RAD, PoseRecord, Stage, TourPose, take_pose, turned_rad
 from ftcalib.sampling import Sampling
+from ftdrive.planning.geometry.scene import down_of
+from ftdrive.runs.run import Run
 from ftdrive.session.events import Compared, Estimated, SensorEvents, State, StateChanged
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key
-from ftdrive.session.pose_book import PoseBook
+from ftdrive.session.pose_book import PoseBook, reporting_early_end
+from ftdrive.session.task import Session
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmState, FtSamples
 
@@ -82,6 +85,19 @@ class _Held:
 
     def check(self) -> None:
         """Accept a stream: it is checked wherever it is read."""
+
+
+def take_by_hand(session: Session) -> Run:
+    """Take poses without any motion command: the operator moves the arm, or a program on the pendant does."""
+    cell, task, run = session.cell, session.task, session.resumed
+    if run is None:
+        run = session.new_run()
+        cell.journal.keep_in(run)
+    book = PoseBook(cell, run, task.judge(by_hand=True), down_of(task.cell.workcell.mounting))
+    with reporting_early_end(cell.journal, run):
+        guide = HandGuided(cell, book, task.cell.sampling, listen=session.options.mode == "listen")
+        guide.run(run.records() if session.resumed else (), task.goal)
+    return run
 
 
 class HandGuided:

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from ftdrive.errors import Declined, SupervisorGone
-from ftdrive.runs.run import Run
+from ftdrive.runs.run import IN_MOTION, Run
 from ftdrive.session.events import Asked, Event, GuardTripped, Hazard, Noted, RunOpened
 from ftdrive.session.guards import Limits
 from ftdrive.session.operator import Key, Operator, Question
@@ -39,7 +39,8 @@ class Journal:
             for event in self._early:
                 run.append_event(event.to_dict())
             self._early.clear()
-        self.show(RunOpened(folder=str(run.folder), resume=_to_continue(run)), sync=True)
+        resume = "" if run.mode in IN_MOTION else run.resume_command
+        self.show(RunOpened(folder=str(run.folder), resume=resume), sync=True)
 
     def show(self, event: Event, *, sync: bool = False) -> None:
         """Show and record an event. Raises `SupervisorGone` at the first one that cannot be seen any more."""
@@ -106,11 +107,6 @@ class Journal:
     def pressed(self) -> Key | None:
         """Return the next key pressed."""
         return self._operator.pressed()
-
-
-def _to_continue(run: Run) -> str:
-    """Return the command that continues a run; a recording in motion starts again."""
-    return "" if run.header().get("mode") in ("sweep", "passive") else run.resume_command
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,12 +5,28 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, cast, get_args
 
+from ftcalib.published.methods import SPECIAL
 from ftcalib.result import Method
 from ftdrive.errors import ConfigError
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Mode, Run
 
 _BY_HAND: Final = ("manual", "listen", "passive")
+_LONGEST_SWEEP_S: Final = 120
+_SHOWN: Final = ("--output", "--png", "--view")
+_OF_MOTION: Final = ("--plan", "--fast", "--dry-run", "--redo", *_SHOWN)
+"""Options of a session without a meaning where ftdrive neither plans nor moves."""
+_EXCLUDE_ONE_ANOTHER: Final = (
+    ("--step", "--manual", "--listen", "--sweep", "--passive"),
+    ("--quick", "--minimal", "--set", "--plan", "--resume", "--sweep", "--passive"),
+    ("--from", "--set"),
+    *(("--method", other) for other in ("--from", "--resume", "--sweep", "--passive")),
+    ("--fast", "--sweep", "--passive"),
+    ("--from", "--resume", "--passive"),
+    *((f"--{hand}", option) for hand in _BY_HAND for option in ("--quick", "--minimal", "--set", *_SHOWN)),
+    *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
+)
+"""Options of `ftdrive calibrate`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +70,20 @@ class SessionOptions:
         return self.mode in _BY_HAND
 
 
+def refuse_contradictions(given: Mapping[str, Any]) -> None:
+    """Raise `ConfigError` for options of `ftdrive calibrate` that exclude one another; their values by name."""
+    for group in _EXCLUDE_ONE_ANOTHER:
+        both = [option for option in group if option in given]
+        if len(both) > 1:
+            raise ConfigError(f"{both[0]} and {both[1]} exclude one another: leave one of them out")
+    if "--manual" in given and (method := given.get("--method")) in SPECIAL:
+        words = f"--manual ends before the 24 orientations that {method} needs"
+        raise ConfigError(f"{words}: leave it out, or choose --method lrom")
+    seconds = given.get("--seconds")
+    if seconds is not None and (seconds > _LONGEST_SWEEP_S if "--sweep" in given else "--passive" not in given):
+        raise ConfigError(f"--seconds {seconds:g} goes with --passive, or up to {_LONGEST_SWEEP_S} with --sweep")
+
+
 def method_of_poses(name: str) -> Method:
     """Return a method by its name, if poses suffice for it. Raises `ConfigError`."""
     if name not in get_args(Method):
@@ -68,7 +98,7 @@ def method_of_poses(name: str) -> Method:
 
 def with_recorded_mode(options: SessionOptions) -> SessionOptions:
     """Return options with the mode of the resumed run; raises `ConfigError` for options that exclude each other."""
-    begun = options.mode if options.resume is None else Run(options.resume).header().get("mode", "auto")
+    begun = options.mode if options.resume is None else Run(options.resume).mode
     if options.resume is not None and begun == "sweep":
         raise ConfigError(f"{options.resume} is a sweep, which is not continued: start again with --sweep")
     if options.mode != "auto" and (begun in _BY_HAND) != options.by_hand:
@@ -79,16 +109,7 @@ def with_recorded_mode(options: SessionOptions) -> SessionOptions:
         raise ConfigError("--redo needs a run: name the run with --resume RUN")
     if not options.by_hand:
         return options
-    no_motion = {
-        "--plan": options.plan is not None,
-        "--fast": options.fast,
-        "--dry-run": options.dry_run,
-        "--redo": bool(options.redo),
-        "--output": options.output is not None,
-        "--png": options.png is not None,
-        "--view": options.view,
-    }
-    if wrong := [name for name, given in no_motion.items() if given]:
+    if wrong := [name for name in _OF_MOTION if getattr(options, name[2:].replace("-", "_"))]:
         raise ConfigError(f"with --{options.mode} ftdrive neither plans nor moves: leave out {' and '.join(wrong)}")
     return options
 

@@ -11,10 +11,13 @@ from ftcalib.result import CalibrationResult
 from ftcalib.rounding import with_sigma
 from ftdrive.errors import Declined
 from ftdrive.runs.motion import MotionRecording, means_of
+from ftdrive.runs.outcome import circumstances_of
 from ftdrive.runs.run import Run
-from ftdrive.session.events import MotionRecorded, Noted
+from ftdrive.session.events import MotionRecorded
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key
+from ftdrive.session.pose_book import reporting_early_end
+from ftdrive.session.task import Session
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 
@@ -29,6 +32,14 @@ _SILENT_S: Final = 10.0
 """A shorter silence of a device is a gap in the recording, not its end."""
 GOOD: Final = 2
 """So many good fits in a row end it."""
+
+
+def take_passively(session: Session) -> Run:
+    """Record the free tool of a session in motion, as `record_passively`."""
+    run = session.new_run()
+    circumstances, _ = circumstances_of(run)
+    record_passively(session.cell, run, session.options.seconds, circumstances["setup"], circumstances["g_m_s2"])
+    return run
 
 
 def record_passively(
@@ -49,13 +60,10 @@ def record_passively(
     cell.note(f"Recording for {seconds:.0f} s at most; nothing is commanded. Keep the tool free for part of the time.")
     cell.journal.keep_in(run)
     executor = fits or ThreadPoolExecutor(1)
+    recorder = _Recorder(cell, run)
     try:
-        recorder = _Recorder(cell, run)
-        recorder.record(seconds, lambda at_s: executor.submit(_fitted, run, at_s, setup, g_m_s2))
-    except BaseException:
-        kept = f"the recording so far is kept; solve it with\n{run.solve_command}"
-        cell.journal.show(Noted(words=kept if run.in_motion else f"nothing was recorded in {run.folder}"), sync=True)
-        raise
+        with reporting_early_end(cell.journal, run):
+            recorder.record(seconds, lambda at_s: executor.submit(_fitted, run, at_s, setup, g_m_s2))
     finally:
         executor.shutdown(wait=False, cancel_futures=True)
     if recorder.duration_s < LEAST_S:

@@ -11,7 +11,27 @@ from ftcalib.routine import PoseRecord
 from ftdrive.runs.run import Run
 from ftdrive.session.events import Compared, Estimated, Noted, PoseTaken
 from ftdrive.session.live_fit import Judge
-from ftdrive.session.open_cell import OpenCell
+from ftdrive.session.open_cell import Journal, OpenCell
+
+
+@contextmanager
+def reporting_early_end(journal: Journal, run: Run) -> Iterator[None]:
+    """Show where the data of a run are if the block ends early."""
+    try:
+        yield
+    except BaseException:
+        journal.show(Noted(words=_describe_kept(run)), sync=True)
+        raise
+
+
+def _describe_kept(run: Run) -> str:
+    if run.mode == "sweep":
+        return f"the sweep was not completed: {run.folder} has its events, and no recording"
+    if run.mode == "passive":
+        kept = f"the recording so far is kept; solve it with\n{run.solve_command}"
+        return kept if run.in_motion else f"nothing was recorded in {run.folder}"
+    words = f"{len(run.stops())} poses saved in {run.folder}; continue with\n{run.resume_command}"
+    return words + (f"\nor solve them with\n{run.solve_command}" if run.stops() and run.command == "calibrate" else "")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,23 +43,6 @@ class PoseBook:
     judge: Judge
     down_base: Array
     """(3,) unit vector down in base, as mounted."""
-
-    @contextmanager
-    def reporting_early_end(self) -> Iterator[None]:
-        """Show where the poses are if the block ends early."""
-        try:
-            yield
-        except BaseException:
-            run = self.run
-            if run.header().get("mode") == "sweep":
-                words = f"the sweep was not completed: {run.folder} has its events, and no recording"
-                self.cell.journal.show(Noted(words=words), sync=True)
-                raise
-            words = f"{len(run.stops())} poses saved in {run.folder}; continue with\n{run.resume_command}"
-            if run.stops() and run.command == "calibrate":
-                words += f"\nor solve them with\n{run.solve_command}"
-            self.cell.journal.show(Noted(words=words), sync=True)
-            raise
 
     def keep(self, record: PoseRecord, *, stops: int, settle_s: float, average_s: float) -> Estimated | Compared:
         """Commit and show a pose; return what the poses show now."""

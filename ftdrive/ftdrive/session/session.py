@@ -12,21 +12,19 @@ from ftdrive.cell.config import CellConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.checks.devices import belonging
 from ftdrive.errors import ConfigError, Declined, PlanRefused
-from ftdrive.planning.geometry.scene import down_of
-from ftdrive.runs.outcome import Outcome, circumstances_of, solve_and_save
-from ftdrive.runs.run import Run
+from ftdrive.runs.outcome import Outcome, solve_and_save
+from ftdrive.runs.run import Mode, Run
 from ftdrive.session import preflight
-from ftdrive.session.along_plan import AlongPlan
+from ftdrive.session.along_plan import take_along_plan
 from ftdrive.session.events import State, StateChanged
 from ftdrive.session.guards import Limits
-from ftdrive.session.hand_guided import HandGuided
+from ftdrive.session.hand_guided import take_by_hand
 from ftdrive.session.open_cell import Journal, OpenCell
 from ftdrive.session.operator import Operator
 from ftdrive.session.options import SessionOptions, plan_on_disk, with_recorded_mode
-from ftdrive.session.passive import record_passively
-from ftdrive.session.pose_book import PoseBook
-from ftdrive.session.sweep import Sweeping, on_script_path
-from ftdrive.session.task import Calibrating, Task
+from ftdrive.session.passive import take_passively
+from ftdrive.session.sweep import on_script_path
+from ftdrive.session.task import Calibrating, Session, Task
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from ftdrivers.registry import Options, split_url
 
@@ -93,9 +91,10 @@ def _meaning(config: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]]) 
 
 def calibrate(cell: CellConfig, operator: Operator, options: SessionOptions) -> Outcome | None:
     """Guide the operator through a calibration; None after a dry run. Raises as `take_poses`."""
-    task = Calibrating(cell, options.real, options.sets, options.method)
     if options.mode == "sweep":
-        task = Sweeping(on_script_path(cell), options.real, seconds=options.seconds)
+        task = Calibrating(on_script_path(cell), options.real, sweep_s=options.seconds)
+    else:
+        task = Calibrating(cell, options.real, options.sets, options.method)
     run = take_poses(task, operator, options)
     return None if run is None else solve_and_save(run)
 
@@ -146,20 +145,26 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
             description = description_of(task, options, connected)
             return locked.enter_context(Run.create(options.runs, options.name, description, config.clock))
 
-        if options.mode == "passive":
-            run: Run | None = (kept := new_run())
-            circumstances, _ = circumstances_of(kept)
-            record_passively(cell, kept, options.seconds, circumstances["setup"], circumstances["g_m_s2"])
-        elif options.by_hand:
-            run = _by_hand(cell, task, resumed, new_run, listen=options.mode == "listen")
-        else:
-            run = AlongPlan(cell, task, options, resumed, new_run).take(plan)
+        run = _take(Session(cell, task, options, resumed, plan, new_run))
     if run is None:
         return None
     if not (run.stops() or run.in_motion):
         raise Declined(f"ended before the first pose: {run.folder} has no pose to solve")
     journal.show(StateChanged(state=State.REPORT))
     return run
+
+
+def _take(session: Session) -> Run | None:
+    """Take the poses or the recording of a session in its mode; None after a dry run."""
+    by_mode: Mapping[Mode, Callable[[Session], Run | None]] = {
+        "auto": take_along_plan,
+        "step": take_along_plan,
+        "sweep": take_along_plan,
+        "manual": take_by_hand,
+        "listen": take_by_hand,
+        "passive": take_passively,
+    }
+    return by_mode[session.options.mode](session)
 
 
 def description_of(task: Task, options: SessionOptions, connected: Mapping[str, DeviceInfo]) -> dict[str, Any]:
@@ -173,15 +178,3 @@ def description_of(task: Task, options: SessionOptions, connected: Mapping[str, 
         **({"station": {}} if task.cell.is_emulated else {}),  # of another process: nothing more is known
         **options.description,
     }
-
-
-def _by_hand(cell: OpenCell, task: Task, resumed: Run | None, new_run: Callable[[], Run], *, listen: bool) -> Run:
-    """Take poses without any motion command: the operator moves the arm, or a program on the pendant does."""
-    config, run = task.cell, resumed
-    if run is None:
-        run = new_run()
-        cell.journal.keep_in(run)
-    book = PoseBook(cell, run, task.judge(by_hand=True), down_of(config.workcell.mounting))
-    with book.reporting_early_end():
-        HandGuided(cell, book, config.sampling, listen=listen).run(run.records() if resumed else (), task.goal)
-    return run

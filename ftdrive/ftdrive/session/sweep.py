@@ -1,30 +1,22 @@
-"""A calibration from a sweep: its curve, its state machine, and what its guards know about the tool."""
+"""A sweep: its speed, its state machine, and what its guards know about the tool."""
 
 from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, noise_level
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
-from ftcalib.routine import PoseRecord
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.planning.cell_plan import sweep_for
-from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.geometry.scene import down_of
-from ftdrive.planning.plan import Plan
 from ftdrive.planning.sweep_planner import at_speed
 from ftdrive.runs.motion import MotionRecording
-from ftdrive.session.events import Estimated, MotionRecorded, State
+from ftdrive.session.events import MotionRecorded, State
 from ftdrive.session.forecast import moves_s
 from ftdrive.session.guards import Guard, Seen
-from ftdrive.session.live_fit import Judge
-from ftdrive.session.operator import Question
 from ftdrive.session.preflight import Before
-from ftdrive.session.task import Calibrating
-from ftdrive.session.tour import Pace, Tour, question_of
+from ftdrive.session.tour import Pace, Tour
 from ftdrivers.sweep import Sweep
 
 KNOWN_S: Final = 3.0
@@ -42,10 +34,9 @@ class FreeTool(Guard):
     """Recursive least squares of the wrench as a linear function of the direction of gravity in the flange.
 
     Force and torque are linear in it, whatever mounting, weight, centre of mass and bias are. It looks as a guard, but
-    never trips.
+    never trips: the contact guard asks it what a free tool weighs.
     """
 
-    weighed_kg: ClassVar[None] = None
     down_base: Array
     """(3,) unit vector."""
     heaviest_kg: float
@@ -56,14 +47,13 @@ class FreeTool(Guard):
     _covariance: Array = field(default_factory=lambda: np.zeros((4, 4)), init=False)
     _coefficients: Array = field(default_factory=lambda: np.zeros((4, 6)), init=False)
 
-    def begin(self, seen: Seen) -> None:
+    def begin(self, _: Seen) -> None:
         """Forget everything: after a stop the tool may be another, and the sensor may have another zero."""
         unknown = (self.heaviest_kg * STANDARD_GRAVITY_M_S2 / _NOISE_N) ** 2
         self._covariance = np.diag([unknown, unknown, unknown, 1e6])
         self._coefficients = np.zeros((4, 6))
         self._waiting.clear()
         self._moving_s = 0.0
-        del seen
 
     def look(self, seen: Seen) -> None:
         """Learn from what was seen a second ago."""
@@ -79,13 +69,6 @@ class FreeTool(Guard):
             gain = Px / (1.0 + x @ Px)
             self._coefficients = self._coefficients + np.outer(gain, wrench - x @ self._coefficients)
             self._covariance = self._covariance - np.outer(gain, Px)
-
-    def add(self, record: PoseRecord) -> Estimated:
-        """Raise: a sweep has no poses."""
-        raise NotImplementedError(f"pose {record.stop} of a sweep")
-
-    def remove(self, stop: int) -> None:
-        """Do nothing."""
 
     def predict(self, R_base_flange: Array) -> Array | None:
         """Wrench (6,) of a free tool at this orientation (3, 3); None while it is uncertain."""
@@ -129,10 +112,9 @@ class SweepTour(Tour):
     def _begin_words(self) -> str:
         return f"The arm stands where the sweep of {self._curve.duration_s:.0f} s begins. Begin?"
 
-    def _how_to_go_on(self, back: int | None, fixed: str) -> Question:
-        del back  # there is no other pose
-        ways = {"resume": f"sweep again from the start{fixed}", "quit": "stop; the next session starts again"}
-        return question_of("A sweep that was stopped is not kept.", ways)
+    def _choices(self, fixed: str) -> tuple[str, dict[str, str], str]:
+        ways = {"resume": f"sweep again from the start{fixed}"}
+        return "A sweep that was stopped is not kept.", ways, "stop; the next session starts again"
 
     def _take(self, stop: int, index: int) -> None:
         sweep, clock = self._curve, self._watcher.clock
@@ -168,9 +150,6 @@ class SweepTour(Tour):
             sync=True,
         )
 
-    def _compare_payload(self) -> None:
-        """Nothing is weighed before the recording is solved."""
-
     def _confirm_first(self) -> None:
         if not self._now.confirmed:
             self._confirm(self._begin_words)
@@ -188,25 +167,6 @@ class SweepTour(Tour):
 FIRST_SHARE: Final = 0.5
 """Of the planned speed, in the first run of a plan."""
 LEAST_SLIDER: Final = 0.5
-_HEAVIEST_KG: Final = 5.0
-
-
-@dataclass(frozen=True, eq=False)
-class Sweeping(Calibrating):
-    """A calibration in motion."""
-
-    seconds: float = 20.0
-    """Of the sweep, at the planned speed."""
-
-    def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
-        """Return a sweep around joint angles (6,)."""
-        del poses
-        return sweep_for(self.cell, certifier, q_rad, self.seconds)
-
-    def judge(self, *, by_hand: bool) -> Judge:
-        """Return what learns the weight of the tool for the contact guard."""
-        del by_hand
-        return FreeTool(down_of(self.cell.workcell.mounting), self.cell.tool.mass_kg or _HEAVIEST_KG)
 
 
 def on_script_path(cell: CellConfig) -> CellConfig:

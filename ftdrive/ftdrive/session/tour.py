@@ -5,7 +5,7 @@ planned from where the arm stands, shown and confirmed.
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
@@ -139,8 +139,6 @@ class Tour:
         self._go(index, stop)
         self._obey_keys()
         self._take(stop, index)
-        self._now.taken_last = stop
-        self._compare_payload()
         del self._now.todo[0]
 
     def _compare_payload(self) -> None:
@@ -272,6 +270,8 @@ class Tour:
         judged = self._book.keep(record, stops=self._now.stops, settle_s=settled_s, average_s=average_s)
         self._guarded.show_new()
         self._journal.show(judged)
+        self._now.taken_last = stop
+        self._compare_payload()
 
     def _go(self, index: int, stop: int) -> None:
         """Move the arm to a pose of the plan, along certified moves only."""
@@ -424,12 +424,18 @@ class Tour:
 
     def _how_to_go_on(self, back: int | None, fixed: str) -> Question:
         """Return the question in a hold; `back` is the index of the pose to which the arm can return."""
-        stop = self._now.todo[0]
-        ways = {"resume": f"go on with pose {stop}{fixed}", "skip": f"leave pose {stop} out"}
+        kept, ways, later = self._choices(fixed)
         if back is not None:
             ways["back"] = f"return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f}°/s"
-        ways["quit"] = "stop; continue later with --resume"
-        return question_of(f"{len(self._book.run.stops())} poses are saved.", ways)
+        ways["quit"] = later
+        choices = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
+        return Question(f"{kept} {choices}", tuple(ways))
+
+    def _choices(self, fixed: str) -> tuple[str, dict[str, str], str]:
+        """Return what is kept, the ways on with their effects, and the effect of quitting."""
+        stop = self._now.todo[0]
+        ways = {"resume": f"go on with pose {stop}{fixed}", "skip": f"leave pose {stop} out"}
+        return f"{len(self._book.run.stops())} poses are saved.", ways, "stop; continue later with --resume"
 
     def _choose(self, question: Question, end: Exception) -> str:
         """Ask how to go on; raise `end`, the first cause, if the operator quits or does not answer."""
@@ -460,9 +466,3 @@ class Tour:
     def _show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
         number = None if stop is None or self._plan.sweep else self._plan.steps[self._now.index(stop)].number
         self._journal.show(StateChanged(state=state, stop=stop, stops=self._now.stops, number=number, words=words))
-
-
-def question_of(first: str, ways: Mapping[str, str]) -> Question:
-    """Return a question whose answers are keys of `ways`, with their effects."""
-    choices = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
-    return Question(f"{first} {choices}", tuple(ways))

@@ -24,6 +24,7 @@ from ftdrive.runs.verification_record import fitted_dataset
 from ftdrive.session.events import Compared
 from ftdrive.session.forecast import Averages
 from ftdrive.session.live_fit import Judge
+from ftdrive.session.task import from_usual_wrist
 
 POSES: Final = 6
 QUICK_POSES: Final = 2
@@ -69,12 +70,16 @@ class Verifying:
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
         """Return the plan of the newest verification with as many poses, or a new one from joint angles (6,)."""
+        q_rad = from_usual_wrist(certifier, q_rad)
         earlier = self._earlier(certifier, q_rad, poses)
         if earlier is not None:
             return earlier
         guess = guess_of(certifier, self.cell.tool.mass_kg)
         plan = plan_verification(certifier, q_rad, poses, self.R_fitted, speeds=speeds_of(self.cell), guess=guess)
         return plan.marked(measured=self.cell.workcell.measured, emulated=self.cell.is_emulated)
+
+    def learner(self) -> None:
+        """Return None: the poses are compared with a calibration."""
 
     def judge(self, *, by_hand: bool) -> Judge:
         """Return who compares each pose with the calibration."""

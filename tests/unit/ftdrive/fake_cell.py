@@ -36,7 +36,6 @@ from ftdrive.session.guards import Limits
 from ftdrive.session.open_cell import Journal, OpenCell
 from ftdrive.session.operator import Key, Question
 from ftdrive.session.options import SessionOptions
-from ftdrive.session.sweep import Sweeping
 from ftdrive.session.task import Calibrating
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
@@ -474,7 +473,7 @@ class Lab:
 
     def sweep(self, **options: Any) -> Run | None:
         chosen = SessionOptions(self.folder / "runs", mode="sweep", **options)
-        return session.take_poses(Sweeping(self.cell, chosen.real, seconds=10.0), self.operator, chosen)
+        return session.take_poses(Calibrating(self.cell, chosen.real, sweep_s=10.0), self.operator, chosen)
 
     def run(self) -> Run:
         (folder,) = (self.folder / "runs").iterdir()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import STORE, read_cell, store_url
+from ftdrive.commands.common import STORE, CellOptions, store_url
 from ftdrive.commands.verify import Wanted, failure_in_words, verify_cell
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.text import echo
@@ -115,7 +115,7 @@ def _verify(one: "StoredCell", store: "Store", url: str | None, fleet: "Fleet") 
 
 def _described(one: "StoredCell") -> "CellConfig":
     """Read the configuration of a cell; raises `ConfigError` if the store does not know its robot."""
-    cell = read_cell(Path(one.config), None, None)
+    cell = CellOptions(Path(one.config)).cell()
     if one.robot_host not in {None, cell.robot.host}:
         raise ConfigError(
             f"its robot is {cell.robot.host}, the store has {one.robot_host}: update the store with `ftdrive fleet add`"

@@ -16,7 +16,7 @@ import pytest
 from ftcalib import CalibrationResult
 from ftdrive import cli
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
-from ftdrive.commands.common import Source, index_run
+from ftdrive.commands.common import CellOptions, Source, index_run
 from ftdrive.commands.live_source import open_log
 from ftdrive.runs.run import Run
 from ftdrive.runs.weighings import FOLDER, WeighingsFile
@@ -301,7 +301,7 @@ def test_weighings_are_kept_with_a_calibration_of_a_file(
     calibration = result(1, station={} if emulated else None)
     config = CellConfig(RobotConfig(host="10.0.0.7"), SensorConfig("ati-can://can0"))
     stream: Any = SimpleNamespace(info=replace(info(calibration), emulated=emulated), cell=config)
-    source = Source(None, None, False, None, None, None, emulated)
+    source = Source(None, None, False, CellOptions(), emulated)
     with ExitStack() as stack:
         assert (open_log(source, stream, stack, print) is None) == emulated
         log = open_log(source._replace(path=tmp_path), stream, stack, print)

@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from ftdrive.commands import live_source, stream
+from ftdrive.commands.common import CellOptions
 from ftdrive.errors import ConfigError, exit_code
 from ftdrive.live.loop import RECOVER_S
 from ftdrive.live.samples import Block, StreamEvent, WrenchFrame
@@ -104,7 +105,7 @@ def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *arguments: str) -> tup
 
     monkeypatch.setattr(live_source, "CompensatedStream", open_)
     monkeypatch.setattr(live_source, "read_calibration", lambda *_, **__: SimpleNamespace())
-    monkeypatch.setattr(live_source, "read_cell", lambda *_: SimpleNamespace())
+    monkeypatch.setattr(CellOptions, "cell", lambda _: SimpleNamespace())
     calibration = tmp_path / "calibration.json"
     calibration.touch()
     outcome = CliRunner().invoke(stream.stream, ["--calibration", str(calibration), "--port", "0", *arguments])

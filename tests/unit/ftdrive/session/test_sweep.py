@@ -15,7 +15,7 @@ from ftdrive.planning import sweep_planner
 from ftdrive.planning.cell_plan import certifier_for, sweep_for
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.motion import MotionRecording
-from ftdrive.session import sweep
+from ftdrive.session import task
 from ftdrive.session.events import Event, GuardTripped, MotionRecorded, State, StateChanged
 from ftdrive.session.guards import ExpectedMotion, Seen
 from ftdrive.session.operator import Key
@@ -43,7 +43,7 @@ def _short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     def planned_once(cell: CellConfig, _: object, q_rad: Array, seconds: float) -> Plan:
         return planned(tuple(q_rad.tolist()), replace(cell, clock=REAL), seconds)
 
-    monkeypatch.setattr(sweep, "sweep_for", planned_once)
+    monkeypatch.setattr(task, "sweep_for", planned_once)
 
 
 @pytest.mark.slow
