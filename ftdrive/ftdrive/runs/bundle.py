@@ -40,7 +40,8 @@ from ftcalib.files import (
 from ftdrive.cell.config import recorded_cell
 from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, check_permissions, check_workcell
 from ftdrive.errors import BadBundle
-from ftdrive.runs.run import CRC, LOCK, ZIP_DAMAGE, Run, event_of, versions, with_crc32
+from ftdrive.runs.numbers import CRC, ZIP_DAMAGE, line_of, read_line
+from ftdrive.runs.run import LOCK, Run, versions
 
 _HOME = re.compile(r"(?:/home|/Users|[A-Za-z]:\\Users)[/\\]([^/\\\s\"':;,<>]+)")
 _URL_HOST = re.compile(r"\b([a-z][a-z0-9+-]*)://(?:[^/@\s]*@)?([A-Za-z0-9][A-Za-z0-9.-]*)")
@@ -113,8 +114,8 @@ class Redaction:
         document = _document(line)
         if document is None:
             return self.text(line)
-        if isinstance(document, dict) and CRC in document and (event := event_of(line)) is not None:
-            return json.dumps(with_crc32(self.json(event)))
+        if isinstance(document, dict) and CRC in document and (event := read_line(line)) is not None:
+            return line_of(self.json(event))
         return json.dumps(self.json(document))
 
     def json(self, value: JSON, key: str = "") -> JSON:

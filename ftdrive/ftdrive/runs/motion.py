@@ -1,7 +1,6 @@
 """A recording of a free tool in motion, raw: every sample of sensor and arm, in one file of a run or in parts of it."""
 
 import hashlib
-import io
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -13,11 +12,10 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult, Known
 from ftcalib.errors import BadDataset
-from ftcalib.files import write_new
 from ftcalib.model import Array
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
-from ftdrive.runs.run import DAMAGE, arrays_of
+from ftdrive.runs.numbers import DAMAGE, read_arrays, write_arrays
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 FORMAT: Final = "ftdrive.motion/1"
@@ -46,12 +44,11 @@ class MotionRecording:
 
     def save(self, path: Path) -> None:
         """Write a new file; returns when it is on disk."""
-        buffer = io.BytesIO()
         wrench = {f"wrench_{name}": getattr(self.samples, name) for name in _WRENCH}
         poses = {f"pose_{name}": getattr(self.states, name) for name in _POSES}
         rate = np.array(self.nominal_rate_Hz)
-        np.savez(buffer, format=np.array(FORMAT), nominal_rate_Hz=rate, **wrench, **poses)
-        write_new(path, buffer.getvalue())
+        arrays = {"format": np.array(FORMAT), "nominal_rate_Hz": rate, **wrench, **poses}
+        write_arrays(path, arrays, compressed=False)
 
     @classmethod
     def load(cls, path: Path) -> "MotionRecording":
@@ -64,7 +61,7 @@ class MotionRecording:
     def load_one(cls, path: Path) -> "MotionRecording":
         """Read one file; raises `BadDataset`."""
         try:
-            data = arrays_of(path)
+            data = read_arrays(path)
             if str(data.get("format")) != FORMAT:
                 raise ValueError(f"its format is {data.get('format')}, this version reads {FORMAT}")
             return cls(

@@ -15,20 +15,13 @@ lock              which process adds poses, or did so last
 Damage is refused: JSON files have a checksum, each line of events.ndjson a CRC-32, and each array of a pose too.
 """
 
-import io
-import json
 import logging
-import lzma
 import os
 import platform
 import shlex
-import struct
 import sys
 import threading
 import time
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -42,13 +35,14 @@ from typing import Any, Final, Literal, Self, get_args
 import numpy as np
 
 from ftcalib.errors import BadDataset
-from ftcalib.files import check_format, open_file, parsed_json, read_file, read_object, write_new, write_object
+from ftcalib.files import check_format, read_file, read_object, write_object
 from ftcalib.model import Array
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord, TourPose
 from ftdrive import __version__
 from ftdrive.cell.config import recorded, without_password
 from ftdrive.errors import ConfigError
+from ftdrive.runs.numbers import DAMAGE, append_lines, read_arrays, read_line, write_arrays
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.interfaces import FtSamples
 
@@ -60,16 +54,7 @@ POSE = "pose-taken"
 """The event of a pose that is on disk, `ftdrive.session.events.PoseTaken`."""
 
 _RESTORE = "take it from a copy"
-ZIP_DAMAGE: Final = (
-    *(EOFError, MemoryError, OverflowError, RuntimeError, ValueError),
-    *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
-)
-"""Errors of `zipfile` for a damaged file: RuntimeError for an apparent password or unknown compression. OSError too."""
-DAMAGE: Final = (*ZIP_DAMAGE, KeyError, OSError, TypeError, tokenize.TokenError)
-"""Errors for a file of arrays; numpy raises TokenError."""
 LOCK: Final = "lock"
-CRC: Final = "crc32"
-"""Field of an event with the CRC-32 of the others, as JSON with sorted keys."""
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 """Of a recording, named as in `FtSamples`."""
 
@@ -234,15 +219,8 @@ class Run:
 
     def append_event(self, event: Mapping[str, Any], *, sync: bool = False) -> None:
         """Add a line to events.ndjson, or nothing; with `sync` return when it is on disk. Any thread."""
-        line = (json.dumps(with_crc32(event)) + "\n").encode()
         with self._events_lock, self._events_path.open("ab", buffering=0) as file:
-            begin = file.tell()
-            try:
-                while line:
-                    line = line[file.write(line) :]
-            except OSError:
-                file.truncate(begin)  # half a line would make the next one unreadable
-                raise
+            append_lines(file, file.tell(), [event])
             if sync:
                 os.fsync(file.fileno())
 
@@ -258,11 +236,11 @@ class Run:
         text = read_file(path).decode(errors="replace") if path.exists() else ""
         *lines, rest = text.split("\n")
         for number, line in enumerate(lines, 1):
-            if (event := event_of(line)) is None:
+            if (event := read_line(line)) is None:
                 raise BadDataset(f"{path}: line {number} is damaged: {_RESTORE}")
             yield event
         # What follows the last line is an event if only the end of its line is damaged.
-        if (event := event_of(rest) or event_of(rest[:-1])) is not None:
+        if (event := read_line(rest) or read_line(rest[:-1])) is not None:
             yield event
 
     @property
@@ -311,24 +289,22 @@ class Run:
     def commit(self, record: PoseRecord) -> PoseRecord:
         """Write one pose; returns it, as `records` reads it, when it is on disk."""
         record = replace(record, clock_offset_ns=record.clock_offset_ns or self._clock_offset_ns)
-        buffer = io.BytesIO()
         readings: dict[str, Any] = {
             f"{when}_{name}": np.asarray(getattr(reading, name))
             for when, reading in (("before", record.before), ("after", record.after))
             for name in ("t_host_ns", "q_rad", "R_base_flange")
         }
-        np.savez_compressed(
-            buffer,
-            format=np.array(RECORDING_FORMAT),
-            stop=np.array(record.stop),
-            number=np.array(record.pose.number),
-            q_target_rad=record.pose.q_rad,
-            steady=np.array(record.steady),
-            clock_offset_ns=np.array(record.clock_offset_ns),
+        arrays = {
+            "format": np.array(RECORDING_FORMAT),
+            "stop": np.array(record.stop),
+            "number": np.array(record.pose.number),
+            "q_target_rad": record.pose.q_rad,
+            "steady": np.array(record.steady),
+            "clock_offset_ns": np.array(record.clock_offset_ns),
             **readings,
             **{name: getattr(record.samples, name) for name in _SAMPLE_COLUMNS},
-        )
-        write_new(unused_path(self.folder / "poses" / f"{record.stop:02d}.npz"), buffer.getvalue())
+        }
+        write_arrays(unused_path(self.folder / "poses" / f"{record.stop:02d}.npz"), arrays, compressed=True)
         return record
 
     def records(self) -> list[PoseRecord]:
@@ -344,26 +320,6 @@ class Run:
 def in_motion(place: Path) -> bool:
     """Whether a place is a run folder with a recording in motion instead of poses."""
     return place.is_dir() and Run(place).in_motion
-
-
-def event_of(line: str) -> dict[str, Any] | None:
-    """Return the event in a line of events.ndjson; None if it is damaged."""
-    try:
-        event = parsed_json(line)
-    except ValueError:
-        return None
-    if not isinstance(event, dict):
-        return None
-    return event if event.pop(CRC, None) == _crc32(event) else None
-
-
-def with_crc32(event: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an event with its CRC-32, as a line of events.ndjson has it."""
-    return {**event, CRC: _crc32(event)}
-
-
-def _crc32(event: Mapping[str, Any]) -> str:
-    return f"{zlib.crc32(json.dumps(event, sort_keys=True).encode()):08x}"
 
 
 def _is_text(value: Any) -> bool:
@@ -441,19 +397,9 @@ def _newest(path: Path) -> Path:
     return found
 
 
-def arrays_of(path: Path) -> dict[str, Any]:
-    """Read a file of arrays; raises one of `DAMAGE`."""
-    with open_file(path) as content, zipfile.ZipFile(content) as file:
-        # `ZipFile.read` reads to the end of each array, where its CRC-32 is checked; `numpy.load` need not.
-        return {
-            name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
-            for name in file.namelist()
-        }
-
-
 def _read_record(path: Path) -> PoseRecord:
     try:
-        data = arrays_of(path)
+        data = read_arrays(path)
         found = str(data.get("format"))
         if found != RECORDING_FORMAT:
             raise BadDataset(f"{path} has format {found!r}: this version reads {RECORDING_FORMAT}")

@@ -16,6 +16,7 @@ from typing import Any, Final, Self
 
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, open_file
+from ftdrive.runs.numbers import append_lines, read_line
 
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
@@ -67,8 +68,6 @@ class WeighingsFile:
         """Add lines, and the header to a new file; returns when they are on disk. Raises `OSError`."""
         import fcntl
 
-        from ftdrive.runs.run import with_crc32
-
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a+b", buffering=0) as file:
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -78,10 +77,8 @@ class WeighingsFile:
             begin = end - len(tail) + tail.rfind(b"\n") + 1  # a power failure may have cut off the last line
             file.truncate(begin)
             written = [*([] if begin else [self.header]), *lines]
-            content = "".join(json.dumps(with_crc32(one)) + "\n" for one in written).encode()
+            append_lines(file, begin, written)
             try:
-                while content:
-                    content = content[file.write(content) :]
                 os.fsync(file.fileno())
             except OSError:
                 file.truncate(begin)
@@ -96,13 +93,11 @@ class WeighingsFile:
             The file is damaged or of another format.
         OSError
         """
-        from ftdrive.runs.run import event_of
-
         with open_file(self.path) as file:
             file.seek(self.size)
             *lines, _ = file.read().split(b"\n")
         for line in lines:
-            if (found := event_of(line.decode(errors="replace"))) is None:
+            if (found := read_line(line.decode(errors="replace"))) is None:
                 raise BadDataset(f"line {self._lines + 1} of the weighings is damaged: take the file from a copy")
             self._take(found)
             self._lines += 1

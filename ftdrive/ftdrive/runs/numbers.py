@@ -1,0 +1,78 @@
+"""Files of arrays and lines of JSON in a run, each with a checksum of its own."""
+
+import io
+import json
+import lzma
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from io import FileIO
+from pathlib import Path
+from typing import Any, Final
+
+from ftcalib.files import open_file, parsed_json, write_new
+
+ZIP_DAMAGE: Final = (
+    *(EOFError, MemoryError, OverflowError, RuntimeError, ValueError),
+    *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
+)
+"""Errors of `zipfile` for a damaged file: RuntimeError for an apparent password or unknown compression. OSError too."""
+DAMAGE: Final = (*ZIP_DAMAGE, KeyError, OSError, TypeError, tokenize.TokenError)
+"""Errors for a file of arrays; numpy raises TokenError."""
+CRC: Final = "crc32"
+"""Field of a line with the CRC-32 of the others, as JSON with sorted keys."""
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool) -> None:
+    """Write a new file of arrays by name; returns when it is on disk."""
+    import numpy as np
+
+    buffer = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(buffer, **arrays)
+    write_new(path, buffer.getvalue())
+
+
+def read_arrays(path: Path) -> dict[str, Any]:
+    """Read a file of arrays; raises one of `DAMAGE`."""
+    import numpy as np
+
+    with open_file(path) as content, zipfile.ZipFile(content) as file:
+        # `ZipFile.read` reads to the end of each array, where its CRC-32 is checked; `numpy.load` need not.
+        return {
+            name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)
+            for name in file.namelist()
+        }
+
+
+def read_line(line: str) -> dict[str, Any] | None:
+    """Return the object in a line; None if it is damaged."""
+    try:
+        content = parsed_json(line)
+    except ValueError:
+        return None
+    if not isinstance(content, dict):
+        return None
+    return content if content.pop(CRC, None) == _crc32(content) else None
+
+
+def line_of(content: Mapping[str, Any]) -> str:
+    """Return an object as a line with its CRC-32, without the end of the line."""
+    return json.dumps({**content, CRC: _crc32(content)})
+
+
+def append_lines(file: FileIO, begin: int, objects: Sequence[Mapping[str, Any]]) -> None:
+    """Add lines to an unbuffered file that ends at `begin`, or nothing. Raises `OSError`."""
+    content = "".join(line_of(one) + "\n" for one in objects).encode()
+    try:
+        while content:
+            content = content[file.write(content) :]
+    except OSError:
+        # Half a line would make the next one unreadable.
+        file.truncate(begin)
+        raise
+
+
+def _crc32(content: Mapping[str, Any]) -> str:
+    return f"{zlib.crc32(json.dumps(content, sort_keys=True).encode()):08x}"
