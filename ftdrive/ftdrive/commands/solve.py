@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
 from typing import Any, get_args
@@ -173,61 +174,77 @@ def solve(
         raise ConfigError("--together joins two runs or more: name them, the oldest first")
     if output is not None and ((len(sources) > 1 and not joined) or method == "all" or cases):
         raise ConfigError("--output takes one result: give one dataset and one method")
-    read: dict[str, Any] = {
-        "orientation": orientation,
-        "known": known_values(mass_kg, level_deg, mounting_deg),
-        "up_in_base": upward(up),
-    }
-    how = {"drift": drift, "as_published": as_published}
-    shown = {"test": test, "tests": _test_set(test, orientation), "cases": cases}
-    motion = {"pair": pair, "point_mass": point_mass, "topics": (wrench_topic, pose_topic)}
+    wanted = _Wanted(
+        method=method,
+        orientation=orientation,
+        known=known_values(mass_kg, level_deg, mounting_deg),
+        up_in_base=upward(up),
+        drift=drift,
+        as_published=as_published,
+        earlier=None if earlier is None else read_calibration(earlier),
+        pair=pair,
+        point_mass=point_mass,
+        topics=(wrench_topic, pose_topic),
+        test=test,
+        tests=_test_set(test, orientation),
+        cases=cases,
+    )
     if joined:
-        _solve_together(sources, how, read, output, force, as_json)
+        _solve_together(sources, wanted, output, force, as_json)
         return
-    if earlier is not None:
-        read["earlier"] = read_calibration(earlier)
     poses = 24 if method in (*SPECIAL, "all") else 6
     options = {"sets": EVERY_SET} if cases else {"poses": poses, "method": "ml" if method == "all" else method}
     with rehearsed_run(sensor, **options) if simulate else nullcontext() as run:
-        _solve_each(sources if run is None else [run], method, how, read, motion, shown, output, force, as_json)
+        _solve_each(sources if run is None else [run], wanted, output, force, as_json)
     if output is not None and sources and sources[0].is_dir():
         index_run(sources[0])  # the result, if it was saved in the run
 
 
-def _solve_each(
-    sources: Sequence[Path],
-    method: str,
-    how: dict[str, Any],
-    read: dict[str, Any],
-    motion: dict[str, Any],
-    shown: dict[str, Any],
-    output: Path | None,
-    force: bool,
-    as_json: bool,
-) -> None:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Wanted:
+    """What is solved, and how."""
+
+    method: str
+    orientation: Orientation
+    known: Known | None
+    up_in_base: Sequence[float] | None
+    drift: Drift
+    as_published: bool
+    earlier: CalibrationResult | None
+    pair: tuple[Path, Path] | None
+    """Files of wrench and orientation of a recording in motion."""
+    point_mass: bool
+    topics: tuple[str | None, str | None]
+    """Of a bag: wrench and pose."""
+    test: Path | None
+    tests: CalibrationDataset | None
+    """The poses of `test`."""
+    cases: bool
+    """The cases of Yu's Table III, instead of one result."""
+
+    def read(self, place: Path) -> Source:
+        """Read poses at rest."""
+        return read_source(place, self.orientation, self.known, self.up_in_base)
+
+
+def _solve_each(sources: Sequence[Path], wanted: _Wanted, output: Path | None, force: bool, as_json: bool) -> None:
     first_failure: AcceptanceError | DataError | None = None
     for source in sources:
         try:
             with unpacked(source) as place:
-                options = {key: value for key, value in read.items() if key != "earlier"}
-                is_motion = is_recording(place) or is_bag(place) or in_motion(place)
-                if method == "all" and motion["pair"] is None and not is_motion:
-                    _show_all(source, read_source(place, **options), how, shown, as_json)
+                if wanted.method == "all" and wanted.pair is None and not _is_in_motion(place):
+                    _show_all(source, wanted.read(place), wanted, as_json)
                     continue
-                if shown["cases"]:
-                    _show_cases(source, read_source(place, **options), as_json)
+                if wanted.cases:
+                    _show_cases(source, wanted.read(place), as_json)
                     continue
-                result, records = _result_of(place, method, how, read, motion)
+                result, records = _result_of(place, wanted)
                 if as_json:
                     found = [one.to_dict() for one in hints(result, records)]
                     write_json({"source": str(source), "hints": found, **result.to_dict()})
                 else:
                     print_result(result, drift=drift_check(records) if records else None, records=records)
-                if not force:
-                    stop_unless_accepted(result, to_be_saved=output is not None)
-                if output is not None:
-                    result.save(output)
-                    beside(as_json).print(f" Saved {output}")
+                _save(result, output, force, as_json)
         except (AcceptanceError, DataError) as error:
             if len(sources) == 1:
                 raise
@@ -239,60 +256,60 @@ def _solve_each(
         raise SystemExit(exit_code(first_failure))
 
 
-def _result_of(
-    place: Path, method: str, how: dict[str, Any], read: dict[str, Any], motion: dict[str, Any]
-) -> tuple[CalibrationResult, Sequence[PoseRecord]]:
-    """Solve a recording in motion, or poses; also return the records of a run."""
-    topics = motion["topics"]
-    from_bag = motion["pair"] is None and is_bag(place)
-    if any(topics) and not from_bag:
-        raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS 2: leave them out")
-    if motion["pair"] is not None or from_bag or is_recording(place) or in_motion(place):
-        if method != "ml":
-            raise ConfigError(f"--method {method} is for poses at rest: leave it out for a recording")
-        options = {"earlier": read.get("earlier"), "known": read["known"], "point_mass": motion["point_mass"]}
-        if in_motion(place):
-            with working("Solving"):
-                return solve_in_motion(Run(place), **options), ()
-        from ftdrive.recording.in_motion import solve_recording  # with the filters of a stream
+def _is_in_motion(place: Path) -> bool:
+    return is_recording(place) or is_bag(place) or in_motion(place)
 
-        options["up_in_base"] = read["up_in_base"]
-        with working("Solving"):
-            means = bag_means(read_bag(place, *topics)) if from_bag else None
-            return solve_recording(place, motion["pair"], means, **options), ()
-    data = read_source(place, **{key: value for key, value in read.items() if key not in ("earlier", "alone")})
-    earlier = None if read.get("alone") else read.get("earlier") or data.earlier
+
+def _result_of(place: Path, wanted: _Wanted) -> tuple[CalibrationResult, Sequence[PoseRecord]]:
+    """Solve a recording in motion, or poses; also return the records of a run."""
+    from_bag = wanted.pair is None and is_bag(place)
+    if any(wanted.topics) and not from_bag:
+        raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS 2: leave them out")
+    if wanted.pair is not None or _is_in_motion(place):
+        if wanted.method != "ml":
+            raise ConfigError(f"--method {wanted.method} is for poses at rest: leave it out for a recording")
+        return _solve_motion(place, wanted), ()
+    data = wanted.read(place)
+    earlier = wanted.earlier or data.earlier
     if earlier is not None:
         require_same_cell(earlier, data.provenance)
         return new_tool(earlier, data.dataset, data.provenance), data.records
-    options = {**how, **data.circumstances, "provenance": data.provenance}
+    return _solve_poses(data, wanted), data.records
+
+
+def _solve_motion(place: Path, wanted: _Wanted) -> CalibrationResult:
+    options: dict[str, Any] = {
+        "earlier": wanted.earlier,
+        "known": wanted.known,
+        "point_mass": wanted.point_mass,
+    }
     with working("Solving"):
-        return _solve(data.dataset, method, options), data.records
+        if in_motion(place):
+            return solve_in_motion(Run(place), **options)
+        from ftdrive.recording.in_motion import solve_recording  # with the filters of a stream
+
+        from_bag = wanted.pair is None and is_bag(place)
+        means = bag_means(read_bag(place, *wanted.topics)) if from_bag else None
+        return solve_recording(place, wanted.pair, means, up_in_base=wanted.up_in_base, **options)
 
 
-_AT_REST = {"pair": None, "point_mass": False, "topics": (None, None)}
-
-
-def _solve_together(
-    sources: Sequence[Path],
-    how: dict[str, Any],
-    read: dict[str, Any],
-    output: Path | None,
-    force: bool,
-    as_json: bool,
-) -> None:
+def _solve_together(sources: Sequence[Path], wanted: _Wanted, output: Path | None, force: bool, as_json: bool) -> None:
     results = []
-    read = {**read, "alone": True}  # a result from another one would count that twice
     for source in sources:
         with unpacked(source) as place:
-            if is_recording(place) or in_motion(place) or is_bag(place):
+            if _is_in_motion(place):
                 raise ConfigError(f"--together joins poses at rest, and {source} is in motion")
-            results.append(_result_of(place, "ml", how, read, _AT_REST)[0])
+            # Without the earlier result of a new tool, because a result from another one would count that twice.
+            results.append(_solve_poses(wanted.read(place), wanted))
     result = together(results)
     if as_json:
         write_json({"sources": [str(source) for source in sources], **result.to_dict()})
     else:
         print_result(result)
+    _save(result, output, force, as_json)
+
+
+def _save(result: CalibrationResult, output: Path | None, force: bool, as_json: bool) -> None:
     if not force:
         stop_unless_accepted(result, to_be_saved=output is not None)
     if output is not None:
@@ -300,12 +317,14 @@ def _solve_together(
         beside(as_json).print(f" Saved {output}")
 
 
-def _solve(dataset: CalibrationDataset, method: Any, options: dict[str, Any]) -> CalibrationResult:
-    chosen: Method = method
-    try:
-        return solve_dataset(dataset, chosen, **options)
-    except ValueError as error:
-        raise ConfigError(str(error)) from error
+def _solve_poses(data: Source, wanted: _Wanted) -> CalibrationResult:
+    chosen: Any = wanted.method
+    how: dict[str, Any] = {"drift": wanted.drift, "as_published": wanted.as_published, **data.circumstances}
+    with working("Solving"):
+        try:
+            return solve_dataset(data.dataset, chosen, **how, provenance=data.provenance)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
 
 
 def _test_set(test: Path | None, orientation: Orientation) -> CalibrationDataset | None:
@@ -315,12 +334,13 @@ def _test_set(test: Path | None, orientation: Orientation) -> CalibrationDataset
         return read_dataset(place, orientation)
 
 
-def _show_all(source: Path, data: Source, how: dict[str, Any], shown: dict[str, Any], as_json: bool) -> None:
-    test, tests, truth = shown["test"], shown["tests"], data.truth
+def _show_all(source: Path, data: Source, wanted: _Wanted, as_json: bool) -> None:
+    test, tests, truth = wanted.test, wanted.tests, data.truth
+    how: dict[str, Any] = {"drift": wanted.drift, "as_published": wanted.as_published, **data.circumstances}
     with working("Solving with all methods"):
-        compared = compare(data.dataset, **how, **data.circumstances, test=tests, truth=truth)
+        compared = compare(data.dataset, **how, test=tests, truth=truth)
     if as_json:
-        given = {"as_published": how["as_published"], **({} if test is None else {"test_set": str(test)})}
+        given = {"as_published": wanted.as_published, **({} if test is None else {"test_set": str(test)})}
         methods = [one.to_dict() for one in compared]
         write_json({"schema_version": 1, "source": str(source), **given, "methods": methods})
         return
@@ -336,7 +356,7 @@ def _show_cases(source: Path, data: Source, as_json: bool) -> None:
         raise ConfigError(f"--table-iii needs the folder of a run, and {source} is a file: calibrate --set {EVERY_SET}")
     with working("Solving the cases of Table III"):
         numbers = numbers_in_dataset(data.records)
-        cases = table_iii(data.dataset, numbers, data.truth, g_m_s2=data.circumstances["g_m_s2"])
+        cases = table_iii(data.dataset, numbers, data.truth, g_m_s2=data.g_m_s2)
     if as_json:
         rows = [{"case": number, "data": sets, "test_set": on, **one.to_dict()} for number, sets, on, one in cases]
         write_json({"schema_version": 1, "source": str(source), "cases": rows})

@@ -61,12 +61,12 @@ def task_of(folder: Path) -> tuple[bytes, bytes]:
         A file of the run is damaged or missing.
     """
     run = Run(folder)
-    circumstances, origin = circumstances_of(run)
+    found = circumstances_of(run)
     own = CalibrationResult.load(run.calibration_path).provenance if run.calibration_path.is_file() else run.header()
     given = {
         "version": __version__,
-        "circumstances": {**circumstances, "method": run.method, "setup": asdict(circumstances["setup"])},
-        "provenance": {"created_utc": own.get("created_utc"), **origin},
+        "circumstances": {"g_m_s2": found.g_m_s2, "setup": asdict(found.setup), "method": run.method},
+        "provenance": {"created_utc": own.get("created_utc"), **found.origin},
     }
     return read_file(run.dataset_path), json.dumps(given).encode()
 

@@ -41,6 +41,21 @@ def _of(document: Any, *keys: str) -> Any:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Circumstances:
+    """What is known of the data of a run beside them."""
+
+    g_m_s2: float
+    setup: Setup
+    """The described cell."""
+    origin: dict[str, Any]
+    """Devices, run, cell and temperature."""
+
+    def provenance(self) -> dict[str, Any]:
+        """Return the provenance of a result that is made now."""
+        return {**made_now(), **self.origin}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Outcome:
     """A solved run."""
 
@@ -72,29 +87,29 @@ def solve_in_motion(
     run: Run, known: Known | None = None, *, earlier: CalibrationResult | None = None, point_mass: bool = False
 ) -> CalibrationResult:
     """Solve the recording of a run in motion; with the earlier result of a new tool that is given, or its own."""
-    circumstances, origin = circumstances_of(run)
+    found = circumstances_of(run)
     earlier = earlier or earlier_of(run)
     if earlier is not None:
-        require_same_cell(earlier, origin)
-    setup: Setup = circumstances["setup"]
+        require_same_cell(earlier, found.origin)
     return solve_motion_file(
         run.motion_path,
-        height_m=setup.sensor_height_m,
+        height_m=found.setup.sensor_height_m,
         known=known,
         earlier=earlier,
         point_mass=point_mass,
         guarded=run.mode == "sweep",
-        provenance={**made_now(), **origin},
-        **circumstances,
+        provenance=found.provenance(),
+        g_m_s2=found.g_m_s2,
+        setup=found.setup,
     )
 
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
-    dataset, circumstances, provenance = dataset_of(run, records)
-    earlier = earlier_of(run)
+    dataset, found = dataset_of(run, records)
+    earlier, provenance = earlier_of(run), found.provenance()
     if earlier is None:
-        result = solve(dataset, run.method, **circumstances, provenance=provenance)
+        result = solve(dataset, run.method, g_m_s2=found.g_m_s2, setup=found.setup, provenance=provenance)
     else:
         require_same_cell(earlier, provenance)
         result = new_tool(earlier, dataset, provenance)
@@ -107,32 +122,31 @@ def earlier_of(run: Run) -> CalibrationResult | None:
     return None if document is None else CalibrationResult.from_dict(document)
 
 
-def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, dict[str, Any], dict[str, Any]]:
-    """Return a run's records as a dataset, the circumstances as `solve` takes them, and the provenance."""
+def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, Circumstances]:
+    """Return a run's records as a dataset, and their circumstances."""
     if not records:
         raise NotObservable(f"{run.folder} has no data to solve: {run.how_to_go_on}")
-    circumstances, origin = circumstances_of(run)
-    emulated = {"emulated": True} if origin["station"] is not None else {}
-    dataset = dataset_from(records, {"run": run.folder.name, "devices": origin["devices"], **emulated})
-    return dataset, circumstances, {**made_now(), **origin}
+    found = circumstances_of(run)
+    emulated = {"emulated": True} if found.origin["station"] is not None else {}
+    return dataset_from(records, {"run": run.folder.name, "devices": found.origin["devices"], **emulated}), found
 
 
-def circumstances_of(run: Run) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what `solve` takes beside the dataset of a run, and where the dataset comes from, without its poses."""
+def circumstances_of(run: Run) -> Circumstances:
+    """Return what `solve` takes beside the data of a run, without reading them."""
     header = run.header()
     config = header["config"]
     setup = _described(run, config)
     mounting, height_mm = setup["mounting"], setup["height_mm"]
-    origin: dict[str, Any] = {
+    origin = {
         "devices": header.get("devices", {}),
         "run": run.folder.name,
         "station": header.get("station"),
         "setup": setup,
         "temperature_C": run.temperature_C(),
     }
-    circumstances = {
-        "g_m_s2": float(config["site"]["g_m_s2"]),
-        "setup": Setup(
+    return Circumstances(
+        float(config["site"]["g_m_s2"]),
+        Setup(
             up_in_base=None if mounting is None else (-down_of(mounting)).tolist(),
             tool_mass_kg=setup["tool_mass_kg"],
             cylinders_m=[[value / 1e3 for value in row] for row in setup["cylinders_mm"]],
@@ -140,8 +154,8 @@ def circumstances_of(run: Run) -> tuple[dict[str, Any], dict[str, Any]]:
             sensor_mass_kg=setup["sensor_mass_kg"],
             payload_kg=setup["payload_kg"],
         ),
-    }
-    return circumstances, origin
+        origin,
+    )
 
 
 def _described(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:

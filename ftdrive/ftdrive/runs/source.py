@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -48,18 +48,28 @@ class RecordedRun:
         """Do nothing: a recording cannot fail."""
 
 
+_UNDESCRIBED: Final = Setup()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
     """What a place holds."""
 
     dataset: CalibrationDataset
-    circumstances: dict[str, Any]
-    """What else `ftcalib.solve` takes: gravity, known values and the described cell."""
     provenance: dict[str, Any]
+    g_m_s2: float = STANDARD_GRAVITY_M_S2
+    setup: Setup = _UNDESCRIBED
+    """The described cell."""
+    known: Known | None = None
     records: Sequence[PoseRecord] = ()
     """Only of a run."""
     earlier: CalibrationResult | None = None
     """Of a run of a new tool: the result that gives mounting, base and gain."""
+
+    @property
+    def circumstances(self) -> dict[str, Any]:
+        """What `ftcalib.solve` takes beside dataset and provenance."""
+        return {"g_m_s2": self.g_m_s2, "setup": self.setup, "known": self.known}
 
     @property
     def truth(self) -> Parameters | None:
@@ -88,24 +98,22 @@ def read_source(
     ------
     BadDataset, OSError
     """
-    earlier = None
     if source.is_dir():
         run = Run(source)
         if run.in_motion:
             raise BadDataset(f"{source} is a recording in motion and has no poses: solve it with {run.solve_command}")
-        records, earlier = run.records(), earlier_of(run)
-        dataset, circumstances, provenance = dataset_of(run, records)
+        records = run.records()
+        dataset, of_run = dataset_of(run, records)
+        found = Source(dataset, of_run.provenance(), of_run.g_m_s2, of_run.setup, None, records, earlier_of(run))
     else:
-        records = []
         dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
-        circumstances = {"g_m_s2": STANDARD_GRAVITY_M_S2, "setup": Setup()}
-        provenance = {"source": source.name, "versions": versions()}
+        found = Source(dataset, {"source": source.name, "versions": versions()})
     if up_in_base is not None:
-        circumstances["setup"] = replace(circumstances["setup"], up_in_base=up_in_base)
-        provenance["up_in_base"] = list(up_in_base)
+        provenance = {**found.provenance, "up_in_base": list(up_in_base)}
+        found = replace(found, setup=replace(found.setup, up_in_base=up_in_base), provenance=provenance)
     if known is not None and known.gravity_direction_base is not None:
-        known = replace(known, gravity_direction_base=-circumstances["setup"].up)
-    return Source(dataset, {**circumstances, "known": known}, provenance, records, earlier)
+        known = replace(known, gravity_direction_base=-found.setup.up)
+    return replace(found, known=known)
 
 
 def read_dataset(path: str | Path, orientation: Orientation = "R_base_flange") -> CalibrationDataset:

@@ -37,8 +37,8 @@ GOOD: Final = 2
 def take_passively(session: Session) -> Run:
     """Record the free tool of a session in motion, as `record_passively`."""
     run = session.new_run()
-    circumstances, _ = circumstances_of(run)
-    record_passively(session.cell, run, session.options.seconds, circumstances["setup"], circumstances["g_m_s2"])
+    found = circumstances_of(run)
+    record_passively(session.cell, run, session.options.seconds, found.setup, found.g_m_s2)
     return run
 
 

@@ -134,11 +134,11 @@ def test_a_session_saves_no_result_as_good_whose_tool_is_elsewhere_unless_it_was
 def test_a_mounting_counts_as_declared_only_if_it_was_given(mounting: str | None, up: Any, lab: Lab) -> None:
     lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting=mounting))
     description = description_of(Calibrating(lab.cell), SessionOptions(lab.folder), {})
-    found = circumstances_of(Run.create(lab.folder, "r", description))[0]["setup"].up_in_base
+    found = circumstances_of(Run.create(lab.folder, "r", description)).setup.up_in_base
     assert found == (None if up is None else pytest.approx(up, abs=1e-12))
 
 
 def test_a_cell_with_a_clock_of_its_own_marks_its_results_as_emulated(lab: Lab) -> None:
     for clock, station in ((FakeClock(), {}), (REAL, None)):
         description = description_of(Calibrating(replace(lab.cell, clock=clock)), SessionOptions(lab.folder), {})
-        assert circumstances_of(Run.create(lab.folder, "r", description))[1]["station"] == station
+        assert circumstances_of(Run.create(lab.folder, "r", description)).origin["station"] == station

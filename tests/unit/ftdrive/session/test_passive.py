@@ -14,6 +14,7 @@ from ftcalib import Setup
 from ftdrive.errors import Declined
 from ftdrive.runs import outcome
 from ftdrive.runs.motion import MotionRecording, files_of
+from ftdrive.runs.outcome import Circumstances
 from ftdrive.runs.run import Run
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.operator import Key
@@ -129,7 +130,7 @@ def test_what_was_recorded_before_a_failure_is_kept_and_solved(
     assert "unplugged" in lost
     assert run.solve_command in kept
     assert MotionRecording.load(run.motion_path).samples.seq[-1] >= 500 * (13.0 - STEP_S) - 1
-    monkeypatch.setattr(outcome, "circumstances_of", lambda _: ({"setup": Setup()}, {}))
+    monkeypatch.setattr(outcome, "circumstances_of", lambda _: Circumstances(9.80665, Setup(), {}))
     assert outcome.solve_in_motion(run).verdict in {"good", "usable"}
 
 
@@ -146,7 +147,7 @@ def test_a_touch_below_that_of_a_guard_is_left_out_of_the_result(
 ) -> None:
     touches = {(start, start + 2.0): np.array([1.0, 0.0, -0.8, 0.0, 0.05, 0.0]) for start in np.arange(4.0, 25.0, 7.0)}
     run = passively(FakeCell(recording(touches)), tmp_path, SECONDS)
-    monkeypatch.setattr(outcome, "circumstances_of", lambda _: ({"setup": Setup()}, {}))
+    monkeypatch.setattr(outcome, "circumstances_of", lambda _: Circumstances(9.80665, Setup(), {}))
     found = outcome.solve_in_motion(run)
     assert found.verdict == "good"
     assert found.motion is not None
