@@ -2,8 +2,8 @@
 
 import pytest
 
-from ftdrive.checks import devices
 from ftdrive.checks.computer import SensorAddress
+from ftdrive.checks.sensor import check_noise, check_stream
 from ftdrivers.interfaces import NOT_REPORTED, ForceTorqueSensor, FtSamples, Health
 from ftdrivers.registry import sensor_from_url
 
@@ -24,7 +24,7 @@ def test_it_reports_who_it_is(sensor: ForceTorqueSensor) -> None:
 
 def test_rate_losses_and_status(stream: tuple[FtSamples, Health], url: str) -> None:
     samples, health = stream
-    checks = devices.check_stream(samples, health, SensorAddress.of(url), DURATION_S)
+    checks = check_stream(samples, health, SensorAddress.of(url), DURATION_S)
     assert [check for check in checks if check.state != "ok"] == []
     assert (samples.t_host_ns[1:] >= samples.t_host_ns[:-1]).all()
     assert (samples.seq[1:] > samples.seq[:-1]).all()
@@ -32,7 +32,7 @@ def test_rate_losses_and_status(stream: tuple[FtSamples, Health], url: str) -> N
 
 def test_noise(stream: tuple[FtSamples, Health]) -> None:
     samples, _ = stream
-    checks = devices.check_noise(samples.wrench, DURATION_S, average_s=2.0, mass_kg=1.0)
+    checks = check_noise(samples.wrench, DURATION_S, average_s=2.0, mass_kg=1.0)
     assert [check for check in checks if check.state != "ok"] == []
 
 

@@ -17,8 +17,8 @@ from ftcalib.model import predict
 from ftcalib.poses.information import special
 from ftcalib.routine import PoseRecord, TourPose
 from ftdrive.recording import Recorder
-from ftdrive.runs.outcome import solve_and_save
 from ftdrive.runs.run import Reading, Run
+from ftdrive.runs.source import solve_and_save
 from ftdrivers.interfaces import FtSamples
 from tests.house.example_data import EXAMPLES, TRUTH
 from tests.unit.ftdrive.recorded import block, info

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.emulated_run import rehearse
+from ftdrive.commands.common import rehearse
 from tests.system.command_line import CommandLine, listen_for
 
 NAMED = {

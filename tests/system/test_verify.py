@@ -9,7 +9,7 @@ import pytest
 
 from ftcalib import CalibrationResult
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.emulated_run import rehearse
+from ftdrive.commands.common import rehearse
 from ftdrive.terminal.report import compensation_error
 from tests.system.command_line import CommandLine
 

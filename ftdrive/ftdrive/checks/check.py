@@ -4,6 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from ftdrivers.interfaces import (
+    DeviceInfo,
+)
+
 State = Literal["ok", "warning", "failed", "skipped"]
 
 
@@ -31,3 +35,8 @@ def merged(name: str, checks: Sequence[Check]) -> Check:
     worst = [check for check in checks if check.state == state]
     fix = "; ".join(check.fix for check in worst if check.fix)
     return Check(name, state, ", ".join(check.found for check in worst), fix or None)
+
+
+def who(info: DeviceInfo) -> str:
+    """Return a device's model, serial number and firmware in words."""
+    return f"{info.model}, serial {info.serial}, firmware {info.firmware}"

@@ -7,7 +7,7 @@ from serial.tools import list_ports
 
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.checks.check import Check
+from ftdrive.checks.check import Check, who
 from ftdrive.checks.computer import (
     can_details,
     can_interfaces,
@@ -15,7 +15,6 @@ from ftdrive.checks.computer import (
     check_serial_port,
     name_by_id,
 )
-from ftdrive.checks.devices import who
 from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError

@@ -14,10 +14,10 @@ from ftdrive.commands.common import (
     JSON,
     NewFile,
     check_simulate,
+    rehearsed_run,
     simulate,
     write_json,
 )
-from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError
 from ftdrive.runs.bundle import write_bundle
 from ftdrive.terminal.console import beside, hanging

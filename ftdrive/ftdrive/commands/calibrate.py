@@ -31,8 +31,8 @@ from ftdrive.commands.common import (
 
 if TYPE_CHECKING:
     from ftdrive.cell.config import CellConfig
-    from ftdrive.runs.outcome import Outcome
     from ftdrive.runs.run import Mode
+    from ftdrive.runs.source import Outcome
 
 
 @click.command()
@@ -112,7 +112,7 @@ def calibrate(
     continues.
     """
     from ftdrive.cell.emulated import REAL_PACE, Station
-    from ftdrive.commands.emulated_run import start_mover
+    from ftdrive.commands.common import start_mover
     from ftdrive.runs.run import Run
     from ftdrive.session.options import SessionOptions, method_of_poses
     from ftdrive.session.rehearsal import describe

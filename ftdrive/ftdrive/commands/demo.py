@@ -8,8 +8,7 @@ import numpy as np
 
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import REAL_PACE, SENSORS, Station
-from ftdrive.commands.common import CONTROL, JSON, METHOD, SETS, runs, stop_unless_accepted, write_json
-from ftdrive.commands.emulated_run import rehearse
+from ftdrive.commands.common import CONTROL, JSON, METHOD, SETS, rehearse, runs, stop_unless_accepted, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.session.options import method_of_poses

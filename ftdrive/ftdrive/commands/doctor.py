@@ -16,9 +16,33 @@ from ftcalib import CalibrationResult
 from ftdrive.cell.config import USUAL_KG, CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station, sensor_reached
-from ftdrive.checks import computer, devices
+from ftdrive.checks import computer
+from ftdrive.checks.arm import (
+    check_arm,
+    check_clock,
+    check_diagnosis,
+    check_kinematics,
+    check_link,
+    check_payload,
+    check_program,
+    check_remote,
+    check_safety,
+    check_speed,
+    check_unreachable,
+)
+from ftdrive.checks.belonging import check_calibration
 from ftdrive.checks.check import Check, verdict
 from ftdrive.checks.computer import SensorAddress
+from ftdrive.checks.sensor import (
+    check_compensated,
+    check_identity,
+    check_load,
+    check_noise,
+    check_push,
+    check_rest,
+    check_sensor_error,
+    check_stream,
+)
 from ftdrive.commands.common import (
     CELL,
     FILE,
@@ -89,7 +113,7 @@ def doctor(
         with working("Reading the arm and its clock"):
             found, arm = _examine_robot(cell, stack)
         permissions = computer.check_permissions(address)
-        blame = partial(devices.check_sensor_error, address=address, permissions=permissions)
+        blame = partial(check_sensor_error, address=address, permissions=permissions)
         mass_kg = mass_kg or cell.tool.mass_kg or USUAL_KG
         with working("Reading the sensor"):
             of_sensor, alive = _examine_sensor(device, address, cell, mass_kg, blame, stack)
@@ -100,7 +124,7 @@ def doctor(
             connected = {"sensor": device.identify()} if alive else {}
             if arm is not None:
                 connected["arm"] = arm.identify()
-            found.append(devices.check_calibration(calibration, connected, cell.sensor.mount))
+            found.append(check_calibration(calibration, connected, cell.sensor.mount))
         if push:
             R_flange_sensor = None if calibration is None else calibration.R_flange_sensor
             if station is not None and calibration is None:
@@ -137,17 +161,17 @@ def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], Rob
         arm.open()
         info, status = arm.identify(), arm.status()
     except DeviceError as error:
-        return [devices.check_unreachable(error, host)], None
+        return [check_unreachable(error, host)], None
     return [
         Check("robot.reachable", "ok", f"{host} answers"),
-        devices.check_arm(info, cell.robot),
-        devices.check_kinematics(info),
-        devices.check_remote(arm),
-        *map(devices.check_diagnosis, arm.diagnose()),
-        devices.check_safety(status),
-        devices.check_program(status),
-        devices.check_speed(status),
-        devices.check_payload(status, cell.tool, cell.sensor.mass_kg),
+        check_arm(info, cell.robot),
+        check_kinematics(info),
+        check_remote(arm),
+        *map(check_diagnosis, arm.diagnose()),
+        check_safety(status),
+        check_program(status),
+        check_speed(status),
+        check_payload(status, cell.tool, cell.sensor.mass_kg),
         *_check_poses(arm, status, cell.clock),
         _check_clock(arm, cell.clock),
     ], arm
@@ -166,7 +190,7 @@ def _check_poses(arm: RobotArm, status: ArmStatus, clock: Clock) -> list[Check]:
     limits = Limits.of(clock)
     return [
         Check(name, "ok", f"TCP offset read; flange at ({where}) mm in base"),
-        devices.check_link(arm, clock, usual_s=limits.link_usual_s, gap_s=limits.link_gap_s),
+        check_link(arm, clock, usual_s=limits.link_usual_s, gap_s=limits.link_gap_s),
     ]
 
 
@@ -182,7 +206,7 @@ def _check_clock(arm: RobotArm, clock: Clock) -> Check:
                 device_s.append(status.t_device_s)
     except DeviceError as error:
         return Check("clock.pace", "failed", error.found, error.fix or "check the robot and the network")
-    return devices.check_clock(host_ns, device_s)
+    return check_clock(host_ns, device_s)
 
 
 def _examine_sensor(
@@ -194,9 +218,9 @@ def _examine_sensor(
     try:
         stack.enter_context(device)
         info = device.identify()
-        found += devices.check_identity(info)
+        found += check_identity(info)
         name = "sensor.stream"
-        found += [devices.check_diagnosis(one, "sensor") for one in device.diagnose()]
+        found += [check_diagnosis(one, "sensor") for one in device.diagnose()]
         samples = device.collect(_LOOK_S)
         health = device.health()
     except DeviceError as error:
@@ -205,11 +229,11 @@ def _examine_sensor(
     limits = None if fact is None else np.asarray(fact.value, dtype=np.float64)
     return [
         *found,
-        devices.check_load(limits, cell),
-        devices.check_rest(samples.wrench, limits, cell, zero_is_arbitrary=info.has_arbitrary_zero),
-        *([devices.check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
-        *devices.check_stream(samples, health, address, _LOOK_S),
-        *devices.check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg),
+        check_load(limits, cell),
+        check_rest(samples.wrench, limits, cell, zero_is_arbitrary=info.has_arbitrary_zero),
+        *([check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
+        *check_stream(samples, health, address, _LOOK_S),
+        *check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg),
     ], True
 
 
@@ -245,7 +269,7 @@ def _examine_push(
     except DeviceError as error:
         return blame("push.sign", error), None
     largest = max(changes, key=lambda change: float(np.linalg.norm(change)))
-    return devices.check_push(largest, R_base_flange, R_flange_sensor, sign)
+    return check_push(largest, R_base_flange, R_flange_sensor, sign)
 
 
 def _print(found: list[Check]) -> None:

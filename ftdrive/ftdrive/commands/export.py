@@ -260,7 +260,7 @@ def _calibrated(source: Path | None, sensor: str | None, *, simulate: bool) -> I
     from ftdrive.errors import ConfigError
 
     if simulate:
-        from ftdrive.commands.emulated_run import rehearsed_run
+        from ftdrive.commands.common import rehearsed_run
 
         with rehearsed_run(sensor) as folder:
             yield folder

@@ -13,8 +13,8 @@ import numpy as np
 from rich.console import Group
 from rich.live import Live
 
+from ftdrive.checks.arm import check_weighed_payload
 from ftdrive.checks.check import Check
-from ftdrive.checks.devices import check_weighed_payload
 from ftdrive.commands.common import (
     FRAME,
     JSON,

@@ -12,12 +12,20 @@ from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.common import CELL, JSON, CellOptions, check_simulate, declined_aborts, simulate, write_json
-from ftdrive.commands.emulated_run import rehearsed_run
+from ftdrive.commands.common import (
+    CELL,
+    JSON,
+    CellOptions,
+    check_simulate,
+    declined_aborts,
+    rehearsed_run,
+    simulate,
+    write_json,
+)
 from ftdrive.errors import ConfigError, SupervisorGone
 from ftdrive.runs.push_receipt import Receipt
 from ftdrive.runs.source import read_calibration
-from ftdrive.session.operator import Question
+from ftdrive.session.events import Question
 from ftdrive.session.settings_push import EFFECTS, WORDS, propose, restore, send
 from ftdrive.terminal.console import answer, beside, messages
 from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words

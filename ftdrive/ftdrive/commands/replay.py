@@ -12,16 +12,15 @@ from ftdrive.commands.common import (
     EMULATED_SENSOR,
     JSON,
     check_simulate,
+    rehearsed_run,
     simulate,
     stop_unless_accepted,
     write_json,
 )
-from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.bundle import unpacked
-from ftdrive.runs.outcome import solve_records
 from ftdrive.runs.run import Run
-from ftdrive.runs.source import RecordedRun
+from ftdrive.runs.source import RecordedRun, solve_records
 from ftdrive.terminal.console import answer, hanging, messages, working
 from ftdrive.terminal.report import print_result
 

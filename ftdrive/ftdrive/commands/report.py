@@ -19,12 +19,12 @@ from ftdrive.commands.common import (
     JSON,
     NewFile,
     check_simulate,
+    rehearsed_run,
     require_extra,
     simulate,
     store_url,
     write_json,
 )
-from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.commands.solve import known_values, upward
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError

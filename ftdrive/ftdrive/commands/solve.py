@@ -33,19 +33,18 @@ from ftdrive.commands.common import (
     check_simulate,
     index_run,
     numbers,
+    rehearsed_run,
     simulate,
     stop_unless_accepted,
     write_json,
 )
-from ftdrive.commands.emulated_run import rehearsed_run
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.recording.bag import bag_means, is_bag, read_bag
 from ftdrive.recording.files import is_recording
 from ftdrive.runs.bundle import unpacked
-from ftdrive.runs.outcome import require_same_cell, solve_in_motion
 from ftdrive.runs.pose_hints import hints, numbers_in_dataset
 from ftdrive.runs.run import Run, in_motion
-from ftdrive.runs.source import Source, read_calibration, read_dataset, read_source
+from ftdrive.runs.source import Source, read_calibration, read_dataset, read_source, require_same_cell, solve_in_motion
 from ftdrive.terminal.console import beside, working
 from ftdrive.terminal.report import print_cases, print_comparison, print_result, print_tests
 from ftdrive.terminal.text import echo, in_one_line

@@ -128,7 +128,7 @@ def verify_cell(
     `path` is the calibration file or its run folder, `station` the emulated cell that `cell` describes. Raises as
     `ftdrive.session.session.take_poses`.
     """
-    from ftdrive.commands.emulated_run import start_mover
+    from ftdrive.commands.common import start_mover
     from ftdrive.runs.run import Run
     from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verified import verify_run
@@ -218,7 +218,7 @@ def _report(verified: "Verified", update: Answer, *, simulated: bool, as_json: b
 def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Path) -> tuple["Station", Path]:
     """Start the cell of a calibration, or calibrate a new one; return it with the path of its calibration."""
     from ftdrive.cell.emulated import Station
-    from ftdrive.commands.emulated_run import rehearse
+    from ftdrive.commands.common import rehearse
     from ftdrive.runs.source import read_calibration
 
     made_by = None if path is None else read_calibration(path).provenance.get("station")
@@ -233,7 +233,7 @@ def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Pat
 def _wants_update(verified: "Verified", update: Answer, *, as_json: bool) -> bool:
     """Whether to save the update; without an answer, no."""
     from ftdrive.errors import Declined
-    from ftdrive.session.operator import Question
+    from ftdrive.session.events import Question
     from ftdrive.terminal.console import messages
     from ftdrive.terminal.operators import JsonOperator, PlainOperator
 

@@ -23,8 +23,8 @@ from ftcalib.files import read_file, read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
 from ftdrive import __version__
 from ftdrive.fleet.workers import OtherVersion, Workers, answers, folder_of_worker, in_words, require_version
-from ftdrive.runs.outcome import circumstances_of, solve_in_motion
 from ftdrive.runs.run import Run, in_motion
+from ftdrive.runs.source import circumstances_of, solve_in_motion
 
 CHANGED_SIGMAS: Final = 3.0
 _IN_MOTION: Final = ("run.json", "events.ndjson", "motion*.npz", "motion/*.npz")

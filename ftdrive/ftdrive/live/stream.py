@@ -18,7 +18,7 @@ from ftcalib.after.series import BiasTemperature
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
-from ftdrive.checks.devices import belonging
+from ftdrive.checks.belonging import belonging
 from ftdrive.errors import ConfigError
 from ftdrive.live.loop import ProcessedStream
 from ftdrive.live.pairing import DelayEstimator, Pairing

@@ -18,8 +18,8 @@ from ftdrive.recording.compensation import NEEDED
 from ftdrive.recording.csv_pair import ORIENTATION, WRENCH, Wanted, read_table
 from ftdrive.recording.files import RecordingReader
 from ftdrive.recording.recording import Header
-from ftdrive.runs.outcome import require_same_cell
 from ftdrive.runs.run import made_now
+from ftdrive.runs.source import require_same_cell
 
 _POSITION = ("x", "y", "z")
 

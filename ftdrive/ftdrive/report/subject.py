@@ -15,9 +15,8 @@ from ftcalib.likelihood.session import Drift
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.runs.outcome import solve_in_motion
 from ftdrive.runs.run import Run, in_motion
-from ftdrive.runs.source import read_source
+from ftdrive.runs.source import read_source, solve_in_motion
 from ftdrive.runs.verification_record import age_of, outcome_in_words, verification_near
 
 

@@ -1,19 +1,22 @@
 """Datasets, calibrations and recorded runs from any place that commands accept: run folders and single files."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, read_csv
+from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, read_csv, solve
+from ftcalib.after.new_tool import new_tool
 from ftcalib.data.dataset import Orientation
-from ftcalib.errors import BadDataset
+from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters
-from ftcalib.routine import ArmReading, PoseRecord, WrenchSamples
-from ftdrive.runs.outcome import dataset_of, earlier_of
-from ftdrive.runs.run import Run, versions
+from ftcalib.routine import ArmReading, DriftCheck, PoseRecord, WrenchSamples, dataset_from, drift_check
+from ftdrive.errors import ConfigError
+from ftdrive.planning.geometry.scene import down_of
+from ftdrive.runs.motion import solve_motion_file
+from ftdrive.runs.run import Run, made_now, versions
 
 
 class RecordedRun:
@@ -169,3 +172,167 @@ def read_calibration(path: str | Path, *, accept_edited: bool = False) -> Calibr
     """
     path = Path(path)
     return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path, accept_edited=accept_edited)
+
+
+def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any]) -> None:
+    """Raise `ConfigError` if a rejected result, or one of another sensor, arm or mount, is to serve a new tool.
+
+    What a file does not name is not compared.
+    """
+    if earlier.verdict == "rejected":
+        raise ConfigError(f"--from: result {earlier.id} is rejected: take an accepted one")
+    before, now = earlier.provenance, provenance
+    for device in ("sensor", "arm"):
+        serials = [_of(one, "devices", device, "serial") for one in (before, now)]
+        if all(serials) and serials[0] != serials[1]:
+            raise ConfigError(
+                f"--from: result {earlier.id} is of {device} {serials[0]}, the new data of {serials[1]}: take one of "
+                f"the same {device}"
+            )
+    mounts = [_of(one, "setup", "mount") for one in (before, now)]
+    if all(mounts) and mounts[0] != mounts[1]:
+        raise ConfigError(f"--from: result {earlier.id} is of mount {mounts[0]}, the new data of {mounts[1]}")
+
+
+def _of(document: Any, *keys: str) -> Any:
+    for key in keys:
+        document = document.get(key) if isinstance(document, Mapping) else None
+    return document
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Circumstances:
+    """What is known of the data of a run beside them."""
+
+    g_m_s2: float
+    setup: Setup
+    """The described cell."""
+    origin: dict[str, Any]
+    """Devices, run, cell and temperature."""
+
+    def provenance(self) -> dict[str, Any]:
+        """Return the provenance of a result that is made now."""
+        return {**made_now(), **self.origin}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """A solved run."""
+
+    run: Run
+    dataset: CalibrationDataset | None
+    """None of a run in motion."""
+    result: CalibrationResult
+    drift: DriftCheck | None
+
+
+def solve_and_save(run: Run) -> Outcome:
+    """Solve a run from its files, so that the files suffice to repeat it. Raises `OSError` if they cannot be saved."""
+    outcome = Outcome(run, None, solve_in_motion(run), None) if run.in_motion else solve_records(run, run.records())
+    try:
+        if outcome.dataset is not None:
+            outcome.dataset.save(run.new_path("dataset"))
+        if outcome.result.verdict != "rejected":
+            outcome.result.save(run.new_path("calibration"))
+    except OSError as error:
+        kept = "all poses are" if outcome.dataset is not None else "the recording is"
+        raise OSError(
+            f"{error.strerror or error}: the result is not saved, but {kept}. Make room in {run.folder}, then "
+            f"{run.solve_command} --output FILE"
+        ) from error
+    return outcome
+
+
+def solve_in_motion(
+    run: Run, known: Known | None = None, *, earlier: CalibrationResult | None = None, point_mass: bool = False
+) -> CalibrationResult:
+    """Solve the recording of a run in motion; with the earlier result of a new tool that is given, or its own."""
+    found = circumstances_of(run)
+    earlier = earlier or earlier_of(run)
+    if earlier is not None:
+        require_same_cell(earlier, found.origin)
+    return solve_motion_file(
+        run.motion_path,
+        height_m=found.setup.sensor_height_m,
+        known=known,
+        earlier=earlier,
+        point_mass=point_mass,
+        guarded=run.mode == "sweep",
+        provenance=found.provenance(),
+        g_m_s2=found.g_m_s2,
+        setup=found.setup,
+    )
+
+
+def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
+    """Solve records of a run, as they are on disk or as a replay gives them."""
+    dataset, found = dataset_of(run, records)
+    earlier, provenance = earlier_of(run), found.provenance()
+    if earlier is None:
+        result = solve(dataset, run.method, g_m_s2=found.g_m_s2, setup=found.setup, provenance=provenance)
+    else:
+        require_same_cell(earlier, provenance)
+        result = new_tool(earlier, dataset, provenance)
+    return Outcome(run, dataset, result, drift_check(records))
+
+
+def earlier_of(run: Run) -> CalibrationResult | None:
+    """Return the result from which a run of a new tool takes mounting, base and gain; None for any other run."""
+    document = run.header().get("earlier")
+    return None if document is None else CalibrationResult.from_dict(document)
+
+
+def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, Circumstances]:
+    """Return a run's records as a dataset, and their circumstances."""
+    if not records:
+        raise NotObservable(f"{run.folder} has no data to solve: {run.how_to_go_on}")
+    found = circumstances_of(run)
+    emulated = {"emulated": True} if found.origin["station"] is not None else {}
+    return dataset_from(records, {"run": run.folder.name, "devices": found.origin["devices"], **emulated}), found
+
+
+def circumstances_of(run: Run) -> Circumstances:
+    """Return what `solve` takes beside the data of a run, without reading them."""
+    header = run.header()
+    config = header["config"]
+    setup = _described(run, config)
+    mounting, height_mm = setup["mounting"], setup["height_mm"]
+    origin = {
+        "devices": header.get("devices", {}),
+        "run": run.folder.name,
+        "station": header.get("station"),
+        "setup": setup,
+        "temperature_C": run.temperature_C(),
+    }
+    return Circumstances(
+        float(config["site"]["g_m_s2"]),
+        Setup(
+            up_in_base=None if mounting is None else (-down_of(mounting)).tolist(),
+            tool_mass_kg=setup["tool_mass_kg"],
+            cylinders_m=[[value / 1e3 for value in row] for row in setup["cylinders_mm"]],
+            sensor_height_m=None if height_mm is None else height_mm / 1e3,
+            sensor_mass_kg=setup["sensor_mass_kg"],
+            payload_kg=setup["payload_kg"],
+        ),
+        origin,
+    )
+
+
+def _described(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a result is bound to or compared with: payload last reported, tool, mount label and mounting."""
+    payload_kg = p_flange_payload_m = None
+    for event in run.events():
+        if event.get("event") == "weighed":
+            payload_kg, p_flange_payload_m = event["payload_kg"], event.get("p_flange_payload_m")
+    sensor, tool, workcell = (config.get(section, {}) for section in ("sensor", "tool", "workcell"))
+    return {
+        "payload_kg": payload_kg,
+        "p_flange_payload_m": p_flange_payload_m,
+        "sensor_mass_kg": sensor.get("mass_kg"),
+        "mounting": workcell.get("mounting"),
+        "height_mm": sensor.get("height_mm"),
+        "tool_mass_kg": tool.get("mass_kg"),
+        "cylinders_mm": [list(row) for row in tool.get("cylinders_mm", ())] if workcell.get("measured") else [],
+        "tool": tool.get("name"),
+        "mount": sensor.get("mount"),
+    }

@@ -14,7 +14,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from ftcalib.model import Array
-from ftdrive.checks.devices import AXES, SATURATION
+from ftdrive.checks.sensor import AXES, SATURATION
 from ftdrive.errors import SupervisorGone
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.events import Hazard

@@ -18,9 +18,8 @@ from ftcalib.routine import MOVED_RAD, PoseRecord, Stage, TourPose, take_pose, t
 from ftcalib.sampling import Sampling
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.run import Run
-from ftdrive.session.events import Compared, Estimated, SensorEvents, State, StateChanged
+from ftdrive.session.events import Compared, Estimated, Key, SensorEvents, State, StateChanged
 from ftdrive.session.open_cell import OpenCell
-from ftdrive.session.operator import Key
 from ftdrive.session.pose_book import PoseBook, reporting_early_end
 from ftdrive.session.task import Session
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken

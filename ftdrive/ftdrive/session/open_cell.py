@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 from ftdrive.errors import Declined, SupervisorGone
 from ftdrive.runs.run import IN_MOTION, Run
-from ftdrive.session.events import Asked, Event, GuardTripped, Hazard, Noted, RunOpened
+from ftdrive.session.events import Asked, Event, GuardTripped, Hazard, Key, Noted, Operator, Question, RunOpened
 from ftdrive.session.guards import Limits
-from ftdrive.session.operator import Key, Operator, Question
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm

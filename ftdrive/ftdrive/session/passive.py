@@ -11,11 +11,10 @@ from ftcalib.result import CalibrationResult
 from ftcalib.rounding import with_sigma
 from ftdrive.errors import Declined
 from ftdrive.runs.motion import MotionRecording, means_of
-from ftdrive.runs.outcome import circumstances_of
 from ftdrive.runs.run import Run
-from ftdrive.session.events import MotionRecorded
+from ftdrive.runs.source import circumstances_of
+from ftdrive.session.events import Key, MotionRecorded
 from ftdrive.session.open_cell import OpenCell
-from ftdrive.session.operator import Key
 from ftdrive.session.pose_book import reporting_early_end
 from ftdrive.session.task import Session
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken

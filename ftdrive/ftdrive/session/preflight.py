@@ -14,8 +14,11 @@ import numpy as np
 
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
-from ftdrive.checks import computer, devices
+from ftdrive.checks import arm as of_arm
+from ftdrive.checks import computer
+from ftdrive.checks.arm import check_arm, check_remote, check_safety, check_speed
 from ftdrive.checks.check import Check, merged
+from ftdrive.checks.sensor import check_level, check_load, check_rate, check_rest
 from ftdrive.errors import NotAccepted, PlanRefused
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.geometry.certify import Certifier
@@ -82,7 +85,7 @@ class Row:
 
 def _check_model(before: Before) -> Check:
     """Check that this is the configured arm, and that its flange is where the forward kinematics have it."""
-    check = devices.check_arm(before.cell.arm.identify(), before.config.robot)
+    check = check_arm(before.cell.arm.identify(), before.config.robot)
     if check.state == "failed":
         return check
     try:
@@ -98,7 +101,7 @@ def _check_model(before: Before) -> Check:
 
 def check_payload(before: Before) -> Check:
     """Check the payload that is set in the controller."""
-    return devices.check_payload(before.cell.arm.status(), before.config.tool, before.config.sensor.mass_kg)
+    return of_arm.check_payload(before.cell.arm.status(), before.config.tool, before.config.sensor.mass_kg)
 
 
 def check_link(before: Before) -> Check:
@@ -106,22 +109,22 @@ def check_link(before: Before) -> Check:
     arm, limits = before.cell.arm, before.cell.limits
     asked_s = limits.link_asked_s if arm.status().tcp_offset is None else 0.0
     usual_s = limits.link_usual_s + asked_s
-    return devices.check_link(arm, before.cell.clock, usual_s=usual_s, gap_s=limits.link_gap_s)
+    return of_arm.check_link(arm, before.cell.clock, usual_s=usual_s, gap_s=limits.link_gap_s)
 
 
 def _check_sensor(before: Before) -> Check:
     """Check that all six axes are alive, at the nominal rate."""
     wrench = before.quiet.wrench
-    rate = devices.check_rate(len(wrench) / LISTEN_S, before.cell.sensor.health().nominal_rate_Hz)
-    return merged("sensor", [rate, devices.check_level(wrench)])
+    rate = check_rate(len(wrench) / LISTEN_S, before.cell.sensor.health().nominal_rate_Hz)
+    return merged("sensor", [rate, check_level(wrench)])
 
 
 def _check_load(before: Before) -> Check:
     """Check that the sensor's range is enough for the tool and for what the sensor reads at rest."""
     limits, config = before.sensor_range, before.config
     is_arbitrary = before.cell.sensor.identify().has_arbitrary_zero
-    rest = devices.check_rest(before.quiet.wrench, limits, config, zero_is_arbitrary=is_arbitrary)
-    return merged("load", [devices.check_load(limits, config), rest])
+    rest = check_rest(before.quiet.wrench, limits, config, zero_is_arbitrary=is_arbitrary)
+    return merged("load", [check_load(limits, config), rest])
 
 
 def _check_workcell(before: Before) -> Check:
@@ -208,11 +211,11 @@ def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
 _APPROACH: Final = Row("approach", _check_approach)
 
 CHECKS: Final[Sequence[Row]] = (
-    Row("safety", lambda before: devices.check_safety(before.cell.arm.status())),
-    Row("remote", lambda before: devices.check_remote(before.cell.arm)),
+    Row("safety", lambda before: check_safety(before.cell.arm.status())),
+    Row("remote", lambda before: check_remote(before.cell.arm)),
     Row("model", _check_model),
     Row("payload", check_payload),
-    Row("slider", lambda before: devices.check_speed(before.cell.arm.status())),
+    Row("slider", lambda before: check_speed(before.cell.arm.status())),
     Row("link", check_link),
     Row("sensor", _check_sensor),
     Row("load", _check_load),

@@ -7,9 +7,8 @@ from typing import Any
 from ftcalib import CalibrationResult
 from ftdrive.cell.emulated import Station
 from ftdrive.errors import Declined, NotAccepted
-from ftdrive.runs.outcome import Outcome
-from ftdrive.session.events import Event
-from ftdrive.session.operator import Key, Operator, Question
+from ftdrive.runs.source import Outcome
+from ftdrive.session.events import Event, Key, Operator, Question
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.session import calibrate
 

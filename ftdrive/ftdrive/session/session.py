@@ -10,17 +10,16 @@ import numpy as np
 from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.checks.devices import belonging
+from ftdrive.checks.belonging import belonging
 from ftdrive.errors import ConfigError, Declined, PlanRefused
-from ftdrive.runs.outcome import Outcome, solve_and_save
 from ftdrive.runs.run import Mode, Run
+from ftdrive.runs.source import Outcome, solve_and_save
 from ftdrive.session import preflight
 from ftdrive.session.along_plan import take_along_plan
-from ftdrive.session.events import State, StateChanged
+from ftdrive.session.events import Operator, State, StateChanged
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import take_by_hand
 from ftdrive.session.open_cell import Journal, OpenCell
-from ftdrive.session.operator import Operator
 from ftdrive.session.options import SessionOptions, plan_on_disk, with_recorded_mode
 from ftdrive.session.passive import take_passively
 from ftdrive.session.sweep import on_script_path

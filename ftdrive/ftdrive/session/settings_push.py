@@ -15,8 +15,11 @@ from ftcalib import CalibrationResult
 from ftcalib.judge.described_cell import Lean, lean_from
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
-from ftdrive.checks import computer, devices
+from ftdrive.checks import computer
+from ftdrive.checks.arm import check_arm, check_remote, check_safety
+from ftdrive.checks.belonging import belonging
 from ftdrive.checks.flange_load import FlangeLoad, flange_load
+from ftdrive.checks.sensor import check_level
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.push_receipt import Receipt, write_receipt
@@ -84,7 +87,7 @@ def propose(
         raise NotAccepted(f"{name} is rejected ({'; '.join(result.reasons)}): calibrate again")
     mass_kg, height_m = _sensor_of(cell)
     connected = {"arm": arm.identify(), "sensor": sensor.identify()}
-    if others := devices.belonging(result, connected, cell.sensor.mount).others:
+    if others := belonging(result, connected, cell.sensor.mount).others:
         raise NotAccepted(f"{others[0]}: push the calibration of this cell")
     _require_ready(cell, arm)
     load, old = flange_load(result, mass_kg, height_m), arm.controller_settings()
@@ -133,9 +136,9 @@ def _require_ready(cell: CellConfig, arm: RobotArm) -> None:
     """Raise `NotAccepted` unless this is the configured arm, free of programs, in remote control, and at rest."""
     require_no_program(arm, cell.clock, Limits())
     for check in (
-        devices.check_arm(arm.identify(), cell.robot),
-        devices.check_remote(arm),
-        devices.check_safety(arm.status()),
+        check_arm(arm.identify(), cell.robot),
+        check_remote(arm),
+        check_safety(arm.status()),
     ):
         if check.state == "failed":
             raise NotAccepted(f"{check.found}: {check.fix}; nothing was sent")
@@ -150,7 +153,7 @@ def _contact(arm: RobotArm, sensor: ForceTorqueSensor, result: CalibrationResult
     """Return the reading beyond a free tool, None where the arm's pose is unknown; raises if it is not steady."""
     for _ in range(_LISTENS):
         wrench = sensor.collect(_LISTEN_S).wrench
-        check = devices.check_level(wrench)
+        check = check_level(wrench)
         if check.state == "ok":
             break
     else:

@@ -17,16 +17,15 @@ from ftcalib.judge import described_cell
 from ftcalib.model import Array
 from ftcalib.routine import Stage, TourPose, take_pose
 from ftcalib.sampling import Sampling
-from ftdrive.checks.devices import SLOWEST_SLIDER
+from ftdrive.checks.arm import SLOWEST_SLIDER
 from ftdrive.errors import Declined, NotAccepted, PlanRefused, SupervisorGone
 from ftdrive.planning.approach import arm_moves, plan_approach
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.words import way_in_words
-from ftdrive.session.events import GuardTripped, Hazard, State, StateChanged, Weighed
+from ftdrive.session.events import GuardTripped, Hazard, Key, Question, State, StateChanged, Weighed
 from ftdrive.session.guards import Tripped, fault
-from ftdrive.session.operator import Key, Question
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.pose_book import PoseBook
 from ftdrive.session.preflight import forbidden

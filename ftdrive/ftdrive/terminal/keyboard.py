@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from threading import Thread
 from typing import Self
 
-from ftdrive.session.operator import Key
+from ftdrive.session.events import Key
 
 # Arrows and function keys arrive as escape, then letters that would be read as keys.
 _ESCAPE = re.compile(rb"\x1b(\[[0-?]*[ -/]*[@-~]|O.|.)?")

@@ -12,6 +12,7 @@ from textual import events
 from textual.app import ComposeResult
 from textual.widgets import Input
 
+from ftdrive.checks.belonging import check_calibration
 from ftdrive.checks.check import Check
 from ftdrive.checks.devices import check_calibration
 from ftdrive.live.loop import ProcessedStream

@@ -8,8 +8,7 @@ from threading import Lock
 from typing import Any, Final, TextIO
 
 from ftdrive.errors import Declined
-from ftdrive.session.events import SCHEMA_VERSION, Asked, Event
-from ftdrive.session.operator import Key, Question
+from ftdrive.session.events import SCHEMA_VERSION, Asked, Event, Key, Question
 from ftdrive.terminal.session_text import SessionText, TextLine
 from ftdrive.terminal.supervisor import Supervisor
 from ftdrive.terminal.text import in_whole_words, visible

@@ -29,14 +29,16 @@ from ftdrive.session.events import (
     Estimated,
     Event,
     GuardTripped,
+    Key,
     Noted,
+    Operator,
     PoseTaken,
+    Question,
     RunOpened,
     State,
     StateChanged,
 )
 from ftdrive.session.live_fit import GREEN
-from ftdrive.session.operator import Key, Operator, Question
 from ftdrive.terminal.console import hanging, messages
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer, prompt, read_line

@@ -21,20 +21,21 @@ from ftdrive.planning.geometry.certify import Certificate, Certifier
 from ftdrive.planning.geometry.kinematics import Frames
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
-from ftdrive.runs.outcome import Outcome
 from ftdrive.runs.run import Run
+from ftdrive.runs.source import Outcome
 from ftdrive.session import along_plan, session, task
 from ftdrive.session.along_plan import remember_completed
 from ftdrive.session.events import (
     Event,
+    Key,
     Noted,
     PoseTaken,
+    Question,
     State,
     StateChanged,
 )
 from ftdrive.session.guards import Limits
 from ftdrive.session.open_cell import Journal, OpenCell
-from ftdrive.session.operator import Key, Question
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.task import Calibrating
 from ftdrive.session.watchdog import Watcher

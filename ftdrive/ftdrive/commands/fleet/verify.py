@@ -136,7 +136,7 @@ def _calibration(one: "StoredCell", tool: str, store: "Store", fleet: "Fleet") -
 def _is_attended(one: "StoredCell", cell: "CellConfig") -> bool:
     """Ask whether an operator stands at the cell; only yes counts, and the end of the input does not."""
     from ftdrive.errors import Declined
-    from ftdrive.session.operator import Question
+    from ftdrive.session.events import Question
     from ftdrive.terminal.operators import PlainOperator
 
     text = (

@@ -11,7 +11,7 @@ from rich.cells import cell_len
 
 from ftcalib.sphere import axes_along
 from ftdrive.checks.check import Check
-from ftdrive.checks.devices import AXES, check_rate
+from ftdrive.checks.sensor import AXES, check_rate
 from ftdrive.errors import ConfigError
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.replay import ReplayedStream

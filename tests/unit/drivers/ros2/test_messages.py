@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, solve
 from ftcalib.errors import AcceptanceError, DataError, FtdriveError
-from ftdrive.checks.devices import check_compensated
+from ftdrive.checks.sensor import check_compensated
 from ftdrivers.errors import BadUrl, DeviceError, ProtocolError
 from ftdrivers.interfaces import FtSamples
 from ftdrivers.registry import sensor_from_url

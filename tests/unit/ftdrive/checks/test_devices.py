@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
-from ftdrive.checks import devices as diagnosis
+from ftdrive.checks import arm as of_arm
+from ftdrive.checks import belonging as of_belonging
+from ftdrive.checks import sensor as of_sensor
 from ftdrive.checks.check import Check
 from ftdrive.checks.computer import SensorAddress
 from ftdrivers.errors import (
@@ -45,14 +47,14 @@ def test_what_the_sensor_itself_changes_is_reported() -> None:
         "software_bias": Fact((745.0, 0.0, 0.0, 0.0, 0.0, -253.0), "device"),
         "tool_transformation": Fact("0;0;132.71;0;0;0 (mm, degrees)", "device"),
     }
-    found = {check.name: check for check in diagnosis.check_identity(DeviceInfo("Net F/T", "FT1", "1", facts))}
+    found = {check.name: check for check in of_sensor.check_identity(DeviceInfo("Net F/T", "FT1", "1", facts))}
     assert "(745, 0, 0, 0, 0, -253)" in found["sensor.bias"].found
     assert "undoes" in found["sensor.origin"].found
     assert "132.71" in found["sensor.origin"].found
 
 
 def test_what_is_known_of_a_sensor_is_said_with_its_source() -> None:
-    found = {check.name: check for check in diagnosis.check_identity(DeviceInfo("Gamma", "FT1", "3.8", FACTS))}
+    found = {check.name: check for check in of_sensor.check_identity(DeviceInfo("Gamma", "FT1", "3.8", FACTS))}
     assert {check.state for check in found.values()} == {"ok"}
     counts = found["sensor.counts"].found
     assert counts.startswith("1000000 counts per N and")
@@ -64,14 +66,14 @@ def test_what_is_known_of_a_sensor_is_said_with_its_source() -> None:
 def test_what_is_assumed_or_unknown_of_a_sensor_is_a_warning() -> None:
     facts = {name: Fact(1e6, "assumed") for name in ("counts_per_N", "counts_per_Nm")}
     info = DeviceInfo("Mini45", NOT_REPORTED, "3.6", facts)
-    found = {check.name: check for check in diagnosis.check_identity(info)}
+    found = {check.name: check for check in of_sensor.check_identity(info)}
     warned = {name for name, check in found.items() if check.state == "warning"}
     assert warned == {"sensor.identity", "sensor.counts", "sensor.range"}
     assert "serial=" in str(found["sensor.identity"].fix)
     assert "range=300,30" in str(found["sensor.range"].fix)
-    assert {check.state for check in diagnosis.check_identity(DeviceInfo("plain", "1", "2"))} == {"ok", "warning"}
+    assert {check.state for check in of_sensor.check_identity(DeviceInfo("plain", "1", "2"))} == {"ok", "warning"}
     for known in ("counts_per_N", "counts_per_Nm"):
-        half = diagnosis.check_identity(DeviceInfo("Nano", "FT1", "1", {known: Fact(1e6, "device")}))
+        half = of_sensor.check_identity(DeviceInfo("Nano", "FT1", "1", {known: Fact(1e6, "device")}))
         assert [check.found for check in half if check.name == "sensor.counts"] == [
             "the driver does not report its scale"
         ]
@@ -95,10 +97,10 @@ STATUS = ArmStatus(
 
 def arm_checks(status: ArmStatus, tool: ToolConfig = TOOL, sensor_kg: float | None = None) -> dict[str, Check]:
     checks = [
-        diagnosis.check_safety(status),
-        diagnosis.check_program(status),
-        diagnosis.check_speed(status),
-        diagnosis.check_payload(status, tool, sensor_kg),
+        of_arm.check_safety(status),
+        of_arm.check_program(status),
+        of_arm.check_speed(status),
+        of_arm.check_payload(status, tool, sensor_kg),
     ]
     return {check.name: check for check in checks}
 
@@ -135,7 +137,7 @@ def test_an_arm_that_is_not(different: dict[str, Any], name: str, state: str, wo
 @pytest.mark.parametrize(("remote", "state"), [(True, "ok"), (False, "failed"), (None, "skipped")])
 def test_remote_control(remote: bool | None, state: str, lab: Lab) -> None:
     lab.arm.remote = remote
-    assert diagnosis.check_remote(lab.arm).state == state
+    assert of_arm.check_remote(lab.arm).state == state
 
 
 def test_a_remote_control_that_cannot_be_queried_fails(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -143,7 +145,7 @@ def test_a_remote_control_that_cannot_be_queried_fails(lab: Lab, monkeypatch: py
         raise NoDashboard("ur5 says: Timeout connecting", "enable the dashboard server")
 
     monkeypatch.setattr(lab.arm, "in_remote_control", no_dashboard)
-    found = diagnosis.check_remote(lab.arm)
+    found = of_arm.check_remote(lab.arm)
     assert (found.state, found.fix) == ("failed", "enable the dashboard server")
 
 
@@ -161,15 +163,15 @@ def test_a_remote_control_that_cannot_be_queried_fails(lab: Lab, monkeypatch: py
     ],
 )
 def test_how_far_an_arm_is_from_its_nominal_model(info: DeviceInfo, state: str, words: str) -> None:
-    found = diagnosis.check_kinematics(info)
+    found = of_arm.check_kinematics(info)
     assert (found.state, words in found.found) == (state, True)
 
 
 def test_the_arm_is_the_configured_one() -> None:
     info = DeviceInfo("UR5e", "A1", "5.15")
-    assert diagnosis.check_arm(info, RobotConfig("ur5")).state == "ok"
-    assert diagnosis.check_arm(info, RobotConfig("ur5", serial="A1")).state == "ok"
-    other = diagnosis.check_arm(info, RobotConfig("ur5", serial="B2"))
+    assert of_arm.check_arm(info, RobotConfig("ur5")).state == "ok"
+    assert of_arm.check_arm(info, RobotConfig("ur5", serial="A1")).state == "ok"
+    other = of_arm.check_arm(info, RobotConfig("ur5", serial="B2"))
     assert (other.state, "has serial A1, [robot] serial is B2" in other.found) == ("failed", True)
 
 
@@ -197,8 +199,8 @@ def test_a_payload_is_compared_with_the_described_tool(
 @pytest.mark.parametrize(("mass_kg", "state"), [(2.0, "ok"), (2.1, "failed"), (None, "skipped")])
 def test_the_tool_must_fit_the_range_of_the_sensor(mass_kg: float | None, state: str) -> None:
     cell = CellConfig(RobotConfig(""), SensorConfig(""), replace(TOOL, mass_kg=mass_kg))
-    assert diagnosis.check_load((50.0, 50.0, 50.0, 10.0, 10.0, 10.0), cell).state == state
-    assert diagnosis.check_load(None, cell).state == "skipped"
+    assert of_sensor.check_load((50.0, 50.0, 50.0, 10.0, 10.0, 10.0), cell).state == state
+    assert of_sensor.check_load(None, cell).state == "skipped"
 
 
 @pytest.mark.parametrize(
@@ -218,11 +220,11 @@ def test_what_a_sensor_reads_at_rest_must_leave_enough_of_its_range(
     cell = CellConfig(RobotConfig(""), SensorConfig(""), replace(TOOL, mass_kg=mass_kg))
     limits = np.array([300.0] * 3 + [30.0] * 3)
     wrench = np.array([rest], dtype=float)
-    check = diagnosis.check_rest(wrench, limits, cell, zero_is_arbitrary=False)
+    check = of_sensor.check_rest(wrench, limits, cell, zero_is_arbitrary=False)
     assert (check.state, says in check.found) == (state, True)
     assert bool(check.fix) == (state != "ok")
-    assert diagnosis.check_rest(wrench, limits, cell, zero_is_arbitrary=True).state == "skipped"
-    assert diagnosis.check_rest(wrench, None, cell, zero_is_arbitrary=False).state == "skipped"
+    assert of_sensor.check_rest(wrench, limits, cell, zero_is_arbitrary=True).state == "skipped"
+    assert of_sensor.check_rest(wrench, None, cell, zero_is_arbitrary=False).state == "skipped"
 
 
 PORT = SensorAddress.of("bota:///dev/ttyUSB7")
@@ -249,7 +251,7 @@ def stream(
     )
     health = Health(received=n, lost=0, malformed=0, rate_Hz=rate_Hz, age_s=0.001, nominal_rate_Hz=nominal_Hz)
     health = replace(health, **counted)
-    return {check.name: check for check in diagnosis.check_stream(samples, health, address, 2.0)}
+    return {check.name: check for check in of_sensor.check_stream(samples, health, address, 2.0)}
 
 
 def test_a_healthy_stream_and_three_that_are_not() -> None:
@@ -307,20 +309,20 @@ def test_a_polled_sensor_may_lose_samples_to_a_busy_computer() -> None:
 
 def test_noise_at_rest_under_a_hand_and_none_at_all() -> None:
     noise = np.random.default_rng(0).normal(size=(2000, 6)) * ([0.03] * 3 + [0.001] * 3)
-    level, accuracy = diagnosis.check_noise(noise, 2.0, 2.0, 1.2)
+    level, accuracy = of_sensor.check_noise(noise, 2.0, 2.0, 1.2)
     assert (level.state, accuracy.state) == ("ok", "ok")
     assert "σ (0.03" in level.found
     assert "1.2 kg" in accuracy.found
     hand = noise.copy()
     hand[1000:, 2] += 0.5
-    assert diagnosis.check_noise(hand, 2.0, 2.0, 1.2)[0].state == "warning"
-    (dead,) = diagnosis.check_noise(np.ones((2000, 6)), 2.0, 2.0, 1.2)
+    assert of_sensor.check_noise(hand, 2.0, 2.0, 1.2)[0].state == "warning"
+    (dead,) = of_sensor.check_noise(np.ones((2000, 6)), 2.0, 2.0, 1.2)
     assert dead.state == "failed"
     one_axis, no_number = noise.copy(), noise.copy()
     one_axis[:, 4] = 0.3
     no_number[7, 1] = np.nan
     for bad, words in ((noise[:10], "10 samples"), (one_axis, "Ty did not change"), (no_number, "not numbers")):
-        (check,) = diagnosis.check_noise(bad, 2.0, 2.0, 1.2)
+        (check,) = of_sensor.check_noise(bad, 2.0, 2.0, 1.2)
         assert (check.state, words in check.found) == ("failed", True)
 
 
@@ -328,7 +330,7 @@ def test_noise_at_rest_under_a_hand_and_none_at_all() -> None:
 def test_pace_of_the_controllers_clock(pace: float, state: str) -> None:
     t_host_s = np.arange(0, 1, 0.02) + np.random.default_rng(0).uniform(0, 0.002, 50)
     t_host_ns = (t_host_s * 1e9).astype(np.int64) + 12345
-    assert diagnosis.check_clock(t_host_ns.tolist(), (7e5 + pace * t_host_s).tolist()).state == state
+    assert of_arm.check_clock(t_host_ns.tolist(), (7e5 + pace * t_host_s).tolist()).state == state
 
 
 rotations = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=seed).as_matrix())
@@ -337,16 +339,16 @@ rotations = st.integers(0, 2**32 - 1).map(lambda seed: Rotation.random(rng=seed)
 @given(rotations, rotations, st.floats(3, 100))
 def test_push_names_axis_and_sign(R_base_flange: Any, R_flange_sensor: Any, size_N: float) -> None:
     R_sensor_base = (R_base_flange @ R_flange_sensor).T
-    check, moved = diagnosis.check_push(R_sensor_base @ [size_N, 0, 0], R_base_flange, R_flange_sensor, 1)
+    check, moved = of_sensor.check_push(R_sensor_base @ [size_N, 0, 0], R_base_flange, R_flange_sensor, 1)
     assert check.state == "ok"
     assert moved["base"]["axis"] == "+X"
     np.testing.assert_allclose(moved["flange"]["force_N"], R_base_flange.T @ [size_N, 0, 0], atol=1e-9)
 
-    check, moved = diagnosis.check_push(R_sensor_base @ [-size_N, 0, 0], R_base_flange, R_flange_sensor, -1)
+    check, moved = of_sensor.check_push(R_sensor_base @ [-size_N, 0, 0], R_base_flange, R_flange_sensor, -1)
     assert (check.state, moved["base"]["axis"]) == ("failed", "-X")
     assert "sign = 1 " in str(check.fix)
 
-    check, moved = diagnosis.check_push(R_sensor_base @ [0, -size_N, 0], R_base_flange, R_flange_sensor, 1)
+    check, moved = of_sensor.check_push(R_sensor_base @ [0, -size_N, 0], R_base_flange, R_flange_sensor, 1)
     assert (check.state, moved["base"]["axis"]) == ("failed", "-Y")
     assert "sign" not in str(check.fix)
 
@@ -364,7 +366,7 @@ def test_the_payload_is_compared_with_the_weighed_load(
     payload_kg: float | None, sensor_kg: float | None, state: str, words: str
 ) -> None:
     calibration = cast(CalibrationResult, SimpleNamespace(mass_kg=1.44))
-    check = diagnosis.check_weighed_payload(payload_kg, calibration, sensor_kg)
+    check = of_arm.check_weighed_payload(payload_kg, calibration, sensor_kg)
     assert (check.name, check.state) == ("robot.payload", state)
     assert words in check.found
     assert (state == "warning") == bool(
@@ -382,18 +384,18 @@ def test_noise_is_compared_with_that_of_the_calibration(factor: float, drifts: f
     dataset = CalibrationDataset(R, np.zeros((6, 6)), cov, np.full(6, 500), np.full(6, np.nan))
     rng = np.random.default_rng(1)
     wrench = factor * sigma * rng.normal(size=(1000, 6)) + drifts * sigma * np.linspace(0, 1, 1000)[:, None]
-    check = diagnosis.check_noise_change(wrench, dataset)
+    check = of_sensor.check_noise_change(wrench, dataset)
     assert check.state == state
     unknown = CalibrationDataset(R, np.zeros((6, 6)), None, np.zeros(6, np.int64), np.full(6, np.nan))
-    assert diagnosis.check_noise_change(wrench, unknown).state == "skipped"
+    assert of_sensor.check_noise_change(wrench, unknown).state == "skipped"
 
 
 def test_push_without_mounting_or_without_a_push() -> None:
-    check, moved = diagnosis.check_push(np.array([0.5, -9.0, 1.0]), np.eye(3), None, 1)
+    check, moved = of_sensor.check_push(np.array([0.5, -9.0, 1.0]), np.eye(3), None, 1)
     assert check.state == "skipped"
     assert moved["sensor"]["axis"] == "-Y"
     assert moved["flange"] is moved["base"] is None
-    check, _ = diagnosis.check_push(np.array([0.5, 0.0, 0.0]), np.eye(3), np.eye(3), 1)
+    check, _ = of_sensor.check_push(np.array([0.5, 0.0, 0.0]), np.eye(3), np.eye(3), 1)
     assert check.state == "failed"
 
 
@@ -405,15 +407,15 @@ def test_calibration_of_another_sensor() -> None:
     made_with = {"arm": {"serial": "A", "model": "UR5e"}, "sensor": {"serial": "S", "model": "M"}}
     provenance = {"devices": made_with, "created_utc": "2026-01-01"}
     result = cast(CalibrationResult, SimpleNamespace(provenance=provenance, verdict="good"))
-    assert diagnosis.check_calibration(result, {"arm": device("A", "UR5e"), "sensor": device("S")}).state == "ok"
-    other = diagnosis.check_calibration(result, {"arm": device("A"), "sensor": device("T")})
+    assert of_belonging.check_calibration(result, {"arm": device("A", "UR5e"), "sensor": device("S")}).state == "ok"
+    other = of_belonging.check_calibration(result, {"arm": device("A"), "sensor": device("T")})
     assert other.state == "failed"
     assert "sensor S, but the sensor T" in other.found
-    unknown = diagnosis.check_calibration(result, {"arm": device("A"), "sensor": device(NOT_REPORTED)})
+    unknown = of_belonging.check_calibration(result, {"arm": device("A"), "sensor": device(NOT_REPORTED)})
     assert unknown.state == "warning"
     assert "cannot be checked" in unknown.found
     assert "serial=" in str(unknown.fix)
-    both = diagnosis.check_calibration(result, {"arm": device("B"), "sensor": device(NOT_REPORTED)})
+    both = of_belonging.check_calibration(result, {"arm": device("B"), "sensor": device(NOT_REPORTED)})
     assert (both.state, both.fix) == ("failed", "ftdrive calibrate")
 
 
@@ -421,10 +423,10 @@ def test_calibration_of_another_sensor() -> None:
 def test_a_calibration_of_another_model_is_of_another_sensor_without_serial_numbers(made: str, connected: str) -> None:
     devices = {"sensor": {"serial": made, "model": "ATI F/T (NETCANOEM, CAN)"}}
     result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
-    check = diagnosis.check_calibration(result, {"sensor": device(connected, "Bota force/torque sensor")})
+    check = of_belonging.check_calibration(result, {"sensor": device(connected, "Bota force/torque sensor")})
     assert (check.state, check.fix) == ("failed", "ftdrive calibrate")
     assert "ATI F/T (NETCANOEM, CAN), but Bota" in check.found
-    same = diagnosis.check_calibration(result, {"sensor": device(connected, "ATI F/T (NETCANOEM, CAN)")})
+    same = of_belonging.check_calibration(result, {"sensor": device(connected, "ATI F/T (NETCANOEM, CAN)")})
     assert same.state == "warning"
 
 
@@ -432,9 +434,9 @@ def test_a_calibration_of_another_model_is_of_another_sensor_without_serial_numb
 def test_a_calibration_that_does_not_know_its_sensor_cannot_be_checked(devices: object) -> None:
     result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
     for serial in ("FT12345", NOT_REPORTED):
-        (words,) = diagnosis.belonging(result, {"sensor": device(serial)}).unknown
+        (words,) = of_belonging.belonging(result, {"sensor": device(serial)}).unknown
         assert "was made with" in words
-        assert not diagnosis.belonging(result, {"sensor": device(serial)}).others
+        assert not of_belonging.belonging(result, {"sensor": device(serial)}).others
 
 
 ALLOWED = Check("permissions.port", "ok", "may be read and written")
@@ -469,7 +471,7 @@ def not_opened(found: str, cure: str = "") -> ConnectError:
 )
 @pytest.mark.parametrize("address", [PORT, BY_NETWORK, BY_PCAN])
 def test_the_cure_that_a_message_names_is_the_one_shown(error: DeviceError, address: SensorAddress) -> None:
-    check = diagnosis.check_sensor_error("sensor.stream", error, address, [ALLOWED])
+    check = of_sensor.check_sensor_error("sensor.stream", error, address, [ALLOWED])
     assert check == Check("sensor.stream", "failed", error.found, error.fix)
 
 
@@ -477,7 +479,7 @@ def test_the_cure_that_a_message_names_is_the_one_shown(error: DeviceError, addr
     ("address", "ask"), [(PORT, "ftdrive devices --probe "), (BY_NETWORK, "ping ")], ids=["serial port", "network"]
 )
 def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: SensorAddress, ask: str) -> None:
-    check = diagnosis.check_sensor_error("sensor.stream", DeviceTimeout("silent", "check cable"), address, [ALLOWED])
+    check = of_sensor.check_sensor_error("sensor.stream", DeviceTimeout("silent", "check cable"), address, [ALLOWED])
     assert str(check.fix).startswith("check cable; ")
     assert str(check.fix).partition(": ")[2].startswith(ask)
 
@@ -506,27 +508,27 @@ def test_to_the_cure_of_a_silence_belongs_how_to_see_who_answers(address: Sensor
 def test_another_cure_is_shown_where_the_way_to_a_sensor_is_wrong_or_its_message_names_none(
     error: DeviceError, address: SensorAddress, permission: Check, cure: str
 ) -> None:
-    found = diagnosis.check_sensor_error("sensor.stream", error, address, [permission])
+    found = of_sensor.check_sensor_error("sensor.stream", error, address, [permission])
     assert (found.name, found.state, found.found) == ("sensor.stream", "failed", error.found)
     assert cure in str(found.fix)
 
 
 def test_a_port_that_another_program_has_is_not_the_fault_of_supply_or_cable() -> None:
     error = PortInUse("the port is in use", "end it, `fuser -v /dev/ttyUSB7` names it")
-    found = diagnosis.check_sensor_error("sensor.identity", error, PORT, [FORBIDDEN])
+    found = of_sensor.check_sensor_error("sensor.identity", error, PORT, [FORBIDDEN])
     assert (found.found, found.fix) == (error.found, error.fix)
 
 
 @pytest.mark.parametrize(("own", "shown"), [("check the robot", "check the robot"), ("", "ping ur5")])
 def test_the_error_of_an_arm_that_names_no_cure_gets_one(own: str, shown: str) -> None:
-    check = diagnosis.check_unreachable(StreamBroken("ur5:30004 was lost (x; y)", own), "ur5")
+    check = of_arm.check_unreachable(StreamBroken("ur5:30004 was lost (x; y)", own), "ur5")
     assert (check.found, check.fix) == ("ur5:30004 was lost (x; y)", shown)
 
 
 def test_a_wrench_without_the_weight_of_the_tool_is_compensated() -> None:
     cell = CellConfig(RobotConfig(""), SensorConfig(""), ToolConfig(mass_kg=2.0))
     for share, state in ((0.0, "warning"), (0.095, "warning"), (0.1, "ok"), (1.0, "ok")):
-        check = diagnosis.check_compensated(np.tile([0.0, 12.0 * share, -16.0 * share, 9.0, 9.0, 9.0], (50, 1)), cell)
+        check = of_sensor.check_compensated(np.tile([0.0, 12.0 * share, -16.0 * share, 9.0, 9.0, 9.0], (50, 1)), cell)
         assert check.state == state
         assert f"{20 * share:.1f} N at rest, the tool weighs 19.6 N" in check.found
-    assert diagnosis.check_compensated(np.ones((50, 6)), replace(cell, tool=ToolConfig())).state == "skipped"
+    assert of_sensor.check_compensated(np.ones((50, 6)), replace(cell, tool=ToolConfig())).state == "skipped"

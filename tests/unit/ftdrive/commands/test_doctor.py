@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from ftdrive import cli
-from ftdrive.checks import devices
 from ftdrive.checks.check import Check
 from ftdrive.commands import doctor
 from ftdrive.commands.doctor import _check_clock, _check_poses, _examine_push, _print
@@ -55,7 +54,7 @@ def test_the_clock_of_the_arm_is_compared_over_some_seconds(pace: float, until: 
 
 def test_the_pose_is_read_in_millimetres(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = FakeClock()
-    monkeypatch.setattr(devices, "check_link", lambda *_, **__: Check("robot.link", "ok", "fast"))
+    monkeypatch.setattr(doctor, "check_link", lambda *_, **__: Check("robot.link", "ok", "fast"))
     status = cast("Any", SimpleNamespace(tcp_offset=np.zeros(6)))
     found = _check_poses(cast("Any", Arm(clock)), status, clock)
     assert found[0].found == "TCP offset read; flange at (100, -200, 346) mm in base"
@@ -88,7 +87,7 @@ def examined(device: Any, monkeypatch: pytest.MonkeyPatch, line: str = "\n", sta
         given.extend(arguments)
         return Check("push.sign", "ok", "found"), {}
 
-    monkeypatch.setattr(devices, "check_push", check_push)
+    monkeypatch.setattr(doctor, "check_push", check_push)
     monkeypatch.setattr("sys.stdin", SimpleNamespace(readline=lambda: line))
     blame = partial(lambda name, error: Check(name, "failed", error.found))
     check, _ = _examine_push(device, cast("Any", Arm(FakeClock())), np.eye(3), -1, station, cast("Any", blame))

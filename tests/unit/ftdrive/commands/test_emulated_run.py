@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from ftdrive.commands import demo, emulated_run
+from ftdrive.commands import common, demo
 from ftdrive.runs.run import Run
 from ftdrive.session import rehearsal
 from ftdrive.session.events import Event, Noted, RunOpened
@@ -47,7 +47,7 @@ def test_the_place_of_a_run_that_is_not_kept_is_not_printed(
 
     monkeypatch.setattr(screen, "open_operator", open_operator)
     monkeypatch.setattr(rehearsal, "calibrate", calibrate)
-    emulated_run.rehearse(STATION, tmp_path, "simulated", kept=kept)
+    common.rehearse(STATION, tmp_path, "simulated", kept=kept)
     assert [type(event) for event in person.events] == expected
 
 

@@ -10,7 +10,7 @@ import yaml
 from click.testing import CliRunner, Result
 
 from ftdrive.cli import cli
-from ftdrive.commands import emulated_run
+from ftdrive.commands import common
 from ftdrive.errors import ConfigError, exit_code
 from ftdrive.exports.formats import FORMATS
 from ftdrive.runs.run import Run
@@ -61,7 +61,7 @@ def test_the_mass_of_an_emulated_sensor_is_that_of_its_run(tmp_path: Path, monke
         tmp_path, "simulated", {"config": {"sensor": {"url": "x", "height_mm": 0.0, "mass_kg": 0.25}}}
     ).folder
     calibration().save(folder / "calibration.json")
-    monkeypatch.setattr(emulated_run, "rehearsed_run", lambda _: nullcontext(folder))
+    monkeypatch.setattr(common, "rehearsed_run", lambda _: nullcontext(folder))
     outcome = export("calibration", "--simulate", "--format", "franka")
     assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.25)
 

@@ -15,7 +15,7 @@ from ftdrive import cli
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import Declined
 from ftdrive.runs.verified import AcceptanceLimits
-from ftdrive.session.operator import Question
+from ftdrive.session.events import Question
 from ftdrive.store.records import StoredCell
 from ftdrive.store.store import Store
 from ftdrivers.errors import ConnectError

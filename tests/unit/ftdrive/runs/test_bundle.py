@@ -24,8 +24,8 @@ from ftdrive.cli import run as run_command
 from ftdrive.errors import BadBundle
 from ftdrive.runs import bundle
 from ftdrive.runs.bundle import Bundled, unpacked, write_bundle
-from ftdrive.runs.outcome import solve_and_save
 from ftdrive.runs.run import Reading, Run
+from ftdrive.runs.source import solve_and_save
 from ftdrivers.interfaces import FtSamples
 
 TRUTH = Parameters(np.eye(3), np.array([0.0, 0, -12]), np.ones(3), np.array([0.0, 0, 0.06]), np.ones(3))

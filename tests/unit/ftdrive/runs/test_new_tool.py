@@ -10,10 +10,10 @@ import pytest
 from ftcalib import CalibrationResult, Setup
 from ftcalib.findings import Finding
 from ftdrive.errors import ConfigError
-from ftdrive.runs import outcome
+from ftdrive.runs import source
 from ftdrive.runs.motion import MotionRecording
-from ftdrive.runs.outcome import require_same_cell
 from ftdrive.runs.run import Run
+from ftdrive.runs.source import require_same_cell
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.moving_load import Truth, record, sweep
 from tests.unit.ftdrive.live.simulated import calibrated, calibrated_from
@@ -68,7 +68,7 @@ def test_a_run_in_motion_is_solved_with_the_earlier_result_that_it_keeps(
     before = calibrated_from({**TRUTH.to_dict(), "noise_force_N": 0.05, "noise_torque_Nm": 0.002})
     run = Run.create(tmp_path, "tool", {"mode": "sweep", "earlier": before.to_dict()})
     MotionRecording(samples, states, 250.0).save(run.new_path("motion", ".npz"))
-    monkeypatch.setattr(outcome, "circumstances_of", lambda _: outcome.Circumstances(9.80665, Setup(), of("FT1", "A1")))
-    assert outcome.solve_in_motion(run).provenance["parent"] == {"id": before.id}
+    monkeypatch.setattr(source, "circumstances_of", lambda _: source.Circumstances(9.80665, Setup(), of("FT1", "A1")))
+    assert source.solve_in_motion(run).provenance["parent"] == {"id": before.id}
     with pytest.raises(ConfigError, match="of sensor FT2"):
-        outcome.solve_in_motion(run, earlier=replace(before, provenance=of("FT2", "A1")))
+        source.solve_in_motion(run, earlier=replace(before, provenance=of("FT2", "A1")))

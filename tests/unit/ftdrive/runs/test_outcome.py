@@ -10,9 +10,9 @@ import pytest
 from ftcalib import CalibrationResult
 from ftcalib.judge import described_cell
 from ftdrive.cell.config import SensorConfig, ToolConfig
-from ftdrive.runs.outcome import circumstances_of, solve_records
 from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.run import Run
+from ftdrive.runs.source import circumstances_of, solve_records
 from ftdrive.session.events import Noted, PoseTaken, Weighed
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.preflight import Before, check_payload

@@ -21,7 +21,7 @@ import pytest
 from ftcalib.errors import BadDataset
 from ftcalib.routine import PoseRecord, TourPose
 from ftdrive.errors import ConfigError
-from ftdrive.runs import outcome
+from ftdrive.runs import source
 from ftdrive.runs.run import Reading, Run
 from ftdrivers.interfaces import FtSamples
 from tests.edited_files import edit
@@ -268,6 +268,6 @@ def test_without_room_for_the_result_the_poses_are_safe(run: Run, monkeypatch: p
         raise OSError(errno.ENOSPC, "No space left on device")
 
     solved = SimpleNamespace(dataset=SimpleNamespace(save=full))
-    monkeypatch.setattr(outcome, "solve_records", lambda *_: solved)
+    monkeypatch.setattr(source, "solve_records", lambda *_: solved)
     with pytest.raises(OSError, match=r"No space left .*not saved, but all poses are.*ftdrive solve .* --output"):
-        outcome.solve_and_save(run)
+        source.solve_and_save(run)

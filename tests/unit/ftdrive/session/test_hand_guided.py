@@ -17,11 +17,10 @@ from ftcalib.model import Array, cross
 from ftcalib.routine import PoseRecord, dataset_from, drift_check
 from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
-from ftdrive.session.events import Compared, Estimated, Event, Noted, PoseTaken, State, StateChanged
+from ftdrive.session.events import Compared, Estimated, Event, Key, Noted, PoseTaken, Question, State, StateChanged
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import HandGuided
 from ftdrive.session.open_cell import OpenCell
-from ftdrive.session.operator import Key, Question
 from ftdrive.session.pose_book import PoseBook
 from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.follow import Follow

@@ -5,8 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from ftdrive.errors import Declined
-from ftdrive.session.events import GuardTripped, Noted, State, StateChanged
-from ftdrive.session.operator import Key
+from ftdrive.session.events import GuardTripped, Key, Noted, State, StateChanged
 from ftdrivers.errors import ConnectError, DeviceFault
 from tests.unit.ftdrive.fake_cell import Lab
 

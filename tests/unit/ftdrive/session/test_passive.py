@@ -12,12 +12,12 @@ import pytest
 
 from ftcalib import Setup
 from ftdrive.errors import Declined
-from ftdrive.runs import outcome
+from ftdrive.runs import source
 from ftdrive.runs.motion import MotionRecording, files_of
-from ftdrive.runs.outcome import Circumstances
 from ftdrive.runs.run import Run
+from ftdrive.runs.source import Circumstances
+from ftdrive.session.events import Key
 from ftdrive.session.open_cell import OpenCell
-from ftdrive.session.operator import Key
 from ftdrive.session.passive import PART_S, record_passively
 from ftdrivers.errors import StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
@@ -130,8 +130,8 @@ def test_what_was_recorded_before_a_failure_is_kept_and_solved(
     assert "unplugged" in lost
     assert run.solve_command in kept
     assert MotionRecording.load(run.motion_path).samples.seq[-1] >= 500 * (13.0 - STEP_S) - 1
-    monkeypatch.setattr(outcome, "circumstances_of", lambda _: Circumstances(9.80665, Setup(), {}))
-    assert outcome.solve_in_motion(run).verdict in {"good", "usable"}
+    monkeypatch.setattr(source, "circumstances_of", lambda _: Circumstances(9.80665, Setup(), {}))
+    assert source.solve_in_motion(run).verdict in {"good", "usable"}
 
 
 def test_memory_holds_one_part_at_a_time(free: Recorded, tmp_path: Path) -> None:
@@ -147,8 +147,8 @@ def test_a_touch_below_that_of_a_guard_is_left_out_of_the_result(
 ) -> None:
     touches = {(start, start + 2.0): np.array([1.0, 0.0, -0.8, 0.0, 0.05, 0.0]) for start in np.arange(4.0, 25.0, 7.0)}
     run = passively(FakeCell(recording(touches)), tmp_path, SECONDS)
-    monkeypatch.setattr(outcome, "circumstances_of", lambda _: Circumstances(9.80665, Setup(), {}))
-    found = outcome.solve_in_motion(run)
+    monkeypatch.setattr(source, "circumstances_of", lambda _: Circumstances(9.80665, Setup(), {}))
+    found = source.solve_in_motion(run)
     assert found.verdict == "good"
     assert found.motion is not None
     assert found.motion.contacts

@@ -12,8 +12,8 @@ import pytest
 
 from ftdrive.cell.config import ToolConfig, WorkcellConfig
 from ftdrive.checks import computer
+from ftdrive.checks.arm import SLOWEST_SLIDER, check_speed
 from ftdrive.checks.check import Check
-from ftdrive.checks.devices import SLOWEST_SLIDER, check_speed
 from ftdrive.errors import NotAccepted
 from ftdrive.session import preflight
 from ftdrive.session.events import Checked, Noted

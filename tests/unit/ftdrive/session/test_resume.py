@@ -21,6 +21,7 @@ from ftdrive.session.events import (
     Estimated,
     Event,
     GuardTripped,
+    Key,
     Noted,
     PoseTaken,
     RunOpened,
@@ -28,7 +29,6 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.live_fit import faces
-from ftdrive.session.operator import Key
 from ftdrive.terminal.report import drift_in_words
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact

@@ -21,12 +21,12 @@ from ftdrive.session.events import (
     Checked,
     Event,
     GuardTripped,
+    Key,
     Noted,
     PoseTaken,
     State,
     StateChanged,
 )
-from ftdrive.session.operator import Key
 from ftdrive.session.preflight import Before
 from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import FtSamples

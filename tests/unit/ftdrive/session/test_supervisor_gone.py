@@ -5,8 +5,7 @@ import json
 import pytest
 
 from ftdrive.errors import SupervisorGone, exit_code
-from ftdrive.session.events import Event, GuardTripped, Hazard, State, StateChanged
-from ftdrive.session.operator import Key
+from ftdrive.session.events import Event, GuardTripped, Hazard, Key, State, StateChanged
 from ftdrivers.errors import DeviceFault
 from tests.unit.ftdrive.fake_cell import Lab, Scripted
 

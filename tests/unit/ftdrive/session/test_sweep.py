@@ -16,9 +16,8 @@ from ftdrive.planning.cell_plan import certifier_for, sweep_for
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.motion import MotionRecording
 from ftdrive.session import task
-from ftdrive.session.events import Event, GuardTripped, MotionRecorded, State, StateChanged
+from ftdrive.session.events import Event, GuardTripped, Key, MotionRecorded, State, StateChanged
 from ftdrive.session.guards import ExpectedMotion, Seen
-from ftdrive.session.operator import Key
 from ftdrive.session.options import SessionOptions, with_recorded_mode
 from ftdrive.session.sweep import FreeTool, on_script_path
 from ftdrivers.clock import REAL

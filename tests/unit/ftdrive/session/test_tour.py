@@ -25,6 +25,7 @@ from ftdrive.session.along_plan import has_completed, remember_completed
 from ftdrive.session.events import (
     Asked,
     Checked,
+    Key,
     Noted,
     Planned,
     PoseTaken,
@@ -32,7 +33,6 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
-from ftdrive.session.operator import Key
 from ftdrive.terminal.session_text import SessionText, in_words
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo

@@ -27,8 +27,7 @@ from ftdrive.errors import Declined
 from ftdrive.planning import cell_plan
 from ftdrive.planning.plan import Plan
 from ftdrive.session import session
-from ftdrive.session.events import Noted
-from ftdrive.session.operator import Question
+from ftdrive.session.events import Noted, Question
 from ftdrive.terminal import console
 from ftdrive.terminal.console import answer, hanging, messages
 from ftdrive.terminal.live.lines import Line

@@ -23,12 +23,13 @@ from ftdrive.session.events import (
     Event,
     GuardTripped,
     Noted,
+    Operator,
     PoseTaken,
+    Question,
     RunOpened,
     State,
     StateChanged,
 )
-from ftdrive.session.operator import Operator, Question
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer
 from ftdrive.terminal.text import in_whole_words
 

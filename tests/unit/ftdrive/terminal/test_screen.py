@@ -27,13 +27,14 @@ from ftdrive.session.events import (
     Estimated,
     Event,
     GuardTripped,
+    Key,
     Noted,
     PoseTaken,
+    Question,
     RunOpened,
     State,
     StateChanged,
 )
-from ftdrive.session.operator import Key, Question
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator
 from ftdrive.terminal.screen import Screen, SessionView, _drift, frame, open_operator

@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 from ftdrive.errors import Declined, SupervisorGone
-from ftdrive.session.operator import Question
+from ftdrive.session.events import Question
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator
 from ftdrive.terminal.screen import Screen

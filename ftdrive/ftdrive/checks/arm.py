@@ -1,0 +1,226 @@
+"""Checks of an arm and its controller."""
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from ftcalib import CalibrationResult
+from ftcalib.judge import described_cell
+from ftdrive.cell.config import RobotConfig, ToolConfig
+from ftdrive.checks.check import Check, State, who
+from ftdrive.planning.geometry.kinematics import frames
+from ftdrivers.clock import Clock
+from ftdrivers.errors import (
+    DeviceError,
+    ModelUnknown,
+)
+from ftdrivers.interfaces import (
+    NOT_REPORTED,
+    ArmStatus,
+    DeviceInfo,
+    Diagnosis,
+    RobotArm,
+)
+from ftdrivers.ur.kinematics import MODELS, kinematics_of
+
+_PAYLOAD_MM: Final = 100.0
+
+
+_LINK_S: Final = 0.5
+
+
+_LINK_TRIES: Final = 3
+
+
+_POSTURES: Final = 200
+
+
+SLOWEST_SLIDER = 0.05
+
+
+# ------------------------------------------------------------------------------------------------------------- the arm
+
+
+def check_unreachable(error: DeviceError, host: str) -> Check:
+    """Return why an arm could not be opened, and what to do about it."""
+    fix = error.fix or f"ping {host}"
+    if isinstance(error, ModelUnknown):
+        fix = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model: one of {", ".join(MODELS)}'
+    return Check("robot.reachable", "failed", error.found, fix)
+
+
+def check_arm(info: DeviceInfo, robot: RobotConfig) -> Check:
+    """Check that the arm is the configured one, where [robot] serial is set."""
+    name = "robot.identity"
+    if robot.serial not in {None, info.serial}:
+        found = f"the arm at {robot.host} has serial {info.serial}, [robot] serial is {robot.serial}"
+        if info.serial == NOT_REPORTED:
+            return Check(name, "failed", f"{found}: they cannot be compared", "remove [robot] serial")
+        return Check(name, "failed", found, "correct one of the two")
+    return Check(name, "ok", who(info))
+
+
+def check_kinematics(info: DeviceInfo) -> Check:
+    """Check that an arm reports its own kinematics, and how far they are from those of its model."""
+    name, own = "robot.kinematics", kinematics_of(info)
+    if info.model not in MODELS:
+        return Check(name, "skipped", f"the kinematics of a {info.model} are not known here")
+    if own is None:
+        found = f"none reported: plans use those of a nominal {info.model}, with wider margins"
+        return Check(name, "warning", found, "enable the primary client interface under Settings, Security, Services")
+    q_rad = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSTURES, 6))
+    real, nominal = frames(own, q_rad), frames(MODELS[info.model], q_rad)
+    off_mm = 1e3 * np.linalg.norm(real.flange_m - nominal.flange_m, axis=1).max()
+    chord = np.linalg.norm(real.R_base_flange - nominal.R_base_flange, axis=(1, 2)).max() / np.sqrt(8.0)
+    off_deg = np.degrees(2 * np.arcsin(chord))
+    found = f"own, up to {off_mm:.1f} mm and {off_deg:.2f}° from a nominal {info.model}"
+    return Check(name, "ok", f"{found}; plans use them")
+
+
+def check_diagnosis(diagnosis: Diagnosis, device: str = "robot") -> Check:
+    """Return what the driver of a robot or a sensor found when it checked its own device."""
+    state: State = "ok" if diagnosis.passed else "failed"
+    return Check(f"{device}.{diagnosis.name}", state, diagnosis.found, diagnosis.fix or None)
+
+
+def check_remote(arm: RobotArm) -> Check:
+    """Check that the controller accepts programs from the network."""
+    name = "robot.remote"
+    try:
+        remote = arm.in_remote_control()
+    except DeviceError as error:
+        return Check(name, "failed", error.found, error.fix or None)
+    if remote is None:
+        return Check(name, "skipped", "this controller does not report whether it accepts programs from the network")
+    if remote:
+        return Check(name, "ok", "remote control on")
+    return Check(name, "failed", "local control", "press Local, Remote Control at the top right of the pendant")
+
+
+def check_safety(status: ArmStatus) -> Check:
+    """Check that the safety system lets the arm move."""
+    if status.fault is not None:
+        return Check("robot.safety", "failed", status.fault.found, status.fault.fix)
+    if status.safety_mode != "normal":
+        fix = "check at the pendant that this mode is intended; calibrate asks for it"
+        return Check("robot.safety", "warning", f"safety mode {status.safety_mode}", fix)
+    return Check("robot.safety", "ok", "powered, brakes released, no stop")
+
+
+def check_program(status: ArmStatus) -> Check:
+    """Check that no program runs on the controller."""
+    if status.program == "stopped":
+        return Check("robot.program", "ok", "no program runs; other clients that only read cannot be detected")
+    found = f"a program is on the controller ({status.program})"
+    return Check("robot.program", "warning", found, "stop it at the pendant: calibrate refuses to start beside it")
+
+
+def check_speed(status: ArmStatus) -> Check:
+    """Check that the speed slider lets the arm move in a reasonable time."""
+    found = f"speed slider at {status.speed_slider:.0%}, the controller allows {status.speed_scaling:.0%}"
+    if status.speed_slider < SLOWEST_SLIDER:
+        fix = "raise the speed slider at the pendant, to 100 % if that is safe: ftdrive never moves it"
+        return Check("robot.speed", "failed", f"{found}: the arm would hardly move", fix)
+    return Check("robot.speed", "ok", found)
+
+
+def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) -> Check:
+    """Check the payload configured in the controller, and compare it with tool and sensor as far as they are described.
+
+    The mass may differ by the larger of `described_cell.PAYLOAD_KG` and its share; the centre must be at the tool.
+    """
+    name, payload_kg, p_m = "robot.payload", status.payload_kg, status.p_flange_payload_m
+    if payload_kg is None:
+        return Check(name, "skipped", "this controller does not report its payload: compare it at the pendant")
+    if payload_kg <= 0:
+        fix = "set mass and centre of mass of all that hangs on the flange at the pendant; else the arm may stop itself"
+        return Check(name, "failed", "no payload is set in the controller", fix)
+    found = f"payload {payload_kg:.2f} kg"
+    if p_m is None:
+        found += ", its centre is not reported"
+    else:
+        found += " at ({:.0f}, {:.0f}, {:.0f}) mm from the flange".format(*(1e3 * value for value in p_m))
+        if tool.cylinders_mm and not _at_tool(p_m, tool):
+            fix = "correct the centre of the payload at the pendant, or [tool] cylinders_mm"
+            return Check(name, "failed", f"{found}, outside the tool", fix)
+    if tool.mass_kg is not None:
+        expected_kg = tool.mass_kg + (sensor_kg or 0.0)
+        found += f", sensor and tool are {expected_kg:.2f} kg"
+        if abs(payload_kg - expected_kg) > max(described_cell.PAYLOAD_KG, described_cell.PAYLOAD_SHARE * expected_kg):
+            return Check(name, "failed", found, "correct the payload at the pendant, or the masses in [tool], [sensor]")
+    if p_m is not None and not any(p_m):
+        fix = "set the centre of gravity at the pendant: Installation, Payload"
+        return Check(name, "warning", f"{found}; nothing hangs in the middle of the flange face", fix)
+    return Check(name, "ok", found)
+
+
+def check_weighed_payload(payload_kg: float | None, result: CalibrationResult, sensor_kg: float | None) -> Check:
+    """Compare the payload configured in the controller with the load that a calibration has weighed.
+
+    Parameters
+    ----------
+    payload_kg : float, optional
+        As the controller reports it.
+    result : CalibrationResult
+    sensor_kg : float, optional
+        Mass of sensor and adapter, which the sensor cannot weigh.
+    """
+    name = "robot.payload"
+    if payload_kg is None:
+        return Check(name, "skipped", "this controller does not report its payload")
+    for finding in described_cell.payload(payload_kg, result.mass_kg, sensor_kg):
+        return Check(name, "warning", finding.found, finding.fix)
+    known = "sensor" if sensor_kg is None else f"{sensor_kg:.2f} kg sensor"
+    return Check(name, "ok", f"robot {payload_kg:.2f} kg; weighed {result.mass_kg:.2f} kg + {known}")
+
+
+def _at_tool(p_flange_m: Sequence[float], tool: ToolConfig) -> bool:
+    x_mm, y_mm, z_mm = (1e3 * value for value in p_flange_m)
+    reach_mm = max(math.hypot(*row[3:]) + row[2] / 2 for row in tool.cylinders_mm)
+    length_mm = max(row[1] for row in tool.cylinders_mm)
+    return math.hypot(x_mm, y_mm) <= reach_mm + _PAYLOAD_MM and -_PAYLOAD_MM <= z_mm <= length_mm + _PAYLOAD_MM
+
+
+def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> Check:
+    """Check that states of the arm arrive soon and without gaps, in one of three half seconds.
+
+    Parameters
+    ----------
+    usual_s : float
+        Longest median of the time for an answer.
+    gap_s : float
+        Longest time for nine of ten answers.
+    """
+    name, found = "robot.link", ""
+    for _ in range(_LINK_TRIES):  # a computer that is busy for a moment is not a bad link
+        try:
+            with clock.keeping_up():
+                took_s = _answers_s(arm, clock)
+        except DeviceError as error:
+            return Check(name, "failed", error.found, error.fix or "check the robot and the network")
+        median_s = float(np.median(took_s))
+        found = f"the arm answers within {1e3 * median_s:.0f} ms, at worst {1e3 * max(took_s):.0f} ms"
+        if median_s < usual_s and np.quantile(took_s, 0.9) < gap_s:
+            return Check(name, "ok", found)
+    limit = f"allowed are {1e3 * usual_s:.0f} ms, {1e3 * gap_s:.0f} ms for nine in ten"
+    return Check(name, "failed", f"{found} ({limit})", "use a cable, and reduce the load of this computer and network")
+
+
+def _answers_s(arm: RobotArm, clock: Clock) -> list[float]:
+    took_s, end_s = list[float](), clock.now_s() + _LINK_S
+    while (started_s := clock.now_s()) < end_s:
+        arm.state()
+        took_s.append(clock.now_s() - started_s)
+    return took_s
+
+
+def check_clock(t_host_ns: Sequence[int], t_device_s: Sequence[float]) -> Check:
+    """Compare the pace of the controller's clock with ours; their readings are never subtracted from each other."""
+    host_s = (np.asarray(t_host_ns) - t_host_ns[0]) / 1e9
+    pace = float(np.polyfit(host_s, np.asarray(t_device_s) - t_device_s[0], 1)[0])
+    found = f"the controller's clock runs at {pace:.4f} of ours, over {host_s[-1]:.1f} s"
+    if abs(pace - 1) < 0.02:
+        return Check("clock.pace", "ok", found)
+    return Check("clock.pace", "warning", found, "close other programs on this computer; look at the network's load")
