@@ -168,7 +168,7 @@ _ROUTINE = {item.name: item.default for item in fields(Sampling)}
 
 
 @dataclass(frozen=True, slots=True)
-class SamplingConfig(Sampling):
+class _SamplingConfig(Sampling):
     """How long each pose is averaged."""
 
     average_s: float = entry(
@@ -213,7 +213,7 @@ class CellConfig:
     sensor: SensorConfig
     tool: ToolConfig = field(default_factory=ToolConfig)
     workcell: WorkcellConfig = field(default_factory=WorkcellConfig)
-    sampling: Sampling = field(default_factory=SamplingConfig)
+    sampling: Sampling = field(default_factory=_SamplingConfig)
     site: SiteConfig = field(default_factory=SiteConfig)
     store: StoreConfig = field(default_factory=StoreConfig)
     clock: Clock = field(default=REAL, compare=False, repr=False)
@@ -255,7 +255,7 @@ SECTIONS: Mapping[str, Any] = {
     "sensor": SensorConfig,
     "tool": ToolConfig,
     "workcell": WorkcellConfig,
-    "sampling": SamplingConfig,
+    "sampling": _SamplingConfig,
     "site": SiteConfig,
     "store": StoreConfig,
 }

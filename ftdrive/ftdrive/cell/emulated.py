@@ -179,11 +179,11 @@ class Station:
         return _with_values(usual, self.values)
 
 
+# What an emulated cell takes from a configuration, beside the truth that `_options` sets.
 _OF_FILE = (
     *("robot.speed_deg_s", "tool.name", "tool.cylinders_mm", "tool.mass_kg"),
     *("workcell.mounting", "workcell.planes_mm", "workcell.boxes_mm"),
 )
-"""What an emulated cell takes from a configuration, beside the truth that `_options` sets."""
 
 
 def _configured(sensor: str | None) -> Mapping[str, Any]:

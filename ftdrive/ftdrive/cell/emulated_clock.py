@@ -15,10 +15,10 @@ from ftdrivers.errors import ConnectError
 
 _VERSION: Final = 1
 _NOW, _COUNT, _SLOTS = 1, 2, 4
+# A thread that keeps up looks at the clock this often while it waits.
 _SLICE_S: Final = 0.005
-"""A thread that keeps up looks at the clock this often while it waits."""
+# When the time has stood still for so long, it is checked whether the station has ended.
 _SUSPECT_S: Final = 0.25
-"""When the time has stood still for so long, it is checked whether the station has ended."""
 _PATIENCE_S: Final = 30.0
 _LOCAL_SLOTS: Final = 8
 _LOCAL_LEAD_NS: Final = 10_000_000
@@ -58,8 +58,8 @@ class EmulatedClock(Clock):
         weakref.finalize(self, os.close, self._descriptor)
         self._own = threading.local()
         self._seen_ns, self._seen_at_s = 0, 0.0
+        # What to add to the computer's clock, once the station has ended.
         self._ended_ns: int | None = None
-        """What to add to the computer's clock, once the station has ended."""
 
     def patience_s(self, limit_s: float) -> float:
         """Return a long limit on another process, which may starve."""

@@ -11,8 +11,8 @@ Rows = tuple[tuple[float, ...], ...]
 Reject = Callable[[Any], str | None]
 """Returns what to do about a value that cannot be used; None for one that can."""
 
+# Values in metres or inches are thinner.
 _THINNEST_MM = 5.0
-"""Values in metres or inches are thinner."""
 
 
 @dataclass(frozen=True, slots=True)

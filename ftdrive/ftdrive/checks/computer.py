@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 SYS = Path("/sys")
 DEV = Path("/dev")
 
+# ARPHRD_CAN, in /sys/class/net/*/type.
 _CAN_INTERFACE = "280"
-"""ARPHRD_CAN, in /sys/class/net/*/type."""
 _ON_SERIAL = ("ati-serial", "bota", "robotiq-ft300", "robotous-serial")
 _ON_ETHERNET = ("ati-netft", "ur-ft")
 _LEAST_BYTES, _FEW_BYTES = 200_000_000, 1_000_000_000

@@ -24,7 +24,7 @@ _ROWS = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Side:
+class _Side:
     """One of the two calibrations."""
 
     calibrated: "Estimated"
@@ -83,7 +83,7 @@ def diff(first: str, second: str, as_json: bool) -> None:
     echo(_in_words(found))
 
 
-def _side(text: str) -> Side:
+def _side(text: str) -> _Side:
     """Find a calibration by path or id; raises `ConfigError`."""
     from ftdrive.errors import ConfigError
     from ftdrive.runs.source import read_calibration
@@ -97,7 +97,7 @@ def _side(text: str) -> Side:
         created = result.provenance.get("created_utc")
         emulated = EMULATED in marks_of(result)
         made = created if isinstance(created, str) else None
-        return Side(result, result.id, text, made, result.mass_kg, sigma_kg, emulated)
+        return _Side(result, result.id, text, made, result.mass_kg, sigma_kg, emulated)
     if len(text) < 4 or not set(text) <= set("0123456789abcdef"):
         raise ConfigError(f"'{text}' is neither a file nor an id: give a path, or 4 digits or more of an id")
     store = Store(store_url())
@@ -108,7 +108,7 @@ def _side(text: str) -> Side:
         ids = ", ".join(one.id for one in found)
         raise ConfigError(f"{text} is the beginning of {ids}: give more digits")
     one = found[0]
-    return Side(one, one.id, one.path, one.created_utc, one.mass_kg, one.mass_sigma_kg, bool(one.emulated))
+    return _Side(one, one.id, one.path, one.created_utc, one.mass_kg, one.mass_sigma_kg, bool(one.emulated))
 
 
 def _line(label: str, change: float, sigma: float) -> str:

@@ -112,10 +112,10 @@ def _say(words: str) -> None:
     messages.print(words)
 
 
+# Of weighings that are listed.
 _MOST_DAYS = 20
-"""Of weighings that are listed."""
+# An earlier weighing is not the last one of a list.
 _RECENT = timedelta(days=90)
-"""An earlier weighing is not the last one of a list."""
 
 
 def _show_weighings(days: "Sequence[StoredWeighings]", name: str, left_out: Sequence[str], as_json: bool) -> None:
@@ -160,8 +160,8 @@ def _mass_in_words(one: "StoredWeighings") -> str:
 
 
 _TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias, N", "run", "°C", "parent")
+# Shown if a result has one.
 _OPTIONAL = {"°C", "parent"}
-"""Shown if a result has one."""
 
 
 def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime) -> tuple[str, ...]:

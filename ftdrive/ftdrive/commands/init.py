@@ -19,8 +19,8 @@ T = TypeVar("T")
 Judge = Callable[[Any], None]
 """Raises `ConfigError` for rows of an answer."""
 
+# Options that may be repeated.
 _ROWS = ("--tool", "--plane", "--box")
-"""Options that may be repeated."""
 _SILENT = "did not answer when this was written"
 
 
@@ -114,7 +114,7 @@ def init(
         if simulate:
             station = stack.enter_context(Station(emulated, ["--time-scale", "1"]))
             robot, sensor, clock = station.cell.robot.host, station.cell.sensor.url, station.clock
-        ask = Questions(yes, defaults)
+        ask = _Questions(yes, defaults)
         ask.command += "" if str(output) == "ftdrive.toml" else f" -o {quote(str(output))}"
         ask.command += " --simulate" * simulate
         host, model, robot_words = _robot(ask, robot, model, clock)
@@ -188,7 +188,7 @@ def init(
     messages.print_next(f"ftdrive doctor{end}", f"ftdrive plan{end}")
 
 
-class Questions:
+class _Questions:
     """Asks for each key that is not given as an option; with `yes` it takes the defaults, by key."""
 
     def __init__(self, yes: bool, defaults: Mapping[str, Any]) -> None:
@@ -306,7 +306,7 @@ def _checked(key: str, value: Any) -> Any:
     return checked(RULES[key].option, key, value)
 
 
-def _robot(ask: Questions, given: str | None, model: str | None, clock: Clock) -> tuple[str, str | None, str]:
+def _robot(ask: _Questions, given: str | None, model: str | None, clock: Clock) -> tuple[str, str | None, str]:
     """Return host, model, and what the arm reports; the operator may keep an address that does not answer."""
     from ftdrive.checks.discovery import identify_robot
     from ftdrivers.errors import DeviceError
@@ -332,7 +332,7 @@ def _robot(ask: Questions, given: str | None, model: str | None, clock: Clock) -
         return host, found, words
 
 
-def _sensor(ask: Questions, given: str | None, clock: Clock) -> tuple[str, str]:
+def _sensor(ask: _Questions, given: str | None, clock: Clock) -> tuple[str, str]:
     """Return address and what the sensor reports; the operator may keep an address that does not answer."""
     from ftcalib.errors import UsageError
     from ftdrive.checks.discovery import identify_sensor, is_place, places, sensor_at

@@ -26,10 +26,10 @@ from ftdrivers.transcript.player import Player
 from ftdrivers.transcript.recorder import INTERRUPTED, Transcript, Writer
 from ftdrivers.transcript.taps import recording
 
+# A `collect` holds a million samples: 143 s of an ATI sensor on a serial port.
 _PIECE_S = 60.0
-"""A `collect` holds a million samples: 143 s of an ATI sensor on a serial port."""
+# Recorded beyond the duration, so that a replay which begins a little later still has enough.
 _TAIL_S = 0.3
-"""Recorded beyond the duration, so that a replay which begins a little later still has enough."""
 
 
 @click.group()

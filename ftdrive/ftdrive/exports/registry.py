@@ -22,11 +22,11 @@ from ftdrive.runs.verification_record import MARKS, marks_of
 
 FORMAT = "ftdrive.export/1"
 
+# Named and defined as in a calibration file.
 _FIELDS = (
     *("mass_kg", "g_m_s2", "weight_N", "gravity_force_base_N"),
     *("R_flange_sensor", "p_sensor_com_m", "force_bias_N", "torque_bias_Nm"),
 )
-"""Named and defined as in a calibration file."""
 
 
 def _as_json(calibration: CalibrationResult, settings: Settings) -> Exported:
@@ -71,8 +71,8 @@ def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, J
 
 
 _STEPS = 500
+# Relative gain of a step, at the start that gains most.
 _CONVERGED = 1e-12
-"""Relative gain of a step, at the start that gains most."""
 
 
 def _compensations(calibration: CalibrationResult, target: Format) -> tuple[Compensator, Compensator]:

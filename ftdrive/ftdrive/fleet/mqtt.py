@@ -25,12 +25,12 @@ SCHEMA_VERSION: Final = 1
 RECONNECT_S: Final = 60
 """Longest time between two attempts to connect; the first is after 1 s."""
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
+# Bad user name or password, and not authorized.
 _REJECTED: Final = {134, 135}
-"""Bad user name or password, and not authorized."""
+# Wildcards, control characters and the broker's own topics, and what is left of a password that is not escaped.
 _NO_TOPIC: Final = re.compile(r"[@+#\x00-\x1f\x7f]|^\$")
-"""Wildcards, control characters and the broker's own topics, and what is left of a password that is not escaped."""
+# So long a broker may take to receive the last message; then it sends the last will.
 _GOODBYE_S: Final = 1.0
-"""So long a broker may take to receive the last message; then it sends the last will."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +93,11 @@ class Messages:
     def __init__(self, broker: Broker, wake: Event, say: Callable[[str], None]) -> None:
         self._broker, self._wake, self._say = broker, wake, say
         self._lock = Lock()
+        # What is retained at the broker, or will be, by topic.
         self._wanted: dict[str, bytes] = {}
-        """What is retained at the broker, or will be, by topic."""
         self._rejection: str | None = None
+        # Whether the broker has answered last; None before its first answer or silence.
         self._answers: bool | None = None
-        """Whether the broker has answered last; None before its first answer or silence."""
         self._was_connected = self._is_open = False
         self._server_topic = f"{broker.prefix}ftdrive/server"
         self._cell_topics = f"{broker.prefix}ftdrive/cells/+/state"

@@ -27,8 +27,8 @@ from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import circumstances_of, solve_in_motion
 
 CHANGED_SIGMAS: Final = 3.0
+# Files of a run in motion from which its result is made.
 _IN_MOTION: Final = ("run.json", "events.ndjson", "motion*.npz", "motion/*.npz")
-"""Files of a run in motion from which its result is made."""
 
 
 def solved_path(folder: Path) -> Path:

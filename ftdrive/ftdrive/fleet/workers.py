@@ -23,13 +23,13 @@ CHECK_S: Final = 5.0
 SAME: Final = ("ftdrive", "numpy", "scipy")
 """Packages whose versions a cluster must share, because the last digits depend on them."""
 
+# More threads than cores are slow, and their number can change the last digits.
 _ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
-"""More threads than cores are slow, and their number can change the last digits."""
 _LOGS: Final = ("distributed", "distributed.client", "tornado.application")
+# Messages that a client keeps for developers of Dask: 1000 by default, with their datasets 130 MB.
 _SHORT_LOG: Final = {"distributed.admin.low-level-log-length": 10}
-"""Messages that a client keeps for developers of Dask: 1000 by default, with their datasets 130 MB."""
+# A recording of 40 s at 1 kHz exceeds the default, and its warning means nothing to a user.
 _LARGE_CALLS: Final = {"distributed.admin.large-graph-warning-threshold": "1TB"}
-"""A recording of 40 s at 1 kHz exceeds the default, and its warning means nothing to a user."""
 _NO_ENGINE: Final = "the workers need {}: pip install 'ftdrive[fleet]'"
 
 _DIED: Final = "each worker that was given it died: `ftdrive solve` or `ftdrive compensate` may show the cause"

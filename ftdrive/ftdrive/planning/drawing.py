@@ -29,13 +29,13 @@ from ftdrivers.ur.kinematics import Array
 
 VIEWS = ((1, 2, "along base x"), (0, 2, "along base y"), (0, 1, "from above"))
 """Axis to the right, axis up, title."""
+# A plane is drawn where it is seen from its edge: of its unit normal, the share along the view is below this.
 _ALONG = 0.1
-"""A plane is drawn where it is seen from its edge: of its unit normal, the share along the view is below this."""
+# One in so many steps of a sweep is drawn.
 _OF_SWEEP = 5
-"""One in so many steps of a sweep is drawn."""
 _FAR_M = 20.0
+# How far from arm and ball surroundings are shown, and some room at the edge.
 _NEAR_M, _EDGE_M = 1.0, 0.06
-"""How far from arm and ball surroundings are shown, and some room at the edge."""
 _TURN = np.linspace(0, 2 * np.pi, 100)
 
 
@@ -190,8 +190,8 @@ HOST, PORT = "127.0.0.1", 8080
 """Only this computer can open the view."""
 _FRAME_RAD = np.radians(3)
 _ARM, _TOOL, _TIP, _BALL, _OBSTACLE = (150, 155, 165), (235, 130, 40), (200, 40, 40), (90, 140, 230), (90, 160, 110)
+# Facets around a body, and over a quarter of its rounding.
 _AROUND, _ARC = 24, 6
-"""Facets around a body, and over a quarter of its rounding."""
 
 
 @contextmanager

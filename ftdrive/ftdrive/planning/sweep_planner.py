@@ -48,13 +48,13 @@ SLOW_HZ, QUICK_HZ = (0.06, 0.16), (0.3, 0.9)
 """Of the two sines of each joint: the slow one turns far, the quick one shows the inertia."""
 MOST_RAD = 1.5
 _MODEL_STEP_S = 0.01
+# Of the points of the proof, one in so many is looked at first.
 _COARSE = 5
-"""Of the points of the proof, one in so many is looked at first."""
+# Score of a curve that touches something, beyond its own: it is the last to be made smaller.
 _TOUCHING = 10.0
-"""Score of a curve that touches something, beyond its own: it is the last to be made smaller."""
 _ROW_S = 0.12
+# Of the logarithm of its sigma, beside that of the compensation error.
 _INERTIA_WORTH = 0.5
-"""Of the logarithm of its sigma, beside that of the compensation error."""
 
 
 def plan_sweep(

@@ -145,8 +145,8 @@ NEXT_STEP = {
     ),
 }
 NOTABLE_CORRELATION = 0.7
+# Parts of a plan that the report leaves out.
 _LONG = ("steps", "made_for", "description")
-"""Parts of a plan that the report leaves out."""
 
 
 def facts_of(subject: Subject) -> dict[str, Any]:

@@ -313,6 +313,7 @@ def _methods_height(facts: Facts) -> float:
 
 
 _Margins = tuple[float, float, float, float]
+# Height and margins (left, right, bottom, top) in inches and how to draw it, by name.
 _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callable[[Any, Facts], None]]] = {
     "force_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "force_N", "mN")),
     "torque_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "torque_Nm", "mN·m")),
@@ -325,4 +326,3 @@ _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callabl
     "sweep": (2.6, (0.65, 0.2, 0.5, 0.1), _sweep),
     "comparison": (3.8, (1.2, 0.2, 0.5, 0.1), _comparison),
 }
-"""Height and margins (left, right, bottom, top) in inches and how to draw it, by name."""

@@ -14,8 +14,8 @@ Facts = Mapping[str, Any]
 
 SUSPICIOUS_SIGMAS = 1.9
 """One good pose in 1000 deviates more, in root mean square over the six channels."""
+# A sigma below this share of the largest one belongs to a known value.
 _ROUNDED = 1e-9
-"""A sigma below this share of the largest one belongs to a known value."""
 _AXES = "xyz"
 
 

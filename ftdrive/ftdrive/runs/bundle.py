@@ -49,20 +49,20 @@ _IPV4 = re.compile(r"(?<![\w.])\d{1,3}(?:\.\d{1,3}){3}(?![\w.]\d|\w)")
 _IPV6 = re.compile(r"(?<![\w:.])[0-9A-Fa-f]*:[0-9A-Fa-f:]+(?![\w:.])")
 _MAC = re.compile(r"(?<![\w:-])(?:[0-9A-Fa-f]{2}[:-]){5}[0-9A-Fa-f]{2}(?![\w:-])")
 _HOST_FIELD = re.compile(r'"host": ?"([A-Za-z0-9.-]+)"|"said": ?{[^}]*"robot": ?"([A-Za-z0-9.-]+)"')
+# Ends of the schemes of addresses whose middle names no host of the cell.
 _NO_NETWORK = ("can", "emulated", "http", "https", "file")
-"""Ends of the schemes of addresses whose middle names no host of the cell."""
+# Names of accounts and hosts that identify nothing; their home directories are redacted.
 _NOT_PERSONAL = {"root", "user", "robot", "ur", "admin", "ubuntu", "operator", "localhost"}
-"""Names of accounts and hosts that identify nothing; their home directories are redacted."""
+# Fields whose four numbers are no address.
 _VERSIONS = ("versions", "packages", "firmware")
-"""Fields whose four numbers are no address."""
+# Bytes of which so many are printable are text. Others are measurements, which stay as they are.
 _TEXT_SHARE = 0.9
-"""Bytes of which so many are printable are text. Others are measurements, which stay as they are."""
+# Fields of a transcript: bytes in hex.
 _ON_THE_WIRE = ("hex", "request", "reply")
-"""Fields of a transcript: bytes in hex."""
 
 
+# From the kind of what was found, and its match, to what stands in its place.
 _Instead = Callable[[str, re.Match[str]], str]
-"""From the kind of what was found, and its match, to what stands in its place."""
 
 
 class Redaction:

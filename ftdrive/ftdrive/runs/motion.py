@@ -19,8 +19,8 @@ from ftdrive.runs.numbers import DAMAGE, read_arrays, write_arrays
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 FORMAT: Final = "ftdrive.motion/1"
+# Arrays and the shape of each sample; a sensor may have any number of counts.
 _WRENCH: Final = {"t_host_ns": (), "t_device_s": (), "seq": (), "counts": None, "wrench": (6,), "status": ()}
-"""Arrays and the shape of each sample; a sensor may have any number of counts."""
 _POSES: Final = {
     "t_host_ns": (),
     "t_device_s": (),
@@ -29,8 +29,8 @@ _POSES: Final = {
     "R_base_flange": (3, 3),
     "p_base_flange_m": (3,),
 }
+# Of samples, from each of which the one counts that is received the soonest.
 _BLOCKS: Final = 200
-"""Of samples, from each of which the one counts that is received the soonest."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

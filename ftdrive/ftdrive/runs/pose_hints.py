@@ -10,8 +10,8 @@ from ftcalib.model import Array
 from ftcalib.routine import MOVED_RAD, DriftCheck, PoseRecord, drift_check, is_return, turned_rad
 
 _SIGNIFICANT = 4.0
+# Findings of a result that changed between two poses.
 _CHANGES = {"com_shifted", "load_changed", "bias_stepped", "sensor_turned", "sensor_changed"}
-"""Findings of a result that changed between two poses."""
 
 
 def names_of(records: Sequence[PoseRecord]) -> tuple[str, ...]:

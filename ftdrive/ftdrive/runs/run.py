@@ -55,8 +55,8 @@ POSE = "pose-taken"
 
 _RESTORE = "take it from a copy"
 LOCK: Final = "lock"
+# Of a recording, named as in `FtSamples`.
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
-"""Of a recording, named as in `FtSamples`."""
 
 Mode = Literal["auto", "step", "manual", "listen", "sweep", "passive"]
 """How a session moves from pose to pose."""
@@ -336,6 +336,7 @@ _TEXT_OR_NULL: _Kind = "a text or null", lambda value: value is None or _is_text
 _TEXTS: _Kind = "a list of texts", lambda value: isinstance(value, list) and all(map(_is_text, value))
 _OBJECT: _Kind = "an object", _is_object
 _OBJECTS: _Kind = "an object of objects", lambda value: _is_object(value) and all(map(_is_object, value.values()))
+# Types of the fields of run.json; `recorded` checks those of config.
 _KINDS: Mapping[str, _Kind] = {
     "config": _OBJECTS,
     "command": _TEXT,
@@ -354,7 +355,6 @@ _KINDS: Mapping[str, _Kind] = {
     "station.options": _TEXTS,
     "verification": _OBJECT,
 }
-"""Types of the fields of run.json; `recorded` checks those of config."""
 
 
 def _require_kinds(header: Mapping[str, Any]) -> None:

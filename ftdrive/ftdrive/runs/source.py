@@ -106,8 +106,8 @@ def read_source(
         if run.in_motion:
             raise BadDataset(f"{source} is a recording in motion and has no poses: solve it with {run.solve_command}")
         records = run.records()
-        dataset, of_run = dataset_of(run, records)
-        found = Source(dataset, of_run.provenance(), of_run.g_m_s2, of_run.setup, None, records, earlier_of(run))
+        dataset, of_run = _dataset_of(run, records)
+        found = Source(dataset, of_run.provenance(), of_run.g_m_s2, of_run.setup, None, records, _earlier_of(run))
     else:
         dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
         found = Source(dataset, {"source": source.name, "versions": versions()})
@@ -248,7 +248,7 @@ def solve_in_motion(
 ) -> CalibrationResult:
     """Solve the recording of a run in motion; with the earlier result of a new tool that is given, or its own."""
     found = circumstances_of(run)
-    earlier = earlier or earlier_of(run)
+    earlier = earlier or _earlier_of(run)
     if earlier is not None:
         require_same_cell(earlier, found.origin)
     return solve_motion_file(
@@ -266,8 +266,8 @@ def solve_in_motion(
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
-    dataset, found = dataset_of(run, records)
-    earlier, provenance = earlier_of(run), found.provenance()
+    dataset, found = _dataset_of(run, records)
+    earlier, provenance = _earlier_of(run), found.provenance()
     if earlier is None:
         result = solve(dataset, run.method, g_m_s2=found.g_m_s2, setup=found.setup, provenance=provenance)
     else:
@@ -276,13 +276,13 @@ def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     return Outcome(run, dataset, result, drift_check(records))
 
 
-def earlier_of(run: Run) -> CalibrationResult | None:
+def _earlier_of(run: Run) -> CalibrationResult | None:
     """Return the result from which a run of a new tool takes mounting, base and gain; None for any other run."""
     document = run.header().get("earlier")
     return None if document is None else CalibrationResult.from_dict(document)
 
 
-def dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, Circumstances]:
+def _dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, Circumstances]:
     """Return a run's records as a dataset, and their circumstances."""
     if not records:
         raise NotObservable(f"{run.folder} has no data to solve: {run.how_to_go_on}")

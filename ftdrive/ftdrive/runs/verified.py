@@ -23,8 +23,8 @@ from ftdrive.runs.verification_record import FORMAT, fitted_dataset, marks_of
 
 FALSE_ALARMS: Final = 0.01
 """Share of verifications of an unchanged cell that fail."""
+# Parts of a calibration's provenance that an update keeps.
 _COPIED: Final = ("devices", "station", "setup", "edited")
-"""Parts of a calibration's provenance that an update keeps."""
 
 
 @dataclass(frozen=True, slots=True)

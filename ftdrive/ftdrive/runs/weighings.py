@@ -27,8 +27,8 @@ REFUSALS: Final = (
 )
 """Why nothing was weighed: the codes of `ftdrive.live.weighing.WORDS`. Each is a column of the store: a change raises
 `ftdrive.store.database.SCHEMA`."""
+# Bytes that contain the end of the line before, if a power failure cut the last one off.
 _TAIL: Final = 1 << 16
-"""Bytes that contain the end of the line before, if a power failure cut the last one off."""
 
 
 def is_weighings(path: Path) -> bool:

@@ -133,21 +133,21 @@ class HandGuided:
         self._redo: int | None = None
         self._light = "red"
         self._paused = False
+        # Where the arm stopped; None while it moves.
         self._rests_at: ArmState | None = None
-        """Where the arm stopped; None while it moves."""
         self._still_since_s = 0.0
+        # Whether the pose where the arm rests was taken or left out.
         self._dealt_with = False
-        """Whether the pose where the arm rests was taken or left out."""
         self._program_ran = False
+        # State of the program, as the controller reports it; empty before its start.
         self._program = ""
-        """State of the program, as the controller reports it; empty before its start."""
+        # Whether the program passes its first pose before its end, as a restarted one does.
         self._passes_first = False
-        """Whether the program passes its first pose before its end, as a restarted one does."""
         self._fault: str | None = None
         self._over = False
         self._ends_by_itself = not (listen or cell.journal.has_keys)
+        # Whether the light is green and the newest pose is good.
         self._enough = False
-        """Whether the light is green and the newest pose is good."""
 
     def run(self, earlier: Sequence[PoseRecord], goal: str) -> None:
         """Take poses.

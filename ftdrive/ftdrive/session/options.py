@@ -14,8 +14,9 @@ from ftdrive.runs.run import Mode, Run
 _BY_HAND: Final = ("manual", "listen", "passive")
 _LONGEST_SWEEP_S: Final = 120
 _SHOWN: Final = ("--output", "--png", "--view")
+# Options of a session without a meaning where ftdrive neither plans nor moves.
 _OF_MOTION: Final = ("--plan", "--fast", "--dry-run", "--redo", *_SHOWN)
-"""Options of a session without a meaning where ftdrive neither plans nor moves."""
+# Options of `ftdrive calibrate`.
 _EXCLUDE_ONE_ANOTHER: Final = (
     ("--step", "--manual", "--listen", "--sweep", "--passive"),
     ("--quick", "--minimal", "--set", "--plan", "--resume", "--sweep", "--passive"),
@@ -26,7 +27,6 @@ _EXCLUDE_ONE_ANOTHER: Final = (
     *((f"--{hand}", option) for hand in _BY_HAND for option in ("--quick", "--minimal", "--set", *_SHOWN)),
     *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
 )
-"""Options of `ftdrive calibrate`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,8 +27,8 @@ LEAST_S: Final = 5.0
 PART_S: Final = 1.0
 """Between two files: what a power failure can lose, and all that is in memory."""
 _READ_S: Final = 0.2
+# A shorter silence of a device is a gap in the recording, not its end.
 _SILENT_S: Final = 10.0
-"""A shorter silence of a device is a gap in the recording, not its end."""
 GOOD: Final = 2
 """So many good fits in a row end it."""
 

@@ -31,10 +31,10 @@ from ftdrivers.clock import Clock
 from ftdrivers.interfaces import FtSamples, RobotArm
 
 LISTEN_S: Final = 2.0
+# Each question takes the controller some 10 ms. Between two points no part is more than 1 mm off their chord.
 _EDGE_RAD: Final = float(np.radians(5))
-"""Each question takes the controller some 10 ms. Between two points no part is more than 1 mm off their chord."""
+# A plan is made for rounded joint angles, and an arm at rest is off its pose by joint noise, about 2e-5 rad.
 _ROUNDED_RAD: Final = float(np.radians(1))
-"""A plan is made for rounded joint angles, and an arm at rest is off its pose by joint noise, about 2e-5 rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

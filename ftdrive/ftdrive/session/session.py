@@ -27,10 +27,10 @@ from ftdrive.session.task import Calibrating, Session, Task
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from ftdrivers.registry import Options, split_url
 
+# Options of a sensor's address that choose one of its calibrations, with their defaults.
 _CHOOSES_CALIBRATION: Final = {"slot": 0, "calibration": 1}
-"""Options of a sensor's address that choose one of its calibrations, with their defaults."""
+# Facts that differ for another scale or calibration.
 _OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range", "software_bias")
-"""Facts that differ for another scale or calibration."""
 
 
 def _require_devices(

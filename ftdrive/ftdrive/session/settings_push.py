@@ -32,10 +32,10 @@ WORDS: Final = {"payload": "PUSH", "gravity": "GRAVITY"}
 
 _STILL_S: Final = 5.0
 _LISTEN_S: Final = 1.0
+# A steady reading fails the test once in some hundred times.
 _LISTENS: Final = 3
-"""A steady reading fails the test once in some hundred times."""
+# Of a value that is read back; it travels as the same 64 bits.
 _TOLERANCE: Final = 1e-6
-"""Of a value that is read back; it travels as the same 64 bits."""
 
 Ask = Callable[[str], None]
 """Asks for the word of a setting, such as "payload"; raises `Declined`."""

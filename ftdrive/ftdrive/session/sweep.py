@@ -23,10 +23,10 @@ KNOWN_S: Final = 3.0
 """The motion teaches so long before anything is predicted."""
 BEHIND_S: Final = 1.0
 """The newest looks do not teach: a contact that grows must not pass for weight."""
+# Of one look, vibration and acceleration included.
 _NOISE_N: Final = 2.0
-"""Of one look, vibration and acceleration included."""
+# A prediction with a larger sigma is none.
 _UNSURE_N: Final = 2.5
-"""A prediction with a larger sigma is none."""
 
 
 @dataclass

@@ -24,8 +24,8 @@ from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.sweep import FreeTool
 
+# The load of a sweep where [tool] mass_kg is not set.
 _HEAVIEST_KG: Final = 5.0
-"""The load of a sweep where [tool] mass_kg is not set."""
 
 
 class Task(Protocol):

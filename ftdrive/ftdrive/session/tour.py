@@ -40,8 +40,8 @@ BACK_RAD_S: Final = float(np.radians(10))
 """Speed back to the previous pose, after a stop between two poses."""
 SLOW: Final = Speeds.first_run()
 _AT_RAD: Final = float(np.radians(0.5))
+# An approach that comes closer than this to a skipped posture passes it.
 _NEAR_RAD: Final = float(np.radians(10))
-"""An approach that comes closer than this to a skipped posture passes it."""
 _FIRST_WORD: Final = "MOVE"
 
 

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 OLD_DAYS: Final = 30.0
 """A calibration that was neither made nor verified for so long should be verified."""
 OTHER_TEMPERATURE_K: Final = 10.0
+# Results with a trend.
 _FEWEST = 3
-"""Results with a trend."""
 
 
 def age_days(created_utc: str | None, now: datetime) -> float | None:

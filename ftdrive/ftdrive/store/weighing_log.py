@@ -16,13 +16,13 @@ from ftdrive.store.records import user_folder, weighings_of
 
 EVERY_S: Final = 30.0
 """Time between two writes to the store."""
+# So long the end of a program waits for the last write: a store is waited for 5 s.
 _GOODBYE_S: Final = 6.0
-"""So long the end of a program waits for the last write: a store is waited for 5 s."""
+# Lines that wait for a disk; then the oldest are lost.
 _MOST_WAITING: Final = 1000
-"""Lines that wait for a disk; then the oldest are lost."""
 _NOT_INDEXED: Final = "Weighings are kept but not in the history yet"
+# Day and content.
 _Line = tuple[str, Mapping[str, JSON]]
-"""Day and content."""
 
 
 class WeighingLog:
@@ -61,10 +61,10 @@ class WeighingLog:
         self._lines = SimpleQueue[_Line | None]()
         self._waiting = list[_Line]()
         self._file: WeighingsFile | None = None
+        # Whether the file has lines that the store lacks.
         self._is_new = False
-        """Whether the file has lines that the store lacks."""
+        # Whether the store may lack other files of the folder.
         self._lacks_older = True
-        """Whether the store may lack other files of the folder."""
         self._store: Any = None
         self._said = set[str]()
         self._thread = Thread(target=self._run, daemon=True, name="weighings")

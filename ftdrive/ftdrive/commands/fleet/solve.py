@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-def ENGINE(command: Callable[..., Any]) -> Callable[..., Any]:
+def _ENGINE(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options `workers` and `cluster`."""
     for option in (
         click.option("--cluster", metavar="dask://HOST:PORT", help="Compute on this Dask cluster instead."),
@@ -39,7 +39,7 @@ def ENGINE(command: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def open_workers(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:
+def _open_workers(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:
     """Start processes, or connect to a cluster; raises `ConfigError` if both are given."""
     from ftdrive.errors import ConfigError
     from ftdrive.fleet.workers import cluster_workers, local_workers
@@ -49,7 +49,7 @@ def open_workers(workers: int | None, cluster: str | None) -> AbstractContextMan
     return local_workers(workers) if cluster is None else cluster_workers(cluster)
 
 
-def with_progress(title: str, found: Iterator[T], total: int) -> Iterator[T]:
+def _with_progress(title: str, found: Iterator[T], total: int) -> Iterator[T]:
     """Show a progress bar on stderr."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -60,7 +60,7 @@ def with_progress(title: str, found: Iterator[T], total: int) -> Iterator[T]:
         yield from progress.track(found, total=total)
 
 
-def runs_to_solve(folders: Sequence[Path], url: str | None, since: datetime | None = None) -> list[Path]:
+def _runs_to_solve(folders: Sequence[Path], url: str | None, since: datetime | None = None) -> list[Path]:
     """Return the calibrations in these folders, or of the store; raises `ConfigError` if both are given.
 
     Those without a dataset or a recording in motion are left out, and counted on stderr.
@@ -115,7 +115,7 @@ def _how_to_finish(folder: Path) -> str:
 @FORCE
 @BIAS
 @FRAME
-@ENGINE
+@_ENGINE
 @JSON
 def compensate(
     paths: Sequence[Path],
@@ -146,9 +146,9 @@ def compensate(
     task = task_of(calibration, read_frame(axes, about), bias, accept_edited=force)
     left = [one for one in recordings if not (folder / one.name).exists()]
     report = _Compensated(recordings=len(recordings), before=len(recordings) - len(left))
-    with open_workers(workers, cluster) as pool:
+    with _open_workers(workers, cluster) as pool:
         folder.mkdir(parents=True, exist_ok=True)
-        for recording, found in with_progress("Compensating", compensate_all(left, folder, task, pool), len(left)):
+        for recording, found in _with_progress("Compensating", compensate_all(left, folder, task, pool), len(left)):
             report.add(recording, found)
     if as_json:
         write_json(report.to_dict())
@@ -231,7 +231,7 @@ _UNITS = {"d": timedelta(days=1), "h": timedelta(hours=1)}
 @click.command()
 @click.argument("folders", metavar="[RUNS]...", nargs=-1, type=FOLDER)
 @click.option("--since", metavar="TIME", help="Only runs since then: 90d, 12h or a date (UTC).")
-@ENGINE
+@_ENGINE
 @STORE
 @JSON
 def solve(
@@ -254,10 +254,10 @@ def solve(
     from ftdrive.errors import NotAccepted
     from ftdrive.fleet.resolve import solve_again, solved_path
 
-    runs = runs_to_solve(folders, url, None if since is None else _time(since))
+    runs = _runs_to_solve(folders, url, None if since is None else _time(since))
     report = _Solved(runs=len(runs), solved_before=sum(solved_path(run).exists() for run in runs))
-    with open_workers(workers, cluster) as pool:
-        for run, found in with_progress("Solving", solve_again(runs, pool), len(runs)):
+    with _open_workers(workers, cluster) as pool:
+        for run, found in _with_progress("Solving", solve_again(runs, pool), len(runs)):
             report.add(run, found)
     if as_json:
         write_json(report.to_dict())

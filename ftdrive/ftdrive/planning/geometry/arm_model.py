@@ -276,6 +276,7 @@ class Cylinder:
         return self.offset_m + self.diameter_m / 2
 
 
+# Name of each body of the arm, and how many joints move it.
 _ARM = (
     ("base", 0),
     ("shoulder", 1),
@@ -293,14 +294,13 @@ _ARM = (
     ("wrist 2", 5),
     ("wrist 3", 6),
 )
-"""Name of each body of the arm, and how many joints move it."""
 _UPPER_ARM, _ELBOW_SIDE, _FOREARM = [*range(2, 9)], 9, [*range(10, 14)]
 _WRIST_1, _WRIST_2_ALONG_6, _WRIST_3, _TOOL = (14, 15), 17, 18, 19
 
+# Ends (n, 3) of the axis of a body, its radius and its rounding.
 _Part = tuple[Array, Array, float, float]
-"""Ends (n, 3) of the axis of a body, its radius and its rounding."""
+# Of a joint: its centre (n, 3), from where to where along the lift axis, its radius and its rounding.
 _Housing = tuple[Array, tuple[float, float], float, float]
-"""Of a joint: its centre (n, 3), from where to where along the lift axis, its radius and its rounding."""
 
 
 class ArmModel:

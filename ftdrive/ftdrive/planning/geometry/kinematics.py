@@ -16,11 +16,11 @@ from ftdrivers.ur.kinematics import Array, Kinematics
 
 ALIGNED = 1e-9
 """Below this sine of q5, joints 4 and 6 turn about one line."""
+# Of Newton's method, from an arm with exactly parallel axes: the rest is rounding.
 _STEPS = 5
-"""Of Newton's method, from an arm with exactly parallel axes: the rest is rounding."""
 _TINY = 1e-14
+# Metres and radians.
 _REACHED = 1e-6
-"""Metres and radians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -182,10 +182,10 @@ DIFFERENT_SHAPES = tuple(np.unique([row[1:3] for row in _TOUR_DEG], axis=0, retu
 """Stops that differ in more than joint 6."""
 
 
+# The wrist angles of an orientation are the same for every nominal arm.
 _NOMINAL = MODELS["UR5e"]
-"""The wrist angles of an orientation are the same for every nominal arm."""
+# Between the table and the wrist angles of a real arm, which is at most 1.3 degrees from the nominal one.
 _ROOM_RAD = float(np.radians(3))
-"""Between the table and the wrist angles of a real arm, which is at most 1.3 degrees from the nominal one."""
 
 
 def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
