@@ -29,8 +29,8 @@ FILE = "ftdrive.toml"
 PREFIX = "FTDRIVE_"
 CLOCK = "FTDRIVE_CLOCK"
 
+# Expected mass of a tool whose mass is not configured.
 USUAL_KG = 1.0
-"""Expected mass of a tool whose mass is not configured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,8 +247,8 @@ def without_password(text: str) -> str:
     return re.sub(r"(://[^:/@]*):.*@", r"\1@", text)
 
 
+# An option of a command, and its value; None where it was not given.
 Flag = tuple[str, Any]
-"""An option of a command, and its value; None where it was not given."""
 
 SECTIONS: Mapping[str, Any] = {
     "robot": RobotConfig,

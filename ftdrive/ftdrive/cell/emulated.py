@@ -16,11 +16,12 @@ from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError
 
+# The emulated arm moves this many times faster; nothing else differs from a real cell.
 TIME_SCALE = 20
-"""The emulated arm moves this many times faster; nothing else differs from a real cell."""
+# Options of a cell whose arm is recorded in motion.
 REAL_PACE = ("--time-scale", "1")
-"""Options of a cell whose arm is recorded in motion."""
 
+# Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm.
 SENSORS = {
     "can": "ATI sensor on CAN",
     "serial": "ATI sensor on RS-485",
@@ -32,14 +33,13 @@ SENSORS = {
     "netft": "ATI Net F/T",
     "ur-ft": "sensor of its own",
 }
-"""Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm."""
 EMULATED = "emulated://"
+# How the emulated arm moves in modes in which the session does not move it: the request to the cell, and words.
 MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
     "manual": ({"do": "hand-guide"}, "its arm is guided by hand from orientation to orientation"),
     "passive": ({"do": "production"}, "a production program picks, places and touches"),
     "listen": ({"do": "pendant-program"}, "a program is started on its pendant, which turns the wrist"),
 }
-"""How the emulated arm moves in modes in which the session does not move it: the request to the cell, and words."""
 
 TOOL_MM = (0.0, 200.0, 100.0)
 

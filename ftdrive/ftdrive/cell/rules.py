@@ -8,8 +8,8 @@ from typing import Any
 from ftdrive.errors import ConfigError
 
 Rows = tuple[tuple[float, ...], ...]
+# Returns what to do about a value that cannot be used; None for one that can.
 Reject = Callable[[Any], str | None]
-"""Returns what to do about a value that cannot be used; None for one that can."""
 
 # Values in metres or inches are thinner.
 _THINNEST_MM = 5.0

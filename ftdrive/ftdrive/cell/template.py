@@ -8,8 +8,8 @@ from typing import Any
 
 from ftdrive.cell.config import FORMAT, RULES, SECTIONS, CellConfig, as_toml
 
+# Of the lines of a file.
 WIDTH = 120
-"""Of the lines of a file."""
 
 
 def cell_file(cell: CellConfig, found: Sequence[str]) -> str:

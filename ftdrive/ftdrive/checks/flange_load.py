@@ -12,13 +12,13 @@ import numpy as np
 from ftcalib import CalibrationResult
 from ftcalib.model import Array, skew
 
+# Rated payloads by Universal Robots' data sheets. Later arms of one model may carry more: see the label of the arm.
+# The curve of payload against the offset of its centre is published only as a picture, in the user manual.
 RATED_KG: Final = (
     {"UR3": 3.0, "UR5": 5.0, "UR10": 10.0}
     | {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 10.0, "UR12e": 12.5, "UR16e": 16.0}
     | {"UR8long": 8.0, "UR15": 15.0, "UR18": 18.0, "UR20": 20.0, "UR30": 30.0}
 )
-"""Rated payloads by Universal Robots' data sheets. Later arms of one model may carry more: see the label of the arm.
-The curve of payload against the offset of its centre is published only as a picture, in the user manual."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -36,12 +36,12 @@ _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs o
 _RATE_TOLERANCE = 0.1
 _MUCH_NOISE: Final = 2.0
 _LOAD: Final = 0.8
+# Share of the sensor's range at which a session stops the arm.
 SATURATION: Final = 0.9
-"""Share of the sensor's range at which a session stops the arm."""
 _MUCH_AT_REST: Final = 0.5
 # A smaller share of the weight at rest is likely to be compensated or zeroed.
+# The centre of the payload may be this far outside the described tool.
 _COMPENSATED: Final = 0.1
-"""The centre of the payload may be this far outside the described tool."""
 """Random ones, in which an arm is compared with its model."""
 """The time-outs of moves allow for this one."""
 AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")

@@ -63,8 +63,8 @@ from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ArmStatus, Array, ForceTorqueSensor, RobotArm
 
+# From the name of a check and the error of a sensor's driver.
 Blame = Callable[[str, DeviceError], Check]
-"""From the name of a check and the error of a sensor's driver."""
 
 _CLOCK_S = 1.0
 _LOOK_S = 2.0

@@ -16,8 +16,8 @@ from ftdrivers.clock import Clock
 
 T = TypeVar("T")
 
+# Raises `ConfigError` for rows of an answer.
 Judge = Callable[[Any], None]
-"""Raises `ConfigError` for rows of an answer."""
 
 # Options that may be repeated.
 _ROWS = ("--tool", "--plane", "--box")

@@ -4,12 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
+# Of a calibration: leaning base; turned sensor; gain and cross-talk of the sensor.
 Property = Literal["tilt", "rotation", "response"]
-"""Of a calibration: leaning base; turned sensor; gain and cross-talk of the sensor."""
 Comment = Literal["#", "# at the end", "<!-- -->", "none"]
 
+# By which the force of a target may differ from ours because it cannot express everything.
 MAX_FORCE_ERROR_N: Final = 0.1
-"""By which the force of a target may differ from ours because it cannot express everything."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +32,7 @@ class Format:
         return "bias" not in self.subtracts and "response" in self.expresses
 
 
+# By name, as `--format` takes it.
 FORMATS: Mapping[str, Format] = {
     "kth": Format("ROS 1 node gravity_compensation of kth-ros-pkg/force_torque_tools", "ft_calib.yaml"),
     "ft-tools": Format("ROS 2 node ft_estimation of ICube-Robotics/ft_tools_ros2", "calibration_parameters.yaml"),
@@ -98,4 +99,3 @@ FORMATS: Mapping[str, Format] = {
         "YAML with everything that compensation needs", "ft.yaml", expresses=("tilt", "rotation", "response")
     ),
 }
-"""By name, as `--format` takes it."""

@@ -10,10 +10,10 @@ from typing import Final
 from ftdrive.servers.program import CODES, DOUBLES, INTEGERS, TRACKED, Command, Condition, State
 from ftdrivers.ur.program_registers import LAST
 
+# Without a new live counter for so long the service is gone; the states below 0 have no other meaning.
 STALE_S: Final = 0.06
-"""Without a new live counter for so long the service is gone; the states below 0 have no other meaning."""
+# So long a request may take.
 LIMIT_S: Final = 2.0
-"""So long a request may take."""
 GONE, LATE, UNSEEN = -1, -2, -3
 
 

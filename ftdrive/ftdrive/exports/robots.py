@@ -21,8 +21,8 @@ from ftdrive.exports.shared import (
     yaml_text,
 )
 
+# mc_rtc/constants.h.
 MC_RTC_G_M_S2 = 9.80665
-"""mc_rtc/constants.h."""
 
 
 def mc_rtc(calibration: CalibrationResult, settings: Settings) -> Exported:

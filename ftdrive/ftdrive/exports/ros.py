@@ -115,8 +115,8 @@ def code_iai(calibration: CalibrationResult, settings: Settings) -> Exported:
     return Exported(yaml_text(document), notes, elsewhere)
 
 
+# Fixed in ft_compensation_node.py.
 CALAW_G_M_S2 = 9.81
-"""Fixed in ft_compensation_node.py."""
 
 
 def ft_tools(calibration: CalibrationResult, settings: Settings) -> Exported:

@@ -124,10 +124,10 @@ def _cell(path: Path, name: str, table: Any) -> StoredCell:
     )
 
 
+# Of the verifications that are read. A drift of the bias shows within weeks, and the store is read every minute.
 WINDOW: Final = timedelta(days=90)
-"""Of the verifications that are read. A drift of the bias shows within weeks, and the store is read every minute."""
+# Results of each tool of a cell that are read: the newest, and what it is compared with.
 NEWEST: Final = 3
-"""Results of each tool of a cell that are read: the newest, and what it is compared with."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

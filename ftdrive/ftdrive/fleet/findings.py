@@ -21,24 +21,24 @@ from ftdrive.report.document import rounded
 from ftdrive.store.records import StoredResult
 
 SIGMAS: Final = 4.0
+# Centres of mass of one tool are alike within the first, that of a payload is wrong from the second on; or 4 sigma,
+# if that is more.
 ALIKE_M, WRONG_M = 0.003, 0.005
-"""Centres of mass of one tool are alike within the first, that of a payload is wrong from the second on; or 4 sigma,
-if that is more."""
+# Likewise masses. A mass is wrong by the larger of share and kg.
 ALIKE_SHARE, WRONG_SHARE, WRONG_KG = 0.03, 0.1, 0.1
-"""Likewise masses. A mass is wrong by the larger of share and kg."""
+# Of sensor and adapter, which a payload includes and the identified mass does not.
 MOST_SENSOR_KG: Final = 1.0
-"""Of sensor and adapter, which a payload includes and the identified mass does not."""
 TILTED_RAD: Final = np.deg2rad(0.1)
+# Added to the sigma of a tilt: postures of an arm bend it differently.
 TILT_FLOOR_RAD: Final = np.deg2rad(0.02)
-"""Added to the sigma of a tilt: postures of an arm bend it differently."""
+# Largest p-value of a turned base: one in 50 fleets of 200 cells shows one by chance.
 SURE: Final = 1e-4
-"""Largest p-value of a turned base: one in 50 fleets of 200 cells shows one by chance."""
+# A verification that is due today is not late yet.
 LATE: Final = timedelta(days=1)
-"""A verification that is due today is not late yet."""
+# With fewer on a day no share of refusals is worth a word.
 MANY_WEIGHINGS: Final = 10
-"""With fewer on a day no share of refusals is worth a word."""
+# Refusals of earlier days are past.
 RECENT: Final = timedelta(days=3)
-"""Refusals of earlier days are past."""
 
 
 def findings(observed: Observed, states: Sequence[CellState]) -> tuple[FleetFinding, ...]:
@@ -228,11 +228,11 @@ def _mm(point_m: Array | None) -> str:
     return "-" if point_m is None else "(" + ", ".join(f"{1e3 * value + 0.0:.0f}" for value in point_m) + ")"
 
 
+# Largest p-value of one component of one sensor: in one of 80 fleets of 200 sensors one follows by chance, and two are
+# needed.
 SURE_OF_TEMPERATURE: Final = 1e-5
-"""Largest p-value of one component of one sensor: in one of 80 fleets of 200 sensors one follows by chance, and two are
-needed."""
+# Verifications of a calibration.
 FEWEST: Final = 8
-"""Verifications of a calibration."""
 _UNITS = ("N", "N·m")
 
 

@@ -27,6 +27,7 @@ def _labels(*texts: str | None) -> list[str]:
     return [visible(text or "") for text in texts]
 
 
+# Metrics with the labels `TOOL`: what they mean, and their value; a value of None is left out.
 OF_TOOL: Final[Mapping[str, tuple[str, Callable[[CellState], float | None]]]] = {
     "ftdrive_calibration_timestamp_seconds": (
         "When the newest accepted calibration was made.",
@@ -71,7 +72,6 @@ OF_TOOL: Final[Mapping[str, tuple[str, Callable[[CellState], float | None]]]] = 
         ),
     ),
 }
-"""Metrics with the labels `TOOL`: what they mean, and their value; a value of None is left out."""
 TOOL: Final = ("cell", "tool")
 CELL_INFO: Final = "ftdrive_cell_info"
 CELL_INFO_LABELS: Final = (*TOOL, "arm_serial", "sensor_serial", "sensor_model", "calibration", "verdict", "emulated")
@@ -80,8 +80,8 @@ REFUSALS: Final = "ftdrive_weighings_refused_total"
 FINDING: Final = "ftdrive_finding"
 STORE_UP: Final = "ftdrive_store_up"
 STATE_TIME: Final = "ftdrive_state_timestamp_seconds"
+# All metrics.
 NAMES: Final = (*OF_TOOL, WEIGHINGS, REFUSALS, CELL_INFO, FINDING, STORE_UP, STATE_TIME)
-"""All metrics."""
 
 
 class MetricsServer(Collector):

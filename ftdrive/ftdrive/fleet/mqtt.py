@@ -22,8 +22,8 @@ except ImportError:
     raise ConfigError("messages need paho-mqtt: pip install 'ftdrive[fleet]'") from None
 
 SCHEMA_VERSION: Final = 1
+# Longest time between two attempts to connect; the first is after 1 s.
 RECONNECT_S: Final = 60
-"""Longest time between two attempts to connect; the first is after 1 s."""
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
 # Bad user name or password, and not authorized.
 _REJECTED: Final = {134, 135}

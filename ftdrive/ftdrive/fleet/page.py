@@ -11,8 +11,8 @@ from ftdrive.report.report import templates, with_code
 from ftdrive.runs.verification_record import age_in_words
 
 WIDTH, HEIGHT, MARGIN = 220, 44, 3
+# Half the height of a plot, unless the bias has changed by more.
 LEAST_SIGMAS = 4.0
-"""Half the height of a plot, unless the bias has changed by more."""
 
 
 def page(fleet: Fleet, observed: Observed, store: str) -> str:

@@ -11,8 +11,8 @@ from ftdrive.fleet.state import Fleet
 from ftdrive.runs.verification_record import age_in_words
 from ftdrivers.clock import Clock
 
+# Time between two reads of the store.
 EVERY_S: Final = 60.0
-"""Time between two reads of the store."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,8 @@ from ftdrive.report.document import rounded
 from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification, StoredWeighings
 from ftdrive.store.store import Store
 
+# The level of a drift is the mean of the verifications of the last week.
 LEVEL_DAYS: Final = 7.0
-"""The level of a drift is the mean of the verifications of the last week."""
 COMPONENTS: Final = tuple(f"{name} bias {axis}" for name in ("force", "torque") for axis in "xyz")
 
 

@@ -16,12 +16,12 @@ from ftdrive import __version__
 from ftdrive.errors import ConfigError
 from ftdrivers.errors import StreamBroken, Unreachable
 
+# For a scheduler to answer, and for its first worker.
 CONNECT_S: Final = 10.0
-"""For a scheduler to answer, and for its first worker."""
+# Without an answer, before the workers are counted again.
 CHECK_S: Final = 5.0
-"""Without an answer, before the workers are counted again."""
+# Packages whose versions a cluster must share, because the last digits depend on them.
 SAME: Final = ("ftdrive", "numpy", "scipy")
-"""Packages whose versions a cluster must share, because the last digits depend on them."""
 
 # More threads than cores are slow, and their number can change the last digits.
 _ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
@@ -34,12 +34,12 @@ _NO_ENGINE: Final = "the workers need {}: pip install 'ftdrive[fleet]'"
 
 _DIED: Final = "each worker that was given it died: `ftdrive solve` or `ftdrive compensate` may show the cause"
 
+# Calls that a Dask worker gets at once: a message costs 15 ms of computing time, a solve 65 ms.
 GROUP: Final = 8
-"""Calls that a Dask worker gets at once: a message costs 15 ms of computing time, a solve 65 ms."""
 
 Item = TypeVar("Item", bound=Hashable)
+# What a call returned or raised.
 Answer = bytes | BaseException
-"""What a call returned or raised."""
 
 
 class WorkerDied(FtdriveError):

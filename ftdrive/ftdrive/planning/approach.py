@@ -19,18 +19,18 @@ from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_jo
 from ftdrive.planning.search.nodes import ELBOW_RAD
 from ftdrivers.ur.kinematics import Array
 
+# If no approach is proven, the operator jogs every joint to within this angle of the first pose.
 NEAR_RAD = float(np.radians(30))
-"""If no approach is proven, the operator jogs every joint to within this angle of the first pose."""
+# Via-poses may lie this far beyond the range between start and end. Joint 6 needs no detour.
 ROOM_RAD = np.radians([120.0, 90.0, 100.0, 120.0, 120.0, 0.0])
-"""Via-poses may lie this far beyond the range between start and end. Joint 6 needs no detour."""
+# An arm within this angle of the first pose needs no approach.
 AT_RAD = 1e-3
-"""An arm within this angle of the first pose needs no approach."""
+# A joint that turns less does not count as moving: no part of any arm moves by 20 mm.
 STILL_RAD = float(np.radians(0.5))
-"""A joint that turns less does not count as moving: no part of any arm moves by 20 mm."""
 NODES = 240
 NEIGHBOURS = 16
+# Maximum number of proof rounds, about a second; then the search gives up.
 ROUNDS = 80
-"""Maximum number of proof rounds, about a second; then the search gives up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,8 +17,8 @@ from ftdrive.planning.planner import TOOL_POSES, guess_of, plan_box, plan_cone, 
 from ftdrive.planning.sweep_planner import plan_sweep
 from ftdrivers.ur.kinematics import MODELS, Kinematics, model_named
 
+# No move is faster, whatever a plan or an old configuration contains.
 FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
-"""No move is faster, whatever a plan or an old configuration contains."""
 
 
 def speeds_of(cell: CellConfig) -> Speeds:

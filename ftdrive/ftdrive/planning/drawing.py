@@ -27,8 +27,8 @@ from ftdrive.planning.words import JOINTS, room_in_words
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
+# Axis to the right, axis up, title.
 VIEWS = ((1, 2, "along base x"), (0, 2, "along base y"), (0, 1, "from above"))
-"""Axis to the right, axis up, title."""
 # A plane is drawn where it is seen from its edge: of its unit normal, the share along the view is below this.
 _ALONG = 0.1
 # One in so many steps of a sweep is drawn.
@@ -186,8 +186,8 @@ def _seen(plane: Plane, view: list[int]) -> bool:
     return abs(plane.normal[depth]) < _ALONG
 
 
+# Only this computer can open the view.
 HOST, PORT = "127.0.0.1", 8080
-"""Only this computer can open the view."""
 _FRAME_RAD = np.radians(3)
 _ARM, _TOOL, _TIP, _BALL, _OBSTACLE = (150, 155, 165), (235, 130, 40), (200, 40, 40), (90, 140, 230), (90, 160, 110)
 # Facets around a body, and over a quarter of its rounding.

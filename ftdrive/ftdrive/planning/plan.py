@@ -20,8 +20,8 @@ from ftdrivers.ur.kinematics import Array, Kinematics
 
 PLAN_FORMAT, OLD_FORMAT = "ftdrive.plan/2", "ftdrive.plan/1"
 BALL_SAMPLES = 181
+# Between two points of a sweep whose straight move is proven clear.
 PROOF_S = 0.1
-"""Between two points of a sweep whose straight move is proven clear."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,20 +25,20 @@ from ftdrive.planning.search.nodes import WRIST_6_RAD, box_nodes, with_room, wri
 from ftdrive.planning.search.tours import clear_tour
 from ftdrivers.ur.kinematics import Array
 
+# All models have room for the constant tour here with usual tools; the wrist is at its first pose.
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
-"""All models have room for the constant tour here with usual tools; the wrist is at its first pose."""
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
+# Of a new tool on a calibrated cell.
 TOOL_POSES = 4
-"""Of a new tool on a calibrated cell."""
 BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6
+# Orientations of a random set beyond those wanted: most of them are reachable.
 SPARE = 100
-"""Orientations of a random set beyond those wanted: most of them are reachable."""
 
+# Numbers of the orientations and joint vectors (n, 6), in the order of travel.
 Found = tuple[Sequence[int], Array]
-"""Numbers of the orientations and joint vectors (n, 6), in the order of travel."""
+# Kind of a tour, the reason for it, and the tour where there is one.
 Attempt = tuple[str, Sequence[str], Found | None]
-"""Kind of a tour, the reason for it, and the tour where there is one."""
 
 
 def guess_of(certifier: Certifier, mass_kg: float | None = None) -> Guess:

@@ -32,20 +32,20 @@ from ftdrivers.ur.kinematics import Array
 
 SECONDS = (10.0, 120.0)
 RAMP_S = 3.0
+# Between two steps of the plan.
 STEP_S = 0.2
-"""Between two steps of the plan."""
+# The `lookahead_time` of the controller.
 SMOOTHED_S = 0.1
-"""The `lookahead_time` of the controller."""
+# Curves that are tried.
 RANDOM, CHANGED = 40, 200
-"""Curves that are tried."""
+# Of a change.
 STEPS = (0.03, 0.1, 0.3)
-"""Of a change."""
+# So many of them, the best ones, are tried at one posture, in each of the sizes.
 PROVEN = 6
-"""So many of them, the best ones, are tried at one posture, in each of the sizes."""
 SIZES = (1.0, 0.9, 0.8, 0.6)
 POSTURES = 6
+# Of the two sines of each joint: the slow one turns far, the quick one shows the inertia.
 SLOW_HZ, QUICK_HZ = (0.06, 0.16), (0.3, 0.9)
-"""Of the two sines of each joint: the slow one turns far, the quick one shows the inertia."""
 MOST_RAD = 1.5
 _MODEL_STEP_S = 0.01
 # Of the points of the proof, one in so many is looked at first.

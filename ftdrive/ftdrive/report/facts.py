@@ -63,10 +63,10 @@ def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, 
     }
 
 
+# Grid of elevation and azimuth.
 STEP_DEG = 10
-"""Grid of elevation and azimuth."""
+# Turns of the tool about its axis at each direction, over a whole turn.
 TURNS = 12
-"""Turns of the tool about its axis at each direction, over a whole turn."""
 
 
 def error_map(result: CalibrationResult) -> dict[str, Any]:

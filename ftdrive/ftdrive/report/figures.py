@@ -22,6 +22,7 @@ Facts = Mapping[str, Any]
 
 INK, PAPER, GRID, BAD = "#010101", "#020202", "#030303", "#040404"
 SERIES = ("#050505", "#060606", "#070707")
+# Colour that stands for each variable of the page.
 VARIABLES = {
     INK: "currentColor",
     PAPER: "var(--paper)",
@@ -29,15 +30,14 @@ VARIABLES = {
     BAD: "var(--bad)",
     **{colour: f"var(--series-{k})" for k, colour in enumerate(SERIES)},
 }
-"""Colour that stands for each variable of the page."""
+# Of every figure: on a phone its letters keep their size, on a desk two stand side by side.
 WIDTH_IN = 5.0
-"""Of every figure: on a phone its letters keep their size, on a desk two stand side by side."""
+# Longer times are shown in minutes.
 LONG_S = 200
-"""Longer times are shown in minutes."""
+# Of many poses every second, third, … is drawn, because each dot has its size in the file.
 MOST_DOTS = 400
-"""Of many poses every second, third, … is drawn, because each dot has its size in the file."""
+# Weaker correlations are not drawn.
 INVISIBLE = 0.02
-"""Weaker correlations are not drawn."""
 _MARKERS = "osD"
 _STYLE: Mapping[Any, Any] = {
     "svg.fonttype": "none",

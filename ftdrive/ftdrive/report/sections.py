@@ -12,8 +12,8 @@ from ftdrive.terminal.report import SIGMA_OF_THE_TOOL, axes_of, quantities_of, v
 
 Facts = Mapping[str, Any]
 
+# One good pose in 1000 deviates more, in root mean square over the six channels.
 SUSPICIOUS_SIGMAS = 1.9
-"""One good pose in 1000 deviates more, in root mean square over the six channels."""
 # A sigma below this share of the largest one belongs to a known value.
 _ROUNDED = 1e-9
 _AXES = "xyz"
@@ -298,10 +298,10 @@ def coverage(facts: Facts) -> Section:
     return Section("coverage", title, text, [figure])
 
 
+# One difference in 370 is larger by chance.
 LIMIT_SIGMAS = 3
-"""One difference in 370 is larger by chance."""
+# Two results of one tool differ more than this by chance in one case of 1000.
 CHANGED_P = 1e-3
-"""Two results of one tool differ more than this by chance in one case of 1000."""
 
 
 def tour(facts: Facts) -> Section:

@@ -14,15 +14,15 @@ from typing import Any, Final
 
 from ftcalib.files import open_file, parsed_json, write_new
 
+# Errors of `zipfile` for a damaged file: RuntimeError for an apparent password or unknown compression. OSError too.
 ZIP_DAMAGE: Final = (
     *(EOFError, MemoryError, OverflowError, RuntimeError, ValueError),
     *(lzma.LZMAError, struct.error, zipfile.BadZipFile, zlib.error),
 )
-"""Errors of `zipfile` for a damaged file: RuntimeError for an apparent password or unknown compression. OSError too."""
+# Errors for a file of arrays; numpy raises TokenError.
 DAMAGE: Final = (*ZIP_DAMAGE, KeyError, OSError, TypeError, tokenize.TokenError)
-"""Errors for a file of arrays; numpy raises TokenError."""
+# Field of a line with the CRC-32 of the others, as JSON with sorted keys.
 CRC: Final = "crc32"
-"""Field of a line with the CRC-32 of the others, as JSON with sorted keys."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool) -> None:

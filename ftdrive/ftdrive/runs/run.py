@@ -50,18 +50,18 @@ RUN_FORMAT = "ftdrive.run/1"
 RECORDING_FORMAT = "ftdrive.recording/1"
 log = logging.getLogger(__name__)
 
+# The event of a pose that is on disk, `ftdrive.session.events.PoseTaken`.
 POSE = "pose-taken"
-"""The event of a pose that is on disk, `ftdrive.session.events.PoseTaken`."""
 
 _RESTORE = "take it from a copy"
 LOCK: Final = "lock"
 # Of a recording, named as in `FtSamples`.
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 
+# How a session moves from pose to pose.
 Mode = Literal["auto", "step", "manual", "listen", "sweep", "passive"]
-"""How a session moves from pose to pose."""
+# Modes that record in motion; such a recording is not continued.
 IN_MOTION: Final = ("sweep", "passive")
-"""Modes that record in motion; such a recording is not continued."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

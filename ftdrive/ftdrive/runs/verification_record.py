@@ -22,12 +22,12 @@ FORMAT: Final = "ftdrive.verification/1"
 EMULATED: Final = "EMULATED"
 EDITED: Final = "EDITED BY HAND"
 FOREIGN: Final = "OF ANOTHER CELL"
+# What every output says of some calibrations: a mark, and its meaning in a sentence.
 MARKS: Final[Mapping[str, str]] = {
     EMULATED: "The cell was EMULATED: these are not the values of a real tool.",
     EDITED: "The file was EDITED BY HAND after it was solved: its verdict and its sigmas are not those of its numbers.",
     FOREIGN: "The calibration is OF ANOTHER CELL: arm, sensor or mounting differ, and --force applies it all the same.",
 }
-"""What every output says of some calibrations: a mark, and its meaning in a sentence."""
 
 
 @dataclass(frozen=True, slots=True)

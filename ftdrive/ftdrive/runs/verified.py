@@ -21,8 +21,8 @@ from ftcalib.routine import DriftCheck, PoseRecord, dataset_from, drift_check, i
 from ftdrive.runs.run import Run, made_now
 from ftdrive.runs.verification_record import FORMAT, fitted_dataset, marks_of
 
+# Share of verifications of an unchanged cell that fail.
 FALSE_ALARMS: Final = 0.01
-"""Share of verifications of an unchanged cell that fail."""
 # Parts of a calibration's provenance that an update keeps.
 _COPIED: Final = ("devices", "station", "setup", "edited")
 

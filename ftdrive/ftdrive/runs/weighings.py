@@ -21,12 +21,12 @@ from ftdrive.runs.numbers import append_lines, read_line
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
 FILES: Final = "weighings-*.ndjson"
+# Why nothing was weighed: the codes of `ftdrive.live.weighing.WORDS`. Each is a column of the store: a change raises
+# `ftdrive.store.database.SCHEMA`.
 REFUSALS: Final = (
     *("samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "undecided", "count"),
     "other",  # of a newer version
 )
-"""Why nothing was weighed: the codes of `ftdrive.live.weighing.WORDS`. Each is a column of the store: a change raises
-`ftdrive.store.database.SCHEMA`."""
 # Bytes that contain the end of the line before, if a power failure cut the last one off.
 _TAIL: Final = 1 << 16
 

@@ -25,22 +25,22 @@ from ftdrive.session.task import Session
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmState, FtSamples
 
+# On the controller's clock, because the controller's `is_steady` is always false in freedrive.
 STILL_S: Final = 1.0
-"""On the controller's clock, because the controller's `is_steady` is always false in freedrive."""
 STILL_RAD_S: Final = 0.002
+# A smaller turn counts as a nudge, not as a move.
 LEFT_RAD: Final = radians(1)
-"""A smaller turn counts as a nudge, not as a move."""
 REPEAT_RAD: Final = radians(10)
+# A program returns to its first pose within this angle.
 RETURN_RAD: Final = radians(0.1)
-"""A program returns to its first pose within this angle."""
 LOOK_S: Final = 0.1
+# A driver that may recover gives up after 10 s.
 BACK_S: Final = 12.0
-"""A driver that may recover gives up after 10 s."""
 SURPRISE_SIGMA: Final = 5.0
+# A pose that differs from the fit of the others by both was probably touched.
 SURPRISE_N: Final = 0.5
-"""A pose that differs from the fit of the others by both was probably touched."""
+# Number of poses, the new one included.
 LEAST_TO_COMPARE: Final = 6
-"""Number of poses, the new one included."""
 
 T = TypeVar("T")
 

@@ -25,12 +25,12 @@ from ftcalib.sphere import axes_along, largest_gap
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.session.events import Compared, Estimated
 
+# As good as gravity directions within 50 to 60 degrees of one another; see `ftcalib.poses.information.Prediction`.
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
-"""As good as gravity directions within 50 to 60 degrees of one another; see `ftcalib.poses.information.Prediction`."""
+# As within 30 to 45 degrees.
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
-"""As within 30 to 45 degrees."""
+# `RunningFit.predict` returns None if its sigma of the force is more than this share of the weight.
 TRUSTED_SHARE = 0.05
-"""`RunningFit.predict` returns None if its sigma of the force is more than this share of the weight."""
 
 
 class Judge(Protocol):

@@ -20,17 +20,17 @@ from ftdrive.session.task import Session
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 
+# Until the first fit; each later one has a quarter more.
 FIRST_S: Final = 10.0
-"""Until the first fit; each later one has a quarter more."""
 LONGER: Final = 1.25
 LEAST_S: Final = 5.0
+# Between two files: what a power failure can lose, and all that is in memory.
 PART_S: Final = 1.0
-"""Between two files: what a power failure can lose, and all that is in memory."""
 _READ_S: Final = 0.2
 # A shorter silence of a device is a gap in the recording, not its end.
 _SILENT_S: Final = 10.0
+# So many good fits in a row end it.
 GOOD: Final = 2
-"""So many good fits in a row end it."""
 
 
 def take_passively(session: Session) -> Run:

@@ -210,6 +210,7 @@ def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
 
 _APPROACH: Final = Row("approach", _check_approach)
 
+# In the order of their events. None of them takes control of the arm.
 CHECKS: Final[Sequence[Row]] = (
     Row("safety", lambda before: check_safety(before.cell.arm.status())),
     Row("remote", lambda before: check_remote(before.cell.arm)),
@@ -225,13 +226,12 @@ CHECKS: Final[Sequence[Row]] = (
     Row("cable", check_cable),
     Row("disk", lambda before: computer.check_disk(before.runs)),
 )
-"""In the order of their events. None of them takes control of the arm."""
 
+# Checks that need a program on the controller, made when all others have passed.
 IN_CONTROL: Final[Sequence[Row]] = (Row("limits", _check_safety_limits),)
-"""Checks that need a program on the controller, made when all others have passed."""
 
+# Checks before a stopped session goes on: all, except that its new approach is judged by itself.
 AGAIN: Final[Sequence[Row]] = (*(row for row in CHECKS if row is not _APPROACH), *IN_CONTROL)
-"""Checks before a stopped session goes on: all, except that its new approach is judged by itself."""
 
 
 def _edges(q_rad: Array, step_rad: float) -> Array:

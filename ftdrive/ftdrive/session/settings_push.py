@@ -27,8 +27,8 @@ from ftdrive.session.guards import Limits
 from ftdrive.session.preflight import require_no_program
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo, ForceTorqueSensor, Guard, RobotArm
 
+# What is typed to send each setting.
 WORDS: Final = {"payload": "PUSH", "gravity": "GRAVITY"}
-"""What is typed to send each setting."""
 
 _STILL_S: Final = 5.0
 _LISTEN_S: Final = 1.0
@@ -37,8 +37,8 @@ _LISTENS: Final = 3
 # Of a value that is read back; it travels as the same 64 bits.
 _TOLERANCE: Final = 1e-6
 
+# Asks for the word of a setting, such as "payload"; raises `Declined`.
 Ask = Callable[[str], None]
-"""Asks for the word of a setting, such as "payload"; raises `Declined`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,6 +233,7 @@ def send(
     return path, read_back
 
 
+# What each setting does, with the question.
 EFFECTS: Final = {
     "payload": (
         "The controller uses the payload to detect collisions and to limit speed. With a wrong one the arm may stop or "
@@ -244,7 +245,6 @@ EFFECTS: Final = {
         "sink in freedrive. Keep the arm free and still, and hands off. Type GRAVITY to send gravity"
     ),
 }
-"""What each setting does, with the question."""
 
 
 def _set(arm: RobotArm, new: ControllerSettings, guard: Guard) -> None:

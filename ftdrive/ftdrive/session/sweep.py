@@ -19,10 +19,10 @@ from ftdrive.session.preflight import Before
 from ftdrive.session.tour import Pace, Tour
 from ftdrivers.sweep import Sweep
 
+# The motion teaches so long before anything is predicted.
 KNOWN_S: Final = 3.0
-"""The motion teaches so long before anything is predicted."""
+# The newest looks do not teach: a contact that grows must not pass for weight.
 BEHIND_S: Final = 1.0
-"""The newest looks do not teach: a contact that grows must not pass for weight."""
 # Of one look, vibration and acceleration included.
 _NOISE_N: Final = 2.0
 # A prediction with a larger sigma is none.
@@ -83,10 +83,10 @@ class FreeTool(Guard):
         return np.append(self.down_base @ R_base_flange, 1.0)
 
 
+# Recorded before the sweep and after it.
 REST_S: Final = 2.0
-"""Recorded before the sweep and after it."""
+# Between two points of the curve that the guards compare with.
 CURVE_S: Final = 0.01
-"""Between two points of the curve that the guards compare with."""
 _READ_S: Final = 1.0
 
 
@@ -164,8 +164,8 @@ class SweepTour(Tour):
                 clock.sleep(0.02)
 
 
+# Of the planned speed, in the first run of a plan.
 FIRST_SHARE: Final = 0.5
-"""Of the planned speed, in the first run of a plan."""
 LEAST_SLIDER: Final = 0.5
 
 

@@ -36,8 +36,8 @@ from ftdrivers.errors import DeviceError
 log = logging.getLogger(__name__)
 
 APPROACH_RAD_S: Final = float(np.radians(15))
+# Speed back to the previous pose, after a stop between two poses.
 BACK_RAD_S: Final = float(np.radians(10))
-"""Speed back to the previous pose, after a stop between two poses."""
 SLOW: Final = Speeds.first_run()
 _AT_RAD: Final = float(np.radians(0.5))
 # An approach that comes closer than this to a skipped posture passes it.

@@ -28,11 +28,11 @@ from ftdrive.session.task import from_usual_wrist
 
 POSES: Final = 6
 QUICK_POSES: Final = 2
+# A pose nearer to one of the calibration does not count.
 FRESH_RAD: Final = float(np.radians(10))
-"""A pose nearer to one of the calibration does not count."""
 HOLDS_N, HOLDS_NM = 2.0, 0.2
+# The contact guard uses the calibration from this many poses on, if all of them are this near their prediction.
 HOLDS_POSES: Final = 3
-"""The contact guard uses the calibration from this many poses on, if all of them are this near their prediction."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,8 +47,8 @@ from ftdrive.store.records import (
     user_folder,
 )
 
+# Version of the index, kept in the database.
 SCHEMA: Final = 4
-"""Version of the index, kept in the database."""
 
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 # Fields of a verification with a column for each component: read three times as fast as JSON.
@@ -116,11 +116,11 @@ RECORDS: Final[Mapping[type[Record], Table]] = {
     StoredWeighings: weighings,
 }
 
+# Columns of a check.
 CHECK: Final = [
     *(verifications.c[name] for name in BriefVerification._fields[:-1]),
     *(verifications.c[f"{name}_{axis}"] for name in _WRENCHES for axis in _WRENCH),
 ]
-"""Columns of a check."""
 _SINGLE = tuple(column.name for column in verifications.columns if not column.name.endswith(_WRENCH))
 
 

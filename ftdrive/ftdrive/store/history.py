@@ -10,8 +10,8 @@ from ftdrive.store.records import StoredResult, StoredVerification
 if TYPE_CHECKING:
     from ftdrive.store.trends import QuantityTrend
 
+# A calibration that was neither made nor verified for so long should be verified.
 OLD_DAYS: Final = 30.0
-"""A calibration that was neither made nor verified for so long should be verified."""
 OTHER_TEMPERATURE_K: Final = 10.0
 # Results with a trend.
 _FEWEST = 3

@@ -24,8 +24,8 @@ from ftdrive.store.records import (
     summed,
 )
 
+# For another writer.
 WAIT_S = 5.0
-"""For another writer."""
 
 _MOST = 5000
 

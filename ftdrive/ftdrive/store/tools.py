@@ -13,8 +13,8 @@ from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.store import Store
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 
+# Searched beside the store, so that a run that is not indexed yet counts too.
 RUNS = Path("runs")
-"""Searched beside the store, so that a run that is not indexed yet counts too."""
 
 
 @dataclass(frozen=True, slots=True)

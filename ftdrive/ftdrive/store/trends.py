@@ -12,10 +12,10 @@ from ftcalib.model import BIASES, PARAMETER_NAMES, Array
 from ftcalib.rounding import with_sigma
 from ftdrive.store.records import StoredResult, StoredVerification
 
+# Largest p-value of a trend that counts.
 SIGNIFICANT: Final = 0.01
-"""Largest p-value of a trend that counts."""
+# Results within fewer days have no trend: a change per 30 days would be extrapolated too far.
 SHORTEST_DAYS: Final = 3.0
-"""Results within fewer days have no trend: a change per 30 days would be extrapolated too far."""
 
 _MONTH_DAYS = 30.0
 _VECTORS: Final = {

@@ -14,8 +14,8 @@ from ftdrive.errors import ConfigError
 from ftdrive.runs.weighings import FOLDER, WeighingsFile
 from ftdrive.store.records import user_folder, weighings_of
 
+# Time between two writes to the store.
 EVERY_S: Final = 30.0
-"""Time between two writes to the store."""
 # So long the end of a program waits for the last write: a store is waited for 5 s.
 _GOODBYE_S: Final = 6.0
 # Lines that wait for a disk; then the oldest are lost.

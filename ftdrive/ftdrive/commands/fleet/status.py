@@ -96,8 +96,8 @@ def _as_json(fleet: "Fleet", name: str, now: datetime) -> dict[str, Any]:
     }
 
 
+# Prometheus has assigned all ports from 9100 to 9999.
 PORT = 10018
-"""Prometheus has assigned all ports from 9100 to 9999."""
 MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
 
 

@@ -25,8 +25,8 @@ from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, model_named
 
 PROJECTIONS = 24
 TINY_M = 1e-12
+# A lower bound that is as close to the true distance is good enough.
 CLOSE_M = 1e-5
-"""A lower bound that is as close to the true distance is good enough."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,12 +183,12 @@ def _between_axes(a: Bodies, b: Bodies) -> tuple[Array, Array]:
     return point, np.sqrt(dot(difference, difference))
 
 
+# Of the edges of the housings at the joints. On the constant tour a UR3e then comes within 22 mm of itself; the convex
+# hulls of its meshes stay 27 mm apart.
 HUB_ROUNDING_M = 0.020
-"""Of the edges of the housings at the joints. On the constant tour a UR3e then comes within 22 mm of itself; the convex
-hulls of its meshes stay 27 mm apart."""
 
+# The same where the forearm carries the wrist.
 FOREARM_END_ROUNDING_M = 0.010
-"""The same where the forearm carries the wrist."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,14 +16,14 @@ from ftdrivers.ur.kinematics import Array
 
 FIRST_STEP_RAD = np.radians(15)
 LAST_STEP_RAD = np.radians(0.4)
+# The reported clearance is at most this fraction, or 2 mm, below the true minimum of the move.
 TIGHTNESS = 0.1
-"""The reported clearance is at most this fraction, or 2 mm, below the true minimum of the move."""
 
 
+# Times the levers of the joints between two bodies: how much more distance is kept if the arm's own kinematics are not
+# known. Of 15 real arms, none is nearer to a plane than its nominal model by more (at most 8.3 mm). Neighbours of the
+# wrist are nearer by up to 6.5 mm, which is part of the margin between parts of the arm.
 NOMINAL_RAD = np.array([0.0025, 0.0025, 0.0025, 0.0, 0.0, 0.0])
-"""Times the levers of the joints between two bodies: how much more distance is kept if the arm's own kinematics are not
-known. Of 15 real arms, none is nearer to a plane than its nominal model by more (at most 8.3 mm). Neighbours of the
-wrist are nearer by up to 6.5 mm, which is part of the margin between parts of the arm."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,8 @@ from ftcalib.model import cross
 from ftdrive.errors import ConfigError
 from ftdrivers.ur.kinematics import Array, Kinematics
 
+# Below this sine of q5, joints 4 and 6 turn about one line.
 ALIGNED = 1e-9
-"""Below this sine of q5, joints 4 and 6 turn about one line."""
 # Of Newton's method, from an arm with exactly parallel axes: the rest is rounding.
 _STEPS = 5
 _TINY = 1e-14

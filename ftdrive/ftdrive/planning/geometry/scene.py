@@ -36,8 +36,8 @@ class Box:
             raise ConfigError(f"a box from {self.low_m} to {self.high_m} m is empty: give its low corner first")
 
 
+# The surface that the base is bolted to.
 BASE_PLANE = Plane((0.0, 0.0, 1.0), 0.0)
-"""The surface that the base is bolted to."""
 
 
 @dataclass(frozen=True, slots=True)

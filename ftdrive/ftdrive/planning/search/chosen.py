@@ -20,20 +20,20 @@ from ftdrive.planning.search.tours import clear_tour, connected
 from ftdrivers.ur.kinematics import Array
 
 DIRECTIONS, SPINS = 150, 8
+# If joint 6 changes what can collide: each spin is a shape of its own then.
 DIRECTIONS_OF_A_LUMP, SPINS_OF_A_LUMP = 60, 4
-"""If joint 6 changes what can collide: each spin is a shape of its own then."""
+# Number of disconnected parts of free space that are tried.
 MOST_PARTS = 2
-"""Number of disconnected parts of free space that are tried."""
+# Number of joint vectors of each part, the nearest ones, to which a straight move is tried.
 FROM_HERE = 6
-"""Number of joint vectors of each part, the nearest ones, to which a straight move is tried."""
+# No other posture is tried if the predicted error is within this factor of the best poses of the cone.
 NEARLY = 1.05
-"""No other posture is tried if the predicted error is within this factor of the best poses of the cone."""
 OTHER_POSTURES = 2
 POSTURE_STEP_DEG = 20
+# Number of the first chosen pose; 1 to 24 are those of the paper.
 FIRST_NUMBER = 101
-"""Number of the first chosen pose; 1 to 24 are those of the paper."""
+# Number of tool directions that compare postures.
 LOOKS = 24
-"""Number of tool directions that compare postures."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

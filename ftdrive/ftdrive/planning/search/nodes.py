@@ -22,14 +22,14 @@ Nodes = NDArray[np.intp]
 
 SHOULDER_RAD = float(np.radians(110))
 WRIST_6_RAD = float(np.radians(200))
+# So that a real arm, which is up to 3 degrees from the table, has both ways to an angle half a turn away.
 HALF_TURN_RAD = float(np.radians(183))
-"""So that a real arm, which is up to 3 degrees from the table, has both ways to an angle half a turn away."""
+# To both sides of where the joints stand. Joint 6 is what winds the cable.
 WINDOW_RAD = np.array([np.pi, SHOULDER_RAD, np.inf, HALF_TURN_RAD, HALF_TURN_RAD, WRIST_6_RAD])
-"""To both sides of where the joints stand. Joint 6 is what winds the cable."""
+# From stretched. The elbow cannot fold further, and the shapes do not know it.
 ELBOW_RAD = float(np.radians(165))
-"""From stretched. The elbow cannot fold further, and the shapes do not know it."""
+# Places of the flange along each edge of a box, as shares of its half size.
 STEPS = (-1.0, 0.0, 1.0)
-"""Places of the flange along each edge of a box, as shares of its half size."""
 
 
 def wrist_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array) -> tuple[Array, Nodes]:
@@ -119,8 +119,8 @@ _GRID_DEG = 10
 _SHOULDER_DEG, _ELBOW_DEG = (-180, 0), (-160, 160)
 _BATCH = 40
 _LEVEL = 1e-9
+# At most so many postures are tried, so that a cell without a tour is reported in time.
 MOST_POSTURES = 200
-"""At most so many postures are tried, so that a cell without a tour is reported in time."""
 
 
 def grid(certifier: Certifier, q_rad: Array, step_deg: int = _GRID_DEG) -> Array:
@@ -176,10 +176,10 @@ _TOUR_DEG = (
     (19, -180, 45, 90),
     (13, -90, 90, 135),
 )
+# Of the orientations, 1 to 24, in the order of travel.
 NUMBERS = tuple(row[0] for row in _TOUR_DEG)
-"""Of the orientations, 1 to 24, in the order of travel."""
+# Stops that differ in more than joint 6.
 DIFFERENT_SHAPES = tuple(np.unique([row[1:3] for row in _TOUR_DEG], axis=0, return_index=True)[1].tolist())
-"""Stops that differ in more than joint 6."""
 
 
 # The wrist angles of an orientation are the same for every nominal arm.

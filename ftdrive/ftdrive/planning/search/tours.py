@@ -17,21 +17,21 @@ from ftdrive.planning.search.nodes import Nodes, distinct
 from ftdrivers.ur.kinematics import Array
 
 FORBIDDEN_S = 1e6
+# Per radian, summed over the joints: among equally fast tours the calmer one.
 COST_OF_TRAVEL_S = 0.02
-"""Per radian, summed over the joints: among equally fast tours the calmer one."""
 SHAKES = 150
 SHAKES_A_ROUND = 10
+# Of proving the moves of a tour and finding another one without those that are not clear.
 ROUNDS = 60
-"""Of proving the moves of a tour and finding another one without those that are not clear."""
+# Of this many joint vectors every move is looked at; of more, those to the nearest ones of each group.
 FEW = 120
-"""Of this many joint vectors every move is looked at; of more, those to the nearest ones of each group."""
 NEAREST_OF_EACH = 2
+# From here on only the nearest of all groups are looked at: moves to each group are as many as their square.
 MANY_GROUPS, NEAREST_OF_ALL = 60, 40
-"""From here on only the nearest of all groups are looked at: moves to each group are as many as their square."""
+# In all layers together, about.
 NEIGHBOURS = 10
-"""In all layers together, about."""
+# Of each group, the first ones; more where those do not hang together.
 MOST_NODES = (25, 60)
-"""Of each group, the first ones; more where those do not hang together."""
 
 
 def connected(certifier: Certifier, q_rad: Array, layer: Nodes) -> Nodes:
