@@ -78,7 +78,7 @@ WALKS = {
     "From poses to a calibration": """
         ftdrive.commands.solve                    solve                    reads the options
         ftdrive.runs.source                       read_source              reads a run folder or a file
-        ftdrive.runs.source                      dataset_of               takes the poses of a run
+        ftdrive.runs.source                      _dataset_of              takes the poses of a run
         ftcalib.routine                           dataset_from             makes arrays of records
         ftcalib.data.dataset                      read_csv                 reads poses of another program
         ftcalib.solver                            solve                    chooses, fits, judges

@@ -33,6 +33,7 @@ CLOCK = "FTDRIVE_CLOCK"
 USUAL_KG = 1.0
 
 
+# The rule of a key stands on its field: separate tables of ranges and texts drifted apart.
 @dataclass(frozen=True, slots=True)
 class RobotConfig:
     """The arm."""

@@ -22,6 +22,7 @@ from ftdrive.exports.shared import (
 )
 
 # mc_rtc/constants.h.
+# A constant of the target's code: the force must be right, so the mass differs by up to 0.3 %.
 MC_RTC_G_M_S2 = 9.80665
 
 
@@ -193,6 +194,7 @@ def mujoco(calibration: CalibrationResult, settings: Settings) -> Exported:
 
     with the reading as the hardware interface gives it, which is minus that of MuJoCo.
     """
+    # The plugin is newer than its release 0.1.2, and wrong without the weight in the model.
     com_m = numbers(calibration.p_sensor_com_m)
     x, y, z, w = quaternion_xyzw(R_frame_sensor(calibration, settings))
     compensation = {"frame_id": settings.sensor_frame, "CoG": {"pos": com_m, "mass": calibration.mass_kg}}

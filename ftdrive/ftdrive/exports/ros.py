@@ -116,6 +116,7 @@ def code_iai(calibration: CalibrationResult, settings: Settings) -> Exported:
 
 
 # Fixed in ft_compensation_node.py.
+# A constant of the target's code: the force must be right, so the mass differs by up to 0.3 %.
 CALAW_G_M_S2 = 9.81
 
 

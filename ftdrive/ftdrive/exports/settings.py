@@ -18,6 +18,7 @@ from ftdrive.runs.verification_record import VerificationRecord
 # Also inside a comment of XML, where `--` is an error.
 _NAME = re.compile(r"[A-Za-z_](-?[A-Za-z0-9_./])*")
 # ur_description/urdf/ur_macro.xacro, joint base_link-base_fixed_joint: 180° about z.
+# ROS users have base_link; without the turn a tilt would be wrong without a message.
 _R_BASE_LINK_BASE = np.diag([-1.0, -1.0, 1.0])
 # ur_description/urdf/ur_macro.xacro, joint flange-tool0: rpy = (π/2, 0, π/2). x of `flange` points out.
 _R_FLANGE_TOOL0 = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

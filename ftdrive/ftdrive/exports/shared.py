@@ -27,6 +27,7 @@ _SPELLED = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–"
 
 def require_usable(plan: Plan) -> None:
     """Raise `PlanRefused` for sweeps, placeholders, moves that are not proven clear, and values no arm can follow."""
+    # The text of an export carries no verdict, so a rejected calibration is not exported.
     if plan.sweep is not None:
         raise PlanRefused("this plan is a sweep, which no other program can follow: export the plan of a tour")
     if not plan.measured:
@@ -74,6 +75,7 @@ def xyz(values: ArrayLike) -> dict[str, float]:
 
 def yaml_text(document: Mapping[str, Any] | list[float]) -> str:
     """Return YAML that keeps every bit of a float and the order of the keys."""
+    # YAML 1.1 reads 1e-05 as a text and yes as true; PyYAML quotes what must be quoted.
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10**6)
 
 
@@ -137,6 +139,7 @@ def world_note(settings: Settings) -> str:
 
 def frame_note(calibration: CalibrationResult, settings: Settings) -> str:
     """Say how the robot model must turn the sensor frame, for targets that look it up there."""
+    # A target that looks up frames trusts the robot model, so the note has the angles that it must have.
     rpy = ", ".join(str(angle) for angle in rpy_rad(R_frame_sensor(calibration, settings)))
     return (
         f"The robot model must turn {settings.sensor_frame} against {settings.flange_frame} by roll, pitch, yaw = "

@@ -125,8 +125,10 @@ def _cell(path: Path, name: str, table: Any) -> StoredCell:
 
 
 # Of the verifications that are read. A drift of the bias shows within weeks, and the store is read every minute.
+# All verifications would take four times as long after a year and find no drift sooner.
 WINDOW: Final = timedelta(days=90)
 # Results of each tool of a cell that are read: the newest, and what it is compared with.
+# The time must not grow with the age of the fleet.
 NEWEST: Final = 3
 
 

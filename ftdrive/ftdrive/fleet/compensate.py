@@ -94,6 +94,7 @@ def compensated_file(source: Path, folder: Path, task: bytes) -> bytes:
     OSError
         The result cannot be written.
     """
+    # Written into a folder .unfinished-…: a result gets its name when it is complete.
     given: dict[str, Any] = json.loads(task)
     require_version(given["version"])
     document = given["calibration"]
@@ -113,6 +114,7 @@ def compensated_bytes(recording: bytes, name: str, task: bytes) -> bytes:
 
     A pure function of its arguments and the installed versions. Raises as `compensated_file`.
     """
+    # A cluster needs no shared disk, so recordings travel as bytes.
     try:
         with TemporaryDirectory(prefix="ftdrive-compensate-", dir=folder_of_worker()) as folder:
             source = Path(folder) / name

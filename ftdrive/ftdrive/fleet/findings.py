@@ -213,6 +213,7 @@ def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
 
 def _wrong_payloads(wrong: Iterable[_Load], words: Callable[[_Load, str], str]) -> Iterator[FleetFinding]:
     """Yield a finding of several loads; `words` takes the first of them and the names of all cells."""
+    # One wrong payload is a finding of its own calibration, so this needs two cells or a reference.
     loads = sorted(wrong, key=lambda one: one.cell)
     if len(loads) > 1:
         cells, first = tuple(one.cell for one in loads), loads[0]

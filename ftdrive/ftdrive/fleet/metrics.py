@@ -19,6 +19,7 @@ except ImportError:
 
 
 def _seconds(time: datetime | None) -> float | None:
+    # A time and not an age: an age would stand still when the server does.
     return None if time is None else time.timestamp()
 
 

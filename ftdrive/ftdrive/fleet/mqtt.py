@@ -158,6 +158,7 @@ class Messages:
     # ------------------------------------------------------------------------------------------------ thread of paho
 
     def _on_connect(self, _client: Client, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+        # Every connection publishes all again: with QoS 1 an old state would follow a newer one and stay retained.
         if reason.is_failure:
             if reason.value in _REJECTED and not self._was_connected:
                 self._rejection = str(reason)

@@ -55,6 +55,7 @@ def _plot(changes: BiasChanges, start: datetime, now: datetime) -> str:
 
     Force is drawn in one colour, torque in another; the gray band is two sigmas to both sides.
     """
+    # Lines in SVG: matplotlib is too slow for 200 plots.
     first = (now - WINDOW - start).total_seconds() / 86400
     x = MARGIN + (changes.t_days - first) / WINDOW.days * (WIDTH - 2 * MARGIN)
     sigmas = changes.in_sigmas

@@ -74,6 +74,7 @@ def serve(
     ConfigError
         A sink can never work.
     """
+    # A store that cannot be read at the start ends the server, so that a wrong address is noticed at once.
     time = now()
     reading = Reading(fleet_at(time), time, time)
     while True:

@@ -24,6 +24,7 @@ CHECK_S: Final = 5.0
 SAME: Final = ("ftdrive", "numpy", "scipy")
 
 # More threads than cores are slow, and their number can change the last digits.
+# One BLAS thread also for one worker, so that all bytes are equal.
 _ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
 _LOGS: Final = ("distributed", "distributed.client", "tornado.application")
 # Messages that a client keeps for developers of Dask: 1000 by default, with their datasets 130 MB.
@@ -132,6 +133,7 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
     StreamBroken
         The scheduler was lost while calls were running.
     """
+    # Through Dask's own executor: the backend of joblib 1.6 waits forever when a call kills its workers.
     found = re.fullmatch(r"dask://([^/:@]+|\[[0-9a-fA-F:]+\]):(\d{1,5})/?", address)
     if found is None:
         raise ConfigError(f"--cluster is '{address}': give the address of a Dask scheduler, such as dask://host:8786")

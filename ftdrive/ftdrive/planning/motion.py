@@ -75,6 +75,7 @@ def durations_s(arm: ArmModel, q_rad: Array, speeds: Speeds) -> Array:
 
 def tips(arm: ArmModel, q_rad: Array) -> Array:
     """Centres (n, k, 3) in base of the far ends of the tool's cylinders."""
+    # Centres of the far ends; a point on the rim may be somewhat faster.
     at = arm.frames(q_rad)
     local = np.array([[part.x_m, part.y_m, part.to_m] for part in arm.tool])
     return np.asarray(at.flange_m[:, None] + local @ np.swapaxes(at.R_base_flange, 1, 2))

@@ -44,6 +44,7 @@ def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, 
         exactly in both; `groups`: `name`, `chi2`, `dof`, `p_value`; `same_data`: whether both rest on one dataset, so
         that the test does not apply.
     """
+    # Results of the same data share their noise, so the test does not apply to them.
     found = difference(before, result)
     data = [one.provenance.get("dataset_sha256") for one in (result, before)]
     tests = {NAMES[name]: test for name, test in found.groups.items() if test.dof} | {"all": found.joint}
@@ -154,6 +155,7 @@ def facts_of(subject: Subject) -> dict[str, Any]:
 
     Units are those of the names: rad, m, N, N·m, s. `result` is the content of the calibration file.
     """
+    # All formats are written from these facts, so they cannot disagree.
     result, dataset = subject.result, subject.dataset
     R_base_flange = _swept(subject) if dataset is None else dataset.R_base_flange
     force_N, torque_Nm = result.likely_error().tolist()

@@ -23,6 +23,7 @@ Facts = Mapping[str, Any]
 INK, PAPER, GRID, BAD = "#010101", "#020202", "#030303", "#040404"
 SERIES = ("#050505", "#060606", "#070707")
 # Colour that stands for each variable of the page.
+# Placeholder colours of matplotlib become currentColor and CSS variables, so one figure serves light and dark pages.
 VARIABLES = {
     INK: "currentColor",
     PAPER: "var(--paper)",
@@ -31,6 +32,7 @@ VARIABLES = {
     **{colour: f"var(--series-{k})" for k, colour in enumerate(SERIES)},
 }
 # Of every figure: on a phone its letters keep their size, on a desk two stand side by side.
+# Letters stay readable on a phone, and two figures fit side by side on a desk.
 WIDTH_IN = 5.0
 # Longer times are shown in minutes.
 LONG_S = 200

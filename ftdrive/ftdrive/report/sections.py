@@ -410,6 +410,7 @@ def provenance(facts: Facts) -> Section:
 
 
 def _last_verification(trust: Facts) -> Iterator[str]:
+    # From folders and store, the later one: a store may be new, and a folder may have moved.
     if last := trust.get("last_verification"):
         outcome = "passed" if last["passed"] else "FAILED"
         yield f"Last verification {last['created_utc'][:16]} UTC, {outcome}: {last['reason']}. File {last['path']}."

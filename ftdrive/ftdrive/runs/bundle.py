@@ -89,6 +89,7 @@ class Redaction:
 
     def learn(self, text: str) -> None:
         """Learn names of hosts and users from a file: from paths, addresses, and the fields that name a host."""
+        # A name that one file reveals is replaced in all; a list of fields misses the next field.
         for value in _strings(text):
             for user in _HOME.findall(value):
                 self._learn_name("user", user)
@@ -120,6 +121,7 @@ class Redaction:
 
     def json(self, value: JSON, key: str = "") -> JSON:
         """Redact all texts in a value of JSON; its keys stay."""
+        # JSON is parsed, so that escapes hide no name.
         if key in _VERSIONS:
             return value
         if isinstance(value, dict):

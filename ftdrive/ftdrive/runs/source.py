@@ -228,6 +228,7 @@ class Outcome:
 
 def solve_and_save(run: Run) -> Outcome:
     """Solve a run from its files, so that the files suffice to repeat it. Raises `OSError` if they cannot be saved."""
+    # Solved from its files and not from memory, so a replay agrees to the last digit.
     outcome = Outcome(run, None, solve_in_motion(run), None) if run.in_motion else solve_records(run, run.records())
     try:
         if outcome.dataset is not None:

@@ -95,6 +95,7 @@ def last_verification(place: Path) -> VerificationRecord | None:
     BadCalibration, OSError
         The calibration cannot be read.
     """
+    # Searched by the id of the calibration: a run folder that is complete gets no more files.
     from ftcalib import CalibrationResult
     from ftdrive.runs.run import Run
 

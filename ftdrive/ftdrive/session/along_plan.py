@@ -116,6 +116,7 @@ _GRID_RAD: Final = float(np.radians(0.1))
 # Target sigma of one average: it gives 0.02 N of bias from 24 poses.
 _TARGET_N, _TARGET_NM = 0.057, 0.0035
 # Length of an average of a new tool in that of other tours: its four poses then show as much as eight.
+# Drift within a pose counts twice as long, but four long poses are as good as six with two moves less.
 _TOOL_AVERAGES: Final = 2.0
 _HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
 _HEAVIEST_OF_ALL_KG: Final = 30.0

@@ -56,6 +56,7 @@ def record_passively(
     DeviceError
         A device has failed; what was recorded is in the run.
     """
+    # Every sample is kept: sums could not judge contact again, and the run could not be solved from its folder.
     cell.note(f"Recording for {seconds:.0f} s at most; nothing is commanded. Keep the tool free for part of the time.")
     cell.journal.keep_in(run)
     executor = fits or ThreadPoolExecutor(1)

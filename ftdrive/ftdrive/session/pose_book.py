@@ -46,6 +46,7 @@ class PoseBook:
 
     def keep(self, record: PoseRecord, *, stops: int, settle_s: float, average_s: float) -> Estimated | Compared:
         """Commit and show a pose; return what the poses show now."""
+        # Each pose is on disk before the arm moves on: a crash costs only the pose in progress.
         record = self.run.commit(record)
         self.cell.journal.show(
             PoseTaken(

@@ -83,6 +83,7 @@ def propose(
     NotAccepted
         The calibration is rejected or of other devices, or the arm is not ready.
     """
+    # Sensor and adapter are one mass halfway up the sensor's height; the plate that carries the tool counts twice.
     if result.verdict == "rejected":
         raise NotAccepted(f"{name} is rejected ({'; '.join(result.reasons)}): calibrate again")
     mass_kg, height_m = _sensor_of(cell)
@@ -165,6 +166,7 @@ def _contact(arm: RobotArm, sensor: ForceTorqueSensor, result: CalibrationResult
 
 def _gravity(result: CalibrationResult, lean: Lean, old: ControllerSettings) -> tuple[float, ...] | None:
     """Return the gravity to be set, as large as the controller has it; None if it agrees."""
+    # A tilt is pushed only where the controller reports its gravity: elsewhere it could not be read back or restored.
     if old.up_base_m_s2 is None:
         raise NotAccepted(
             f"the controller does not report its gravity, so a change could not be read back; the base {lean}, "
@@ -206,6 +208,7 @@ def send(
     DeviceError
         The arm failed. If something may have been sent, there is a receipt.
     """
+    # Read back after the pushing program has ended, because only that shows what remains; so the arm is opened twice.
     disk = computer.check_disk(folder)
     if disk.state == "failed":
         raise NotAccepted(f"no receipt can be written, {disk.found}: copy the run to another folder; nothing was sent")

@@ -49,6 +49,7 @@ class FreeTool(Guard):
 
     def begin(self, _: Seen) -> None:
         """Forget everything: after a stop the tool may be another, and the sensor may have another zero."""
+        # After a stop the tool may be another, and the sensor may have another zero.
         unknown = (self.heaviest_kg * STANDARD_GRAVITY_M_S2 / _NOISE_N) ** 2
         self._covariance = np.diag([unknown, unknown, unknown, 1e6])
         self._coefficients = np.zeros((4, 6))
@@ -57,6 +58,7 @@ class FreeTool(Guard):
 
     def look(self, seen: Seen) -> None:
         """Learn from what was seen a second ago."""
+        # Learns from a second ago and before; a push that grows over several seconds is partly learned.
         if seen.motion.curve_rad is not None:
             self._moving_s += seen.dt_s
         if seen.sample == self._sample:
@@ -72,6 +74,8 @@ class FreeTool(Guard):
 
     def predict(self, R_base_flange: Array) -> Array | None:
         """Wrench (6,) of a free tool at this orientation (3, 3); None while it is uncertain."""
+        # The full fit takes longer than a guard may wait, and knows no contact, so a linear function of gravity
+        # predicts.
         if self._moving_s < KNOWN_S:
             return None
         x = self._features(R_base_flange)
@@ -171,6 +175,7 @@ LEAST_SLIDER: Final = 0.5
 
 def on_script_path(cell: CellConfig) -> CellConfig:
     """Return the cell with the control path that follows a curve; raises `ConfigError` if another one is set."""
+    # Only our own program evaluates the curve and stops with its heartbeat.
     if cell.robot.control == "ur-rtde":
         raise ConfigError(
             "a sweep needs the control path script, whose program evaluates the curve on the controller and stops "

@@ -52,6 +52,7 @@ SCHEMA: Final = 4
 
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
 # Fields of a verification with a column for each component: read three times as fast as JSON.
+# 18 columns are read three times as fast as JSON in one.
 _WRENCHES = ("bias_change", "bias_change_sigma", "calibration_sigma")
 
 metadata: Final = MetaData()
@@ -228,6 +229,7 @@ class Database:
 
         Missing tables are created. The index of an older version is replaced by an empty one; cells are kept.
         """
+        # Writers take turns by one lock: with locks of rows, two writers of the same copies wait for each other.
         if self._file is not None:
             with self._in_words("written"):
                 self._file.parent.mkdir(parents=True, exist_ok=True)
@@ -266,6 +268,7 @@ class Database:
 
     def _version(self, connection: Connection) -> int | None:
         """Return the version of the tables, 0 where it is lost; None where there are no tables."""
+        # No migrations: the run folders are the truth, and an older index is built again.
         if not inspect(connection).has_table(schema.name):
             return None
         version = connection.scalar(select(schema.c.version)) or 0

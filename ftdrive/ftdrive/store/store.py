@@ -87,6 +87,7 @@ class Store:
         A file that is known by its path is not read again, because no file of a run is ever overwritten. One of
         weighings is, if it has grown.
         """
+        # No file of a run is ever overwritten, so a known path is not read again; a file of weighings grows.
         paths = record_paths(folders)
         with self._current.reading() as connection:
             known = set() if connection is None else _known(connection, paths)
@@ -97,6 +98,7 @@ class Store:
 
         Runs whose parent folder cannot be reached are kept: a disk may be missing, or another computer has them.
         """
+        # Results whose folder cannot be reached stay: a disk may be missing.
         with self._current.reading() as connection:
             known = set() if connection is None else all_paths(connection)
         parents = {Path(path).parent.parent for path in known}
@@ -132,6 +134,7 @@ class Store:
 
     def _write(self, connection: Connection, records: Sequence[Record], forget: Sequence[str] = ()) -> None:
         """Insert records; of two files with the same content the first by path counts, whatever the order."""
+        # The key is the content: a copied or moved run is one result, also on two computers.
         for kind, table in database.RECORDS.items():
             rows = [database.to_row(one) for one in records if isinstance(one, kind)]
             same = _paths_where(connection, table, table.c.id, [row["id"] for row in rows])

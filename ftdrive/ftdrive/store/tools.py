@@ -60,6 +60,7 @@ def calibration_of_tool(
     ConfigError
         There is none; the message lists the tools that are calibrated on these devices.
     """
+    # A tool is a name in its runs, so nothing has to be edited after a calibration.
     store, warnings = Store(url), list[str]()
     results: list[StoredResult] = []
     try:

@@ -133,6 +133,7 @@ class WeighingLog:
         self._attempt(_NOT_INDEXED, self._put_weighings)
 
     def _put_weighings(self) -> None:
+        # One row a file and day: a row for each weighing would be 6 million a year and cell.
         if self._store is None:
             self._open()
         if self._lacks_older:
