@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters
 from ftcalib.errors import NotObservable
 from ftcalib.model import predict
-from ftdrive.fleet.resolve import solved, task_of
+from ftdrive.fleet.resolve import solve_task, task_of
 from ftdrive.runs.motion import MotionRecording
 from ftdrive.runs.run import RUN_FORMAT
 from ftdrivers.interfaces import ArmStates, FtSamples
@@ -93,5 +93,5 @@ _solved = dict[tuple[int, int], CalibrationResult]()
 
 def _own(folder: Path, seed: int, poses: int) -> CalibrationResult:
     if (seed, poses) not in _solved:
-        _solved[seed, poses] = CalibrationResult.from_dict(json.loads(solved(*task_of(folder))))
+        _solved[seed, poses] = CalibrationResult.from_dict(json.loads(solve_task(*task_of(folder))))
     return _solved[seed, poses]

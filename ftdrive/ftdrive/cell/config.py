@@ -319,7 +319,7 @@ def settings(
         found |= _from_environment()
     for key, (option, value) in (flags or {}).items():
         if value is not None:
-            found[key] = Setting(checked(option, key, value), option)
+            found[key] = Setting(check_value(option, key, value), option)
     if "sampling.average_s" in found:  # a set averaging time is not chosen again
         found.setdefault("sampling.noise_record_s", Setting(0.0, found["sampling.average_s"].origin))
     defaults = {key: None if item.default is MISSING else item.default for key, item in _KEYS.items()}
@@ -392,7 +392,7 @@ def _from_file(path: Path) -> dict[str, Setting]:
         for key, value in content.items():
             if f"{section}.{key}" not in _KEYS:
                 raise ConfigError(f"{path}: [{section}] has no key '{key}': {_known(key, 'keys', _names(section))}")
-            values[f"{section}.{key}"] = Setting(checked(str(path), f"{section}.{key}", value), str(path))
+            values[f"{section}.{key}"] = Setting(check_value(str(path), f"{section}.{key}", value), str(path))
     return values
 
 
@@ -411,7 +411,7 @@ def _from_environment() -> dict[str, Setting]:
     names = {variable(key): key for key in _KEYS}
     for name, text in os.environ.items():
         if name in names:
-            values[names[name]] = Setting(checked(name, names[name], _parsed(name, names[name], text)), name)
+            values[names[name]] = Setting(check_value(name, names[name], _parsed(name, names[name], text)), name)
             continue
         for section in SECTIONS:
             if name.startswith(start := variable(section) + "_"):
@@ -443,7 +443,7 @@ def _known(unknown: str, kind: str, names: Iterable[str]) -> str:
     return f"{f'did you mean {near[0]}? ' if near else ''}the {kind} are {', '.join(names)}"
 
 
-def recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+def read_recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Return the cell that a run has recorded; raises `ConfigError` for a value of a wrong type.
 
     Keys that this version does not know are left out. Ranges are not checked: another version may have had others.
@@ -464,7 +464,7 @@ def recorded_cell(config: Mapping[str, Mapping[str, Any]]) -> CellConfig:
     return CellConfig(**{name: kind(**config.get(name, {})) for name, kind in SECTIONS.items()}, clock=clock_in_force())
 
 
-def checked(place: str, key: str, value: Any) -> Any:
+def check_value(place: str, key: str, value: Any) -> Any:
     """Return the value of a key such as "robot.host" as its section takes it, or raise `ConfigError`."""
     where = f"{place}: [{key.replace('.', '] ')} = {value!r}"
     if key == "workcell.mounting" and rules.is_number(value):  # degrees

@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any, Self
 
 from ftcalib.sampling import Sampling
-from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, checked, settings
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, check_value, settings
 from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError
@@ -95,7 +95,7 @@ class Station:
         made_by = made_by or _configured(sensor)
         name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
         path = control_path or made_by.get("control_path", "auto")
-        values = {key: checked("the run", key, value) for key, value in made_by.get("values", {}).items()}
+        values = {key: check_value("the run", key, value) for key, value in made_by.get("values", {}).items()}
         return cls(name, (*made_by.get("options", ()), *options), control_path=path, values=values)
 
     def __enter__(self) -> Self:

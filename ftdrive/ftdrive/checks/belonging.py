@@ -22,7 +22,7 @@ class Belonging:
     """Devices of the same model where a serial number is unknown."""
 
 
-def belonging(
+def compare_devices(
     result: CalibrationResult, connected: Mapping[str, DeviceInfo], mount: str | EllipsisType | None = ...
 ) -> Belonging:
     """Compare the devices of a calibration with the connected ones, by role.
@@ -57,7 +57,7 @@ def check_calibration(
 ) -> Check:
     """Check that a calibration belongs to the connected devices, and as `belonging` does to the mounting."""
     name = "calibration.devices"
-    belongs = belonging(result, connected, mount)
+    belongs = compare_devices(result, connected, mount)
     if belongs.others:
         return Check(name, "failed", "; ".join(belongs.others), "ftdrive calibrate")
     created = result.provenance.get("created_utc")

@@ -29,7 +29,7 @@ def verdict(checks: Sequence[Check]) -> State:
     return "failed" if "failed" in states else "warning" if "warning" in states else "ok"
 
 
-def merged(name: str, checks: Sequence[Check]) -> Check:
+def merge_checks(name: str, checks: Sequence[Check]) -> Check:
     """Merge checks into one with their worst state; it says what those in this state found."""
     state = verdict(checks)
     worst = [check for check in checks if check.state == state]

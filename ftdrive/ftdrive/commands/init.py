@@ -301,9 +301,9 @@ class _Questions:
 
 
 def _checked(key: str, value: Any) -> Any:
-    from ftdrive.cell.config import RULES, checked
+    from ftdrive.cell.config import RULES, check_value
 
-    return checked(RULES[key].option, key, value)
+    return check_value(RULES[key].option, key, value)
 
 
 def _robot(ask: _Questions, given: str | None, model: str | None, clock: Clock) -> tuple[str, str | None, str]:

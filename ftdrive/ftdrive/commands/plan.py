@@ -190,10 +190,10 @@ def _look(made: "Plan", certifier: "Certifier") -> None:
     import threading
     from contextlib import suppress
 
-    from ftdrive.planning.drawing import open_in_browser, shown
+    from ftdrive.planning.drawing import open_in_browser, serve_view
     from ftdrive.terminal.console import print_address
 
-    with shown(made, certifier) as url, suppress(KeyboardInterrupt):
+    with serve_view(made, certifier) as url, suppress(KeyboardInterrupt):
         print_address("The plan is shown until Ctrl-C at ", url)
         open_in_browser(url)
         threading.Event().wait()

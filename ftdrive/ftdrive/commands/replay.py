@@ -18,7 +18,7 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.runs.bundle import unpacked
+from ftdrive.runs.bundle import unpack
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import RecordedRun, solve_records
 from ftdrive.terminal.console import answer, hanging, messages, working
@@ -40,7 +40,7 @@ def replay(source: Path | None, simulate: bool, sensor: str | None, as_json: boo
         with rehearsed_run(sensor) as recorded:
             _repeat(Run(recorded), recorded, as_json)
     elif source is not None:
-        with unpacked(source) as folder:
+        with unpack(source) as folder:
             _repeat(Run(folder), source, as_json)
     else:
         raise ConfigError("no run: give its folder or bundle, or --simulate")

@@ -25,14 +25,14 @@ from ftdrive.commands.common import (
     store_url,
     write_json,
 )
-from ftdrive.commands.solve import known_values, upward
+from ftdrive.commands.solve import known_values, up_direction
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError
 from ftdrive.report.facts import facts_of
 from ftdrive.report.report import Format
 from ftdrive.report.report import report as written
 from ftdrive.report.subject import SolveOptions, read_subject, trust
-from ftdrive.runs.bundle import unpacked
+from ftdrive.runs.bundle import unpack
 from ftdrive.runs.run import unused_path
 from ftdrive.terminal.console import beside, hanging, messages, working
 from ftdrive.terminal.text import echo
@@ -108,10 +108,10 @@ def report(
             raise ConfigError(f"{error} with --output") from error
     if form == "html":
         require_extra("report", "a report in HTML (not --format md)", "jinja2", "matplotlib")
-    given = known_values(mass_kg, level_deg, mounting_deg), upward(up)
+    given = known_values(mass_kg, level_deg, mounting_deg), up_direction(up)
     options = SolveOptions(method, orientation, drift, *given, _typed(click.get_current_context()))
     gc.freeze()  # or the imports are searched for garbage again and again, as in `fleet status`
-    with unpacked(source) if source is not None else rehearsed_run(sensor) as found:
+    with unpack(source) if source is not None else rehearsed_run(sensor) as found:
         with working("Solving"):
             subject = read_subject(found, options, parent)
         known = trust(subject.result, found, store_url, datetime.now(UTC))

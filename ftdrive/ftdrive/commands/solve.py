@@ -41,10 +41,17 @@ from ftdrive.commands.common import (
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
 from ftdrive.recording.bag import bag_means, is_bag, read_bag
 from ftdrive.recording.files import is_recording
-from ftdrive.runs.bundle import unpacked
+from ftdrive.runs.bundle import unpack
 from ftdrive.runs.pose_hints import hints, numbers_in_dataset
 from ftdrive.runs.run import Run, in_motion
-from ftdrive.runs.source import Source, read_calibration, read_dataset, read_source, require_same_cell, solve_in_motion
+from ftdrive.runs.source import (
+    RecordedData,
+    read_calibration,
+    read_dataset,
+    read_source,
+    require_same_cell,
+    solve_in_motion,
+)
 from ftdrive.terminal.console import beside, working
 from ftdrive.terminal.report import print_cases, print_comparison, print_result, print_tests
 from ftdrive.terminal.text import echo, in_one_line
@@ -177,7 +184,7 @@ def solve(
         method=method,
         orientation=orientation,
         known=known_values(mass_kg, level_deg, mounting_deg),
-        up_in_base=upward(up),
+        up_in_base=up_direction(up),
         drift=drift,
         as_published=as_published,
         earlier=None if earlier is None else read_calibration(earlier),
@@ -221,7 +228,7 @@ class _Wanted:
     cases: bool
     """The cases of Yu's Table III, instead of one result."""
 
-    def read(self, place: Path) -> Source:
+    def read(self, place: Path) -> RecordedData:
         """Read poses at rest."""
         return read_source(place, self.orientation, self.known, self.up_in_base)
 
@@ -230,7 +237,7 @@ def _solve_each(sources: Sequence[Path], wanted: _Wanted, output: Path | None, f
     first_failure: AcceptanceError | DataError | None = None
     for source in sources:
         try:
-            with unpacked(source) as place:
+            with unpack(source) as place:
                 if wanted.method == "all" and wanted.pair is None and not _is_in_motion(place):
                     _show_all(source, wanted.read(place), wanted, as_json)
                     continue
@@ -295,7 +302,7 @@ def _solve_motion(place: Path, wanted: _Wanted) -> CalibrationResult:
 def _solve_together(sources: Sequence[Path], wanted: _Wanted, output: Path | None, force: bool, as_json: bool) -> None:
     results = []
     for source in sources:
-        with unpacked(source) as place:
+        with unpack(source) as place:
             if _is_in_motion(place):
                 raise ConfigError(f"--together joins poses at rest, and {source} is in motion")
             # Without the earlier result of a new tool, because a result from another one would count that twice.
@@ -316,7 +323,7 @@ def _save(result: CalibrationResult, output: Path | None, force: bool, as_json: 
         beside(as_json).print(f" Saved {output}")
 
 
-def _solve_poses(data: Source, wanted: _Wanted) -> CalibrationResult:
+def _solve_poses(data: RecordedData, wanted: _Wanted) -> CalibrationResult:
     chosen: Any = wanted.method
     how: dict[str, Any] = {"drift": wanted.drift, "as_published": wanted.as_published, **data.circumstances}
     with working("Solving"):
@@ -329,11 +336,11 @@ def _solve_poses(data: Source, wanted: _Wanted) -> CalibrationResult:
 def _test_set(test: Path | None, orientation: Orientation) -> CalibrationDataset | None:
     if test is None:
         return None
-    with unpacked(test) as place:
+    with unpack(test) as place:
         return read_dataset(place, orientation)
 
 
-def _show_all(source: Path, data: Source, wanted: _Wanted, as_json: bool) -> None:
+def _show_all(source: Path, data: RecordedData, wanted: _Wanted, as_json: bool) -> None:
     test, tests, truth = wanted.test, wanted.tests, data.truth
     how: dict[str, Any] = {"drift": wanted.drift, "as_published": wanted.as_published, **data.circumstances}
     with working("Solving with all methods"):
@@ -350,7 +357,7 @@ def _show_all(source: Path, data: Source, wanted: _Wanted, as_json: bool) -> Non
         print_tests(("method",), [((one.method,), one) for one in compared], heading)
 
 
-def _show_cases(source: Path, data: Source, as_json: bool) -> None:
+def _show_cases(source: Path, data: RecordedData, as_json: bool) -> None:
     if not data.records:
         raise ConfigError(f"--table-iii needs the folder of a run, and {source} is a file: calibrate --set {EVERY_SET}")
     with working("Solving the cases of Table III"):
@@ -382,7 +389,7 @@ def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: s
         raise ConfigError(str(error)) from error
 
 
-def upward(up: str | None) -> list[float] | None:
+def up_direction(up: str | None) -> list[float] | None:
     """Return the direction (3,) of `--up`; None without it. Raises `ConfigError`."""
     if up is None:
         return None

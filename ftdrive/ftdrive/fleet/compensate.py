@@ -15,7 +15,7 @@ from ftcalib import CalibrationResult
 from ftcalib.files import write_new
 from ftdrive import __version__
 from ftdrive.errors import BadRecording, ConfigError
-from ftdrive.fleet.workers import OtherVersion, Workers, answers, folder_of_worker, in_words, require_version
+from ftdrive.fleet.workers import OtherVersion, Workers, answers, describe_error, folder_of_worker, require_version
 from ftdrive.live.samples import WrenchFrame
 from ftdrive.recording.compensation import compensate_recording, read_with_calibration
 from ftdrive.recording.files import ENDINGS, format_of
@@ -157,7 +157,7 @@ def compensate_all(
             if isinstance(answer, OtherVersion):
                 raise answer
             if isinstance(answer, BaseException):
-                yield recording, in_words(answer)
+                yield recording, describe_error(answer)
             else:
                 yield recording, _saved(folder / recording.name, answer, is_path=workers.share_files)
 

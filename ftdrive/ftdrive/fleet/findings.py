@@ -16,7 +16,7 @@ from scipy.special import fdtrc as f_sf
 from ftcalib.after.series import spans_temperature
 from ftcalib.model import Array, angle_between_vectors, skew
 from ftdrive.fleet.cells import BiasChanges, Observed, when
-from ftdrive.fleet.state import CellState, FleetFinding, listed
+from ftdrive.fleet.state import CellState, FleetFinding, list_names
 from ftdrive.report.document import rounded
 from ftdrive.store.records import StoredResult
 
@@ -64,7 +64,7 @@ def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[FleetF
         days = (observed.now - due).days
         what = f"The verification of {worst} is late by {days} d"
         if len(cells) > 1:
-            what = f"The verifications of {listed(cells)} are late, that of {worst} by {days} d"
+            what = f"The verifications of {list_names(cells)} are late, that of {worst} by {days} d"
         yield FleetFinding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
 
 
@@ -77,10 +77,10 @@ def _refused_weighings(states: Sequence[CellState], observed: Observed) -> Itera
     for one in states:
         if one.weighings is None or one.weighings.day < first:
             continue
-        refused = sum(one.weighings.refused.values())
-        tried = refused + one.weighings.number
+        refused = sum(one.weighings.refusals.values())
+        tried = refused + one.weighings.weighings
         if tried >= MANY_WEIGHINGS and 2 * refused > tried:
-            code = max(one.weighings.refused.items(), key=lambda found: found[1])[0]
+            code = max(one.weighings.refusals.items(), key=lambda found: found[1])[0]
             yield FleetFinding(
                 "weighing",
                 (one.cell,),
@@ -218,7 +218,7 @@ def _wrong_payloads(wrong: Iterable[_Load], words: Callable[[_Load, str], str]) 
     if len(loads) > 1:
         cells, first = tuple(one.cell for one in loads), loads[0]
         fix = "set them with `ftdrive push`"
-        yield FleetFinding("payload", cells, f"{words(first, listed(cells))} in {first.cell}: {fix}")
+        yield FleetFinding("payload", cells, f"{words(first, list_names(cells))} in {first.cell}: {fix}")
 
 
 def _either(least: float, sigma: Array) -> Array:
@@ -297,7 +297,7 @@ def _finding(model: str, sensors: Mapping[str, _Sums]) -> Iterator[FleetFinding]
         "temperature",
         cells,
         f"The bias of {len(following)} of {len(sensors)} sensors {model} follows their temperature, by up to "
-        f"{size} a kelvin (in {listed(cells)}): let them warm up before a calibration, and tare them at "
+        f"{size} a kelvin (in {list_names(cells)}): let them warm up before a calibration, and tare them at "
         "the temperature of the work",
     )
 

@@ -5,7 +5,7 @@ from datetime import datetime
 from typing import Any, Final
 
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.fleet.serve import Reading
+from ftdrive.fleet.serve import FleetReading
 from ftdrive.fleet.state import CellState
 from ftdrive.http_gate import Gate, hidden_host
 from ftdrive.terminal.text import visible
@@ -105,7 +105,7 @@ class MetricsServer(Collector):
 
     def __init__(self, host: str, port: int, page: Callable[[], str] | None = None) -> None:
         self._page = page
-        self._reading: Reading | None = None
+        self._reading: FleetReading | None = None
         registry = CollectorRegistry()
         registry.register(self)
         behind = hidden_host()
@@ -122,7 +122,7 @@ class MetricsServer(Collector):
             self._server.set_app(self._answer)
         self.port = self._gate.port
 
-    def update(self, reading: Reading) -> None:
+    def update(self, reading: FleetReading) -> None:
         """Serve this reading from now on."""
         self._reading = reading
 
@@ -171,9 +171,10 @@ class MetricsServer(Collector):
         refusals = CounterMetricFamily(REFUSALS, "Weighings refused on the last day.", labels=(*TOOL, "code"))
         for one in cells:
             if one.weighings is not None:
-                weighings.add_metric(_labels(one.cell, one.tool), one.weighings.number)
-                for code, number in one.weighings.refused.items():
-                    refusals.add_metric(_labels(one.cell, one.tool, code), number)
+                weighings.add_metric(_labels(one.cell, one.tool), one.weighings.weighings)
+                for code, number in one.weighings.refusals.items():
+                    if number:
+                        refusals.add_metric(_labels(one.cell, one.tool, code), number)
         yield weighings
         yield refusals
         finding = GaugeMetricFamily(FINDING, "1 for each cell of a finding.", labels=("kind", "cell"))

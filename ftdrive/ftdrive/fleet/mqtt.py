@@ -12,7 +12,7 @@ from urllib.parse import unquote, urlsplit
 
 from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
-from ftdrive.fleet.serve import Reading
+from ftdrive.fleet.serve import FleetReading
 from ftdrive.http_gate import with_port
 
 try:
@@ -112,7 +112,7 @@ class Messages:
         client.on_connect, client.on_connect_fail = self._on_connect, self._on_connect_fail
         client.on_disconnect, client.on_message = self._on_disconnect, self._on_message
 
-    def update(self, reading: Reading) -> None:
+    def update(self, reading: FleetReading) -> None:
         """Publish what has changed; the first call connects.
 
         Raises
@@ -202,7 +202,7 @@ class Messages:
         self._client.publish(topic, payload, retain=True)
 
 
-def _about_server(reading: Reading) -> dict[str, JSON]:
+def _about_server(reading: FleetReading) -> dict[str, JSON]:
     return {
         "schema_version": SCHEMA_VERSION,
         "online": True,
@@ -212,7 +212,7 @@ def _about_server(reading: Reading) -> dict[str, JSON]:
     }
 
 
-def _about_cells(reading: Reading) -> dict[str, dict[str, JSON]]:
+def _about_cells(reading: FleetReading) -> dict[str, dict[str, JSON]]:
     """Return the message of each cell by name: its tools, and the findings that concern it."""
     tools, findings = defaultdict[str, list[JSON]](list), defaultdict[str, list[JSON]](list)
     for one in reading.fleet.cells:

@@ -22,7 +22,7 @@ from ftcalib.errors import BadCalibration, BadDataset
 from ftcalib.files import read_file, read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
 from ftdrive import __version__
-from ftdrive.fleet.workers import OtherVersion, Workers, answers, folder_of_worker, in_words, require_version
+from ftdrive.fleet.workers import OtherVersion, Workers, answers, describe_error, folder_of_worker, require_version
 from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import circumstances_of, solve_in_motion
 
@@ -71,7 +71,7 @@ def task_of(folder: Path) -> tuple[bytes, bytes]:
     return read_file(run.dataset_path), json.dumps(given).encode()
 
 
-def solved(dataset: bytes, task: bytes) -> bytes:
+def solve_task(dataset: bytes, task: bytes) -> bytes:
     """Return the calibration file of a task: a pure function of its bytes and of the installed versions.
 
     Raises
@@ -173,11 +173,11 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
     moved = dict.fromkeys(folder for folder in rest if in_motion(folder))
     here = answers(_solved_motion, lambda folder: (folder, __version__), moved, workers)
     there = answers(_solved_files, lambda folder: (*_files_of(folder), __version__), moved, replace(workers, group=1))
-    at_rest = answers(solved, task_of, (folder for folder in rest if folder not in moved), workers)
+    at_rest = answers(solve_task, task_of, (folder for folder in rest if folder not in moved), workers)
     for folder, answer in chain(at_rest, here if workers.share_files else there):
         if isinstance(answer, OtherVersion):
             raise answer
-        yield folder, in_words(answer) if isinstance(answer, BaseException) else _compared(folder, answer)
+        yield folder, describe_error(answer) if isinstance(answer, BaseException) else _compared(folder, answer)
 
 
 def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
@@ -188,7 +188,7 @@ def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
         new, path = CalibrationResult.load(solved_path(folder)), Run(folder).calibration_path
         old = CalibrationResult.load(path) if path.is_file() else None
     except (BadCalibration, OSError) as error:
-        return in_words(error)
+        return describe_error(error)
     finding = None if new.verdict == "good" else new.findings[0]
     if old is None or _data_of(old) != _data_of(new):
         return Comparison(None, new.verdict, finding, PARAMETER_NAMES[0], 0.0)

@@ -16,7 +16,7 @@ EVERY_S: Final = 60.0
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class FleetReading:
     """The state of a fleet as it was read last."""
 
     fleet: Fleet
@@ -30,7 +30,7 @@ class Reading:
 class Sink(Protocol):
     """Where readings go."""
 
-    def update(self, reading: Reading) -> None:
+    def update(self, reading: FleetReading) -> None:
         """Take the newest reading; returns at once. Raises `ConfigError` if the sink can never work."""
 
 
@@ -76,7 +76,7 @@ def serve(
     """
     # A store that cannot be read at the start ends the server, so that a wrong address is noticed at once.
     time = now()
-    reading = Reading(fleet_at(time), time, time)
+    reading = FleetReading(fleet_at(time), time, time)
     while True:
         for sink in sinks:
             sink.update(reading)
@@ -84,7 +84,7 @@ def serve(
         wake.clear()
         was_up, time = reading.store_up, now()
         try:
-            reading = Reading(fleet_at(time), time, time)
+            reading = FleetReading(fleet_at(time), time, time)
         except BadStore as error:
             reading = replace(reading, now=time, store_up=False)
             if was_up:

@@ -1,13 +1,14 @@
 """The state of a fleet, and its words: what the status, its page, the metrics and the messages show."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Final, Literal
 
+from ftcalib.files import JSON
 from ftcalib.rounding import counted
 from ftdrive.runs.verification_record import age_in_words
-from ftdrive.store.records import tool_in_words
+from ftdrive.store.records import StoredWeighings, tool_in_words
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,23 +21,6 @@ class BiasDrift:
     """Whether a component has begun to drift; a steady offset is none."""
     words: str
     """Such as "force bias x drifts by 0.12 N a week since 2026-03-02"; empty if `found` is false."""
-
-
-@dataclass(frozen=True, slots=True)
-class Weighings:
-    """Of one tool on its last day with weighings."""
-
-    day: str
-    """As ISO 8601, UTC."""
-    number: int
-    """Of parts that were weighed."""
-    refused: Mapping[str, int]
-    """How often nothing was weighed, by the code of the reason."""
-    last_utc: str | None
-    """When the last part was weighed; None if every weighing of that day was refused or found nothing."""
-    mass_kg: float | None
-    """Of the last part."""
-    mass_sigma_kg: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +48,8 @@ class CellState:
     temperature_C: float | None = None
     drift: BiasDrift | None = None
     """None with too few verifications."""
-    weighings: Weighings | None = None
-    """None without any in the last 90 days."""
+    weighings: StoredWeighings | None = None
+    """Of the last day with weighings; None without any in the last 90 days."""
     emulated: bool = False
     """Whether the calibration was made in an emulated cell."""
 
@@ -80,10 +64,15 @@ class CellState:
 
     def to_dict(self, now: datetime) -> dict[str, Any]:
         """Return the fields as JSON, and whether it is due."""
-        plain = {
-            key: value.isoformat() if isinstance(value, datetime) else value for key, value in asdict(self).items()
-        }
+        found = asdict(self) | {"weighings": None if self.weighings is None else _counts(self.weighings)}
+        plain = {key: value.isoformat() if isinstance(value, datetime) else value for key, value in found.items()}
         return {**plain, "is_due": self.is_due(now)}
+
+
+def _counts(day: StoredWeighings) -> dict[str, JSON]:
+    refused: dict[str, JSON] = {code: number for code, number in day.refusals.items() if number}
+    named: dict[str, JSON] = {name: getattr(day, name) for name in ("last_utc", "mass_kg", "mass_sigma_kg")}
+    return {"day": day.day, "number": day.weighings, "refused": refused, **named}
 
 
 FindingKind = Literal["payload", "temperature", "base", "overdue", "weighing"]
@@ -110,7 +99,7 @@ class Fleet:
 MOST: Final = 4
 
 
-def listed(names: Sequence[str]) -> str:
+def list_names(names: Sequence[str]) -> str:
     """Write names in a sentence, such as "a, b and c"; of many only the first."""
     shown = list(names) if len(names) <= MOST + 1 else [*names[:MOST], f"{len(names) - MOST} more"]
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"

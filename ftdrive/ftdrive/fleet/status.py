@@ -8,9 +8,9 @@ import numpy as np
 from ftcalib.after.series import drift_onset
 from ftdrive.fleet.cells import BiasChanges, Observed, when
 from ftdrive.fleet.findings import findings
-from ftdrive.fleet.state import BiasDrift, CellState, Fleet, Weighings
+from ftdrive.fleet.state import BiasDrift, CellState, Fleet
 from ftdrive.report.document import rounded
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification, StoredWeighings
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification
 from ftdrive.store.store import Store
 
 # The level of a drift is the mean of the verifications of the last week.
@@ -84,13 +84,6 @@ def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: St
         mass_kg=result.mass_kg,
         temperature_C=next((one for one in temperatures if one is not None), None),
         drift=_drift_of(observed.changes.get(result.id), calibrated),
-        weighings=_weighings(observed.weighings.get((cell.name, result.tool, result.emulated))),
+        weighings=observed.weighings.get((cell.name, result.tool, result.emulated)),
         emulated=result.emulated,
     )
-
-
-def _weighings(found: StoredWeighings | None) -> Weighings | None:
-    if found is None:
-        return None
-    refused = {code: number for code, number in found.refusals.items() if number}
-    return Weighings(found.day, found.weighings, refused, found.last_utc, found.mass_kg, found.mass_sigma_kg)

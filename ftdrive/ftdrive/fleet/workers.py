@@ -70,7 +70,7 @@ def folder_of_worker() -> str | None:
         return None
 
 
-def in_words(error: BaseException) -> str:
+def describe_error(error: BaseException) -> str:
     """Return why a call failed."""
     expected = isinstance(error, FtdriveError | OSError)
     return str(error) if expected else f"unexpected {type(error).__name__}: {error}"

@@ -18,7 +18,7 @@ from ftcalib.after.series import BiasTemperature
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
-from ftdrive.checks.belonging import belonging
+from ftdrive.checks.belonging import compare_devices
 from ftdrive.errors import ConfigError
 from ftdrive.live.loop import ProcessedStream
 from ftdrive.live.pairing import DelayEstimator, Pairing
@@ -181,7 +181,7 @@ class CompensatedStream(ProcessedStream):
             tool = calibration_of_tool(calibration, arm, sensor, mount, url=url, force=self._force)
             calibration, name, warnings = tool.calibration, str(tool.path), tool.warnings
             temperature = tool.temperature
-        belongs = belonging(calibration, {"arm": arm, "sensor": sensor}, mount)
+        belongs = compare_devices(calibration, {"arm": arm, "sensor": sensor}, mount)
         if belongs.others and not self._force:
             raise ConfigError(f"{belongs.others[0]}: calibrate this cell, or apply it all the same with --force")
         self._foreign = bool(belongs.others)

@@ -195,7 +195,7 @@ _AROUND, _ARC = 24, 6
 
 
 @contextmanager
-def shown(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array = ()) -> Iterator[str]:
+def serve_view(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array = ()) -> Iterator[str]:
     """Serve the scene to browsers on this computer while the block runs; yields its address. Needs the extra `viz`.
 
     Parameters

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
 from ftcalib.model import BIASES, jacobian
-from ftdrive.checks.belonging import belonging
+from ftdrive.checks.belonging import compare_devices
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.processing import Processor
 from ftdrive.live.samples import Block, Paired, StreamEvent, WrenchFrame
@@ -65,7 +65,7 @@ def read_with_calibration(
     reader = RecordingReader(path, columns)
     if calibration is not None:
         info = reader.header.info
-        if others := belonging(calibration, {"arm": info.arm, "sensor": info.sensor}).others:
+        if others := compare_devices(calibration, {"arm": info.arm, "sensor": info.sensor}).others:
             raise ConfigError(f"{path.name} is of other devices than the calibration: {others[0]}")
         reader.header = with_calibration(reader.header, calibration, name)
     return reader

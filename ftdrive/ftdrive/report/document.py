@@ -74,7 +74,7 @@ def capital(words: str) -> str:
     return words[:1].upper() + words[1:]
 
 
-def in_words(p_value: float) -> str:
+def p_value_in_words(p_value: float) -> str:
     """Write a probability."""
     return "< 0.0001" if p_value < 1e-4 else f"{p_value:.2g}"
 

@@ -7,7 +7,17 @@ from typing import Any
 import numpy as np
 
 from ftcalib.rounding import to_place_of, with_sigma
-from ftdrive.report.document import Figure, Section, Table, capital, flattened, in_words, label_of, rounded, shown_poses
+from ftdrive.report.document import (
+    Figure,
+    Section,
+    Table,
+    capital,
+    flattened,
+    label_of,
+    p_value_in_words,
+    rounded,
+    shown_poses,
+)
 from ftdrive.terminal.report import SIGMA_OF_THE_TOOL, axes_of, quantities_of, values_of
 
 Facts = Mapping[str, Any]
@@ -160,7 +170,7 @@ def residuals(facts: Facts) -> Section:
     text = [
         f"Residuals: force {rounded(sums['force_rms_N'])} N rms, {rounded(sums['force_max_N'])} N at most; torque "
         f"{rounded(sums['torque_rms_Nm'])} N·m rms, {rounded(sums['torque_max_Nm'])} N·m at most.",
-        f"They are {result['noise_factor']:.2f} times the measured noise (p = {in_words(result['p_value'])})."
+        f"They are {result['noise_factor']:.2f} times the measured noise (p = {p_value_in_words(result['p_value'])})."
         if result["p_value"] is not None
         else "The noise was not measured but estimated from the residuals, so their size does not test the fit.",
     ]
@@ -376,7 +386,10 @@ def comparison(facts: Facts) -> Section:
             else "Nothing changed by more than chance explains."
         )
         text.append("A bias may change from day to day; a change of anything else means another tool or mounting.")
-    groups = [(one["name"], f"{one['chi2']:.4g}", str(one["dof"]), in_words(one["p_value"])) for one in found["groups"]]
+    groups = [
+        (one["name"], f"{one['chi2']:.4g}", str(one["dof"]), p_value_in_words(one["p_value"]))
+        for one in found["groups"]
+    ]
     rows = [
         (label_of(one["name"]), f"{one['change']:+.2g}", "-" if one["sigmas"] is None else f"{one['sigmas']:+.1f}")
         for one in found["parameters"]

@@ -280,7 +280,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
 
 
 @contextmanager
-def unpacked(source: Path) -> Iterator[Path]:
+def unpack(source: Path) -> Iterator[Path]:
     """Yield the run folder in a bundle, which is deleted afterwards; any source but a .zip file as it is.
 
     Raises

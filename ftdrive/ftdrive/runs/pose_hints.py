@@ -40,7 +40,7 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Fin
     records = _in_dataset(records)
     if len(records) != result.n_poses:
         raise ValueError(f"{len(records)} records do not belong to a result of {result.n_poses} poses")
-    names, found = names_of(records), moved(records)
+    names, found = names_of(records), find_moved(records)
     if any(one.code in _CHANGES for one in result.findings):  # which explains the rest
         return tuple(found)
     odd = [row for row in _out_of_line(result) if _steady(records[row])]
@@ -67,7 +67,7 @@ def _steady(record: PoseRecord) -> bool:
     return record.steady and turned_rad(record.before, record.after) < MOVED_RAD
 
 
-def moved(records: Sequence[PoseRecord]) -> list[Finding]:
+def find_moved(records: Sequence[PoseRecord]) -> list[Finding]:
     """Name the poses that were not steady; each row of a dataset has one record."""
     found = []
     for record, name in zip(records, names_of(records), strict=True):

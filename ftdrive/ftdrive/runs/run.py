@@ -40,7 +40,7 @@ from ftcalib.model import Array
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord, TourPose
 from ftdrive import __version__
-from ftdrive.cell.config import recorded, without_password
+from ftdrive.cell.config import read_recorded, without_password
 from ftdrive.errors import ConfigError
 from ftdrive.runs.numbers import DAMAGE, append_lines, read_arrays, read_line, write_arrays
 from ftdrivers.clock import REAL, Clock
@@ -269,7 +269,7 @@ class Run:
             check_format(header, RUN_FORMAT, BadDataset)
             _require_kinds(header)
             if "config" in header:
-                header["config"] = recorded(header["config"])
+                header["config"] = read_recorded(header["config"])
         except (BadDataset, ConfigError) as error:
             raise BadDataset(f"{path}: {error}") from error
         return _Whole(path, header)

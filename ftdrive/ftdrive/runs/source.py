@@ -55,7 +55,7 @@ _UNDESCRIBED: Final = Setup()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Source:
+class RecordedData:
     """What a place holds."""
 
     dataset: CalibrationDataset
@@ -83,7 +83,7 @@ class Source:
 
 def read_source(
     source: Path, orientation: Orientation, known: Known | None = None, up_in_base: Sequence[float] | None = None
-) -> Source:
+) -> RecordedData:
     """Read the data of a place.
 
     Parameters
@@ -107,10 +107,10 @@ def read_source(
             raise BadDataset(f"{source} is a recording in motion and has no poses: solve it with {run.solve_command}")
         records = run.records()
         dataset, of_run = _dataset_of(run, records)
-        found = Source(dataset, of_run.provenance(), of_run.g_m_s2, of_run.setup, None, records, _earlier_of(run))
+        found = RecordedData(dataset, of_run.provenance(), of_run.g_m_s2, of_run.setup, None, records, _earlier_of(run))
     else:
         dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
-        found = Source(dataset, {"source": source.name, "versions": versions()})
+        found = RecordedData(dataset, {"source": source.name, "versions": versions()})
     if up_in_base is not None:
         provenance = {**found.provenance, "up_in_base": list(up_in_base)}
         found = replace(found, setup=replace(found.setup, up_in_base=up_in_base), provenance=provenance)

@@ -26,7 +26,7 @@ from ftdrive.planning.words import point_in_words, stop_in_words, turns_in_words
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
 from ftdrive.session.events import GuardTripped, Planned
-from ftdrive.session.forecast import Averages, at_most, moves_s
+from ftdrive.session.forecast import Averages, limit_speeds, moves_s
 from ftdrive.session.live_fit import Judge
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.options import SessionOptions
@@ -218,7 +218,7 @@ class _AlongPlan:
             why = f": {_NO_SERIAL}" if self._serial == NOT_REPORTED else ""
             cell.note(f"{'every' if why else 'the first'} run of a plan is slow{why}", warning=True)
         speeds = speeds_of(self.task.cell)
-        driven = at_most(plan, before.certifier, slower(speeds, SLOW) if slow else speeds)
+        driven = limit_speeds(plan, before.certifier, slower(speeds, SLOW) if slow else speeds)
         total_s = moves_s(driven, todo, before.approach)
         total_s += len(todo) * (sampling.average_s + 0.6)
         cell.note(
@@ -333,9 +333,9 @@ def _show_plan(before: Before, options: SessionOptions) -> None:
         draw(plan, before.certifier, options.png, way)
         cell.note(f"plan drawn in {options.png}")
     if options.view:
-        from ftdrive.planning.drawing import open_in_browser, shown
+        from ftdrive.planning.drawing import open_in_browser, serve_view
 
-        with shown(plan, before.certifier, way) as url:
+        with serve_view(plan, before.certifier, way) as url:
             open_in_browser(url)
             cell.journal.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
 

@@ -17,7 +17,7 @@ from ftdrive.planning.planner import guess_of
 from ftdrive.session.tour import APPROACH_RAD_S, SLOW
 
 
-def at_most(plan: Plan, certifier: Certifier, speeds: Speeds) -> Plan:
+def limit_speeds(plan: Plan, certifier: Certifier, speeds: Speeds) -> Plan:
     """Return a plan with its speeds reduced to these limits."""
     q = np.array([step.q_rad for step in plan.steps])
     allowed = speed_of_leading_joint(certifier.arm, q, np.roll(q, -1, axis=0), speeds)

@@ -17,7 +17,7 @@ from ftdrive.cell.config import CellConfig
 from ftdrive.checks import arm as of_arm
 from ftdrive.checks import computer
 from ftdrive.checks.arm import check_arm, check_remote, check_safety, check_speed
-from ftdrive.checks.check import Check, merged
+from ftdrive.checks.check import Check, merge_checks
 from ftdrive.checks.sensor import check_level, check_load, check_rate, check_rest
 from ftdrive.errors import NotAccepted, PlanRefused
 from ftdrive.planning.approach import Approach
@@ -116,7 +116,7 @@ def _check_sensor(before: Before) -> Check:
     """Check that all six axes are alive, at the nominal rate."""
     wrench = before.quiet.wrench
     rate = check_rate(len(wrench) / LISTEN_S, before.cell.sensor.health().nominal_rate_Hz)
-    return merged("sensor", [rate, check_level(wrench)])
+    return merge_checks("sensor", [rate, check_level(wrench)])
 
 
 def _check_load(before: Before) -> Check:
@@ -124,7 +124,7 @@ def _check_load(before: Before) -> Check:
     limits, config = before.sensor_range, before.config
     is_arbitrary = before.cell.sensor.identify().has_arbitrary_zero
     rest = check_rest(before.quiet.wrench, limits, config, zero_is_arbitrary=is_arbitrary)
-    return merged("load", [check_load(limits, config), rest])
+    return merge_checks("load", [check_load(limits, config), rest])
 
 
 def _check_workcell(before: Before) -> Check:

@@ -10,7 +10,7 @@ import numpy as np
 from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.checks.belonging import belonging
+from ftdrive.checks.belonging import compare_devices
 from ftdrive.errors import ConfigError, Declined, PlanRefused
 from ftdrive.runs.run import Mode, Run
 from ftdrive.runs.source import Outcome, solve_and_save
@@ -45,7 +45,7 @@ def _require_devices(
     PlanRefused
         As `_require_same_devices`.
     """
-    belongs = None if calibration is None else belonging(calibration, connected, config.mount)
+    belongs = None if calibration is None else compare_devices(calibration, connected, config.mount)
     if belongs is not None and belongs.others:
         raise ConfigError(f"{belongs.others[0]}: calibrate this cell")
     if run is not None:

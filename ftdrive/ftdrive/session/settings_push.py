@@ -17,7 +17,7 @@ from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.checks import computer
 from ftdrive.checks.arm import check_arm, check_remote, check_safety
-from ftdrive.checks.belonging import belonging
+from ftdrive.checks.belonging import compare_devices
 from ftdrive.checks.flange_load import FlangeLoad, flange_load
 from ftdrive.checks.sensor import check_level
 from ftdrive.errors import ConfigError, NotAccepted
@@ -88,7 +88,7 @@ def propose(
         raise NotAccepted(f"{name} is rejected ({'; '.join(result.reasons)}): calibrate again")
     mass_kg, height_m = _sensor_of(cell)
     connected = {"arm": arm.identify(), "sensor": sensor.identify()}
-    if others := belonging(result, connected, cell.sensor.mount).others:
+    if others := compare_devices(result, connected, cell.sensor.mount).others:
         raise NotAccepted(f"{others[0]}: push the calibration of this cell")
     _require_ready(cell, arm)
     load, old = flange_load(result, mass_kg, height_m), arm.controller_settings()

@@ -176,7 +176,7 @@ def user_folder() -> Path:
     return folder / "ftdrive"
 
 
-def summed(days: Iterable[StoredWeighings]) -> list[StoredWeighings]:
+def sum_up(days: Iterable[StoredWeighings]) -> list[StoredWeighings]:
     """Sum up the files of each tool and arm, and keep the last weighing; the oldest first.
 
     A tool has several files on a day if it was calibrated meanwhile.

@@ -21,7 +21,7 @@ from ftdrive.store.records import (
     StoredWeighings,
     read_records,
     record_paths,
-    summed,
+    sum_up,
 )
 
 # For another writer.
@@ -179,7 +179,7 @@ class Store:
 
     def last_weighings(self, since_day: str, tool: str | None = None) -> list[StoredWeighings]:
         """Return the last day with weighings of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
-        return summed(self._read(_last_weighings(since_day, tool), database.to_weighings))
+        return sum_up(self._read(_last_weighings(since_day, tool), database.to_weighings))
 
     def cells(self) -> list[StoredCell]:
         """Return all cells by name."""
@@ -207,7 +207,7 @@ class Store:
             found = _rows(connection, checks, database.to_check)
             weighings = _rows(connection, _last_weighings(start[:10]), database.to_weighings)
         cells.sort(key=lambda cell: cell.name)
-        return cells, results, sorted(found, key=lambda check: check.created_utc), summed(weighings)
+        return cells, results, sorted(found, key=lambda check: check.created_utc), sum_up(weighings)
 
     def _read(self, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
         with self._current.reading() as connection:

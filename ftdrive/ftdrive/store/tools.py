@@ -7,7 +7,7 @@ from pathlib import Path
 from ftcalib import CalibrationResult
 from ftcalib.after.series import BiasTemperature
 from ftcalib.errors import BadCalibration
-from ftdrive.checks.belonging import belonging
+from ftdrive.checks.belonging import compare_devices
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.store import Store
@@ -73,7 +73,7 @@ def calibration_of_tool(
     )
     ours = [one for one in accepted if _may_belong(one, arm, sensor)]
     for one in (one for one in ours if one.tool == name):
-        if (loaded := _load(one)) and not belonging(loaded, {"arm": arm, "sensor": sensor}, mount).others:
+        if (loaded := _load(one)) and not compare_devices(loaded, {"arm": arm, "sensor": sensor}, mount).others:
             found = _temperature(store, one, results)
             return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)), found)
     if force:

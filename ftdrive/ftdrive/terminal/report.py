@@ -13,7 +13,7 @@ from ftcalib import CalibrationResult
 from ftcalib.compare import MethodResult
 from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
-from ftdrive.runs.pose_hints import hints, moved, names_of
+from ftdrive.runs.pose_hints import find_moved, hints, names_of
 from ftdrive.runs.verified import FALSE_ALARMS, Verified
 from ftdrive.terminal.console import answer, hanging, messages
 from ftdrivers.interfaces import Array
@@ -383,7 +383,7 @@ def print_verification(verified: Verified) -> None:
     answer.print(hanging(Text.assemble(" ", verdict, "  "), verdict_in_words(verified), answer))
     if not found.passed:
         answer.print(hanging("   ", found.reason, answer), style="yellow")
-    for finding in moved(verified.records):
+    for finding in find_moved(verified.records):
         answer.print(hanging(" ? ", finding.words, answer), style="yellow")
     if verified.drift is not None:
         words, bad = drift_in_words(verified.drift)

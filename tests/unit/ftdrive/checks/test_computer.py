@@ -11,7 +11,7 @@ import pytest
 
 from ftdrive.cell import config
 from ftdrive.checks import computer as checks
-from ftdrive.checks.check import Check, merged, verdict
+from ftdrive.checks.check import Check, merge_checks, verdict
 from ftdrive.checks.computer import SensorAddress
 from ftdrivers.errors import BadUrl
 
@@ -258,6 +258,6 @@ def test_merged_checks_say_what_the_worst_found() -> None:
         Check("b", "warning", "slow", "wait"),
         Check("c", "failed", "dead", "go"),
     )
-    assert merged("x", [fine, fine]) == Check("x", "ok", "1 Hz, 1 Hz")
-    assert merged("x", [fine, slow, slow]) == Check("x", "warning", "slow, slow", "wait; wait")
-    assert merged("x", [dead, slow, fine]) == Check("x", "failed", "dead", "go")
+    assert merge_checks("x", [fine, fine]) == Check("x", "ok", "1 Hz, 1 Hz")
+    assert merge_checks("x", [fine, slow, slow]) == Check("x", "warning", "slow, slow", "wait; wait")
+    assert merge_checks("x", [dead, slow, fine]) == Check("x", "failed", "dead", "go")

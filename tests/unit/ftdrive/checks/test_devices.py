@@ -434,9 +434,9 @@ def test_a_calibration_of_another_model_is_of_another_sensor_without_serial_numb
 def test_a_calibration_that_does_not_know_its_sensor_cannot_be_checked(devices: object) -> None:
     result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
     for serial in ("FT12345", NOT_REPORTED):
-        (words,) = of_belonging.belonging(result, {"sensor": device(serial)}).unknown
+        (words,) = of_belonging.compare_devices(result, {"sensor": device(serial)}).unknown
         assert "was made with" in words
-        assert not of_belonging.belonging(result, {"sensor": device(serial)}).others
+        assert not of_belonging.compare_devices(result, {"sensor": device(serial)}).others
 
 
 ALLOWED = Check("permissions.port", "ok", "may be read and written")

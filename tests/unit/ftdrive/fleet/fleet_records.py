@@ -19,7 +19,7 @@ from ftdrive.store.records import (
     StoredResult,
     StoredVerification,
     StoredWeighings,
-    summed,
+    sum_up,
 )
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.live.simulated import calibrated
@@ -143,7 +143,7 @@ class FakeStore:
     def fleet(
         self, newest: int, since: datetime
     ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[StoredWeighings]]:
-        return self.cells(), self._newest_accepted(newest), self._checks(since), summed(self.kept_weighings)
+        return self.cells(), self._newest_accepted(newest), self._checks(since), sum_up(self.kept_weighings)
 
     def _newest_accepted(self, most: int) -> list[StoredResult]:
         found = sorted(self.kept_results, key=lambda one: (one.created_utc or "", one.id), reverse=True)

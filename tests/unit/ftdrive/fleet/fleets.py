@@ -3,7 +3,7 @@
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from ftdrive.fleet.serve import Reading
+from ftdrive.fleet.serve import FleetReading
 from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
@@ -41,6 +41,6 @@ def fleet(*cells: CellState, findings: tuple[FleetFinding, ...] = ()) -> Fleet:
     return Fleet(cells, findings)
 
 
-def reading(*cells: CellState, findings: tuple[FleetFinding, ...] = (), store_up: bool = True) -> Reading:
+def reading(*cells: CellState, findings: tuple[FleetFinding, ...] = (), store_up: bool = True) -> FleetReading:
     """A reading of a moment ago."""
-    return Reading(Fleet(cells, findings), NOW, NOW, store_up)
+    return FleetReading(Fleet(cells, findings), NOW, NOW, store_up)

@@ -14,7 +14,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.fleet.metrics import NAMES, MetricsServer
-from ftdrive.fleet.state import FleetFinding, Weighings
+from ftdrive.fleet.state import FleetFinding
+from tests.unit.ftdrive.fleet.fleet_records import weighed
 from tests.unit.ftdrive.fleet.fleets import DRIFTING, NOW, cell, never_calibrated, reading
 
 pytestmark = pytest.mark.usefixtures("quick_shutdown")
@@ -91,8 +92,8 @@ def test_every_field_of_a_cell_is_a_metric_and_what_is_unknown_is_absent(server:
 
 def test_weighings_are_a_mass_a_time_and_counters(server: MetricsServer) -> None:
     at = NOW - timedelta(hours=1)
-    some = Weighings("2026-11-22", 40, {"cable": 3, "contact": 1}, at.isoformat(), 0.25, 1e-3)
-    none = Weighings("2026-11-22", 0, {"cable": 5}, None, None, None)
+    some = weighed("A", 0, weighings=40, refusals={"cable": 3, "contact": 1}, last_utc=at.isoformat())
+    none = weighed("A", 0, weighings=0, refusals={"cable": 5}, last_utc=None, mass_kg=None, mass_sigma_kg=None)
     server.update(reading(cell("A", weighings=some), cell("B", weighings=none), cell("C")))
     found = samples(server)
     assert {name: value for name, value in found.items() if name[0].startswith("ftdrive_weighing_")} == {
@@ -139,7 +140,7 @@ def test_names_and_units_are_those_prometheus_asks_for(server: MetricsServer) ->
     promtool = shutil.which("promtool")
     if promtool is None:
         pytest.skip("promtool is not installed")
-    weighings = Weighings("2026-11-22", 40, {"cable": 3}, NOW.isoformat(), 0.25, 1e-3)
+    weighings = weighed("A", 0, weighings=40, refusals={"cable": 3}, last_utc=NOW.isoformat())
     server.update(reading(cell("A", temperature_C=30.0, weighings=weighings)))
     command = [promtool, "check", "metrics"]
     checked = subprocess.run(command, input=scraped(server), capture_output=True, text=True, check=False)

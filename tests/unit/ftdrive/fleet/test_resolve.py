@@ -18,7 +18,7 @@ from ftdrive.fleet.resolve import (
     is_calibration,
     run_folders,
     solve_again,
-    solved,
+    solve_task,
     solved_path,
     task_of,
 )
@@ -58,7 +58,7 @@ def test_the_result_is_that_of_the_run_and_replaces_nothing(tmp_path: Path) -> N
     assert new.provenance == {**own.provenance, "created_utc": FIRST.isoformat(), "run": "run"}
     assert new.provenance["setup"]["tool"] == "gripper"
     assert (folder / "calibration.json").read_bytes() == before
-    assert solved_path(folder).read_bytes() == solved(*task_of(folder))
+    assert solved_path(folder).read_bytes() == solve_task(*task_of(folder))
 
 
 def test_a_run_in_motion_is_solved_here_and_from_its_files_to_the_same_bytes(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from threading import Event
 import pytest
 
 from ftdrive.errors import BadStore
-from ftdrive.fleet.serve import EVERY_S, Reading, serve
+from ftdrive.fleet.serve import EVERY_S, FleetReading, serve
 from ftdrive.fleet.state import Fleet
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fleet.fleets import NOW, cell, fleet
@@ -18,7 +18,7 @@ class Served:
 
     def __init__(self, *answers: Fleet | Exception, on_update: Callable[["Served"], None] = lambda _: None) -> None:
         self.clock, self.wake = FakeClock(), Event()
-        self.readings: list[tuple[float, Reading]] = []
+        self.readings: list[tuple[float, FleetReading]] = []
         self.said: list[str] = []
         self._answers = [*answers, KeyboardInterrupt()]
         self._on_update, self._start_s = on_update, self.clock.now_s()
@@ -27,7 +27,7 @@ class Served:
     def t_s(self) -> float:
         return self.clock.now_s() - self._start_s
 
-    def update(self, reading: Reading) -> None:
+    def update(self, reading: FleetReading) -> None:
         self.readings.append((self.t_s, reading))
         self._on_update(self)
 

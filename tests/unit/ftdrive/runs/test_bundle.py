@@ -23,7 +23,7 @@ from ftdrive.cli import cli
 from ftdrive.cli import run as run_command
 from ftdrive.errors import BadBundle
 from ftdrive.runs import bundle
-from ftdrive.runs.bundle import Bundled, unpacked, write_bundle
+from ftdrive.runs.bundle import Bundled, unpack, write_bundle
 from ftdrive.runs.run import Reading, Run
 from ftdrive.runs.source import solve_and_save
 from ftdrivers.interfaces import FtSamples
@@ -103,7 +103,7 @@ def test_a_bundle_gives_the_result_of_its_run_to_the_last_digit(run: Run, bundle
         assert {key: again[key] for key in expected if key != "provenance"} == {
             key: value for key, value in expected.items() if key != "provenance"
         }
-    with unpacked(path) as folder:
+    with unpack(path) as folder:
         assert len(Run(folder).records()) == 8
     assert not folder.exists()
 
@@ -188,7 +188,7 @@ def test_a_hostile_or_damaged_bundle_is_refused(
 ) -> None:
     monkeypatch.setattr(bundle, "MOST_BYTES", 1_000_000)
     path = zipped(tmp_path / "a.zip", files)
-    with pytest.raises(BadBundle, match=words), unpacked(path):
+    with pytest.raises(BadBundle, match=words), unpack(path):
         pass
     assert [file.name for file in tmp_path.iterdir()] == ["a.zip"]
 
@@ -197,7 +197,7 @@ def test_arrays_that_unpack_to_too_much_are_refused(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(bundle, "MOST_BYTES", 1_000_000)
     np.savez_compressed(inner := io.BytesIO(), wrench=np.zeros(200_000))
     files = {"bundle.json": ABOUT, "r/run.json": "{}", "r/poses/01.npz": inner.getvalue()}
-    with pytest.raises(BadBundle, match="do not use"), unpacked(zipped(tmp_path / "a.zip", files)):
+    with pytest.raises(BadBundle, match="do not use"), unpack(zipped(tmp_path / "a.zip", files)):
         pass
 
 
@@ -252,7 +252,7 @@ def test_a_flipped_bit_is_refused_or_changes_no_number(run: Run, bundled: tuple[
         damaged[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(damaged)
         try:
-            with unpacked(path) as folder:
+            with unpack(path) as folder:
                 found = Run(folder)
                 assert [record.samples.wrench.tolist() for record in found.records()] == [w.tolist() for w in wrenches]
                 assert found.header()["config"]["site"] == {"g_m_s2": 9.81}
@@ -268,7 +268,7 @@ def test_a_bundle_of_a_damaged_run_keeps_the_damage_visible(run: Run, tmp_path: 
     path = folder / "run.json"
     path.write_text(path.read_text().replace("9.81", "9.83"))
     write_bundle(folder, tmp_path / "a.zip")
-    with unpacked(tmp_path / "a.zip") as found, pytest.raises(BadDataset, match="differs from its checksum"):
+    with unpack(tmp_path / "a.zip") as found, pytest.raises(BadDataset, match="differs from its checksum"):
         Run(found).header()
 
 

@@ -12,7 +12,7 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
-from ftdrive.session.forecast import at_most, moves_s
+from ftdrive.session.forecast import limit_speeds, moves_s
 from ftdrive.session.tour import APPROACH_RAD_S, SLOW
 
 
@@ -46,10 +46,10 @@ def test_the_rest_of_a_tour_counts_what_is_left_and_the_ways_past_what_is_not(ce
 
 
 def test_limits_in_force_slow_a_plan_down_and_never_speed_it_up(certifier: Certifier, plan: Plan) -> None:
-    slow = at_most(plan, certifier, Speeds(0.2, 0.3, 0.1))
+    slow = limit_speeds(plan, certifier, Speeds(0.2, 0.3, 0.1))
     assert max(step.speed_rad_s for step in slow.steps) <= 0.2
     assert slow.acceleration_rad_s2 == 0.3
-    assert at_most(slow, certifier, Speeds()) == slow
+    assert limit_speeds(slow, certifier, Speeds()) == slow
 
 
 def test_not_even_the_settings_of_an_old_run_go_faster_than_allowed() -> None:

@@ -326,7 +326,7 @@ def test_the_browser_is_waited_for(lab: Lab, monkeypatch: pytest.MonkeyPatch) ->
         yield "http://here"
         served.append("closed")
 
-    monkeypatch.setattr(drawing, "shown", shown)
+    monkeypatch.setattr(drawing, "serve_view", shown)
     monkeypatch.setattr(drawing, "open_in_browser", served.append)
     lab.operator.answers["http://here"] = ["yes", "no"]
     assert lab.take_poses(dry_run=True, view=True) is None

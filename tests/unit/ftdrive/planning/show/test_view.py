@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ftdrive.errors import ConfigError
-from ftdrive.planning.drawing import describe, path, revolved, shown, turned_up
+from ftdrive.planning.drawing import describe, path, revolved, serve_view, turned_up
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
@@ -85,10 +85,10 @@ def test_straight_down_is_a_direction_too() -> None:
 
 def test_a_page_on_this_computer_or_what_to_install(plan: Plan, certifier: Certifier) -> None:
     if find_spec("viser") is None:
-        with pytest.raises(ConfigError, match=r"ftdrive\[viz\]"), shown(plan, certifier):
+        with pytest.raises(ConfigError, match=r"ftdrive\[viz\]"), serve_view(plan, certifier):
             pass
         return
-    with shown(plan, certifier) as url:
+    with serve_view(plan, certifier) as url:
         assert url.startswith("http://127.0.0.1:")
         with urllib.request.urlopen(url, timeout=10) as page:
             assert b"<html" in page.read()
