@@ -105,7 +105,6 @@ _TYPES = {**_TYPES, str | None: _TYPES[str], float | None: _TYPES[float]}
 
 
 def _unless(fits: Callable[[Any], bool], fix: str) -> Reject:
-    """Reject values that do not fit."""
     return lambda value: None if fits(value) else fix
 
 

@@ -212,7 +212,6 @@ def _check_clock(arm: RobotArm, clock: Clock) -> Check:
 def _examine_sensor(
     device: ForceTorqueSensor, address: SensorAddress, cell: CellConfig, mass_kg: float, blame: Blame, stack: ExitStack
 ) -> tuple[list[Check], bool]:
-    """Return the checks of the sensor, and whether it streams."""
     found: list[Check] = []
     name = "sensor.identity"
     try:

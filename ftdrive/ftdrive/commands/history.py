@@ -188,7 +188,6 @@ def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime)
 
 
 def _print_table(rows: Sequence[Sequence[str]]) -> None:
-    """Print the columns that every table has, and those that a result has."""
     from ftdrive.terminal.text import print_table
 
     shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]

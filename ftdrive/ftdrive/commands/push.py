@@ -113,6 +113,5 @@ def push(
 
 
 def _emulated_cell(of: CalibrationResult | Receipt, sensor: str | None, stack: ExitStack) -> CellConfig:
-    """Start the emulated cell of a calibration, or any."""
     made_by = of.provenance.get("station") if isinstance(of, CalibrationResult) else None
     return stack.enter_context(Station.of(made_by, sensor)).cell

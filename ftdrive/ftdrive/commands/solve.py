@@ -208,8 +208,6 @@ def solve(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Wanted:
-    """What is solved, and how."""
-
     method: str
     orientation: Orientation
     known: Known | None

@@ -231,7 +231,6 @@ def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Pat
 
 
 def _wants_update(verified: "Verified", update: Answer, *, as_json: bool) -> bool:
-    """Whether to save the update; without an answer, no."""
     from ftdrive.errors import Declined
     from ftdrive.session.events import Question
     from ftdrive.terminal.console import messages

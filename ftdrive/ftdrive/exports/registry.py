@@ -217,7 +217,6 @@ def _lossless(calibration: CalibrationResult, target: Format) -> Iterator[str]:
 
 
 def _in_words(value: JSON) -> str:
-    """Write a value of `elsewhere` for people."""
     if isinstance(value, Mapping):
         return f"({', '.join(f'{name} {_in_words(one)}' for name, one in value.items())})"
     if isinstance(value, list):

@@ -78,7 +78,6 @@ def _plot(changes: BiasChanges, start: datetime, now: datetime) -> str:
 
 
 def _words(state: CellState, now: datetime) -> dict[str, str]:
-    """Return what the columns show."""
     drift = state.drift
     return {
         "age": "-" if state.calibrated is None else age_in_words(now - state.calibrated),

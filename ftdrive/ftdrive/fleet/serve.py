@@ -35,7 +35,6 @@ class Sink(Protocol):
 
 
 def _utc_now() -> datetime:
-    """Return the time of this computer, UTC."""
     return datetime.now(UTC)
 
 

@@ -240,7 +240,6 @@ def _round(
 
 
 def _each(function: Callable[..., bytes], calls: Sequence[Iterable[Any]]) -> list[Answer]:
-    """Call a function with each of several arguments, in a worker."""
     return [_answer(function, call) for call in calls]
 
 

@@ -222,7 +222,6 @@ def serve_view(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Arra
 
 
 def _gate(behind: tuple[str, int]) -> Gate:
-    """Return a gate at the usual port, or at a free one if that is in use."""
     try:
         return Gate((HOST, PORT), lambda _: behind)
     except OSError:

@@ -107,7 +107,6 @@ def _attempts(certifier: Certifier, q_now: Array, poses: int, speeds: Speeds, gu
 
 
 def _reason(poses: int) -> str:
-    """Return why the plan is not the constant tour."""
     if poses == 24:
         return "The constant tour cannot be proven clear at the present posture"
     return f"{poses} of the 24 orientations were requested"

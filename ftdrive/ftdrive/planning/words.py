@@ -117,7 +117,6 @@ def _summary(plan: Plan) -> list[str]:
 
 
 def _accuracy(plan: Plan) -> str:
-    """Return the predicted accuracy of a calibration from these poses."""
     sigma, guess = plan.predicted, plan.description["guess"]
     tilt_deg = np.degrees(_largest([sigma["tilt_alpha_rad"], sigma["tilt_beta_rad"]]))
     return (

@@ -330,7 +330,6 @@ def _motion(subject: Subject) -> dict[str, Any] | None:
 
 
 def _tour(run: Run, stops: int) -> dict[str, Any]:
-    """Return settings and devices of a run, and what its plan predicted."""
     header = run.header()
     plan, why_not = None, ""
     if run.plan_path.is_file():
@@ -352,5 +351,4 @@ def _tour(run: Run, stops: int) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Copy nested mappings as plain ones."""
     return {str(k): _plain(v) for k, v in value.items()} if isinstance(value, Mapping) else value

@@ -57,7 +57,6 @@ def _of_store(calibration_id: str, url: Callable[[], str | None]) -> tuple[Any, 
 
 
 def _plain(one: Any) -> dict[str, Any]:
-    """Return the fields that a `VerificationRecord` and a `StoredVerification` share."""
     at = one.created_utc if isinstance(one.created_utc, datetime) else datetime.fromisoformat(one.created_utc)
     return {
         "created_utc": at.astimezone(UTC).isoformat(),

@@ -432,7 +432,6 @@ def made_now() -> dict[str, Any]:
 
 
 def _command_line() -> list[str]:
-    """Return the command line without passwords in addresses."""
     return [without_password(word) for word in sys.argv]
 
 

@@ -283,7 +283,6 @@ class _AlongPlan:
         return guards.ContactGuard(self.cell.limits, heaviest_kg, reach_m, acceleration_rad_s2, pace.quiet_std, predict)
 
     def _keep_plan(self, plan: Plan) -> Run:
-        """Create the run, with the plan in it."""
         run = self._session.new_run()
         plan.save(run.plan_path)
         self.cell.journal.keep_in(run)

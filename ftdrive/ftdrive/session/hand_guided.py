@@ -219,7 +219,6 @@ class HandGuided:
             self._clock.sleep(LOOK_S)
 
     def _may_measure(self) -> bool:
-        """Whether a standstill now may be measured."""
         status = self._ask(self._arm.status)
         fault = str(status.fault or "")
         if fault and fault != self._fault:
@@ -321,7 +320,6 @@ class HandGuided:
 
     @property
     def _may_finish(self) -> bool:
-        """Whether the operator may end with k."""
         return self._light == "green" and not (self._listen or self._ends_by_itself)
 
     def _learn(self, record: PoseRecord, judged: Estimated | Compared) -> None:
@@ -351,7 +349,6 @@ class HandGuided:
         return touched
 
     def _note_unrest(self, stop: int, samples: FtSamples, advice: str) -> None:
-        """Show what is not quiet in a dwell."""
         unrest, wrench = "its mean still changes", samples.wrench
         if self._level is not None:
             for c in np.flatnonzero(restless_channels(wrench, self._level))[:1]:

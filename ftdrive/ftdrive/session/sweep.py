@@ -159,7 +159,6 @@ class SweepTour(Tour):
             self._confirm(self._begin_words)
 
     def _rest(self, centre: np.ndarray) -> None:
-        """Record the arm at rest, under guard."""
         clock = self._watcher.clock
         self._arm.wait_until_still(timeout_s=self._pace.sampling.still_timeout_s, guard=self._between_looks)
         with self._watcher.watching(centre, centre, moving=False):

@@ -308,7 +308,6 @@ class Database:
 
     @contextmanager
     def _in_words(self, verb: str) -> Iterator[None]:
-        """Turn an error of the database into one sentence."""
         try:
             yield
         except (DBAPIError, OSError) as error:

@@ -28,7 +28,6 @@ T = TypeVar("T")
 
 
 def _ENGINE(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options `workers` and `cluster`."""
     for option in (
         click.option("--cluster", metavar="dask://HOST:PORT", help="Compute on this Dask cluster instead."),
         click.option(
@@ -50,7 +49,6 @@ def _open_workers(workers: int | None, cluster: str | None) -> AbstractContextMa
 
 
 def _with_progress(title: str, found: Iterator[T], total: int) -> Iterator[T]:
-    """Show a progress bar on stderr."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from ftdrive.terminal.console import messages
@@ -171,8 +169,6 @@ def _mention_incomplete(paths: Sequence[Path]) -> None:
 
 @dataclass(slots=True)
 class _Compensated:
-    """What became of the recordings."""
-
     recordings: int
     before: int
     compensated: list[dict[str, Any]] = field(default_factory=list)
@@ -284,8 +280,6 @@ def _time(since: str) -> datetime:
 
 @dataclass(slots=True)
 class _Solved:
-    """What became of the runs."""
-
     runs: int
     solved_before: int
     unchanged: int = 0

@@ -156,7 +156,6 @@ def serve(address: str, broker_url: str | None, url: str | None) -> None:
 
 
 def _page(store: "Store") -> str:
-    """Return the page of the fleet as it is now."""
     from datetime import UTC, datetime
 
     from ftdrive.fleet.cells import Observed

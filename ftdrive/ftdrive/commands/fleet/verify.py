@@ -124,7 +124,6 @@ def _described(one: "StoredCell") -> "CellConfig":
 
 
 def _calibration(one: "StoredCell", tool: str, store: "Store", fleet: "Fleet") -> Path:
-    """Return the newest accepted calibration of a tool of a cell."""
     for state in fleet.cells:
         if (state.cell, state.tool) == (one.name, tool) and state.calibration_id is not None:
             found = [result for result in store.find(state.calibration_id) if result.id == state.calibration_id]

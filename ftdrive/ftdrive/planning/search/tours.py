@@ -84,7 +84,6 @@ def clear_tour(certifier: Certifier, q_rad: Array, group: Nodes, speeds: Speeds)
 def _tour_of(
     certifier: Certifier, proof: "_Proof", q_rad: Array, group: Nodes, known_as: Nodes, speeds: Speeds
 ) -> Nodes | None:
-    """Find a clear tour through some of the nodes of a proof."""
     count = len(q_rad) if len(q_rad) <= FEW else NEAREST_OF_EACH
     near, count = (group, count) if group.max() < MANY_GROUPS else (np.zeros_like(group), NEAREST_OF_ALL)
     part = proof.parts(known_as, *_to_every_group(proof.shapes[proof.of[known_as]], near, count))
