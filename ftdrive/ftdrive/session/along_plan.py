@@ -26,7 +26,7 @@ from ftdrive.planning.words import point_in_words, stop_in_words, turns_in_words
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
 from ftdrive.session.events import GuardTripped, Planned
-from ftdrive.session.forecast import Averages, limit_speeds, moves_s
+from ftdrive.session.forecast import limit_speeds, moves_s, rms_sigma
 from ftdrive.session.live_fit import Judge
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.options import SessionOptions
@@ -212,7 +212,9 @@ class _AlongPlan:
         if plan.sweep is not None:
             return sweep_pace(before, slow=self.options.real and not before.known)
         sampling, sigma = _chosen_sampling(before, todo)
-        cell.note(self.task.forecast(Averages(plan, before.certifier, sampling.average_s, sigma)))
+        force_N, torque_Nm = rms_sigma(sigma)
+        noise = f"sigma of {sampling.average_s:g} s averages: {force_N:.2g} N, {torque_Nm:.2g} N·m"
+        cell.note("; ".join(filter(None, (noise, self.task.forecast(plan, before.certifier, sigma)))))
         slow = self._is_slow(before)
         if self.options.fast and slow:
             why = f": {_NO_SERIAL}" if self._serial == NOT_REPORTED else ""

@@ -1,7 +1,7 @@
 """Forecast of a tour: its speeds, its duration, and its accuracy with the noise of this sensor."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -53,45 +53,24 @@ def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:
     return total_s
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Averages:
-    """The averages that a session will take."""
-
-    plan: Plan
-    certifier: Certifier
-    average_s: float
-    sigma: Array
-    """(6,) standard deviation of one, as measured, N and N·m."""
-
-    @property
-    def rms_sigma(self) -> tuple[float, float]:
-        """Standard deviation of one axis: force, N, and torque, N·m."""
-        force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (self.sigma[:3], self.sigma[3:]))
-        return force_N, torque_Nm
-
-    def __str__(self) -> str:
-        """Describe them."""
-        force_N, torque_Nm = self.rms_sigma
-        return f"sigma of {self.average_s:g} s averages: {force_N:.2g} N, {torque_Nm:.2g} N·m"
+def rms_sigma(sigma: Array) -> tuple[float, float]:
+    """Return one standard deviation of one axis, force in N and torque in N·m, from those of all six axes."""
+    force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
+    return force_N, torque_Nm
 
 
-def prediction(averages: Averages, mass_kg: float | None, *, assumed: bool) -> str:
-    """Describe the accuracy of a calibration from such averages.
+def predict_accuracy(plan: Plan, certifier: Certifier, sigma: Array, mass_kg: float | None, *, assumed: bool) -> str:
+    """Describe the accuracy of a calibration from averages with one standard deviation `sigma` (6,), N and N·m.
 
-    Parameters
-    ----------
-    mass_kg : float or None
-        Of the tool.
-    assumed : bool
-        It is not configured.
+    `assumed` says that the mass of the tool is not configured.
     """
-    force_N, torque_Nm = averages.rms_sigma
-    guess = replace(guess_of(averages.certifier, mass_kg), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
-    found = predicted_sigma(np.array([step.R_base_flange for step in averages.plan.steps]), guess)
+    force_N, torque_Nm = rms_sigma(sigma)
+    guess = replace(guess_of(certifier, mass_kg), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
+    found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
     mass_g = 1e3 * np.hypot(found.sigma["mass_kg"], LEAST_COMMON_GAIN * guess.mass_kg)
     mass = f"{guess.mass_kg:g} kg" + (" (assumed: [tool] mass_kg is not set)" if assumed else "")
     return (
-        f"{averages}; predicted from that for {mass}, one sigma: mass {mass_g:.2g} g, "
+        f"predicted from that for {mass}, one sigma: mass {mass_g:.2g} g, "
         f"force bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
         f"{found.torque_rms_Nm:.2g} N·m"
     )

@@ -18,7 +18,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import NUMBERS
 from ftdrive.planning.search.nodes import constant_tour
 from ftdrive.runs.run import Run
-from ftdrive.session.forecast import Averages, prediction
+from ftdrive.session.forecast import predict_accuracy
 from ftdrive.session.live_fit import Judge, RunningFit
 from ftdrive.session.open_cell import OpenCell
 from ftdrive.session.options import SessionOptions
@@ -60,8 +60,8 @@ class Task(Protocol):
     def learner(self) -> FreeTool | None:
         """Return what learns the wrench of a free tool in motion; None where the poses show it."""
 
-    def forecast(self, averages: Averages) -> str:
-        """Describe what such averages can show."""
+    def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
+        """Describe what averages with one standard deviation `sigma` (6,) can show; empty if that is not known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,9 +138,9 @@ class Calibrating:
             return None
         return FreeTool(down_of(self.cell.workcell.mounting), self.cell.tool.mass_kg or _HEAVIEST_KG)
 
-    def forecast(self, averages: Averages) -> str:
+    def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
         """Describe the sigmas of the result; those of a new tool depend on the earlier result too."""
-        if averages.plan.kind == "tool":
-            return str(averages)
+        if plan.kind == "tool":
+            return ""
         mass_kg = self.cell.tool.mass_kg
-        return prediction(averages, mass_kg, assumed=self.real and not mass_kg)
+        return predict_accuracy(plan, certifier, sigma, mass_kg, assumed=self.real and not mass_kg)

@@ -22,7 +22,6 @@ from ftdrive.planning.search.nodes import WRIST_6_RAD
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification_record import fitted_dataset
 from ftdrive.session.events import Compared
-from ftdrive.session.forecast import Averages
 from ftdrive.session.live_fit import Judge
 from ftdrive.session.task import from_usual_wrist
 
@@ -85,10 +84,10 @@ class Verifying:
         """Return who compares each pose with the calibration."""
         return RunningComparison(self.calibration, self.R_fitted if by_hand else np.zeros((0, 3, 3)), self.poses)
 
-    def forecast(self, averages: Averages) -> str:
+    def forecast(self, _plan: Plan, _certifier: Certifier, _sigma: Array, /) -> str:
         """Describe how far poses of an unchanged cell may be from the prediction."""
         error_N, error_Nm = self.calibration.likely_error()
-        return f"{averages}; error of the calibration: {error_N:.2g} N, {error_Nm:.2g} N·m"
+        return f"error of the calibration: {error_N:.2g} N, {error_Nm:.2g} N·m"
 
     def _earlier(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan | None:
         """Find a plan that was driven before: it may have been completed, so that it may run fast."""
