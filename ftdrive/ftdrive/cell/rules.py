@@ -23,7 +23,7 @@ class Rule:
     unit: str
     between: tuple[float, float] | None
     option: str
-    """Of `ftdrive init`, which asks for it."""
+    """Option of `ftdrive init`, which asks for it."""
     reject: Reject
 
     @property

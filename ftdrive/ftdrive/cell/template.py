@@ -8,7 +8,7 @@ from typing import Any
 
 from ftdrive.cell.config import FORMAT, RULES, SECTIONS, CellConfig, as_toml
 
-# Of the lines of a file.
+# Longest line of a file.
 WIDTH = 120
 
 

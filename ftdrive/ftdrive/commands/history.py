@@ -112,7 +112,7 @@ def _say(words: str) -> None:
     messages.print(words)
 
 
-# Of weighings that are listed.
+# Most days of weighings that are listed.
 _MOST_DAYS = 20
 # An earlier weighing is not the last one of a list.
 _RECENT = timedelta(days=90)

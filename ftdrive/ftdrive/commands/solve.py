@@ -219,7 +219,7 @@ class _Wanted:
     """Files of wrench and orientation of a recording in motion."""
     point_mass: bool
     topics: tuple[str | None, str | None]
-    """Of a bag: wrench and pose."""
+    """Topics of a bag: wrench and pose."""
     test: Path | None
     tests: CalibrationDataset | None
     """The poses of `test`."""

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
-# Of a calibration: leaning base; turned sensor; gain and cross-talk of the sensor.
+# What a calibration has: leaning base; turned sensor; gain and cross-talk of the sensor.
 Property = Literal["tilt", "rotation", "response"]
 Comment = Literal["#", "# at the end", "<!-- -->", "none"]
 
@@ -20,9 +20,9 @@ class Format:
     file: str
     """Usual name of the file."""
     subtracts: tuple[Literal["bias", "weight"], ...] = ("bias", "weight")
-    """Of the reading, by the target."""
+    """What the target subtracts from the reading."""
     expresses: tuple[Property, ...] = ("tilt", "rotation")
-    """Of the calibration: in the file, or where the target reads it instead. Response: or see `has_own_reading`."""
+    """What the target has of the calibration, in the file or where it reads it; response: see `has_own_reading`."""
     comment: Comment = "#"
     """How the header is written."""
 

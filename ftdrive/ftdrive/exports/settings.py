@@ -36,9 +36,9 @@ class Settings:
     """Also the name of the sensor, where a target has one."""
     tool_frame: str = "tool"
     height_mm: float | None = None
-    """Of the sensor's origin above the flange face."""
+    """Height of the sensor's origin above the flange face."""
     sensor_mass_kg: float | None = None
-    """Of sensor and adapter."""
+    """Mass of sensor and adapter."""
     sensor_com_mm: tuple[float, ...] | None = None
     """Centre of mass of sensor and adapter, from the flange, in flange axes; None: half way up on the flange axis."""
     verification: VerificationRecord | None = None

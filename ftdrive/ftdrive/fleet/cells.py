@@ -124,7 +124,7 @@ def _cell(path: Path, name: str, table: Any) -> StoredCell:
     )
 
 
-# Of the verifications that are read. A drift of the bias shows within weeks, and the store is read every minute.
+# Age of the oldest verification that is read: a drift of the bias shows within weeks.
 # All verifications would take four times as long after a year and find no drift sooner.
 WINDOW: Final = timedelta(days=90)
 # Results of each tool of a cell that are read: the newest, and what it is compared with.

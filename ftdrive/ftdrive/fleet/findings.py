@@ -26,7 +26,7 @@ SIGMAS: Final = 4.0
 ALIKE_M, WRONG_M = 0.003, 0.005
 # Likewise masses. A mass is wrong by the larger of share and kg.
 ALIKE_SHARE, WRONG_SHARE, WRONG_KG = 0.03, 0.1, 0.1
-# Of sensor and adapter, which a payload includes and the identified mass does not.
+# Mass of sensor and adapter, which a payload includes and the identified mass does not.
 MOST_SENSOR_KG: Final = 1.0
 TILTED_RAD: Final = np.deg2rad(0.1)
 # Added to the sigma of a tilt: postures of an arm bend it differently.

@@ -33,12 +33,12 @@ class CellState:
     sensor_serial: str | None = None
     sensor_model: str | None = None
     calibration_id: str | None = None
-    """Of the newest accepted calibration."""
+    """Id of the newest accepted calibration."""
     verdict: str | None = None
     calibrated: datetime | None = None
     """UTC."""
     verified: datetime | None = None
-    """Of the last verification of that calibration, UTC."""
+    """Time of the last verification of that calibration, UTC."""
     passed: bool | None = None
     change: str | None = None
     """What the last verification found to have changed, such as "bias"."""
@@ -49,7 +49,7 @@ class CellState:
     drift: BiasDrift | None = None
     """None with too few verifications."""
     weighings: StoredWeighings | None = None
-    """Of the last day with weighings; None without any in the last 90 days."""
+    """The last day with weighings; None without any in the last 90 days."""
     emulated: bool = False
     """Whether the calibration was made in an emulated cell."""
 

@@ -84,7 +84,7 @@ class Workers:
     submit: Callable[..., "Future[list[Answer]]"]
     """Takes a function and its arguments."""
     death: type[Exception]
-    """Of a future whose worker ended without an answer."""
+    """Exception of a future whose worker ended without an answer."""
     group: int = 1
     """Calls that a worker gets at once."""
     share_files: bool = False

@@ -28,7 +28,7 @@ from ftdrivers.ur.kinematics import Array
 # All models have room for the constant tour here with usual tools; the wrist is at its first pose.
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
-# Of a new tool on a calibrated cell.
+# Poses of a new tool on a calibrated cell.
 TOOL_POSES = 4
 BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6

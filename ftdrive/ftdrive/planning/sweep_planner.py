@@ -39,23 +39,23 @@ STEP_S = 0.2
 SMOOTHED_S = 0.1
 # Curves that are tried.
 RANDOM, CHANGED = 40, 200
-# Of a change.
+# Sizes of a change.
 STEPS = (0.03, 0.1, 0.3)
 # So many of them, the best ones, are tried at one posture, in each of the sizes.
 PROVEN = 6
 SIZES = (1.0, 0.9, 0.8, 0.6)
 POSTURES = 6
-# Of the two sines of each joint: the slow one turns far, the quick one shows the inertia.
+# Frequencies of the two sines of each joint: the slow one turns far, the quick one shows the inertia.
 # Inertia shows in acceleration, which costs little speed at 0.3 to 0.9 Hz; ISO 10218-1 allows 250 mm/s beside people.
 SLOW_HZ, QUICK_HZ = (0.06, 0.16), (0.3, 0.9)
 MOST_RAD = 1.5
 _MODEL_STEP_S = 0.01
-# Of the points of the proof, one in so many is looked at first.
+# Among the points of the proof, one in so many is looked at first.
 _COARSE = 5
 # Score of a curve that touches something, beyond its own: it is the last to be made smaller.
 _TOUCHING = 10.0
 _ROW_S = 0.12
-# Of the logarithm of its sigma, beside that of the compensation error.
+# Weight of the logarithm of its sigma, beside that of the compensation error.
 _INERTIA_WORTH = 0.5
 
 

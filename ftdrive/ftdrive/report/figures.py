@@ -31,12 +31,11 @@ VARIABLES = {
     BAD: "var(--bad)",
     **{colour: f"var(--series-{k})" for k, colour in enumerate(SERIES)},
 }
-# Of every figure: on a phone its letters keep their size, on a desk two stand side by side.
 # Letters stay readable on a phone, and two figures fit side by side on a desk.
 WIDTH_IN = 5.0
 # Longer times are shown in minutes.
 LONG_S = 200
-# Of many poses every second, third, … is drawn, because each dot has its size in the file.
+# Most dots of a figure: of more poses every second, third, … is drawn, because each dot has its size in the file.
 MOST_DOTS = 400
 # Weaker correlations are not drawn.
 INVISIBLE = 0.02

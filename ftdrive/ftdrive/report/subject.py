@@ -95,7 +95,7 @@ class Subject:
     """What `ftcalib.compare` takes beside the dataset."""
     parent: CalibrationResult | None = None
     parent_name: str = ""
-    """Of the result to compare with, or why there is none."""
+    """Name of the result to compare with, or why there is none."""
     trust: Mapping[str, Any] | None = None
     """Age and last verification, from `ftdrive.report.subject`; None if nothing was looked up."""
 

@@ -212,7 +212,7 @@ def _values(value: Any) -> Iterator[str]:
 
 
 FORMAT: Final = "ftdrive.bundle/1"
-# Of all files of a bundle together, unpacked. An hour at 7 kHz is 3 GB.
+# Most bytes of all files of a bundle together, unpacked. An hour at 7 kHz is 3 GB.
 MOST_BYTES: Final = 4_000_000_000
 MOST_FILES: Final = 20_000
 _COPY_AGAIN: Final = "copy the bundle again, or ask for a new one"

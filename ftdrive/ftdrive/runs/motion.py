@@ -29,7 +29,7 @@ _POSES: Final = {
     "R_base_flange": (3, 3),
     "p_base_flange_m": (3,),
 }
-# Of samples, from each of which the one counts that is received the soonest.
+# Number of blocks of samples; of each the one counts that is received the soonest.
 _BLOCKS: Final = 200
 
 
@@ -40,7 +40,7 @@ class MotionRecording:
     samples: FtSamples
     states: ArmStates
     nominal_rate_Hz: float = math.nan
-    """Of a sensor that sends at an even rate; NaN for one that is polled."""
+    """Rate of a sensor that sends evenly; NaN for one that is polled."""
 
     def save(self, path: Path) -> None:
         """Write a new file; returns when it is on disk."""

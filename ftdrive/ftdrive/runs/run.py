@@ -55,7 +55,7 @@ POSE = "pose-taken"
 
 _RESTORE = "take it from a copy"
 LOCK: Final = "lock"
-# Of a recording, named as in `FtSamples`.
+# Columns of a recording, named as in `FtSamples`.
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 
 # How a session moves from pose to pose.

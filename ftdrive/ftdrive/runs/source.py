@@ -67,7 +67,7 @@ class RecordedData:
     records: Sequence[PoseRecord] = ()
     """Only of a run."""
     earlier: CalibrationResult | None = None
-    """Of a run of a new tool: the result that gives mounting, base and gain."""
+    """The result that gives a new tool its mounting, base and gain."""
 
     @property
     def circumstances(self) -> dict[str, Any]:

@@ -88,7 +88,7 @@ class Verified:
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """Of the calibration, and of a verification in an emulated cell."""
+        """Marks of the calibration, and that of a verification in an emulated cell."""
         return marks_of(self.calibration, emulated=self.run.header().get("station") is not None)
 
     @property

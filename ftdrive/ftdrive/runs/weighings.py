@@ -50,10 +50,10 @@ class WeighingsFile:
         self.size = 0
         """Bytes that were read."""
         self.weighings = 0
-        """Of a part: an empty gripper does not count."""
+        """Number of weighings of a part: an empty gripper does not count."""
         self.refusals = dict.fromkeys(REFUSALS, 0)
         self.last: Mapping[str, JSON] = {}
-        """Of a part."""
+        """The last line of a part."""
         self._lines = 0
 
     @classmethod

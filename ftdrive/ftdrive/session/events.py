@@ -104,7 +104,7 @@ class StateChanged(Event):
     """Place in the tour, from 1; the return to the first pose comes last."""
     stops: int | None = None
     number: int | None = None
-    """Of the orientation."""
+    """Number of the orientation."""
     words: str = ""
     """The cause, for STOP and HOLD; else what happens or what to do."""
 
@@ -163,7 +163,7 @@ class PoseTaken(Event):
     attempts: int
     steady: bool
     temperature_C: float | None = None
-    """Of the sensor, where it reports it."""
+    """Temperature of the sensor, where it reports it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -173,11 +173,11 @@ class MotionRecorded(Event):
     file: str
     duration_s: float
     samples: int
-    """Of the sensor."""
+    """Samples of the sensor."""
     states: int
-    """Of the arm."""
+    """States of the arm."""
     temperature_C: float | None = None
-    """Of the sensor, where it reports it."""
+    """Temperature of the sensor, where it reports it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -190,9 +190,9 @@ class Estimated(Event):
     sigma: Mapping[str, Any]
     """One standard deviation each, same names."""
     residual_sigma: float | None
-    """Of the newest pose: largest of its six residuals over its standard deviation."""
+    """Largest of the six residuals of the newest pose, each over its standard deviation."""
     residual_force_N: float | None
-    """Of the newest pose: norm."""
+    """Norm of the residual force of the newest pose."""
     faces: tuple[int, int, int, int, int, int]
     """Poses by the flange axis that gravity is nearest to: +x -x +y -y +z -z."""
     cond9: float
@@ -228,7 +228,7 @@ class Weighed(Event):
     """The running fit is reliable: the identified mass, beside the payload set on the controller."""
 
     mass_kg: float
-    """Of what the sensor carries, so without sensor and adapter."""
+    """Mass that the sensor carries, so without sensor and adapter."""
     payload_kg: float
     p_flange_payload_m: tuple[float, ...] | None
     """(3,) centre of mass of that payload, flange axes; None for a controller that does not report it."""

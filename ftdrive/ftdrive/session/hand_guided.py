@@ -64,7 +64,7 @@ class _Held:
         self._state, self._collect = state, collect
         self._before: ArmState | None = None
         self.samples: FtSamples | None = None
-        """Of the last dwell."""
+        """Samples of the last dwell."""
 
     def wait_until_still(self, **_: object) -> None:
         self._before = None

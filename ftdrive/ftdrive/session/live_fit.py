@@ -65,7 +65,7 @@ class RunningFit:
         self._down_base = np.asarray(down_base, dtype=np.float64)
         self._records: dict[int, PoseRecord] = {}
         self.result: CalibrationResult | None = None
-        """Of `ftcalib.solve` for the poses so far; None while they do not determine it."""
+        """Result of `ftcalib.solve` for the poses so far; None while they do not determine it."""
 
     @property
     def weighed_kg(self) -> float | None:

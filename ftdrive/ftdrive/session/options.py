@@ -60,7 +60,7 @@ class SessionOptions:
     yes: bool = False
     """Answer the safety questions automatically, never the first motion."""
     seconds: float = 20.0
-    """Of a sweep, at the planned speed; of a passive calibration at most."""
+    """Duration of a sweep at the planned speed; the longest of a passive calibration."""
     description: Mapping[str, Any] = field(default_factory=dict)
     """Goes into run.json."""
 

@@ -34,7 +34,7 @@ _STILL_S: Final = 5.0
 _LISTEN_S: Final = 1.0
 # A steady reading fails the test once in some hundred times.
 _LISTENS: Final = 3
-# Of a value that is read back; it travels as the same 64 bits.
+# Largest difference of a value that is read back; it travels as the same 64 bits.
 _TOLERANCE: Final = 1e-6
 
 # Asks for the word of a setting, such as "payload"; raises `Declined`.
@@ -53,7 +53,7 @@ class Push:
     """What the values come from, for the receipt."""
     load: FlangeLoad | None = None
     lean: Lean | None = None
-    """Of the base, compared with the gravity of the controller, or with the configured mounting if it is unknown."""
+    """Tilt of the base from the gravity of the controller, or from the configured mounting if it is unknown."""
     contact: Array | None = None
     """(6,) what the sensor reads beyond a free tool: contact, or drift since the calibration."""
 

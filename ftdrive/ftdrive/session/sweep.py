@@ -23,7 +23,7 @@ from ftdrivers.sweep import Sweep
 KNOWN_S: Final = 3.0
 # The newest looks do not teach: a contact that grows must not pass for weight.
 BEHIND_S: Final = 1.0
-# Of one look, vibration and acceleration included.
+# Noise of one look, vibration and acceleration included.
 _NOISE_N: Final = 2.0
 # A prediction with a larger sigma is none.
 _UNSURE_N: Final = 2.5
@@ -40,7 +40,7 @@ class FreeTool(Guard):
     down_base: Array
     """(3,) unit vector."""
     heaviest_kg: float
-    """Of a possible tool: the size of what is unknown."""
+    """Mass of the heaviest possible tool: the size of what is unknown."""
     _moving_s: float = field(default=0.0, init=False)
     _sample: int = field(default=-1, init=False)
     _waiting: deque[tuple[float, Array, Array]] = field(default_factory=deque, init=False)
@@ -167,7 +167,7 @@ class SweepTour(Tour):
                 clock.sleep(0.02)
 
 
-# Of the planned speed, in the first run of a plan.
+# Share of the planned speed in the first run of a plan.
 FIRST_SHARE: Final = 0.5
 LEAST_SLIDER: Final = 0.5
 

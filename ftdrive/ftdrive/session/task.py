@@ -106,7 +106,7 @@ class Calibrating:
     method: Method = "ml"
     """Method that will solve the poses."""
     sweep_s: float | None = None
-    """Duration of a sweep at the planned speed; None of poses."""
+    """Duration of a sweep at the planned speed; None for poses."""
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
         """Return a sweep or a tour. Raises `PlanRefused` if it lacks orientations that the method needs."""

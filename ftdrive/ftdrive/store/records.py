@@ -50,7 +50,7 @@ class StoredResult:
     update: str | None
     """What was updated, such as "bias"."""
     temperature_C: float | None
-    """Of the sensor, where a device reports it."""
+    """Temperature of the sensor, where a device reports it."""
     payload_kg: float | None
     """That the controller reported during the calibration."""
     payload_com_m: list[float] | None
@@ -152,11 +152,11 @@ class StoredWeighings:
     size: int
     """Bytes that were read; a file that has more is read again."""
     weighings: int
-    """Of a part: an empty gripper does not count."""
+    """Number of weighings of a part: an empty gripper does not count."""
     refusals: dict[str, int]
     """By the codes of `ftdrive.runs.weighings.REFUSALS`."""
     last_utc: str | None
-    """Of the last part."""
+    """When the last part was weighed."""
     mass_kg: float | None
     mass_sigma_kg: float | None
 

@@ -184,7 +184,7 @@ class _Compensated:
 
     @property
     def samples(self) -> int:
-        """Of the recordings that were compensated now."""
+        """Samples of the recordings that were compensated now."""
         return sum(one["samples"] for one in self.compensated)
 
     def to_dict(self) -> dict[str, Any]:

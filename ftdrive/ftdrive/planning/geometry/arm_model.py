@@ -183,8 +183,8 @@ def _between_axes(a: Bodies, b: Bodies) -> tuple[Array, Array]:
     return point, np.sqrt(dot(difference, difference))
 
 
-# Of the edges of the housings at the joints. On the constant tour a UR3e then comes within 22 mm of itself; the convex
-# hulls of its meshes stay 27 mm apart.
+# Rounding of the edges of the housings at the joints. On the constant tour a UR3e then comes within 22 mm of itself;
+# the convex hulls of its meshes stay 27 mm apart.
 HUB_ROUNDING_M = 0.020
 
 # The same where the forearm carries the wrist.
@@ -251,7 +251,7 @@ class Cylinder:
     to_m: float
     diameter_m: float
     x_m: float = 0.0
-    """Of its axis, which is parallel to the flange z axis."""
+    """Place of its axis, which is parallel to the flange z axis."""
     y_m: float = 0.0
 
     def __post_init__(self) -> None:
@@ -299,7 +299,7 @@ _WRIST_1, _WRIST_2_ALONG_6, _WRIST_3, _TOOL = (14, 15), 17, 18, 19
 
 # Ends (n, 3) of the axis of a body, its radius and its rounding.
 _Part = tuple[Array, Array, float, float]
-# Of a joint: its centre (n, 3), from where to where along the lift axis, its radius and its rounding.
+# The housing of a joint: its centre (n, 3), from where to where along the lift axis, its radius and its rounding.
 _Housing = tuple[Array, tuple[float, float], float, float]
 
 

@@ -16,7 +16,7 @@ from ftdrivers.ur.kinematics import Array, Kinematics
 
 # Below this sine of q5, joints 4 and 6 turn about one line.
 ALIGNED = 1e-9
-# Of Newton's method, from an arm with exactly parallel axes: the rest is rounding.
+# Steps of Newton's method, from an arm with exactly parallel axes: the rest is rounding.
 _STEPS = 5
 _TINY = 1e-14
 # Metres and radians.
@@ -31,7 +31,7 @@ class Frames:
     """Direction of joint axis 2."""
     lift_3: Array
     lift_4: Array
-    """Of joint axes 3 and 4, parallel to axis 2 on a nominal arm."""
+    """Directions of joint axes 3 and 4, parallel to axis 2 on a nominal arm."""
     shoulder_m: Array
     elbow_m: Array
     forearm_end_m: Array

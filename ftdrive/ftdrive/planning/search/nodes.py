@@ -179,7 +179,7 @@ _TOUR_DEG = (
     (19, -180, 45, 90),
     (13, -90, 90, 135),
 )
-# Of the orientations, 1 to 24, in the order of travel.
+# Numbers of the orientations, 1 to 24, in the order of travel.
 NUMBERS = tuple(row[0] for row in _TOUR_DEG)
 # Stops that differ in more than joint 6.
 DIFFERENT_SHAPES = tuple(np.unique([row[1:3] for row in _TOUR_DEG], axis=0, return_index=True)[1].tolist())

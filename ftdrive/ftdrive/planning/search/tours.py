@@ -21,16 +21,16 @@ FORBIDDEN_S = 1e6
 COST_OF_TRAVEL_S = 0.02
 SHAKES = 150
 SHAKES_A_ROUND = 10
-# Of proving the moves of a tour and finding another one without those that are not clear.
+# Most rounds of proving the moves of a tour and finding another one without those that are not clear.
 ROUNDS = 60
-# Of this many joint vectors every move is looked at; of more, those to the nearest ones of each group.
+# Up to this many joint vectors every move is looked at; of more, those to the nearest ones of each group.
 FEW = 120
 NEAREST_OF_EACH = 2
 # From here on only the nearest of all groups are looked at: moves to each group are as many as their square.
 MANY_GROUPS, NEAREST_OF_ALL = 60, 40
 # In all layers together, about.
 NEIGHBOURS = 10
-# Of each group, the first ones; more where those do not hang together.
+# Number of the first nodes of each group; more where those do not hang together.
 MOST_NODES = (25, 60)
 
 
