@@ -16,7 +16,6 @@ from typing import Any, Final, Self
 
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, open_file
-from ftdrive.runs.numbers import append_lines, read_line
 
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
@@ -68,6 +67,8 @@ class WeighingsFile:
         """Add lines, and the header to a new file; returns when they are on disk. Raises `OSError`."""
         import fcntl
 
+        from ftdrive.runs.numbers import append_lines
+
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a+b", buffering=0) as file:
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -93,6 +94,9 @@ class WeighingsFile:
             The file is damaged or of another format.
         OSError
         """
+        # Imported here, because a list of weighings from the store needs no zipfile.
+        from ftdrive.runs.numbers import read_line
+
         with open_file(self.path) as file:
             file.seek(self.size)
             *lines, _ = file.read().split(b"\n")
