@@ -80,7 +80,7 @@ def diff(first: str, second: str, as_json: bool) -> None:
         for k, axis in enumerate("xyz"):
             row = 3 * i + k
             echo(_line(f"{label} {axis}, {unit}", scale * found.change[row], scale * found.sigma[row]))
-    echo(_in_words(found))
+    echo(_describe_difference(found))
 
 
 def _side(text: str) -> _Side:
@@ -120,7 +120,7 @@ def _line(label: str, change: float, sigma: float) -> str:
     return f"{label:22}{to_place_of(change, sigma, '+'):>12}{spread:>12}{ratio}"
 
 
-def _in_words(found: "Difference") -> str:
+def _describe_difference(found: "Difference") -> str:
     joint = found.joint
     if joint.dof == 0:
         return "The calibrations are the same."

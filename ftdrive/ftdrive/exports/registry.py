@@ -188,7 +188,7 @@ def export(
                 )
             notes.insert(0, f"{words}.")
     notes[:0] = [MARKS[mark] for mark in marks_of(calibration)]
-    notes += [f"Also set {place} = {_in_words(value)}." for place, value in exported.elsewhere.items()]
+    notes += [f"Also set {place} = {_describe_value(value)}." for place, value in exported.elsewhere.items()]
     origin = made_by(calibration, settings.verification)
     text = with_header(exported.text, target.comment, [origin, target.description, *notes])
     return Export(text, tuple(notes), exported.elsewhere, force_N, torque_Nm)
@@ -216,9 +216,9 @@ def _lossless(calibration: CalibrationResult, target: Format) -> Iterator[str]:
             yield name
 
 
-def _in_words(value: JSON) -> str:
+def _describe_value(value: JSON) -> str:
     if isinstance(value, Mapping):
-        return f"({', '.join(f'{name} {_in_words(one)}' for name, one in value.items())})"
+        return f"({', '.join(f'{name} {_describe_value(one)}' for name, one in value.items())})"
     if isinstance(value, list):
-        return f"[{', '.join(map(_in_words, value))}]"
+        return f"[{', '.join(map(_describe_value, value))}]"
     return str(value)  # of a float every digit

@@ -146,10 +146,10 @@ def _fitted(run: Run, at_s: float, setup: Setup, g_m_s2: float) -> tuple[str, bo
         result = solve_motion(wrench, poses, setup=setup, height_m=setup.sensor_height_m, g_m_s2=g_m_s2)
     except (AcceptanceError, DataError) as error:
         return f"{at_s:.0f} s: {error}", False
-    return f"{at_s:.0f} s: {_in_words(result)}", result.verdict == "good"
+    return f"{at_s:.0f} s: {_describe_fit(result)}", result.verdict == "good"
 
 
-def _in_words(result: CalibrationResult) -> str:
+def _describe_fit(result: CalibrationResult) -> str:
     """Return what is determined so far, with sigmas, and why it is not good yet."""
     mass = with_sigma(result.mass_kg, float(result.sigma["mass_kg"]))
     force_N, torque_Nm = result.predicted_error()

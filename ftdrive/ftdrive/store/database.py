@@ -231,7 +231,7 @@ class Database:
         """
         # Writers take turns by one lock: with locks of rows, two writers of the same copies wait for each other.
         if self._file is not None:
-            with self._in_words("written"):
+            with self._naming_store("written"):
                 self._file.parent.mkdir(parents=True, exist_ok=True)
         with self._connected("written") as connection:
             if self._is_sqlite:
@@ -301,13 +301,13 @@ class Database:
 
     @contextmanager
     def _connected(self, verb: str) -> Iterator[Connection]:
-        with self._in_words(verb), self._engine.connect() as connection:
+        with self._naming_store(verb), self._engine.connect() as connection:
             if not self._is_sqlite:
                 connection.exec_driver_sql(f"SET LOCAL lock_timeout = {round(1000 * self._wait_s)}")
             yield connection
 
     @contextmanager
-    def _in_words(self, verb: str) -> Iterator[None]:
+    def _naming_store(self, verb: str) -> Iterator[None]:
         try:
             yield
         except (DBAPIError, OSError) as error:
