@@ -320,7 +320,8 @@ def settings(
     for key, (option, value) in (flags or {}).items():
         if value is not None:
             found[key] = Setting(check_value(option, key, value), option)
-    if "sampling.average_s" in found:  # a set averaging time is not chosen again
+    # A set averaging time is not chosen again.
+    if "sampling.average_s" in found:
         found.setdefault("sampling.noise_record_s", Setting(0.0, found["sampling.average_s"].origin))
     defaults = {key: None if item.default is MISSING else item.default for key, item in _KEYS.items()}
     unset = {key: Setting(value, "not set" if value is None else "default") for key, value in defaults.items()}

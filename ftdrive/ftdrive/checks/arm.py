@@ -194,7 +194,8 @@ def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> 
         Longest time for nine of ten answers.
     """
     name, found = "robot.link", ""
-    for _ in range(_LINK_TRIES):  # a computer that is busy for a moment is not a bad link
+    # A computer that is busy for a moment is not a bad link.
+    for _ in range(_LINK_TRIES):
         try:
             with clock.keeping_up():
                 took_s = _answers_s(arm, clock)

@@ -222,7 +222,8 @@ class _Questions:
             try:
                 answer = click.prompt(visible(shown), default=usual, show_default=False, prompt_suffix="", err=True)
             except click.Abort as abort:
-                echo(err=True)  # the next message begins a line
+                # The next message begins a line.
+                echo(err=True)
                 if isinstance(abort.__context__, EOFError):
                     raise ConfigError(
                         f"the input ended before {option} was given; the answers so far are kept in this command:\n"

@@ -127,7 +127,8 @@ def report(
     if output is not None:
         try:
             write_new(output, text)
-        except FileExistsError:  # another report took the name meanwhile
+        # Another report took the name meanwhile.
+        except FileExistsError:
             if chosen is not None:
                 raise
             write_new(output := unused_path(DEFAULT), text)

@@ -234,6 +234,7 @@ class _Wanted:
 def _solve_each(sources: Sequence[Path], wanted: _Wanted, output: Path | None, force: bool, as_json: bool) -> None:
     first_failure: AcceptanceError | DataError | None = None
     for source in sources:
+        # One source that fails does not keep the others from being solved.
         try:
             with unpack(source) as place:
                 if wanted.method == "all" and wanted.pair is None and not _is_in_motion(place):

@@ -75,7 +75,8 @@ def _emulated(sensor: str | None) -> str:
 
 def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) -> tuple[str, dict[str, Any]]:
     """Record; return the address of the driver, and what it received. A file that is `kept` is named on the screen."""
-    if sensor.startswith("ur-ft:") or sensor == f"{EMULATED}ur-ft":  # rejected before an emulated one starts
+    # Rejected before an emulated one starts.
+    if sensor.startswith("ur-ft:") or sensor == f"{EMULATED}ur-ft":
         raise ConfigError(
             f"{sensor} is read over RTDE, which is not recorded: capture TCP port 30004 of the arm with Wireshark"
         )
@@ -105,7 +106,8 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
         seen = {"error": f"{type(error).__name__}: {error}"}
         raise
     finally:
-        if not writer.has_port and seen["error"] in {None, INTERRUPTED}:  # a port that does not open is worth a report
+        # A port that does not open is worth a report.
+        if not writer.has_port and seen["error"] in {None, INTERRUPTED}:
             writer.discard()
         else:
             writer.end(**seen)
@@ -137,7 +139,8 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
         loaded = Transcript.load(file)
     else:
         raise ConfigError("no transcript is given: add its FILE, or --simulate")
-    clock = LocalClock()  # a busy computer makes it slow, never late
+    # A busy computer makes it slow, never late.
+    clock = LocalClock()
     player = Player(loaded, clock)
     with player as port:
         device = sensor_from_url(loaded.url_at(port), clock=clock)

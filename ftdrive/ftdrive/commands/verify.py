@@ -140,7 +140,8 @@ def verify_cell(
     calibration = read_calibration(path)
     path = Run(path).calibration_path if path.is_dir() else path
     description = {"verification": {**asdict(wanted), "id": calibration.id, "path": str(path.absolute())}}
-    if wanted.quick:  # 12 s of noise would take longer than the poses
+    # 12 s of noise would take longer than the poses.
+    if wanted.quick:
         cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
     if station is not None:
         description |= describe(station)

@@ -123,7 +123,8 @@ def R_frame_sensor(calibration: CalibrationResult, settings: Settings) -> Array:
 def rpy_rad(R: Array) -> list[float]:
     """Return a rotation as URDF has it: roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll)."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # at a pitch of 90 degrees roll is set to zero
+        # At a pitch of 90 degrees roll is set to zero.
+        warnings.simplefilter("ignore")
         return numbers(Rotation.from_matrix(R).as_euler("xyz"))
 
 

@@ -147,7 +147,8 @@ def _scene(scene: dict[str, Any]) -> Iterator[str]:
     lean_rad = float(scene["lean_rad"])
     names = [name for name, angle in MOUNTINGS.items() if abs(lean_rad - angle) < 1e-9]
     yield f"mounted: {names[0] if names else f'base leans {degrees(lean_rad):.1f} deg towards its -x'}"
-    for plane in scene["planes"]:  # the first one is what the base is bolted to
+    # The first one is what the base is bolted to.
+    for plane in scene["planes"]:
         normal = ":".join(f"{value:.6g}" for value in plane["normal"])
         place_mm = 1e3 * float(plane["offset_m"])
         yield f"plane {normal}:{place_mm:.1f}, the arm stays where normal times place is that or more"

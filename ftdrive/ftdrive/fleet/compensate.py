@@ -104,7 +104,8 @@ def compensated_file(source: Path, folder: Path, task: bytes) -> bytes:
         output = Path(mkdtemp(dir=folder)) / f"result{source.suffix}"
         estimate = given["bias"] == "estimate"
         numbers, _ = compensate_recording(reader, frame_of(given), output, estimate_bias=estimate, overlap=False)
-    except BadRecording as error:  # the report names the recording, which here may be a temporary file
+    # The report names the recording, which here may be a temporary file.
+    except BadRecording as error:
         raise BadRecording(error.problem) from error
     return f"{output}\n{json.dumps(numbers)}".encode()
 
@@ -139,7 +140,8 @@ def compensate_all(
     OtherVersion
         A worker has another version.
     """
-    alone = replace(workers, group=1)  # a recording is large
+    # A recording is large.
+    alone = replace(workers, group=1)
     with TemporaryDirectory(prefix=".unfinished-", dir=folder) as unfinished:
 
         def paths(recording: Path) -> tuple[Path, Path, bytes]:

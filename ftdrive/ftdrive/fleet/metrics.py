@@ -148,7 +148,8 @@ class MetricsServer(Collector):
 
     def collect(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
         """Yield the metrics; called by a thread for each scrape."""
-        reading = self._reading  # the server may set another one meanwhile
+        # The server may set another one meanwhile.
+        reading = self._reading
         if reading is None:
             return
         yield GaugeMetricFamily(STORE_UP, "1 if the store could be read, else 0.", value=reading.store_up)

@@ -173,13 +173,15 @@ class Messages:
             if self._answers is False:
                 self._say(f"The MQTT broker {self._broker} answers again.")
             self._answers = self._was_connected = True
-            self._client.subscribe(self._cell_topics)  # retained messages, also of cells that are gone
+            # Retained messages, also of cells that are gone.
+            self._client.subscribe(self._cell_topics)
             for topic, payload in self._wanted.items():
                 self._retain(topic, payload)
 
     def _on_connect_fail(self, _client: Client, _data: Any) -> None:
         if self._is_open:
-            self._lost(_words(sys.exception()))  # paho calls this where it handles the error
+            # Paho calls this where it handles the error.
+            self._lost(_words(sys.exception()))
 
     def _on_disconnect(self, _client: Client, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if self._is_open and self._rejection is None:

@@ -105,7 +105,8 @@ def local_workers(count: int | None = None) -> Iterator[Workers]:
         get_reusable_executor,
         max_workers=count,
         timeout=None,
-        initializer=signal.signal,  # Ctrl-C reaches every process of a terminal, but only the parent must act on it
+        # Ctrl-C reaches every process of a terminal, but only the parent must act on it.
+        initializer=signal.signal,
         initargs=(signal.SIGINT, signal.SIG_IGN),
         env=_ONE_THREAD,
     )
@@ -143,19 +144,22 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
     except ModuleNotFoundError as error:
         raise ConfigError(_NO_ENGINE.format(error.name)) from None
     for name in _LOGS:
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # a lost cluster is one sentence, not several tracebacks
+        # A lost cluster is one sentence, not several tracebacks.
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     dask: Any = distributed  # most of it has no types
     try:
         with config.set(_SHORT_LOG):
             client = dask.Client(f"tcp://{found[1]}:{found[2]}", timeout=timeout_s, set_as_default=False)
-    except (OSError, ValueError, MemoryError) as error:  # the answer of another server may look like a huge length
+    # The answer of another server may look like a huge length.
+    except (OSError, ValueError, MemoryError) as error:
         raise Unreachable(
             f"no Dask scheduler answers at {address} ({error})", "start it, or correct --cluster"
         ) from error
     with config.set(_LARGE_CALLS), client:
         start = f"start one: dask worker tcp://{found[1]}:{found[2]} --nthreads 1"
 
-        def require_one() -> None:  # `dask worker` starts another one in place of one that died
+        # `dask worker` starts another one in place of one that died.
+        def require_one() -> None:
             try:
                 client.wait_for_workers(1, timeout=timeout_s)
             except OSError as error:

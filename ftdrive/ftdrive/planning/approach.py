@@ -114,7 +114,8 @@ def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Spe
     near = np.argsort(cost, axis=1, kind="stable")[:, 1 : NEIGHBOURS + 1]
     possible = np.zeros(cost.shape, dtype=np.bool_)
     possible[np.arange(len(nodes))[:, None], near] = True
-    possible[:2] = True  # both ends see every node
+    # Both ends see every node.
+    possible[:2] = True
     possible |= possible.T
     possible[0, 1] = possible[1, 0] = False
     np.fill_diagonal(possible, val=False)

@@ -210,7 +210,8 @@ def serve_view(plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Arra
     except ImportError:
         raise ConfigError("a view needs viser: install ftdrive with its extra viz, `ftdrive[viz]`") from None
     behind = hidden_host()
-    with redirect_stdout(StringIO()):  # it prints a banner; our stdout is data
+    # It prints a banner; our stdout is data.
+    with redirect_stdout(StringIO()):
         server = ViserServer(host=behind, label=f"ftdrive plan, {certifier.arm.name}", verbose=False)
     try:
         _fill(server, plan, certifier, way_rad)

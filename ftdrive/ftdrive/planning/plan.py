@@ -165,7 +165,8 @@ class Plan:
         }
         if self.sweep is not None:
             document |= {"sweep": self.sweep.to_dict(), "off_curve_m": self.off_curve_m}
-        document = json.loads(json.dumps(document))  # tuples become lists, as they come back from a file
+        # Tuples become lists, as they come back from a file.
+        document = json.loads(json.dumps(document))
         return document | {"sha256": digest(document)}
 
     def save(self, path: str | Path) -> None:

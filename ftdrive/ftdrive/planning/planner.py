@@ -287,7 +287,8 @@ def plan_verification(
             f"no tour of {poses} fresh poses is reachable and proven clear: jog the arm to another posture, or clear "
             "the surroundings"
         )
-    nearest = -int(np.abs(found[1] - q_now).max(axis=1).argmin())  # a closed tour may begin anywhere
+    # A closed tour may begin anywhere.
+    nearest = -int(np.abs(found[1] - q_now).max(axis=1).argmin())
     numbers, q = np.roll(found[0], nearest), np.roll(found[1], nearest, axis=0)
     why = [f"{poses} poses that were not used in the calibration, far from its {len(R_fitted)} poses."]
     why += [] if np.array_equal(q[0, :3], q_now[:3]) else [_elsewhere_words(q[0])]

@@ -218,7 +218,8 @@ def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, 
     prior = np.zeros(23)
     prior[INERTIA], prior[HEIGHT], prior[DELAY] = guess.mass_kg * GYRATION_M**2, HEIGHT_M, DELAY_S
     weight = np.divide(1.0, prior**2, out=np.zeros(23), where=prior > 0)
-    weight[:15] = 1e-6 / guess.scale**2  # what the motion does not show stays finite
+    # What the motion does not show stays finite.
+    weight[:15] = 1e-6 / guess.scale**2
     covariance = np.linalg.inv(J.T @ J + np.diag(weight))
     force_N, torque_Nm = expected_error(guess.parameters, covariance[:15, :15])
     return force_N, torque_Nm, float(np.sqrt(np.diag(covariance)[INERTIA].max()))

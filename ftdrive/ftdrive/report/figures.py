@@ -79,7 +79,8 @@ def draw(name: str, facts: Facts) -> str:
     height, (left, right, bottom, top), fill = _FIGURES[name]
     height_in = height(facts) if callable(height) else height
     with mpl.rc_context(dict(_STYLE)):
-        figure = Figure(figsize=(WIDTH_IN, height_in))  # fixed margins, because a layout takes as long as the drawing
+        # Fixed margins, because a layout takes as long as the drawing.
+        figure = Figure(figsize=(WIDTH_IN, height_in))
         figure.subplots_adjust(left / WIDTH_IN, bottom / height_in, 1 - right / WIDTH_IN, 1 - top / height_in)
         fill(figure, facts)
         written = StringIO()

@@ -76,7 +76,8 @@ class Redaction:
         self.placeholders: dict[str, str] = {}
         """From what was redacted to its placeholder: never written to a file."""
         self._names: dict[str, str] = {}
-        with suppress(OSError, KeyError):  # a container may have no name for its user
+        # A container may have no name for its user.
+        with suppress(OSError, KeyError):
             self._learn_name("user", getpass.getuser())
         self._learn_name("host", platform.node())
         self._home = str(Path.home())
@@ -246,7 +247,8 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
     poses: dict[str, bytes] = {}
     for file in sorted(one for one in folder.rglob("*") if (not one.is_dir() or one.is_symlink()) and one.name != LOCK):
         name = file.relative_to(folder.parent).as_posix()
-        content = file.read_bytes() if file.is_file() and not file.is_symlink() else None  # a pipe has no end
+        # A pipe has no end.
+        content = file.read_bytes() if file.is_file() and not file.is_symlink() else None
         if content is not None and file.suffix == ".npz":
             poses[name] = content
         elif content is not None and (text := _text(content)) is not None:
@@ -358,7 +360,8 @@ def _text(content: bytes) -> str | None:
 def _is_emulated(folder: Path) -> bool | None:
     try:
         return Run(folder).header().get("station") is not None
-    except BadDataset:  # a damaged run is worth a report too
+    # A damaged run is worth a report too.
+    except BadDataset:
         return None
 
 
@@ -376,6 +379,7 @@ def _environment(folder: Path) -> dict[str, Any]:
         cell = recorded_cell(Run(folder).header()["config"])
         checks = [check_disk(folder), check_workcell(cell, cell.robot.model)]
         checks += check_permissions(SensorAddress.of(cell.sensor.url))
-    except (BadDataset, UsageError, TypeError) as error:  # a damaged run is worth a report too
+    # A damaged run is worth a report too.
+    except (BadDataset, UsageError, TypeError) as error:
         return facts | {"error": str(error)}
     return facts | {"checks": [asdict(check) for check in checks]}

@@ -75,7 +75,8 @@ class WeighingsFile:
             end = file.seek(0, os.SEEK_END)
             file.seek(max(0, end - _TAIL))
             tail = file.read()
-            begin = end - len(tail) + tail.rfind(b"\n") + 1  # a power failure may have cut off the last line
+            # A power failure may have cut off the last line.
+            begin = end - len(tail) + tail.rfind(b"\n") + 1
             file.truncate(begin)
             written = [*([] if begin else [self.header]), *lines]
             append_lines(file, begin, written)

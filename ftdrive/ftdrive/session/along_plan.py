@@ -157,6 +157,7 @@ class _AlongPlan:
         if dry_run:
             cell.note("the controller's safety limits are not checked: only a program on the controller can query them")
         else:
+            # Control of the arm is taken last, when all other checks have passed.
             cell.arm.open(control=True)
             if path := cell.arm.identify().facts.get("control"):
                 cell.note(f"control path {path.value}")
@@ -175,7 +176,8 @@ class _AlongPlan:
     def _certifier(self) -> Certifier:
         arm = self.cell.arm
         if not self.options.dry_run and arm.status().tcp_offset is None:
-            arm.open(control=True)  # an old controller reports no poses before
+            # An old controller reports no poses before.
+            arm.open(control=True)
         info = arm.identify()
         return certifier_for(self.task.cell, info.model, kinematics_of(info))
 
@@ -293,7 +295,8 @@ class _AlongPlan:
     def _recheck(self, before: Before, questions: _SafetyQuestions, asks: bool) -> None:
         """Repeat the checks after a stop; with `asks`, all the safety questions too."""
         q = self.cell.arm.state().q_rad
-        stays = plan_approach(before.certifier, q, q, SLOW)  # the next approach is checked when its goal is known
+        # The next approach is checked when its goal is known.
+        stays = plan_approach(before.certifier, q, q, SLOW)
         quiet = self.cell.listen(LISTEN_S)
         check(replace(before, quiet=quiet, approach=stays, known=True, resumed=True), AGAIN)
         if not self.options.questions:

@@ -167,7 +167,8 @@ class HandGuided:
             Whatever the arm or the sensor raises; the poses committed so far stand.
         """
         self._passes_first = bool(earlier)
-        with self._clock.keeping_up():  # an emulated clock waits for this thread, which must see each standstill
+        # An emulated clock waits for this thread, which must see each standstill.
+        with self._clock.keeping_up():
             self._greet(goal)
             for record in earlier:
                 self._learn(record, self._book.judge.add(record))
@@ -325,7 +326,8 @@ class HandGuided:
     def _learn(self, record: PoseRecord, judged: Estimated | Compared) -> None:
         """Show what the poses show with one more, which is on disk."""
         self._taken[record.stop] = record
-        if record.steady:  # the quietest pose gives the scatter of the untouched sensor
+        # The quietest pose gives the scatter of the untouched sensor.
+        if record.steady:
             std = record.samples.wrench.std(axis=0, ddof=1)
             self._level = std if self._level is None else np.minimum(self._level, std)
         self._operator.show(replace(judged, hint="") if self._listen else judged)

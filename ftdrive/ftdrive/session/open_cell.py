@@ -61,7 +61,8 @@ class Journal:
             return
         try:
             self._run.append_event(event.to_dict(), sync=sync)
-        except OSError as error:  # a pose that cannot be written raises
+        # A pose that cannot be written raises.
+        except OSError as error:
             log.warning("events.ndjson cannot be written: %s", error)
 
     def absence(self) -> str | None:

@@ -271,7 +271,8 @@ def awake() -> Iterator[str]:
         start_new_session=True,
     )
     try:
-        with suppress(subprocess.TimeoutExpired):  # it only ends by itself when systemd denies the request
+        # It only ends by itself when systemd denies the request.
+        with suppress(subprocess.TimeoutExpired):
             process.wait(timeout=0.3)
         yield "this computer is kept awake" if process.returncode is None else asleep
     finally:

@@ -107,5 +107,6 @@ def short_calibration(operator: Operator, sensor: str | None = None) -> Calibrat
 
 def station_of(calibration: CalibrationResult, sensor: str | None = None) -> Station:
     """Return the emulated cell of a calibration for a stream, not started; `sensor` replaces its sensor."""
-    pace = ("--time-scale", "1")  # a stream pairs by the controller's clock
+    # A stream pairs by the controller's clock.
+    pace = ("--time-scale", "1")
     return Station.of(calibration.provenance.get("station"), sensor, pace)

@@ -117,6 +117,7 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
     resumed = None if options.resume is None else Run(options.resume, config.clock)
     if resumed is not None and resumed.command != task.command:
         raise ConfigError(f"{resumed.folder} was not made by {task.command}: continue it with {resumed.resume_command}")
+    # A plan that lacks a pose is refused before a device is opened.
     plan = None if options.by_hand else plan_on_disk(options, resumed)
     device, driver = build_sensor(config), build_arm(config)
     with (
@@ -132,6 +133,7 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
         arm.open()
         journal.show(StateChanged(state=State.PREFLIGHT))
         if not options.by_hand:
+            # A program of another client is never ended to begin.
             preflight.require_no_program(arm, cell.clock, cell.limits)
             if options.real and not options.dry_run:
                 cell.note(kept_awake)

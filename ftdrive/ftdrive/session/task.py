@@ -85,7 +85,8 @@ def from_usual_wrist(certifier: Certifier, q_rad: Array) -> Array:
     Joint 6 keeps its turn, which shows how the cable is wound.
     """
     q = q_rad.copy()
-    with suppress(ConfigError):  # the planner reports it, with what to do
+    # The planner reports it, with what to do.
+    with suppress(ConfigError):
         q[3:5] = constant_tour(q, certifier.arm.kinematics)[0, 3:5]
     return q
 

@@ -300,6 +300,7 @@ class Tour:
         return self._plan.steps[at if (index - at) % n == 1 else index].speed_rad_s
 
     def _approach(self, q: Array, index: int, stop: int, *, back: bool = False) -> None:
+        # The only moves that are not in the plan, so they are proven, shown and confirmed by themselves.
         approach = plan_approach(self._certifier, q, self._nodes[index], SLOW)
         if not len(approach.q_rad):
             return
@@ -356,7 +357,8 @@ class Tour:
         with self._watcher.watching(start, goal, moving=True):
             self._arm.move_to(
                 goal.tolist(),
-                timeout_s=(duration_s + 1.5) / SLOWEST_SLIDER,  # `StallGuard` sees an arm that stands still
+                # `StallGuard` sees an arm that stands still.
+                timeout_s=(duration_s + 1.5) / SLOWEST_SLIDER,
                 guard=self._between_looks,
                 speed_rad_s=speed_rad_s,
                 acceleration_rad_s2=acceleration_rad_s2,
@@ -382,6 +384,7 @@ class Tour:
 
     def _hold(self, error: Exception) -> None:
         """Show why the arm has stopped, and wait for the operator; returns when the tour may go on."""
+        # The arm stops first, whatever the cause is.
         self._arm.stop()
         if isinstance(error, _OperatorStop) and error.for_good:
             self._show_state(State.STOP, words=str(error))

@@ -97,7 +97,8 @@ class Watcher:
         with self._judging:
             try:
                 status = self._arm.status()
-            except Exception as error:  # another package's arm may raise anything; reopening it reports the cause
+            # Another package's arm may raise anything; reopening it reports the cause.
+            except Exception as error:
                 log.debug("the arm reports no status: %r", error)
                 now_s = self.clock.now_s()
                 self._blind_since_s = self._blind_since_s or now_s
@@ -169,7 +170,8 @@ class Watcher:
         try:
             state = self._arm.state()
         except DeviceFault as error:
-            status = self._arm.status()  # the stop may have come between the two readings
+            # The stop may have come between the two readings.
+            status = self._arm.status()
             if status.fault is not None:
                 raise by_safety(status, str(error)) from error
             raise Tripped(Hazard.WRONG_MODEL, error) from error
@@ -178,7 +180,8 @@ class Watcher:
             sample = self._sensor.latest(timeout_s=0.0)
         except DeviceError as error:
             raise Tripped(Hazard.SENSOR_LOST, error) from error
-        if motion is not self._motion:  # the block has ended meanwhile: the readings may belong to the next one
+        # The block has ended meanwhile: the readings may belong to the next one.
+        if motion is not self._motion:
             return
         now_s = self.clock.now_s()
         dt_s = min(now_s - self._looked_s, self._limits.counted_s)
@@ -203,7 +206,8 @@ class Watcher:
         self.clock.wait(stopped, self._limits.slow_stop_s)
         try:
             self._on_trip(trip)
-        except Exception as error:  # a screen or a disk failed: the arm is watched all the same
+        # A screen or a disk failed: the arm is watched all the same.
+        except Exception as error:
             log.exception("a stop could not be reported")
             self.report_error = error
         while not self.clock.wait(stopped, 1.0):

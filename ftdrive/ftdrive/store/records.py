@@ -14,7 +14,8 @@ from ftcalib.files import JSON, check_format, read_file, read_object
 from ftdrive.runs.verification_record import EMULATED, FORMAT, marks_of
 from ftdrive.runs.weighings import FILES, FOLDER, WeighingsFile, is_weighings
 
-if TYPE_CHECKING:  # a list of results needs no numpy
+# A list of results needs no numpy.
+if TYPE_CHECKING:
     from ftcalib.model import Array, Parameters
 
 

@@ -119,7 +119,8 @@ def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array, enough_m: A
     """
     centre, half = (low_m + high_m) / 2, (high_m - low_m) / 2
     point = bodies.centre_m
-    best = np.full(len(point), -1.0)  # if a body intersects the box, the depth is not computed
+    # If a body intersects the box, the depth is not computed.
+    best = np.full(len(point), -1.0)
     open_ = np.arange(len(point))
     for _ in range(PROJECTIONS):
         on_box = np.clip(point, low_m, high_m)

@@ -212,7 +212,8 @@ def _refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array, p_base_
             J = np.concatenate([np.stack(levers, axis=2), J], axis=1)
             off = np.concatenate([p_base_flange_m - points[6], off], axis=1)
         JT = np.swapaxes(J, 1, 2)
-        damping = np.square(off).sum(axis=1)[:, None, None] + _TINY  # no step is above half a radian
+        # No step is above half a radian.
+        damping = np.square(off).sum(axis=1)[:, None, None] + _TINY
         step = JT @ np.linalg.solve(J @ JT + damping * np.eye(J.shape[1]), off[:, :, None])
         q[:, first:] += step[:, :, 0]
     return q

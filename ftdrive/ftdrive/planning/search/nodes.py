@@ -127,7 +127,8 @@ MOST_POSTURES = 200
 def grid(certifier: Certifier, q_rad: Array, step_deg: int = _GRID_DEG) -> Array:
     """Candidate postures (m, 3) of joints 1 to 3, the nearest first."""
     level = not certifier.scene.boxes and all(np.hypot(*plane.normal[:2]) < _LEVEL for plane in certifier.scene.planes)
-    pans = q_rad[0] + np.radians(_PANS_DEG[:1] if level else _PANS_DEG)  # nothing distinguishes one pan from another
+    # Nothing distinguishes one pan from another.
+    pans = q_rad[0] + np.radians(_PANS_DEG[:1] if level else _PANS_DEG)
     shoulder, elbow = (np.radians(np.arange(low, high + 1, step_deg)) for low, high in (_SHOULDER_DEG, _ELBOW_DEG))
     postures = np.array(list(product(pans, shoulder, elbow)))
     postures = postures[np.abs(postures[:, 0]) <= 2 * np.pi]
