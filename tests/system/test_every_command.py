@@ -152,7 +152,7 @@ def test_a_command_that_needs_a_run_works_with_simulate_and_json(
     capfd: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    module = importlib.import_module(f"ftdrive.commands.{'emulated_run' if ' ' in command else command}")
+    module = importlib.import_module(f"ftdrive.commands.{'common' if ' ' in command else command}")
     monkeypatch.setattr(module, "rehearsed_run", lambda _, **_options: nullcontext(Path(demo["run"])))
     works_with_simulate_and_json(command, ftdrive, capfd)
 
@@ -218,7 +218,7 @@ def test_a_file_gets_the_answer_and_a_reader_that_ends_ends_the_command(
     command: str, demo: dict[str, Any], ftdrive: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if command in REHEARSED:
-        module = importlib.import_module(f"ftdrive.commands.{'emulated_run' if ' ' in command else command}")
+        module = importlib.import_module(f"ftdrive.commands.{'common' if ' ' in command else command}")
         monkeypatch.setattr(module, "rehearsed_run", lambda _, **_options: nullcontext(Path(demo["run"])))
     recorder = Recorder([csv := ftdrive.folder / "peg.csv"], info(), {})
     recorder.write(block(100))
