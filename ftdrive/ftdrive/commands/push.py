@@ -28,8 +28,8 @@ from ftdrive.runs.source import read_calibration
 from ftdrive.session.events import Question
 from ftdrive.session.settings_push import EFFECTS, WORDS, propose, restore, send
 from ftdrive.terminal.console import answer, beside, messages
-from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
 from ftdrive.terminal.screen import open_operator
+from ftdrive.terminal.session_text import proposal_in_lines, settings_in_words
 from ftdrive.terminal.text import echo
 
 _PATH = click.Path(exists=True, path_type=Path)

@@ -14,7 +14,7 @@ from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfi
 from ftdrive.errors import ConfigError, Declined, NotAccepted, SupervisorGone
 from ftdrive.runs.push_receipt import Receipt
 from ftdrive.session.settings_push import Push, propose, restore, send
-from ftdrive.terminal.push_text import proposal_in_lines, settings_in_words
+from ftdrive.terminal.session_text import proposal_in_lines, settings_in_words
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo, Guard
