@@ -71,8 +71,8 @@ class Columns:
     """n consecutive samples, one array for each quantity, one row for each sample."""
 
     __slots__ = ()
+    # Fields that are no arrays by rows: one value for all of them, and of joined blocks that of the last.
     _COMMON: ClassVar[frozenset[str]] = frozenset()
-    """Fields that are no arrays by rows: one value for all of them, and of joined blocks that of the last."""
     t_host_ns: NDArray[np.int64]
 
     def __len__(self) -> int:

@@ -27,10 +27,10 @@ Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device
 141 the reader of the output has ended."""
 
 
+# As a shell reports a program that SIGPIPE ended.
 _CLOSED_PIPE = 128 + 13
-"""As a shell reports a program that SIGPIPE ended."""
+# Signals of a terminal that was closed; whatever fails after one is its consequence.
 _closed_terminals: list[int] = []
-"""Signals of a terminal that was closed; whatever fails after one is its consequence."""
 
 
 @contextmanager

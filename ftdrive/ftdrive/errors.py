@@ -69,6 +69,7 @@ class SupervisorGone(FtdriveError):
         super().__init__(f"{why}: {effect}")
 
 
+# The first kind that fits counts.
 _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (UsageError, 2),
     (ConnectError, 3),
@@ -81,7 +82,6 @@ _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (AcceptanceError, 7),
     (SupervisorGone, 9),
 )
-"""The first kind that fits counts."""
 
 
 def exit_code(error: BaseException) -> int | None:

@@ -26,8 +26,8 @@ from ftdrive.errors import ConfigError
 
 Address = tuple[str, int]
 
+# A request may take so long.
 _HEAD_S: Final = 10.0
-"""A request may take so long."""
 _HEAD_BYTES: Final = 1 << 16
 _PIECE: Final = 1 << 16
 

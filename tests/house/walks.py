@@ -91,7 +91,7 @@ WALKS = {
         ftcalib.likelihood.rotation_minima        minima                   finds those of the force cost
         ftcalib.likelihood.explanation            select                   adds components, drops others
         ftcalib.likelihood.variance_components    maximise                 estimates their variances
-        ftcalib.likelihood.fit                    fit_of                   adds covariance and response
+        ftcalib.likelihood.fit                    _fit_of                  adds covariance and response
         ftcalib.likelihood.explanation            rivals                   finds other explanations
         ftcalib.judge.verdict                     judge                    makes findings and verdict
         ftcalib.judge.faults                      faults                   names mistakes in the data

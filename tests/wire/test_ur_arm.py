@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.ur.arm import UrArm
-from ftdrivers.ur.control import Control, ControlProcess
+from ftdrivers.ur.control import Control
+from ftdrivers.ur.control_process import ControlProcess
 from ftdrivers.ur.kinematics import forward, kinematics_of
 from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station, on_ur_rtde, one_path

@@ -49,7 +49,8 @@ import pytest
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.ur.arm import UrArm
-from ftdrivers.ur.control import Control, ControlPath, ControlProcess
+from ftdrivers.ur.control import Control, ControlPath
+from ftdrivers.ur.control_process import ControlProcess
 from ftdrivers.ur.opening import Opening
 from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station, on_ur_rtde, one_path

@@ -399,12 +399,12 @@ def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Ar
 
 
 class _Fit(NamedTuple):
+    # (k, 3) coefficients of the columns.
     x: Array
-    """(k, 3) coefficients of the columns."""
+    # (3,) of the last coefficient.
     sigma: Array
-    """(3,) of the last coefficient."""
+    # Rms of what each run differs from its prediction by the others.
     left_out: float
-    """Rms of what each run differs from its prediction by the others."""
 
 
 def _fit_columns(X: Array, walk: Array, y: Array, noise: Array) -> _Fit:

@@ -304,7 +304,7 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
         chosen = _with_expected_noise(session, chosen)
     static = minima if chosen.kept.all() else session.descent.minima(weights * chosen.kept[:, None, None])
     for _ in range(len(static)):
-        found = with_all_minima(session, chosen, static)
+        found = _with_all_minima(session, chosen, static)
         if session.descent.same(found[0].parameters, chosen.parameters):
             break
         other = _improve(session, found[0].parameters, chosen.kept)
@@ -434,7 +434,7 @@ def _criterion(session: Session, at: Point, distances: Array) -> float:
     return value
 
 
-def with_all_minima(session: Session, e: Explanation, others: list[Minimum]) -> list[Minimum]:
+def _with_all_minima(session: Session, e: Explanation, others: list[Minimum]) -> list[Minimum]:
     """Find the minima again, under the noise of the explanation."""
     noise = noise_under(session, e, e.parameters)
     statistics, logdet = session.statistics(noise, e.parameters), noise.logdet

@@ -173,10 +173,10 @@ def fit(
         The lowest point reached is not a minimum. Poor information is not refused here: see `Fit.information`.
     """
     session = Session(R_base_flange, wrench, wrench_cov, t_s, drift, Constraints(known or Known(), g_m_s2))
-    return fit_of(session, *explain(session))
+    return _fit_of(session, *explain(session))
 
 
-def fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
+def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
     """Put together what follows from an explanation; arguments as `explain` returns them."""
     best = minima[0]
     if not best.settled:

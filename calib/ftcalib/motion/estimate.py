@@ -275,8 +275,8 @@ class _Problem:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Step:
     step: Array
+    # Chi2 of rows and priors after the step.
     cost: float
-    """Chi2 of rows and priors after the step."""
     criterion: float
     basis: Array
     factor: tuple[Array, bool]

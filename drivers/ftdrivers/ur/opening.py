@@ -11,8 +11,9 @@ from typing import Final
 from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import Diagnosis
-from ftdrivers.ur import control, primary, script_control
-from ftdrivers.ur.control import Control, ControlPath, ControlProcess, ControlSetting, ProgramRefused
+from ftdrivers.ur import control_process, primary, script_control
+from ftdrivers.ur.control import Control, ControlPath, ControlSetting, ProgramRefused
+from ftdrivers.ur.control_process import ControlProcess
 from ftdrivers.ur.primary import find_program_port
 from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.rtde import registers_in_use, registers_taken
@@ -212,7 +213,7 @@ class Opening:
 
     def require_registers(self) -> None:
         """Raise `ConnectError` when another client keeps the registers, before any of its programs is stopped."""
-        inputs = control.INPUTS if self.path == "ur-rtde" else tuple(script_control.INPUTS)
+        inputs = control_process.INPUTS if self.path == "ur-rtde" else tuple(script_control.INPUTS)
         deadline_s = self.clock.now_s() + self.timing.release_s
         while taken := registers_in_use(self.host, inputs, timeout_s=self.timing.connect_s, clock=self.clock):
             if self.clock.now_s() > deadline_s:
@@ -221,7 +222,7 @@ class Opening:
 
     @property
     def _port(self) -> int:
-        return control.PROGRAM_PORT if self.path == "ur-rtde" else primary.PORT
+        return control_process.PROGRAM_PORT if self.path == "ur-rtde" else primary.PORT
 
     def _start(self, path: ControlPath) -> Control:
         if path == "script":

@@ -41,8 +41,8 @@ SATURATION: Final = 0.9
 _MUCH_AT_REST: Final = 0.5
 # A smaller share of the weight at rest is likely to be compensated or zeroed.
 # The centre of the payload may be this far outside the described tool.
+# Random ones, in which an arm is compared with its model.
 _COMPENSATED: Final = 0.1
-"""Random ones, in which an arm is compared with its model."""
 """The time-outs of moves allow for this one."""
 AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 

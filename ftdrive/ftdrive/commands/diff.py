@@ -33,8 +33,8 @@ class _Side:
     created_utc: str | None
     mass_kg: float
     mass_sigma_kg: float
+    # Whether it was made in an emulated cell.
     emulated: bool
-    """Whether it was made in an emulated cell."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as JSON, without the calibration itself."""

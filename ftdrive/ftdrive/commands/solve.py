@@ -215,16 +215,16 @@ class _Wanted:
     drift: Drift
     as_published: bool
     earlier: CalibrationResult | None
+    # Files of wrench and orientation of a recording in motion.
     pair: tuple[Path, Path] | None
-    """Files of wrench and orientation of a recording in motion."""
     point_mass: bool
+    # Topics of a bag: wrench and pose.
     topics: tuple[str | None, str | None]
-    """Topics of a bag: wrench and pose."""
     test: Path | None
+    # The poses of `test`.
     tests: CalibrationDataset | None
-    """The poses of `test`."""
+    # The cases of Yu's Table III, instead of one result.
     cases: bool
-    """The cases of Yu's Table III, instead of one result."""
 
     def read(self, place: Path) -> RecordedData:
         """Read poses at rest."""

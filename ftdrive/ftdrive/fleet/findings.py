@@ -143,12 +143,12 @@ class _Load:
     cell: str
     mass_kg: float
     mass_sigma_kg: float
+    # (2,) identified centre of mass of the tool, flange axes.
     off_axis_m: Array
-    """(2,) identified centre of mass of the tool, flange axes."""
     off_axis_sigma_m: Array
     payload_kg: float
+    # (2,) the centre that the payload amounts to, if sensor and adapter are centred on the axis of the flange.
     configured_off_axis_m: Array | None
-    """(2,) the centre that the payload amounts to, if sensor and adapter are centred on the axis of the flange."""
 
 
 def _payloads(newest: Sequence[tuple[str, StoredResult]]) -> Iterator[FleetFinding]:

@@ -24,8 +24,8 @@ from ftdrivers.interfaces import ArmState, ArmStatus
 
 G_M_S2: Final = 9.81
 _SLIDER: Final = 0.02
+# On a curve, an arm that has moved so far makes progress.
 _PROGRESS_RAD: Final = 1e-3
-"""On a curve, an arm that has moved so far makes progress."""
 
 
 class Tripped(Exception):

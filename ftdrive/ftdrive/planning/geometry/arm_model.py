@@ -209,8 +209,8 @@ class _Shape:
     elbow_hub_m: tuple[float, float]
     forearm_hub_m: tuple[float, float]
     forearm_end_hub_m: tuple[float, float]
+    # From the centres of joints 5 and 6 back to the lids of wrists 1 and 2.
     wrist_lid_m: float
-    """From the centres of joints 5 and 6 back to the lids of wrists 1 and 2."""
 
 
 _UR5E = _Shape(

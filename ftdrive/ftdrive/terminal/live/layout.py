@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ftdrive.checks.devices import AXES
+from ftdrive.checks.sensor import AXES
 from ftdrive.terminal.live import panels
 from ftdrive.terminal.live.lines import CONTACT, FAINT, STRONG, Line, characters, envelope, level
 from ftdrive.terminal.live.view import PlotColumns, View

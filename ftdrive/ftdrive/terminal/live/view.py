@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
-from ftdrive.checks.devices import check_noise_change
+from ftdrive.checks.sensor import check_noise_change
 from ftdrive.live.frames import FrameTransform
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block, Stages, StreamInfo, StreamStatus, WrenchFrame

@@ -24,7 +24,8 @@ from ftdrivers.errors import NoDashboard
 from ftdrivers.ur import arm as arm_module
 from ftdrivers.ur import control_child, opening, reading
 from ftdrivers.ur.arm import UrArm
-from ftdrivers.ur.control import STOP_RAD_S2, ControlProcess
+from ftdrivers.ur.control import STOP_RAD_S2
+from ftdrivers.ur.control_process import ControlProcess
 from ftdrivers.ur.kinematics import MODELS, Kinematics, Pose, forward
 from ftdrivers.ur.reading import Reader
 from ftdrivers.ur.rtde import Recipe

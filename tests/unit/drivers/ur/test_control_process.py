@@ -15,7 +15,7 @@ import pytest
 from ftdrivers.clock import REAL
 from ftdrivers.errors import StreamBroken
 from ftdrivers.ur import control_child
-from ftdrivers.ur.control import ControlProcess
+from ftdrivers.ur.control_process import ControlProcess
 from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import Controller
