@@ -108,7 +108,14 @@ def test_a_no_before_the_first_motion_ends_the_session(words: str, lab: Lab) -> 
 # ------------------------------------------------------------------------------- an emergency stop is pressed meanwhile
 
 
-@pytest.mark.parametrize("mode", ["robot emergency stop", "system emergency stop", "safeguard stop", "protective stop"])
+@pytest.mark.parametrize(
+    "mode",
+    [
+        "robot emergency stop",
+        *(pytest.param(mode, marks=pytest.mark.slow) for mode in ("system emergency stop", "safeguard stop")),
+        "protective stop",
+    ],
+)
 def test_an_emergency_stop_that_is_pressed_in_a_hold_brings_the_questions_again(mode: str, lab: Lab) -> None:
     pause_on_the_way(lab, 4)
     lab.operator.answers["resume:"] = ["resume"]

@@ -133,7 +133,9 @@ def test_one_figure_that_is_not_good_enough_decides_the_light(different: dict[st
     assert _light(replace(just_good, **different)) == light
 
 
-@pytest.mark.parametrize(("half_angle_deg", "light"), [(70, "green"), (37, "amber"), (15, "red")])
+@pytest.mark.parametrize(
+    ("half_angle_deg", "light"), [(70, "green"), pytest.param(37, "amber", marks=pytest.mark.slow), (15, "red")]
+)
 def test_the_light_distinguishes_wide_cones_from_narrow_ones(half_angle_deg: float, light: str) -> None:
     from ftcalib.poses.information import Guess
     from ftcalib.poses.selection import choose
@@ -322,11 +324,15 @@ def test_a_load_that_shifts_is_named_with_the_pose_from_which_on(since: int) -> 
     assert (change.code, change.values["pose"]) == ("com_shifted", since)
 
 
-def test_a_tare_and_a_lost_part_in_mid_tour_are_distinguished() -> None:
+def test_a_tare_in_mid_tour_is_a_step_of_the_bias() -> None:
     step = np.array([0.3, 0, 0.2, 0, 0, 0])
     change = changed(disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop >= 10) * step))
     assert (change.code, change.values["pose"]) == ("bias_stepped", 10)
     assert change.values["force_N"] == pytest.approx(np.linalg.norm(step), abs=0.03)
+
+
+@pytest.mark.slow
+def test_a_part_that_is_lost_in_mid_tour_changes_the_load() -> None:
     lighter = replace(TRUTH, gravity_force_base_N=0.95 * TRUTH.gravity_force_base_N)
     change = changed(disturbed(lambda stop, R, _: predict(lighter if stop >= 14 else TRUTH, R)))
     assert (change.code, change.values["pose"]) == ("load_changed", 14)

@@ -18,6 +18,11 @@ from ftdrive.session.options import method_of_poses
 from tests.unit.ftdrive.fake_cell import Lab
 
 
+@pytest.fixture(autouse=True)
+def _few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ftcalib.solver.SIMULATIONS", 20)  # of the covariance of a published method
+
+
 def test_the_run_keeps_its_method_and_every_solve_uses_it(lab: Lab) -> None:
     outcome = lab.calibrate(method="lrom")
     assert outcome is not None
@@ -37,7 +42,7 @@ def test_the_run_keeps_its_method_and_every_solve_uses_it(lab: Lab) -> None:
     [
         ("srom", None, "the tour has 6 of them: plan all 24"),
         ("srom", "H", "the tour has 0 of them"),
-        ("mixed", "H", "the tour has 0 of them"),
+        pytest.param("mixed", "H", "the tour has 0 of them", marks=pytest.mark.slow),
         ("srom", "A+H", "the tour has 12 other poses: choose --method mixed"),
     ],
 )
@@ -49,6 +54,7 @@ def test_a_tour_without_the_special_orientations_is_refused_before_it_moves(
     assert lab.arm.moves == []
 
 
+@pytest.mark.slow
 def test_case_8_and_its_table_come_from_one_run(lab: Lab) -> None:
     outcome = lab.calibrate(method="mixed", sets="A+H")
     assert outcome is not None

@@ -448,7 +448,9 @@ def hold_and_resume(lab: Lab, fault: Callable[[], None], repair: Callable[[], No
     lab.take_poses()
 
 
-@pytest.mark.parametrize("mode", ["robot emergency stop", "safeguard stop", "protective stop"])
+@pytest.mark.parametrize(
+    "mode", ["robot emergency stop", pytest.param("safeguard stop", marks=pytest.mark.slow), "protective stop"]
+)
 def test_after_an_emergency_stop_the_whole_preflight_is_done_again_questions_too(mode: str, lab: Lab) -> None:
     hold_and_resume(lab, lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode=mode), lab.arm.set_status)
     names = [event.name for event in lab.operator.of(Checked)]

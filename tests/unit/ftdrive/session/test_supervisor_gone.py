@@ -37,7 +37,9 @@ def resumes(lab: Lab, poses: int) -> None:
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
 
 
-@pytest.mark.parametrize("shown", [True, False], ids=["input ended", "output closed"])
+@pytest.mark.parametrize(
+    "shown", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["input ended", "output closed"]
+)
 def test_the_arm_stops_in_mid_move_before_anything_else(shown: bool, lab: Lab) -> None:
     begun_s: list[float] = []
 

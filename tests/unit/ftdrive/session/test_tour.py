@@ -172,6 +172,13 @@ def test_a_skipped_pose_counts_against_the_plan_though_resume_takes_it(lab: Lab)
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     assert not has_run(lab)
     assert "slow again" in lab.said()
+
+
+@pytest.mark.slow
+def test_a_plan_counts_once_all_its_poses_are_taken_again(lab: Lab) -> None:
+    lab.operator.answers["Pose 3 of 7"] = ["s"]
+    lab.take_poses(mode="step")
+    lab.take_poses(resume=lab.run().folder, mode="auto")
     lab.operator.shown.clear()
     lab.take_poses(resume=lab.run().folder)  # nothing is left to take: nothing to be said of moves
     assert "slow again" not in lab.said()
@@ -188,7 +195,7 @@ def test_a_pose_that_is_skipped_where_the_arm_stands_counts_against_the_plan(lab
     assert "poses are missing" in lab.said()
 
 
-@pytest.mark.parametrize(("key", "answer"), [(Key.PAUSE, "back"), (Key.STOP, "")])
+@pytest.mark.parametrize(("key", "answer"), [(Key.PAUSE, "back"), pytest.param(Key.STOP, "", marks=pytest.mark.slow)])
 def test_a_move_that_was_broken_off_counts_against_the_plan(key: Key, answer: str, lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(key)
     lab.operator.answers["poses are saved"] = [answer, "resume"]

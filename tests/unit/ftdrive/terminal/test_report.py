@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -47,9 +48,11 @@ TILTED = Parameters(  # 0.5 kg under a base that is 1.9 degrees off level
 LEVEL = Known(gravity_direction_base=(0, 0, -1), mass_kg=0.5)  # which that base is not
 
 
-@pytest.fixture(autouse=True)
-def _few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ftcalib.solver.SIMULATIONS", 20)  # of the covariance of a published method
+@pytest.fixture(autouse=True, scope="module")
+def _few_simulations() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ftcalib.solver.SIMULATIONS", 20)  # of the covariance of a published method
+        yield
 
 
 def tilted(*, measured: bool = True) -> CalibrationDataset:
@@ -65,7 +68,10 @@ def test_the_error_of_an_angle_does_not_count_whole_turns() -> None:
     np.testing.assert_allclose(errors_in_sigma(result, truth)["tilt_beta_rad"], 2)
 
 
-@pytest.mark.parametrize(("method", "measured"), [("carlson-cayley", True), ("ml", False)])
+@pytest.mark.parametrize(
+    ("method", "measured"),
+    [("carlson-cayley", True), ("carlson-cayley", False), pytest.param("ml", False, marks=pytest.mark.slow)],
+)
 def test_the_headline_promises_no_error_that_the_residuals_refute(method: Method, measured: bool) -> None:
     result = solve(tilted(measured=measured), method, known=LEVEL)
     left_out_N = result.quality["loo_force_rms_N"]
