@@ -1,5 +1,7 @@
 """Times of measurement, interpolated poses, and which sample gets which pose."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -31,13 +33,17 @@ def received(seconds: float, rate_Hz: float, batch: int, seed: int = 1) -> tuple
     return count, T0_NS + np.repeat(at_s * 1e9, batch).astype(np.int64)
 
 
+def stamped(line: Timeline, count: np.ndarray, t_ns: np.ndarray) -> np.ndarray:
+    """Times of measurement of samples that arrive in batches of 8."""
+    parts = [slice(i, i + 8) for i in range(0, len(count), 8)]
+    return np.concatenate([line.stamp(count[part].astype(float), t_ns[part]) for part in parts])
+
+
 @pytest.mark.parametrize("true_Hz", [1000.0, 1004.0, 998.5])
 def test_times_are_those_of_the_measurement_though_batches_come_late(true_Hz: float) -> None:
     count, t_ns = received(20.0, true_Hz, 8)
     line = Timeline(1 / 1000.0, RATE_TOLERANCE)  # the nominal rate is a little wrong
-    stamps = np.concatenate(
-        [line.stamp(count[i : i + 8].astype(float), t_ns[i : i + 8]) for i in range(0, len(count), 8)]
-    )
+    stamps = stamped(line, count, t_ns)
     error_s = (stamps - T0_NS) * 1e-9 - count / true_Hz - 2e-4
     assert np.abs(error_s[5000:]).max() < 2e-4  # the batches scatter by 2 ms
     assert (np.diff(stamps) > 0).all()
@@ -140,25 +146,38 @@ def test_the_pose_is_that_of_the_measurement(delay_s: float) -> None:
     assert angle_between(R, motion.pose(seq * 1e-3)[0]).max() < 5e-4  # half a millisecond at 1 rad/s
 
 
-def recording(delay_s: float, scale: float = 1.0, touch: bool = False) -> tuple[FtSamples, ArmStates]:
+def recording(delay_s: float, scale: float = 1.0) -> tuple[FtSamples, ArmStates]:
     """A recording with exact times, but the wrench is late."""
     motion = Motion(scale, 2 * scale)
     samples, states = motion.links(12.0, 0.0, rate_Hz=500.0, batch_s=1e-9)
     t_ns = T0_NS + np.arange(len(samples)) * 2_000_000
-    wrench = samples.wrench.copy()
-    if touch:
-        wrench[1500:2500, :3] += np.array([5.0, -8.0, 3.0]) * np.sin(np.arange(1000) * 0.02)[:, None]
-    samples = FtSamples.of(t_ns + round(delay_s * 1e9), samples.seq, wrench)
+    samples = FtSamples.of(t_ns + round(delay_s * 1e9), samples.seq, samples.wrench)
     exact = T0_NS + np.arange(len(states)) * 2_000_000
     return samples, ArmStates(exact, *(getattr(states, n) for n in ArmStates._names()[1:]))
 
 
-@pytest.mark.parametrize(("delay_s", "touch"), [(0.0, False), (0.02, False), (-0.015, False), (0.01, True)])
-def test_the_delay_between_the_links_is_found_from_motion(delay_s: float, touch: bool) -> None:
-    estimator = DelayEstimator(calibrated(6), P_FLANGE_SENSOR_M, window=60)
-    samples, states = recording(delay_s, touch=touch)
-    estimate_delay([samples], [states], estimator)
-    assert estimator.delay_s == pytest.approx(delay_s, abs=max(6 * estimator.sigma_s, 5e-5))
+PUSHED, DRIFTED = np.zeros((6000, 6)), np.array([1.0, -1.0, 2.0, 0, 0, 0])
+PUSHED[1500:2500, :3] = np.array([5.0, -8.0, 3.0]) * np.sin(np.arange(1000) * 0.02)[:, None]
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "added", "poses", "p_flange_sensor_m", "most_s"),
+    [
+        *((delay_s, 0.0, 6, P_FLANGE_SENSOR_M, 5e-5) for delay_s in (0.0, 0.02, -0.015)),
+        (0.01, PUSHED, 6, P_FLANGE_SENSOR_M, 5e-5),
+        (0.005, DRIFTED, 24, P_FLANGE_SENSOR_M, 1e-4),
+        (0.01, 0.0, 24, np.full(3, np.nan), 1e-4),
+    ],
+    ids=["none", "late", "early", "a touch", "a wrong bias", "an unknown height"],
+)
+def test_the_delay_between_the_links_is_found_from_motion(
+    delay_s: float, added: Any, poses: int, p_flange_sensor_m: np.ndarray, most_s: float
+) -> None:
+    estimator = DelayEstimator(calibrated(poses), p_flange_sensor_m, window=60)
+    samples, states = recording(delay_s)
+    pushed = FtSamples.of(samples.t_host_ns, samples.seq, samples.wrench + added)
+    estimate_delay([pushed], [states], estimator)
+    assert estimator.delay_s == pytest.approx(delay_s, abs=max(6 * estimator.sigma_s, most_s))
     assert estimator.sigma_s < 2e-4
 
 
@@ -172,21 +191,6 @@ def test_vibration_and_noisy_poses_are_not_taken_for_a_delay() -> None:
     estimator = DelayEstimator(calibration, np.array([0, 0, truth.height_m]), window=60)
     estimate_delay([samples], [states], estimator)
     assert abs(estimator.delay_s - truth.delay_s) < 3 * estimator.sigma_s < 3e-3
-
-
-def test_an_unknown_height_of_the_sensor_is_not_taken_for_a_delay() -> None:
-    estimator = DelayEstimator(calibrated(), np.full(3, np.nan), window=60)
-    samples, states = recording(0.01)
-    estimate_delay([samples], [states], estimator)
-    assert estimator.delay_s == pytest.approx(0.01, abs=max(6 * estimator.sigma_s, 1e-4))
-
-
-def test_a_wrong_bias_is_not_taken_for_a_delay() -> None:
-    samples, states = recording(0.005)
-    drifted = FtSamples.of(samples.t_host_ns, samples.seq, samples.wrench + np.array([1.0, -1.0, 2.0, 0, 0, 0]))
-    estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M, window=60)
-    estimate_delay([drifted], [states], estimator)
-    assert estimator.delay_s == pytest.approx(0.005, abs=max(6 * estimator.sigma_s, 1e-4))
 
 
 def test_an_arm_at_rest_shows_no_delay() -> None:
@@ -209,9 +213,7 @@ def test_a_busy_computer_at_the_beginning_does_not_bend_the_line() -> None:
     )  # more and more, then it catches up
     t_ns = T0_NS + np.maximum.accumulate((count * 1e-3 + late_s) * 1e9).astype(np.int64)
     line = Timeline(1e-3, RATE_TOLERANCE)
-    stamps = np.concatenate(
-        [line.stamp(count[i : i + 8].astype(float), t_ns[i : i + 8]) for i in range(0, len(count), 8)]
-    )
+    stamps = stamped(line, count, t_ns)
     assert np.abs((stamps - T0_NS) * 1e-9 - count * 1e-3).max() < 5e-3
 
 
@@ -219,9 +221,7 @@ def test_lost_samples_that_nothing_counts_bend_the_line_for_some_seconds_only() 
     count, t_ns = received(12.0, 1000.0, 8)
     t_ns[4000:] += 30_000_000  # 30 samples are missing
     line = Timeline(1e-3, RATE_TOLERANCE)
-    stamps = np.concatenate(
-        [line.stamp(count[i : i + 8].astype(float), t_ns[i : i + 8]) for i in range(0, len(count), 8)]
-    )
+    stamps = stamped(line, count, t_ns)
     error_s = (stamps - T0_NS) * 1e-9 - count * 1e-3 - 2e-4 - np.where(count < 4000, 0, 0.03)
     assert np.abs(error_s[7000:]).max() < 5e-4
     assert (np.diff(stamps) > 0).all()

@@ -442,25 +442,17 @@ def test_a_tare_without_samples_is_refused() -> None:
     assert "only 100 samples" in processor.tare().text
 
 
-def test_drift_is_found_with_its_sigma_and_warned_of_once() -> None:
-    n, per_h = 24_000, 12.0  # 4 minutes at 100 Hz
-    drift = np.zeros((n, 6))
-    drift[:, 0] = per_h * np.arange(n) / 100 / 3600
+@pytest.mark.parametrize("per_h", [12.0, 0.0])
+def test_drift_is_found_with_its_sigma_and_warned_of_once(per_h: float) -> None:
+    n = 24_000  # 4 minutes at 100 Hz
+    drift = np.outer(per_h * np.arange(n) / 100 / 3600, np.eye(6)[0])
     rows = paired(np.tile(UPSIDE_DOWN, (n, 1, 1)), 100.0, push=drift)
     processor, _ = processed(rows, block=2000, rate_Hz=100.0)
     rate, sigma = processor._drift.force_rate_N_h
     assert sigma < 2.0
     assert rate == pytest.approx(per_h, abs=6 * sigma)
-    assert [event for event in kinds(processor) if event == "drift"] == ["drift"]
+    assert kinds(processor).count("drift") == (per_h > 0)
     assert processor.tare_wrench is None
-
-
-def test_without_drift_there_is_no_warning() -> None:
-    rows = paired(np.tile(UPSIDE_DOWN, (24_000, 1, 1)), 100.0)
-    processor, _ = processed(rows, block=2000, rate_Hz=100.0)
-    rate, sigma = processor._drift.force_rate_N_h
-    assert rate < 5 * sigma
-    assert "drift" not in kinds(processor)
 
 
 def test_the_bias_follows_the_temperature_in_small_steps_and_events_in_large_ones() -> None:

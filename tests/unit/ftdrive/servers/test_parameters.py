@@ -2,16 +2,14 @@
 
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
-from foxglove import Parameter
 
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.servers import parameters as of_ros2
-from ftdrive.servers.foxglove import Parameters
 from ftdrive.servers.parameters import Fixed, NodeParameters, checked_value
 
 FRAME = WrenchFrame("base", "tcp")
@@ -59,33 +57,6 @@ def test_a_value_is_taken_as_the_stages_have_it(name: str, value: Any, wanted: A
 def test_another_value_is_rejected_with_those_that_are_right(name: str, value: Any, fix: str) -> None:
     with pytest.raises(ConfigError, match=rf"{name} cannot be .*: .*{fix}"):
         checked_value(name, value)
-
-
-def test_foxglove_sets_all_or_nothing() -> None:
-    stream = SimpleNamespace(frame=FRAME, stages=Stages(notch_Hz=30.0))
-    warned: list[str] = []
-    parameters, client = Parameters(cast("Any", stream), warned.append), cast("Any", None)
-    shown = {one.name: one.get_value() for one in parameters.on_get_parameters(client, [])}
-    assert shown == {
-        "axes": "base",
-        "about": "tcp",
-        "bias": True,
-        "gravity": True,
-        "inertia": False,
-        "notch_Hz": 30.0,
-        "lowpass_Hz": 0.0,
-        "deadband_N": 0.0,
-        "deadband_Nm": 0.0,
-    }
-    assert [one.name for one in parameters.on_get_parameters(client, ["axes", "bias"])] == ["axes", "bias"]
-    changes: dict[str, Any] = {"axes": "tcp", "about": [0.0, 0.0, 0.1], "lowpass_Hz": 40.0, "notch_Hz": 0.0}
-    found = parameters.on_set_parameters(client, [Parameter(name, value=value) for name, value in changes.items()])
-    assert {one.name: one.get_value() for one in found} == {**shown, **changes}
-    before = stream.frame, stream.stages
-    assert before == (WrenchFrame("tcp", (0.0, 0.0, 0.1)), Stages(lowpass_Hz=40.0))
-    parameters.on_set_parameters(client, [Parameter("axes", value="base"), Parameter("bias", value=3.0)])
-    assert (stream.frame, stream.stages) == before
-    assert warned == ["bias cannot be 3.0: set true or false"]
 
 
 class FakeNode:
