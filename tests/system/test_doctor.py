@@ -15,37 +15,18 @@ from ftdrive.commands.common import rehearse
 from tests.system.command_line import CommandLine, listen_for
 
 NAMED = {
-    "robot.kinematics",
-    *(
-        "robot.reachable",
-        "robot.identity",
-        "robot.remote",
-        "robot.safety",
-        "robot.program",
-        "robot.flange",
-    ),
-    *("clock.pace", "sensor.identity", "sensor.rate", "sensor.lost", "sensor.age", "sensor.status", "sensor.counts"),
-    *(
-        "sensor.range",
-        "sensor.sign",
-        "robot.speed",
-        "robot.payload",
-        "robot.control",
-        "robot.registers",
-        "robot.programs",
-        "robot.version",
-    ),
-    *(
-        "robot.version",
-        "robot.link",
-        "sensor.load",
-        "sensor.rest",
-        "noise.level",
-        "noise.accuracy",
-        "disk.runs",
-        "workcell.measured",
-    ),
-    *("permissions.port", "permissions.by-id", "permissions.latency_timer"),
+    f"{room}.{name}"
+    for room, names in {
+        "clock": "pace",
+        "disk": "runs",
+        "noise": "accuracy level",
+        "permissions": "by-id latency_timer port",
+        "robot": "control flange identity kinematics link payload program programs reachable registers remote safety "
+        "speed version",
+        "sensor": "age counts identity load lost range rate rest sign status",
+        "workcell": "measured",
+    }.items()
+    for name in names.split()
 }
 
 

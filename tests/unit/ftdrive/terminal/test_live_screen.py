@@ -76,6 +76,10 @@ class Screen:
 
         return asyncio.run(main())
 
+    def pressed(self, *keys: str) -> list[str]:
+        """Press the keys, and return the lines of the screen."""
+        return self.run(lambda screen, pilot: screen.press(pilot, *keys))
+
     async def lines(self, pilot: Pilot[None]) -> list[str]:
         self.app.draw()
         await pilot.pause()
@@ -152,16 +156,13 @@ def test_a_frame_that_is_not_configured_is_left_out_and_named() -> None:
 
         blocks = 0
 
-    async def act(screen: Screen, pilot: Pilot[None]) -> None:
-        await screen.press(pilot, "x", "x")
-
     screen = Screen(blocks=0)
     screen.stream = NoTcp()
     screen.stream.frame = WrenchFrame("flange", "flange")
     screen.feed = Feed(screen.stream)
     screen.summary = Summary(screen.feed)
     screen.step(10)
-    lines = screen.run(act)
+    lines = screen.pressed("x", "x")
     assert screen.stream.frame == WrenchFrame("sensor", "flange")
     assert "does not report its active TCP" in "".join(lines)
 
@@ -181,16 +182,11 @@ def test_keys_tare_undo_and_mark() -> None:
 
 
 def test_a_key_pushes_the_tool_of_an_emulated_cell_only() -> None:
-    async def act(screen: Screen, pilot: Pilot[None]) -> None:
-        await screen.press(pilot, "f")
-        await pilot.pause()
-
     pushes: list[str] = []
-    screen = Screen()
-    assert "f push" not in screen.run(act)[-1]
+    assert "f push" not in Screen().pressed("f")[-1]
     screen = Screen()
     screen.feed.push = partial(pushes.append, "pushed")
-    lines = screen.run(act)
+    lines = screen.pressed("f")
     assert pushes == ["pushed"]
     assert "f push" in lines[-1]
     assert "the emulated tool is pushed" in lines[-3]

@@ -9,9 +9,7 @@ import sys
 import termios
 import threading
 from collections.abc import Callable
-from typing import Any
 
-import numpy as np
 import pytest
 from syrupy.assertion import SnapshotAssertion
 
@@ -19,12 +17,10 @@ from ftdrive.errors import Declined, exit_code
 from ftdrive.session.events import (
     Asked,
     Checked,
-    Estimated,
     Event,
     GuardTripped,
     Noted,
     Operator,
-    PoseTaken,
     Question,
     RunOpened,
     State,
@@ -32,6 +28,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer
 from ftdrive.terminal.text import in_whole_words
+from tests.unit.ftdrive.terminal.test_screen import estimated, pose
 
 FREE = Question("Is the tool free?", assumed="yes")
 MOVE = Question("Type MOVE to let the arm move", ("MOVE",))
@@ -40,36 +37,7 @@ STEP = Question("Next pose?", ("", "s", "r", "q"))
 HELD = Question("What now?", ("resume", "skip", "back", "quit"))
 
 
-def estimated(**changes: Any) -> Estimated:
-    fields: dict[str, Any] = {
-        "poses": 5,
-        "values": {"mass_kg": 1.2},
-        "sigma": {"mass_kg": 0.003},
-        "residual_sigma": 1.5,
-        "residual_force_N": 0.06,
-        "faces": (1, 0, 2, 0, 1, 1),
-        "cond9": 5.1,
-        "cond_u1": float("inf"),
-        "empty_cap_deg": 95.0,
-        "light": "amber",
-        "hint": "point the tool's +x axis down: turn the last joint by +90°",
-    }
-    return Estimated(**(fields | changes))
-
-
-POSE = PoseTaken(
-    stop=7,
-    stops=25,
-    number=5,
-    gravity_flange=np.array([0.0, 0.0, 1.0]),
-    mean=np.zeros(6),
-    sigma=np.repeat([0.031, 0.0012], 3),
-    samples=2000,
-    settle_s=0.9,
-    average_s=2.0,
-    attempts=2,
-    steady=False,
-)
+POSE = pose(7, 5, attempts=2, steady=False)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +75,7 @@ def test_a_script_reads_events_and_answers_questions() -> None:
     operator: Operator = JsonOperator(stdin=stdin, stdout=stdout)
     operator.show(StateChanged(state=State.MOVE, stop=1, stops=25, number=19))
     assert operator.ask(MOVE) == "MOVE"
-    operator.show(estimated())
+    operator.show(estimated(cond_u1=float("inf")))
     operator.show(POSE)
     lines = [json.loads(line) for line in stdout.getvalue().splitlines()]
     assert [line["event"] for line in lines] == ["state-changed", "question", "question", "estimated", "pose-taken"]
@@ -116,7 +84,7 @@ def test_a_script_reads_events_and_answers_questions() -> None:
     assert lines[1]["error"] is None
     assert "'no idea'" in lines[2]["error"]
     assert lines[3]["cond_u1"] is None  # JSON has no infinity
-    assert lines[3]["values"] == {"mass_kg": 1.2}
+    assert lines[3]["values"]["mass_kg"] == 1.187
     assert lines[4]["sigma"] == POSE.sigma.tolist()
     assert operator.pressed() is None
     assert not operator.has_keys
