@@ -73,6 +73,7 @@ def test_a_station_that_is_stopped_for_a_while_loses_no_sample(name: str) -> Non
         assert sensor.health().lost == 0
 
 
+@pytest.mark.slow
 def test_an_emulated_address_starts_a_sensor_without_an_arm() -> None:
     url, clock = sensor_reached("emulated://bota")
     assert url.startswith("bota:///dev/pts/")

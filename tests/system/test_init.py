@@ -76,7 +76,7 @@ def test_a_script_needs_no_questions(station: Station) -> None:
     assert cell.workcell.boxes_mm == ((500, 500, 0, 900, 900, 90),)
 
 
-@pytest.mark.parametrize("signal", ["end of input", "Ctrl-C"])
+@pytest.mark.parametrize("signal", ["end of input", pytest.param("Ctrl-C", marks=pytest.mark.slow)])
 def test_answers_are_kept_in_a_command_that_goes_on(
     station: Station, monkeypatch: pytest.MonkeyPatch, signal: str
 ) -> None:

@@ -1,5 +1,7 @@
 """A table in wide and narrow terminals, and in a pipe."""
 
+from collections.abc import Callable
+
 import pytest
 
 from ftdrive.terminal.text import print_table
@@ -8,35 +10,38 @@ TITLES = ("cell", "tool", "due")
 ROWS = [("press-4", "a gripper with a long name", "now"), ("b", "", "in 5 d")]
 
 
-def printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int | None) -> list[str]:
-    monkeypatch.setattr("sys.stdout.isatty", lambda: columns is not None)
-    monkeypatch.setenv("COLUMNS", str(columns or 10))
-    monkeypatch.setenv("NO_COLOR", "1")
-    print_table(TITLES, ROWS, folding={"tool"})
-    return capsys.readouterr().out.splitlines()
+Printed = Callable[[int | None], list[str]]
+
+
+@pytest.fixture
+def printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Printed:
+    """Print the table to a terminal with so many columns, or to a pipe."""
+
+    def run(columns: int | None) -> list[str]:
+        monkeypatch.setattr("sys.stdout.isatty", lambda: columns is not None)
+        monkeypatch.setenv("COLUMNS", str(columns or 10))
+        monkeypatch.setenv("NO_COLOR", "1")
+        print_table(TITLES, ROWS, folding={"tool"})
+        return capsys.readouterr().out.splitlines()
+
+    return run
 
 
 @pytest.mark.parametrize("columns", [None, 80])
-def test_a_row_is_one_line_where_it_fits_and_in_a_pipe(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int | None
-) -> None:
-    head, *lines = printed(capsys, monkeypatch, columns)
+def test_a_row_is_one_line_where_it_fits_and_in_a_pipe(columns: int | None, printed: Printed) -> None:
+    head, *lines = printed(columns)
     assert head.removeprefix("\x1b[1m").startswith("cell     tool                        due")
     assert lines == ["press-4  a gripper with a long name  now", "b                                    in 5 d"]
 
 
 @pytest.mark.parametrize("columns", [26, 22, 12])
-def test_no_word_is_ever_broken(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int
-) -> None:
+def test_no_word_is_ever_broken(columns: int, printed: Printed) -> None:
     words = {word for row in ROWS for text in row for word in text.split()}
-    assert words <= {word for line in printed(capsys, monkeypatch, columns)[1:] for word in line.split()}
+    assert words <= {word for line in printed(columns)[1:] for word in line.split()}
 
 
-def test_a_narrow_terminal_folds_only_what_may_be_folded(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, *lines = (line.rstrip() for line in printed(capsys, monkeypatch, 30))
+def test_a_narrow_terminal_folds_only_what_may_be_folded(printed: Printed) -> None:
+    _, *lines = (line.rstrip() for line in printed(30))
     assert lines == [
         "press-4  a gripper      now",
         "         with a long",
@@ -45,8 +50,6 @@ def test_a_narrow_terminal_folds_only_what_may_be_folded(
     ]
 
 
-def test_the_last_columns_begin_a_line_where_the_terminal_is_too_narrow(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, *lines = (line.rstrip() for line in printed(capsys, monkeypatch, 18))
+def test_the_last_columns_begin_a_line_where_the_terminal_is_too_narrow(printed: Printed) -> None:
+    _, *lines = (line.rstrip() for line in printed(18))
     assert lines == ["  due", "press-4  a gripper", "         with a", "         long name", "  now", "b", "  in 5 d"]

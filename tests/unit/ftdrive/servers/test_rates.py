@@ -1,11 +1,12 @@
-"""Means at a lower rate: their times and numbers, losses, and what an interruption cuts."""
+"""Lower rates: means with their times, losses and interruptions, and rows that are picked."""
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from ftdrive.live.samples import WrenchFrame
-from ftdrive.servers.rates import Averaged
+from ftdrive.servers.rates import Averaged, Picked
 from tests.unit.ftdrive.servers.fake_stream import block
 
 
@@ -43,3 +44,22 @@ def test_the_rest_of_an_interval_is_dropped_where_its_mean_would_be_late_or_of_t
     averaged.add(block(7, 14 * 200))
     turned = replace(block(7, 14 * 200 + 7), frame=WrenchFrame("base"))
     assert np.allclose(averaged.add(turned).raw, turned.raw.mean(axis=0))
+
+
+@pytest.mark.parametrize("size", [1, 7, 70, 7000])
+def test_the_rate_of_picked_rows_does_not_depend_on_the_size_of_the_blocks(size: int) -> None:
+    t_ns = (np.arange(7000) * 1_000_000_000) // 7000
+    picked = Picked(60.0)
+    chosen = np.concatenate([picked.rows(t_ns[i : i + size]) for i in range(0, len(t_ns), size)])
+    assert chosen.sum() == 60
+    assert np.ptp(np.diff(t_ns[chosen])) < 2 * (t_ns[1] + 1)
+
+
+def test_of_a_slow_stream_every_row_is_picked() -> None:
+    assert Picked(500.0).rows(np.arange(10) * 8_000_000).all()
+
+
+def test_a_pause_is_no_debt() -> None:
+    picked = Picked(100.0)
+    picked.rows(np.array([0]))
+    assert picked.rows(np.array([5_000_000_000, 5_001_000_000, 5_002_000_000])).tolist() == [True, False, False]
