@@ -1,7 +1,7 @@
 """A simulated cell for the stream: a known truth, its calibration, and motions whose wrench is known exactly."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
 from ftcalib.model import Array, predict
+from ftdrive.live.noise import SensorNoise
 from ftdrive.live.samples import Paired, StreamInfo
 from ftdrivers.interfaces import ArmStates, DeviceInfo, FtSamples
 
@@ -147,3 +148,21 @@ class Motion:
         R, p = self.pose(arm_s)
         nothing = np.zeros((len(arm_s), 6))
         return samples, ArmStates(T0_NS + (received_s * 1e9).astype(np.int64), arm_s + 55.0, nothing, nothing, R, p)
+
+
+class KnownNoise:
+    """The noise of every state is this one."""
+
+    def __init__(self, noise: SensorNoise) -> None:
+        self._noise = noise
+
+    def of(self, _: int) -> SensorNoise:
+        return self._noise
+
+
+def moving(seconds: float, motion: Motion = Motion(), *, noise: float = 1.0) -> Paired:
+    """Samples of a moving tool."""
+    t_s = np.arange(0, seconds, 1e-3)
+    R, p = motion.pose(t_s)
+    raw = motion.wrench(t_s) + noise * NOISE * np.random.default_rng(3).normal(size=(len(t_s), 6))
+    return replace(paired(R), raw=raw, p_base_flange_m=p)

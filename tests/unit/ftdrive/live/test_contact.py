@@ -10,7 +10,7 @@ from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import Array
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia, _hotelling
 from ftdrive.live.noise import SensorNoise
-from tests.unit.ftdrive.live.simulated import calibrated
+from tests.unit.ftdrive.live.simulated import KnownNoise, calibrated
 
 RATE_HZ, SIZE = 1000.0, 20
 """A reading is 0.02 s."""
@@ -23,13 +23,6 @@ R = np.linalg.qr(RNG.standard_normal((3, 3)))[0]
 FRICTION_AXIS = np.array([0.0, 0.6, 0.8])
 
 
-class Known:
-    """The noise of every state."""
-
-    def of(self, _: int) -> SensorNoise:
-        return NOISE
-
-
 def judged(
     test: ContactTest, residual: Array, predicted: Array, state: int, felt: Array, inertia: Inertia
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -37,7 +30,7 @@ def judged(
     test.expect((calibration.parameters, calibration.covariance, calibration.response), MASS_KG, tensor_known=False)
     n = len(residual)
     motion: Any = np.full(n, state, np.int8), np.tile(felt, (n, 1))
-    noise: Any = Known()
+    noise: Any = KnownNoise(NOISE)
     poses = np.tile(R, (n, 1, 1))
     return test.judge(residual, predicted, poses, motion, noise, delay_sigma_s=0.003, inertia=inertia)
 

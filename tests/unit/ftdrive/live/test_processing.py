@@ -31,6 +31,7 @@ from tests.unit.ftdrive.live.simulated import (
     calibrated,
     dwells,
     info,
+    moving,
     paired,
 )
 
@@ -193,14 +194,6 @@ def test_a_switch_of_stages_has_no_transient() -> None:
 def test_an_impossible_filter_is_rejected() -> None:
     with pytest.raises(ConfigError, match="less than 500 Hz"):
         Processor(info(calibrated()), stages=Stages(lowpass_Hz=600.0))
-
-
-def moving(seconds: float) -> Paired:
-    motion, t_s = Motion(), np.arange(0, seconds, 1e-3)
-    R, p = motion.pose(t_s)
-    rows = paired(R)
-    raw = motion.wrench(t_s) + NOISE * np.random.default_rng(3).normal(size=(len(t_s), 6))
-    return replace(rows, raw=raw, p_base_flange_m=p)
 
 
 def test_inertia_leaves_only_noise_of_a_moving_tool() -> None:

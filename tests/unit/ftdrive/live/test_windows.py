@@ -12,26 +12,25 @@ from ftdrive.live.motion import REST
 from ftdrive.live.noise import SensorNoise
 from ftdrive.live.samples import Paired
 from ftdrive.live.tracking import Window, Windows
-from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, T0_NS, TRUTH, G, Motion, calibrated, info, paired
+from tests.unit.ftdrive.live.simulated import (
+    P_FLANGE_SENSOR_M,
+    T0_NS,
+    TRUTH,
+    G,
+    KnownNoise,
+    Motion,
+    calibrated,
+    info,
+    moving,
+)
 
 NOISE = SensorNoise(np.eye(6), np.diag(np.arange(1.0, 7.0)), np.zeros((6, 6)), 100.0)
 MASS_KG = float(np.linalg.norm(TRUTH.gravity_force_base_N)) / G
 H_S = 1e-3
 
 
-class Known:
-    def of(self, _: int) -> SensorNoise:
-        return NOISE
-
-
-def moving(motion: Motion, seconds: float) -> Paired:
-    t_s = np.arange(0, seconds, 1e-3)
-    R, p = motion.pose(t_s)
-    return replace(paired(R), raw=motion.wrench(t_s), p_base_flange_m=p)
-
-
 def windows(rows: Paired, state: int) -> list[Window]:
-    noise: Any = Known()
+    noise: Any = KnownNoise(NOISE)
     collected, found = Windows(info(calibrated())), []
     for i in range(0, len(rows), 70):
         part = rows.rows(slice(i, i + 70))
@@ -59,7 +58,7 @@ def rates(motion: Motion, t_s: Array) -> tuple[Array, Array, Array]:
 
 def test_a_window_has_the_motion_of_the_sensor() -> None:
     motion, calibration = Motion(), calibrated()
-    found = windows(moving(motion, 1.0), 3)
+    found = windows(moving(1.0, motion, noise=0.0), 3)
     covariance = calibration.covariance.copy()
     covariance[[6, 7, 8, 12, 13, 14]] = 0.0  # the bias is what is tracked
     covariance[:, [6, 7, 8, 12, 13, 14]] = 0.0
@@ -92,7 +91,7 @@ def test_a_window_has_the_motion_of_the_sensor() -> None:
 
 def test_inertia_counts_in_motion_only_and_a_window_without_all_samples_is_left_out() -> None:
     motion = Motion(0.0, 2.0)
-    rows = moving(motion, 0.6)
+    rows = moving(0.6, motion, noise=0.0)
     at_rest, in_motion = windows(rows, REST)[0], windows(rows, 1)[0]
     assert np.linalg.norm(at_rest.residual[:3]) > 10 * np.linalg.norm(in_motion.residual[:3])
     late = replace(rows, t_host_ns=T0_NS + (rows.t_host_ns - T0_NS) * 13 // 10)
@@ -102,7 +101,7 @@ def test_inertia_counts_in_motion_only_and_a_window_without_all_samples_is_left_
 
 
 def test_without_positions_an_acceleration_is_not_known() -> None:
-    rows = moving(Motion(0.5, 0.0), 0.4)
+    rows = moving(0.4, Motion(0.5, 0.0), noise=0.0)
     unknown = replace(rows, p_base_flange_m=np.full((len(rows), 3), np.nan))
     (known,), (window,), (still,) = windows(rows, 2), windows(unknown, 2), windows(unknown, REST)
     extra = np.zeros((6, 6))

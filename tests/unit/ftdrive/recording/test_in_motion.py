@@ -59,19 +59,29 @@ def test_a_recording_is_solved_from_its_motion(tmp_path: Path, swept: Recorded) 
     assert loaded.provenance["devices"]["sensor"]["serial"] == "FT1"
 
 
-def test_files_of_another_program_are_solved(tmp_path: Path, swept: Recorded) -> None:
+@pytest.fixture
+def files(tmp_path: Path, swept: Recorded) -> tuple[object, ...]:
+    """The options of wrench and poses as another program writes them."""
     vectors = Rotation.from_matrix(swept.R_base_flange).as_rotvec()
     wrench = table(tmp_path / "w.csv", "t,fx,fy,fz,tx,ty,tz", swept.t_s, swept.wrench)
     poses = table(tmp_path / "p.csv", "t,rx,ry,rz,x,y,z", swept.t_pose_s, vectors, swept.p_base_flange_m)
-    document = run("--wrench", wrench, "--orientation-file", poses, "--up", "0,0,1")
+    return "--wrench", wrench, "--orientation-file", poses
+
+
+def test_files_of_another_program_are_solved(files: tuple[object, ...]) -> None:
+    document = run(*files, "--up", "0,0,1")
     assert document["verdict"] == "good"
     assert document["mass_kg"] == pytest.approx(TRUTH.mass_kg, abs=1e-3)
     assert document["sigma"]["inertia_kg_m2"][0][0] > 0
+
+
+@pytest.mark.slow
+def test_files_of_another_program_are_joined_with_an_earlier_result(tmp_path: Path, files: tuple[object, ...]) -> None:
     earlier = calibrated_from({**TRUTH.to_dict(), "noise_force_N": 0.05, "noise_torque_Nm": 0.002})
     earlier.save(tmp_path / "earlier.json")
-    joined = run("--wrench", wrench, "--orientation-file", poses, "--from", tmp_path / "earlier.json")
+    alone, joined = run(*files), run(*files, "--from", tmp_path / "earlier.json")
     assert joined["provenance"]["parent"] == {"id": earlier.id}
-    assert joined["covariance"][0][0] < document["covariance"][0][0]
+    assert joined["covariance"][0][0] < alone["covariance"][0][0]
 
 
 @pytest.mark.parametrize(

@@ -51,7 +51,7 @@ def holds(lab: Lab) -> list[str]:
 # ---------------------------------------------------------------------------------------------------- a person says no
 
 
-@pytest.mark.parametrize("answer", ["resume", "skip"])
+@pytest.mark.parametrize("answer", ["resume", pytest.param("skip", marks=pytest.mark.slow)])
 def test_a_way_that_is_not_confirmed_leads_back_to_the_hold(answer: str, lab: Lab) -> None:
     pause_on_the_way(lab, 4)
     lab.operator.answers["resume:"] = ["resume", answer]

@@ -289,7 +289,8 @@ def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None
 
 
 @pytest.mark.parametrize(
-    ("begun", "asked", "in_steps"), [("step", "auto", True), ("auto", "step", True), ("auto", "auto", False)]
+    ("begun", "asked", "in_steps"),
+    [pytest.param("step", "auto", True, marks=pytest.mark.slow), ("auto", "step", True), ("auto", "auto", False)],
 )
 def test_a_run_goes_on_in_its_own_mode_or_in_steps(begun: str, asked: str, in_steps: bool, lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
