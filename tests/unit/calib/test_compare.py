@@ -27,6 +27,12 @@ NUMBERS = np.concatenate([numbers_of(name) for name in NAMES])
 POSES = np.concatenate([paper_set(name) for name in NAMES])
 
 
+@pytest.fixture(autouse=True)
+def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No column has the sigmas of closed forms, which are simulated."""
+    monkeypatch.setattr("ftcalib.solver.SIMULATIONS", 2)
+
+
 def measured(sigma_N: float, R: np.ndarray = POSES) -> CalibrationDataset:
     noise = np.random.default_rng(3).normal(0.0, sigma_N, (len(R), 6)) * [1, 1, 1, 0.025, 0.025, 0.025]
     return CalibrationDataset.of(R, predict(TRUTH, R) + noise)
@@ -110,7 +116,7 @@ def test_a_reference_of_zero_has_no_relative_errors() -> None:
 def test_more_data_are_better_and_the_inside_of_the_data_is_best() -> None:
     """The rules that the text draws from the table: cases 3 and 4, 5 and 6, 6 and 11."""
     errors = np.zeros(len(CASES))
-    for seed in range(20):
+    for seed in range(6):
         noise = np.random.default_rng(seed).normal(0.0, 0.2, (len(POSES), 6)) * [1, 1, 1, 0.025, 0.025, 0.025]
         dataset = CalibrationDataset.of(POSES, predict(TRUTH, POSES) + noise)
         clean = predict(TRUTH, POSES)
@@ -142,9 +148,12 @@ def test_a_case_has_every_number_that_json_shows() -> None:
 
 
 def test_carlson_as_published_has_no_bias() -> None:
-    poses = measured(0.01, paper_set("A"))
-    printed = {one.method: one for one in compare(poses, as_published=True)}
-    extended = {one.method: one for one in compare(poses)}
+    poses = measured(0.01, paper_set("A")[::2])
+    default = solve(poses)
+    printed, extended = (
+        {one.method: one for one in compare(poses, default=default, as_published=as_published)}
+        for as_published in (True, False)
+    )
     for method in ("carlson-eigen", "carlson-nullspace"):
         without, with_bias = printed[method].parameters, extended[method].parameters
         assert without is not None

@@ -144,7 +144,7 @@ def test_the_covariance_is_honest(orientations: str, seed: int, runs: int) -> No
     np.testing.assert_allclose(stated.reshape(5, 3).sum(axis=1) / bound, 1, atol=widened)
 
 
-@pytest.mark.parametrize("method", ["srom", "lrom"])
+@pytest.mark.parametrize("method", ["srom", pytest.param("lrom", marks=pytest.mark.slow)])
 def test_sigmas_of_the_closed_forms_are_their_own(method: Method, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.undo()
     rng = np.random.default_rng(3)
@@ -161,7 +161,7 @@ def test_sigmas_of_the_closed_forms_are_their_own(method: Method, monkeypatch: p
 def test_noise_that_was_not_measured_is_estimated_from_the_residuals() -> None:
     rng = np.random.default_rng(4)
     stated = []
-    for _ in range(12):
+    for _ in range(6):
         R = Rotation.random(8, rng=rng).as_matrix()
         best = fit(R, noisy(rng, R, white(8)), None)
         stated.append(np.sqrt(np.diag(best.wrench_cov[0]))[[0, 3]])
@@ -384,7 +384,7 @@ def test_deviations_from_the_special_orientations_are_named_with_their_error(met
             assert note.values["force_N"] == pytest.approx(np.linalg.norm(without_noise), rel=0.5)
 
 
-@pytest.mark.parametrize("runs", [10, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [6, pytest.param(200, marks=pytest.mark.slow)])
 def test_the_sigma_of_srom_includes_the_deviation_of_its_orientations(
     runs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -30,7 +30,7 @@ def test_arms_spread_as_real_ones_do() -> None:
     """20 real arms: medians .13 to 1.04° and .7 to 3.2 mm, no posture beyond 1.32° and 7.5 mm."""
     nominal, postures = MODELS["UR5e"], np.random.default_rng(0).uniform(-math.pi, math.pi, (20, 6)).tolist()
     off = []
-    for seed in range(50):
+    for seed in range(25):
         pairs = [(forward(drawn("UR5e", seed), q), forward(nominal, q)) for q in postures]
         turns_deg = [math.degrees(math.hypot(*rotvec(X[:3, :3] @ Y[:3, :3].T))) for X, Y in pairs]
         off.append([(deg, 1e3 * math.dist(X[:3, 3], Y[:3, 3])) for deg, (X, Y) in zip(turns_deg, pairs, strict=True)])

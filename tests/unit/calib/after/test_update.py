@@ -228,7 +228,9 @@ def test_the_covariance_covers_noise_and_the_old_errors() -> None:
     assert np.mean(misfits) == pytest.approx(1, rel=0.2)
 
 
-@pytest.mark.parametrize(("kind", "gain"), [*((kind, False) for kind in BLOCKS), ("all", True)])
+@pytest.mark.parametrize(
+    ("kind", "gain"), [*((kind, False) for kind in BLOCKS), pytest.param("all", True, marks=pytest.mark.slow)]
+)
 def test_the_covariance_is_that_of_first_order(kind: str, gain: bool) -> None:
     """Of readings and of the old calibration, whose errors are kept where nothing is estimated."""
     n = 4 if kind == "all" else 3

@@ -88,7 +88,7 @@ def test_several_poses_show_the_whole_centre_of_mass() -> None:
     z = []
     for seed in range(20):
         gripper = Gripper(seed)
-        weight = gripper.weigh(calibrated(12, seed % 20), *(gripper.turn() for _ in range(3)))
+        weight = gripper.weigh(calibrated(12, seed % 5), *(gripper.turn() for _ in range(3)))
         assert weight.line is None
         assert weight.com_sigma_m.max() < 2e-3
         z += ((weight.p_sensor_com_m - gripper.com_m) / weight.com_sigma_m).tolist()
@@ -259,7 +259,7 @@ def test_a_tool_with_a_part_predicts_both() -> None:
     z2 = []
     for seed in range(40):
         gripper = Gripper(seed)
-        empty = calibrated(12, seed % 20)
+        empty = calibrated(12, seed % 5)
         weight = gripper.weigh(empty, *(gripper.turn() for _ in range(4)))
         load = holding(empty, weight, G)
         R = gripper.turn()

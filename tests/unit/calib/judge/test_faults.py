@@ -299,7 +299,7 @@ def test_rotation_vectors_in_degrees_are_refused(tmp_path: Path) -> None:
 
 
 def test_nothing_is_named_in_sound_sessions() -> None:
-    for seed in range(10, 16):
+    for seed in range(10, 13):
         _, R, wrench = session(seed, 12)
         result = solved(R, wrench)
         assert result.verdict == "good"
@@ -398,15 +398,15 @@ def of_a_level_base(seed: int, decimals: int, steps: float, off_deg: float) -> t
 
 @pytest.mark.parametrize("decimals", [2, 4])
 def test_readings_that_tie_because_they_are_rounded_are_neither_saturated_nor_copied(decimals: int) -> None:
-    """None of 45 sets; noise of 0.3 to 3 steps, base 0 to 1 degree off."""
+    """None of 15 sets; noise of 0.3 to 3 steps, base 0 to 1 degree off."""
     wrong = []
-    for seed in range(45):
+    for seed in range(15):
         R, wrench = of_a_level_base(seed, decimals, (0.3, 1.0, 3.0)[seed % 3], (0.0, 0.05, 0.1, 0.3, 1.0)[seed % 5])
         wrong += [(seed, one.code) for one in broken_channels(wrench, R) if one.code != "quantised"]
     assert wrong == []
 
 
-@pytest.mark.parametrize("method", ["ml", "srom", "lrom"])
+@pytest.mark.parametrize("method", ["ml", *(pytest.param(one, marks=pytest.mark.slow) for one in ("srom", "lrom"))])
 def test_readings_without_noise_are_not_saturated(method: Method) -> None:
     R, wrench = of_a_level_base(3, 15, 0.0, 0.0)
     result = solve(CalibrationDataset(R, wrench, None, np.zeros(24, np.int64), np.arange(24.0)), method=method)
@@ -417,7 +417,7 @@ def test_readings_without_noise_are_not_saturated(method: Method) -> None:
 def test_readings_that_are_cut_off_are_saturated() -> None:
     """Of 6 to 24 poses that lose 10 sigma or more."""
     rng, missed, all_ = np.random.default_rng(4), [], 0
-    while all_ < 50:
+    while all_ < 25:
         seed, n, channel = int(rng.integers(10**6)), int(rng.choice([6, 12, 24])), int(rng.integers(6))
         _, R, wrench = session(seed, n)
         readings = np.sort(wrench[:, channel])
@@ -430,7 +430,7 @@ def test_readings_that_are_cut_off_are_saturated() -> None:
         found = [(one.code, one.values["channel"]) for one in broken_channels(wrench, R)]
         if found != [("saturated", CHANNELS[channel])]:
             missed.append((seed, n, channel, found))
-    assert len(missed) <= 1, missed
+    assert missed == []
 
 
 def test_copied_rows_are_named_beside_rows_that_are_equal_by_right() -> None:

@@ -95,7 +95,11 @@ def test_poses_count_as_they_were_taken_not_as_they_stand() -> None:
 
 @pytest.mark.parametrize(
     ("after", "code", "measured"),
-    [(TARED, "bias_stepped", False), (TURNED, "sensor_turned", True), (OTHER, "sensor_changed", False)],
+    [
+        (TARED, "bias_stepped", False),
+        pytest.param(TURNED, "sensor_turned", True, marks=pytest.mark.slow),
+        (OTHER, "sensor_changed", False),
+    ],
 )
 def test_other_changes_are_named_before_the_drift_that_they_look_like(
     after: Parameters, code: str, measured: bool

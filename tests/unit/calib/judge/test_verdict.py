@@ -199,15 +199,16 @@ def test_the_expected_error_is_the_mean_over_all_orientations() -> None:
 # Statistics
 
 
-def test_p_values_are_uniform_and_clean_runs_are_good_without_a_finding() -> None:
+@pytest.mark.parametrize("runs", [25, pytest.param(80, marks=pytest.mark.slow)])
+def test_p_values_are_uniform_and_clean_runs_are_good_without_a_finding(runs: int) -> None:
     rng = np.random.default_rng(7)
-    judged = [judge(fit(R24, noisy(rng, R24), white(24))) for _ in range(80)]
+    judged = [judge(fit(R24, noisy(rng, R24), white(24))) for _ in range(runs)]
     p = np.sort([q.chi2_p for q in judged if q.chi2_p is not None])
-    assert len(p) == 80
-    assert np.abs(p - np.arange(1, 81) / 80).max() < 0.18  # Kolmogorov's 1 %
+    assert len(p) == runs
+    assert np.abs(p - np.arange(1, runs + 1) / runs).max() < 1.6 / np.sqrt(runs)  # Kolmogorov's 1 %
     assert all(q.verdict == "good" for q in judged)
-    assert sum(bool(q.findings) for q in judged) <= 2
-    assert np.mean([q.lag1 for q in judged]) == pytest.approx(0, abs=0.04)
+    assert sum(bool(q.findings) for q in judged) <= max(1, runs // 40)
+    assert np.mean([q.lag1 for q in judged]) == pytest.approx(0, abs=0.36 / np.sqrt(runs))
 
 
 def test_drift_shows_between_successive_poses_in_time_not_in_rows() -> None:
@@ -393,13 +394,18 @@ DISAGREE = {"orientations_inverted", "axes_disagree", "weight_upwards", "forces_
     ("reversed_channels", "code", "corrections"),
     [
         (F + T, "weight_upwards", None),
-        (["fx", "tx"], "weight_upwards", None),
+        pytest.param(["fx", "tx"], "weight_upwards", None, marks=pytest.mark.slow),
         (F, "forces_reversed", None),
         (T, "torques_reversed", None),
         (["tx"], "axes_disagree", [["torque", ["-x", "y", "z"]]]),
         (["fy"], "axes_disagree", [["force", ["x", "-y", "z"]]]),
         (["ty", "tz"], "axes_disagree", [["torque", ["x", "-y", "-z"]], ["force", ["x", "-y", "-z"]]]),
-        (["fx", "fy"], "axes_disagree", [["torque", ["-x", "-y", "z"]], ["force", ["-x", "-y", "z"]]]),
+        pytest.param(
+            ["fx", "fy"],
+            "axes_disagree",
+            [["torque", ["-x", "-y", "z"]], ["force", ["-x", "-y", "z"]]],
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_reversed_channels_are_detected(
@@ -416,7 +422,7 @@ def test_reversed_channels_are_detected(
 
 def test_nothing_is_suspected_of_a_sound_sensor() -> None:
     rng = np.random.default_rng(19)
-    for sigma in (SIGMA, 10 * SIGMA, 40 * SIGMA):
+    for sigma in (SIGMA, 40 * SIGMA):
         R = Rotation.random(12, rng=rng).as_matrix()
         wrench = noisy(rng, R, sigma=sigma)
         assert faults(R, wrench) == []
@@ -680,7 +686,14 @@ def test_a_real_session_read_with_wrong_signs_is_found_out(real_data: Path) -> N
     assert corrections == [["torque", ["-x", "y", "z"]]]
 
 
-@pytest.mark.parametrize(("sigma", "digits"), [(None, 15), (None, 6), (1e-9, 15), (0.01, 15), (0.01, 6)])
+@pytest.mark.parametrize(
+    ("sigma", "digits"),
+    [
+        (None, 6),
+        (0.01, 15),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((None, 15), (1e-9, 15), (0.01, 6))),
+    ],
+)
 def test_findings_are_not_made_of_rounding(sigma: float | None, digits: int) -> None:
     cov = None if sigma is None else np.eye(6) * sigma**2
     textbook = Parameters(np.eye(3), np.array([0.0, 0, -10]), np.zeros(3), np.array([0, 0, 0.05]), np.zeros(3))

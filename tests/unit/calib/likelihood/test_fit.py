@@ -123,7 +123,7 @@ def test_statistics_give_the_normal_equations_of_the_data() -> None:
 @pytest.mark.parametrize(
     ("kind", "runs"),
     [
-        ("haar12", 30),
+        ("haar12", 20),
         pytest.param("haar12", 80, marks=pytest.mark.slow),
         pytest.param("haar6", 60, marks=pytest.mark.slow),
         pytest.param("cone40_24", 40, marks=pytest.mark.slow),

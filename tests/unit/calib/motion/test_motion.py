@@ -114,7 +114,7 @@ def other_poses(swept: Recorded) -> Recorded:
     ("change", "code"),
     [
         (lambda s: replace(s, t_pose_s=s.t_pose_s + 0.5), "clock_offset"),
-        (compensated, "wrench_compensated"),
+        pytest.param(compensated, "wrench_compensated", marks=pytest.mark.slow),
         pytest.param(other_poses, "other_recording", marks=pytest.mark.slow),
         (lambda s: replace(s, wrench=s.wrench * [1, -1, 1, -1, 1, -1]), "forces_reversed"),
         (lambda _: record(TRUTH, sweep(SWEEP_S, (0.17, 0.17, 0.17)), SWEEP_S, 1), "motion_narrow"),
@@ -128,7 +128,7 @@ def test_wrong_data_are_named(swept: Recorded, change: object, code: str) -> Non
 
 def test_a_motion_about_one_axis_determines_nothing() -> None:
     with pytest.raises(NotObservable, match=r"last joint.*turn wrist 1"):
-        solve_motion(*means_of(record(TRUTH, sweep(SWEEP_S, (0, 0, 1.5)), SWEEP_S, 1)))
+        solve_motion(*means_of(record(TRUTH, sweep(6.0, (0, 0, 1.5)), 6.0, 1)))
 
 
 def test_known_values_determine_what_the_motion_does_not() -> None:

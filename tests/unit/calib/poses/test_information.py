@@ -256,7 +256,7 @@ def test_cone_candidates_fill_the_cone() -> None:
         cone_candidates(0.0)
 
 
-@pytest.mark.parametrize("n", [6, 12])
+@pytest.mark.parametrize("n", [6, pytest.param(12, marks=pytest.mark.slow)])
 def test_chosen_poses_beat_random_ones(n: int) -> None:
     rng = np.random.default_rng(n)
     candidates = ball(40, 500, rng)
