@@ -55,7 +55,7 @@ def one_fast(schemes: Iterable[str]) -> list[Any]:
 def test_wrench_counts_and_samples(shared: Emulator) -> None:
     kind = shared.kind
     with shared.sensor() as sensor:
-        samples = sensor.collect(0.4)
+        samples = sensor.collect(0.3)
         info, health = sensor.identify(), sensor.health()
     n = len(samples)
     bound = np.repeat(kind.quantisation, 3) / 2 + 5 * np.hypot(NOISE, np.repeat(kind.quantisation, 3)) / math.sqrt(n)
@@ -64,9 +64,9 @@ def test_wrench_counts_and_samples(shared: Emulator) -> None:
     assert samples.seq[-1] - samples.seq[0] + 1 - n <= health.lost <= max(3, 0.01 * n)
     assert (np.diff(samples.t_host_ns) >= 0).all()
     if kind.scheme == "ati-can":  # polled: as many as the machine can
-        assert 10 < n < 0.44 * kind.rate_Hz
+        assert 10 < n < 0.33 * kind.rate_Hz
     else:
-        assert n == pytest.approx(0.4 * kind.rate_Hz, rel=0.1)
+        assert n == pytest.approx(0.3 * kind.rate_Hz, rel=0.1)
     assert samples.counts.shape == (n, kind.counts)
     assert (samples.status == 0).all()
     assert info.serial.startswith(kind.serial)
@@ -143,7 +143,8 @@ def test_a_silent_device_is_no_device(start: Start, scheme: str) -> None:
 @pytest.mark.parametrize(
     ("scheme", "fault"),
     [
-        (scheme, fault)
+        # one driver with the faults that each codec has in its own tests
+        pytest.param(scheme, fault, marks=[] if fault == "drop" or scheme == "robotous-serial" else pytest.mark.slow)
         for scheme in SCHEMES
         if scheme != "ati-serial"  # its records have no header and a short sum: see `test_serial_driver.py`
         for fault in ("drop", "corrupt", "byte_slip")
@@ -198,9 +199,8 @@ def test_bota_too_slow_is_a_warning(start: Start, caplog: pytest.LogCaptureFixtu
 @pytest.mark.parametrize(
     ("options", "query"),
     [
-        ({"baud_code": 3}, ""),
         ({"baud_code": 1}, "baud=57600"),
-        pytest.param({"boot_s": 3}, "", marks=pytest.mark.slow),
+        *(pytest.param(options, "", marks=pytest.mark.slow) for options in ({"baud_code": 3}, {"boot_s": 3})),
         pytest.param({"baud_code": 3, "boot_s": 3}, "", marks=pytest.mark.slow),
         pytest.param({"baud_code": 3, "boot_s": 3}, "sinc=256", marks=pytest.mark.slow),
     ],

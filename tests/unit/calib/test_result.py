@@ -72,13 +72,14 @@ def test_every_promised_key_is_in_the_file_with_its_value() -> None:
 def test_sigmas_of_mass_and_tilt_agree_with_sampling() -> None:
     rng = np.random.default_rng(2)
     steps = rng.multivariate_normal(np.zeros(15), RESULT.covariance, 1000)
-    samples = [replace(RESULT, parameters=RESULT.parameters.moved(step)) for step in steps]
-    common_gain = {
-        "weight_N": 0.002 * RESULT.weight_N,
-        "mass_kg": 0.002 * RESULT.mass_kg,
-    }  # of sigma, not of covariance
-    for name in ("mass_kg", "weight_N", "tilt_alpha_rad", "tilt_beta_rad"):
-        spread = np.hypot(np.std([getattr(s, name) for s in samples]), common_gain.get(name, 0.0))
+    samples = [weight_and_tilt(RESULT.parameters.moved(step).gravity_force_base_N) for step in steps]
+    weight_N, *tilt = np.std(samples, axis=0)
+    weight_N = np.hypot(weight_N, 0.002 * RESULT.weight_N)  # the common gain is in sigma, not in the covariance
+    for name, spread in {
+        "mass_kg": weight_N / RESULT.g_m_s2,
+        "weight_N": weight_N,
+        **dict(zip(("tilt_alpha_rad", "tilt_beta_rad"), tilt, strict=True)),
+    }.items():
         assert spread == pytest.approx(RESULT.sigma[name], rel=0.06), name
 
 

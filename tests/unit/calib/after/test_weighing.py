@@ -181,7 +181,7 @@ def moved(known: Known, error: Array) -> Known:
     return Known(known.parameters.moved(error[:15]), C, response)
 
 
-@pytest.mark.parametrize("gain", [False, True])
+@pytest.mark.parametrize("gain", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_covariance_has_all_errors_of_readings_and_calibration(gain: bool) -> None:
     gripper, (tool, C, response) = Gripper(5), rough(gain=gain)
     reference = Known(tool, C, response)

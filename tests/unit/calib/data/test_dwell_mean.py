@@ -123,7 +123,7 @@ def filtered(rng: np.random.Generator, seconds: float, corner_Hz: float) -> Arra
     return samples
 
 
-@pytest.mark.parametrize("corner_Hz", [1e9, 5])
+@pytest.mark.parametrize("corner_Hz", [5, pytest.param(1e9, marks=pytest.mark.slow)])
 def test_a_sensor_left_alone_is_quiet(corner_Hz: float) -> None:
     rng = np.random.default_rng(17)
     level = noise_level(filtered(rng, 20, corner_Hz), 1000)

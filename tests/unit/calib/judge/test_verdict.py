@@ -678,6 +678,7 @@ def test_the_likely_error_is_that_of_the_next_use_where_the_bias_walks() -> None
     assert 0.6 < np.sqrt(np.mean(ratios)) < 1.3
 
 
+@pytest.mark.slow
 def test_a_real_session_read_with_wrong_signs_is_found_out(real_data: Path) -> None:
     dataset = read_csv(real_data / "agimus_mini45_b" / "poses.csv", "R_flange_base")
     R, wrench = dataset.R_base_flange, dataset.wrench

@@ -393,7 +393,7 @@ def random_known(name: str, p: Parameters, rng: np.random.Generator) -> Known:
     ],
 )
 def test_knowledge_is_used_for_what_it_is_worth(name: str, unknowns: int) -> None:
-    runs = 4
+    runs = 2
     distance, chi2 = [], []
     for seed in range(runs):
         rng = np.random.default_rng(seed)

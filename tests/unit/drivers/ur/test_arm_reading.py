@@ -362,7 +362,9 @@ def test_a_moving_arm_may_be_a_control_cycle_behind(controller: Controller) -> N
         reader._check_pose(q, forward(MODELS["UR5e"], q + 0.008 * qd), np.zeros(6))
 
 
-@pytest.mark.parametrize("number", sorted(real()))
+@pytest.mark.parametrize(
+    "number", [pytest.param(one, marks=[pytest.mark.slow] if k % 5 else []) for k, one in enumerate(sorted(real()))]
+)
 def test_every_real_arm_is_nearest_to_its_own_model(controller: Controller, number: str) -> None:
     model, own = real()[number]
     for controller.kinematics in (own, None):
