@@ -320,30 +320,33 @@ def test_carlsons_printed_form_is_judged_by_the_bias_that_it_leaves_out() -> Non
             solve(data, method, as_published=True)  # type: ignore[arg-type]  # literals in a loop
 
 
-def test_a_wrong_assumption_of_a_baseline_is_named() -> None:
-    rng = np.random.default_rng(3)
-    cov, mounting = white(48), LEVEL.R_flange_sensor
-    wrench = predict(LEVEL, R48) + rng.normal(size=(48, 6)) * SIGMA
-    yawed = Known(R_flange_sensor=Rotation.from_rotvec([0, 0, 0.1]).as_matrix() @ mounting)
-    rolled = Known(R_flange_sensor=Rotation.from_rotvec([0.05, 0, 0]).as_matrix() @ mounting)
-    leaning = replace(LEVEL, gravity_force_base_N=Rotation.from_rotvec([0.05, 0, 0]).apply([0, 0, -20.0]))
-    leaning_wrench = predict(leaning, R48) + rng.normal(size=(48, 6)) * SIGMA
-    exact = Known(R_flange_sensor=mounting)
-    for method, known, data, code in (
-        ("vougioukas", yawed, wrench, "known_mounting"),
-        ("wang", yawed, wrench, "known_mounting"),
-        ("yang", yawed, wrench, None),
-        ("yang", rolled, wrench, "known_mounting"),
-        ("vougioukas", exact, leaning_wrench, "known_gravity_direction"),
-        ("wang", exact, leaning_wrench, None),
-    ):
-        result = solve(dataset(R48, data, cov), method, known=known)  # type: ignore[arg-type]  # literals in a loop
-        assert (result.verdict == "good") == (code is None)
-        assert code is None or code in {one.code for one in result.findings}
-        assert np.abs(result.covariance[:2, :2]).max() < 1e-30
-    up = (-leaning.gravity_force_base_N).tolist()
-    declared = solve(dataset(R48, leaning_wrench, cov), "vougioukas", known=exact, setup=Setup(up_in_base=up))
-    assert declared.verdict == "good"
+YAWED = Known(R_flange_sensor=Rotation.from_rotvec([0, 0, 0.1]).as_matrix() @ LEVEL.R_flange_sensor)
+ROLLED = Known(R_flange_sensor=Rotation.from_rotvec([0.05, 0, 0]).as_matrix() @ LEVEL.R_flange_sensor)
+EXACT = Known(R_flange_sensor=LEVEL.R_flange_sensor)
+LEANING = replace(LEVEL, gravity_force_base_N=Rotation.from_rotvec([0.05, 0, 0]).apply([0, 0, -20.0]))
+UP = Setup(up_in_base=(-LEANING.gravity_force_base_N).tolist())
+
+
+@pytest.mark.parametrize(
+    ("method", "known", "truth", "setup", "code"),
+    [
+        pytest.param("vougioukas", YAWED, LEVEL, Setup(), "known_mounting", marks=pytest.mark.slow),
+        ("wang", YAWED, LEVEL, Setup(), "known_mounting"),
+        ("yang", YAWED, LEVEL, Setup(), None),
+        pytest.param("yang", ROLLED, LEVEL, Setup(), "known_mounting", marks=pytest.mark.slow),
+        ("vougioukas", EXACT, LEANING, Setup(), "known_gravity_direction"),
+        ("wang", EXACT, LEANING, Setup(), None),
+        ("vougioukas", EXACT, LEANING, UP, None),
+    ],
+)
+def test_a_wrong_assumption_of_a_baseline_is_named(
+    method: Method, known: Known, truth: Parameters, setup: Setup, code: str | None
+) -> None:
+    wrench = predict(truth, R48) + np.random.default_rng(3).normal(size=(48, 6)) * SIGMA
+    result = solve(dataset(R48, wrench, white(48)), method, known=known, setup=setup)
+    assert (result.verdict == "good") == (code is None)
+    assert code is None or code in {one.code for one in result.findings}
+    assert np.abs(result.covariance[:2, :2]).max() < 1e-30
 
 
 def test_baselines_take_the_mounting_and_nothing_else() -> None:
@@ -405,8 +408,6 @@ def test_knowledge_makes_poor_poses_enough() -> None:
     R = spin("z", 150.0)
     wrench = noisy(np.random.default_rng(12), R, white(8))
     data = dataset(R, wrench, white(8))
-    with pytest.raises(NotObservable, match="the last joint"):
-        solve(data)
     known = Known(
         gravity_direction_base=TRUTH.gravity_force_base_N,
         mass_kg=float(np.linalg.norm(TRUTH.gravity_force_base_N)) / 9.80665,
@@ -500,11 +501,10 @@ def test_findings_give_the_verdict() -> None:
 
 def test_nothing_on_the_sensor_is_never_a_calibration() -> None:
     rng = np.random.default_rng(10)
-    for _ in range(2):
-        R = Rotation.random(12, rng=rng).as_matrix()
-        verdict, found = verdict_of(rng.normal(size=(12, 6)) * SIGMA + [1, 2, 3, 0, 0, 0], R, white(12))
-        assert verdict == "rejected"
-        assert "weight_insignificant" in found
+    R = Rotation.random(12, rng=rng).as_matrix()
+    verdict, found = verdict_of(rng.normal(size=(12, 6)) * SIGMA + [1, 2, 3, 0, 0, 0], R, white(12))
+    assert verdict == "rejected"
+    assert "weight_insignificant" in found
 
 
 def test_what_is_known_to_be_down_depends_on_the_mounting(monkeypatch: pytest.MonkeyPatch) -> None:
