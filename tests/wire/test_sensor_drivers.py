@@ -212,6 +212,7 @@ def test_bota_is_found_at_its_baud_rate_while_it_boots(start: Start, options: di
         assert sensor.health().nominal_rate_Hz == pytest.approx(200 if query == "sinc=256" else 100)
 
 
+@pytest.mark.slow
 def test_bota_at_another_baud_rate_is_refused(start: Start) -> None:
     with pytest.raises(ConnectError, match=r"at 460800 baud.*at 230400 baud.*baud="):
         start("bota", baud_code=2).sensor().open()

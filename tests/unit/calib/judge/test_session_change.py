@@ -71,7 +71,10 @@ def sigmas(result: CalibrationResult, truth: Parameters) -> Array:
     return np.asarray(result.parameters.difference(truth) / np.sqrt(np.diag(result.covariance)))
 
 
-@pytest.mark.parametrize(("after", "code", "position"), [(SHIFTED, "com_shifted", 10), (LIGHTER, "load_changed", 21)])
+@pytest.mark.parametrize(
+    ("after", "code", "position"),
+    [pytest.param(SHIFTED, "com_shifted", 10, marks=pytest.mark.slow), (LIGHTER, "load_changed", 21)],
+)
 def test_poses_of_two_loads_are_refused(after: Parameters, code: str, position: int) -> None:
     result = session(after, position, seed=position)
     first = result.findings[0]

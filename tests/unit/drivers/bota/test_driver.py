@@ -119,6 +119,11 @@ def test_both_usual_baud_rates_are_tried_unless_one_is_given(
     assert opened == [*bauds, bauds[-1]]  # the right one is tried first
 
 
+def test_a_sensor_at_neither_usual_baud_rate_is_refused(table: Table) -> None:
+    with table.serial([]) as wire, pytest.raises(ConnectError, match=r"at 460800 baud.*at 230400 baud.*baud="):
+        Sensor(wire.clock).open()
+
+
 def test_a_reply_in_pieces_is_a_reply(table: Table) -> None:
     run = b"R", Stream(frames(count(0, 10_000)), 0.01, b"r,0,R,0")
     pieces = b"C", Stream([b"r", b",0,C", b",0"], 0.005)
