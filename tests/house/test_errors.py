@@ -14,7 +14,7 @@ from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, DeviceTimeout, U
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHONS_OWN = {name for name, kind in vars(builtins).items() if isinstance(kind, type) and issubclass(kind, Exception)}
-INSIDE = {"Tripped", "OperatorStop", "Turned", "Interrupted", "Moved"}
+INSIDE = {"Tripped", "_OperatorStop", "_Turned", "_Interrupted", "_Moved"}
 """The session catches these itself."""
 
 
