@@ -175,8 +175,6 @@ def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, boo
     slipped : bool
         All bytes behind `settled` are misaligned.
     """
-    # There is no sync byte, and after a slip one record in 128 passes the sum: three damaged ones in a row mean a
-    # slip, and an intact one between two damaged ones is dropped.
     bad = ~intact
     n = len(bad)
     runs = np.flatnonzero(bad[:-2] & bad[1:-1] & bad[2:]) if n >= 3 else np.zeros(0, np.intp)

@@ -103,8 +103,6 @@ class Halves:
 
     def _complete(self) -> bool:
         """Return whether all fields that were due since the clock was set have arrived."""
-        # Halves carry no number: they must take turns, and a silence must have as many samples as the output rate
-        # demands.
         if self._clock_ns is None:
             return True
         # more fields than due mean that the clock was set late

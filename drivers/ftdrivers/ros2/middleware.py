@@ -36,11 +36,8 @@ def ros2_module(name: str) -> Any:
 
 
 def _stay_on_loopback() -> None:
-    """Have Fast DDS bind its ports to loopback where ROS is configured for this computer alone.
-
-    The range of discovery by itself leaves them open on all interfaces. A profile of the user goes first.
-    """
-    # The discovery range by itself leaves the ports of Fast DDS open on all interfaces.
+    """Have Fast DDS bind its ports to loopback where ROS is configured for this computer alone."""
+    # The range of discovery by itself leaves them open on all interfaces. A profile of the user goes first.
     if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") != "LOCALHOST" or _PROFILES & os.environ.keys():
         return
     if not Path("DEFAULT_FASTDDS_PROFILES.xml").exists():

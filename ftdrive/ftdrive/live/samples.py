@@ -294,7 +294,7 @@ class StreamInfo:
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """What every output says of the cell and the calibration, see `ftdrive.runs.verification.MARKS`."""
+        """What every output says of the cell and the calibration, see `ftdrive.runs.verification_record.MARKS`."""
         return marks_of(self.calibration, emulated=self.emulated, foreign=self.foreign)
 
 

@@ -48,7 +48,7 @@ class FreeTool(Guard):
     _coefficients: Array = field(default_factory=lambda: np.zeros((4, 6)), init=False)
 
     def begin(self, _: Seen) -> None:
-        """Forget everything: after a stop the tool may be another, and the sensor may have another zero."""
+        """Forget everything."""
         # After a stop the tool may be another, and the sensor may have another zero.
         unknown = (self.heaviest_kg * STANDARD_GRAVITY_M_S2 / _NOISE_N) ** 2
         self._covariance = np.diag([unknown, unknown, unknown, 1e6])

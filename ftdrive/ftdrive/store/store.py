@@ -87,7 +87,6 @@ class Store:
         A file that is known by its path is not read again, because no file of a run is ever overwritten. One of
         weighings is, if it has grown.
         """
-        # No file of a run is ever overwritten, so a known path is not read again; a file of weighings grows.
         paths = record_paths(folders)
         with self._current.reading() as connection:
             known = set() if connection is None else _known(connection, paths)
@@ -98,7 +97,6 @@ class Store:
 
         Runs whose parent folder cannot be reached are kept: a disk may be missing, or another computer has them.
         """
-        # Results whose folder cannot be reached stay: a disk may be missing.
         with self._current.reading() as connection:
             known = set() if connection is None else all_paths(connection)
         parents = {Path(path).parent.parent for path in known}

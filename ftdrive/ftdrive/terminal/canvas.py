@@ -1,6 +1,6 @@
 """Screens of Textual: an app that survives a closed terminal, and a canvas of lines.
 
-Textual is an optional dependency, so only a screen that is shown imports this module.
+Only a screen that is shown imports this module: no other command waits for the import of Textual.
 """
 
 import signal

@@ -78,7 +78,8 @@ class Feed:
         What is new; the screen takes it.
     status : StreamStatus
     sigma : array, shape (6,)
-        Of a mean over `MEAN_S`; like the status at most 50 ms of the stream older than the newest block.
+        Standard deviation of a mean over `MEAN_S`. Like the status it is at most 50 ms of the stream older than the
+        newest block.
     reader : BlockReader
         Its `failure` is why the stream gives no samples now.
     crash : BaseException or None

@@ -14,7 +14,7 @@ from ftdrive.commands import common
 from ftdrive.errors import ConfigError, exit_code
 from ftdrive.exports.formats import FORMATS
 from ftdrive.runs.run import Run
-from tests.unit.ftdrive.exports.calibration.example import calibration, tilted
+from tests.unit.ftdrive.exports.example import calibration, tilted
 from tests.unit.ftdrive.store.run_folders import new_run, verified
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ftdrive.report.sections import coverage, cross_validation, drift, error, estimates, noise, residuals
-from tests.unit.ftdrive.exports.calibration.example import calibration, responding
+from tests.unit.ftdrive.exports.example import calibration, responding
 
 
 def test_a_drift_is_listed_in_newton_and_millinewton_metre() -> None:

@@ -33,7 +33,7 @@ from ftdrive.terminal.report import (
     print_comparison,
     print_result,
 )
-from tests.unit.ftdrive.exports.calibration.example import calibration as followed
+from tests.unit.ftdrive.exports.example import calibration as followed
 from tests.unit.ftdrive.fake_cell import Lab
 
 SIGMA = np.repeat([2e-3, 1e-4], 3)

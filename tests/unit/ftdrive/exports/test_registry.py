@@ -16,7 +16,7 @@ from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.exports.formats import FORMATS
 from ftdrive.exports.registry import TARGETS, export, largest_difference
 from ftdrive.exports.settings import Settings
-from tests.unit.ftdrive.exports.calibration.example import (
+from tests.unit.ftdrive.exports.example import (
     MEASURED,
     UPRIGHT,
     WEIGHT_N,

@@ -17,7 +17,7 @@ from ftdrive import __version__
 from ftdrive.exports.formats import FORMATS
 from ftdrive.exports.registry import TARGETS, Export, export
 from ftdrive.exports.settings import Settings
-from tests.unit.ftdrive.exports.calibration.example import (
+from tests.unit.ftdrive.exports.example import (
     MEASURED,
     calibration,
     responding,
