@@ -28,7 +28,7 @@ SENSORS: Mapping[str, str] = {
     "bota": "ftdrivers.bota.sensor:BotaSensor",
     "robotiq-ft300": "ftdrivers.robotiq.sensor:RobotiqFt300",
     "robotous-can": "ftdrivers.robotous.can:RobotousCan",
-    "robotous-serial": "ftdrivers.robotous.serial:RobotousSerial",
+    "robotous-serial": "ftdrivers.robotous.sensor:RobotousSerial",
     "ros2": "ftdrivers.ros2.sensor:Ros2Sensor",
     "ur-ft": "ftdrivers.ur.sensor:UrWristSensor",
 }

@@ -1,6 +1,6 @@
-"""Robotous RFT force/torque sensor, on either wire.
+"""Robotous RFT force/torque sensor, on either wire; and on a serial port, where each field has a frame with a sum.
 
-Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.8.
+Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.8: 8N1, 115200 baud from the factory.
 Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py and the emulator (tests/wire).
 
 A streaming sensor accepts only stop and bias, so a reply to any other command proves that it has stopped. This driver
@@ -8,15 +8,18 @@ never sends the bias command.
 """
 
 from abc import abstractmethod
+from typing import Self
 
 import numpy as np
 
-from ftdrivers.clock import Clock
+from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import DeviceInfo, FtSamples
+from ftdrivers.registry import Options
 from ftdrivers.robotous import codec
 from ftdrivers.robotous.codec import Command, Field
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
+from ftdrivers.wires.serial_port import SerialPort
 
 _REPLY_S = 0.15
 _ATTEMPTS = 3
@@ -143,3 +146,63 @@ class RobotousSensor(StreamingSensor):
             f"{self.name}: no reply to {command.name} after {_ATTEMPTS} attempts of {_REPLY_S} s",
             "check supply, wiring, bit rate and, on CAN, the option ids in its address",
         )
+
+
+class RobotousSerial(RobotousSensor):
+    """A Robotous RFT on a serial port.
+
+    `baud` is one of `codec.FASTEST_Hz`; the other parameters are those of `RobotousSensor`.
+    """
+
+    def __init__(
+        self,
+        port: str,
+        *,
+        baud: int = 115_200,
+        rate_Hz: int | None = None,
+        counts_per_unit: tuple[int, int] | None = None,
+        sign: int = 1,
+        clock: Clock = REAL,
+    ) -> None:
+        if baud not in codec.FASTEST_Hz:
+            raise ValueError(f"baud is {baud}; choose one of {', '.join(map(str, codec.FASTEST_Hz))}")
+        super().__init__(
+            f"Robotous sensor on {port}",
+            codec.FASTEST_Hz[baud],
+            rate_Hz=rate_Hz,
+            counts_per_unit=counts_per_unit,
+            sign=sign,
+            clock=clock,
+        )
+        self._port = SerialPort(self.name, port, baud, clock=clock)
+
+    @classmethod
+    def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
+        """Build from ``robotous-serial:///dev/serial/by-id/…?baud=921600&rate=1000``."""
+        return cls(
+            address,
+            baud=options.integer("baud", 115_200, 57_600, 921_600),
+            rate_Hz=options.integer("rate", 0, 0, 1000) or None,
+            counts_per_unit=options.counts(),
+            sign=sign,
+            clock=clock,
+        )
+
+    def _open(self) -> None:
+        self._frames = codec.deframer()
+        self._port.open()
+
+    def _close(self) -> None:
+        self._port.close()
+
+    def _send(self, field: bytes) -> None:
+        self._port.write(codec.encode_frame(field))
+
+    def _receive(self) -> list[Field]:
+        frames = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))
+        t_host_ns = self._clock.now_ns()
+        return [Field(number, t_host_ns, frame[1:-2]) for number, frame in frames]
+
+    def _damaged(self) -> int:
+        # Frames carry no number: only damaged ones are counted, and one lost as a whole shows in the rate.
+        return self._frames.damaged

@@ -23,7 +23,7 @@ from ftdrivers.interfaces import Fact
 from ftdrivers.registry import arm_class, in_url, sensor_from_url, split_url
 from ftdrivers.robotiq.sensor import RobotiqFt300
 from ftdrivers.robotous.can import RobotousCan
-from ftdrivers.robotous.serial import RobotousSerial
+from ftdrivers.robotous.sensor import RobotousSerial
 from ftdrivers.streaming.sensor import StreamingSensor
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.sensor import UrWristSensor

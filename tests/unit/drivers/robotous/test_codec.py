@@ -5,7 +5,7 @@ import pytest
 from ftdrivers.errors import ProtocolError
 from ftdrivers.robotous import codec
 from ftdrivers.robotous.codec import Command
-from ftdrivers.robotous.serial import RobotousSerial
+from ftdrivers.robotous.sensor import RobotousSerial
 from ftdrivers.wires.framing import Deframer
 
 SAMPLE = bytes.fromhex("55 0B 01F4 FF06 03E8 07D0 FC18 0064 00 0000 3F AA")

@@ -10,8 +10,7 @@ import pytest
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import Fact
 from ftdrivers.robotous.can import RobotousCan
-from ftdrivers.robotous.sensor import RobotousSensor
-from ftdrivers.robotous.serial import RobotousSerial
+from ftdrivers.robotous.sensor import RobotousSensor, RobotousSerial
 from tests.unit.drivers.dialogue import CanWire, SerialWire, Stream, Table
 from tests.unit.drivers.in_one_thread import InOneThread
 
