@@ -56,17 +56,17 @@ WALKS = {
         ftdrivers.streaming.plausibility   Liveness.judge             finds a frozen sensor
         ftdrivers.follow                   Unread.put                 keeps every row for each follower
         ~ftdrive.terminal.live.feed        Feed._run                  is the thread that reads the stream
-        ftdrive.live.loop                  BlockReader.read           reads on after an interruption
+        ftdrive.live.stream                BlockReader.read           reads on after an interruption
         ftdrive.live.stream                CompensatedStream.read     waits for rows whose pose is known
         ftdrivers.follow                   Follow.read                takes the rows that wait
         ftdrive.live.pairing               Pairing.add_samples        puts them on the common clock
         ftdrive.live.pairing               Pairing.take               gives each row its pose
-        ftdrive.live.loop                  ProcessedStream._process_read  is shared with replays
+        ftdrive.live.stream                ProcessedStream._process_read  is shared with replays
         ftdrive.live.processing            Processor.process          runs the stages in chunks
         ftdrive.live.stages                FreeTool.predict           has bias and weight of a free tool
         ftdrive.live.contact               ContactTest.judge          tests the residual for contact
         ftdrive.live.stages                Filter                     filters, if a stage asks for it
-        ftdrive.live.frames                FrameTransform             turns to the chosen axes and point
+        ftdrive.live.samples               FrameTransform             turns to the chosen axes and point
         ftdrive.live.samples               Block                      has what a consumer may need
         ftdrive.terminal.live.feed         Feed.take                  hands the block to screen and recorder
         ~ftdrive.terminal.live_screen      LiveApp.draw               draws ten times a second

@@ -28,10 +28,9 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.live_source import open_source
 from ftdrive.errors import ConfigError
-from ftdrive.live.loop import RECOVER_S, ProcessedStream
 from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Axes, StreamInfo, Tracking, WrenchFrame
-from ftdrive.live.stream import CompensatedStream
+from ftdrive.live.stream import RECOVER_S, CompensatedStream, ProcessedStream
 from ftdrive.recording import Recorder, read_recording
 from ftdrive.recording.recording import with_calibration
 from ftdrive.runs.run import Run

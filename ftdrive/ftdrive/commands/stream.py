@@ -16,9 +16,8 @@ from ftdrive.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from ftdrive.live.loop import ProcessedStream
     from ftdrive.live.samples import Axes, Tracking
-    from ftdrive.live.stream import CompensatedStream
+    from ftdrive.live.stream import CompensatedStream, ProcessedStream
     from ftdrive.servers.foxglove import FoxgloveServer
     from ftdrive.servers.udp import UdpSender
 
@@ -77,7 +76,7 @@ def stream(
 
 def serve(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
     """Send blocks and events until Ctrl-C is pressed, or a device is silent for `RECOVER_S`."""
-    from ftdrive.live.loop import RECOVER_S, BlockReader
+    from ftdrive.live.stream import RECOVER_S, BlockReader
     from ftdrive.terminal.console import messages
 
     meanwhile = f"Viewers stay connected for {RECOVER_S:g} s."

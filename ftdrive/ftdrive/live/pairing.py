@@ -17,9 +17,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
 from ftcalib.model import jacobian, skew
-from ftdrive.live.frames import matrices, quaternions
 from ftdrive.live.motion import MovedLoad
-from ftdrive.live.samples import Ns, Paired
+from ftdrive.live.samples import Ns, Paired, matrices, quaternions
 from ftdrivers.interfaces import ArmStates, Array, FtSamples
 
 _BUCKET_S, _BUCKETS = 0.25, 40

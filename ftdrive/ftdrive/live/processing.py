@@ -14,12 +14,12 @@ from ftcalib.files import JSON
 from ftcalib.rounding import with_sigma
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia
-from ftdrive.live.frames import FrameTransform
 from ftdrive.live.motion import READING_S, REST, wrench_by_acceleration
 from ftdrive.live.noise import DriftFilter, NoiseEstimator, variance_at_next_use
 from ftdrive.live.samples import (
     Block,
     EventKind,
+    FrameTransform,
     Paired,
     Stages,
     StreamEvent,

@@ -9,7 +9,6 @@ import numpy as np
 
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
-from ftdrive.live.loop import ProcessedStream
 from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME
 from ftdrive.live.samples import (
     Block,
@@ -22,6 +21,7 @@ from ftdrive.live.samples import (
     WrenchFrame,
     sensor_origin_m,
 )
+from ftdrive.live.stream import ProcessedStream
 from ftdrive.runs.run import Run
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo

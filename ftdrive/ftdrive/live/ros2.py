@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ftdrive.live.frames import quaternions
+from ftdrive.live.samples import quaternions
 from ftdrivers.interfaces import Array
 
 RAW, COMPENSATED, POSE, JOINTS = "/ft_raw", "/ft_compensated", "/flange_pose", "/joint_states"

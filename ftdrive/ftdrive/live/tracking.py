@@ -15,10 +15,9 @@ from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import BIASES, Array, skew
 from ftcalib.rounding import with_sigma
 from ftdrive.live.contact import GYRATION_M
-from ftdrive.live.frames import gripping_point
 from ftdrive.live.motion import READING_S, REST, STATES, MovedLoad, wrench_by_acceleration
 from ftdrive.live.noise import NoiseEstimator, variance_at_next_use
-from ftdrive.live.samples import Paired, StreamEvent, StreamInfo, Tracked
+from ftdrive.live.samples import Paired, StreamEvent, StreamInfo, Tracked, gripping_point
 
 # Squared innovation of a window that bias and part do not explain.
 _GATE = float(chdtri(6, 1e-4))

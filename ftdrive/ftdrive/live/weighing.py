@@ -14,13 +14,11 @@ from ftcalib.errors import AcceptanceError
 from ftcalib.files import JSON
 from ftcalib.model import angle_between
 from ftdrive.errors import ConfigError
-from ftdrive.live.frames import gripping_point
-from ftdrive.live.loop import ProcessedStream
 from ftdrive.live.noise import unexplained_variance
 from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import Paired, StreamEvent, StreamInfo
+from ftdrive.live.samples import Paired, StreamEvent, StreamInfo, gripping_point
 from ftdrive.live.stages import TARE_S, is_still, try_tare
-from ftdrive.live.stream import CompensatedStream
+from ftdrive.live.stream import CompensatedStream, ProcessedStream
 from ftdrive.live.tracking import weight_of
 from ftdrivers.clock import Clock
 from ftdrivers.interfaces import Array

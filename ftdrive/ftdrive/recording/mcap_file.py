@@ -25,8 +25,7 @@ from ftcalib.files import open_file, parsed_json
 from ftdrive import __version__
 from ftdrive.errors import BadRecording
 from ftdrive.live import ros2
-from ftdrive.live.frames import frames_in_flange, matrices
-from ftdrive.live.samples import StreamEvent
+from ftdrive.live.samples import StreamEvent, frames_in_flange, matrices
 from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.recording.recording import ROW, Header, Piece, Rows, changed
 

@@ -17,8 +17,17 @@ from ftcalib import CalibrationResult
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, parsed_json
 from ftdrive.errors import BadRecording
-from ftdrive.live.frames import matrices, quaternions
-from ftdrive.live.samples import Block, Paired, Stages, StreamEvent, StreamInfo, WrenchFrame, sensor_origin_m
+from ftdrive.live.samples import (
+    Block,
+    Paired,
+    Stages,
+    StreamEvent,
+    StreamInfo,
+    WrenchFrame,
+    matrices,
+    quaternions,
+    sensor_origin_m,
+)
 from ftdrive.runs.verification_record import VerificationRecord
 from ftdrivers.interfaces import DeviceInfo, Fact
 

@@ -15,9 +15,8 @@ import numpy as np
 
 from ftcalib.after.weighing import Weight
 from ftcalib.model import angle_between_vectors
-from ftdrive.live.loop import BlockReader
 from ftdrive.live.samples import Block, StreamInfo, Tracking
-from ftdrive.live.stream import CompensatedStream
+from ftdrive.live.stream import BlockReader, CompensatedStream
 from ftdrive.live.weighing import WEIGH_S, CannotWeigh, Scale, load_values
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import Array

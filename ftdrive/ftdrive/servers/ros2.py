@@ -18,12 +18,19 @@ import numpy as np
 
 from ftdrive.errors import ConfigError
 from ftdrive.live import ros2
-from ftdrive.live.frames import frames_in_flange
-from ftdrive.live.loop import BlockReader, ProcessedStream
 from ftdrive.live.processing import SENSOR_FRAME
-from ftdrive.live.samples import Block, LinkStatus, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
+from ftdrive.live.samples import (
+    Block,
+    LinkStatus,
+    Stages,
+    StreamEvent,
+    StreamInfo,
+    StreamStatus,
+    WrenchFrame,
+    frames_in_flange,
+)
 from ftdrive.live.stages import stages_in_words
-from ftdrive.live.stream import CompensatedStream
+from ftdrive.live.stream import BlockReader, CompensatedStream, ProcessedStream
 from ftdrive.servers.parameters import Fixed, NodeParameters
 from ftdrive.servers.rates import Averaged, Picked
 from ftdrivers.errors import DeviceError, NoRos2

@@ -14,7 +14,7 @@ from textual.widgets import Input
 
 from ftdrive.checks.belonging import check_calibration
 from ftdrive.checks.check import Check
-from ftdrive.live.loop import ProcessedStream
+from ftdrive.live.stream import ProcessedStream
 from ftdrive.runs.verification_record import fitted_dataset
 from ftdrive.terminal.canvas import REFRESH_S, Canvas, ClosableApp
 from ftdrive.terminal.console import messages

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 from ftcalib.after.weighing import Weight
 from ftcalib.rounding import counted, with_sigma
 from ftdrive.errors import NotAccepted
-from ftdrive.live.loop import RECOVER_S, BlockReader
 from ftdrive.live.samples import Block
-from ftdrive.live.stream import CompensatedStream
+from ftdrive.live.stream import RECOVER_S, BlockReader, CompensatedStream
 from ftdrive.live.weighing import FAULTS, WEIGH_S, WORDS, CannotWeigh, Scale, count_of, load_values, weigh_in_motion
 from ftdrive.recording import Recorder
 

@@ -14,9 +14,9 @@ from typing import Protocol, TypeVar, get_args
 import numpy as np
 
 from ftdrive.errors import ConfigError
-from ftdrive.live.loop import BlockReader, ProcessedStream
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Axes, Block, Point, StreamEvent, WrenchFrame
+from ftdrive.live.stream import BlockReader, ProcessedStream
 from ftdrive.terminal.live.lines import BAD, CONTACT, GOOD, STRONG, WARNING
 from ftdrivers.errors import DeviceError
 

@@ -13,9 +13,8 @@ from ftcalib.sphere import axes_along
 from ftdrive.checks.check import Check
 from ftdrive.checks.sensor import AXES, check_rate
 from ftdrive.errors import ConfigError
-from ftdrive.live.frames import FrameTransform
 from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import LinkStatus, Stages, StreamInfo, WrenchFrame
+from ftdrive.live.samples import FrameTransform, LinkStatus, Stages, StreamInfo, WrenchFrame
 from ftdrive.runs.verification_record import EMULATED, age_in_words
 from ftdrive.terminal.live.feed import Note
 from ftdrive.terminal.live.lines import (

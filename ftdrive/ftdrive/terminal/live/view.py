@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
 from ftdrive.checks.sensor import check_noise_change
-from ftdrive.live.frames import FrameTransform
 from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import Block, Stages, StreamInfo, StreamStatus, WrenchFrame
+from ftdrive.live.samples import Block, FrameTransform, Stages, StreamInfo, StreamStatus, WrenchFrame
 from ftdrive.live.stream import STALE_S
 from ftdrive.terminal.live.feed import MEAN_S, Feed, Note
 from ftdrive.terminal.live.lines import WARNING

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from ftdrive.commands import live_source, stream
 from ftdrive.commands.common import CellOptions
 from ftdrive.errors import ConfigError, exit_code
-from ftdrive.live.loop import RECOVER_S
 from ftdrive.live.samples import Block, StreamEvent, WrenchFrame
+from ftdrive.live.stream import RECOVER_S
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.servers.fake_stream import FakeStream, block

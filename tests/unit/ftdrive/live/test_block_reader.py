@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from ftdrive.live.loop import RECOVER_S, BlockReader
+from ftdrive.live.stream import RECOVER_S, BlockReader
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 

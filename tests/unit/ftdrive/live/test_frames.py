@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftdrive.live.frames import frames_in_flange
-from ftdrive.live.samples import WrenchFrame, sensor_origin_m
+from ftdrive.live.samples import WrenchFrame, frames_in_flange, sensor_origin_m
 from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, P_FLANGE_TCP_M, R_FLANGE_TCP, calibrated, info
 
 INFO = info(calibrated())

@@ -15,9 +15,8 @@ from ftcalib.after.series import BiasTemperature
 from ftcalib.model import Array, predict
 from ftcalib.result import MotionResult
 from ftdrive.errors import ConfigError
-from ftdrive.live.frames import FrameTransform
 from ftdrive.live.processing import Processor
-from ftdrive.live.samples import Axes, Block, Paired, Point, Stages, WrenchFrame
+from ftdrive.live.samples import Axes, Block, FrameTransform, Paired, Point, Stages, WrenchFrame
 from ftdrive.live.stages import stages_in_words
 from tests.moving_load import HOME, flange
 from tests.unit.ftdrive.live.simulated import (

@@ -10,10 +10,10 @@ import numpy as np
 
 from ftcalib import CalibrationResult, Parameters
 from ftcalib.model import predict
-from ftdrive.live.frames import FrameTransform
 from ftdrive.live.samples import (
     Block,
     EventKind,
+    FrameTransform,
     LinkStatus,
     Stages,
     StreamEvent,
