@@ -19,9 +19,9 @@ from rich.console import Console
 from rich.text import Text
 
 from ftdrive.checks.check import Check
-from ftdrive.terminal.live.feed import Feed
-from ftdrive.terminal.live.view import Summary
+from ftdrive.terminal.live_feed import Feed
 from ftdrive.terminal.live_screen import LiveApp
+from ftdrive.terminal.live_view import Summary
 from tests.benchmarks.common import show
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream, Scenario
 

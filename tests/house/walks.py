@@ -55,7 +55,7 @@ WALKS = {
         ftdrivers.streaming.sensor         StreamingSensor._publish   drops late and repeated rows
         ftdrivers.streaming.plausibility   Liveness.judge             finds a frozen sensor
         ftdrivers.follow                   Unread.put                 keeps every row for each follower
-        ~ftdrive.terminal.live.feed        Feed._run                  is the thread that reads the stream
+        ~ftdrive.terminal.live_feed        Feed._run                  is the thread that reads the stream
         ftdrive.live.stream                BlockReader.read           reads on after an interruption
         ftdrive.live.stream                CompensatedStream.read     waits for rows whose pose is known
         ftdrivers.follow                   Follow.read                takes the rows that wait
@@ -68,12 +68,12 @@ WALKS = {
         ftdrive.live.stages                Filter                     filters, if a stage asks for it
         ftdrive.live.samples               FrameTransform             turns to the chosen axes and point
         ftdrive.live.samples               Block                      has what a consumer may need
-        ftdrive.terminal.live.feed         Feed.take                  hands the block to screen and recorder
+        ftdrive.terminal.live_feed         Feed.take                  hands the block to screen and recorder
         ~ftdrive.terminal.live_screen      LiveApp.draw               draws ten times a second
-        ftdrive.terminal.live.view         Summary.view               means, peaks and history so far
-        ftdrive.terminal.live.layout       frame                      places the panels
-        ftdrive.terminal.live.panels       table                      writes numbers with their digits
-        ftdrive.terminal.canvas            Canvas.show                sends the lines that changed
+        ftdrive.terminal.live_view         Summary.view               means, peaks and history so far
+        ftdrive.terminal.live_screen       frame                      places the panels
+        ftdrive.terminal.live_panels       table                      writes numbers with their digits
+        ftdrive.terminal.live_screen        Canvas.show                sends the lines that changed
     """,
     "From poses to a calibration": """
         ftdrive.commands.solve                    solve                    reads the options

@@ -37,9 +37,9 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.source import read_calibration
 from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrive.terminal.live.feed import MEAN_S, Feed
-from ftdrive.terminal.live.layout import plain as plain_lines
-from ftdrive.terminal.live.view import Summary, View
+from ftdrive.terminal.live_feed import MEAN_S, Feed
+from ftdrive.terminal.live_panels import plain as plain_lines
+from ftdrive.terminal.live_view import Summary, View
 from ftdrive.terminal.text import echo
 from ftdrivers.interfaces import Array
 

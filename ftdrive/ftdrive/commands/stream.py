@@ -16,10 +16,9 @@ from ftdrive.commands.common import (
 )
 
 if TYPE_CHECKING:
-    from ftdrive.live.samples import Axes, Tracking
+    from ftdrive.live.samples import Axes, Sink, Tracking
     from ftdrive.live.stream import CompensatedStream, ProcessedStream
     from ftdrive.servers.foxglove import FoxgloveServer
-    from ftdrive.servers.udp import UdpSender
 
 
 @click.command()
@@ -67,14 +66,14 @@ def stream(
         server = stack.enter_context(
             closing(FoxgloveServer(opened, host, port, origins=origins, allow_control=allow_control))
         )
-        sinks: list[FoxgloveServer | UdpSender] = [server]
+        sinks: list[Sink] = [server]
         if udp_address is not None:
             sinks.append(stack.enter_context(closing(UdpSender(opened.info, *udp_address))))
         _introduce(opened, server, host, udp_address)
         serve(opened, sinks)
 
 
-def serve(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
+def serve(source: "CompensatedStream", sinks: Sequence["Sink"]) -> None:
     """Send blocks and events until Ctrl-C is pressed, or a device is silent for `RECOVER_S`."""
     from ftdrive.live.stream import RECOVER_S, BlockReader
     from ftdrive.terminal.console import messages
@@ -90,7 +89,7 @@ def serve(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | UdpSend
         _send_events(source, sinks)
 
 
-def _send_events(source: "CompensatedStream", sinks: Sequence["FoxgloveServer | UdpSender"]) -> None:
+def _send_events(source: "CompensatedStream", sinks: Sequence["Sink"]) -> None:
     for event in source.take_events():
         for sink in sinks:
             sink.event(event)

@@ -14,7 +14,7 @@ from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftdrive.live.samples import StreamInfo
-    from ftdrive.terminal.weighing import Shown, Weighing
+    from ftdrive.live.weighing import ScaleState, Weighing
 
 
 @click.command()
@@ -47,9 +47,9 @@ def weigh(
     """
     from ftdrive.commands.live_source import open_log, open_source
     from ftdrive.live.processing import SENSOR_FRAME
+    from ftdrive.live.weighing import Weighing
     from ftdrive.recording import Recorder
     from ftdrive.terminal.console import messages
-    from ftdrive.terminal.weighing import Weighing
 
     if moving and (zero or poses > 1):
         raise ConfigError("--moving follows the bias and has the whole centre of mass: leave out --zero and --poses")
@@ -83,7 +83,7 @@ def _print_all(texts: Sequence[str]) -> None:
         messages.print(words)
 
 
-def _answer_of(shown: "Shown", info: "StreamInfo") -> dict[str, Any]:
+def _answer_of(shown: "ScaleState", info: "StreamInfo") -> dict[str, Any]:
     from ftdrive.live.weighing import load_values
 
     values: dict[str, Any] = {"schema_version": 1, "calibration_id": info.calibration.id, "marks": list(info.marks)}
@@ -93,7 +93,7 @@ def _answer_of(shown: "Shown", info: "StreamInfo") -> dict[str, Any]:
 
 def _print(weighing: "Weighing", *, once: bool, waits: bool, poses: int, as_json: bool) -> None:
     """Print each new weight or fault as a line; with `once` end with the first weight."""
-    from ftdrive.terminal.weighing import PATIENCE_S, line_of
+    from ftdrive.live.weighing import PATIENCE_S, line_of
 
     clock = weighing.stream.clock
     begin_s = clock.now_s()

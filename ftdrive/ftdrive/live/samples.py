@@ -5,7 +5,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -474,3 +474,16 @@ def matrices(quat: Array) -> Array:
     xy, xz, yz, wx, wy, wz = x * y2, x * z2, y * z2, w * x2, w * y2, w * z2
     columns = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
     return np.stack(columns, axis=1).reshape(-1, 3, 3)
+
+
+class Sink(Protocol):
+    """A consumer of blocks, such as a recorder."""
+
+    def write(self, block: Block) -> None:
+        """Take samples."""
+
+    def event(self, event: StreamEvent) -> None:
+        """Take an event."""
+
+    def close(self) -> None:
+        """Complete the output."""

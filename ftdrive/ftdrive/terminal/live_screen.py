@@ -1,27 +1,36 @@
 """The live screen: the compensated wrench in a terminal, with keys and mouse.
 
-`Feed` reads the stream in a thread. Ten times a second `Summary` takes what is new, `layout.frame` draws its `View` as
-lines, and only the lines that changed are sent to the terminal.
+`Feed` reads the stream in a thread. Ten times a second `Summary` takes what is new, `frame` draws its `View` as lines,
+and only the lines that changed are sent to the terminal.
 """
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+from rich.segment import Segment
+from rich.style import Style
 from textual import events
 from textual.app import ComposeResult
+from textual.geometry import Region
+from textual.strip import Strip
+from textual.widget import Widget
 from textual.widgets import Input
 
 from ftdrive.checks.belonging import check_calibration
 from ftdrive.checks.check import Check
+from ftdrive.checks.sensor import AXES
+from ftdrive.live.samples import Sink
 from ftdrive.live.stream import ProcessedStream
 from ftdrive.runs.verification_record import fitted_dataset
-from ftdrive.terminal.canvas import REFRESH_S, Canvas, ClosableApp
+from ftdrive.terminal import live_panels
+from ftdrive.terminal.closable_app import REFRESH_S, ClosableApp
 from ftdrive.terminal.console import messages
-from ftdrive.terminal.live.feed import Feed, Sink, after
-from ftdrive.terminal.live.layout import frame
-from ftdrive.terminal.live.lines import Line
-from ftdrive.terminal.live.view import SPANS_S, Summary
+from ftdrive.terminal.lines import CONTACT, FAINT, STRONG, Line, Part, characters, envelope, level
+from ftdrive.terminal.live_feed import Feed, after
+from ftdrive.terminal.live_view import SPANS_S, PlotColumns, Summary, View
 
 _HELP = """\
  ftdrive live: the wrench on the tool, ten times a second
@@ -165,3 +174,165 @@ class LiveApp(ClosableApp):
         else:
             self._feed.request(key)
         self.draw()
+
+
+# From this width on the plots stand beside the table.
+_WIDE = 120
+_LEFT = 78
+# Columns for the scale of a plot.
+_GUTTER = 7
+_LEAST_PLOT_ROWS, _LEAST_EVENTS = 3, 3
+
+
+def frame(view: View, width: int, height: int) -> list[Line]:
+    """Draw the screen.
+
+    Returns
+    -------
+    list of Line
+        `height` lines of `width` cells.
+    """
+    head = [
+        live_panels.title(view, width),
+        live_panels.provenance(view, width),
+        live_panels.state(view, width),
+        live_panels.rule(view, width),
+    ]
+    foot = live_panels.keys(view, width)
+    rows = max(0, height - len(head) - 1)
+    body = _wide(view, width, rows) if width >= _WIDE else _narrow(view, width, rows)
+    return [*head, *body, *[Line().to(width)] * (rows - len(body)), foot][:height]
+
+
+def _narrow(view: View, width: int, rows: int) -> list[Line]:
+    body = live_panels.table(view, width, with_trace=True)
+    separator = Line("─" * width, FAINT)
+    if rows - len(body) >= 3 * _LEAST_PLOT_ROWS + 10:
+        plot_rows = min(7, (rows - len(body) - 10) // 3)
+        body += _plots(view, width, 3 * plot_rows, across=2)
+    links = [separator, *live_panels.links(view, width)]
+    # a refusal is read to its end
+    if rows - len(body) - len(links) - 1 >= max(1, live_panels.newest_rows(view, width)):
+        body += links
+    if rows - len(body) >= 20:
+        body += [separator, *live_panels.identity(view, width)]
+    left = rows - len(body) - 1
+    if left > 0:
+        body += [separator, *live_panels.events(view, width, left)]
+    return body[:rows]
+
+
+def _wide(view: View, width: int, rows: int) -> list[Line]:
+    separator = Line("─" * _LEFT, FAINT)
+    left = [*live_panels.table(view, _LEFT, with_trace=False), separator, *live_panels.links(view, _LEFT), separator]
+    for extra in (live_panels.others(view, _LEFT), live_panels.sphere(view, _LEFT), live_panels.identity(view, _LEFT)):
+        if rows - len(left) >= len(extra) + 1 + _LEAST_EVENTS:
+            left += [*extra, separator]
+    left += live_panels.events(view, _LEFT, max(0, rows - len(left)))
+    right = _plots(view, width - _LEFT - 1, rows, across=1)
+    right += [Line()] * (rows - len(right))
+    return [
+        Line().join(a.fit(_LEFT)).add("│", FAINT).join(b.fit(width - _LEFT - 1))
+        for a, b in zip(left[:rows], right, strict=True)
+    ]
+
+
+def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
+    """Draw all six plots in `rows` lines, the last of which is the time axis."""
+    each, cells = (rows - 1) // (6 // across), width // across - _GUTTER - 1
+    if each < 2 or cells < 8:
+        return []
+    columns = view.columns(2 * cells)
+    full = [live_panels.full_scale(columns, view.reading, first) for first in (0, 3)]
+    drawn = [_plot(view, columns, i, full[i // 3], each, with_value=across == 1) for i in range(6)]
+    lines = []
+    for first in range(6 // across):
+        beside = drawn[first::3] if across == 2 else [drawn[first]]
+        for parts in zip(*beside, strict=True):
+            line = Line()
+            for part in parts:
+                line.join(part.fit(width // across))
+            lines.append(line.fit(width))
+    axis = Line()
+    for _ in range(across):
+        axis.join(_time_axis(columns, cells).fit(width // across))
+    return [*lines, axis.fit(width)]
+
+
+def _time_axis(columns: PlotColumns, cells: int) -> Line:
+    span, half = f"-{live_panels.span(columns)}", f"-{columns.span_s / 2:.0f}"
+    line = Line(" " * _GUTTER).add(span, FAINT, "g")
+    line.to(_GUTTER + cells // 2 - len(half)).add(half, FAINT)
+    return line.to(_GUTTER + cells - 3).add("now", FAINT)
+
+
+def _plot(view: View, columns: PlotColumns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
+    """Draw one component: a line with contacts, marks and perhaps the value, then `rows` - 1 lines of Braille.
+
+    The envelope of the samples stands before the zero line and the band of ±1 sigma of a sample about it.
+    """
+    reading, unit = view.reading, "N" if i < 3 else "N·m"
+    head = Line(f"{AXES[i]:>{_GUTTER - 1}} ", STRONG)
+    if with_value and reading is not None and not view.silent:
+        places = live_panels.decimals(reading, i // 3 * 3)
+        head.add(f"{reading.wrench[i]:+z.{places}f} ± {live_panels.digits(reading.sigma[i], places)} {unit} ")
+    contact = columns.contact_cells
+    cells = len(contact)
+    marks = {
+        column // 2
+        for note in view.notes
+        if note.is_mark and note.t_host_ns is not None and (column := columns.column_of(note.t_host_ns)) is not None
+    }
+    shown = slice(head.width - _GUTTER, cells)
+    text, styles = (["━" if it else "─" for it in contact], [CONTACT if it else FAINT for it in contact])
+    for cell in marks:
+        text[cell], styles[cell] = "◆", STRONG
+    head.join(Line.of_cells(text[shown], styles[shown]))
+
+    rows -= 1
+    ink = characters(envelope(columns.low[i], columns.high[i], rows, full))
+    under = np.zeros((4 * rows, 2 * cells), np.bool_)
+    if reading is not None and np.isfinite(sigma := reading.sample_sigma[i]):
+        for value in (-sigma, 0.0, sigma):
+            if (dot := level(value, rows, full)) is not None:
+                under[dot, ::4] = True
+    under[::2, [2 * cell for cell in marks]] = True
+    paper = characters(under)
+    lines = [head]
+    for row in range(rows):
+        label = f"{full:+g}" if row == 0 else f"{-full:+g}" if row == rows - 1 else "0" if row == rows // 2 else ""
+        line = Line(f"{label:>{_GUTTER - 1}} ", FAINT)
+        lines.append(line.join(live_panels.layers(ink[row], paper[row], contact)))
+    return lines
+
+
+# Lines instead of widgets, because one plot of textual-plotext takes 45 % of a core.
+class Canvas(Widget):
+    """Shows lines; only those that changed are drawn again."""
+
+    DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[list[Part]] = []
+
+    def show(self, lines: Sequence[Line]) -> None:
+        """Replace the lines."""
+        new, old = [line.parts for line in lines], self.lines
+        self.lines = new
+        width = self.size.width
+        changed = [Region(0, y, width, 1) for y, parts in enumerate(new) if y >= len(old) or parts != old[y]]
+        if changed:
+            self.refresh(*changed)
+
+    def render_line(self, y: int) -> Strip:
+        """Return a line as Textual draws it."""
+        if y >= len(self.lines):
+            return Strip.blank(self.size.width)
+        return Strip([Segment(part.text, _style(part.style, part.key)) for part in self.lines[y]])
+
+
+@lru_cache
+def _style(name: str, key: str) -> Style:
+    style = Style.parse(name)
+    return style + Style.from_meta({"@click": f"app.press('{key}')"}) if key else style

@@ -1,4 +1,4 @@
-"""The screen of `ftdrive weigh`: one large number, in the digits of Textual instead of lines on the canvas."""
+"""The screen of `ftdrive weigh`: one large number, in the digits of Textual."""
 
 import threading
 from typing import ClassVar
@@ -9,8 +9,8 @@ from textual.widgets import Digits, Static
 from ftcalib.after.weighing import Weight
 from ftcalib.rounding import counted, to_place_of
 from ftdrive.errors import NotAccepted
-from ftdrive.terminal.canvas import REFRESH_S, ClosableApp
-from ftdrive.terminal.weighing import Shown, Weighing, line_of
+from ftdrive.live.weighing import ScaleState, Weighing, line_of
+from ftdrive.terminal.closable_app import REFRESH_S, ClosableApp
 
 # With a larger smallest mass the drift since the calibration decides, and a zero helps.
 _UNZEROED_KG = 0.1
@@ -22,7 +22,7 @@ class _Reader(threading.Thread):
     def __init__(self, weighing: Weighing) -> None:
         super().__init__(daemon=True)
         self._weighing = weighing
-        self.shown = Shown(None, "samples")
+        self.shown = ScaleState(None, "samples")
         self.note = ""
         self.failure: BaseException | None = None
         self.zero_requested = False
@@ -37,7 +37,7 @@ class _Reader(threading.Thread):
                 if self.zero_requested:
                     self.zero_requested = False
                     # the number of before would look live
-                    self.shown = Shown(None, "samples")
+                    self.shown = ScaleState(None, "samples")
                     self.note = self._zero()
         except BaseException as error:  # the main thread raises it
             self.failure = error

@@ -21,8 +21,8 @@ from ftdrive.commands import live
 from ftdrive.live.processing import Processor
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block, Stages, WrenchFrame
-from ftdrive.terminal.live import feed
-from ftdrive.terminal.live.layout import plain
+from ftdrive.terminal import live_feed
+from ftdrive.terminal.live_panels import plain
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.live.simulated import NOISE, calibrated, dwells, info, paired
@@ -186,7 +186,7 @@ def test_a_silent_device_is_shown_and_no_old_number() -> None:
 
 
 def test_a_failure_that_lasts_ends_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(feed, "_RETRY_S", 0.0)
+    monkeypatch.setattr(live_feed, "_RETRY_S", 0.0)
     for failures, raises in ((1000, False), (1, True)):
         stream: Any = Interrupted(failures)
         with pytest.raises(DeviceTimeout):

@@ -12,36 +12,35 @@ from click.testing import CliRunner
 from ftdrive.cli import cli
 from ftdrive.commands.weigh import _print
 from ftdrive.errors import ConfigError
-from ftdrive.live.weighing import CannotWeigh
-from ftdrive.terminal.weighing import Shown
+from ftdrive.live.weighing import CannotWeigh, ScaleState
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import INFO
 from tests.unit.ftdrive.terminal.test_weigh_screen import PART
 
-EMPTY = Shown(replace(PART, mass_kg=0.001), None)
-ONE, TWO = Shown(PART, None), Shown(replace(PART, mass_kg=0.3, poses=2), None)
-CABLE, MOVING = Shown(PART, "cable"), Shown(None, "moving")
+EMPTY = ScaleState(replace(PART, mass_kg=0.001), None)
+ONE, TWO = ScaleState(PART, None), ScaleState(replace(PART, mass_kg=0.3, poses=2), None)
+CABLE, MOVING = ScaleState(PART, "cable"), ScaleState(None, "moving")
 
 
 class Scale:
     """A scale that shows one state after the other, each second."""
 
-    def __init__(self, *states: tuple[Shown, bool]) -> None:
+    def __init__(self, *states: tuple[ScaleState, bool]) -> None:
         self.stream = SimpleNamespace(clock=FakeClock(), info=replace(INFO, emulated=True))
-        self._states: Sequence[tuple[Shown, bool]] = states
+        self._states: Sequence[tuple[ScaleState, bool]] = states
         self.raises: bool | None = None
         self.zeros = 0
 
     def zero(self) -> None:
         self.zeros += 1
 
-    def states(self, *, raises: bool = False) -> Iterator[tuple[Shown, bool]]:
+    def states(self, *, raises: bool = False) -> Iterator[tuple[ScaleState, bool]]:
         self.raises = raises
         for one in self._states:
             self.stream.clock.sleep(1.0)
             yield one
 
-    def given_up(self, shown: Shown) -> CannotWeigh:
+    def given_up(self, shown: ScaleState) -> CannotWeigh:
         return CannotWeigh(shown.refusal or "samples")
 
 
@@ -108,7 +107,7 @@ def weighed(scale: Scale, monkeypatch: pytest.MonkeyPatch, *options: str) -> tup
 
     monkeypatch.setattr("ftdrive.commands.live_source.open_source", open_source)
     monkeypatch.setattr("ftdrive.commands.live_source.open_log", lambda *_: None)
-    monkeypatch.setattr("ftdrive.terminal.weighing.Weighing", weighing)
+    monkeypatch.setattr("ftdrive.live.weighing.Weighing", weighing)
     outcome = CliRunner().invoke(cli, ["weigh", "--simulate", *options])
     assert outcome.exit_code == 0, outcome.output
     return opened, outcome.stdout
@@ -116,7 +115,7 @@ def weighed(scale: Scale, monkeypatch: pytest.MonkeyPatch, *options: str) -> tup
 
 def test_in_motion_one_answer_to_a_part_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     carried = [
-        (Shown(replace(one, poses=0, in_motion=True), None), True) for one in (replace(PART, mass_kg=0.001), PART)
+        (ScaleState(replace(one, poses=0, in_motion=True), None), True) for one in (replace(PART, mass_kg=0.001), PART)
     ]
     opened, out = weighed(Scale(*carried), monkeypatch, "--moving", "--once", "--count", "0.4")
     assert (opened["track"], opened["moving"], opened["joins"], opened["part_kg"]) == ("show", True, False, 0.4)

@@ -30,7 +30,7 @@ from ftdrive.session import session
 from ftdrive.session.events import Noted, Question
 from ftdrive.terminal import console
 from ftdrive.terminal.console import answer, hanging, messages
-from ftdrive.terminal.live.lines import Line
+from ftdrive.terminal.lines import Line
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.text import echo, in_whole_words, print_table, visible

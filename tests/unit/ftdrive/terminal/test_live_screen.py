@@ -22,10 +22,9 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.replay import STEP_S, ReplayedStream
 from ftdrive.live.samples import Block, Paired, Stages, WrenchFrame
 from ftdrive.terminal.console import messages
-from ftdrive.terminal.live.feed import Feed
-from ftdrive.terminal.live.layout import frame
-from ftdrive.terminal.live.view import Summary
-from ftdrive.terminal.live_screen import LiveApp, run_live
+from ftdrive.terminal.live_feed import Feed
+from ftdrive.terminal.live_screen import LiveApp, frame, run_live
+from ftdrive.terminal.live_view import Summary
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import FREE, INFO, R_BASE_FLANGE, SIGMA, START_NS, FakeStream, Scenario

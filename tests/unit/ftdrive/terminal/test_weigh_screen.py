@@ -13,9 +13,8 @@ from textual.widgets import Digits, Static
 
 from ftcalib.after.weighing import Weight
 from ftdrive.errors import NotAccepted
-from ftdrive.live.weighing import WORDS
+from ftdrive.live.weighing import WORDS, ScaleState, line_of
 from ftdrive.terminal.weigh_screen import WeighApp, run_weigh
-from ftdrive.terminal.weighing import Shown, line_of
 from ftdrivers.errors import StreamBroken
 from tests.unit.ftdrive.terminal.fake_stream import INFO
 
@@ -38,7 +37,7 @@ NOTHING = replace(PART, mass_kg=-0.00021, mass_sigma_kg=0.1, least_kg=0.4)
 class FakeWeighing:
     """A scale that stays in the state it is given."""
 
-    def __init__(self, shown: Shown, *, moving: bool = False, fails: Exception | None = None) -> None:
+    def __init__(self, shown: ScaleState, *, moving: bool = False, fails: Exception | None = None) -> None:
         self.stream = SimpleNamespace(info=replace(INFO, emulated=True))
         self.shown, self.moving, self.joins, self.fails = shown, moving, False, fails
         self.zeros = 0
@@ -46,7 +45,7 @@ class FakeWeighing:
         self.in_zero, self.may_zero = threading.Event(), threading.Event()
         self.ends = threading.Event()
 
-    def states(self) -> Iterator[tuple[Shown, bool]]:
+    def states(self) -> Iterator[tuple[ScaleState, bool]]:
         while not self.ends.wait(0.001):
             yield self.shown, False
             if self.fails is not None:
@@ -92,11 +91,11 @@ class Scale:
 
 
 def test_a_screen_that_closes_is_not_drawn_any_more() -> None:
-    Scale(FakeWeighing(Shown(PART, None))).app.draw()
+    Scale(FakeWeighing(ScaleState(PART, None))).app.draw()
 
 
 def test_the_number_ends_where_its_sigma_does() -> None:
-    scale = Scale(FakeWeighing(Shown(PART, None, 3)))
+    scale = Scale(FakeWeighing(ScaleState(PART, None, 3)))
     assert scale.title == "ftdrive weigh   tool gripper_a   EMULATED"
     assert scale.mass == " 0.8123 kg"
     assert scale.sigma == "3 parts   sigma 1.2 g, smallest mass 4.8 g"
@@ -105,46 +104,46 @@ def test_the_number_ends_where_its_sigma_does() -> None:
 
 
 def test_a_scale_without_a_zero_asks_for_one() -> None:
-    scale = Scale(FakeWeighing(Shown(NOTHING, None)))
+    scale = Scale(FakeWeighing(ScaleState(NOTHING, None)))
     assert scale.mass == " 0.00 kg"  # neither -0 nor another place of the digits
     hint = "   not zeroed: press z with an empty gripper"
     assert scale.sigma == f"sigma 100 g, smallest mass 400 g{hint}"
     assert scale.line == "nothing: -0.00 ± 0.10 kg, less than 0.4 kg"
-    assert hint in Scale(FakeWeighing(Shown(replace(NOTHING, least_kg=0.101), None))).sigma
-    assert hint not in Scale(FakeWeighing(Shown(replace(NOTHING, least_kg=0.099), None))).sigma
+    assert hint in Scale(FakeWeighing(ScaleState(replace(NOTHING, least_kg=0.101), None))).sigma
+    assert hint not in Scale(FakeWeighing(ScaleState(replace(NOTHING, least_kg=0.099), None))).sigma
 
 
 @pytest.mark.parametrize(
     ("shown", "line"),
     [
-        (Shown(PART, "contact"), f"not weighed: {WORDS['contact']}"),
-        (Shown(None, "moving"), f"not weighed: {WORDS['moving']}"),
-        (Shown(None, None, stale="[sensor] silent for 0.3 s"), "stale: [sensor] silent for 0.3 s"),
+        (ScaleState(PART, "contact"), f"not weighed: {WORDS['contact']}"),
+        (ScaleState(None, "moving"), f"not weighed: {WORDS['moving']}"),
+        (ScaleState(None, None, stale="[sensor] silent for 0.3 s"), "stale: [sensor] silent for 0.3 s"),
     ],
 )
-def test_what_is_not_weighed_has_no_number(shown: Shown, line: str) -> None:
+def test_what_is_not_weighed_has_no_number(shown: ScaleState, line: str) -> None:
     scale = Scale(FakeWeighing(shown))
     assert (scale.mass, scale.sigma, scale.line) == ("- - -", "", line)
 
 
 def test_what_cannot_be_counted_has_a_mass() -> None:
-    scale = Scale(FakeWeighing(Shown(PART, "count")))
+    scale = Scale(FakeWeighing(ScaleState(PART, "count")))
     assert (scale.mass, scale.sigma) == (" 0.8123 kg", "sigma 1.2 g, smallest mass 4.8 g")
     assert scale.line == f"not weighed: {WORDS['count']}"
 
 
 def test_poses_are_joined_until_the_key_is_pressed_again() -> None:
-    scale = Scale(FakeWeighing(Shown(PART, None)), "p")
+    scale = Scale(FakeWeighing(ScaleState(PART, None)), "p")
     assert scale.weighing.joins
     assert scale.sigma.endswith("4.8 g   1 pose joined, turn the tool for more")
-    assert not Scale(FakeWeighing(Shown(PART, None)), "p", "p").weighing.joins
+    assert not Scale(FakeWeighing(ScaleState(PART, None)), "p", "p").weighing.joins
 
 
 @pytest.mark.parametrize(
     ("refuses", "note"), [(False, "zero: the empty gripper was tared"), (True, "no zero: the arm moves")]
 )
 def test_a_zero_hides_the_number_of_before(refuses: bool, note: str) -> None:
-    weighing = FakeWeighing(Shown(PART, None))
+    weighing = FakeWeighing(ScaleState(PART, None))
     weighing.refuses = refuses
     scale = Scale(weighing, "z")
     assert weighing.zeros == 1
@@ -153,7 +152,7 @@ def test_a_zero_hides_the_number_of_before(refuses: bool, note: str) -> None:
 
 
 def test_in_motion_neither_zero_nor_poses_are_offered() -> None:
-    weighing = FakeWeighing(Shown(replace(NOTHING, poses=0, in_motion=True), None), moving=True)
+    weighing = FakeWeighing(ScaleState(replace(NOTHING, poses=0, in_motion=True), None), moving=True)
     scale = Scale(weighing, "z", "p")
     assert (weighing.zeros, weighing.joins) == (0, False)
     assert (scale.keys, scale.note) == ("q quit", "")
@@ -163,7 +162,7 @@ def test_in_motion_neither_zero_nor_poses_are_offered() -> None:
 @pytest.mark.parametrize("error", [StreamBroken("the cable is cut"), OSError(28, "No space left on device")])
 def test_what_ends_the_reading_ends_the_screen(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else the last number would stay, as if it were live."""
-    weighing, run = FakeWeighing(Shown(PART, None), fails=error), WeighApp.run
+    weighing, run = FakeWeighing(ScaleState(PART, None), fails=error), WeighApp.run
     monkeypatch.setattr(WeighApp, "run", lambda app: run(app, headless=True))
     with pytest.raises(type(error)) as raised:
         run_weigh(cast("Any", weighing))
@@ -173,7 +172,7 @@ def test_what_ends_the_reading_ends_the_screen(error: Exception, monkeypatch: py
 @pytest.mark.parametrize("key", ["q", "ctrl+c"])
 def test_two_keys_end_it(key: str) -> None:
     async def main() -> bool:
-        weighing = FakeWeighing(Shown(PART, None))
+        weighing = FakeWeighing(ScaleState(PART, None))
         app = WeighApp(cast("Any", weighing))
         async with app.run_test() as pilot:
             await pilot.press(key)
@@ -184,4 +183,4 @@ def test_two_keys_end_it(key: str) -> None:
 
 
 def test_one_part_is_no_plural() -> None:
-    assert line_of(Shown(PART, None, 1)).startswith("1 part, 0.8123")
+    assert line_of(ScaleState(PART, None, 1)).startswith("1 part, 0.8123")

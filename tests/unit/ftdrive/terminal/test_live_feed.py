@@ -7,7 +7,7 @@ import pytest
 
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, StreamEvent
-from ftdrive.terminal.live.feed import Feed
+from ftdrive.terminal.live_feed import Feed
 from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream
 
@@ -124,7 +124,7 @@ def test_what_ends_the_thread_is_kept() -> None:
 
 
 def test_a_screen_that_does_not_draw_costs_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ftdrive.terminal.live.feed._MOST_BLOCKS", 20)
+    monkeypatch.setattr("ftdrive.terminal.live_feed._MOST_BLOCKS", 20)
     feed = Feed(FakeStream())
     for _ in range(30):
         feed.step()

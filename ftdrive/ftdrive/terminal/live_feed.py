@@ -9,15 +9,15 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Protocol, TypeVar, get_args
+from typing import TypeVar, get_args
 
 import numpy as np
 
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import Axes, Block, Point, StreamEvent, WrenchFrame
+from ftdrive.live.samples import Axes, Block, Point, Sink, StreamEvent, WrenchFrame
 from ftdrive.live.stream import BlockReader, ProcessedStream
-from ftdrive.terminal.live.lines import BAD, CONTACT, GOOD, STRONG, WARNING
+from ftdrive.terminal.lines import BAD, CONTACT, GOOD, STRONG, WARNING
 from ftdrivers.errors import DeviceError
 
 T = TypeVar("T")
@@ -44,19 +44,6 @@ _STYLES = {
     "recovered": GOOD,
     "mark": STRONG,
 }
-
-
-class Sink(Protocol):
-    """A consumer of blocks, such as a recorder."""
-
-    def write(self, block: Block) -> None:
-        """Take samples."""
-
-    def event(self, event: StreamEvent) -> None:
-        """Take an event."""
-
-    def close(self) -> None:
-        """Complete the output."""
 
 
 class Feed:

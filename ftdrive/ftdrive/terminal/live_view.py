@@ -15,8 +15,8 @@ from ftdrive.checks.sensor import check_noise_change
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block, FrameTransform, Stages, StreamInfo, StreamStatus, WrenchFrame
 from ftdrive.live.stream import STALE_S
-from ftdrive.terminal.live.feed import MEAN_S, Feed, Note
-from ftdrive.terminal.live.lines import WARNING
+from ftdrive.terminal.lines import WARNING
+from ftdrive.terminal.live_feed import MEAN_S, Feed, Note
 from ftdrivers.interfaces import Array
 
 T = TypeVar("T")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ftdrive.terminal.live.lines import characters, envelope, level, row_text
+from ftdrive.terminal.lines import characters, envelope, level, row_text
 
 
 def drawn(low: list[float], high: list[float], rows: int, full: float) -> list[str]:

@@ -16,8 +16,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import FrameTransform, LinkStatus, Stages, StreamInfo, WrenchFrame
 from ftdrive.runs.verification_record import EMULATED, age_in_words
-from ftdrive.terminal.live.feed import Note
-from ftdrive.terminal.live.lines import (
+from ftdrive.terminal.lines import (
     BAD,
     CONTACT,
     FAINT,
@@ -32,7 +31,8 @@ from ftdrive.terminal.live.lines import (
     envelope,
     row_text,
 )
-from ftdrive.terminal.live.view import PlotColumns, ShownWrench, View
+from ftdrive.terminal.live_feed import Note
+from ftdrive.terminal.live_view import PlotColumns, ShownWrench, View
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 
 LEAST_FULL_SIGMA = 10.0
@@ -584,3 +584,16 @@ def _clock(duration_s: float) -> str:
 
 def _short(duration_s: float) -> str:
     return f"{1e3 * duration_s:.0f} ms" if duration_s < 1 else f"{duration_s:.1f} s"
+
+
+def plain(view: View, width: int) -> list[Line]:
+    """Draw the table and the state of both links, without keys and events."""
+    return [
+        title(view, width),
+        provenance(view, width),
+        state(view, width),
+        rule(view, width),
+        *table(view, width, with_trace=True),
+        Line("─" * width, FAINT),
+        *links(view, width),
+    ]

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.weighing import CannotWeigh
-from ftdrive.terminal.weighing import Weighing
+from ftdrive.live.weighing import CannotWeigh, Weighing
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.live.simulated import calibrated, info
 from tests.unit.ftdrive.live.test_weighing import NOTHING, POSE, part, rests

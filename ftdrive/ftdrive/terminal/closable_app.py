@@ -1,24 +1,15 @@
-"""Screens of Textual: an app that survives a closed terminal, and a canvas of lines.
+"""An app of Textual that survives a closed terminal.
 
 Only a screen that is shown imports this module: no other command waits for the import of Textual.
 """
 
 import signal
 import threading
-from collections.abc import Sequence
 from contextlib import suppress
-from functools import lru_cache
 from typing import Any, cast
 
-from rich.segment import Segment
-from rich.style import Style
 from textual.app import App
 from textual.driver import Driver
-from textual.geometry import Region
-from textual.strip import Strip
-from textual.widget import Widget
-
-from ftdrive.terminal.live.lines import Line, Part
 
 REFRESH_S = 0.1
 
@@ -78,35 +69,3 @@ class _UntilClosed:
     def flush(self) -> None:
         with suppress(OSError):
             self.file.flush()
-
-
-# Lines instead of widgets, because one plot of textual-plotext takes 45 % of a core.
-class Canvas(Widget):
-    """Shows lines; only those that changed are drawn again."""
-
-    DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lines: list[list[Part]] = []
-
-    def show(self, lines: Sequence[Line]) -> None:
-        """Replace the lines."""
-        new, old = [line.parts for line in lines], self.lines
-        self.lines = new
-        width = self.size.width
-        changed = [Region(0, y, width, 1) for y, parts in enumerate(new) if y >= len(old) or parts != old[y]]
-        if changed:
-            self.refresh(*changed)
-
-    def render_line(self, y: int) -> Strip:
-        """Return a line as Textual draws it."""
-        if y >= len(self.lines):
-            return Strip.blank(self.size.width)
-        return Strip([Segment(part.text, _style(part.style, part.key)) for part in self.lines[y]])
-
-
-@lru_cache
-def _style(name: str, key: str) -> Style:
-    style = Style.parse(name)
-    return style + Style.from_meta({"@click": f"app.press('{key}')"}) if key else style

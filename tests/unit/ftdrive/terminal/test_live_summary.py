@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
 from ftdrive.live.samples import Block, WrenchFrame
-from ftdrive.terminal.live.feed import Feed
-from ftdrive.terminal.live.view import ShownWrench, Summary, View
+from ftdrive.terminal.live_feed import Feed
+from ftdrive.terminal.live_view import ShownWrench, Summary, View
 from tests.unit.ftdrive.terminal.fake_stream import R_BASE_FLANGE, SIGMA, FakeStream
 
 

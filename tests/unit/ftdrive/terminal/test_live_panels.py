@@ -8,15 +8,15 @@ import pytest
 from ftcalib.model import Array
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.runs.verification_record import FOREIGN
-from ftdrive.terminal.live import panels
-from ftdrive.terminal.live.feed import Note
-from ftdrive.terminal.live.layout import frame
-from ftdrive.terminal.live.lines import BAD, GOOD, WARNING, Line
-from ftdrive.terminal.live.panels import _range, line_of_force, others, sphere
-from ftdrive.terminal.live.view import View
+from ftdrive.terminal import live_panels
+from ftdrive.terminal.lines import BAD, GOOD, WARNING, Line
+from ftdrive.terminal.live_feed import Note
+from ftdrive.terminal.live_panels import _range, line_of_force, others, sphere
+from ftdrive.terminal.live_screen import frame
+from ftdrive.terminal.live_view import View
 from ftdrivers.interfaces import Fact
 from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, SIGMA, TARE, FakeStream
-from tests.unit.ftdrive.terminal.live.test_summary import Rig, reading_of
+from tests.unit.ftdrive.terminal.test_live_summary import Rig, reading_of
 
 SENSOR = WrenchFrame("sensor", "sensor")
 
@@ -91,7 +91,7 @@ def directions(*angles_deg: float) -> Array:
 def test_the_sphere_says_how_near_the_calibrated_orientations_are(view: View) -> None:
     reading = replace(reading_of(view), R_base_flange=R_BASE_FLANGE)
     lines = sphere(replace(view, reading=reading, calibrated=directions(70, 23, 110)), 80)
-    words = [text(line)[2 * panels._DISC + 6 :].strip() for line in lines]
+    words = [text(line)[2 * live_panels._DISC + 6 :].strip() for line in lines]
     covariance = view.info.calibration.wrench_covariance(R_BASE_FLANGE)
     variances = np.diag(covariance)
     assert words[1:9] == [
@@ -120,17 +120,17 @@ def test_the_sphere_says_how_near_the_calibrated_orientations_are(view: View) ->
 )
 def test_what_is_left_in_the_wrench_is_named(stages: Stages, words: str, view: View) -> None:
     reading = replace(reading_of(view), stages=stages, frame=WrenchFrame("flange", (0.0, 0.01, -0.15)))
-    line = text(panels.provenance(replace(view, reading=reading), 120))
+    line = text(live_panels.provenance(replace(view, reading=reading), 120))
     assert line.rstrip().endswith(f"{words}, flange @ (0,10,-150) mm")
 
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_a_calibration_of_another_cell_is_marked_in_the_header_and_not_green(view: View, width: int) -> None:
     foreign = replace(view, info=replace(view.info, foreign=True, emulated=True))
-    assert FOREIGN in text(panels.title(foreign, width))
-    styles = {part.text: part.style for part in panels.state(foreign, width).parts}
+    assert FOREIGN in text(live_panels.title(foreign, width))
+    styles = {part.text: part.style for part in live_panels.state(foreign, width).parts}
     assert styles["GOOD"] == WARNING
-    assert {part.text: part.style for part in panels.state(view, width).parts}["GOOD"] == GOOD
+    assert {part.text: part.style for part in live_panels.state(view, width).parts}["GOOD"] == GOOD
 
 
 def test_a_refusal_is_read_to_its_end_on_a_low_screen(view: View) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ftdrive.terminal.live.view import History
+from ftdrive.terminal.live_view import History
 
 MS = 1_000_000
 START_NS = 5_000_000_000_000
