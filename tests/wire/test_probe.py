@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ftdrivers.errors import ConnectError
-from ftdrivers.probe.serial_line import probe
+from ftdrivers.probe import probe_serial
 from ftdrivers.registry import sensor_from_url
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.ati_serial import AtiSerialBox
@@ -43,7 +43,7 @@ def test_a_sensor_shows_itself(
     device = kind(measure, seed=1, clock=cell_time.of_devices, **options)
     try:
         port = device.start()
-        answer = probe(port, cell_time.of_drivers)
+        answer = probe_serial(port, cell_time.of_drivers)
     finally:
         device.stop()
     if scheme is None or what is None:
@@ -60,7 +60,7 @@ def test_the_address_of_a_port_with_a_strange_name_works(tmp_path: Path, cell_ti
     box = BotaBox(lambda n: rng.normal(size=(n, 6)), seed=1, clock=cell_time.of_devices, boot_s=0.5)
     try:
         port.symlink_to(box.start())
-        answer = probe(str(port), cell_time.of_drivers)
+        answer = probe_serial(str(port), cell_time.of_drivers)
         assert answer is not None
         assert answer.url is not None
         with sensor_from_url(answer.url, clock=cell_time.of_drivers) as sensor:
@@ -71,4 +71,4 @@ def test_the_address_of_a_port_with_a_strange_name_works(tmp_path: Path, cell_ti
 
 def test_a_port_that_is_not_there() -> None:
     with pytest.raises(ConnectError, match="does not open"):
-        probe("/dev/no-such-port")
+        probe_serial("/dev/no-such-port")

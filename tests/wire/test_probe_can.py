@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import serial
 
+from ftdrivers import probe as module
 from ftdrivers.errors import ConnectError, PortInUse
-from ftdrivers.probe import can_bus as module
-from ftdrivers.probe.can_bus import probe_can
+from ftdrivers.probe import probe_can
 from ftdrivers.registry import sensor_from_url
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.robotous import RobotousCanNode
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.slow  # every test needs a process of its own
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """All that these tests send comes many times in this time."""
-    monkeypatch.setattr(module, "_LISTEN_S", 0.4)
+    monkeypatch.setattr(module, "_LISTEN_BUS_S", 0.4)
 
 
 @pytest.fixture

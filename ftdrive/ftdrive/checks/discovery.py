@@ -18,8 +18,7 @@ from ftdrive.checks.computer import (
 from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError
-from ftdrivers.probe.can_bus import probe_can
-from ftdrivers.probe.serial_line import Answer, probe
+from ftdrivers.probe import Answer, probe_can, probe_serial
 from ftdrivers.registry import Options, split_url
 
 _LOOK_S = 0.5
@@ -84,7 +83,7 @@ def ask(place: str, clock: Clock = REAL) -> list[Answer]:
         return _ask_can(place, clock)
     if "/" in place or place.upper().startswith("COM"):
         _must_pass(check_serial_port(Path(place)))
-        answer = probe(place, clock)
+        answer = probe_serial(place, clock)
         return [] if answer is None else [answer]
     return _ask_can(f"socketcan://{place}", clock)
 

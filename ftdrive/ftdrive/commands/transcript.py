@@ -23,8 +23,7 @@ from ftdrivers.errors import BadTranscript, ConnectError, DeviceTimeout, Protoco
 from ftdrivers.interfaces import ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import INTERRUPTED, Transcript, Writer
-from ftdrivers.transcript.taps import recording
+from ftdrivers.transcript.recorder import INTERRUPTED, Transcript, Writer, recording
 
 # A `collect` holds a million samples: 143 s of an ATI sensor on a serial port.
 _PIECE_S = 60.0

@@ -11,7 +11,7 @@ from ftdrive.checks import computer, discovery
 from ftdrive.checks.discovery import ask, is_place, places, sensor_at
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError
-from ftdrivers.probe.serial_line import Answer
+from ftdrivers.probe import Answer
 
 FOUND = Answer("ati-can://can0?bitrate=500000", "ATI")
 REFUSED = Answer(None, "a Robotous was not asked")
@@ -40,7 +40,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         return [FOUND, REFUSED]
 
     monkeypatch.setattr(discovery, "probe_can", probe_can)
-    monkeypatch.setattr(discovery, "probe", lambda port, clock: calls.append((port, clock)))
+    monkeypatch.setattr(discovery, "probe_serial", lambda port, clock: calls.append((port, clock)))
     return calls
 
 

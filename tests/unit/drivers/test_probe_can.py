@@ -5,8 +5,7 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from ftdrivers.probe.can_bus import probe_can
-from ftdrivers.probe.serial_line import Answer
+from ftdrivers.probe import Answer, probe_can
 from tests.unit.drivers.dialogue import CanWire, Stream, Table
 
 ATI_SERIAL, ATI_FIRMWARE, ROBOTOUS_MODEL = "205", "20F", "064 0100000000000000"

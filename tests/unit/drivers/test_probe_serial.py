@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import serial
 
-from ftdrivers.probe.serial_line import Answer, probe
+from ftdrivers.probe import Answer, probe_serial
 from ftdrivers.wires.framing import crc16_modbus
 from tests.fake_clock import FakeClock
 
@@ -71,7 +71,7 @@ class Line:
 def probed(line: Line, monkeypatch: pytest.MonkeyPatch) -> Answer | None:
     monkeypatch.setattr("serial.Serial", line)
     monkeypatch.setattr("ftdrivers.wires.serial_port.ask_for_marks", lambda _: False)
-    return probe("/dev/ttyX", line.clock)
+    return probe_serial("/dev/ttyX", line.clock)
 
 
 def test_a_silent_port_is_listened_to_and_then_asked_by_readings_only(monkeypatch: pytest.MonkeyPatch) -> None:
