@@ -51,7 +51,7 @@ WALKS = {
         ftdrivers.streaming.sensor         StreamingSensor._run       is the thread of the driver
         ftdrivers.ati.can                  AtiCanSensor._read_block   polls once; other sensors stream
         ftdrivers.ati.codec                decode_gauges              makes counts of bytes
-        ftdrivers.ati.calibration          Calibration.wrench         makes N and N·m of counts
+        ftdrivers.ati.codec                Calibration.wrench         makes N and N·m of counts
         ftdrivers.streaming.sensor         StreamingSensor._publish   drops late and repeated rows
         ftdrivers.streaming.plausibility   Liveness.judge             finds a frozen sensor
         ftdrivers.follow                   Unread.put                 keeps every row for each follower

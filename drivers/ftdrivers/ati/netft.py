@@ -20,7 +20,7 @@ import numpy as np
 import pynetft
 from scipy.spatial.transform import Rotation
 
-from ftdrivers.ati.calibration import FORCE_UNITS_N, TORQUE_UNITS_NM
+from ftdrivers.ati.codec import FORCE_UNITS_N, TORQUE_UNITS_NM
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import UNUSABLE, ConnectError, DeviceFault, ProtocolError, StreamBroken
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo, Fact, FtSamples, Health

@@ -16,7 +16,7 @@ from typing import Self
 import numpy as np
 
 from ftdrivers.ati import modbus
-from ftdrivers.ati.calibration import Calibration, refuse_saturated, units
+from ftdrivers.ati.codec import Calibration, refuse_saturated, units
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples

@@ -25,10 +25,18 @@ from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
 from ftdrive.http_gate import Gate, hidden_host
 from ftdrive.live import ros2
-from ftdrive.live.samples import Block, Stages, StreamEvent, StreamInfo, WrenchFrame, frames_in_flange, quaternions
+from ftdrive.live.samples import (
+    Block,
+    Picked,
+    Stages,
+    StreamEvent,
+    StreamInfo,
+    WrenchFrame,
+    frames_in_flange,
+    quaternions,
+)
 from ftdrive.live.stream import ProcessedStream
 from ftdrive.servers.parameters import checked_value
-from ftdrive.servers.rates import Picked
 from ftdrivers.interfaces import Array
 
 try:

@@ -5,8 +5,7 @@ import socket
 from math import isfinite
 
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Block, StreamEvent, StreamInfo
-from ftdrive.servers.rates import Picked
+from ftdrive.live.samples import Block, Picked, StreamEvent, StreamInfo
 
 RATE_HZ = 200.0
 """A plot of 5 s is about 1000 pixels wide: a higher rate is not visible. PlotJuggler parses datagrams in the thread of

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ftdrivers.ati.calibration import NEWTON, NEWTON_METRE, Calibration, refuse_saturated
+from ftdrivers.ati.codec import NEWTON, NEWTON_METRE, Calibration, refuse_saturated
 from ftdrivers.errors import DeviceFault, ProtocolError
 
 MATRIX = np.array(
