@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, fields
 from functools import cache
-from typing import ClassVar, Final, Literal, Self
+from typing import Any, ClassVar, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -78,6 +78,10 @@ class Columns:
     def __len__(self) -> int:
         """Count the rows."""
         return len(self.t_host_ns)
+
+    def columns(self) -> dict[str, Any]:
+        """Return the fields, for samples that have further ones."""
+        return {name: getattr(self, name) for name in self._names()}
 
     @classmethod
     def concatenate(cls, blocks: Sequence[Self]) -> Self:

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
+from ftcalib.after.state import Calibrated
 from ftcalib.files import JSON
-from ftcalib.likelihood.response import Response, predicted_covariance
-from ftcalib.model import Array, Parameters
+from ftcalib.likelihood.response import predicted_covariance
+from ftcalib.model import Array
 from ftdrive.live.motion import READING_S, REST, samples_in_reading, wrench_by_acceleration
 from ftdrive.live.noise import NoiseEstimator, SensorNoise
 from ftdrive.live.samples import Ns
@@ -83,7 +84,7 @@ class ContactTest:
         self._friction = np.zeros((6, 6))
         if friction_axis is not None:
             self._friction[3:, 3:] = _FRICTION_NM**2 * np.outer(friction_axis, friction_axis)
-        self._calibration: tuple[Parameters, Array, Response | None] | None = None
+        self._calibration: Calibrated | None = None
         # Covariance of what inertia leaves.
         self._unknown = dict.fromkeys(Inertia, np.zeros((6, 6)))
         self.uncertainty = np.zeros((6, 6))
@@ -105,13 +106,11 @@ class ContactTest:
         self._sum, self._count, self._is_free = np.zeros(6), 0, True
         self._whitening: tuple[tuple[SensorNoise, float, Inertia | None], Array] | None = None
 
-    def expect(
-        self, calibration: tuple[Parameters, Array, Response | None], mass_kg: float, *, tensor_known: bool
-    ) -> None:
-        """Set the calibration of a free tool: parameters, covariance, response, mass, and whether it has a tensor."""
-        if self._calibration is None or calibration[0] is not self._calibration[0]:
+    def expect(self, calibration: Calibrated, mass_kg: float, *, tensor_known: bool) -> None:
+        """Set the calibration of a free tool, its mass, and whether its inertia tensor is known."""
+        if self._calibration is None or calibration.parameters is not self._calibration.parameters:
             self._R = None
-            B = wrench_by_acceleration(mass_kg, calibration[0].p_sensor_com_m)
+            B = wrench_by_acceleration(mass_kg, calibration.parameters.p_sensor_com_m)
             turned = np.diag(np.repeat([0.0, (mass_kg * GYRATION_M**2 * _UNKNOWN_RAD_S2) ** 2], 3))
             self._unknown = {
                 Inertia.UNKNOWN: _UNKNOWN_M_S2**2 * B @ B.T + turned,
@@ -197,10 +196,12 @@ class ContactTest:
 
     def _turn(self, R_base_flange: Array) -> None:
         """Evaluate the covariance of the prediction at another orientation, where its error is another one."""
-        if self._calibration is None or (self._R is not None and np.abs(R_base_flange - self._R).max() < _TURN_RAD):
+        known = self._calibration
+        if known is None or (self._R is not None and np.abs(R_base_flange - self._R).max() < _TURN_RAD):
             return
         self._R = R_base_flange
-        self.uncertainty = predicted_covariance(*self._calibration, R_base_flange) + self._beyond
+        predicted = predicted_covariance(known.parameters, known.covariance, known.response, R_base_flange)
+        self.uncertainty = predicted + self._beyond
         self._share = 2.0 if self._offset.any() else 1.0
         self._whitening = None
 

@@ -1,7 +1,7 @@
 """Noise of a sensor in each state of motion of the arm, from its stream."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
 from ftcalib.data.dwell_mean import RESOLUTION
+from ftcalib.files import JSON
+from ftcalib.rounding import with_sigma
 from ftdrive.live.motion import READING_S, REST, STATES, samples_in_reading
 from ftdrive.live.samples import Ns
 from ftdrivers.interfaces import Array
@@ -258,14 +260,17 @@ class DriftFilter:
         """Account for a change (6,) of the subtracted bias."""
         self._x[:, 0] -= change
 
-    def warning(self, usual_N_h: float) -> tuple[float, float] | None:
-        """Return rate and sigma once when the drift becomes larger than usual, and clearly larger than its sigma."""
+    def warning(self, usual_N_h: float) -> tuple[str, Mapping[str, JSON]] | None:
+        """Return text and values of an event, once, when the drift exceeds the usual one and clearly its sigma."""
         rate, sigma = self.force_rate_N_h
         worth = max(usual_N_h, _WARNED_SIGMAS * sigma)
         before = self._warned
         # half the limit ends a drift, so that one near the limit is reported once
         self._warned = rate > (0.5 if before else 1.0) * worth
-        return (rate, sigma) if rate > worth and not before else None
+        if rate <= worth or before:
+            return None
+        text = f"the bias drifts by {with_sigma(rate, sigma)} N/h (1 sigma); tare when the tool is free"
+        return text, {"drift_N_h": rate, "sigma_N_h": sigma}
 
     @property
     def force_rate_N_h(self) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""From paired samples to a block: stages, frame, uncertainty, contact, tare, drift."""
+"""From paired samples to a block: stages, frame, uncertainty, contact, drift."""
 
 from collections import deque
 from collections.abc import Iterable, Mapping
@@ -8,10 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.after.series import BiasTemperature
-from ftcalib.after.state import Calibrated
 from ftcalib.after.weighing import Weight
 from ftcalib.files import JSON
-from ftcalib.rounding import with_sigma
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia
 from ftdrive.live.motion import READING_S, REST, wrench_by_acceleration
@@ -24,21 +22,11 @@ from ftdrive.live.samples import (
     Stages,
     StreamEvent,
     StreamInfo,
-    Tracked,
     Tracking,
     WrenchFrame,
     find_gaps,
 )
-from ftdrive.live.stages import (
-    TARE_S,
-    Filter,
-    FreeTool,
-    InertiaStage,
-    deadband,
-    stages_in_words,
-    standard_stages,
-    try_tare,
-)
+from ftdrive.live.stages import TARE_S, Filter, FreeTool, InertiaStage, deadband, stages_in_words, standard_stages
 from ftdrive.live.tracking import NOTHING_KG, Following, part_of, update_by
 from ftdrivers.interfaces import WRIST_SENSOR, Array
 
@@ -60,7 +48,7 @@ class Processor:
     false_alarm_rate : float
         Share of independent readings of a free tool beyond the limit. See `ftdrive.live.contact`.
     temperature : BiasTemperature, optional
-        Of the sensor: `warm` then corrects the bias.
+        Of the sensor: a stream then corrects the bias.
 
     Raises
     ------
@@ -229,12 +217,7 @@ class Processor:
             left = residual - inertial
         if not self._noise_is_learnt:
             self._noise.add(left, states)
-        expected = tool.expected
-        self._test.expect(
-            (expected.parameters, expected.covariance, expected.response),
-            tool.mass_kg,
-            tensor_known=self._inertia.knows_tensor,
-        )
+        self._test.expect(tool.expected, tool.mass_kg, tensor_known=self._inertia.knows_tensor)
         readings, chi2, beyond = self._test.judge(
             left,
             gravity + inertial,
@@ -261,20 +244,13 @@ class Processor:
         wrench = deadband(wrench, stages.deadband_N, stages.deadband_Nm)
         self._follow_drift(rows, residual)
         return Block(
-            rows.t_host_ns,
-            rows.t_device_s,
-            rows.seq,
-            rows.status,
-            rows.raw,
-            rows.q_rad,
-            rows.R_base_flange,
-            rows.p_base_flange_m,
-            wrench,
-            chi2,
-            in_contact,
-            self.sigma_of_mean(rows.R_base_flange[-1]) if n else np.full(6, np.nan),
-            self._frame,
-            stages,
+            **rows.columns(),
+            wrench=wrench,
+            chi2=chi2,
+            in_contact=in_contact,
+            sigma=self.sigma_of_mean(rows.R_base_flange[-1]) if n else np.full(6, np.nan),
+            frame=self._frame,
+            stages=stages,
         )
 
     def sigma_of_mean(self, R_base_flange: Array, duration_s: float = 0.0) -> Array:
@@ -323,16 +299,6 @@ class Processor:
         self._events.append(event)
         return event
 
-    def mark(self, text: str) -> StreamEvent:
-        """Add a mark to the events."""
-        return self.note("mark", text, {})
-
-    def take_contacts(self) -> list[Contact]:
-        """Return the contacts that have begun or ended since the last call."""
-        with self._lock:
-            contacts, self._contacts = self._contacts, []
-        return contacts
-
     def _note_contacts(self, contacts: list[Contact]) -> None:
         self._contacts += contacts
         for contact in contacts:
@@ -343,47 +309,6 @@ class Processor:
                 )
 
     # ---------------------------------------------------------------------------------------------------- bias, noise
-
-    def tare(self) -> StreamEvent:
-        """Change the bias so that the free tool reads zero in the last half second, or refuse; see `try_tare`."""
-        with self._lock:
-            if not self._recent:
-                return self.note("tare-refused", "tare refused: no sample has arrived yet; tare again", {})
-            rows = Paired.concatenate(list(self._recent))
-            rows = rows.rows(rows.t_host_ns >= self._newest_ns - round(TARE_S * 1e9))
-            update, text, values = try_tare(rows, self._tool.empty)
-            if update is None:
-                return self.note("tare-refused", text, values)
-            self._begin_bias(self._tool.set_tare(update, self._newest_ns))
-            return self.note("tare", text, values)
-
-    def undo_tare(self) -> StreamEvent:
-        """Take the last tare back."""
-        with self._lock:
-            if self.tare_wrench is None:
-                return self.note("tare-refused", "there is no tare to undo", {})
-            self._begin_bias(self._tool.undo_tare())
-            left = self.tare_wrench
-            return self.note("tare-undone", "tare undone", {"tare": None if left is None else left.tolist()})
-
-    def _begin_bias(self, change: Array) -> None:
-        self._drift.shift(change)
-        self._test.restart()
-        self._filter = self._filter_of(self._stages)
-
-    @property
-    def tare_wrench(self) -> Array | None:
-        """(6,) change of the bias by tares, N and N·m, sensor axes; None without a tare."""
-        return self._tool.tare_wrench
-
-    def warm(self, temperature_C: float) -> None:
-        """Correct the bias for this temperature of the sensor, if it is known how, and at which it was calibrated."""
-        if not self._tool.is_warmed_by(temperature_C):
-            return
-        with self._lock:
-            self._drift.shift(self._tool.warm(temperature_C))
-            if (warming := self._tool.warming()) is not None:
-                self.note("temperature", *warming)
 
     def hold(self, weight: Weight | None) -> None:
         """Count a part that was weighed as part of the tool from now on; None empties the gripper."""
@@ -398,32 +323,6 @@ class Processor:
         """Return the samples of the last half second; None before the first."""
         with self._lock:
             return Paired.concatenate(list(self._recent)) if self._recent else None
-
-    def reference(self) -> tuple[Calibrated, float]:
-        """Return the empty tool, and how many seconds ago it was tared; infinite without a tare."""
-        with self._lock:
-            tare_ns = self._tool.tare_t_ns
-            return self._tool.empty, float("inf") if tare_ns is None else (self._newest_ns - tare_ns) * 1e-9
-
-    @property
-    def rest_sigma(self) -> Array | None:
-        """(6,) standard deviation of one sample at rest; None until it is known."""
-        noise = self._noise.of(REST)
-        return None if noise is None else np.sqrt(np.diag(noise.sample))
-
-    def contact_reading(self) -> Array:
-        """Return the mean (6,) of the newest 20 ms minus the load, sensor axes, about its origin."""
-        return self._reading
-
-    @property
-    def contact_limit(self) -> float:
-        """Limit of `Block.chi2`."""
-        return self._test.limit
-
-    @property
-    def tracked(self) -> Tracked | None:
-        """Bias and part as followed; None unless they are, and before the first window."""
-        return None if self.track == "off" else self._following.tracked
 
     def _follow_load(self, rows: Paired, states: NDArray[np.int8]) -> None:
         """Follow bias and part; apply them if that is wanted."""
@@ -446,6 +345,4 @@ class Processor:
         ):
             return
         if (warning := self._drift.warning(float(self.info.calibration.likely_error()[0]))) is not None:
-            rate, sigma = warning
-            text = f"the bias drifts by {with_sigma(rate, sigma)} N/h (1 sigma); tare when the tool is free"
-            self.note("drift", text, {"drift_N_h": rate, "sigma_N_h": sigma})
+            self.note("drift", *warning)

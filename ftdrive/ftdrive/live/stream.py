@@ -19,12 +19,14 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
 from ftcalib.after.series import BiasTemperature
+from ftcalib.after.state import Calibrated
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
 from ftdrive.checks.belonging import compare_devices
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact
+from ftdrive.live.motion import REST
 from ftdrive.live.pairing import DelayEstimator, Pairing
 from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME, Processor
 from ftdrive.live.samples import (
@@ -36,16 +38,18 @@ from ftdrive.live.samples import (
     StreamEvent,
     StreamInfo,
     StreamStatus,
+    Tracked,
     WrenchFrame,
     mean_rate_Hz,
     sensor_origin_m,
 )
+from ftdrive.live.stages import TARE_S, try_tare
 from ftdrive.runs.run import versions
 from ftdrive.runs.verification_record import VerificationRecord, calibration_in_words, marks_of, verification_near
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
-from ftdrivers.interfaces import ArmStates, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
+from ftdrivers.interfaces import ArmStates, ArmStatus, Array, DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 
 STALE_S = 0.3
 """Without a new sample of either device for so long, `CompensatedStream.read` raises."""
@@ -80,6 +84,12 @@ class ProcessedStream(Processor, ABC):
         self._call_on_contact()
         return block
 
+    def take_contacts(self) -> list[Contact]:
+        """Return the contacts that have begun or ended since the last call."""
+        with self._lock:
+            contacts, self._contacts = self._contacts, []
+        return contacts
+
     def _call_on_contact(self) -> None:
         # Outside of the lock of the processor: the function may call the stream.
         for contact in self.take_contacts():
@@ -102,6 +112,76 @@ class ProcessedStream(Processor, ABC):
             false_alarm_rate=self._test.false_alarm_rate,
             tracked=self.tracked,
         )
+
+    def tare(self) -> StreamEvent:
+        """Change the bias so that the free tool reads zero in the last half second, or refuse; see `try_tare`."""
+        with self._lock:
+            if (rows := self.recent()) is None:
+                return self.note("tare-refused", "tare refused: no sample has arrived yet; tare again", {})
+            rows = rows.rows(rows.t_host_ns >= self._newest_ns - round(TARE_S * 1e9))
+            update, text, values = try_tare(rows, self._tool.empty)
+            if update is None:
+                return self.note("tare-refused", text, values)
+            self._begin_bias(self._tool.set_tare(update, self._newest_ns))
+            return self.note("tare", text, values)
+
+    def undo_tare(self) -> StreamEvent:
+        """Take the last tare back."""
+        with self._lock:
+            if self.tare_wrench is None:
+                return self.note("tare-refused", "there is no tare to undo", {})
+            self._begin_bias(self._tool.undo_tare())
+            left = self.tare_wrench
+            return self.note("tare-undone", "tare undone", {"tare": None if left is None else left.tolist()})
+
+    @property
+    def tare_wrench(self) -> Array | None:
+        """(6,) change of the bias by tares, N and N·m, sensor axes; None without a tare."""
+        return self._tool.tare_wrench
+
+    def _begin_bias(self, change: Array) -> None:
+        self._drift.shift(change)
+        self._test.restart()
+        self._filter = self._filter_of(self._stages)
+
+    def warm(self, temperature_C: float) -> None:
+        """Correct the bias for this temperature of the sensor, if it is known how, and at which it was calibrated."""
+        if not self._tool.is_warmed_by(temperature_C):
+            return
+        with self._lock:
+            self._drift.shift(self._tool.warm(temperature_C))
+            if (warming := self._tool.warming()) is not None:
+                self.note("temperature", *warming)
+
+    def mark(self, text: str) -> StreamEvent:
+        """Add a mark to the events."""
+        return self.note("mark", text, {})
+
+    def reference(self) -> tuple[Calibrated, float]:
+        """Return the empty tool, and how many seconds ago it was tared; infinite without a tare."""
+        with self._lock:
+            tare_ns = self._tool.tare_t_ns
+            return self._tool.empty, float("inf") if tare_ns is None else (self._newest_ns - tare_ns) * 1e-9
+
+    @property
+    def rest_sigma(self) -> Array | None:
+        """(6,) standard deviation of one sample at rest; None until it is known."""
+        noise = self._noise.of(REST)
+        return None if noise is None else np.sqrt(np.diag(noise.sample))
+
+    def contact_reading(self) -> Array:
+        """Return the mean (6,) of the newest 20 ms minus the load, sensor axes, about its origin."""
+        return self._reading
+
+    @property
+    def contact_limit(self) -> float:
+        """Limit of `Block.chi2`."""
+        return self._test.limit
+
+    @property
+    def tracked(self) -> Tracked | None:
+        """Bias and part as followed; None unless they are, and before the first window."""
+        return None if self.track == "off" else self._following.tracked
 
 
 class CompensatedStream(ProcessedStream):

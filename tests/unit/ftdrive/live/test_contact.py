@@ -26,8 +26,7 @@ FRICTION_AXIS = np.array([0.0, 0.6, 0.8])
 def judged(
     test: ContactTest, residual: Array, predicted: Array, state: int, felt: Array, inertia: Inertia
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    calibration = calibrated()
-    test.expect((calibration.parameters, calibration.covariance, calibration.response), MASS_KG, tensor_known=False)
+    test.expect(calibrated(), MASS_KG, tensor_known=False)
     n = len(residual)
     motion: Any = np.full(n, state, np.int8), np.tile(felt, (n, 1))
     noise: Any = KnownNoise(NOISE)

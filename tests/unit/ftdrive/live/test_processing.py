@@ -15,9 +15,9 @@ from ftcalib.after.series import BiasTemperature
 from ftcalib.model import Array, predict
 from ftcalib.result import MotionResult
 from ftdrive.errors import ConfigError
-from ftdrive.live.processing import Processor
 from ftdrive.live.samples import Axes, Block, FrameTransform, Paired, Point, Stages, WrenchFrame
 from ftdrive.live.stages import stages_in_words
+from ftdrive.live.stream import ProcessedStream
 from tests.moving_load import HOME, flange
 from tests.unit.ftdrive.live.simulated import (
     NOISE,
@@ -39,24 +39,34 @@ POINTS: tuple[Point | tuple[float, float, float], ...] = ("sensor", "flange", "t
 UPSIDE_DOWN = Rotation.from_euler("xz", [170, 25], degrees=True).as_matrix()
 
 
+class Fed(ProcessedStream):
+    """A stream whose samples the test brings."""
+
+    def read(self) -> Any:
+        raise NotImplementedError
+
+    def status(self) -> Any:
+        raise NotImplementedError
+
+
 def still(seconds: float, rate_Hz: float = 1000.0) -> Array:
     return np.tile(UPSIDE_DOWN, (round(seconds * rate_Hz), 1, 1))
 
 
-def processed(rows: Paired, *, block: int = 50, rate_Hz: float = 1000.0, **options: Any) -> tuple[Processor, Block]:
+def processed(rows: Paired, *, block: int = 50, rate_Hz: float = 1000.0, **options: Any) -> tuple[Fed, Block]:
     """Process in blocks; the block returned has all rows."""
-    processor = Processor(info(calibrated(), rate_Hz), **options)
+    processor = Fed(info(calibrated(), rate_Hz), **options)
     return processor, run(processor, rows, block)
 
 
-def run(processor: Processor, rows: Paired, block: int = 50) -> Block:
+def run(processor: Fed, rows: Paired, block: int = 50) -> Block:
     blocks = [processor.process(rows.rows(slice(i, i + block))) for i in range(0, len(rows), block)]
     columns = ("t_host_ns", "wrench", "chi2", "in_contact", "seq")
     joined: dict[str, Any] = {name: np.concatenate([getattr(b, name) for b in blocks]) for name in columns}
     return replace(blocks[-1], **joined)
 
 
-def kinds(processor: Processor) -> list[str]:
+def kinds(processor: Fed) -> list[str]:
     return [event.kind for event in processor.take_events()]
 
 
@@ -122,7 +132,7 @@ def test_a_frame_needs_the_height_of_the_sensor() -> None:
     for about in ("flange", "tcp", (0.0, 0.0, 0.1)):
         with pytest.raises(ConfigError, match=r"\[sensor\] height_mm"):
             FrameTransform(WrenchFrame("sensor", about), without)
-    processor = Processor(without)
+    processor = Fed(without)
     with pytest.raises(ConfigError, match="height_mm"):
         processor.frame = WrenchFrame("base", "tcp")
     with pytest.raises(ConfigError, match="height_mm"):
@@ -160,7 +170,7 @@ def test_blocks_of_any_size_give_the_same() -> None:
     rows = moving(0.6)
     stages = Stages(lowpass_Hz=30.0, notch_Hz=100.0, inertia=True)
     _, small = processed(rows, block=7, stages=stages)
-    processor = Processor(info(calibrated()), stages=stages)
+    processor = Fed(info(calibrated()), stages=stages)
     large = processor.process(rows, last=True)
     n = len(small.t_host_ns)
     assert n > 550  # the last rows wait for poses after them
@@ -181,7 +191,7 @@ def test_a_lowpass_reduces_the_noise_as_its_sigma_says() -> None:
 
 def test_a_switch_of_stages_has_no_transient() -> None:
     push = np.array([0, 0, 20.0, 0, 0, 0])
-    processor = Processor(info(calibrated()), stages=Stages(lowpass_Hz=5.0))
+    processor = Fed(info(calibrated()), stages=Stages(lowpass_Hz=5.0))
     run(processor, paired(still(0.3), push=push, noise=0.01))
     processor.stages = Stages(gravity=False, lowpass_Hz=5.0)
     weight = predict(TRUTH, UPSIDE_DOWN)[:3] - TRUTH.force_bias_N
@@ -192,7 +202,7 @@ def test_a_switch_of_stages_has_no_transient() -> None:
 
 def test_an_impossible_filter_is_rejected() -> None:
     with pytest.raises(ConfigError, match="less than 500 Hz"):
-        Processor(info(calibrated()), stages=Stages(lowpass_Hz=600.0))
+        Fed(info(calibrated()), stages=Stages(lowpass_Hz=600.0))
 
 
 def test_inertia_leaves_only_noise_of_a_moving_tool() -> None:
@@ -217,7 +227,7 @@ def test_a_known_inertia_tensor_is_subtracted_too() -> None:
     rows = moving(3.0)
     _, point = processed(rows, block=500, stages=Stages(inertia=True))
     in_motion = replace(calibrated(), motion=MotionResult(tensor, 0.0, 0.03, np.eye(23), 1.0))
-    processor = Processor(info(in_motion))
+    processor = Fed(info(in_motion))
     assert processor.stages.inertia, "a stage that is on where the calibration has what it needs"
     body = run(processor, rows, 500)
     difference = body.wrench - point.wrench
@@ -249,7 +259,7 @@ def test_false_alarms_are_as_rare_as_stated(poses: int) -> None:
     alarms = readings = 0
     for seed in range(25):
         R = np.concatenate([np.repeat(dwells(1, 1, seed), 20_000, axis=0), dwells(100, 740, seed + 1000)])
-        processor = Processor(info(calibrated(poses, seed)), false_alarm_rate=0.01)
+        processor = Fed(info(calibrated(poses, seed)), false_alarm_rate=0.01)
         chi2 = processor.process(paired(R, seed=seed)).chi2[20_000:].reshape(100, 740)[:, 559::20].ravel()  # at rest
         alarms, readings = alarms + int((chi2 > processor.contact_limit).sum()), readings + len(chi2)
     assert readings == 25 * 1000
@@ -285,7 +295,7 @@ def test_a_contact_is_reported_after_40_ms_and_at_its_end_and_a_shorter_touch_is
     push = np.zeros((2800, 6))
     for start, stop in ((1500, 2100), (2600, 2615)):
         push[start:stop, 2] = 8.0
-    rows, processor = paired(still(2.8), push=push), Processor(info(calibrated()))
+    rows, processor = paired(still(2.8), push=push), Fed(info(calibrated()))
     processor.process(rows.rows(slice(0, 1400)))
     changes = []
     for i in range(1400, len(rows), 10):
@@ -429,7 +439,7 @@ def test_a_tare_is_refused_while_the_arm_moves() -> None:
 
 
 def test_a_tare_without_samples_is_refused() -> None:
-    assert Processor(info(calibrated())).tare().kind == "tare-refused"
+    assert Fed(info(calibrated())).tare().kind == "tare-refused"
     processor, _ = processed(paired(still(0.1)))
     assert "only 100 samples" in processor.tare().text
 
@@ -453,7 +463,7 @@ def test_the_bias_follows_the_temperature_in_small_steps_and_events_in_large_one
     warmth = BiasTemperature(slope, np.full(6, 1e-3), 12, 15.0, 40.0, *errors, np.zeros(2))
     made = calibrated()
     known = replace(made, provenance={**made.provenance, "temperature_C": 20.0})
-    processor = Processor(info(known), temperature=warmth)
+    processor = Fed(info(known), temperature=warmth)
     for temperature_C, bias_C in ((20.04, 20.0), (20.06, 20.06), (20.95, 20.95)):
         processor.warm(temperature_C)
         change = processor.reference()[0].parameters.bias - made.parameters.bias
@@ -466,7 +476,7 @@ def test_the_bias_follows_the_temperature_in_small_steps_and_events_in_large_one
     processor.warm(22.0)  # less than 1 °C after the last event
     processor.warm(20.02)
     assert kinds(processor) == ["temperature"]
-    for unknown in (Processor(info(made), temperature=warmth), Processor(info(known))):
+    for unknown in (Fed(info(made), temperature=warmth), Fed(info(known))):
         unknown.warm(35.0)
         assert unknown.reference()[0].parameters.bias.tolist() == made.parameters.bias.tolist()
         assert not kinds(unknown)
