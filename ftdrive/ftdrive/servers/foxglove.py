@@ -125,7 +125,7 @@ def _arrow(vector_m: Array, color: Color) -> ArrowPrimitive:
     )
 
 
-class Parameters(ServerListener):
+class _Parameters(ServerListener):
     """Lets clients read and set `axes`, `about` and each stage. Called in threads of the SDK.
 
     Parameters
@@ -257,7 +257,7 @@ class FoxgloveServer:
             capabilities=[Capability.Parameters, Capability.Services],
             supported_encodings=["json"],
             services=[self._service("tare", stream.tare), self._service("undo_tare", stream.undo_tare)],
-            server_listener=Parameters(stream, self._warn),
+            server_listener=_Parameters(stream, self._warn),
         )
         # the SDK sees no Origin, so its rights are those of a server
         self._read_only = sdk.start_server(**options)

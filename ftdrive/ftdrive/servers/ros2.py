@@ -175,7 +175,7 @@ class Level(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Diagnosis:
+class PartState:
     """One part of the node: "stream", "sensor", "arm" or "calibration"."""
 
     part: str
@@ -196,12 +196,7 @@ class Diagnosis:
         )
 
 
-def not_open(text: str, level: Level) -> list[Diagnosis]:
-    """Report a stream that is not open."""
-    return [Diagnosis("stream", level, text)]
-
-
-def reports_of(stream: ProcessedStream, warnings: tuple[str, ...], lost_before: int, sent: int) -> list[Diagnosis]:
+def reports_of(stream: ProcessedStream, warnings: tuple[str, ...], lost_before: int, sent: int) -> list[PartState]:
     """Report an open stream; `lost_before` is the number of lost samples at the report before."""
     status, info = stream.status(), stream.info
     sensor = _link("sensor", status.sensor, info.sensor, status.sensor.lost - lost_before)
@@ -211,14 +206,14 @@ def reports_of(stream: ProcessedStream, warnings: tuple[str, ...], lost_before: 
     usable = calibration.verdict != "rejected"
     level = Level.ERROR if not usable else Level.WARN if doubts else Level.OK
     text = "; ".join(doubts) or info.calibration_state
-    state = Diagnosis("calibration", level, text, {"file": info.calibration_name, "verdict": calibration.verdict})
+    state = PartState("calibration", level, text, {"file": info.calibration_name, "verdict": calibration.verdict})
     failed = status.sensor.error or status.arm.error
     words = failed or f"{stream.frame}; {stages_in_words(stream.stages)}"
-    whole = Diagnosis("stream", Level.ERROR if failed else Level.OK, words, _values(stream, status, sent))
+    whole = PartState("stream", Level.ERROR if failed else Level.OK, words, _values(stream, status, sent))
     return [whole, sensor, arm, state]
 
 
-def _link(part: str, link: LinkStatus, device: Any, lost: int) -> Diagnosis:
+def _link(part: str, link: LinkStatus, device: Any, lost: int) -> PartState:
     values = {"rate_Hz": f"{link.rate_Hz:.1f}", "lost": str(link.lost), "age_s": f"{link.age_s:.3f}"}
     if link.error:
         level, text = Level.ERROR, link.error
@@ -226,7 +221,7 @@ def _link(part: str, link: LinkStatus, device: Any, lost: int) -> Diagnosis:
         level, text = Level.WARN, f"{lost} samples lost since the report before"
     else:
         level, text = Level.OK, f"{link.rate_Hz:.0f} Hz"
-    return Diagnosis(part, level, text, values, f"{device.model} {device.serial}")
+    return PartState(part, level, text, values, f"{device.model} {device.serial}")
 
 
 def _values(stream: ProcessedStream, status: StreamStatus, sent: int) -> dict[str, str]:
@@ -317,7 +312,7 @@ class Ros2Node:
         self._averaged: Averaged | None = None
         # Tools that clients request: name, where the reason of a refusal goes, when it is decided.
         self._wanted: SimpleQueue[tuple[str, list[str], Event]] = SimpleQueue()
-        self._failure, self._reported, self._reported_s, self._lost = "", list[Diagnosis](), 0.0, 0
+        self._failure, self._reported, self._reported_s, self._lost = "", list[PartState](), 0.0, 0
         self._in_contact, self._contact_s, self.sent = False, 0.0, 0
         self._ros.spin()
 
@@ -364,7 +359,7 @@ class Ros2Node:
         """Open the stream and publish it, again after each failure, until an exception such as Ctrl-C ends it."""
         while True:
             try:
-                self._report(not_open("the devices are being opened", Level.STALE))
+                self._report([PartState("stream", Level.STALE, "the devices are being opened")])
                 with open_stream() as stream:
                     self.begin(stream)
                     reader = BlockReader(stream, math.inf)
@@ -376,7 +371,7 @@ class Ros2Node:
                 wait_s = _RETRY_S if isinstance(error, DeviceError) else _RETRY_CONFIG_S
                 until_s = time.monotonic() + wait_s
                 while time.monotonic() < until_s:
-                    self._report(not_open(str(error), Level.ERROR))
+                    self._report([PartState("stream", Level.ERROR, str(error))])
                     time.sleep(REPORT_S)
             finally:
                 self.end()
@@ -464,7 +459,7 @@ class Ros2Node:
             self._lost = self._stream.status().sensor.lost
             self._report(reports)
 
-    def _report(self, reports: list[Diagnosis]) -> None:
+    def _report(self, reports: list[PartState]) -> None:
         """Publish reports, at once if a level has changed."""
         now_s = time.monotonic()
         levels, before = ([(one.part, one.level) for one in some] for some in (reports, self._reported))

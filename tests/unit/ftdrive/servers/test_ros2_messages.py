@@ -11,7 +11,7 @@ import pytest
 from ftdrive.live.samples import LinkStatus, Stages, StreamStatus, WrenchFrame
 from ftdrive.servers import ros2
 from ftdrive.servers.parameters import Fixed
-from ftdrive.servers.ros2 import Diagnosis, Level, Transforms, not_open, reports_of
+from ftdrive.servers.ros2 import Level, PartState, Transforms, reports_of
 from ftdrivers.errors import NoRos2
 from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, FakeStream
 
@@ -20,7 +20,7 @@ LINK = LinkStatus(998.4, 1000.0, 7, 0.0012)
 
 def reports(
     *, warnings: tuple[str, ...] = (), lost_before: int = 7, verdict: str = "good", **status: Any
-) -> list[Diagnosis]:
+) -> list[PartState]:
     stream = FakeStream()
     calibration = SimpleNamespace(verdict=verdict, id="29ce87")
     stream.info = cast("Any", SimpleNamespace(
@@ -60,7 +60,6 @@ def test_what_is_wrong_has_its_level() -> None:
     doubtful = reports(warnings=("another tool",), mark=True)[3]
     assert (doubtful.level, doubtful.text) == (Level.WARN, "EMULATED; another tool")
     assert reports(verdict="rejected")[3].level is Level.ERROR
-    assert not_open("no calibration", Level.STALE) == [Diagnosis("stream", Level.STALE, "no calibration")]
 
 
 def test_a_report_becomes_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
