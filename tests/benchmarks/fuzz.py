@@ -33,7 +33,7 @@ from ftdrivers.registry import SENSORS, sensor_from_url
 from ftdrivers.robotiq import codec as robotiq
 from ftdrivers.robotous import codec as robotous
 from ftdrivers.robotous.can import Halves
-from ftdrivers.transcript.recorder import FORMAT, Transcript
+from ftdrivers.transcript import FORMAT, Transcript
 from ftdrivers.ur import rtde
 from ftdrivers.wires.framing import crc16_modbus, crc16_x25
 from tests.benchmarks.common import show

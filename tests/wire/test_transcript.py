@@ -19,8 +19,7 @@ from ftdrivers.clock import Clock, Follower
 from ftdrivers.errors import ConnectError
 from ftdrivers.interfaces import DeviceInfo, ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
-from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import Transcript, Writer, recording
+from ftdrivers.transcript import Player, Transcript, Writer, recording
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.ati_serial import AtiSerialBox
 from ftmocks.sensors.bota import BotaBox

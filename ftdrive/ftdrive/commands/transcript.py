@@ -22,8 +22,7 @@ from ftdrive.terminal.console import answer, messages, working
 from ftdrivers.errors import BadTranscript, ConnectError, DeviceTimeout, ProtocolError
 from ftdrivers.interfaces import ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
-from ftdrivers.transcript.player import Player
-from ftdrivers.transcript.recorder import INTERRUPTED, Transcript, Writer, recording
+from ftdrivers.transcript import INTERRUPTED, Player, Transcript, Writer, recording
 
 # A `collect` holds a million samples: 143 s of an ATI sensor on a serial port.
 _PIECE_S = 60.0

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 import serial
 
-from ftdrivers.transcript.player import Player, _Terminal
-from ftdrivers.transcript.recorder import Passage, Transcript
+from ftdrivers.transcript import Passage, Player, Transcript, _Terminal
 from ftdrivers.wires.serial_port import SerialPort, ask_for_marks
 from tests.fake_clock import FakeClock
 

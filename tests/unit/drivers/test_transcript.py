@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from ftdrivers.errors import BadTranscript
-from ftdrivers.transcript.recorder import Transcript, Writer
+from ftdrivers.transcript import Transcript, Writer
 from tests.fake_clock import FakeClock
 
 
