@@ -13,7 +13,8 @@ from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
-    from ftdrive.store.records import StoredResult, StoredVerification, StoredWeighings
+    from ftdrive.runs.verification_record import VerificationRecord
+    from ftdrive.store.records import StoredResult, StoredWeighings
 
 
 @click.command()
@@ -40,8 +41,9 @@ def history(
     Where a sensor reports its temperature, its bias is fitted against that too.
     """
     from ftdrive.errors import ConfigError
+    from ftdrive.runs.verification_record import VerificationRecord
     from ftdrive.store.history import drifts, warnings
-    from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
+    from ftdrive.store.records import StoredResult, read_records, record_paths
 
     left_out: tuple[str, ...] = ()
     weighed: Sequence[StoredWeighings] = ()
@@ -54,8 +56,8 @@ def history(
         records, left_out = read_records(record_paths(folders))
         results = [one for one in records if isinstance(one, StoredResult) and tool in {None, one.tool}]
         results.sort(key=lambda one: (one.created_utc or "", one.id))
-        checks = [one for one in records if isinstance(one, StoredVerification)]
-        checks.sort(key=lambda one: one.created_utc or "")
+        checks = [one for one in records if isinstance(one, VerificationRecord)]
+        checks.sort(key=lambda one: one.to_store_dict()["created_utc"] or "")
     else:
         store = open_store(url)
         name = store.name
@@ -164,7 +166,7 @@ _TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias
 _OPTIONAL = {"°C", "parent"}
 
 
-def _row(one: "StoredResult", check: "StoredVerification | None", now: datetime) -> tuple[str, ...]:
+def _row(one: "StoredResult", check: "VerificationRecord | None", now: datetime) -> tuple[str, ...]:
     from ftdrive.store.history import age_days
 
     verified = "-"
@@ -198,7 +200,7 @@ def _print_table(rows: Sequence[Sequence[str]]) -> None:
     )
 
 
-def _as_json(one: "StoredResult", check: "StoredVerification | None", now: datetime) -> dict[str, Any]:
+def _as_json(one: "StoredResult", check: "VerificationRecord | None", now: datetime) -> dict[str, Any]:
     import numpy as np
 
     from ftcalib.model import BIASES
@@ -213,5 +215,5 @@ def _as_json(one: "StoredResult", check: "StoredVerification | None", now: datet
         "mass_sigma_kg": one.mass_sigma_kg,
         **bias,
         "bias_sigma": {"force_N": sigma[:3], "torque_Nm": sigma[3:]},
-        "last_verification": None if check is None else asdict(check),
+        "last_verification": None if check is None else check.to_store_dict(),
     }

@@ -58,7 +58,7 @@ def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, J
         "created_utc": made if isinstance(made, str) else None,
         "verification": None
         if last is None
-        else {"created_utc": last.created_utc.isoformat(), "passed": last.passed, "change": last.change},
+        else {name: last.to_dict()[name] for name in ("created_utc", "passed", "change")},
         "made_by": f"ftdrive {__version__}",
         "sign": "wrench on the sensor, sensor axes, about the sensor origin; contact = raw - bias - weight",
         **{name: result[name] for name in _FIELDS},

@@ -86,7 +86,7 @@ def made_by(calibration: CalibrationResult, verification: VerificationRecord | N
     verified = "not verified"
     if verification is not None:
         verified = "last verified" if verification.passed else "VERIFICATION FAILED"
-        verified += f" {verification.created_utc.isoformat()}"
+        verified += f" {verification.to_dict()['created_utc']}"
     marks = "".join(f"{mark} " for mark in marks_of(calibration))
     return f"{marks}ftdrive calibration {calibration.id}, made {date}, {verified}; made by ftdrive {__version__}"
 

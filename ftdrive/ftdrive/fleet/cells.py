@@ -23,7 +23,8 @@ import numpy as np
 from ftcalib.model import Array
 from ftdrive.cell.config import read_toml, settings
 from ftdrive.errors import ConfigError
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification, StoredWeighings
+from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredWeighings
 from ftdrive.store.store import Store
 
 FORMAT: Final = "ftdrive.cells/1"
@@ -222,6 +223,6 @@ def _changes(result: StoredResult, checks: Sequence[BriefVerification]) -> BiasC
     return BiasChanges(days[measured], change, sigma, np.median(common, axis=0), known[measured])
 
 
-def when(one: StoredResult | StoredVerification | BriefVerification) -> datetime:
+def when(one: StoredResult | VerificationRecord | BriefVerification) -> datetime:
     """Return the time of a record that has one."""
     return datetime.fromisoformat(str(one.created_utc))

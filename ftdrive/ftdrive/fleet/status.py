@@ -10,7 +10,8 @@ from ftdrive.fleet.cells import BiasChanges, Observed, when
 from ftdrive.fleet.findings import findings
 from ftdrive.fleet.state import BiasDrift, CellState, Fleet
 from ftdrive.report.document import rounded
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredVerification
+from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult
 from ftdrive.store.store import Store
 
 # The level of a drift is the mean of the verifications of the last week.
@@ -63,7 +64,7 @@ def _drift_of(changes: BiasChanges | None, start: datetime) -> BiasDrift | None:
 
 def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: Store) -> CellState:
     calibrated = when(result)
-    check: BriefVerification | StoredVerification | None = next(reversed(observed.checks.get(result.id, ())), None)
+    check: BriefVerification | VerificationRecord | None = next(reversed(observed.checks.get(result.id, ())), None)
     if check is None and observed.is_cut(result):
         check = store.last_verification(result.id)
     verified = None if check is None or check.created_utc is None else when(check)

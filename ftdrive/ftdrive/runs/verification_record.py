@@ -5,8 +5,8 @@ in the run folders beside that of the calibration, in those in `runs` beside the
 `runs` of the current folder.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -32,17 +32,36 @@ MARKS: Final[Mapping[str, str]] = {
 
 @dataclass(frozen=True, slots=True)
 class VerificationRecord:
-    """The outcome of a verification, as its file has it."""
+    """The outcome of a verification of a calibration.
+
+    Streams and recordings keep it up to `torque_max_Nm`, the store all but the two largest differences.
+    """
 
     path: Path
+    """verification.json, in its run folder."""
     calibration_id: str
-    created_utc: datetime
+    created_utc: datetime | None
+    """None only in the store, of a file that does not say it."""
     passed: bool
     change: str | None
-    """What has changed; None if nothing, or if no change explains the readings."""
-    reason: str
-    force_max_N: float
-    torque_max_Nm: float
+    """What has changed, such as "bias"; None if nothing, or if no change explains the readings."""
+    reason: str | None
+    force_max_N: float | None = None
+    torque_max_Nm: float | None = None
+    id: str = ""
+    """12 hex digits of the SHA-256 of its file."""
+    temperature_C: float | None = None
+    bias_change: list[float] | None = None
+    """(6,) change of the bias since the calibration, in N, then N·m, sensor frame."""
+    bias_change_sigma: list[float] | None = None
+    """(6,) its standard deviation from the readings of this verification."""
+    calibration_sigma: list[float] | None = None
+    """(6,) its standard deviation from the calibration, which all its verifications share."""
+
+    @property
+    def run(self) -> str:
+        """Name of its run folder."""
+        return self.path.parent.name
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -75,11 +94,42 @@ class VerificationRecord:
 
     def to_dict(self) -> dict[str, JSON]:
         """Return what streams and recordings keep of it."""
-        return asdict(self) | {"path": str(self.path), "created_utc": self.created_utc.isoformat()}
+        return {
+            "path": str(self.path),
+            "calibration_id": self.calibration_id,
+            "created_utc": None if self.created_utc is None else self.created_utc.isoformat(),
+            "passed": self.passed,
+            "change": self.change,
+            "reason": self.reason,
+            "force_max_N": self.force_max_N,
+            "torque_max_Nm": self.torque_max_Nm,
+        }
 
-    def in_words(self, now: datetime) -> str:
-        """Return the result and its age, such as "verified 2 h ago"."""
-        return outcome_in_words(now - self.created_utc, passed=self.passed, change=self.change)
+    def to_store_dict(self) -> dict[str, Any]:
+        """Return what the store and the list of results keep of it."""
+        # With microseconds, so that texts sort as times.
+        created = None if self.created_utc is None else self.created_utc.isoformat(timespec="microseconds")
+        return {
+            "id": self.id,
+            "path": str(self.path),
+            "run": self.run,
+            "calibration_id": self.calibration_id,
+            "created_utc": created,
+            "passed": self.passed,
+            "change": self.change,
+            "reason": self.reason,
+            "temperature_C": self.temperature_C,
+            "bias_change": self.bias_change,
+            "bias_change_sigma": self.bias_change_sigma,
+            "calibration_sigma": self.calibration_sigma,
+        }
+
+    def in_words(self, now: datetime | None) -> str:
+        """Return the result and its age, such as "verified 2 h ago"; the age is 0 if `now` is None."""
+        age = timedelta(0) if now is None or self.created_utc is None else now - self.created_utc
+        if self.passed:
+            return f"verified {age_in_words(age)} ago"
+        return f"VERIFICATION FAILED {age_in_words(age)} ago" + (f" ({self.change})" if self.change else "")
 
 
 def last_verification(place: Path) -> VerificationRecord | None:
@@ -106,7 +156,13 @@ def last_verification(place: Path) -> VerificationRecord | None:
 def verification_near(place: Path, calibration_id: str) -> VerificationRecord | None:
     """Return the newest verification of a calibration as `last_verification`; its file need not be in that place."""
     found = [record for record in _records_near(place) if record.calibration_id == calibration_id]
-    return max(found, key=lambda record: record.created_utc, default=None)
+    return newest(found)
+
+
+def newest(records: Iterable[VerificationRecord]) -> VerificationRecord | None:
+    """Return the verification that was made last; None without any that has a time."""
+    timed = [(record.created_utc, record) for record in records if record.created_utc is not None]
+    return max(timed, key=lambda pair: pair[0], default=(None, None))[1]
 
 
 def _records_near(place: Path) -> Iterator[VerificationRecord]:
@@ -137,13 +193,6 @@ def fitted_dataset(calibration: "CalibrationResult", place: Path) -> "Calibratio
         if dataset.sha256() == calibration.provenance.get("dataset_sha256"):
             return dataset
     return None
-
-
-def outcome_in_words(age: timedelta, *, passed: bool, change: str | None) -> str:
-    """Return the outcome of a verification and its age, such as "verified 2 h ago"."""
-    if passed:
-        return f"verified {age_in_words(age)} ago"
-    return f"VERIFICATION FAILED {age_in_words(age)} ago" + (f" ({change})" if change else "")
 
 
 def age_in_words(age: timedelta) -> str:

@@ -7,6 +7,7 @@ its files.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from datetime import datetime
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -36,13 +37,13 @@ from sqlalchemy import (
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from ftdrive.errors import BadStore, ConfigError
+from ftdrive.runs.verification_record import VerificationRecord
 from ftdrive.runs.weighings import REFUSALS
 from ftdrive.store.records import (
     BriefVerification,
     Record,
     StoredCell,
     StoredResult,
-    StoredVerification,
     StoredWeighings,
     user_folder,
 )
@@ -51,8 +52,7 @@ from ftdrive.store.records import (
 SCHEMA: Final = 4
 
 _WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
-# Fields of a verification with a column for each component: read three times as fast as JSON.
-# 18 columns are read three times as fast as JSON in one.
+# Fields of a verification with a column for each component: 18 columns are read three times as fast as JSON in one.
 _WRENCHES = ("bias_change", "bias_change_sigma", "calibration_sigma")
 
 metadata: Final = MetaData()
@@ -113,7 +113,7 @@ cells: Final = Table(
 )
 RECORDS: Final[Mapping[type[Record], Table]] = {
     StoredResult: results,
-    StoredVerification: verifications,
+    VerificationRecord: verifications,
     StoredWeighings: weighings,
 }
 
@@ -127,9 +127,9 @@ _SINGLE = tuple(column.name for column in verifications.columns if not column.na
 
 def to_row(record: Record | StoredCell) -> dict[str, Any]:
     """Return a record by columns."""
-    row = asdict(record)
+    row = record.to_store_dict() if isinstance(record, VerificationRecord) else asdict(record)
     row |= {f"refused_{code}": number for code, number in row.pop("refusals", {}).items()}
-    for name in _WRENCHES if isinstance(record, StoredVerification) else ():
+    for name in _WRENCHES if isinstance(record, VerificationRecord) else ():
         values = row.pop(name) or [None] * len(_WRENCH)
         row |= {f"{name}_{axis}": value for axis, value in zip(_WRENCH, values, strict=True)}
     return row
@@ -145,10 +145,14 @@ def to_cell(row: Row[Any]) -> StoredCell:
     return StoredCell(**row._asdict())
 
 
-def to_verification(row: Row[Any]) -> StoredVerification:
+def to_verification(row: Row[Any]) -> VerificationRecord:
     """Return a row of `verifications` as a record."""
-    return StoredVerification(
-        **dict(zip(_SINGLE, row, strict=False)),
+    values = dict(zip(_SINGLE, row, strict=False))
+    path, _, created = values.pop("path"), values.pop("run"), values.pop("created_utc")
+    return VerificationRecord(
+        path=Path(path),
+        created_utc=None if created is None else datetime.fromisoformat(created),
+        **values,
         bias_change=_wrench(row[-18:-12]),
         bias_change_sigma=_wrench(row[-12:-6]),
         calibration_sigma=_wrench(row[-6:]),

@@ -5,7 +5,8 @@ from datetime import datetime
 from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
-from ftdrive.store.records import StoredResult, StoredVerification
+from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.store.records import StoredResult
 
 if TYPE_CHECKING:
     from ftdrive.store.trends import QuantityTrend
@@ -17,9 +18,10 @@ OTHER_TEMPERATURE_K: Final = 10.0
 _FEWEST = 3
 
 
-def age_days(created_utc: str | None, now: datetime) -> float | None:
+def age_days(created_utc: str | datetime | None, now: datetime) -> float | None:
     """Return the days since a time; None where the time is unknown."""
-    return None if created_utc is None else (now - datetime.fromisoformat(created_utc)).total_seconds() / 86400
+    made = datetime.fromisoformat(created_utc) if isinstance(created_utc, str) else created_utc
+    return None if made is None else (now - made).total_seconds() / 86400
 
 
 def drifts(results: Sequence[StoredResult]) -> list["QuantityTrend"]:
@@ -33,7 +35,7 @@ def drifts(results: Sequence[StoredResult]) -> list["QuantityTrend"]:
 
 
 def warnings(
-    results: Sequence[StoredResult], verifications: Sequence[StoredVerification], now: datetime
+    results: Sequence[StoredResult], verifications: Sequence[VerificationRecord], now: datetime
 ) -> Iterator[str]:
     """Yield what to do about the newest calibration of each tool: old, failed, or at another temperature."""
     for series in _series(results):

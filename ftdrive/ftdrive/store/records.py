@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_file, read_object
-from ftdrive.runs.verification_record import EMULATED, FORMAT, marks_of
+from ftdrive.runs.verification_record import EMULATED, FORMAT, VerificationRecord, marks_of
 from ftdrive.runs.weighings import FILES, FOLDER, WeighingsFile, is_weighings
 
 # A list of results needs no numpy.
@@ -86,29 +86,6 @@ class StoredResult:
         return mass_sigma_kg(self.parameters, self.covariance, self.g_m_s2)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StoredVerification:
-    """One verification of a calibration."""
-
-    id: str
-    """12 hex digits of the SHA-256 of its file."""
-    path: str
-    run: str
-    calibration_id: str
-    created_utc: str | None
-    passed: bool
-    change: str | None
-    """What has changed since the calibration, such as "bias"."""
-    reason: str | None
-    temperature_C: float | None
-    bias_change: list[float] | None
-    """(6,) change of the bias since the calibration, in N, then N·m, sensor frame."""
-    bias_change_sigma: list[float] | None
-    """(6,) its standard deviation from the readings of this verification."""
-    calibration_sigma: list[float] | None
-    """(6,) its standard deviation from the calibration, which all its verifications share."""
-
-
 class BriefVerification(NamedTuple):
     """What a fleet needs of a verification: a tuple, because it reads 20,000 of them a minute."""
 
@@ -118,7 +95,7 @@ class BriefVerification(NamedTuple):
     change: str | None
     temperature_C: float | None
     bias: tuple[float | None, ...]
-    """(18,) `bias_change`, `bias_change_sigma` and `calibration_sigma` of `StoredVerification`."""
+    """(18,) `bias_change`, `bias_change_sigma` and `calibration_sigma` of `VerificationRecord`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,7 +144,7 @@ class StoredWeighings:
         return tool_in_words(self.tool, emulated=self.emulated)
 
 
-Record = StoredResult | StoredVerification | StoredWeighings
+Record = StoredResult | VerificationRecord | StoredWeighings
 
 
 def user_folder() -> Path:
@@ -322,19 +299,19 @@ def _result(path: Path) -> StoredResult:
     )
 
 
-def _verification(path: Path) -> StoredVerification:
+def _verification(path: Path) -> VerificationRecord:
     document = read_object(path, BadDataset)
     check_format(document, FORMAT, BadDataset)
     calibration_id, passed = _text(_object(document.get("calibration")).get("id")), document.get("passed")
     if calibration_id is None or not isinstance(passed, bool):
         raise BadDataset(f"{path.name} lacks the id of its calibration or the outcome: the file is damaged")
     bias_change = _object(document.get("bias_change"))
-    return StoredVerification(
+    created = _utc(document.get("created_utc"))
+    return VerificationRecord(
         id=hashlib.sha256(read_file(path)).hexdigest()[:12],
-        path=str(path),
-        run=path.parent.name,
+        path=path,
         calibration_id=calibration_id,
-        created_utc=_utc(document.get("created_utc")),
+        created_utc=None if created is None else datetime.fromisoformat(created),
         passed=passed,
         change=_text(document.get("change")),
         reason=_text(document.get("reason")),

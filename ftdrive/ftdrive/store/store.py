@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
 
+from ftdrive.runs.verification_record import VerificationRecord
 from ftdrive.runs.weighings import is_weighings
 from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths
@@ -17,7 +18,6 @@ from ftdrive.store.records import (
     Record,
     StoredCell,
     StoredResult,
-    StoredVerification,
     StoredWeighings,
     read_records,
     record_paths,
@@ -126,7 +126,7 @@ class Store:
         if records or forget:
             with self._current.writing() as connection:
                 self._write(connection, records, forget)
-        kinds = (StoredResult, StoredVerification, StoredWeighings)
+        kinds = (StoredResult, VerificationRecord, StoredWeighings)
         results, verifications, weighings = (sum(isinstance(one, kind) for one in records) for kind in kinds)
         return Indexed(results, verifications, weighings, unreadable)
 
@@ -156,14 +156,14 @@ class Store:
         query = select(database.results).where(database.results.c.id.startswith(start, autoescape=True))
         return self._read(query, database.to_result)
 
-    def verifications(self, calibration_id: str | None = None) -> list[StoredVerification]:
+    def verifications(self, calibration_id: str | None = None) -> list[VerificationRecord]:
         """Return all verifications, or those of a calibration, the oldest first."""
         query = _oldest_first(database.verifications)
         if calibration_id is not None:
             query = query.where(database.verifications.c.calibration_id == calibration_id)
         return self._read(query, database.to_verification)
 
-    def last_verification(self, calibration_id: str) -> StoredVerification | None:
+    def last_verification(self, calibration_id: str) -> VerificationRecord | None:
         """Return the newest verification of a calibration, if there is one."""
         return next(reversed(self.verifications(calibration_id)), None)
 

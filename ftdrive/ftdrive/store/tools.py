@@ -129,4 +129,4 @@ def _failed(store: Store, one: StoredResult) -> Iterator[str]:
     except BadStore:
         return
     if last is not None and not last.passed:
-        yield f"the last verification of this calibration failed: {last.reason or 'see ' + last.path}; calibrate again"
+        yield f"the last verification of this calibration failed: {last.reason or f'see {last.path}'}; calibrate again"

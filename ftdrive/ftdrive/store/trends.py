@@ -10,7 +10,8 @@ import numpy as np
 from ftcalib.after.series import FEWEST_ESTIMATES, BiasTemperature, Trend, bias_temperature, trend
 from ftcalib.model import BIASES, PARAMETER_NAMES, Array
 from ftcalib.rounding import with_sigma
-from ftdrive.store.records import StoredResult, StoredVerification
+from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.store.records import StoredResult
 
 # Largest p-value of a trend that counts.
 SIGNIFICANT: Final = 0.01
@@ -150,14 +151,14 @@ class SensorTemperature:
 
 
 class _Run(NamedTuple):
-    created_utc: str
+    created_utc: datetime
     temperature_C: float
     bias: Array
     sigma: Array
 
 
 def temperatures(
-    results: Iterable[StoredResult], verifications: Sequence[StoredVerification]
+    results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]
 ) -> list[SensorTemperature]:
     """Fit each sensor on each arm and mount that has runs enough.
 
@@ -173,7 +174,7 @@ def temperatures(
         made[one.id] = found, one
         if one.update in (None, "tool") and one.created_utc is not None and one.temperature_C is not None:
             sigma = np.sqrt(np.diag(one.covariance)[BIASES])
-            found.append(_Run(one.created_utc, one.temperature_C, one.parameters.bias, sigma))
+            found.append(_Run(datetime.fromisoformat(one.created_utc), one.temperature_C, one.parameters.bias, sigma))
     for check in verifications:
         if check.calibration_id not in made or not (check.passed or check.change == "bias"):
             continue
@@ -194,7 +195,6 @@ def temperatures(
 def _fit(runs: Sequence[_Run]) -> BiasTemperature | None:
     if not runs:
         return None
-    first = datetime.fromisoformat(runs[0].created_utc)
-    days = [(datetime.fromisoformat(run.created_utc) - first).total_seconds() / 86400 for run in runs]
+    days = [(run.created_utc - runs[0].created_utc).total_seconds() / 86400 for run in runs]
     columns = (np.array([run[k] for run in runs]) for k in (1, 2, 3))
     return bias_temperature(np.array(days), *columns)

@@ -154,7 +154,7 @@ def _verified(view: View) -> tuple[str, str]:
     found = view.info.verification
     if found is None:
         return "not verified", FAINT
-    now = found.created_utc if view.reading is None else _now(view.info, view.reading)
+    now = None if view.reading is None else _now(view.info, view.reading)
     return found.in_words(now), GOOD if found.passed else BAD
 
 

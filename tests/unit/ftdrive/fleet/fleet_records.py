@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -12,12 +13,12 @@ from ftcalib.model import Array
 from ftdrive.fleet.cells import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
+from ftdrive.runs.verification_record import VerificationRecord, newest
 from ftdrive.runs.weighings import REFUSALS
 from ftdrive.store.records import (
     BriefVerification,
     StoredCell,
     StoredResult,
-    StoredVerification,
     StoredWeighings,
     sum_up,
 )
@@ -67,14 +68,13 @@ def result(name: str, days_ago: float, *, step: Array | None = None, **more: Any
     return StoredResult(**(values | more))
 
 
-def check(of: StoredResult, days_ago: float, *, passed: bool = True, **more: Any) -> StoredVerification:
+def check(of: StoredResult, days_ago: float, *, passed: bool = True, **more: Any) -> VerificationRecord:
     id_ = f"{of.id}-verified-{days_ago:g}"
     values = {
         "id": id_,
-        "path": f"/runs/{id_}/verification.json",
-        "run": id_,
+        "path": Path(f"/runs/{id_}/verification.json"),
         "calibration_id": of.id,
-        "created_utc": time(days_ago),
+        "created_utc": NOW - timedelta(days=days_ago),
         "passed": passed,
         "change": None if passed else "bias",
         "reason": None,
@@ -83,7 +83,7 @@ def check(of: StoredResult, days_ago: float, *, passed: bool = True, **more: Any
         "bias_change_sigma": SIGMA.tolist(),
         "calibration_sigma": (SIGMA / 2).tolist(),
     }
-    return StoredVerification(**(values | more))
+    return VerificationRecord(**(values | more))
 
 
 def daily(of: StoredResult, days: int, seed: int = 0, added: Array | None = None, **more: Any) -> list[Any]:
@@ -119,12 +119,12 @@ def time(days_ago: float) -> str:
     return (NOW - timedelta(days=days_ago)).isoformat(timespec="microseconds")
 
 
-def _check(one: StoredVerification) -> BriefVerification:
+def _check(one: VerificationRecord) -> BriefVerification:
     nothing: list[float | None] = [None] * 6
     bias = (one.bias_change or nothing, one.bias_change_sigma or nothing, one.calibration_sigma or nothing)
     values = tuple(value for part in bias for value in part)
     return BriefVerification(
-        one.calibration_id, one.created_utc or "", one.passed, one.change, one.temperature_C, values
+        one.calibration_id, one.to_store_dict()["created_utc"] or "", one.passed, one.change, one.temperature_C, values
     )
 
 
@@ -134,7 +134,7 @@ class FakeStore:
 
     kept_cells: Sequence[StoredCell] = ()
     kept_results: Sequence[StoredResult] = ()
-    kept_checks: Sequence[StoredVerification] = field(default_factory=list)
+    kept_checks: Sequence[VerificationRecord] = field(default_factory=list)
     kept_weighings: Sequence[StoredWeighings] = ()
 
     def cells(self) -> list[StoredCell]:
@@ -157,13 +157,12 @@ class FakeStore:
         return kept[::-1]
 
     def _checks(self, since: datetime) -> list[BriefVerification]:
-        start = since.isoformat(timespec="microseconds")
-        found = [one for one in self.kept_checks if one.created_utc is not None and one.created_utc >= start]
-        return [_check(one) for one in sorted(found, key=lambda one: (one.created_utc or "", one.id))]
+        found = [one for one in self.kept_checks if one.created_utc is not None and one.created_utc >= since]
+        return [_check(one) for one in sorted(found, key=lambda one: (one.created_utc or NOW, one.id))]
 
-    def last_verification(self, calibration_id: str) -> StoredVerification | None:
+    def last_verification(self, calibration_id: str) -> VerificationRecord | None:
         found = [one for one in self.kept_checks if one.calibration_id == calibration_id]
-        return max(found, key=lambda one: one.created_utc or "", default=None)
+        return newest(found)
 
 
 def store(

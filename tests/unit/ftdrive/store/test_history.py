@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 
 from ftcalib.model import BIASES, Array
+from ftdrive.runs.verification_record import VerificationRecord
 from ftdrive.store.history import age_days, drifts, warnings
-from ftdrive.store.records import StoredResult, StoredVerification, read_records, record_paths
+from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.trends import QuantityTrend, temperatures
 from tests.unit.ftdrive.live.simulated import calibrated
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
 
 
-def records(folder: Path) -> tuple[list[StoredResult], list[StoredVerification]]:
+def records(folder: Path) -> tuple[list[StoredResult], list[VerificationRecord]]:
     found, unreadable = read_records(record_paths([folder]))
     assert unreadable == ()
     return [one for one in found if isinstance(one, StoredResult)], [
-        one for one in found if isinstance(one, StoredVerification)
+        one for one in found if isinstance(one, VerificationRecord)
     ]
 
 

@@ -218,7 +218,7 @@ def test_the_newest_are_selected_by_time_in_any_zone(store_url: str, tmp_path: P
     store.index(tmp_path)
     since = (FIRST + timedelta(days=2)).astimezone(timezone(timedelta(hours=-9)))
     assert [one.created_utc for one in store.fleet(1, since)[2]] == [
-        one.created_utc for one in store.verifications()[3:]
+        one.to_store_dict()["created_utc"] for one in store.verifications()[3:]
     ]
     assert [one.run for one in store.verifications()] == ["no-time", "0", "1", "2", "3"]
 
