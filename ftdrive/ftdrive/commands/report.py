@@ -31,9 +31,10 @@ from ftdrive.errors import ConfigError
 from ftdrive.report.facts import facts_of
 from ftdrive.report.report import Format
 from ftdrive.report.report import report as written
-from ftdrive.report.subject import SolveOptions, read_subject, trust
+from ftdrive.report.subject import read_subject, trust
 from ftdrive.runs.bundle import unpack
 from ftdrive.runs.run import unused_path
+from ftdrive.runs.source import SolveOptions
 from ftdrive.terminal.console import beside, hanging, messages, working
 from ftdrive.terminal.text import echo
 
@@ -109,7 +110,7 @@ def report(
     if form == "html":
         require_extra("report", "a report in HTML (not --format md)", "jinja2", "matplotlib")
     given = known_values(mass_kg, level_deg, mounting_deg), up_direction(up)
-    options = SolveOptions(method, orientation, drift, *given, _typed(click.get_current_context()))
+    options = SolveOptions(method, orientation, drift, *given, words=_typed(click.get_current_context()))
     gc.freeze()  # or the imports are searched for garbage again and again, as in `fleet status`
     with unpack(source) if source is not None else rehearsed_run(sensor) as found:
         with working("Solving"):

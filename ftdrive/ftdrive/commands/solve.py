@@ -1,8 +1,8 @@
 """`ftdrive solve`: a calibration from data on disk, without a device."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from textwrap import fill
 from typing import Any, get_args
@@ -46,6 +46,7 @@ from ftdrive.runs.pose_hints import hints, numbers_in_dataset
 from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import (
     RecordedData,
+    SolveOptions,
     read_calibration,
     read_dataset,
     read_source,
@@ -180,70 +181,50 @@ def solve(
         raise ConfigError("--together joins two runs or more: name them, the oldest first")
     if output is not None and ((len(sources) > 1 and not joined) or method == "all" or cases):
         raise ConfigError("--output takes one result: give one dataset and one method")
-    wanted = _Wanted(
-        method=method,
-        orientation=orientation,
-        known=known_values(mass_kg, level_deg, mounting_deg),
-        up_in_base=up_direction(up),
-        drift=drift,
+    options = SolveOptions(
+        method,
+        orientation,
+        drift,
+        known_values(mass_kg, level_deg, mounting_deg),
+        up_direction(up),
         as_published=as_published,
         earlier=None if earlier is None else read_calibration(earlier),
         pair=pair,
         point_mass=point_mass,
         topics=(wrench_topic, pose_topic),
-        test=test,
-        tests=_test_set(test, orientation),
-        cases=cases,
     )
+    tests = _test_set(test, orientation)
+    show = _show_cases if cases else partial(_show_all, options, test, tests) if method == "all" else None
     if joined:
-        _solve_together(sources, wanted, output, force, as_json)
+        _solve_together(sources, options, output, force, as_json)
         return
     poses = 24 if method in (*SPECIAL, "all") else 6
-    options = {"sets": EVERY_SET} if cases else {"poses": poses, "method": "ml" if method == "all" else method}
-    with rehearsed_run(sensor, **options) if simulate else nullcontext() as run:
-        _solve_each(sources if run is None else [run], wanted, output, force, as_json)
+    rehearsed = {"sets": EVERY_SET} if cases else {"poses": poses, "method": "ml" if method == "all" else method}
+    with rehearsed_run(sensor, **rehearsed) if simulate else nullcontext() as run:
+        _solve_each(sources if run is None else [run], options, show, output, force, as_json)
     if output is not None and sources and sources[0].is_dir():
         index_run(sources[0])  # the result, if it was saved in the run
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Wanted:
-    method: str
-    orientation: Orientation
-    known: Known | None
-    up_in_base: Sequence[float] | None
-    drift: Drift
-    as_published: bool
-    earlier: CalibrationResult | None
-    # Files of wrench and orientation of a recording in motion.
-    pair: tuple[Path, Path] | None
-    point_mass: bool
-    # Topics of a bag: wrench and pose.
-    topics: tuple[str | None, str | None]
-    test: Path | None
-    # The poses of `test`.
-    tests: CalibrationDataset | None
-    # The cases of Yu's Table III, instead of one result.
-    cases: bool
-
-    def read(self, place: Path) -> RecordedData:
-        """Read poses at rest."""
-        return read_source(place, self.orientation, self.known, self.up_in_base)
-
-
-def _solve_each(sources: Sequence[Path], wanted: _Wanted, output: Path | None, force: bool, as_json: bool) -> None:
+def _solve_each(
+    sources: Sequence[Path],
+    options: SolveOptions,
+    show: Callable[[Path, RecordedData, bool], None] | None,
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+) -> None:
+    """Solve each source by itself; `show` compares methods or cases on poses at rest, instead of one result."""
     first_failure: AcceptanceError | DataError | None = None
     for source in sources:
         # One source that fails does not keep the others from being solved.
         try:
             with unpack(source) as place:
-                if wanted.method == "all" and wanted.pair is None and not _is_in_motion(place):
-                    _show_all(source, wanted.read(place), wanted, as_json)
+                at_rest = options.pair is None and not _is_in_motion(place)
+                if show is not None and (at_rest or options.method != "all"):
+                    show(source, read_source(place, options), as_json)
                     continue
-                if wanted.cases:
-                    _show_cases(source, wanted.read(place), as_json)
-                    continue
-                result, records = _result_of(place, wanted)
+                result, records = _result_of(place, options)
                 if as_json:
                     found = [one.to_dict() for one in hints(result, records)]
                     write_json({"source": str(source), "hints": found, **result.to_dict()})
@@ -265,47 +246,45 @@ def _is_in_motion(place: Path) -> bool:
     return is_recording(place) or is_bag(place) or in_motion(place)
 
 
-def _result_of(place: Path, wanted: _Wanted) -> tuple[CalibrationResult, Sequence[PoseRecord]]:
+def _result_of(place: Path, options: SolveOptions) -> tuple[CalibrationResult, Sequence[PoseRecord]]:
     """Solve a recording in motion, or poses; also return the records of a run."""
-    from_bag = wanted.pair is None and is_bag(place)
-    if any(wanted.topics) and not from_bag:
+    from_bag = options.pair is None and is_bag(place)
+    if any(options.topics) and not from_bag:
         raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS 2: leave them out")
-    if wanted.pair is not None or _is_in_motion(place):
-        if wanted.method != "ml":
-            raise ConfigError(f"--method {wanted.method} is for poses at rest: leave it out for a recording")
-        return _solve_motion(place, wanted), ()
-    data = wanted.read(place)
-    earlier = wanted.earlier or data.earlier
+    if options.pair is not None or _is_in_motion(place):
+        if options.method != "ml":
+            raise ConfigError(f"--method {options.method} is for poses at rest: leave it out for a recording")
+        return _solve_motion(place, options), ()
+    data = read_source(place, options)
+    earlier = options.earlier or data.earlier
     if earlier is not None:
         require_same_cell(earlier, data.provenance)
         return new_tool(earlier, data.dataset, data.provenance), data.records
-    return _solve_poses(data, wanted), data.records
+    return _solve_poses(data, options), data.records
 
 
-def _solve_motion(place: Path, wanted: _Wanted) -> CalibrationResult:
-    options: dict[str, Any] = {
-        "earlier": wanted.earlier,
-        "known": wanted.known,
-        "point_mass": wanted.point_mass,
-    }
+def _solve_motion(place: Path, options: SolveOptions) -> CalibrationResult:
+    how: dict[str, Any] = {"earlier": options.earlier, "known": options.known, "point_mass": options.point_mass}
     with working("Solving"):
         if in_motion(place):
-            return solve_in_motion(Run(place), **options)
+            return solve_in_motion(Run(place), **how)
         from ftdrive.recording.in_motion import solve_recording  # with the filters of a stream
 
-        from_bag = wanted.pair is None and is_bag(place)
-        means = bag_means(read_bag(place, *wanted.topics)) if from_bag else None
-        return solve_recording(place, wanted.pair, means, up_in_base=wanted.up_in_base, **options)
+        from_bag = options.pair is None and is_bag(place)
+        means = bag_means(read_bag(place, *options.topics)) if from_bag else None
+        return solve_recording(place, options.pair, means, up_in_base=options.up_in_base, **how)
 
 
-def _solve_together(sources: Sequence[Path], wanted: _Wanted, output: Path | None, force: bool, as_json: bool) -> None:
+def _solve_together(
+    sources: Sequence[Path], options: SolveOptions, output: Path | None, force: bool, as_json: bool
+) -> None:
     results = []
     for source in sources:
         with unpack(source) as place:
             if _is_in_motion(place):
                 raise ConfigError(f"--together joins poses at rest, and {source} is in motion")
             # Without the earlier result of a new tool, because a result from another one would count that twice.
-            results.append(_solve_poses(wanted.read(place), wanted))
+            results.append(_solve_poses(read_source(place, options), options))
     result = together(results)
     if as_json:
         write_json({"sources": [str(source) for source in sources], **result.to_dict()})
@@ -322,9 +301,9 @@ def _save(result: CalibrationResult, output: Path | None, force: bool, as_json: 
         beside(as_json).print(f" Saved {output}")
 
 
-def _solve_poses(data: RecordedData, wanted: _Wanted) -> CalibrationResult:
-    chosen: Any = wanted.method
-    how: dict[str, Any] = {"drift": wanted.drift, "as_published": wanted.as_published, **data.circumstances}
+def _solve_poses(data: RecordedData, options: SolveOptions) -> CalibrationResult:
+    chosen: Any = options.method
+    how: dict[str, Any] = {"drift": options.drift, "as_published": options.as_published, **data.circumstances}
     with working("Solving"):
         try:
             return solve_dataset(data.dataset, chosen, **how, provenance=data.provenance)
@@ -339,13 +318,20 @@ def _test_set(test: Path | None, orientation: Orientation) -> CalibrationDataset
         return read_dataset(place, orientation)
 
 
-def _show_all(source: Path, data: RecordedData, wanted: _Wanted, as_json: bool) -> None:
-    test, tests, truth = wanted.test, wanted.tests, data.truth
-    how: dict[str, Any] = {"drift": wanted.drift, "as_published": wanted.as_published, **data.circumstances}
+def _show_all(
+    options: SolveOptions,
+    test: Path | None,
+    tests: CalibrationDataset | None,
+    source: Path,
+    data: RecordedData,
+    as_json: bool,
+) -> None:
+    truth = data.truth
+    how: dict[str, Any] = {"drift": options.drift, "as_published": options.as_published, **data.circumstances}
     with working("Solving with all methods"):
         compared = compare(data.dataset, **how, test=tests, truth=truth)
     if as_json:
-        given = {"as_published": wanted.as_published, **({} if test is None else {"test_set": str(test)})}
+        given = {"as_published": options.as_published, **({} if test is None else {"test_set": str(test)})}
         methods = [one.to_dict() for one in compared]
         write_json({"schema_version": 1, "source": str(source), **given, "methods": methods})
         return

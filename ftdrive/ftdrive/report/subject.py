@@ -5,19 +5,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from ftcalib import CalibrationDataset, CalibrationResult, Known, solve
-from ftcalib.data.dataset import Orientation
+from ftcalib import CalibrationDataset, CalibrationResult, solve
 from ftcalib.errors import BadCalibration
 from ftcalib.files import read_object
-from ftcalib.likelihood.session import Drift
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs.run import Run, in_motion
-from ftdrive.runs.source import read_source, solve_in_motion
-from ftdrive.runs.verification_record import age_of, outcome_in_words, verification_near
+from ftdrive.runs.source import SolveOptions, read_source, solve_in_motion
+from ftdrive.runs.verification_record import VerificationRecord, age_of, newest, verification_near
 
 
 def trust(
@@ -34,19 +32,13 @@ def trust(
         Reads `[store] url`; None is the user's store.
     now : datetime
     """
-    near = verification_near(source, result.id)
     kept, error = _of_store(result.id, store_url)
-    known = [_plain(one) for one in (near, kept) if one is not None and one.created_utc]
-    last = max(known, key=lambda one: datetime.fromisoformat(one["created_utc"]), default=None)
-    verified = "not verified"
-    if last is not None:
-        age = now - datetime.fromisoformat(last["created_utc"])
-        verified = outcome_in_words(age, passed=last["passed"], change=last["change"])
-    words = ", ".join([*age_of(result, now), verified])
-    return {"words": words, "last_verification": last, "store_error": error}
+    last = newest(one for one in (verification_near(source, result.id), kept) if one is not None)
+    words = ", ".join([*age_of(result, now), "not verified" if last is None else last.in_words(now)])
+    return {"words": words, "last_verification": None if last is None else _plain(last), "store_error": error}
 
 
-def _of_store(calibration_id: str, url: Callable[[], str | None]) -> tuple[Any, str]:
+def _of_store(calibration_id: str, url: Callable[[], str | None]) -> tuple[VerificationRecord | None, str]:
     """Return what the store has, and why it cannot be read."""
     from ftdrive.store.store import Store
 
@@ -56,28 +48,14 @@ def _of_store(calibration_id: str, url: Callable[[], str | None]) -> tuple[Any, 
         return None, str(error)
 
 
-def _plain(one: Any) -> dict[str, Any]:
-    at = one.created_utc if isinstance(one.created_utc, datetime) else datetime.fromisoformat(one.created_utc)
+def _plain(one: VerificationRecord) -> dict[str, Any]:
     return {
-        "created_utc": at.astimezone(UTC).isoformat(),
+        "created_utc": None if one.created_utc is None else one.created_utc.astimezone(UTC).isoformat(),
         "passed": one.passed,
         "change": one.change,
         "reason": one.reason or "",
         "path": str(one.path),
     }
-
-
-@dataclass(frozen=True, slots=True)
-class SolveOptions:
-    """Options of `ftdrive solve` for a source without a result."""
-
-    method: Method = "ml"
-    orientation: Orientation = "R_base_flange"
-    drift: Drift = "auto"
-    known: Known | None = None
-    up_in_base: Sequence[float] | None = None
-    words: tuple[str, ...] = ()
-    """The same as typed, quoted for a shell."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,7 +120,7 @@ def _is_calibration(source: Path) -> bool:
 def _of_result(source: Path, result: CalibrationResult) -> Subject:
     folder = source.absolute().parent
     if (folder / "run.json").is_file() and not in_motion(folder):
-        data = read_source(folder, "R_base_flange")
+        data = read_source(folder, SolveOptions())
         if data.dataset.sha256() == result.provenance.get("dataset_sha256"):
             run = Run(folder)
             return Subject(source, result, run.solve_command, data.dataset, run, data.records, data.circumstances)
@@ -162,10 +140,10 @@ def _in_motion(source: Path, options: SolveOptions) -> Subject:
 def _of_data(source: Path, options: SolveOptions) -> Subject:
     if in_motion(source):
         return _in_motion(source, options)
-    data = read_source(source, options.orientation, options.known, options.up_in_base)
+    data = read_source(source, options)
     solved_with = {"drift": options.drift, **data.circumstances}
     run = Run(source) if source.is_dir() else None
-    result, method = None, options.method
+    result, method = None, cast("Method", options.method)
     command = " ".join(["ftdrive solve", shlex.quote(str(source)), *options.words])
     if run is not None and options == SolveOptions():
         method, command = run.method, run.solve_command

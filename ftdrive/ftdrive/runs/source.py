@@ -11,6 +11,7 @@ from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, read_cs
 from ftcalib.after.new_tool import new_tool
 from ftcalib.data.dataset import Orientation
 from ftcalib.errors import BadDataset, NotObservable
+from ftcalib.likelihood.session import Drift
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters
 from ftcalib.routine import ArmReading, DriftCheck, PoseRecord, WrenchSamples, dataset_from, drift_check
 from ftdrive.errors import ConfigError
@@ -54,6 +55,31 @@ class RecordedRun:
 _UNDESCRIBED: Final = Setup()
 
 
+@dataclass(frozen=True, slots=True)
+class SolveOptions:
+    """Options of `ftdrive solve` and `ftdrive report`: what is known of the data, and how they are solved."""
+
+    method: str = "ml"
+    """A `ftcalib.result.Method`; "all" compares them."""
+    orientation: Orientation = "R_base_flange"
+    """Of the rotations in a CSV file."""
+    drift: Drift = "auto"
+    known: Known | None = None
+    """A known direction of gravity means a base that is level with respect to the mounting."""
+    up_in_base: Sequence[float] | None = None
+    """(3,) declared up direction, instead of that of a run's mounting."""
+    as_published: bool = False
+    earlier: CalibrationResult | None = None
+    """The result that gives a new tool its mounting, base and gain."""
+    pair: tuple[Path, Path] | None = None
+    """Files of wrench and orientation of a recording in motion."""
+    point_mass: bool = False
+    topics: tuple[str | None, str | None] = (None, None)
+    """Topics of a bag: wrench and pose."""
+    words: tuple[str, ...] = ()
+    """The same as typed, quoted for a shell."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedData:
     """What a place holds."""
@@ -81,26 +107,8 @@ class RecordedData:
         return None if truth is None else Parameters(*(np.array(truth[one.name]) for one in fields(Parameters)))
 
 
-def read_source(
-    source: Path, orientation: Orientation, known: Known | None = None, up_in_base: Sequence[float] | None = None
-) -> RecordedData:
-    """Read the data of a place.
-
-    Parameters
-    ----------
-    source : Path
-        A run folder, a dataset.json or a CSV file.
-    orientation : Orientation
-        Of the rotations in a CSV file.
-    known : Known, optional
-        A known direction of gravity means a base that is level with respect to the mounting.
-    up_in_base : sequence of float, optional
-        (3,) declared up direction, instead of that of a run's mounting.
-
-    Raises
-    ------
-    BadDataset, OSError
-    """
+def read_source(source: Path, options: SolveOptions) -> RecordedData:
+    """Read poses at rest from a run folder, a dataset.json or a CSV file. Raises `BadDataset` or `OSError`."""
     if source.is_dir():
         run = Run(source)
         if run.in_motion:
@@ -109,8 +117,9 @@ def read_source(
         dataset, of_run = _dataset_of(run, records)
         found = RecordedData(dataset, of_run.provenance(), of_run.g_m_s2, of_run.setup, None, records, _earlier_of(run))
     else:
-        dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, orientation)
+        dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, options.orientation)
         found = RecordedData(dataset, {"source": source.name, "versions": versions()})
+    up_in_base, known = options.up_in_base, options.known
     if up_in_base is not None:
         provenance = {**found.provenance, "up_in_base": list(up_in_base)}
         found = replace(found, setup=replace(found.setup, up_in_base=up_in_base), provenance=provenance)
@@ -143,7 +152,7 @@ def read_dataset(path: str | Path, orientation: Orientation = "R_base_flange") -
     >>> dataset.wrench.shape
     (24, 6)
     """
-    return read_source(Path(path), orientation).dataset
+    return read_source(Path(path), SolveOptions(orientation=orientation)).dataset
 
 
 def read_calibration(path: str | Path, *, accept_edited: bool = False) -> CalibrationResult:

@@ -29,8 +29,9 @@ from ftdrive.report.facts import about_of, compared, error_map, facts_of, orient
 from ftdrive.report.figures import VARIABLES
 from ftdrive.report.report import report
 from ftdrive.report.sections import sections_of
-from ftdrive.report.subject import SolveOptions, Subject, read_subject
+from ftdrive.report.subject import Subject, read_subject
 from ftdrive.runs.run import Reading, Run
+from ftdrive.runs.source import SolveOptions
 from ftdrivers.interfaces import FtSamples
 
 TRUTH = Parameters(

@@ -10,7 +10,7 @@ from ftcalib import CalibrationDataset, Known, Parameters
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftdrive.runs.run import Run
-from ftdrive.runs.source import read_source
+from ftdrive.runs.source import SolveOptions, read_source
 
 
 @pytest.fixture
@@ -25,22 +25,24 @@ def dataset(tmp_path: Path) -> Path:
 def test_a_known_direction_of_gravity_is_that_of_the_mounting(
     dataset: Path, up: tuple[float, float, float] | None, down: tuple[float, float, float]
 ) -> None:
-    found = read_source(dataset, "R_base_flange", Known(gravity_direction_base=(0, 0, -1), mass_kg=2.0), up)
+    found = read_source(
+        dataset, SolveOptions(known=Known(gravity_direction_base=(0, 0, -1), mass_kg=2.0), up_in_base=up)
+    )
     known = found.circumstances["known"]
     np.testing.assert_array_equal(known.gravity_direction_base, down)
     assert known.mass_kg == 2.0
     assert found.circumstances["g_m_s2"] == STANDARD_GRAVITY_M_S2
     assert found.provenance.get("up_in_base") == (None if up is None else list(up))
-    free = read_source(dataset, "R_base_flange", Known(mass_kg=2.0), up).circumstances["known"]
+    free = read_source(dataset, SolveOptions(known=Known(mass_kg=2.0), up_in_base=up)).circumstances["known"]
     assert free.gravity_direction_base is None
-    assert read_source(dataset, "R_base_flange").circumstances["known"] is None
+    assert read_source(dataset, SolveOptions()).circumstances["known"] is None
 
 
 def test_a_recording_in_motion_has_no_poses(tmp_path: Path) -> None:
     run = Run.create(tmp_path, "gripper", {})
     run.motion_path.touch()
     with pytest.raises(BadDataset, match="in motion"):
-        read_source(run.folder, "R_base_flange")
+        read_source(run.folder, SolveOptions())
 
 
 @pytest.mark.parametrize(
@@ -50,11 +52,11 @@ def test_a_recording_in_motion_has_no_poses(tmp_path: Path) -> None:
 def test_a_run_without_data_says_how_to_go_on(mode: str, words: str, tmp_path: Path) -> None:
     run = Run.create(tmp_path, "stopped", {"mode": mode, "config": {"site": {"g_m_s2": 9.81}}})
     with pytest.raises(NotObservable, match=f"stopped has no data to solve: .*{words}"):
-        read_source(run.folder, "R_base_flange")
+        read_source(run.folder, SolveOptions())
 
 
 def test_the_truth_is_that_of_a_described_emulated_cell(dataset: Path) -> None:
-    found = read_source(dataset, "R_base_flange")
+    found = read_source(dataset, SolveOptions())
     assert found.truth is None
     truth = Parameters(np.diag([1.0, -1.0, -1.0]), *np.arange(12.0).reshape(4, 3))
     described = {one.name: getattr(truth, one.name).tolist() for one in fields(truth)}

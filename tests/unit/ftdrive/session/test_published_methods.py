@@ -10,10 +10,10 @@ from click.testing import CliRunner
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.fleet.resolve import solve_task, task_of
-from ftdrive.report.subject import SolveOptions, read_subject
+from ftdrive.report.subject import read_subject
 from ftdrive.runs.bundle import write_bundle
 from ftdrive.runs.run import Run
-from ftdrive.runs.source import read_dataset
+from ftdrive.runs.source import SolveOptions, read_dataset
 from ftdrive.session.options import method_of_poses
 from tests.unit.ftdrive.fake_cell import Lab
 
