@@ -1,10 +1,10 @@
 """`ftdrive verify`: fresh poses against the prediction of a calibration."""
 
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -95,20 +95,18 @@ def verify(
     from ftdrive.session.options import SessionOptions
 
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
-    wanted = _wanted(path, quick, poses, AcceptanceLimits(force_N, torque_Nm), resume)
     mode: Mode = "manual" if manual else "auto"
-    options = SessionOptions(
-        runs, "verify", wanted.poses, mode, fast=wanted.quick, resume=resume, real=not simulate, yes=yes
-    )
+    options = SessionOptions(runs, "verify", mode=mode, fast=quick, resume=resume, real=not simulate, yes=yes)
+    path, limits, options = _with_poses(options, path, poses, AcceptanceLimits(force_N, torque_Nm))
     with ExitStack() as stack:
-        station, path = None, wanted.path
+        station = None
         if simulate:
             station, path = _emulated(stack, path, described.sensor, runs)
         elif path is None:
             raise ConfigError("no calibration: give --calibration PATH, or --simulate")
         cell = described.cell() if station is None else station.cell
         with declined_aborts():
-            verified = verify_cell(cell, path, wanted, options, station, update=update, as_json=as_json)
+            verified = verify_cell(cell, path, limits, options, station, update=update, as_json=as_json)
     if not verified.passed:
         raise NotAccepted(f"the verification failed: {failure_in_words(verified)}")
 
@@ -116,7 +114,7 @@ def verify(
 def verify_cell(
     cell: "CellConfig",
     path: Path,
-    wanted: "Wanted",
+    limits: "AcceptanceLimits",
     options: "SessionOptions",
     station: "Station | None" = None,
     *,
@@ -125,8 +123,8 @@ def verify_cell(
 ) -> "Verified":
     """Guide the operator through the poses, compare them with a calibration, report, and add the run to the store.
 
-    `path` is the calibration file or its run folder, `station` the emulated cell that `cell` describes. Raises as
-    `ftdrive.session.session.take_poses`.
+    `path` is the calibration file or its run folder, `station` the emulated cell that `cell` describes. A verification
+    is quick if `options` are fast. Raises as `ftdrive.session.session.take_poses`.
     """
     from ftdrive.commands.common import start_mover
     from ftdrive.runs.run import Run
@@ -139,19 +137,21 @@ def verify_cell(
 
     calibration = read_calibration(path)
     path = Run(path).calibration_path if path.is_dir() else path
-    description = {"verification": {**asdict(wanted), "id": calibration.id, "path": str(path.absolute())}}
+    # The run keeps what is verified and how, so that --resume continues alike.
+    kept = {"path": str(path.absolute()), "poses": options.poses, "quick": options.fast, "limits": asdict(limits)}
+    description: dict[str, Any] = {"verification": {**kept, "id": calibration.id}}
     # 12 s of noise would take longer than the poses.
-    if wanted.quick:
+    if options.fast:
         cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
     if station is not None:
         description |= describe(station)
         start_mover(station, options)
-    task = Verifying(cell, calibration, path, wanted.poses, options.runs)
+    task = Verifying(cell, calibration, path, options.poses, options.runs)
     with open_operator(as_json=as_json, command=task.command) as operator:
         run = take_poses(task, operator, replace(options, description=description))
     if run is None:
         raise RuntimeError("a verification is never a dry run")
-    verified = verify_run(run, calibration, path, wanted.limits)
+    verified = verify_run(run, calibration, path, limits)
     _report(verified, update, simulated=station is not None, as_json=as_json)
     index_run(run.folder, cell if station is None else None)
     return verified
@@ -162,27 +162,19 @@ def failure_in_words(verified: "Verified") -> str:
     return "; ".join(verified.exceeded if verified.limits.given else (verified.verification.reason,))
 
 
-@dataclass(frozen=True, slots=True)
-class Wanted:
-    """What is verified, and how; the run keeps it, so that --resume continues alike."""
-
-    path: Path | None
-    poses: int
-    quick: bool
-    limits: "AcceptanceLimits"
-
-
-def _wanted(
-    path: Path | None, quick: bool, poses: int | None, limits: "AcceptanceLimits", resume: Path | None
-) -> Wanted:
+def _with_poses(
+    options: "SessionOptions", path: Path | None, poses: int | None, limits: "AcceptanceLimits"
+) -> tuple[Path | None, "AcceptanceLimits", "SessionOptions"]:
+    """Return what is verified and how: as given, or as the run that is resumed was begun."""
     from ftdrive.runs.run import Run
     from ftdrive.runs.verified import AcceptanceLimits
     from ftdrive.session.verifying import POSES, QUICK_POSES
 
+    quick, resume = options.fast, options.resume
     if quick and poses is not None:
         raise ConfigError("--quick and --poses exclude one another: leave one of them out")
     if resume is None:
-        return Wanted(path, poses or (QUICK_POSES if quick else POSES), quick, limits)
+        return path, limits, replace(options, poses=poses or (QUICK_POSES if quick else POSES))
     given = {"--calibration": path, "--quick": quick, "--poses": poses, "--max-force or --max-torque": limits.given}
     if wrong := [option for option, value in given.items() if value]:
         raise ConfigError(f"--resume continues with the options of its run: leave out {' and '.join(wrong)}")
@@ -190,7 +182,8 @@ def _wanted(
     if run.command != "verify":
         raise ConfigError(f"{resume} is not a verification: continue it with {run.resume_command}")
     begun = run.header()["verification"]
-    return Wanted(Path(begun["path"]), begun["poses"], begun["quick"], AcceptanceLimits(**begun["limits"]))
+    options = replace(options, poses=begun["poses"], fast=begun["quick"])
+    return Path(begun["path"]), AcceptanceLimits(**begun["limits"]), options
 
 
 def _report(verified: "Verified", update: Answer, *, simulated: bool, as_json: bool) -> None:

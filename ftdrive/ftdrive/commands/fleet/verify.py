@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ftdrive.commands.common import STORE, CellOptions, store_url
-from ftdrive.commands.verify import Wanted, failure_in_words, verify_cell
+from ftdrive.commands.verify import failure_in_words, verify_cell
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.text import echo
 
@@ -109,7 +109,7 @@ def _verify(one: "StoredCell", store: "Store", url: str | None, fleet: "Fleet") 
         return "skipped", ""
     options = SessionOptions(path.parent.parent, "verify", poses=POSES)
     cell = replace(cell, store=replace(cell.store, url=url))
-    verified = verify_cell(cell, path, Wanted(path, POSES, quick=False, limits=AcceptanceLimits()), options)
+    verified = verify_cell(cell, path, AcceptanceLimits(), options)
     return ("passed", "") if verified.passed else ("FAILED", failure_in_words(verified))
 
 

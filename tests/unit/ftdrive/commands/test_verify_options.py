@@ -1,6 +1,7 @@
 """Options of `ftdrive verify` that exclude one another, and the outcome that it prints."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from ftdrive.commands import verify as command
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.runs.verified import AcceptanceLimits, Verified
+from ftdrive.session.options import SessionOptions
 from ftdrive.terminal.report import verdict_in_words
 from tests.unit.ftdrive.recorded import calibration
 
@@ -45,12 +47,12 @@ def test_options_that_contradict_are_refused(arguments: tuple[str, ...], words: 
 
 
 def test_a_resumed_verification_keeps_its_options(begun: Path) -> None:
-    wanted = command._wanted(None, quick=False, poses=None, limits=AcceptanceLimits(), resume=begun)
-    assert (wanted.path, wanted.poses) == (Path("cell/calibration.json"), 3)
-    assert wanted.limits == AcceptanceLimits(force_N=0.5)
+    options = SessionOptions(begun.parent, resume=begun)
+    path, limits, options = command._with_poses(options, None, None, AcceptanceLimits())
+    assert (path, options.poses, limits) == (Path("cell/calibration.json"), 3, AcceptanceLimits(force_N=0.5))
     calibrate = Run.create(begun.parent, "calibrate", {"mode": "auto"}).folder
     with pytest.raises(ConfigError, match="ftdrive calibrate --resume"):
-        command._wanted(None, quick=False, poses=None, limits=AcceptanceLimits(), resume=calibrate)
+        command._with_poses(replace(options, resume=calibrate), None, None, AcceptanceLimits())
 
 
 def failed(folder: Path, limits: AcceptanceLimits) -> Any:
