@@ -259,3 +259,23 @@ def read_only(value: ArrayLike) -> Array:
     array = np.array(value, dtype=np.float64)
     array.setflags(write=False)
     return array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriftResult:
+    """Change of the bias during the tour; arrays are read-only."""
+
+    change: Array
+    """(6,) bias at the last pose minus bias at the first, N and N·m."""
+    sigma: Array
+    """(6,) one standard deviation of that."""
+    course: Array | None = None
+    """(n, 6) bias of each pose minus the mean bias, in the order of the poses given; None in a result, which keeps the
+    change alone."""
+
+    def __post_init__(self) -> None:
+        for name in ("change", "sigma"):
+            value = read_only(getattr(self, name))
+            if value.shape != (6,) or not np.isfinite(value).all():
+                raise ValueError(f"the drift's {name} must be six finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)

@@ -19,7 +19,7 @@ from ftcalib.files import JSON, check_format, is_changed, read_object, write_obj
 from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.judge.verdict import SURE, expected_error
 from ftcalib.likelihood.response import COMMON_GAIN, Response, hidden_covariance, joint_covariance, predicted_covariance
-from ftcalib.model import PARAMETER_NAMES, Array, Parameters, Rotations, is_rotation, read_only
+from ftcalib.model import PARAMETER_NAMES, Array, DriftResult, Parameters, Rotations, is_rotation, read_only
 from ftcalib.published.yu import weight_and_tilt
 
 FORMAT = "ftdrive.calibration/1"
@@ -48,23 +48,6 @@ Method = Literal[
     "yaw-only",
 ]
 NoiseSource = Literal["measured", "residuals"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DriftResult:
-    """Change of the bias during the tour; arrays are read-only."""
-
-    change: Array
-    """(6,) bias at the last pose minus bias at the first, N and N·m."""
-    sigma: Array
-    """(6,) one standard deviation of that."""
-
-    def __post_init__(self) -> None:
-        for name in ("change", "sigma"):
-            value = read_only(getattr(self, name))
-            if value.shape != (6,) or not np.isfinite(value).all():
-                raise ValueError(f"the drift's {name} must be six finite numbers, got shape {value.shape}")
-            object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

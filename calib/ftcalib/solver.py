@@ -22,7 +22,7 @@ from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters, predict
 from ftcalib.published.methods import BASELINES, PUBLISHED, SPECIAL, Estimator, published, require_printed_form
 from ftcalib.published.yu import ROUNDING_RAD, special_deviation_rad, special_numbers
-from ftcalib.result import CalibrationResult, DriftResult, Method, require_positive_definite
+from ftcalib.result import CalibrationResult, Method, require_positive_definite
 
 SIMULATIONS = 400
 # No sensor resolves smaller differences of force.
@@ -121,7 +121,7 @@ def solve(
         measured_sigma=measured_sigma,
         weights=judged.weights,
         components=judged.components,
-        drift=None if judged.drift is None else DriftResult(judged.drift.change, judged.drift.sigma),
+        drift=None if judged.drift is None else replace(judged.drift, course=None),
         response=judged.response,
         gain_sigma=judged.gain_sigma,
         cable_shift=quality.cable_shift,

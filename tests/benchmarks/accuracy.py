@@ -280,8 +280,8 @@ def _left_out(name: str, R: Array, y: Array, cov: Array | None, time_s: Array, f
     else:
         fit = likelihood.fit(*training, cov, t_s=time_s[kept])
         estimate = fit.parameters
-        if fit.drift is not None:
-            bias = np.stack([np.interp(time_s[fold], time_s[kept], column) for column in fit.drift.bias.T], axis=1)
+        if fit.drift is not None and fit.drift.course is not None:
+            bias = np.stack([np.interp(time_s[fold], time_s[kept], column) for column in fit.drift.course.T], axis=1)
     return y[fold] - sim.readings(sim.as_truth(estimate), R[fold]) - bias
 
 

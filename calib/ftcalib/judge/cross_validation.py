@@ -10,11 +10,11 @@ from typing import Self
 import numpy as np
 
 from ftcalib.likelihood.descent import column_scale
-from ftcalib.likelihood.fit import DriftEstimate, Fit
+from ftcalib.likelihood.fit import Fit
 from ftcalib.likelihood.response import Response
 from ftcalib.likelihood.session_noise import CHUNK, Noise, summed_products
 from ftcalib.likelihood.variance_components import FORCE, TORQUE, component, left_out
-from ftcalib.model import Array, Parameters, jacobian, predict
+from ftcalib.model import Array, DriftResult, Parameters, jacobian, predict
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +43,7 @@ class Judged:
     second_basin_chi2: float | None
     components: Mapping[str, float]
     response: Response | None = None
-    drift: DriftEstimate | None = None
+    drift: DriftResult | None = None
     gain_sigma: float = 0.0
     fit: Fit | None = None
     """The fit by maximum likelihood that has these values; None for another method, whose noise has no model."""
@@ -158,14 +158,14 @@ def drift_ahead(fit: Judged, t_s: Array | None = None) -> DriftAhead:
     t_s : array, shape (n,), optional
         When each pose was measured; without it, or with times that are not finite, one pose every 10 s in their order.
     """
-    if fit.drift is None:
+    if fit.drift is None or fit.drift.course is None:
         return DriftAhead(np.zeros(6), np.zeros(6), np.zeros(6))
     n = len(fit.weights)
     timed = t_s is not None and np.isfinite(t_s).all() and np.ptp(t_s) > 0
     time = np.asarray(t_s if timed else USUAL_INTERVAL_S * np.arange(n), dtype=np.float64)
     used = np.flatnonzero(fit.weights > 0)
     first, last = used[np.argmin(time[used])], used[np.argmax(time[used])]
-    offset = fit.drift.bias[last]
+    offset = fit.drift.course[last]
     intervals = NEXT_USE_S * (n - 1) / np.ptp(time)
     walk = np.zeros(6)
     for channels in (FORCE, TORQUE, *([c] for c in range(6))):

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from ftcalib.findings import Finding
 from ftcalib.judge import units
 from ftcalib.judge.faults import channels
+from ftcalib.judge.observability import axes_along, evenly_spread
 from ftcalib.judge.units import FARTHEST_COM_M
 from ftcalib.known import Known, Setup, turn_between, unit_vector
 from ftcalib.model import UP_IN_BASE, Array, Parameters
 from ftcalib.rounding import decimals
-from ftcalib.sphere import axes_along, evenly_spread
 
 # A centre of mass may lie this far on the robot's side of the sensor origin, because adapter plates do.
 INSIDE_M = 0.01

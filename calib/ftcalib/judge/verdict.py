@@ -19,9 +19,8 @@ from ftcalib.judge.faults import COLLAPSE, ROUNDING, broken_channels, constant_w
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
 from ftcalib.judge.session_change import cable_of, session_change
 from ftcalib.known import NOTHING, Known, Setup
-from ftcalib.likelihood.fit import DriftEstimate
 from ftcalib.likelihood.response import Response, predicted_covariance
-from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters
+from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters
 from ftcalib.published.yu import SPECIAL_R_flange_base
 
 SIGNIFICANT_SIGMAS = 5.0
@@ -385,7 +384,7 @@ def _poses(fit: Judged, quality: Quality, severity_of_rejected: Severity) -> lis
     return findings
 
 
-def _drift(drift: DriftEstimate | None, ahead: DriftAhead, weight_N: float, *, is_cause: bool) -> list[Finding]:
+def _drift(drift: DriftResult | None, ahead: DriftAhead, weight_N: float, *, is_cause: bool) -> list[Finding]:
     """Name a significant drift, 0 where it is not.
 
     It limits the result if it is no consequence, and large from the first pose to the last or up to the next use.

@@ -25,19 +25,7 @@ from ftcalib.likelihood.variance_components import (
     left_out,
     point,
 )
-from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DriftEstimate:
-    """How the bias moved."""
-
-    change: Array
-    """(6,) bias at the last pose minus bias at the first, N and N·m."""
-    sigma: Array
-    """(6,) standard deviation of that."""
-    bias: Array
-    """(n, 6) bias of each pose minus the mean bias, in the order of the poses given."""
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +50,7 @@ class Fit:
     components: Mapping[str, float]
     """Standard deviations of what was found, by name and unit: beyond the measured noise, or all of the noise
     where it was not measured. A `walk` is per mean interval between poses, a `slope` per session."""
-    drift: DriftEstimate | None
+    drift: DriftResult | None
     noise: Noise
     """Covariance of all wrenches under the noise model, poses in the order of `order`."""
     order: NDArray[np.intp]
@@ -237,7 +225,7 @@ def _deviation(session: Session, c: Component, variance: float) -> float:
     return float(np.sqrt(variance + least))
 
 
-def _drift(session: Session, best: Minimum, noise: Noise, C: Array, found: Mapping[Component, float]) -> DriftEstimate:
+def _drift(session: Session, best: Minimum, noise: Noise, C: Array, found: Mapping[Component, float]) -> DriftResult:
     """Best linear prediction of the bias at every pose, and the error of its change."""
     J, r = jacobian(best.parameters, session.R), session.wrench - predict(best.parameters, session.R)
     problem = session.linearise(best.parameters, noise.kept)
@@ -265,7 +253,7 @@ def _drift(session: Session, best: Minimum, noise: Noise, C: Array, found: Mappi
     E = summed_products(select_ends, J) - summed_products(WY, J)
     cov = summed_products(select_ends, Y) - summed_products(Y, WY) + E @ C @ E.T
     change = sorted_bias[ends[1]] - sorted_bias[ends[0]]
-    return DriftEstimate(change, np.sqrt(np.maximum(np.diag(cov), 0.0)), bias)
+    return DriftResult(change, np.sqrt(np.maximum(np.diag(cov), 0.0)), bias)
 
 
 def _inverse(information: Array) -> Array:

@@ -16,11 +16,11 @@ from ftcalib.judge.observability import assess
 from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, expected_error, judge
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.response import Response
-from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, DriftResult, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, rough_delay
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
 from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, rows_of
-from ftcalib.result import CalibrationResult, DriftResult, MotionResult
+from ftcalib.result import CalibrationResult, MotionResult
 
 LEAST_S = 5.0
 # Largest delay that is found.

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from ftcalib.after.inertia import SensorMotion, inertial_wrench, motion_of_poses
+from ftcalib.compensation import SensorMotion, inertial_wrench, motion_of_poses
 from ftcalib.model import Parameters, skew
 from ftdrivers.interfaces import Array
 

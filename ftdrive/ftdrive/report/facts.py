@@ -12,11 +12,10 @@ from ftcalib import CalibrationResult
 from ftcalib.after.series import difference
 from ftcalib.compare import compare
 from ftcalib.errors import NotObservable
-from ftcalib.judge.observability import assess
+from ftcalib.judge.observability import assess, axes_along, largest_gap
 from ftcalib.judge.verdict import strong_correlations
 from ftcalib.model import PARAMETER_NAMES, Array
 from ftcalib.routine import drift_check
-from ftcalib.sphere import axes_along, largest_gap
 from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.plan import Plan
 from ftdrive.report.subject import Subject

@@ -14,14 +14,15 @@ from ftcalib.judge.observability import (
     LEAST_POSES,
     RECOMMENDED_POSES,
     WEAK_GAP,
+    axes_along,
     different_orientations,
+    largest_gap,
 )
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.poses.information import Guess, Prediction, predicted_sigma
 from ftcalib.poses.selection import next_pose
 from ftcalib.published.yu import weight_and_tilt
 from ftcalib.routine import PoseRecord, dataset_from, is_return
-from ftcalib.sphere import axes_along, largest_gap
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.session.events import Compared, Estimated
 

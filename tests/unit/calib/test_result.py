@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import BadCalibration, CalibrationDataset, CalibrationResult, Parameters, solve
 from ftcalib.likelihood.response import COMMON_GAIN, SIZE, Response, hidden_covariance
-from ftcalib.model import predict
+from ftcalib.model import DriftResult, predict
 from ftcalib.published.yu import weight_and_tilt
-from ftcalib.result import DriftResult, MotionResult, _weight_and_tilt_sigma, require_positive_definite
+from ftcalib.result import MotionResult, _weight_and_tilt_sigma, require_positive_definite
 
 RNG = np.random.default_rng(1)
 R = Rotation.random(10, rng=RNG).as_matrix()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ftcalib.sphere import evenly_spread, largest_gap
+from ftcalib.judge.observability import evenly_spread, largest_gap
 
 
 @pytest.mark.parametrize("n", [500, 2000])

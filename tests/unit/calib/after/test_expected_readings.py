@@ -23,9 +23,8 @@ from ftcalib.after.expected_readings import (
     expected_with_walk,
 )
 from ftcalib.after.state import Update
-from ftcalib.model import BIASES, Array, gravity_wrench, jacobian, predict
+from ftcalib.model import BIASES, Array, DriftResult, gravity_wrench, jacobian, predict
 from ftcalib.poses.information import SUBSET_6, special
-from ftcalib.result import DriftResult
 from tests.first_order import propagated
 from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, calibrated
 

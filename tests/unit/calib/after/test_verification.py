@@ -13,9 +13,8 @@ from ftcalib.after.expected_readings import expected_with_inexact_orientations
 from ftcalib.after.state import apply_update
 from ftcalib.after.verification import Verification, verify
 from ftcalib.likelihood.response import response_columns
-from ftcalib.model import Array, predict
+from ftcalib.model import Array, DriftResult, predict
 from ftcalib.poses.information import SUBSET_6, special
-from ftcalib.result import DriftResult
 
 SIGMA = np.repeat([0.05, 0.002], 3) / np.sqrt(200)
 TRUTH = Parameters(

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from ftcalib.judge.cross_validation import Judged, drift_ahead, standardize
-from ftcalib.likelihood.fit import DriftEstimate
-from ftcalib.model import Array
+from ftcalib.model import Array, DriftResult
 
 
 def test_a_covariance_that_rounding_made_indefinite_still_scales_residuals() -> None:
@@ -30,7 +29,7 @@ CHANGE, SIGMA = np.array([0.3, 0, 0.4, 0, 0.01, 0]), np.array([0.02, 0.02, 0.02,
 def drifting(components: dict[str, float], rows: Array) -> Judged:
     """Of 12 poses, whose bias grows by a twelfth of its change at each; the first and the last are left out."""
     share = (rows - 5.5) / 12
-    drift, used = DriftEstimate(CHANGE, SIGMA, share[:, None] * CHANGE), (rows > 0) & (rows < 11)
+    drift, used = DriftResult(CHANGE, SIGMA, share[:, None] * CHANGE), (rows > 0) & (rows < 11)
     return cast(Judged, SimpleNamespace(drift=drift, weights=used.astype(float), components=components))
 
 

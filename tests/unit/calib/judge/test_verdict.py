@@ -31,9 +31,8 @@ from ftcalib.judge.verdict import (
     strong_correlations,
     successive_correlation,
 )
-from ftcalib.likelihood.fit import DriftEstimate
 from ftcalib.likelihood.response import SIZE, Response, predicted_covariance
-from ftcalib.model import Array, jacobian, predict
+from ftcalib.model import Array, DriftResult, jacobian, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
@@ -599,7 +598,7 @@ def test_many_poses_are_looked_at_in_runs() -> None:
 def test_a_drift_is_named_from_three_sigmas_on_and_limits_from_two_percent_of_the_weight(
     change: list[float], is_cause: bool, found: tuple[str, float, float] | None
 ) -> None:
-    drift = DriftEstimate(np.array(change), np.repeat([0.01, 0.001], 3), np.zeros((2, 6)))
+    drift = DriftResult(np.array(change), np.repeat([0.01, 0.001], 3), np.zeros((2, 6)))
     ahead = DriftAhead(np.zeros(6), np.zeros(6), np.zeros(6))
     findings = _drift(drift, ahead, 20.0, is_cause=is_cause)
     named = [(one.severity, one.values["force_N"], one.values["torque_Nm"]) for one in findings]
@@ -636,7 +635,7 @@ def test_known_values_are_doubted_where_the_data_leave_less_than_four_tenths_wit
 
 def test_a_drift_of_rounding_size_is_no_drift() -> None:
     change, sigma = np.array([0.0, 0.1, 0.0, 0.0, 0.0, 3e-20]), np.array([0.01] * 3 + [1e-21] * 3)
-    drift, zero = DriftEstimate(change, sigma, np.zeros((2, 6))), np.zeros(6)
+    drift, zero = DriftResult(change, sigma, np.zeros((2, 6))), np.zeros(6)
     for at_next_use_N, severity in ((0.3, "note"), (0.5, "limit")):  # of 20 N, 2 % are 0.4
         ahead = DriftAhead(zero, zero, np.array([0.0, at_next_use_N**2, 0, 0, 0, 0]))
         (finding,) = _drift(drift, ahead, 20.0, is_cause=True)

@@ -293,7 +293,9 @@ def test_times_order_the_poses() -> None:
     np.testing.assert_allclose(shuffled.left_out_residuals, best.left_out_residuals[order], atol=1e-5)
     assert best.drift is not None
     assert shuffled.drift is not None
-    np.testing.assert_allclose(shuffled.drift.bias, best.drift.bias[order], atol=1e-5)
+    assert best.drift.course is not None
+    assert shuffled.drift.course is not None
+    np.testing.assert_allclose(shuffled.drift.course, best.drift.course[order], atol=1e-5)
 
 
 @pytest.mark.parametrize("drift", DRIFTS[1:])
@@ -331,7 +333,8 @@ def test_a_drift_is_the_best_linear_prediction_and_its_sigma_that_of_its_error()
     P = W - W @ J @ np.linalg.inv(J.T @ W @ J) @ J.T @ W
     change = np.kron(np.eye(12)[11] - np.eye(12)[0], np.eye(6))
     assert best.drift is not None
-    np.testing.assert_allclose(best.drift.bias, (K @ P @ e).reshape(12, 6), atol=1e-7)
+    assert best.drift.course is not None
+    np.testing.assert_allclose(best.drift.course, (K @ P @ e).reshape(12, 6), atol=1e-7)
     np.testing.assert_allclose(best.drift.change, change @ K @ P @ e, atol=1e-7)
     sigma = np.sqrt(np.diag(change @ (K - K @ P @ K) @ change.T))
     np.testing.assert_allclose(best.drift.sigma, sigma, rtol=1e-6)

@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Known, Parameters, Setup, solve
 from ftcalib.compare import MethodResult, compare
 from ftcalib.errors import NotObservable
-from ftcalib.model import predict
+from ftcalib.model import DriftResult, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
-from ftcalib.result import DriftResult, Method
+from ftcalib.result import Method
 from ftcalib.routine import DriftCheck
 from ftdrive.commands.solve import solve as solve_command
 from ftdrive.errors import ConfigError

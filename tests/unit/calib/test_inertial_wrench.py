@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import Parameters
-from ftcalib.after.inertia import SensorMotion, inertial_wrench, motion_of_poses
+from ftcalib.compensation import SensorMotion, inertial_wrench, motion_of_poses
 from ftcalib.model import Array, predict
 
 G = 9.80665
