@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from ftdrive.errors import ConfigError
 from ftdrive.exports.registry import export
-from ftdrive.exports.settings import Settings
+from ftdrive.exports.shared import Settings
 from ftdrive.live.processing import Processor
 from ftdrive.live.samples import EventKind, Stages, StreamEvent, WrenchFrame
 from ftdrivers.errors import NoRos2

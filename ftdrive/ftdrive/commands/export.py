@@ -157,7 +157,7 @@ def calibration(
     """
     from ftcalib.files import write_new
     from ftdrive.exports import registry
-    from ftdrive.exports.settings import Settings, recorded_sensor
+    from ftdrive.exports.shared import Settings, recorded_sensor
     from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verification_record import marks_of, verification_near
     from ftdrive.terminal.console import beside, hanging, messages

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import degrees
 
 import numpy as np
@@ -16,8 +16,7 @@ from ftdrive import __version__
 from ftdrive.errors import NotAccepted
 from ftdrive.exports import robots, ros
 from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, Format
-from ftdrive.exports.settings import Settings
-from ftdrive.exports.shared import Exported, made_by, with_header, yaml_text
+from ftdrive.exports.shared import Exported, Settings, made_by, with_header, yaml_text
 from ftdrive.runs.verification_record import MARKS, marks_of
 
 FORMAT = "ftdrive.export/1"
@@ -135,21 +134,9 @@ TARGETS: Mapping[str, Callable[[CalibrationResult, Settings], Exported]] = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Export:
-    """The text of one target and what must be known with it."""
-
-    text: str
-    notes: tuple[str, ...]
-    elsewhere: Mapping[str, JSON]
-    max_force_error_N: float
-    """Largest difference to `CalibrationResult.compensate` over all orientations."""
-    max_torque_error_Nm: float
-
-
 def export(
     calibration: CalibrationResult, name: str, settings: Settings, *, max_force_error_N: float = MAX_FORCE_ERROR_N
-) -> Export:
+) -> Exported:
     """Write a calibration for one target.
 
     Parameters
@@ -191,7 +178,7 @@ def export(
     notes += [f"Also set {place} = {_describe_value(value)}." for place, value in exported.elsewhere.items()]
     origin = made_by(calibration, settings.verification)
     text = with_header(exported.text, target.comment, [origin, target.description, *notes])
-    return Export(text, tuple(notes), exported.elsewhere, force_N, torque_Nm)
+    return Exported(text, tuple(notes), exported.elsewhere, force_N, torque_Nm)
 
 
 def _lost(calibration: CalibrationResult, target: Format) -> Iterator[str]:

@@ -5,10 +5,10 @@ import xml.etree.ElementTree as ET
 import numpy as np
 
 from ftcalib import CalibrationResult
-from ftdrive.exports.settings import Settings
 from ftdrive.exports.shared import (
     Exported,
     R_frame_sensor,
+    Settings,
     gravity_in_frame_m_s2,
     gravity_m_s2,
     inertia_kg_m2,

@@ -5,10 +5,10 @@ from typing import Any
 
 from ftcalib import CalibrationResult
 from ftcalib.files import JSON
-from ftdrive.exports.settings import Settings
 from ftdrive.exports.shared import (
     Exported,
     R_frame_sensor,
+    Settings,
     frame_note,
     gravity_in_frame_m_s2,
     numbers,

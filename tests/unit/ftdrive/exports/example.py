@@ -8,7 +8,7 @@ import numpy as np
 from ftcalib import CalibrationResult, Finding, Parameters
 from ftcalib.likelihood.response import SIZE, Response
 from ftcalib.model import Array
-from ftdrive.exports.settings import Settings
+from ftdrive.exports.shared import Settings
 
 G_M_S2 = 9.80665
 WEIGHT_N = 2 * G_M_S2

@@ -15,7 +15,7 @@ from ftcalib.model import Parameters
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.exports.formats import FORMATS
 from ftdrive.exports.registry import TARGETS, export, largest_difference
-from ftdrive.exports.settings import Settings
+from ftdrive.exports.shared import Settings
 from tests.unit.ftdrive.exports.example import (
     MEASURED,
     UPRIGHT,

@@ -17,8 +17,8 @@ from ftcalib.likelihood.response import SIZE, Response
 from ftcalib.model import Array
 from ftdrive.errors import NotAccepted
 from ftdrive.exports.formats import FORMATS, Property
-from ftdrive.exports.registry import Export, export
-from ftdrive.exports.settings import Settings
+from ftdrive.exports.registry import export
+from ftdrive.exports.shared import Exported, Settings
 from tests.target_files import tool0_from, world_from_base
 from tests.target_formulas import evaluate
 from tests.target_payloads import mujoco_plugin
@@ -69,7 +69,7 @@ def settings_of(rng: np.random.Generator, base_frame: str = "base", flange_frame
     )
 
 
-def gravity_m_s2(name: str, made: Export, calibration: CalibrationResult) -> Array | None:
+def gravity_m_s2(name: str, made: Exported, calibration: CalibrationResult) -> Array | None:
     """(3,) in the controller's base, as the target gets it from `elsewhere`; fails where this reads not all of it."""
     e: dict[str, Any] = dict(made.elsewhere)
     frame, gravity = "base", None
@@ -97,7 +97,7 @@ def gravity_m_s2(name: str, made: Export, calibration: CalibrationResult) -> Arr
 
 
 def compensated(
-    name: str, made: Export, calibration: CalibrationResult, settings: Settings, R_base_flange: Array, wrench: Array
+    name: str, made: Exported, calibration: CalibrationResult, settings: Settings, R_base_flange: Array, wrench: Array
 ) -> Array:
     """What the target makes of the file."""
     given = calibration.parameters

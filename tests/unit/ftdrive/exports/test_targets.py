@@ -15,8 +15,8 @@ from ftcalib import CalibrationResult
 from ftcalib.result import MotionResult
 from ftdrive import __version__
 from ftdrive.exports.formats import FORMATS
-from ftdrive.exports.registry import TARGETS, Export, export
-from ftdrive.exports.settings import Settings
+from ftdrive.exports.registry import TARGETS, export
+from ftdrive.exports.shared import Exported, Settings
 from tests.unit.ftdrive.exports.example import (
     MEASURED,
     calibration,
@@ -26,7 +26,7 @@ from tests.unit.ftdrive.exports.example import (
 IN_YAML = [name for name, one in FORMATS.items() if one.file.endswith(".yaml")]
 
 
-def made(name: str, settings: Settings = MEASURED, limit_N: float = 1e3) -> Export:
+def made(name: str, settings: Settings = MEASURED, limit_N: float = 1e3) -> Exported:
     return export(calibration(), name, settings, max_force_error_N=limit_N)
 
 
