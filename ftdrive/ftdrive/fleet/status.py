@@ -1,14 +1,23 @@
-"""The state of each cell: its newest calibrations, when they are to be verified, and whether their bias drifts."""
+"""The state of each cell, from its newest calibrations and their verifications, and what several cells show together.
 
+Together they show wrong payloads, moved bases, late verifications, and biases that follow the temperature. Within the
+verifications of one calibration, a component of the bias is d = a + b t + c T + e, with the time t, so that seasons and
+drift do not count, and the temperature T of the sensor. The calibrations of one sensor share c.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from typing import Final
 
 import numpy as np
+from scipy.special import chdtrc as chi2_sf
+from scipy.special import fdtrc as f_sf
 
-from ftcalib.after.series import drift_onset
+from ftcalib.after.series import drift_onset, spans_temperature
+from ftcalib.model import Array, angle_between_vectors, skew
 from ftdrive.fleet.cells import BiasChanges, Observed, when
-from ftdrive.fleet.findings import findings
-from ftdrive.fleet.state import BiasDrift, CellState, Fleet
+from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding, list_names
 from ftdrive.report.document import rounded
 from ftdrive.runs.verification_record import VerificationRecord
 from ftdrive.store.records import BriefVerification, StoredCell, StoredResult
@@ -38,7 +47,7 @@ def fleet_of(observed: Observed, store: Store) -> Fleet:
         if not found or cell.tool not in {None, *(one.tool for one in found)}:
             found.append(CellState(cell.name, cell.tool, cell.arm_serial))
         states += sorted(found, key=lambda one: one.tool or "")
-    return Fleet(tuple(states), findings(observed, states))
+    return Fleet(tuple(states), _findings(observed, states))
 
 
 def _drift_of(changes: BiasChanges | None, start: datetime) -> BiasDrift | None:
@@ -88,3 +97,293 @@ def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: St
         weighings=observed.weighings.get((cell.name, result.tool, result.emulated)),
         emulated=result.emulated,
     )
+
+
+SIGMAS: Final = 4.0
+# Centres of mass of one tool are alike within the first, that of a payload is wrong from the second on; or 4 sigma,
+# if that is more.
+ALIKE_M, WRONG_M = 0.003, 0.005
+# Likewise masses. A mass is wrong by the larger of share and kg.
+ALIKE_SHARE, WRONG_SHARE, WRONG_KG = 0.03, 0.1, 0.1
+# Mass of sensor and adapter, which a payload includes and the identified mass does not.
+MOST_SENSOR_KG: Final = 1.0
+TILTED_RAD: Final = np.deg2rad(0.1)
+# Added to the sigma of a tilt: postures of an arm bend it differently.
+TILT_FLOOR_RAD: Final = np.deg2rad(0.02)
+# Largest p-value of a turned base: one in 50 fleets of 200 cells shows one by chance.
+SURE: Final = 1e-4
+# A verification that is due today is not late yet.
+LATE: Final = timedelta(days=1)
+# With fewer on a day no share of refusals is worth a word.
+MANY_WEIGHINGS: Final = 10
+# Refusals of earlier days are past.
+RECENT: Final = timedelta(days=3)
+
+
+def _findings(observed: Observed, states: Sequence[CellState]) -> tuple[FleetFinding, ...]:
+    """Return all findings."""
+    newest = [(cell.name, one) for cell in observed.cells for one in observed.newest(cell)]
+    return (
+        *_overdue(states, observed),
+        *_bases(observed),
+        *_payloads(newest),
+        *_temperature_findings(observed),
+        *_refused_weighings(states, observed),
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------ schedule
+
+
+def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[FleetFinding]:
+    late = [(one.due, one.cell) for one in states if one.due is not None and one.due + LATE < observed.now]
+    if late:
+        due, worst = min(late)
+        cells = tuple(sorted({cell for _, cell in late}))
+        days = (observed.now - due).days
+        what = f"The verification of {worst} is late by {days} d"
+        if len(cells) > 1:
+            what = f"The verifications of {list_names(cells)} are late, that of {worst} by {days} d"
+        yield FleetFinding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
+
+
+# ----------------------------------------------------------------------------------------------------------- weighings
+
+
+def _refused_weighings(states: Sequence[CellState], observed: Observed) -> Iterator[FleetFinding]:
+    """Yield the cells that could not weigh most parts of their last day."""
+    first = (observed.now - RECENT).date().isoformat()
+    for one in states:
+        if one.weighings is None or one.weighings.day < first:
+            continue
+        refused = sum(one.weighings.refusals.values())
+        tried = refused + one.weighings.weighings
+        if tried >= MANY_WEIGHINGS and 2 * refused > tried:
+            code = max(one.weighings.refusals.items(), key=lambda found: found[1])[0]
+            yield FleetFinding(
+                "weighing",
+                (one.cell,),
+                f"{one.cell}: {refused} of {tried} weighings with {one.tool or 'its tool'} were refused on "
+                f"{one.weighings.day}, mostly as '{code}': run `ftdrive weigh` there to see why",
+            )
+
+
+# ---------------------------------------------------------------------------------------------------------------- base
+
+
+def _bases(observed: Observed) -> Iterator[FleetFinding]:
+    """Yield the cells whose base has turned between the newest calibration and the one before.
+
+    An update that copies the direction of gravity shows nothing.
+    """
+    for name, results in observed.results.items():
+        seen = list[StoredResult]()
+        for one in reversed(results):
+            if not seen or _turned(one, seen[0])[0] > 1e-9:
+                seen.append(one)
+            if len(seen) == 2:
+                angle, p_value = _turned(*reversed(seen))
+                if angle > TILTED_RAD and p_value < SURE:
+                    yield FleetFinding(
+                        "base",
+                        (name,),
+                        f"{name}: gravity has turned by {np.rad2deg(angle):.2f}° in the base between the calibrations "
+                        f"of {when(one):%Y-%m-%d} and {when(seen[0]):%Y-%m-%d}: check the bolts and the frame under "
+                        "the base, then calibrate its other tools again",
+                    )
+                break
+
+
+def _turned(before: StoredResult, after: StoredResult) -> tuple[float, float]:
+    """Return the angle in rad between two directions of gravity, and its p-value if the base has not moved."""
+    forces = [one.numbers["gravity_force_base_N"] for one in (before, after)]
+    weights = [float(np.linalg.norm(force)) for force in forces]
+    if not min(weights) > 0:
+        return 0.0, 1.0
+    old, new = (np.array(force) / weight for force, weight in zip(forces, weights, strict=True))
+    angle = angle_between_vectors(old, new)
+    if angle <= TILTED_RAD:
+        return angle, 1.0
+    across = np.linalg.svd(skew(old))[0][:, :2]  # (3, 2)
+    covariance = TILT_FLOOR_RAD**2 * np.eye(2)
+    for one, weight in zip((before, after), weights, strict=True):
+        covariance += across.T @ one.covariance[3:6, 3:6] @ across / weight**2
+    change = across.T @ (new - old)
+    return angle, float(chi2_sf(2, change @ np.linalg.solve(covariance, change)))
+
+
+# ------------------------------------------------------------------------------------------------------------- payload
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Load:
+    """A tool as one cell has identified it, and as its controller has it."""
+
+    cell: str
+    mass_kg: float
+    mass_sigma_kg: float
+    # (2,) identified centre of mass of the tool, flange axes.
+    off_axis_m: Array
+    off_axis_sigma_m: Array
+    payload_kg: float
+    # (2,) the centre that the payload amounts to, if sensor and adapter are centred on the axis of the flange.
+    configured_off_axis_m: Array | None
+
+
+def _payloads(newest: Sequence[tuple[str, StoredResult]]) -> Iterator[FleetFinding]:
+    """Yield the tools that several cells identify alike, and whose controllers have another mass or centre."""
+    tools = dict[str, list[_Load]]()
+    for cell, one in newest:
+        if one.tool is not None and one.payload_kg is not None and one.mass_kg > 0:
+            tools.setdefault(one.tool, []).append(_load(cell, one, one.payload_kg))
+    for tool, loads in tools.items():
+        if len(loads) > 1:
+            yield from _centre(tool, loads)
+            yield from _mass(tool, loads)
+
+
+def _load(cell: str, one: StoredResult, payload_kg: float) -> _Load:
+    """Sensor and adapter drop out of the moment about the axis, whatever their mass and height."""
+    R, covariance = np.array(one.numbers["R_flange_sensor"]), one.covariance
+    arm_m = R @ np.array(one.numbers["p_sensor_com_m"])
+    J = np.concatenate([-skew(arm_m), R], axis=1)  # by the rotation about the flange axes, and by the centre
+    rows = np.r_[0:3, 9:12]
+    sigma = np.sqrt(np.diag(J @ covariance[np.ix_(rows, rows)] @ J.T))
+    com = one.payload_com_m
+    configured = None if com is None else np.array(com[:2]) * payload_kg / one.mass_kg
+    return _Load(cell, one.mass_kg, one.mass_sigma_kg, arm_m[:2], sigma[:2], payload_kg, configured)
+
+
+def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
+    centre = np.median([one.off_axis_m for one in loads], axis=0)
+    alike = [one for one in loads if (abs(one.off_axis_m - centre) <= _either(ALIKE_M, one.off_axis_sigma_m)).all()]
+    wrong = [
+        one
+        for one in alike
+        if one.configured_off_axis_m is not None
+        and (abs(one.configured_off_axis_m - one.off_axis_m) > _either(WRONG_M, one.off_axis_sigma_m)).any()
+    ]
+    yield from _wrong_payloads(
+        wrong,
+        lambda first, cells: (
+            f"The tool {tool} has its centre of mass {_mm(centre)} mm off the flange axis in {cells} alike. "
+            f"The payloads of their controllers amount to others, such as {_mm(first.configured_off_axis_m)} mm"
+        ),
+    )
+
+
+def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
+    mass_kg = float(np.median([one.mass_kg for one in loads]))
+    wrong = []
+    for one in loads:
+        margin_kg = max(WRONG_KG, WRONG_SHARE * one.mass_kg, SIGMAS * one.mass_sigma_kg)
+        above_kg = one.payload_kg - one.mass_kg
+        alike = abs(one.mass_kg - mass_kg) <= max(ALIKE_SHARE * mass_kg, SIGMAS * one.mass_sigma_kg)
+        if alike and not -margin_kg <= above_kg <= MOST_SENSOR_KG + margin_kg:
+            wrong.append(one)
+    yield from _wrong_payloads(
+        wrong,
+        lambda first, cells: (
+            f"The tool {tool} weighs {mass_kg:.2f} kg without sensor and adapter in {cells} alike. "
+            f"The payloads of their controllers do not agree, such as {first.payload_kg:.2f} kg"
+        ),
+    )
+
+
+def _wrong_payloads(wrong: Iterable[_Load], words: Callable[[_Load, str], str]) -> Iterator[FleetFinding]:
+    """Yield a finding of several loads; `words` takes the first of them and the names of all cells."""
+    # One wrong payload is a finding of its own calibration, so this needs two cells or a reference.
+    loads = sorted(wrong, key=lambda one: one.cell)
+    if len(loads) > 1:
+        cells, first = tuple(one.cell for one in loads), loads[0]
+        fix = "set them with `ftdrive push`"
+        yield FleetFinding("payload", cells, f"{words(first, list_names(cells))} in {first.cell}: {fix}")
+
+
+def _either(least: float, sigma: Array) -> Array:
+    return np.maximum(least, SIGMAS * sigma)
+
+
+def _mm(point_m: Array | None) -> str:
+    return "-" if point_m is None else "(" + ", ".join(f"{1e3 * value + 0.0:.0f}" for value in point_m) + ")"
+
+
+# Largest p-value of one component of one sensor: in one of 80 fleets of 200 sensors one follows by chance, and two are
+# needed.
+SURE_OF_TEMPERATURE: Final = 1e-5
+# Verifications of a calibration.
+FEWEST: Final = 8
+_UNITS = ("N", "N·m")
+
+
+@dataclass(slots=True, eq=False)
+class _Sums:
+    """Sums over the calibrations of one sensor, (6,) each, and its cells."""
+
+    cells: set[str]
+    xx: Array
+    xy: Array
+    yy: Array
+    dof: int = 0
+
+
+def _temperature_findings(observed: Observed) -> Iterator[FleetFinding]:
+    """Yield the models of which two sensors or more follow their temperature."""
+    models = dict[str, dict[str, _Sums]]()
+    for cell in observed.cells:
+        for result in observed.results[cell.name]:
+            changes = observed.changes.get(result.id)
+            if changes is not None and result.sensor_model and result.sensor_serial:
+                _add(models.setdefault(result.sensor_model, {}), result.sensor_serial, cell.name, changes)
+    for model, sensors in sorted(models.items()):
+        yield from _finding(model, sensors)
+
+
+def _add(sensors: dict[str, _Sums], serial: str, cell: str, changes: BiasChanges) -> None:
+    known = np.isfinite(changes.temperature_C)
+    T = changes.temperature_C[known]
+    if not spans_temperature(T, FEWEST):
+        return
+    found = sensors.setdefault(serial, _Sums(set(), np.zeros(6), np.zeros(6), np.zeros(6)))
+    found.cells.add(cell)
+    found.dof += len(T) - 3
+    weight = 1 / changes.sigma[known].T  # (6, n)
+    base = np.stack([np.ones_like(T), changes.t_days[known] - changes.t_days[known].mean()], axis=1)
+    Q, _ = np.linalg.qr(weight[..., None] * base)  # (6, n, 2)
+    x, y = (
+        part - (Q @ (Q.swapaxes(1, 2) @ part[..., None]))[..., 0]
+        for part in (weight * T, weight * changes.change[known].T)
+    )
+    found.xx += np.sum(x * x, axis=1)
+    found.xy += np.sum(x * y, axis=1)
+    found.yy += np.sum(y * y, axis=1)
+
+
+def _finding(model: str, sensors: Mapping[str, _Sums]) -> Iterator[FleetFinding]:
+    following = {
+        serial: sums for serial, sums in sorted(sensors.items()) if _p_values(sums).min() < SURE_OF_TEMPERATURE
+    }
+    if len(following) < 2:
+        return
+    cells = tuple(sorted({cell for sums in following.values() for cell in sums.cells}))
+    slopes = np.max(
+        [np.where(_p_values(one) < SURE_OF_TEMPERATURE, abs(one.xy / one.xx), 0.0) for one in following.values()],
+        axis=0,
+    )
+    largest = zip((slopes[:3].max(), slopes[3:].max()), _UNITS, strict=True)
+    size = " and ".join(f"{rounded(float(slope), 2)} {unit}" for slope, unit in largest if slope)
+    yield FleetFinding(
+        "temperature",
+        cells,
+        f"The bias of {len(following)} of {len(sensors)} sensors {model} follows their temperature, by up to "
+        f"{size} a kelvin (in {list_names(cells)}): let them warm up before a calibration, and tare them at "
+        "the temperature of the work",
+    )
+
+
+def _p_values(sums: _Sums) -> Array:
+    """Return p of each component (6,): the larger of those against the stated sigmas and against the scatter."""
+    usable = sums.xx > 0
+    chi2 = np.where(usable, sums.xy**2 / np.where(usable, sums.xx, 1.0), 0.0)
+    rest = np.maximum(sums.yy - chi2, 1e-12) / sums.dof
+    return np.maximum(chi2_sf(1, chi2), f_sf(1, sums.dof, chi2 / rest))
