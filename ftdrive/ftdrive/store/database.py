@@ -4,10 +4,8 @@ A change of a column of results, verifications or weighings raises `SCHEMA`: an 
 its files.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
-from datetime import datetime
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +21,6 @@ from sqlalchemy import (
     Integer,
     MetaData,
     NullPool,
-    Row,
     String,
     Table,
     collate,
@@ -40,9 +37,7 @@ from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs.verification_record import VerificationRecord
 from ftdrive.runs.weighings import REFUSALS
 from ftdrive.store.records import (
-    BriefVerification,
     Record,
-    StoredCell,
     StoredResult,
     StoredWeighings,
     user_folder,
@@ -51,9 +46,9 @@ from ftdrive.store.records import (
 # Version of the index, kept in the database.
 SCHEMA: Final = 4
 
-_WRENCH = ("fx", "fy", "fz", "tx", "ty", "tz")
+AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 # Fields of a verification with a column for each component: 18 columns are read three times as fast as JSON in one.
-_WRENCHES = ("bias_change", "bias_change_sigma", "calibration_sigma")
+WRENCHES = ("bias_change", "bias_change_sigma", "calibration_sigma")
 
 metadata: Final = MetaData()
 schema: Final = Table("ftdrive_schema", metadata, Column("version", Integer, primary_key=True, autoincrement=False))
@@ -87,7 +82,7 @@ verifications: Final = Table(
     Column("passed", Boolean, nullable=False),
     *(Column(name, String) for name in ("change", "reason")),
     Column("temperature_C", Float),
-    *(Column(f"{name}_{axis}", Float) for name in _WRENCHES for axis in _WRENCH),
+    *(Column(f"{name}_{axis}", Float) for name in WRENCHES for axis in AXES),
 )
 weighings: Final = Table(
     "ftdrive_weighings",
@@ -116,65 +111,6 @@ RECORDS: Final[Mapping[type[Record], Table]] = {
     VerificationRecord: verifications,
     StoredWeighings: weighings,
 }
-
-# Columns of a check.
-CHECK: Final = [
-    *(verifications.c[name] for name in BriefVerification._fields[:-1]),
-    *(verifications.c[f"{name}_{axis}"] for name in _WRENCHES for axis in _WRENCH),
-]
-_SINGLE = tuple(column.name for column in verifications.columns if not column.name.endswith(_WRENCH))
-
-
-def to_row(record: Record | StoredCell) -> dict[str, Any]:
-    """Return a record by columns."""
-    row = record.to_store_dict() if isinstance(record, VerificationRecord) else asdict(record)
-    row |= {f"refused_{code}": number for code, number in row.pop("refusals", {}).items()}
-    for name in _WRENCHES if isinstance(record, VerificationRecord) else ():
-        values = row.pop(name) or [None] * len(_WRENCH)
-        row |= {f"{name}_{axis}": value for axis, value in zip(_WRENCH, values, strict=True)}
-    return row
-
-
-def to_result(row: Row[Any]) -> StoredResult:
-    """Return a row of `results` as a record."""
-    return StoredResult(**row._asdict())
-
-
-def to_cell(row: Row[Any]) -> StoredCell:
-    """Return a row of `cells` as a record."""
-    return StoredCell(**row._asdict())
-
-
-def to_verification(row: Row[Any]) -> VerificationRecord:
-    """Return a row of `verifications` as a record."""
-    values = dict(zip(_SINGLE, row, strict=False))
-    path, _, created = values.pop("path"), values.pop("run"), values.pop("created_utc")
-    return VerificationRecord(
-        path=Path(path),
-        created_utc=None if created is None else datetime.fromisoformat(created),
-        **values,
-        bias_change=_wrench(row[-18:-12]),
-        bias_change_sigma=_wrench(row[-12:-6]),
-        calibration_sigma=_wrench(row[-6:]),
-    )
-
-
-def to_weighings(row: Row[Any]) -> StoredWeighings:
-    """Return a row of `weighings` as a record."""
-    values = row._asdict()
-    refusals = {code: values.pop(f"refused_{code}") for code in REFUSALS}
-    return StoredWeighings(**values, refusals=refusals)
-
-
-def to_check(row: Sequence[Any]) -> BriefVerification:
-    """Return a row with the columns `CHECK` as a check."""
-    calibration_id, created_utc, passed, change, temperature_C, *bias = row
-    return BriefVerification(calibration_id, created_utc, passed, change, temperature_C, tuple(bias))
-
-
-def _wrench(values: Sequence[Any]) -> list[float] | None:
-    return None if values[0] is None else list(values)
-
 
 # Collation that sorts texts alike everywhere.
 _BYTE_ORDER: Final = {"sqlite": "BINARY", "postgresql": "C"}

@@ -1,7 +1,7 @@
 """The store itself: results, verifications and cells, written from run folders and rebuilt from them at any time."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
 
 from ftdrive.runs.verification_record import VerificationRecord
-from ftdrive.runs.weighings import is_weighings
+from ftdrive.runs.weighings import REFUSALS, is_weighings
 from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import (
@@ -30,6 +30,13 @@ WAIT_S = 5.0
 _MOST = 5000
 
 _Stored = TypeVar("_Stored")
+
+# Columns of a check.
+_CHECK = [
+    *(database.verifications.c[name] for name in BriefVerification._fields[:-1]),
+    *(database.verifications.c[f"{name}_{axis}"] for name in database.WRENCHES for axis in database.AXES),
+]
+_SINGLE = tuple(column.name for column in database.verifications.columns if not column.name.endswith(database.AXES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +117,7 @@ class Store:
 
     def put_cells(self, cells: Iterable[StoredCell]) -> None:
         """Insert cells, or replace those of the same name: all or none."""
-        if rows := [database.to_row(cell) for cell in cells]:
+        if rows := [_to_row(cell) for cell in cells]:
             with self._current.writing() as connection:
                 connection.execute(self._database.upsert(database.cells), rows)
 
@@ -134,7 +141,7 @@ class Store:
         """Insert records; of two files with the same content the first by path counts, whatever the order."""
         # The key is the content: a copied or moved run is one result, also on two computers.
         for kind, table in database.RECORDS.items():
-            rows = [database.to_row(one) for one in records if isinstance(one, kind)]
+            rows = [_to_row(one) for one in records if isinstance(one, kind)]
             same = _paths_where(connection, table, table.c.id, [row["id"] for row in rows])
             if gone := [*forget, *(path for path in same if not Path(path).exists())]:
                 which = delete(table).where(table.c.path == bindparam("gone"))
@@ -149,19 +156,19 @@ class Store:
         query = _oldest_first(database.results)
         if tool is not None:
             query = query.where(database.results.c.tool == tool)
-        return self._read(query, database.to_result)
+        return self._read(query, _to_result)
 
     def find(self, start: str) -> list[StoredResult]:
         """Return the results whose id begins so."""
         query = select(database.results).where(database.results.c.id.startswith(start, autoescape=True))
-        return self._read(query, database.to_result)
+        return self._read(query, _to_result)
 
     def verifications(self, calibration_id: str | None = None) -> list[VerificationRecord]:
         """Return all verifications, or those of a calibration, the oldest first."""
         query = _oldest_first(database.verifications)
         if calibration_id is not None:
             query = query.where(database.verifications.c.calibration_id == calibration_id)
-        return self._read(query, database.to_verification)
+        return self._read(query, _to_verification)
 
     def last_verification(self, calibration_id: str) -> VerificationRecord | None:
         """Return the newest verification of a calibration, if there is one."""
@@ -173,15 +180,15 @@ class Store:
         query = select(table).order_by(table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id).limit(most)
         if tool is not None:
             query = query.where(table.c.tool == tool)
-        return self._read(query, database.to_weighings)[::-1]
+        return self._read(query, _to_weighings)[::-1]
 
     def last_weighings(self, since_day: str, tool: str | None = None) -> list[StoredWeighings]:
         """Return the last day with weighings of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
-        return sum_up(self._read(_last_weighings(since_day, tool), database.to_weighings))
+        return sum_up(self._read(_last_weighings(since_day, tool), _to_weighings))
 
     def cells(self) -> list[StoredCell]:
         """Return all cells by name."""
-        return sorted(self._read(select(database.cells), database.to_cell), key=lambda cell: cell.name)
+        return sorted(self._read(select(database.cells), _to_cell), key=lambda cell: cell.name)
 
     def fleet(
         self, newest: int, since: datetime
@@ -198,12 +205,12 @@ class Store:
             Verifications and weighings made then or later.
         """
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
-        checks = select(*database.CHECK).where(database.verifications.c.created_utc >= start)
+        checks = select(*_CHECK).where(database.verifications.c.created_utc >= start)
         with self._current.reading() as connection:
-            cells = _rows(connection, select(database.cells), database.to_cell)
-            results = _rows(connection, _newest_accepted(newest), database.to_result)
-            found = _rows(connection, checks, database.to_check)
-            weighings = _rows(connection, _last_weighings(start[:10]), database.to_weighings)
+            cells = _rows(connection, select(database.cells), _to_cell)
+            results = _rows(connection, _newest_accepted(newest), _to_result)
+            found = _rows(connection, checks, _to_check)
+            weighings = _rows(connection, _last_weighings(start[:10]), _to_weighings)
         cells.sort(key=lambda cell: cell.name)
         return cells, results, sorted(found, key=lambda check: check.created_utc), sum_up(weighings)
 
@@ -262,3 +269,54 @@ def _last_weighings(since_day: str, tool: str | None = None) -> Select[Any]:
         ranked = ranked.where(table.c.tool == tool)
     found = ranked.subquery()
     return select(table).where(table.c.id.in_(select(found.c.id).where(found.c.rank == 1)))
+
+
+def _to_row(record: Record | StoredCell) -> dict[str, Any]:
+    """Return a record by columns."""
+    row = record.to_store_dict() if isinstance(record, VerificationRecord) else asdict(record)
+    row |= {f"refused_{code}": number for code, number in row.pop("refusals", {}).items()}
+    for name in database.WRENCHES if isinstance(record, VerificationRecord) else ():
+        values = row.pop(name) or [None] * len(database.AXES)
+        row |= {f"{name}_{axis}": value for axis, value in zip(database.AXES, values, strict=True)}
+    return row
+
+
+def _to_result(row: Row[Any]) -> StoredResult:
+    """Return a row of `results` as a record."""
+    return StoredResult(**row._asdict())
+
+
+def _to_cell(row: Row[Any]) -> StoredCell:
+    """Return a row of `cells` as a record."""
+    return StoredCell(**row._asdict())
+
+
+def _to_verification(row: Row[Any]) -> VerificationRecord:
+    """Return a row of `verifications` as a record."""
+    values = dict(zip(_SINGLE, row, strict=False))
+    path, _, created = values.pop("path"), values.pop("run"), values.pop("created_utc")
+    return VerificationRecord(
+        path=Path(path),
+        created_utc=None if created is None else datetime.fromisoformat(created),
+        **values,
+        bias_change=_wrench(row[-18:-12]),
+        bias_change_sigma=_wrench(row[-12:-6]),
+        calibration_sigma=_wrench(row[-6:]),
+    )
+
+
+def _to_weighings(row: Row[Any]) -> StoredWeighings:
+    """Return a row of `weighings` as a record."""
+    values = row._asdict()
+    refusals = {code: values.pop(f"refused_{code}") for code in REFUSALS}
+    return StoredWeighings(**values, refusals=refusals)
+
+
+def _to_check(row: Sequence[Any]) -> BriefVerification:
+    """Return a row with the columns `CHECK` as a check."""
+    calibration_id, created_utc, passed, change, temperature_C, *bias = row
+    return BriefVerification(calibration_id, created_utc, passed, change, temperature_C, tuple(bias))
+
+
+def _wrench(values: Sequence[Any]) -> list[float] | None:
+    return None if values[0] is None else list(values)
