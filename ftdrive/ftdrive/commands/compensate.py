@@ -125,7 +125,7 @@ def _open(
 
 def _words(result: dict[str, Any], frame: str) -> Iterator[str]:
     from ftcalib.rounding import with_sigma
-    from ftdrive.runs.verification_record import MARKS
+    from ftdrive.runs.verification import MARKS
 
     yield from (f" {MARKS[mark]}" for mark in result["marks"])
     yield f" {result['samples']} samples, {result['duration_s']:.2f} s, gaps: {result['gaps']}"

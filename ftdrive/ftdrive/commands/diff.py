@@ -87,7 +87,7 @@ def _side(text: str) -> _Side:
     """Find a calibration by path or id; raises `ConfigError`."""
     from ftdrive.errors import ConfigError
     from ftdrive.runs.source import read_calibration
-    from ftdrive.runs.verification_record import EMULATED, marks_of
+    from ftdrive.runs.verification import EMULATED, marks_of
     from ftdrive.store.records import mass_sigma_kg
     from ftdrive.store.store import Store
 

@@ -159,7 +159,7 @@ def calibration(
     from ftdrive.exports import registry
     from ftdrive.exports.shared import Settings, recorded_sensor
     from ftdrive.runs.source import read_calibration
-    from ftdrive.runs.verification_record import marks_of, verification_near
+    from ftdrive.runs.verification import marks_of, verification_near
     from ftdrive.terminal.console import beside, hanging, messages
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})

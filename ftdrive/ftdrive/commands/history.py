@@ -13,7 +13,7 @@ from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
-    from ftdrive.runs.verification_record import VerificationRecord
+    from ftdrive.runs.verification import VerificationRecord
     from ftdrive.store.records import StoredResult, StoredWeighings
 
 
@@ -41,7 +41,7 @@ def history(
     Where a sensor reports its temperature, its bias is fitted against that too.
     """
     from ftdrive.errors import ConfigError
-    from ftdrive.runs.verification_record import VerificationRecord
+    from ftdrive.runs.verification import VerificationRecord
     from ftdrive.store.history import drifts, warnings
     from ftdrive.store.records import StoredResult, read_records, record_paths
 

@@ -12,7 +12,7 @@ from ftdrive.live.processing import SENSOR_FRAME
 from ftdrive.live.samples import Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.source import read_calibration
-from ftdrive.runs.verification_record import EMULATED
+from ftdrive.runs.verification import EMULATED
 from ftdrive.session.rehearsal import short_calibration, station_of
 from ftdrive.store.weighing_log import WeighingLog
 from ftdrive.terminal.console import messages

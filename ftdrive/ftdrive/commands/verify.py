@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ftdrive.cell.config import CellConfig
     from ftdrive.cell.emulated import Station
     from ftdrive.runs.run import Mode
-    from ftdrive.runs.verified import AcceptanceLimits, Verified
+    from ftdrive.runs.verification import AcceptanceLimits, Verified
     from ftdrive.session.options import SessionOptions
 
 Answer = Literal["ask", "no", "yes"]
@@ -91,7 +91,7 @@ def verify(
     update, and ends with exit code 7.
     """
     from ftdrive.errors import NotAccepted
-    from ftdrive.runs.verified import AcceptanceLimits
+    from ftdrive.runs.verification import AcceptanceLimits
     from ftdrive.session.options import SessionOptions
 
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
@@ -129,7 +129,7 @@ def verify_cell(
     from ftdrive.commands.common import start_mover
     from ftdrive.runs.run import Run
     from ftdrive.runs.source import read_calibration
-    from ftdrive.runs.verified import verify_run
+    from ftdrive.runs.verification import verify_run
     from ftdrive.session.rehearsal import describe
     from ftdrive.session.session import take_poses
     from ftdrive.session.verifying import Verifying
@@ -167,7 +167,7 @@ def _with_poses(
 ) -> tuple[Path | None, "AcceptanceLimits", "SessionOptions"]:
     """Return what is verified and how: as given, or as the run that is resumed was begun."""
     from ftdrive.runs.run import Run
-    from ftdrive.runs.verified import AcceptanceLimits
+    from ftdrive.runs.verification import AcceptanceLimits
     from ftdrive.session.verifying import POSES, QUICK_POSES
 
     quick, resume = options.fast, options.resume
@@ -188,7 +188,7 @@ def _with_poses(
 
 def _report(verified: "Verified", update: Answer, *, simulated: bool, as_json: bool) -> None:
     """Print the outcome and what to do next; save the update if it is wanted."""
-    from ftdrive.runs.verified import save_update
+    from ftdrive.runs.verification import save_update
     from ftdrive.terminal.console import answer, messages
     from ftdrive.terminal.report import print_verification
 

@@ -17,7 +17,7 @@ from ftdrive.errors import NotAccepted
 from ftdrive.exports import robots, ros
 from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, Format
 from ftdrive.exports.shared import Exported, Settings, made_by, with_header, yaml_text
-from ftdrive.runs.verification_record import MARKS, marks_of
+from ftdrive.runs.verification import MARKS, marks_of
 
 FORMAT = "ftdrive.export/1"
 

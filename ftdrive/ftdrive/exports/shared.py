@@ -23,7 +23,7 @@ from ftdrive.exports.formats import Comment
 from ftdrive.live.samples import sensor_origin_m
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification_record import VerificationRecord, marks_of
+from ftdrive.runs.verification import VerificationRecord, marks_of
 
 _FASTEST_RAD_S, _FASTEST_RAD_S2 = pi + 1e-9, radians(300) + 1e-9
 _SPELLED = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"})

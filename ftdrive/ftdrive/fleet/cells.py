@@ -23,7 +23,7 @@ import numpy as np
 from ftcalib.model import Array
 from ftdrive.cell.config import read_toml, settings
 from ftdrive.errors import ConfigError
-from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredWeighings
 from ftdrive.store.store import Store
 

@@ -8,7 +8,7 @@ from ftdrive import __version__
 from ftdrive.fleet.cells import WINDOW, BiasChanges, Observed, when
 from ftdrive.fleet.state import CellState, Fleet, attention, due_in_words, summary, verified_in_words, weighed_in_words
 from ftdrive.report.report import templates, with_code
-from ftdrive.runs.verification_record import age_in_words
+from ftdrive.runs.verification import age_in_words
 
 WIDTH, HEIGHT, MARGIN = 220, 44, 3
 # Half the height of a plot, unless the bias has changed by more.

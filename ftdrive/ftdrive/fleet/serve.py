@@ -8,7 +8,7 @@ from typing import Final, Protocol
 
 from ftdrive.errors import BadStore
 from ftdrive.fleet.state import Fleet
-from ftdrive.runs.verification_record import age_in_words
+from ftdrive.runs.verification import age_in_words
 from ftdrivers.clock import Clock
 
 # Time between two reads of the store.

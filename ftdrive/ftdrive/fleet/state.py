@@ -7,7 +7,7 @@ from typing import Any, Final, Literal
 
 from ftcalib.files import JSON
 from ftcalib.rounding import counted
-from ftdrive.runs.verification_record import age_in_words
+from ftdrive.runs.verification import age_in_words
 from ftdrive.store.records import StoredWeighings, tool_in_words
 
 

@@ -19,7 +19,7 @@ from ftcalib.model import Array, angle_between_vectors, skew
 from ftdrive.fleet.cells import BiasChanges, Observed, when
 from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding, list_names
 from ftdrive.report.document import rounded
-from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.records import BriefVerification, StoredCell, StoredResult
 from ftdrive.store.store import Store
 

@@ -16,7 +16,7 @@ from ftcalib.model import skew
 from ftcalib.motion.model import HEIGHT
 from ftcalib.rounding import with_sigma
 from ftdrive.errors import ConfigError
-from ftdrive.runs.verification_record import VerificationRecord, marks_of
+from ftdrive.runs.verification import VerificationRecord, marks_of
 from ftdrivers.interfaces import Array, Columns, DeviceInfo
 
 Axes = Literal["sensor", "flange", "base", "tcp"]
@@ -299,7 +299,7 @@ class StreamInfo:
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """What every output says of the cell and the calibration, see `ftdrive.runs.verification_record.MARKS`."""
+        """What every output says of the cell and the calibration, see `ftdrive.runs.verification.MARKS`."""
         return marks_of(self.calibration, emulated=self.emulated, foreign=self.foreign)
 
 

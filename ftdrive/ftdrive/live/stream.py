@@ -45,7 +45,7 @@ from ftdrive.live.samples import (
 )
 from ftdrive.live.stages import TARE_S, try_tare
 from ftdrive.runs.run import versions
-from ftdrive.runs.verification_record import VerificationRecord, calibration_in_words, marks_of, verification_near
+from ftdrive.runs.verification import VerificationRecord, calibration_in_words, marks_of, verification_near
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow

@@ -28,7 +28,7 @@ from ftdrive.live.samples import (
     quaternions,
     sensor_origin_m,
 )
-from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.runs.verification import VerificationRecord
 from ftdrivers.interfaces import DeviceInfo, Fact
 
 T = TypeVar("T")

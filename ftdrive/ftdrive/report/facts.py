@@ -21,7 +21,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.report.subject import Subject
 from ftdrive.runs.pose_hints import hints, names_of
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification_record import MARKS, marks_of
+from ftdrive.runs.verification import MARKS, marks_of
 from ftdrive.terminal.report import drift_in_use, drift_in_words, error_in_words
 
 NAMES = {

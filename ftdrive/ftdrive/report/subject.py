@@ -15,7 +15,7 @@ from ftcalib.routine import PoseRecord
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import SolveOptions, read_source, solve_in_motion
-from ftdrive.runs.verification_record import VerificationRecord, age_of, newest, verification_near
+from ftdrive.runs.verification import VerificationRecord, age_of, newest, verification_near
 
 
 def trust(

@@ -8,7 +8,7 @@ motion/1.npz ...  the same in parts, each on disk within seconds, of a recording
 poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on; 01-2.npz took its place
 dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after poses were added or taken again
 calibration.json  ftdrive.calibration/1: the result; calibration-2.json likewise. Of a verification: the accepted update
-verification.json ftdrive.verification/1: the outcome of a verification; see `ftdrive.runs.verified`
+verification.json ftdrive.verification/1: the outcome of a verification; see `ftdrive.runs.verification`
 solved-0.1.0.json ftdrive.calibration/1: the result of a later version; see `ftdrive.fleet.resolve`
 lock              which process adds poses, or did so last
 

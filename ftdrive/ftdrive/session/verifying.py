@@ -20,7 +20,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_verification
 from ftdrive.planning.search.nodes import WRIST_6_RAD
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification_record import fitted_dataset
+from ftdrive.runs.verification import fitted_dataset
 from ftdrive.session.events import Compared
 from ftdrive.session.live_fit import Judge
 from ftdrive.session.task import from_usual_wrist

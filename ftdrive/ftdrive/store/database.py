@@ -34,7 +34,7 @@ from sqlalchemy import (
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import REFUSALS
 from ftdrive.store.records import (
     Record,

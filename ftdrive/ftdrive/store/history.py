@@ -5,7 +5,7 @@ from datetime import datetime
 from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
-from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.records import StoredResult
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_file, read_object
-from ftdrive.runs.verification_record import EMULATED, FORMAT, VerificationRecord, marks_of
+from ftdrive.runs.verification import EMULATED, FORMAT, VerificationRecord, marks_of
 from ftdrive.runs.weighings import FILES, FOLDER, WeighingsFile, is_weighings
 
 # A list of results needs no numpy.

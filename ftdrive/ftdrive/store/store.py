@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
 
-from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import REFUSALS, is_weighings
 from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths

@@ -10,7 +10,7 @@ import numpy as np
 from ftcalib.after.series import FEWEST_ESTIMATES, BiasTemperature, Trend, bias_temperature, trend
 from ftcalib.model import BIASES, PARAMETER_NAMES, Array
 from ftcalib.rounding import with_sigma
-from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.records import StoredResult
 
 # Largest p-value of a trend that counts.

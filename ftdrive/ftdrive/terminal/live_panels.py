@@ -15,7 +15,7 @@ from ftdrive.checks.sensor import AXES, check_rate
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import FrameTransform, LinkStatus, Stages, StreamInfo, WrenchFrame
-from ftdrive.runs.verification_record import EMULATED, age_in_words
+from ftdrive.runs.verification import EMULATED, age_in_words
 from ftdrive.terminal.lines import (
     BAD,
     CONTACT,

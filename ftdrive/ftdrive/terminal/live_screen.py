@@ -24,7 +24,7 @@ from ftdrive.checks.check import Check
 from ftdrive.checks.sensor import AXES
 from ftdrive.live.samples import Sink
 from ftdrive.live.stream import ProcessedStream
-from ftdrive.runs.verification_record import fitted_dataset
+from ftdrive.runs.verification import fitted_dataset
 from ftdrive.terminal import live_panels
 from ftdrive.terminal.closable_app import REFRESH_S, ClosableApp
 from ftdrive.terminal.console import messages

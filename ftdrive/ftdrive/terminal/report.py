@@ -14,7 +14,7 @@ from ftcalib.compare import MethodResult
 from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftdrive.runs.pose_hints import find_moved, hints, names_of
-from ftdrive.runs.verified import FALSE_ALARMS, Verified
+from ftdrive.runs.verification import FALSE_ALARMS, Verified
 from ftdrive.terminal.console import answer, hanging, messages
 from ftdrivers.interfaces import Array
 

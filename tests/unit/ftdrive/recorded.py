@@ -11,7 +11,7 @@ from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
 from ftcalib.model import predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftdrive.live.samples import Block, Stages, StreamInfo, WrenchFrame
-from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.runs.verification import VerificationRecord
 from ftdrivers.interfaces import DeviceInfo, Fact
 
 TRUTH = Parameters(

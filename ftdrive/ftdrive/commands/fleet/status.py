@@ -69,7 +69,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
 
 def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
     from ftdrive.fleet.state import due_in_words, verified_in_words, weighed_in_words
-    from ftdrive.runs.verification_record import age_in_words
+    from ftdrive.runs.verification import age_in_words
 
     drift = "-"
     if one.drift is not None:

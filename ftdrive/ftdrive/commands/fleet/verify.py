@@ -99,7 +99,7 @@ def _is_due(one: "StoredCell", fleet: "Fleet", now: datetime) -> bool:
 
 def _verify(one: "StoredCell", store: "Store", url: str | None, fleet: "Fleet") -> tuple[str, str]:
     """Ask at a cell and verify it; return the outcome and why. Raises as `verify_cell`."""
-    from ftdrive.runs.verified import AcceptanceLimits
+    from ftdrive.runs.verification import AcceptanceLimits
     from ftdrive.session.options import SessionOptions
     from ftdrive.session.verifying import POSES
 

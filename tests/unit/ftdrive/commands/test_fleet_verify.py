@@ -14,7 +14,7 @@ import pytest
 from ftdrive import cli
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import Declined
-from ftdrive.runs.verified import AcceptanceLimits
+from ftdrive.runs.verification import AcceptanceLimits
 from ftdrive.session.events import Question
 from ftdrive.store.records import StoredCell
 from ftdrive.store.store import Store

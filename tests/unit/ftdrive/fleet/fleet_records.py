@@ -13,7 +13,7 @@ from ftcalib.model import Array
 from ftdrive.fleet.cells import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
-from ftdrive.runs.verification_record import VerificationRecord, newest
+from ftdrive.runs.verification import VerificationRecord, newest
 from ftdrive.runs.weighings import REFUSALS
 from ftdrive.store.records import (
     BriefVerification,

@@ -20,7 +20,7 @@ from ftdrive.live.contact import Contact
 from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.source import read_calibration
-from ftdrive.runs.verification_record import FOREIGN
+from ftdrive.runs.verification import FOREIGN
 from ftdrive.store import tools as named_tools
 from ftdrive.store.tools import Tool
 from ftdrivers.errors import DeviceError, DeviceTimeout

@@ -18,8 +18,7 @@ from ftcalib.routine import PoseRecord
 from ftdrive.errors import ConfigError
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Reading, Run
-from ftdrive.runs.verification_record import last_verification
-from ftdrive.runs.verified import AcceptanceLimits, Verified, save_update, verify_run
+from ftdrive.runs.verification import AcceptanceLimits, Verified, last_verification, save_update, verify_run
 from ftdrive.session.along_plan import has_completed
 from ftdrive.session.events import Checked, Compared, Noted, PoseTaken, RunOpened, State
 from ftdrive.session.options import SessionOptions

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftcalib.model import BIASES, Array
-from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.history import age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.trends import QuantityTrend, temperatures

@@ -21,7 +21,7 @@ from ftdrive.live.samples import (
     StreamStatus,
     WrenchFrame,
 )
-from ftdrive.runs.verification_record import VerificationRecord
+from ftdrive.runs.verification import VerificationRecord
 from ftdrivers.clock import REAL
 from ftdrivers.errors import DeviceTimeout
 from ftdrivers.interfaces import Array, DeviceInfo, Fact

@@ -7,7 +7,7 @@ import pytest
 
 from ftcalib.model import Array
 from ftdrive.live.samples import Stages, WrenchFrame
-from ftdrive.runs.verification_record import FOREIGN
+from ftdrive.runs.verification import FOREIGN
 from ftdrive.terminal import live_panels
 from ftdrive.terminal.lines import BAD, GOOD, WARNING, Line
 from ftdrive.terminal.live_feed import Note

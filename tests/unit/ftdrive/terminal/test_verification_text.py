@@ -9,7 +9,7 @@ import pytest
 
 from ftcalib.after.expected_readings import BiasChange
 from ftcalib.after.verification import Verification
-from ftdrive.runs.verified import AcceptanceLimits
+from ftdrive.runs.verification import AcceptanceLimits
 from ftdrive.terminal import report
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.report import print_verification

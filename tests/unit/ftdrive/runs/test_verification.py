@@ -11,7 +11,7 @@ import pytest
 
 from ftcalib import CalibrationDataset, CalibrationResult
 from ftcalib.errors import BadCalibration
-from ftdrive.runs.verification_record import (
+from ftdrive.runs.verification import (
     FORMAT,
     VerificationRecord,
     age_in_words,
