@@ -13,7 +13,7 @@ from scipy.special import ndtri
 from ftcalib.after.new_tool import WHOLE, CellPrior
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
-from ftcalib.model import Array, Parameters, angle_between, nearest_rotation
+from ftcalib.model import Array, DriftResult, Parameters, angle_between, nearest_rotation
 from ftcalib.motion.model import (
     CROSS_TALK,
     DELAY,
@@ -89,10 +89,8 @@ class MotionFit:
     """(n, 6) of a row's noise."""
     distance: Array
     """(n,) squared, of each residual from 0: chi2 with 6 degrees of freedom without contact."""
-    drift: Array
-    """(n, 6) bias of each row minus that of the load."""
-    drift_change: tuple[Array, Array] | None
-    """(6,) from the first row to the last, and its sigma."""
+    drift: DriftResult | None
+    """From the first row to the last, with the course of the bias minus that of the load; None without a walk."""
     components: Mapping[str, float] = field(default_factory=dict)
     second_basin_chi2: float | None = None
     chi2: float = 0.0
@@ -362,13 +360,14 @@ def fit(
             there = problem.sums(other, drift, noise, kept, state)
             # What one linear step would leave at the other mounting, less the chi2 of this one.
             others.append(there[2] - float(there[1] @ problem.solve(sizes, there, other, drift).step) - chi2)
-    change = None
+    walk = None
     if sizes.get("walk_N") or sizes.get("walk_Nm"):
         ends = np.zeros((6, SIZE + 6 * len(problem.knots)))
         ends[:, -6:] += np.eye(6)
         ends[:, SIZE : SIZE + 6] -= np.eye(6)
         ends = ends @ block_diag(np.eye(SIZE), problem.centred)
-        change = drift[-1] - drift[0], np.sqrt(np.einsum("ij,jk,ik->i", ends, solved.covariance, ends))
+        sigma = np.sqrt(np.einsum("ij,jk,ik->i", ends, solved.covariance, ends))
+        walk = DriftResult(drift[-1] - drift[0], sigma, problem.hats(rows.t_s) @ drift)
     return MotionFit(
         load=load,
         covariance=solved.covariance[:SIZE, :SIZE],
@@ -376,8 +375,7 @@ def fit(
         residuals=r,
         sigma=noise.scale[state],
         distance=distance,
-        drift=problem.hats(rows.t_s) @ drift,
-        drift_change=change,
+        drift=walk,
         components={name: size for name, size in sizes.items() if 0 < size < np.inf},
         second_basin_chi2=max(min(others), 0.0) if others else None,
         chi2=chi2,

@@ -16,7 +16,7 @@ from ftcalib.judge.observability import assess
 from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, expected_error, judge
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.response import Response
-from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, DriftResult, nearest_rotation, predict
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, rough_delay
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
 from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, rows_of
@@ -147,7 +147,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         findings=ordered(findings),
         provenance={**(provenance or {}), **({} if earlier is None else {"parent": {"id": earlier.id}})},
         components=best.components,
-        drift=None if best.drift_change is None else DriftResult(*best.drift_change),
+        drift=None if best.drift is None else replace(best.drift, course=None),
         response=response,
         gain_sigma=best.components.get("gain", 0.0 if earlier is None else earlier.gain_sigma),
         second_basin_chi2=best.second_basin_chi2,

@@ -239,18 +239,19 @@ def test_a_walk_of_the_bias_is_found() -> None:
     walk = np.cumsum(steps, axis=0) * np.repeat([0.3, 0.012], 3)
     found = fit(replace(rows, wrench=rows.wrench + walk), None, G)
     assert 0.1 < found.components["walk_N"] < 0.5
-    assert found.drift_change is not None
-    change, sigma = found.drift_change
-    np.testing.assert_allclose(found.drift[-1] - found.drift[0], change)
+    assert found.drift is not None
+    change, sigma, course = found.drift.change, found.drift.sigma, found.drift.course
+    assert course is not None
+    np.testing.assert_allclose(course[-1] - course[0], change)
     assert np.abs((change - walk[-1] + walk[0]) / sigma).max() < 4
     assert (sigma < 3 * np.repeat([0.3, 0.012], 3) * np.sqrt(200 * ROW_S)).all()
-    assert np.corrcoef(found.drift[:, 2], walk[:, 2])[0, 1] > 0.9
+    assert np.corrcoef(course[:, 2], walk[:, 2])[0, 1] > 0.9
 
 
 def test_another_mounting_costs_what_its_own_fit_does() -> None:
     rows = rows_of(100, load_of(Truth()), seed=5, turn_rad=0.6, sigma=20 * SIGMA)
     found = fit(rows, None, G)
-    assert found.drift_change is None
+    assert found.drift is None
     assert found.kept.all()
     np.testing.assert_allclose(found.sigma, np.tile(20 * SIGMA, (100, 1)), rtol=0.2)
     assert found.distance.mean() == pytest.approx(6, rel=0.1)
