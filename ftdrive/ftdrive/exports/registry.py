@@ -1,7 +1,7 @@
 """The function of each target, the complete JSON and YAML, and how far a target is from the calibration."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from math import degrees
 
@@ -15,9 +15,9 @@ from ftcalib.model import Array, angle_between, angle_between_vectors, nearest_r
 from ftdrive import __version__
 from ftdrive.errors import NotAccepted
 from ftdrive.exports import robots, ros
-from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, Format
-from ftdrive.exports.shared import Exported, Settings, made_by, with_header, yaml_text
-from ftdrive.runs.verification import MARKS, marks_of
+from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, Comment, Format
+from ftdrive.exports.shared import Exported, Settings, plain, yaml_text
+from ftdrive.runs.verification import MARKS, VerificationRecord, marks_of
 
 FORMAT = "ftdrive.export/1"
 
@@ -176,8 +176,8 @@ def export(
             notes.insert(0, f"{words}.")
     notes[:0] = [MARKS[mark] for mark in marks_of(calibration)]
     notes += [f"Also set {place} = {_describe_value(value)}." for place, value in exported.elsewhere.items()]
-    origin = made_by(calibration, settings.verification)
-    text = with_header(exported.text, target.comment, [origin, target.description, *notes])
+    origin = _made_by(calibration, settings.verification)
+    text = _with_header(exported.text, target.comment, [origin, target.description, *notes])
     return Exported(text, tuple(notes), exported.elsewhere, force_N, torque_Nm)
 
 
@@ -209,3 +209,27 @@ def _describe_value(value: JSON) -> str:
     if isinstance(value, list):
         return f"[{', '.join(map(_describe_value, value))}]"
     return str(value)  # of a float every digit
+
+
+def _made_by(calibration: CalibrationResult, verification: VerificationRecord | None) -> str:
+    """Say which calibration this is, when it was made and last verified, and by which version."""
+    made = calibration.provenance.get("created_utc")
+    date = made if isinstance(made, str) else "at an unknown time"
+    verified = "not verified"
+    if verification is not None:
+        verified = "last verified" if verification.passed else "VERIFICATION FAILED"
+        verified += f" {verification.to_dict()['created_utc']}"
+    marks = "".join(f"{mark} " for mark in marks_of(calibration))
+    return f"{marks}ftdrive calibration {calibration.id}, made {date}, {verified}; made by ftdrive {__version__}"
+
+
+def _with_header(text: str, comment: Comment, lines: Iterable[str]) -> str:
+    """Add comment lines, reduced to printable ASCII."""
+    clean = [plain(line) for line in lines]
+    if comment == "none":
+        return text
+    if comment == "<!-- -->":
+        inside = "\n".join(f"  {line.replace('--', '- -')}" for line in clean)
+        return f"<!--\n{inside}\n-->\n{text}"
+    head = "".join(f"# {line}\n" for line in clean)
+    return text + head if comment == "# at the end" else head + text

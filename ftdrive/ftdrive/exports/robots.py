@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 
 from ftcalib import CalibrationResult
+from ftcalib.model import Array
 from ftdrive.exports.shared import (
     Exported,
     R_frame_sensor,
@@ -12,12 +13,9 @@ from ftdrive.exports.shared import (
     gravity_in_frame_m_s2,
     gravity_m_s2,
     inertia_kg_m2,
-    inertia_note,
     numbers,
-    payload_inertia_kg_m2,
     quaternion_xyzw,
     rpy_rad,
-    world_note,
     yaml_text,
 )
 
@@ -118,13 +116,13 @@ def ur_payload(calibration: CalibrationResult, settings: Settings) -> Exported:
     """
     mass_kg, com_m = settings.payload("ur-payload", calibration)
     cog = ", ".join(_fixed(x) for x in com_m)
-    J = payload_inertia_kg_m2(calibration, mass_kg, np.asarray(com_m), settings.p_flange_sensor_m("ur-payload"))
+    J = _payload_inertia_kg_m2(calibration, mass_kg, np.asarray(com_m), settings.p_flange_sensor_m("ur-payload"))
     inertia = "0, 0, 0, 0, 0, 0" if J is None else ", ".join(map(_fixed, J[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]))
     text = f"set_target_payload({_fixed(mass_kg)}, [{cog}], [{inertia}])\n"
     notes = (
         *settings.assumed,
         "The controller zeroes its own force sensor when this runs: keep the tool free and the arm still.",
-        f"{inertia_note(calibration)} Needs PolyScope 5.10; set_payload before that.",
+        f"{_inertia_note(calibration)} Needs PolyScope 5.10; set_payload before that.",
         "The payload has no bias. How the controller uses it is not public: compare get_tcp_force() without contact in "
         "two poses.",
         "set_gravity takes the acceleration away from the earth, in base axes. The mounting in PolyScope sets it too.",
@@ -169,10 +167,10 @@ def urdf(calibration: CalibrationResult, settings: Settings) -> Exported:
     _fix(robot, settings.sensor_frame, settings.tool_frame, [0.0] * 3, [0.0] * 3)
     ET.indent(robot)
     notes = (
-        inertia_note(calibration),
+        _inertia_note(calibration),
         f"Leave out the link {settings.flange_frame} if your robot has it.",
         "The mass of the sensor itself is not in it, nor its bias.",
-        world_note(settings),
+        _world_note(settings),
     )
     elsewhere = {"gravity of the simulation": numbers(gravity_in_frame_m_s2(calibration, settings))}
     return Exported(ET.tostring(robot, encoding="unicode") + "\n", notes, elsewhere)
@@ -223,9 +221,9 @@ def mujoco(calibration: CalibrationResult, settings: Settings) -> Exported:
         f"Attach the body {settings.tool_frame} to {settings.flange_frame}. A simulated sensor has no bias.",
         "Plain MuJoCo sensors have the opposite sign: negate sensordata, as the hardware interface of "
         "mujoco_ros2_control does, to get the wrench on the sensor.",
-        f"{inertia_note(calibration)} The mass of the sensor itself is not in it.",
+        f"{_inertia_note(calibration)} The mass of the sensor itself is not in it.",
         "The plugin FtsGravCompPlugin needs a mujoco_ros2_control newer than 0.1.2 (pull request 308, September 2026).",
-        world_note(settings),
+        _world_note(settings),
     )
     elsewhere = {"option gravity": numbers(gravity_in_frame_m_s2(calibration, settings))}
     return Exported(ET.tostring(root, encoding="unicode") + "\n", notes, elsewhere)
@@ -240,3 +238,41 @@ def _fix(robot: ET.Element, parent: str, child: str, xyz: list[float], rpy: list
 
 def _words(values: list[float]) -> str:
     return " ".join(repr(value) for value in numbers(values))
+
+
+def _world_note(settings: Settings) -> str:
+    """Say in which axes gravity is, for simulations."""
+    return f"Gravity is in axes of {settings.base_frame}, {settings.base_axes}: turn it if those of the world differ."
+
+
+def _payload_inertia_kg_m2(
+    calibration: CalibrationResult, mass_kg: float, p_flange_com_m: Array, p_flange_sensor_m: Array
+) -> Array | None:
+    """Return the inertia (3, 3) of all that the flange carries, about its centre of mass, flange axes; None as above.
+
+    The sensor itself counts as a point at its centre of mass.
+    """
+    J = inertia_kg_m2(calibration)
+    if J is None:
+        return None
+    Q, tool_kg = calibration.R_flange_sensor, calibration.mass_kg
+    tool_m = p_flange_sensor_m + Q @ calibration.p_sensor_com_m - p_flange_com_m
+    total, sensor_kg = Q @ J @ Q.T + tool_kg * _steiner(tool_m), mass_kg - tool_kg
+    if sensor_kg > 0:
+        total += sensor_kg * _steiner(-tool_kg / sensor_kg * tool_m)
+    return np.asarray(total)
+
+
+def _inertia_note(calibration: CalibrationResult) -> str:
+    """Say whether the inertia was identified."""
+    motion = calibration.motion
+    if motion is None or inertia_kg_m2(calibration) is None:
+        why = "" if motion is None else " well enough"
+        return f"The inertia was not identified{why}: zeros stand for a point mass. Take the values of a CAD model."
+    sigma = 1e3 * float(np.sqrt(np.diag(motion.covariance)[15:21].max()))
+    return f"The inertia was identified from motion, with a sigma of {sigma:.2g} g·m2 at most."
+
+
+def _steiner(p_m: Array) -> Array:
+    """Inertia per mass (3, 3) of a point about the origin."""
+    return np.asarray(p_m @ p_m * np.eye(3) - np.outer(p_m, p_m))

@@ -9,10 +9,10 @@ from ftdrive.exports.shared import (
     Exported,
     R_frame_sensor,
     Settings,
-    frame_note,
     gravity_in_frame_m_s2,
     numbers,
     quaternion_xyzw,
+    rpy_rad,
     xyz,
     yaml_text,
 )
@@ -38,7 +38,7 @@ def kth(calibration: CalibrationResult, settings: Settings) -> Exported:
     notes = (
         "The node waits for an IMU. Without one, publish sensor_msgs/Imu with the acceleration below, more than 10 "
         "times a second. Versions before May 2021 need it with the opposite sign.",
-        frame_note(calibration, settings),
+        _frame_note(calibration, settings),
     )
     elsewhere = {
         "imu header.frame_id": settings.base_frame,
@@ -85,7 +85,7 @@ def kit(calibration: CalibrationResult, settings: Settings) -> Exported:
     notes = (
         "Some versions of force_torque_sensor_handle.cpp assign torque offsets y and z to x: search it for "
         "m_calibOffset.torque.y before use.",
-        frame_note(calibration, settings),
+        _frame_note(calibration, settings),
     )
     return Exported(yaml_text(document), notes)
 
@@ -105,7 +105,7 @@ def code_iai(calibration: CalibrationResult, settings: Settings) -> Exported:
     }
     notes = (
         "Topics that end in _zeroed have bias and weight subtracted, those that end in _clean only the bias.",
-        frame_note(calibration, settings),
+        _frame_note(calibration, settings),
     )
     elsewhere = {
         "gravity_publisher fixed_frame": settings.base_frame,
@@ -135,7 +135,7 @@ def ft_tools(calibration: CalibrationResult, settings: Settings) -> Exported:
         "force_offset": numbers(calibration.force_bias_N),
         "torque_offset": numbers(calibration.torque_bias_Nm),
     }
-    return Exported(yaml_text(document), (frame_note(calibration, settings),), _ft_estimation(calibration, settings))
+    return Exported(yaml_text(document), (_frame_note(calibration, settings),), _ft_estimation(calibration, settings))
 
 
 def ros2_message(calibration: CalibrationResult, settings: Settings) -> Exported:
@@ -152,7 +152,7 @@ def ros2_message(calibration: CalibrationResult, settings: Settings) -> Exported
     }
     notes = (
         "The request of the service ft_estimation_node/set_calibration has it in the field ft_calibration.",
-        frame_note(calibration, settings),
+        _frame_note(calibration, settings),
     )
     return Exported(yaml_text(document), notes, _ft_estimation(calibration, settings))
 
@@ -189,7 +189,7 @@ def calaw(calibration: CalibrationResult, settings: Settings) -> Exported:
         f"mass is weight / {CALAW_G_M_S2:g} m/s2, because the node multiplies it by {CALAW_G_M_S2:g}.",
         "The node does not read the file. Copy the ten numbers below into ft_compensation_node.py. The frames of "
         "gravity (world) and sensor are fixed there too.",
-        frame_note(calibration, settings),
+        _frame_note(calibration, settings),
     )
     ten = [-mass_kg, *(value for vector in vectors.values() for value in vector)]
     return Exported(yaml_text({"mass": -mass_kg, **vectors}), notes, {"calib_params": ten})
@@ -229,7 +229,7 @@ def ros2_control(calibration: CalibrationResult, settings: Settings) -> Exported
     notes = (
         "offset is minus the bias, because the broadcaster adds it.",
         "sensor_filter_chain needs ros2_controllers of September 2025 or newer; Humble has neither it nor offset.",
-        frame_note(calibration, settings),
+        _frame_note(calibration, settings),
     )
     return Exported(yaml_text({"force_torque_sensor_broadcaster": {"ros__parameters": parameters}}), notes)
 
@@ -257,7 +257,7 @@ def admittance(calibration: CalibrationResult, settings: Settings) -> Exported:
         f"The controller subtracts no bias: subtract [{bias}] (N, N·m) where the hardware interface reads the sensor.",
         "If your version has the parameter sensor_filter_chain in place of gravity_compensation, copy the filter of "
         "the format ros2-control.",
-        frame_note(calibration, settings),
+        _frame_note(calibration, settings),
     )
     return Exported(yaml_text({"admittance_controller": {"ros__parameters": parameters}}), notes)
 
@@ -276,3 +276,14 @@ def static_transform(calibration: CalibrationResult, settings: Settings) -> Expo
     words += [word for name, value in values.items() for word in (f"--{name}", repr(value))]
     words += [word for name, frame in frames.items() for word in (f"--{name}", shlex.quote(frame))]
     return Exported(" ".join(words) + "\n", ("It has the place of the sensor only, no bias and no weight.",))
+
+
+def _frame_note(calibration: CalibrationResult, settings: Settings) -> str:
+    """Say how the robot model must turn the sensor frame, for targets that look it up there."""
+    # A target that looks up frames trusts the robot model, so the note has the angles that it must have.
+    rpy = ", ".join(str(angle) for angle in rpy_rad(R_frame_sensor(calibration, settings)))
+    return (
+        f"The robot model must turn {settings.sensor_frame} against {settings.flange_frame} by roll, pitch, yaw = "
+        f"({rpy}) rad: the formats urdf and static-transform write it. {settings.base_frame} must have the axes of "
+        f"{settings.base_axes}."
+    )

@@ -2,9 +2,8 @@
 
 import re
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import pi, radians
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +15,12 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationResult
 from ftcalib.files import JSON
 from ftcalib.model import Array
-from ftdrive import __version__
 from ftdrive.checks.flange_load import flange_load
-from ftdrive.errors import ConfigError, PlanRefused
-from ftdrive.exports.formats import Comment
+from ftdrive.errors import ConfigError
 from ftdrive.live.samples import sensor_origin_m
-from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import VerificationRecord, marks_of
+from ftdrive.runs.verification import VerificationRecord
 
-_FASTEST_RAD_S, _FASTEST_RAD_S2 = pi + 1e-9, radians(300) + 1e-9
 _SPELLED = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"})
 
 
@@ -127,28 +122,6 @@ class Settings:
         )
 
 
-def require_usable(plan: Plan) -> None:
-    """Raise `PlanRefused` for sweeps, placeholders, moves that are not proven clear, and values no arm can follow."""
-    # The text of an export carries no verdict, so a rejected calibration is not exported.
-    if plan.sweep is not None:
-        raise PlanRefused("this plan is a sweep, which no other program can follow: export the plan of a tour")
-    if not plan.measured:
-        raise PlanRefused(
-            "tool, planes and boxes of this plan are not marked as measured: "
-            "measure them, set measured = true in [workcell], and make a new plan"
-        )
-    if not plan.certified:
-        raise PlanRefused("a move of the plan is not proven clear: it is not exported")
-    angles = [angle for step in plan.steps for angle in step.q_rad]
-    if (
-        any(len(step.q_rad) != 6 for step in plan.steps)
-        or not all(abs(angle) <= 2 * pi + 1e-9 for angle in angles)
-        or not all(0 < step.speed_rad_s <= _FASTEST_RAD_S for step in plan.steps)
-        or not 0 < plan.acceleration_rad_s2 <= _FASTEST_RAD_S2
-    ):
-        raise PlanRefused("the plan holds a joint angle, speed or acceleration that no arm can follow: make a new plan")
-
-
 def plain(text: str) -> str:
     """Reduce a text to printable ASCII without quotes and backslashes, because URScript strings have no escapes."""
     return "".join(c if " " <= c <= "~" and c not in "\"'\\" else "?" for c in text.translate(_SPELLED))
@@ -184,30 +157,6 @@ def yaml_text(document: Mapping[str, Any] | list[float]) -> str:
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10**6)
 
 
-def made_by(calibration: CalibrationResult, verification: VerificationRecord | None) -> str:
-    """Say which calibration this is, when it was made and last verified, and by which version."""
-    made = calibration.provenance.get("created_utc")
-    date = made if isinstance(made, str) else "at an unknown time"
-    verified = "not verified"
-    if verification is not None:
-        verified = "last verified" if verification.passed else "VERIFICATION FAILED"
-        verified += f" {verification.to_dict()['created_utc']}"
-    marks = "".join(f"{mark} " for mark in marks_of(calibration))
-    return f"{marks}ftdrive calibration {calibration.id}, made {date}, {verified}; made by ftdrive {__version__}"
-
-
-def with_header(text: str, comment: Comment, lines: Iterable[str]) -> str:
-    """Add comment lines, reduced to printable ASCII."""
-    clean = [plain(line) for line in lines]
-    if comment == "none":
-        return text
-    if comment == "<!-- -->":
-        inside = "\n".join(f"  {line.replace('--', '- -')}" for line in clean)
-        return f"<!--\n{inside}\n-->\n{text}"
-    head = "".join(f"# {line}\n" for line in clean)
-    return text + head if comment == "# at the end" else head + text
-
-
 def gravity_m_s2(calibration: CalibrationResult) -> Array:
     """Return gravity (3,) in axes of the controller's base, pointing down, m/s²; along -z if nothing hangs."""
     if calibration.mass_kg == 0.0:
@@ -238,22 +187,6 @@ def quaternion_xyzw(R: Array) -> list[float]:
     return numbers(Rotation.from_matrix(R).as_quat(canonical=True))
 
 
-def world_note(settings: Settings) -> str:
-    """Say in which axes gravity is, for simulations."""
-    return f"Gravity is in axes of {settings.base_frame}, {settings.base_axes}: turn it if those of the world differ."
-
-
-def frame_note(calibration: CalibrationResult, settings: Settings) -> str:
-    """Say how the robot model must turn the sensor frame, for targets that look it up there."""
-    # A target that looks up frames trusts the robot model, so the note has the angles that it must have.
-    rpy = ", ".join(str(angle) for angle in rpy_rad(R_frame_sensor(calibration, settings)))
-    return (
-        f"The robot model must turn {settings.sensor_frame} against {settings.flange_frame} by roll, pitch, yaw = "
-        f"({rpy}) rad: the formats urdf and static-transform write it. {settings.base_frame} must have the axes of "
-        f"{settings.base_axes}."
-    )
-
-
 def inertia_kg_m2(calibration: CalibrationResult) -> Array | None:
     """Return the inertia (3, 3) about the centre of mass, sensor axes; None if motion did not identify one of a body.
 
@@ -264,39 +197,6 @@ def inertia_kg_m2(calibration: CalibrationResult) -> Array | None:
     J = calibration.motion.inertia_kg_m2
     low, middle, high = np.linalg.eigvalsh(J)
     return J if low > 0 and high <= low + middle else None
-
-
-def payload_inertia_kg_m2(
-    calibration: CalibrationResult, mass_kg: float, p_flange_com_m: Array, p_flange_sensor_m: Array
-) -> Array | None:
-    """Return the inertia (3, 3) of all that the flange carries, about its centre of mass, flange axes; None as above.
-
-    The sensor itself counts as a point at its centre of mass.
-    """
-    J = inertia_kg_m2(calibration)
-    if J is None:
-        return None
-    Q, tool_kg = calibration.R_flange_sensor, calibration.mass_kg
-    tool_m = p_flange_sensor_m + Q @ calibration.p_sensor_com_m - p_flange_com_m
-    total, sensor_kg = Q @ J @ Q.T + tool_kg * _steiner(tool_m), mass_kg - tool_kg
-    if sensor_kg > 0:
-        total += sensor_kg * _steiner(-tool_kg / sensor_kg * tool_m)
-    return np.asarray(total)
-
-
-def _steiner(p_m: Array) -> Array:
-    """Inertia per mass (3, 3) of a point about the origin."""
-    return np.asarray(p_m @ p_m * np.eye(3) - np.outer(p_m, p_m))
-
-
-def inertia_note(calibration: CalibrationResult) -> str:
-    """Say whether the inertia was identified."""
-    motion = calibration.motion
-    if motion is None or inertia_kg_m2(calibration) is None:
-        why = "" if motion is None else " well enough"
-        return f"The inertia was not identified{why}: zeros stand for a point mass. Take the values of a CAD model."
-    sigma = 1e3 * float(np.sqrt(np.diag(motion.covariance)[15:21].max()))
-    return f"The inertia was identified from motion, with a sigma of {sigma:.2g} g·m2 at most."
 
 
 def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float | None, float | None]:

@@ -5,10 +5,11 @@ Checked on hardware: no.
 """
 
 from collections.abc import Iterator
-from math import degrees, radians
+from math import degrees, pi, radians
 from typing import Any
 
-from ftdrive.exports.shared import plain, require_usable
+from ftdrive.errors import PlanRefused
+from ftdrive.exports.shared import plain
 from ftdrive.planning.approach import NEAR_RAD
 from ftdrive.planning.geometry.scene import MOUNTINGS
 from ftdrive.planning.plan import Plan
@@ -16,6 +17,7 @@ from ftdrive.planning.words import point_in_words, room_in_words
 
 FORMAT = "ftdrive.targets/1"
 COLUMNS = "pose,orientation,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,speed_rad_s,acceleration_rad_s2,clearance_m"
+_FASTEST_RAD_S, _FASTEST_RAD_S2 = pi + 1e-9, radians(300) + 1e-9
 
 
 def table(plan: Plan) -> str:
@@ -23,7 +25,7 @@ def table(plan: Plan) -> str:
 
     The first line is a comment with the format, the plan's hash, the model, and whether the cell was emulated.
     """
-    require_usable(plan)
+    _require_usable(plan)
     lines = [f"# {FORMAT} plan {plan.to_dict()['sha256']} {plain(plan.description['model'])}{_emulated(plan)}", COLUMNS]
     for i, step in enumerate(plan.steps, start=1):
         numbers = (*step.q_rad, step.speed_rad_s, plan.acceleration_rad_s2, step.clearance_m)
@@ -51,7 +53,7 @@ def program(plan: Plan, *, dwell_s: float) -> str:
     PlanRefused
         A move is not proven clear, or no arm can follow a value in the plan.
     """
-    require_usable(plan)
+    _require_usable(plan)
     return "".join(
         f"{line}\n"
         for line in ("def ftdrive_tour():", *(f"  {line}" if line else "" for line in _body(plan, dwell_s)), "end")
@@ -162,3 +164,25 @@ def _cylinder(part: dict[str, Any]) -> str:
     mm = {name: f"{1e3 * float(value):.1f}" for name, value in part.items()}
     aside = f", axis at x {mm['x_m']}, y {mm['y_m']}" if float(part["x_m"]) or float(part["y_m"]) else ""
     return f"from {mm['from_m']} to {mm['to_m']}, diameter {mm['diameter_m']}{aside}"
+
+
+def _require_usable(plan: Plan) -> None:
+    """Raise `PlanRefused` for sweeps, placeholders, moves that are not proven clear, and values no arm can follow."""
+    # The text of an export carries no verdict, so a rejected calibration is not exported.
+    if plan.sweep is not None:
+        raise PlanRefused("this plan is a sweep, which no other program can follow: export the plan of a tour")
+    if not plan.measured:
+        raise PlanRefused(
+            "tool, planes and boxes of this plan are not marked as measured: "
+            "measure them, set measured = true in [workcell], and make a new plan"
+        )
+    if not plan.certified:
+        raise PlanRefused("a move of the plan is not proven clear: it is not exported")
+    angles = [angle for step in plan.steps for angle in step.q_rad]
+    if (
+        any(len(step.q_rad) != 6 for step in plan.steps)
+        or not all(abs(angle) <= 2 * pi + 1e-9 for angle in angles)
+        or not all(0 < step.speed_rad_s <= _FASTEST_RAD_S for step in plan.steps)
+        or not 0 < plan.acceleration_rad_s2 <= _FASTEST_RAD_S2
+    ):
+        raise PlanRefused("the plan holds a joint angle, speed or acceleration that no arm can follow: make a new plan")

@@ -1,7 +1,7 @@
 """A report as sections of sentences, tables and figures, and the words that all formats share."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -74,11 +74,6 @@ def capital(words: str) -> str:
     return words[:1].upper() + words[1:]
 
 
-def p_value_in_words(p_value: float) -> str:
-    """Write a probability."""
-    return "< 0.0001" if p_value < 1e-4 else f"{p_value:.2g}"
-
-
 def shown_poses(poses: Sequence[Any], most: int = 200) -> list[Any]:
     """Choose the poses to list and draw, in their order: all, or the worst quarter and evenly spread others."""
     if len(poses) <= most:
@@ -87,18 +82,3 @@ def shown_poses(poses: Sequence[Any], most: int = 200) -> list[Any]:
     worst = np.argsort(-size)[: most // 4]
     even = np.linspace(0, len(poses) - 1, most - len(worst)).astype(int)
     return [poses[row] for row in np.unique([*worst, *even])]
-
-
-def flattened(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the values of nested objects with their full names, as text."""
-    for name, inner in value.items():
-        if isinstance(inner, Mapping):
-            yield from flattened(inner, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", _text(inner)
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, list):
-        return " ".join(map(_text, value))
-    return "-" if value is None else str(value)

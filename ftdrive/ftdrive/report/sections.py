@@ -7,17 +7,7 @@ from typing import Any
 import numpy as np
 
 from ftcalib.rounding import to_place_of, with_sigma
-from ftdrive.report.document import (
-    Figure,
-    Section,
-    Table,
-    capital,
-    flattened,
-    label_of,
-    p_value_in_words,
-    rounded,
-    shown_poses,
-)
+from ftdrive.report.document import Figure, Section, Table, capital, label_of, rounded, shown_poses
 from ftdrive.terminal.report import SIGMA_OF_THE_TOOL, axes_of, quantities_of, values_of
 
 Facts = Mapping[str, Any]
@@ -170,7 +160,7 @@ def residuals(facts: Facts) -> Section:
     text = [
         f"Residuals: force {rounded(sums['force_rms_N'])} N rms, {rounded(sums['force_max_N'])} N at most; torque "
         f"{rounded(sums['torque_rms_Nm'])} N·m rms, {rounded(sums['torque_max_Nm'])} N·m at most.",
-        f"They are {result['noise_factor']:.2f} times the measured noise (p = {p_value_in_words(result['p_value'])})."
+        f"They are {result['noise_factor']:.2f} times the measured noise (p = {_p_value_in_words(result['p_value'])})."
         if result["p_value"] is not None
         else "The noise was not measured but estimated from the residuals, so their size does not test the fit.",
     ]
@@ -323,7 +313,7 @@ def tour(facts: Facts) -> Section:
     text = [f"Run {run['run']}, started {started}, mode {run['mode']}, {run['stops']} stops."]
     tables = [
         Table("Devices", ("device", "model", "serial", "firmware"), _devices(run["devices"])),
-        Table("Settings", ("setting", "value"), list(flattened(run["config"])), folded=True),
+        Table("Settings", ("setting", "value"), list(_flattened(run["config"])), folded=True),
     ]
     plan = run["plan"]
     if plan is None:
@@ -387,7 +377,7 @@ def comparison(facts: Facts) -> Section:
         )
         text.append("A bias may change from day to day; a change of anything else means another tool or mounting.")
     groups = [
-        (one["name"], f"{one['chi2']:.4g}", str(one["dof"]), p_value_in_words(one["p_value"]))
+        (one["name"], f"{one['chi2']:.4g}", str(one["dof"]), _p_value_in_words(one["p_value"]))
         for one in found["groups"]
     ]
     rows = [
@@ -415,7 +405,7 @@ def provenance(facts: Facts) -> Section:
     else:
         text.append("The file holds no data: solve the dataset with the hash below to reproduce the result.")
     text += _last_verification(facts["trust"] or {})
-    rows, columns = list(flattened(facts["result"]["provenance"])), ("field", "value")
+    rows, columns = list(_flattened(facts["result"]["provenance"])), ("field", "value")
     long = [row for row in rows if row[0].startswith(("devices.", "station."))]
     tables = [Table("", columns, [row for row in rows if row not in long])]
     tables += [Table("Devices", columns, long, folded=True)] if long else []
@@ -494,3 +484,23 @@ def sections_of(facts: Mapping[str, Any]) -> list[Section]:
         comparison(facts),
         provenance(facts),
     ]
+
+
+def _p_value_in_words(p_value: float) -> str:
+    """Write a probability."""
+    return "< 0.0001" if p_value < 1e-4 else f"{p_value:.2g}"
+
+
+def _flattened(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the values of nested objects with their full names, as text."""
+    for name, inner in value.items():
+        if isinstance(inner, Mapping):
+            yield from _flattened(inner, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", _text(inner)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return " ".join(map(_text, value))
+    return "-" if value is None else str(value)
