@@ -70,7 +70,7 @@ def implausible(estimate: Parameters, residual_N: float, *, described: bool) -> 
     described : bool
         Whether the shape of the tool is, which alone limits how far its centre of mass may be.
     """
-    weight_N, com_m = (float(np.linalg.norm(x)) for x in (estimate.gravity_force_base_N, estimate.p_sensor_com_m))
+    weight_N, com_m = estimate.weight_N, float(np.linalg.norm(estimate.p_sensor_com_m))
     findings = too_light(weight_N, com_m, residual_N)
     if weight_N > HEAVIEST_N:
         severity: Severity = "reject" if weight_N > IMPOSSIBLE_N else "limit"

@@ -24,7 +24,7 @@ from ftcalib.model import Array
 from ftdrive.cell.config import read_toml, settings
 from ftdrive.errors import ConfigError
 from ftdrive.runs.verification import VerificationRecord
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredWeighings
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredWeighings, shows_bias
 from ftdrive.store.store import Store
 
 FORMAT: Final = "ftdrive.cells/1"
@@ -206,12 +206,8 @@ class Observed:
 
 
 def _changes(result: StoredResult, checks: Sequence[BriefVerification]) -> BiasChanges | None:
-    """Return how the bias has changed since a calibration; None if no verification has this.
-
-    A verification counts if it passed, or found that the bias has changed: another change, or a hand on the tool,
-    spoils the estimate.
-    """
-    used = [one for one in checks if (one.passed or one.change == "bias") and None not in one.bias]
+    """Return how the bias has changed since a calibration; None if no verification has this."""
+    used = [one for one in checks if shows_bias(one) and None not in one.bias]
     bias = np.array([one.bias for one in used], dtype=np.float64).reshape(-1, 18)
     measured = bias[:, 6:12].min(axis=1, initial=np.inf) > 0
     if not measured.any():

@@ -196,11 +196,10 @@ def _bases(observed: Observed) -> Iterator[FleetFinding]:
 
 def _turned(before: StoredResult, after: StoredResult) -> tuple[float, float]:
     """Return the angle in rad between two directions of gravity, and its p-value if the base has not moved."""
-    forces = [one.numbers["gravity_force_base_N"] for one in (before, after)]
-    weights = [float(np.linalg.norm(force)) for force in forces]
+    weights = [one.parameters.weight_N for one in (before, after)]
     if not min(weights) > 0:
         return 0.0, 1.0
-    old, new = (np.array(force) / weight for force, weight in zip(forces, weights, strict=True))
+    old, new = before.parameters.down, after.parameters.down
     angle = angle_between_vectors(old, new)
     if angle <= TILTED_RAD:
         return angle, 1.0

@@ -284,8 +284,7 @@ def _noise(subject: Subject) -> dict[str, Any] | None:
 def _coverage(subject: Subject, R_base_flange: Array) -> dict[str, Any]:
     parameters = subject.result.parameters
     seen = assess(R_base_flange, parameters, advise=False)
-    down = parameters.gravity_force_base_N / (np.linalg.norm(parameters.gravity_force_base_N) or 1.0)
-    gravity, tool = down @ R_base_flange, R_base_flange[:, :, 2]
+    gravity, tool = parameters.down @ R_base_flange, R_base_flange[:, :, 2]
     gap_rad, towards = largest_gap(gravity)
     return {
         "orientations": seen.orientations,

@@ -183,9 +183,16 @@ def mass_sigma_kg(parameters: "Parameters", covariance: "Array", g_m_s2: float) 
     """Return one standard deviation of the mass from the covariance (15, 15) alone."""
     import numpy as np
 
-    force = parameters.gravity_force_base_N
-    down = force / (np.linalg.norm(force) or 1.0)
+    down = parameters.down
     return float(np.sqrt(np.maximum(down @ covariance[3:6, 3:6] @ down, 0.0))) / g_m_s2
+
+
+def shows_bias(check: VerificationRecord | BriefVerification) -> bool:
+    """Whether the change of the bias that a verification has estimated counts.
+
+    It passed, or found that the bias has changed: another change, or a hand on the tool, spoils the estimate.
+    """
+    return check.passed or check.change == "bias"
 
 
 def record_paths(folders: Iterable[Path]) -> list[Path]:

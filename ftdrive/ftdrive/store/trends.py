@@ -11,7 +11,7 @@ from ftcalib.after.series import FEWEST_ESTIMATES, BiasTemperature, Trend, bias_
 from ftcalib.model import BIASES, PARAMETER_NAMES, Array
 from ftcalib.rounding import with_sigma
 from ftdrive.runs.verification import VerificationRecord
-from ftdrive.store.records import StoredResult
+from ftdrive.store.records import StoredResult, shows_bias
 
 # Largest p-value of a trend that counts.
 SIGNIFICANT: Final = 0.01
@@ -160,11 +160,7 @@ class _Run(NamedTuple):
 def temperatures(
     results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]
 ) -> list[SensorTemperature]:
-    """Fit each sensor on each arm and mount that has runs enough.
-
-    A verification counts if it passed, or found that the bias has changed: another change, or a hand on the tool,
-    spoils the estimate of the bias.
-    """
+    """Fit each sensor on each arm and mount that has runs enough."""
     runs = dict[tuple[str, str | None, str | None], list[_Run]]()
     made = dict[str, tuple[list[_Run], StoredResult]]()
     for one in results:
@@ -176,7 +172,7 @@ def temperatures(
             sigma = np.sqrt(np.diag(one.covariance)[BIASES])
             found.append(_Run(datetime.fromisoformat(one.created_utc), one.temperature_C, one.parameters.bias, sigma))
     for check in verifications:
-        if check.calibration_id not in made or not (check.passed or check.change == "bias"):
+        if check.calibration_id not in made or not shows_bias(check):
             continue
         found, calibration = made[check.calibration_id]
         change, sigma_6 = check.bias_change, check.bias_change_sigma
