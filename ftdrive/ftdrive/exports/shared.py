@@ -54,9 +54,9 @@ class Settings:
     """The last one of the calibration; None if there is none."""
 
     def __post_init__(self) -> None:
-        for name_of in ("base_frame", "flange_frame", "sensor_frame", "tool_frame"):
-            if not _NAME.fullmatch(name := getattr(self, name_of)):
-                option = name_of.replace("_", "-")
+        for field_name in ("base_frame", "flange_frame", "sensor_frame", "tool_frame"):
+            if not _NAME.fullmatch(name := getattr(self, field_name)):
+                option = field_name.replace("_", "-")
                 raise ConfigError(
                     f"--{option} is {name!r}: use letters, digits and _ . / -, a letter or _ first, no --"
                 )
