@@ -33,7 +33,7 @@ WALKS = {
         ftdrive.session.session            _require_devices           compares serial numbers
         ftdrive.session.along_plan         take_along_plan            goes through the stages of a session
         ftdrive.planning.cell_plan         certifier_for              describes arm, tool and surroundings
-        ftdrive.session.task               Calibrating.plan           plans for the method
+        ftdrive.session.session            Calibrating.plan           plans for the method
         ftdrive.planning.cell_plan         plan_for                   chooses the kind of plan
         ftdrive.planning.planner           plan_tour                  finds poses, proves each move
         ftdrive.planning.approach          plan_approach              proves the way to the first pose
@@ -41,7 +41,7 @@ WALKS = {
         ftcalib.data.dwell_mean            averaging_time             chooses the time at each pose
         ftdrive.session.watchdog           Watcher                    starts the thread of the guards
         ftdrive.session.along_plan         _SafetyQuestions.ask       asks what no device reports
-        ftdrive.session.recovery           GuardedCell                leads from a stop back to motion
+        ftdrive.session.tour           GuardedCell                leads from a stop back to motion
         ftdrive.session.tour               Tour.run                   goes from stop to stop
         ftdrive.session.tour               Tour._move                 first move, after a typed word
         ftdrivers.ur.arm                   UrArm.move_to              watches the move to its end

@@ -53,6 +53,12 @@ class Approach:
         """(k, 6) where each move ends."""
         return self.way_rad[1:]
 
+    def duration_s(self, most_rad_s: float, acceleration_rad_s2: float) -> float:
+        """Return how long its moves take where none is faster than `most_rad_s`."""
+        turns = np.abs(np.diff(self.way_rad, axis=0)).max(axis=1)
+        speeds = np.minimum(self.speed_rad_s, most_rad_s)
+        return float(move_duration_s(turns, speeds, acceleration_rad_s2).sum())
+
 
 def arm_moves(way_rad: ArrayLike) -> bool:
     """Return whether base, shoulder or elbow turn along a path (n, 6)."""

@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -17,25 +18,20 @@ from ftcalib.model import Array
 from ftcalib.routine import PoseRecord
 from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
-from ftdrive.planning.approach import arm_moves, plan_approach
+from ftdrive.planning.approach import Approach, arm_moves, plan_approach
 from ftdrive.planning.cell_plan import certifier_for, speeds_of
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.motion import slower
+from ftdrive.planning.motion import Speeds, move_duration_s, slower, speed_of_leading_joint
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.words import point_in_words, stop_in_words, turns_in_words, way_in_words
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
 from ftdrive.session.events import GuardTripped, Planned
-from ftdrive.session.forecast import limit_speeds, moves_s, rms_sigma
-from ftdrive.session.live_fit import Judge
-from ftdrive.session.open_cell import OpenCell
+from ftdrive.session.open_session import Judge, OpenCell, PoseBook, Session, reporting_early_end
 from ftdrive.session.options import SessionOptions
-from ftdrive.session.pose_book import PoseBook, reporting_early_end
 from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
-from ftdrive.session.recovery import GuardedCell
-from ftdrive.session.sweep import SweepTour, sweep_pace
-from ftdrive.session.task import Session
-from ftdrive.session.tour import SLOW, Pace, Tour
+from ftdrive.session.sweep import FreeTool, SweepTour, sweep_pace
+from ftdrive.session.tour import APPROACH_RAD_S, SLOW, GuardedCell, Pace, Tour
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.interfaces import NOT_REPORTED
 from ftdrivers.ur.kinematics import kinematics_of
@@ -120,6 +116,8 @@ _TARGET_N, _TARGET_NM = 0.057, 0.0035
 _TOOL_AVERAGES: Final = 2.0
 _HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
 _HEAVIEST_OF_ALL_KG: Final = 30.0
+# The load of a sweep where [tool] mass_kg is not set.
+_HEAVIEST_SWEPT_KG: Final = 5.0
 _NO_SERIAL: Final = (
     "the controller reports no serial number, so a completed plan cannot be assigned to an arm: newer PolyScope "
     "versions report it"
@@ -243,7 +241,9 @@ class _AlongPlan:
         """Ask the safety questions, then visit every pose that is left; each is on disk before the next move."""
         cell, options, way = self.cell, self.options, before.approach.way_rad
         load = guards.RangeGuard(cell.limits, before.sensor_range, before.sensor_zero)
-        learner = self.task.learner()
+        learner = None
+        if options.mode == "sweep":  # no pose shows what the tool weighs while it moves
+            learner = FreeTool(before.certifier.scene.down_base, self.task.cell.tool.mass_kg or _HEAVIEST_SWEPT_KG)
         contact = self._contact_guard(pace, judge.predict if learner is None else learner.predict)
         rows = (
             guards.SupervisorGuard(cell.journal.absence),
@@ -342,6 +342,46 @@ def _show_plan(before: Before, options: SessionOptions) -> None:
         with serve_view(plan, before.certifier, way) as url:
             open_in_browser(url)
             cell.journal.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
+
+
+def limit_speeds(plan: Plan, certifier: Certifier, speeds: Speeds) -> Plan:
+    """Return a plan with its speeds reduced to these limits."""
+    q = np.array([step.q_rad for step in plan.steps])
+    allowed = speed_of_leading_joint(certifier.arm, q, np.roll(q, -1, axis=0), speeds)
+    steps = (
+        replace(step, speed_rad_s=min(step.speed_rad_s, float(most)))
+        for step, most in zip(plan.steps, allowed, strict=True)
+    )
+    acceleration_rad_s2 = min(plan.acceleration_rad_s2, speeds.joint_rad_s2)
+    return replace(plan, steps=tuple(steps), acceleration_rad_s2=acceleration_rad_s2)
+
+
+def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:
+    """Return the time of all moves: the approach to the first stop, then moves of the plan to the rest.
+
+    Parameters
+    ----------
+    plan : Plan
+        With the speeds it is driven at.
+    todo : sequence of int
+        Stops, from 1; where some are left out between two, there is an approach too, counted as a straight move.
+    """
+    total_s = approach.duration_s(APPROACH_RAD_S, SLOW.joint_rad_s2)
+    for stop, following in pairwise(todo):
+        step = plan.steps[stop - 1]
+        turn, speed, acceleration = step.turn_rad, step.speed_rad_s, plan.acceleration_rad_s2
+        if following != stop + 1:
+            goal = plan.steps[(following - 1) % len(plan.steps)].q_rad
+            turn = float(np.abs(np.subtract(goal, step.q_rad)).max())
+            speed, acceleration = APPROACH_RAD_S, SLOW.joint_rad_s2
+        total_s += float(move_duration_s(np.array(turn), speed, acceleration))
+    return total_s
+
+
+def rms_sigma(sigma: Array) -> tuple[float, float]:
+    """Return one standard deviation of one axis, force in N and torque in N·m, from those of all six axes."""
+    force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
+    return force_N, torque_Nm
 
 
 def _chosen_sampling(before: Before, todo: Sequence[int]) -> tuple[Sampling, Array]:

@@ -19,9 +19,7 @@ from ftcalib.sampling import Sampling
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.run import Run
 from ftdrive.session.events import Compared, Estimated, Key, SensorEvents, State, StateChanged
-from ftdrive.session.open_cell import OpenCell
-from ftdrive.session.pose_book import PoseBook, reporting_early_end
-from ftdrive.session.task import Session
+from ftdrive.session.open_session import OpenCell, PoseBook, Session, reporting_early_end
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmState, FtSamples
 

@@ -1,7 +1,7 @@
 """The fit over the poses so far, their coverage, and the most useful next pose."""
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +24,7 @@ from ftcalib.poses.selection import next_pose
 from ftcalib.published.yu import weight_and_tilt
 from ftcalib.routine import PoseRecord, dataset_from, is_return
 from ftdrive.cell.config import USUAL_KG
-from ftdrive.session.events import Compared, Estimated
+from ftdrive.session.events import Estimated
 
 # As good as gravity directions within 50 to 60 degrees of one another; see `ftcalib.poses.information.Prediction`.
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
@@ -32,23 +32,6 @@ GREEN = {"cond9": 4.0, "cond_u1": 8.0}
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
 # `RunningFit.predict` returns None if its sigma of the force is more than this share of the weight.
 TRUSTED_SHARE = 0.05
-
-
-class Judge(Protocol):
-    """Judges the poses so far."""
-
-    @property
-    def weighed_kg(self) -> float | None:
-        """Mass that the sensor carries; None while it is uncertain."""
-
-    def add(self, record: PoseRecord) -> Estimated | Compared:
-        """Add a pose, in place of one with the same `stop`; return what the poses show now."""
-
-    def remove(self, stop: int) -> None:
-        """Remove a pose, so that it can be taken again; a stop that was not taken is ignored."""
-
-    def predict(self, R_base_flange: Array) -> Array | None:
-        """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain."""
 
 
 class RunningFit:

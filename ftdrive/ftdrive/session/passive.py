@@ -14,9 +14,7 @@ from ftdrive.runs.motion import MotionRecording, means_of
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import circumstances_of
 from ftdrive.session.events import Key, MotionRecorded
-from ftdrive.session.open_cell import OpenCell
-from ftdrive.session.pose_book import reporting_early_end
-from ftdrive.session.task import Session
+from ftdrive.session.open_session import OpenCell, Session, reporting_early_end
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 

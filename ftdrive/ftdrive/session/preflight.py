@@ -26,7 +26,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.nodes import WRIST_6_RAD
 from ftdrive.session.events import Checked
 from ftdrive.session.guards import Limits, ModelGuard, Tripped
-from ftdrive.session.open_cell import OpenCell
+from ftdrive.session.open_session import OpenCell
 from ftdrivers.clock import Clock
 from ftdrivers.interfaces import FtSamples, RobotArm
 

@@ -1,29 +1,39 @@
-"""A session from its cell to its result."""
+"""A session from its cell to its result: what a calibration takes poses for, and the table of the modes."""
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
-from dataclasses import asdict
-from typing import Any, Final
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
 from ftcalib import CalibrationResult
+from ftcalib.model import Array
+from ftcalib.poses.information import predicted_sigma
+from ftcalib.published.methods import SPECIAL
+from ftcalib.result import LEAST_COMMON_GAIN, Method
 from ftdrive.cell.config import CellConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.checks.belonging import compare_devices
 from ftdrive.errors import ConfigError, Declined, PlanRefused
+from ftdrive.planning.cell_plan import plan_for, sweep_for
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.geometry.scene import down_of
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import NUMBERS, guess_of
+from ftdrive.planning.search.nodes import from_usual_wrist
 from ftdrive.runs.run import Mode, Run
 from ftdrive.runs.source import Outcome, solve_and_save
 from ftdrive.session import preflight
-from ftdrive.session.along_plan import take_along_plan
+from ftdrive.session.along_plan import rms_sigma, take_along_plan
 from ftdrive.session.events import Operator, State, StateChanged
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import take_by_hand
-from ftdrive.session.open_cell import Journal, OpenCell
+from ftdrive.session.live_fit import RunningFit
+from ftdrive.session.open_session import Journal, Judge, OpenCell, Session, Task
 from ftdrive.session.options import SessionOptions, plan_on_disk, with_recorded_mode
 from ftdrive.session.passive import take_passively
 from ftdrive.session.sweep import on_script_path
-from ftdrive.session.task import Calibrating, Session, Task
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from ftdrivers.registry import Options, split_url
 
@@ -86,6 +96,65 @@ def _meaning(config: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]]) 
     chosen = {f"option {name}": options.integer(name, usual, 0, 255) for name, usual in _CHOOSES_CALIBRATION.items()}
     scale = {name: fact["value"] for name, fact in facts.items() if name in _OF_NUMBERS}
     return {"[sensor] sign": config.get("sign", 1), **chosen, **scale}
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrating:
+    """A calibration."""
+
+    command: ClassVar[str] = "calibrate"
+    goal: ClassVar[str] = "the coverage is green"
+    calibration: ClassVar[None] = None
+    warnings: ClassVar[tuple[str, ...]] = ()
+    cell: CellConfig
+    real: bool = True
+    """Whether a real arm moves."""
+    sets: str | None = None
+    """Sets of Yu's Fig. 6 instead of a number of poses."""
+    method: Method = "ml"
+    """Method that will solve the poses."""
+    sweep_s: float | None = None
+    """Duration of a sweep at the planned speed; None for poses."""
+
+    def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
+        """Return a sweep or a tour. Raises `PlanRefused` if it lacks orientations that the method needs."""
+        if self.sweep_s is not None:
+            return sweep_for(self.cell, certifier, q_rad, self.sweep_s)
+        q_rad = from_usual_wrist(certifier, q_rad)
+        plan = plan_for(self.cell, certifier, q_rad, poses, sets=self.sets)
+        special = sum(step.number in NUMBERS[24] for step in plan.steps)
+        if self.method in SPECIAL and special < 24:
+            raise PlanRefused(
+                f"{self.method} needs the 24 special orientations, and the tour has {special} of them: plan all 24, "
+                "jog the arm to a posture with more room, or choose --method lrom"
+            )
+        if self.method == "srom" and len(plan.steps) > 24:
+            raise PlanRefused(
+                f"srom needs the 24 special orientations alone, and the tour has {len(plan.steps) - 24} other poses: "
+                "choose --method mixed"
+            )
+        return plan
+
+    def judge(self, *, by_hand: bool) -> Judge:
+        """Return the running fit."""
+        down_base = down_of(self.cell.workcell.mounting)
+        return RunningFit(g_m_s2=self.cell.site.g_m_s2, down_base=down_base, advise=by_hand)
+
+    def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
+        """Describe the sigmas of the result; those of a new tool depend on the earlier result too."""
+        if plan.kind == "tool":
+            return ""
+        mass_kg = self.cell.tool.mass_kg
+        force_N, torque_Nm = rms_sigma(sigma)
+        guess = replace(guess_of(certifier, mass_kg), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
+        found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
+        mass_g = 1e3 * np.hypot(found.sigma["mass_kg"], LEAST_COMMON_GAIN * guess.mass_kg)
+        assumed = " (assumed: [tool] mass_kg is not set)" if self.real and not mass_kg else ""
+        return (
+            f"predicted from that for {guess.mass_kg:g} kg{assumed}, one sigma: mass {mass_g:.2g} g, "
+            f"force bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
+            f"{found.torque_rms_Nm:.2g} N·m"
+        )
 
 
 def calibrate(cell: CellConfig, operator: Operator, options: SessionOptions) -> Outcome | None:

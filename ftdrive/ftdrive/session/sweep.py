@@ -13,10 +13,9 @@ from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.planning.sweep_planner import at_speed
 from ftdrive.runs.motion import MotionRecording
 from ftdrive.session.events import MotionRecorded, State
-from ftdrive.session.forecast import moves_s
 from ftdrive.session.guards import Guard, Seen
 from ftdrive.session.preflight import Before
-from ftdrive.session.tour import Pace, Tour
+from ftdrive.session.tour import APPROACH_RAD_S, SLOW, Pace, Tour
 from ftdrivers.sweep import Sweep
 
 # The motion teaches so long before anything is predicted.
@@ -199,7 +198,7 @@ def sweep_pace(before: Before, *, slow: bool) -> Pace:
     if plan.sweep is None:
         raise NotAccepted("the plan holds no sweep: make it with --sweep")
     why = "the first run of a plan is slow" if slow else f"speed slider {100 * slider:.0f} %"
-    total_s = plan.sweep.duration_s + 2 * REST_S + moves_s(plan, (), before.approach)
+    total_s = plan.sweep.duration_s + 2 * REST_S + before.approach.duration_s(APPROACH_RAD_S, SLOW.joint_rad_s2)
     cell.note(
         f"sweep of {plan.sweep.duration_s:.0f} s at {100 * share:.0f} % of the planned speed ({why}), at most "
         f"{np.degrees(plan.top_speed_rad_s):.0f}°/s: about {total_s:.0f} s of motion"

@@ -18,12 +18,11 @@ from ftdrive.planning.cell_plan import speeds_of
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_verification
-from ftdrive.planning.search.nodes import WRIST_6_RAD
+from ftdrive.planning.search.nodes import WRIST_6_RAD, from_usual_wrist
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification import fitted_dataset
 from ftdrive.session.events import Compared
-from ftdrive.session.live_fit import Judge
-from ftdrive.session.task import from_usual_wrist
+from ftdrive.session.open_session import Judge
 
 POSES: Final = 6
 QUICK_POSES: Final = 2
@@ -76,9 +75,6 @@ class Verifying:
         guess = guess_of(certifier, self.cell.tool.mass_kg)
         plan = plan_verification(certifier, q_rad, poses, self.R_fitted, speeds=speeds_of(self.cell), guess=guess)
         return plan.marked(measured=self.cell.workcell.measured, emulated=self.cell.is_emulated)
-
-    def learner(self) -> None:
-        """Return None: the poses are compared with a calibration."""
 
     def judge(self, *, by_hand: bool) -> Judge:
         """Return who compares each pose with the calibration."""

@@ -14,7 +14,7 @@ from ftcalib.model import Array
 from ftcalib.routine import turned_rad
 from ftdrive.session.events import Hazard
 from ftdrive.session.guards import ExpectedMotion, Guard, Seen, Tripped, arm_lost, by_safety, fault
-from ftdrive.session.open_cell import OpenCell
+from ftdrive.session.open_session import OpenCell
 from ftdrivers.clock import Follower
 from ftdrivers.errors import DeviceError, DeviceFault
 from ftdrivers.interfaces import ArmState

@@ -23,7 +23,7 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import Outcome
-from ftdrive.session import along_plan, session, task
+from ftdrive.session import along_plan, session
 from ftdrive.session.along_plan import remember_completed
 from ftdrive.session.events import (
     Event,
@@ -35,9 +35,9 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.guards import Limits
-from ftdrive.session.open_cell import Journal, OpenCell
+from ftdrive.session.open_session import Journal, OpenCell
 from ftdrive.session.options import SessionOptions
-from ftdrive.session.task import Calibrating
+from ftdrive.session.session import Calibrating
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceFault
@@ -435,7 +435,7 @@ class Lab:
         """Of each session that came to its tour."""
         monkeypatch.setattr(session, "build_arm", lambda _: self.arm)
         monkeypatch.setattr(session, "build_sensor", lambda _: self.sensor)
-        monkeypatch.setattr(task, "plan_for", planned_once)
+        monkeypatch.setattr(session, "plan_for", planned_once)
         monkeypatch.setattr(Certifier, "certify", certify_once)
         monkeypatch.setattr(ArmModel, "frames", frames_once)
         monkeypatch.setattr(along_plan, "Watcher", self._watcher)

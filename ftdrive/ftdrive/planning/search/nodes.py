@@ -9,11 +9,13 @@ the speed of the tool's tip is limited: 16 moves turn joint 6 alone. Wrist 1 tur
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import checked_joints, frames, inverse, is_exact, wrist_inverse, wrist_refined
 from ftdrivers.ur.kinematics import MODELS, Array, Kinematics
@@ -224,3 +226,15 @@ def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
     if is_exact(kinematics):
         return tour
     return wrist_refined(kinematics, tour, frames(_NOMINAL, tour).R_base_flange)
+
+
+def from_usual_wrist(certifier: Certifier, q_rad: Array) -> Array:
+    """Return joint angles (6,) with joints 4 and 5 as the constant tour begins, from which most tours are found.
+
+    Joint 6 keeps its turn, which shows how the cable is wound.
+    """
+    q = q_rad.copy()
+    # The planner reports it, with what to do.
+    with suppress(ConfigError):
+        q[3:5] = constant_tour(q, certifier.arm.kinematics)[0, 3:5]
+    return q

@@ -18,7 +18,7 @@ from ftdrive.errors import ConfigError, exit_code
 from ftdrive.runs.run import Run
 from ftdrive.session import session
 from ftdrive.session.options import SessionOptions
-from ftdrive.session.task import Calibrating
+from ftdrive.session.session import Calibrating
 from tests.edited_files import edit
 
 CELL = """format = "ftdrive.config/1"

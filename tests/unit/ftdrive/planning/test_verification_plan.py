@@ -15,7 +15,7 @@ from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_verification
 from ftdrive.planning.words import plan_in_words
-from ftdrive.session.forecast import moves_s
+from ftdrive.session.along_plan import moves_s
 from ftdrive.session.tour import SLOW
 
 CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))

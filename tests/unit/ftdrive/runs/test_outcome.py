@@ -16,8 +16,7 @@ from ftdrive.runs.source import circumstances_of, solve_records
 from ftdrive.session.events import Noted, PoseTaken, Weighed
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.preflight import Before, check_payload
-from ftdrive.session.session import description_of
-from ftdrive.session.task import Calibrating
+from ftdrive.session.session import Calibrating, description_of
 from ftdrivers.clock import REAL
 from tests.edited_files import edit
 from tests.fake_clock import FakeClock

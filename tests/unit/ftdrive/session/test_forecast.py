@@ -12,7 +12,7 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
-from ftdrive.session.forecast import limit_speeds, moves_s
+from ftdrive.session.along_plan import limit_speeds, moves_s
 from ftdrive.session.tour import APPROACH_RAD_S, SLOW
 
 

@@ -20,8 +20,7 @@ from ftdrive.errors import SupervisorGone
 from ftdrive.session.events import Compared, Estimated, Event, Key, Noted, PoseTaken, Question, State, StateChanged
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import HandGuided
-from ftdrive.session.open_cell import OpenCell
-from ftdrive.session.pose_book import PoseBook
+from ftdrive.session.open_session import OpenCell, PoseBook
 from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Health

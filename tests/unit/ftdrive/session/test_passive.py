@@ -17,7 +17,7 @@ from ftdrive.runs.motion import MotionRecording, files_of
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import Circumstances
 from ftdrive.session.events import Key
-from ftdrive.session.open_cell import OpenCell
+from ftdrive.session.open_session import OpenCell
 from ftdrive.session.passive import PART_S, record_passively
 from ftdrivers.errors import StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples

@@ -15,7 +15,7 @@ from ftdrive.planning import sweep_planner
 from ftdrive.planning.cell_plan import certifier_for, sweep_for
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.motion import MotionRecording
-from ftdrive.session import task
+from ftdrive.session import session
 from ftdrive.session.events import Event, GuardTripped, Key, MotionRecorded, State, StateChanged
 from ftdrive.session.guards import ExpectedMotion, Seen
 from ftdrive.session.options import SessionOptions, with_recorded_mode
@@ -42,7 +42,7 @@ def _short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     def planned_once(cell: CellConfig, _: object, q_rad: Array, seconds: float) -> Plan:
         return planned(tuple(q_rad.tolist()), replace(cell, clock=REAL), seconds)
 
-    monkeypatch.setattr(task, "sweep_for", planned_once)
+    monkeypatch.setattr(session, "sweep_for", planned_once)
 
 
 @pytest.mark.slow

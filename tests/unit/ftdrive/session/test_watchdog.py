@@ -10,7 +10,7 @@ import pytest
 
 from ftdrive.session.events import Event, GuardTripped, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.guards import Guard, Limits, Seen, SensorGuard, StallGuard, Tripped
-from ftdrive.session.open_cell import Journal, OpenCell
+from ftdrive.session.open_session import Journal, OpenCell
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout

@@ -1,0 +1,276 @@
+"""What every mode of a session works with: the open cell, its journal, what the poses are taken for, and their book."""
+
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ftcalib import CalibrationResult
+from ftcalib.model import Array
+from ftcalib.routine import PoseRecord
+from ftdrive.cell.config import CellConfig
+from ftdrive.errors import Declined, SupervisorGone
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.plan import Plan
+from ftdrive.runs.run import IN_MOTION, Run
+from ftdrive.session.events import (
+    Asked,
+    Compared,
+    Estimated,
+    Event,
+    GuardTripped,
+    Hazard,
+    Key,
+    Noted,
+    Operator,
+    PoseTaken,
+    Question,
+    RunOpened,
+)
+from ftdrive.session.guards import Limits
+from ftdrive.session.options import SessionOptions
+from ftdrivers.clock import Clock
+from ftdrivers.errors import DeviceError
+from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
+
+log = logging.getLogger(__name__)
+
+
+class Journal:
+    """Shows and records every event, one at a time, from any thread.
+
+    With `yes` it gives the assumed answer of questions that have one; the operator answers the others.
+    """
+
+    def __init__(self, operator: Operator, *, yes: bool = False) -> None:
+        self._operator, self._yes = operator, yes
+        self._lock = threading.RLock()
+        self._run: Run | None = None
+        self._early: list[Event] = []
+        self._is_seen = True
+        self._absence_recorded = False
+
+    def keep_in(self, run: Run) -> None:
+        """Record in the run, starting with the events so far."""
+        with self._lock:
+            self._run = run
+            for event in self._early:
+                run.append_event(event.to_dict())
+            self._early.clear()
+        resume = "" if run.mode in IN_MOTION else run.resume_command
+        self.show(RunOpened(folder=str(run.folder), resume=resume), sync=True)
+
+    def show(self, event: Event, *, sync: bool = False) -> None:
+        """Show and record an event. Raises `SupervisorGone` at the first one that cannot be seen any more."""
+        with self._lock:
+            try:
+                self._operator.show(event)
+            except SupervisorGone:
+                self._record(event, sync=sync)
+                if self._is_seen:
+                    self._is_seen = False
+                    raise
+            else:
+                self._record(event, sync=sync)
+
+    def _record(self, event: Event, *, sync: bool) -> None:
+        self._absence_recorded |= isinstance(event, GuardTripped) and event.hazard == Hazard.SUPERVISOR_GONE
+        if self._run is None:
+            self._early.append(event)
+            return
+        try:
+            self._run.append_event(event.to_dict(), sync=sync)
+        # A pose that cannot be written raises.
+        except OSError as error:
+            log.warning("events.ndjson cannot be written: %s", error)
+
+    def absence(self) -> str | None:
+        """As `Operator.absence`."""
+        return self._operator.absence()
+
+    def require_operator(self) -> None:
+        """Raise `SupervisorGone` if no operator follows the session any more."""
+        if why := self.absence():
+            raise SupervisorGone(why)
+
+    @contextmanager
+    def recording_absence(self) -> Iterator[None]:
+        """Record a `SupervisorGone` of the block, unless its event is recorded already."""
+        try:
+            yield
+        except SupervisorGone as gone:
+            if not self._absence_recorded:
+                with suppress(SupervisorGone):
+                    self.show(GuardTripped(hazard=Hazard.SUPERVISOR_GONE, words=str(gone)), sync=True)
+            raise
+
+    def ask(self, question: Question) -> str:
+        """Ask; record the answer and who gave it. Raises `SupervisorGone`, also where `--yes` would answer."""
+        assumed = question.assumed if self._yes else None
+        with self.recording_absence():  # the arm stands
+            self.require_operator()
+            answer = self._operator.ask(question) if assumed is None else assumed
+        self.show(Asked(question=question.text, answer=answer, by="person" if assumed is None else "--yes"))
+        return answer
+
+    def require(self, text: str, *, assumed: bool) -> None:
+        """Ask a question; raises `Declined` unless the answer is yes."""
+        if self.ask(Question(text, assumed="yes" if assumed else None)) != "yes":
+            raise Declined(f"not confirmed, nothing moves: {text}")
+
+    @property
+    def has_keys(self) -> bool:
+        """Whether the operator has keys to press."""
+        return self._operator.has_keys
+
+    def pressed(self) -> Key | None:
+        """Return the next key pressed."""
+        return self._operator.pressed()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OpenCell:
+    """Arm and sensor, open; the clock that times them, the journal, and the limits of the session."""
+
+    arm: RobotArm
+    sensor: ForceTorqueSensor
+    clock: Clock
+    journal: Journal
+    limits: Limits
+
+    def note(self, words: str, *, warning: bool = False) -> None:
+        """Show a note."""
+        self.journal.show(Noted(words=words, warning=warning))
+
+    def listen(self, duration_s: float) -> FtSamples:
+        """Collect samples of the resting sensor; reopen it once if it fails, as after a killed session."""
+        try:
+            return self.sensor.collect(duration_s)
+        except DeviceError as error:
+            self.note(f"{error}; trying once more", warning=True)
+        self.sensor.close()
+        self.sensor.open()
+        return self.sensor.collect(duration_s)
+
+
+class Judge(Protocol):
+    """Judges the poses so far."""
+
+    @property
+    def weighed_kg(self) -> float | None:
+        """Mass that the sensor carries; None while it is uncertain."""
+
+    def add(self, record: PoseRecord) -> Estimated | Compared:
+        """Add a pose, in place of one with the same `stop`; return what the poses show now."""
+
+    def remove(self, stop: int) -> None:
+        """Remove a pose, so that it can be taken again; a stop that was not taken is ignored."""
+
+    def predict(self, R_base_flange: Array) -> Array | None:
+        """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain."""
+
+
+class Task(Protocol):
+    """Which poses are taken, and how they are judged."""
+
+    @property
+    def command(self) -> str:
+        """The command line of the task; the run folder names it."""
+
+    @property
+    def cell(self) -> CellConfig:
+        """The cell of the session."""
+
+    @property
+    def calibration(self) -> CalibrationResult | None:
+        """The calibration that the poses are compared with: arm, sensor and mounting must be its own."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the operator should know before a pose is taken."""
+
+    @property
+    def goal(self) -> str:
+        """When the poses suffice that the operator moves the arm to."""
+
+    def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
+        """Plan the poses from joint angles (6,). Raises `PlanRefused`."""
+
+    def judge(self, *, by_hand: bool) -> Judge:
+        """Return who judges the poses; `by_hand` says that no plan chooses them."""
+
+    def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
+        """Describe what averages with one standard deviation `sigma` (6,) can show; empty if that is not known."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Session:
+    """An open cell, and what its poses are taken for."""
+
+    cell: OpenCell
+    task: Task
+    options: SessionOptions
+    resumed: Run | None
+    """The run that is continued."""
+    plan: Plan | None
+    """The plan on disk that is followed; None where it is made when the posture of the arm is known."""
+    new_run: Callable[[], Run]
+    """Creates the folder of a new run."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseBook:
+    """Keeps the poses of a session, and judges them."""
+
+    cell: OpenCell
+    run: Run
+    judge: Judge
+    down_base: Array
+    """(3,) unit vector down in base, as mounted."""
+
+    def keep(self, record: PoseRecord, *, stops: int, settle_s: float, average_s: float) -> Estimated | Compared:
+        """Commit and show a pose; return what the poses show now."""
+        # Each pose is on disk before the arm moves on: a crash costs only the pose in progress.
+        record = self.run.commit(record)
+        self.cell.journal.show(
+            PoseTaken(
+                stop=record.stop,
+                stops=stops,
+                number=record.pose.number,
+                gravity_flange=record.before.R_base_flange.T @ self.down_base,
+                mean=record.mean.mean,
+                sigma=np.sqrt(np.diag(record.mean.covariance)),
+                samples=len(record.samples.t_host_ns),
+                settle_s=settle_s,
+                average_s=average_s,
+                attempts=record.attempts,
+                steady=record.steady,
+                temperature_C=self.cell.sensor.temperature_C(),
+            ),
+            sync=True,
+        )
+        return self.judge.add(record)
+
+
+@contextmanager
+def reporting_early_end(journal: Journal, run: Run) -> Iterator[None]:
+    """Show where the data of a run are if the block ends early."""
+    try:
+        yield
+    except BaseException:
+        journal.show(Noted(words=_describe_kept(run)), sync=True)
+        raise
+
+
+def _describe_kept(run: Run) -> str:
+    if run.mode == "sweep":
+        return f"the sweep was not completed: {run.folder} has its events, and no recording"
+    if run.mode == "passive":
+        kept = f"the recording so far is kept; solve it with\n{run.solve_command}"
+        return kept if run.in_motion else f"nothing was recorded in {run.folder}"
+    words = f"{len(run.stops())} poses saved in {run.folder}; continue with\n{run.resume_command}"
+    return words + (f"\nor solve them with\n{run.solve_command}" if run.stops() and run.command == "calibrate" else "")
