@@ -14,9 +14,8 @@ from ftdrive.live.contact import Contact
 from ftdrive.live.processing import SENSOR_FRAME
 from ftdrive.live.samples import Stages, Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
-from ftdrive.planning.cell_plan import certifier_for, plan_for
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import USUAL_POSTURE_RAD
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
 from ftdrive.runs.source import read_calibration
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 

@@ -32,9 +32,9 @@ WALKS = {
         ftdrivers.ur.arm                   UrArm.open                 connects, still without control
         ftdrive.session.session            _require_devices           compares serial numbers
         ftdrive.session.along_plan         take_along_plan            goes through the stages of a session
-        ftdrive.planning.cell_plan         certifier_for              describes arm, tool and surroundings
+        ftdrive.planning.planner         certifier_for              describes arm, tool and surroundings
         ftdrive.session.session            Calibrating.plan           plans for the method
-        ftdrive.planning.cell_plan         plan_for                   chooses the kind of plan
+        ftdrive.planning.planner         plan_for                   chooses the kind of plan
         ftdrive.planning.planner           plan_tour                  finds poses, proves each move
         ftdrive.planning.approach          plan_approach              proves the way to the first pose
         ftdrive.session.preflight          check                      refuses a cell that is not ready

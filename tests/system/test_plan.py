@@ -46,7 +46,7 @@ def test_a_file_that_cannot_be_made_is_refused_before_any_work(
     option: str, name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "there").touch()
-    monkeypatch.setattr("ftdrive.planning.cell_plan.plan_for", lambda *_, **__: pytest.fail("it was planned"))
+    monkeypatch.setattr("ftdrive.planning.planner.plan_for", lambda *_, **__: pytest.fail("it was planned"))
     error = run(*UR5E, option, str(tmp_path / name)).exception
     assert isinstance(error, ConfigError)
     assert str(tmp_path / name).removesuffix("/there") in str(error)

@@ -104,7 +104,7 @@ def check_disk(folder: Path) -> Check:
 
 def check_workcell(cell: "CellConfig", model: str | None) -> Check:
     """Check that tool and surroundings are described, possible for this arm, and measured."""
-    from ftdrive.planning.cell_plan import require_possible
+    from ftdrive.planning.planner import require_possible
 
     name = "workcell.measured"
     if not cell.tool.cylinders_mm:

@@ -29,8 +29,7 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
     An option of a command comes first, then the environment, then ./ftdrive.toml, then the user's file, then the
     default.
     """
-    from ftdrive.cell.config import RULES, settings, without_password
-    from ftdrive.cell.template import WIDTH, document
+    from ftdrive.cell.config import RULES, WIDTH, document, settings, without_password
 
     check_simulate(simulate, real={"--config": path}, emulated={"--sensor": sensor})
     if simulate:

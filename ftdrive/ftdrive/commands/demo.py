@@ -94,9 +94,9 @@ def demo(
 
 def _draw(cell: CellConfig, run: Run) -> None:
     """Draw the sweep into its run, where matplotlib is installed."""
-    from ftdrive.planning.cell_plan import certifier_for
     from ftdrive.planning.drawing import draw
     from ftdrive.planning.plan import Plan
+    from ftdrive.planning.planner import certifier_for
 
     path = run.folder / "sweep.png"
     try:

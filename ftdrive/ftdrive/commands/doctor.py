@@ -30,8 +30,7 @@ from ftdrive.checks.arm import (
     check_speed,
     check_unreachable,
 )
-from ftdrive.checks.belonging import check_calibration
-from ftdrive.checks.check import Check, verdict
+from ftdrive.checks.check import Check, check_calibration, verdict
 from ftdrive.checks.computer import SensorAddress
 from ftdrive.checks.sensor import (
     check_compensated,

@@ -272,8 +272,7 @@ def _calibrated(source: Path | None, sensor: str | None, *, simulate: bool) -> I
 
 def _emulated() -> "Plan":
     from ftdrive.cell.emulated import Station
-    from ftdrive.planning.cell_plan import certifier_for, plan_for
-    from ftdrive.planning.planner import USUAL_POSTURE_RAD
+    from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
 
     with Station.of(None) as station:
         cell = station.cell

@@ -96,13 +96,13 @@ def init(
         SensorConfig,
         ToolConfig,
         WorkcellConfig,
+        cell_file,
         clock_in_force,
         settings,
     )
     from ftdrive.cell.emulated import EMULATED, Station, sensor_name
-    from ftdrive.cell.template import cell_file
-    from ftdrive.planning.cell_plan import require_possible
     from ftdrive.planning.geometry.arm_model import SHAPES
+    from ftdrive.planning.planner import require_possible
     from ftdrive.terminal.console import beside, messages
     from ftdrivers.ur.kinematics import model_named
 

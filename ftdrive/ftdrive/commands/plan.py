@@ -109,8 +109,7 @@ def plan(
     from ftdrive.cell.config import cell_of, settings
     from ftdrive.cell.emulated import Station
     from ftdrive.errors import ConfigError
-    from ftdrive.planning.cell_plan import certifier_for, plan_for
-    from ftdrive.planning.planner import USUAL_POSTURE_RAD
+    from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
     from ftdrive.terminal.console import answer, messages, working
 
     for one, other in ((quick, minimal), (cone_deg, box_mm)):

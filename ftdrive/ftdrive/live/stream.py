@@ -23,7 +23,7 @@ from ftcalib.after.state import Calibrated
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
-from ftdrive.checks.belonging import compare_devices
+from ftdrive.checks.check import compare_devices
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact
 from ftdrive.live.motion import REST

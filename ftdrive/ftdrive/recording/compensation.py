@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
 from ftcalib.model import BIASES, jacobian
-from ftdrive.checks.belonging import compare_devices
+from ftdrive.checks.check import compare_devices
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.processing import Processor
 from ftdrive.live.samples import Block, Paired, StreamEvent, WrenchFrame

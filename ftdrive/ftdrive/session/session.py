@@ -14,13 +14,12 @@ from ftcalib.published.methods import SPECIAL
 from ftcalib.result import LEAST_COMMON_GAIN, Method
 from ftdrive.cell.config import CellConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.checks.belonging import compare_devices
+from ftdrive.checks.check import compare_devices
 from ftdrive.errors import ConfigError, Declined, PlanRefused
-from ftdrive.planning.cell_plan import plan_for, sweep_for
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import NUMBERS, guess_of
+from ftdrive.planning.planner import NUMBERS, guess_of, plan_for, sweep_for
 from ftdrive.planning.search.nodes import from_usual_wrist
 from ftdrive.runs.run import Mode, Run
 from ftdrive.runs.source import Outcome, solve_and_save

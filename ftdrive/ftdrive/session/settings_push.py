@@ -16,9 +16,8 @@ from ftcalib.judge.described_cell import Lean, lean_from
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.checks import computer
-from ftdrive.checks.arm import check_arm, check_remote, check_safety
-from ftdrive.checks.belonging import compare_devices
-from ftdrive.checks.flange_load import FlangeLoad, flange_load
+from ftdrive.checks.arm import FlangeLoad, check_arm, check_remote, check_safety, flange_load
+from ftdrive.checks.check import compare_devices
 from ftdrive.checks.sensor import check_level
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.planning.geometry.scene import down_of

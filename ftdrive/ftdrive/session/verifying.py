@@ -14,10 +14,9 @@ from ftcalib.model import Array
 from ftcalib.routine import PoseRecord
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import BadPlan, PlanRefused
-from ftdrive.planning.cell_plan import speeds_of
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import guess_of, plan_verification
+from ftdrive.planning.planner import guess_of, plan_verification, speeds_of
 from ftdrive.planning.search.nodes import WRIST_6_RAD, from_usual_wrist
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification import fitted_dataset

@@ -7,7 +7,7 @@ from pathlib import Path
 from ftcalib import CalibrationResult
 from ftcalib.after.series import BiasTemperature
 from ftcalib.errors import BadCalibration
-from ftdrive.checks.belonging import compare_devices
+from ftdrive.checks.check import compare_devices
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.store import Store

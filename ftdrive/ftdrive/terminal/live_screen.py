@@ -19,8 +19,7 @@ from textual.strip import Strip
 from textual.widget import Widget
 from textual.widgets import Input
 
-from ftdrive.checks.belonging import check_calibration
-from ftdrive.checks.check import Check
+from ftdrive.checks.check import Check, check_calibration
 from ftdrive.checks.sensor import AXES
 from ftdrive.live.samples import Sink
 from ftdrive.live.stream import ProcessedStream

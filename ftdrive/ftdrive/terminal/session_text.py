@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftcalib.rounding import to_place_of, with_sigma
-from ftdrive.checks.flange_load import FlangeLoad, margin_in_words
+from ftdrive.checks.arm import FlangeLoad, margin_in_words
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.words import plan_in_words, point_in_words
 from ftdrive.session.events import (

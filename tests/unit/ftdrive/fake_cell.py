@@ -15,12 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
-from ftdrive.planning.cell_plan import certifier_for, plan_for
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certificate, Certifier
 from ftdrive.planning.geometry.kinematics import Frames
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import USUAL_POSTURE_RAD
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import Outcome
 from ftdrive.session import along_plan, session

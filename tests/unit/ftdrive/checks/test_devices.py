@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, CalibrationResult
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.checks import arm as of_arm
-from ftdrive.checks import belonging as of_belonging
 from ftdrive.checks import sensor as of_sensor
-from ftdrive.checks.check import Check
+from ftdrive.checks.check import Check, check_calibration, compare_devices
 from ftdrive.checks.computer import SensorAddress
 from ftdrivers.errors import (
     ConnectError,
@@ -407,15 +406,15 @@ def test_calibration_of_another_sensor() -> None:
     made_with = {"arm": {"serial": "A", "model": "UR5e"}, "sensor": {"serial": "S", "model": "M"}}
     provenance = {"devices": made_with, "created_utc": "2026-01-01"}
     result = cast(CalibrationResult, SimpleNamespace(provenance=provenance, verdict="good"))
-    assert of_belonging.check_calibration(result, {"arm": device("A", "UR5e"), "sensor": device("S")}).state == "ok"
-    other = of_belonging.check_calibration(result, {"arm": device("A"), "sensor": device("T")})
+    assert check_calibration(result, {"arm": device("A", "UR5e"), "sensor": device("S")}).state == "ok"
+    other = check_calibration(result, {"arm": device("A"), "sensor": device("T")})
     assert other.state == "failed"
     assert "sensor S, but the sensor T" in other.found
-    unknown = of_belonging.check_calibration(result, {"arm": device("A"), "sensor": device(NOT_REPORTED)})
+    unknown = check_calibration(result, {"arm": device("A"), "sensor": device(NOT_REPORTED)})
     assert unknown.state == "warning"
     assert "cannot be checked" in unknown.found
     assert "serial=" in str(unknown.fix)
-    both = of_belonging.check_calibration(result, {"arm": device("B"), "sensor": device(NOT_REPORTED)})
+    both = check_calibration(result, {"arm": device("B"), "sensor": device(NOT_REPORTED)})
     assert (both.state, both.fix) == ("failed", "ftdrive calibrate")
 
 
@@ -423,10 +422,10 @@ def test_calibration_of_another_sensor() -> None:
 def test_a_calibration_of_another_model_is_of_another_sensor_without_serial_numbers(made: str, connected: str) -> None:
     devices = {"sensor": {"serial": made, "model": "ATI F/T (NETCANOEM, CAN)"}}
     result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
-    check = of_belonging.check_calibration(result, {"sensor": device(connected, "Bota force/torque sensor")})
+    check = check_calibration(result, {"sensor": device(connected, "Bota force/torque sensor")})
     assert (check.state, check.fix) == ("failed", "ftdrive calibrate")
     assert "ATI F/T (NETCANOEM, CAN), but Bota" in check.found
-    same = of_belonging.check_calibration(result, {"sensor": device(connected, "ATI F/T (NETCANOEM, CAN)")})
+    same = check_calibration(result, {"sensor": device(connected, "ATI F/T (NETCANOEM, CAN)")})
     assert same.state == "warning"
 
 
@@ -434,9 +433,9 @@ def test_a_calibration_of_another_model_is_of_another_sensor_without_serial_numb
 def test_a_calibration_that_does_not_know_its_sensor_cannot_be_checked(devices: object) -> None:
     result = cast(CalibrationResult, SimpleNamespace(provenance={"devices": devices}, verdict="good"))
     for serial in ("FT12345", NOT_REPORTED):
-        (words,) = of_belonging.compare_devices(result, {"sensor": device(serial)}).unknown
+        (words,) = compare_devices(result, {"sensor": device(serial)}).unknown
         assert "was made with" in words
-        assert not of_belonging.compare_devices(result, {"sensor": device(serial)}).others
+        assert not compare_devices(result, {"sensor": device(serial)}).others
 
 
 ALLOWED = Check("permissions.port", "ok", "may be read and written")

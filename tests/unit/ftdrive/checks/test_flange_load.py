@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Parameters
-from ftdrive.checks.flange_load import RATED_KG, flange_load, margin_in_words
+from ftdrive.checks.arm import RATED_KG, flange_load, margin_in_words
 
 Array = NDArray[np.float64]
 QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

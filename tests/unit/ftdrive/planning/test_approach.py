@@ -7,12 +7,11 @@ from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfi
 from ftdrive.cell.rules import Rows
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.approach import Approach, arm_moves, plan_approach
-from ftdrive.planning.cell_plan import certifier_for
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.planner import USUAL_POSTURE_RAD
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for
 from ftdrivers.ur.kinematics import Array
 
 TOOL = (Cylinder(0, 0.2, 0.1),)

@@ -5,13 +5,12 @@ import pytest
 
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.planning.approach import plan_approach
-from ftdrive.planning.cell_plan import speeds_of
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour, speeds_of
 from ftdrive.session.along_plan import limit_speeds, moves_s
 from ftdrive.session.tour import APPROACH_RAD_S, SLOW
 

@@ -12,8 +12,8 @@ from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, SupervisorGone
 from ftdrive.planning import sweep_planner
-from ftdrive.planning.cell_plan import certifier_for, sweep_for
 from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import certifier_for, sweep_for
 from ftdrive.runs.motion import MotionRecording
 from ftdrive.session import session
 from ftdrive.session.events import Event, GuardTripped, Key, MotionRecorded, State, StateChanged

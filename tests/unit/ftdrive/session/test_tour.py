@@ -15,11 +15,10 @@ from ftcalib.sampling import Sampling
 from ftdrive.cell.config import WorkcellConfig
 from ftdrive.errors import Declined, NotAccepted
 from ftdrive.planning import drawing
-from ftdrive.planning.cell_plan import certifier_for
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, guess_of, plan_tour
 from ftdrive.session import preflight
 from ftdrive.session.along_plan import has_completed, remember_completed
 from ftdrive.session.events import (

@@ -24,7 +24,7 @@ from ftdrive.cli import cli, in_a_sentence
 from ftdrive.cli import run as cli_run
 from ftdrive.commands.doctor import _print
 from ftdrive.errors import Declined
-from ftdrive.planning import cell_plan
+from ftdrive.planning import planner
 from ftdrive.planning.plan import Plan
 from ftdrive.session import session
 from ftdrive.session.events import Noted, Question
@@ -98,13 +98,13 @@ def test_findings_of_doctor_and_their_cures_are_indented(
 
 
 def test_quiet_leaves_only_errors_and_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    plan_for, plans = cell_plan.plan_for, list[Plan]()
+    plan_for, plans = planner.plan_for, list[Plan]()
 
     def plan_once(*arguments: Any, **options: Any) -> Plan:
         plans.extend([] if plans else [plan_for(*arguments, **options)])
         return plans[0]
 
-    monkeypatch.setattr(cell_plan, "plan_for", plan_once)
+    monkeypatch.setattr(planner, "plan_for", plan_once)
     shown, quiet = run(*PLAN), run("-q", *PLAN)
     assert "Predicted" in shown.stdout
     assert shown.stderr.splitlines()[-2:] == ["Next", "   ftdrive calibrate   (asks before anything moves)"]

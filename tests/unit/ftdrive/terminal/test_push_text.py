@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ftdrive.checks.flange_load import FlangeLoad
+from ftdrive.checks.arm import FlangeLoad
 from ftdrive.session.settings_push import Push
 from ftdrive.terminal.session_text import proposal_in_lines, settings_in_words
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo

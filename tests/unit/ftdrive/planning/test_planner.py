@@ -11,9 +11,9 @@ from syrupy.assertion import SnapshotAssertion
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.cell.rules import Rows
 from ftdrive.errors import ConfigError
-from ftdrive.planning.cell_plan import box_from_mm, certifier_for, plane_from_mm, require_possible
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder, height_above, separation_from_box
 from ftdrive.planning.geometry.certify import Margins
+from ftdrive.planning.planner import box_from_mm, certifier_for, plane_from_mm, require_possible
 
 Row = Sequence[float]
 SHOULDER = 1
