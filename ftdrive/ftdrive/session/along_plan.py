@@ -30,8 +30,8 @@ from ftdrive.session.events import GuardTripped, Planned
 from ftdrive.session.open_session import Judge, OpenCell, PoseBook, Session, reporting_early_end
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
-from ftdrive.session.sweep import FreeTool, SweepTour, sweep_pace
-from ftdrive.session.tour import APPROACH_RAD_S, SLOW, GuardedCell, Pace, Tour
+from ftdrive.session.sweep import FreeTool, SweepTour, choose_sweep_speed
+from ftdrive.session.tour import APPROACH_RAD_S, SLOW, GuardedCell, Tour
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.interfaces import NOT_REPORTED
 from ftdrivers.ur.kinematics import kinematics_of
@@ -160,8 +160,8 @@ class _AlongPlan:
             if path := cell.arm.identify().facts.get("control"):
                 cell.note(f"control path {path.value}")
             check(before, IN_CONTROL)
-        pace = self._pace(before, todo, taken=len(taken))
-        return None if dry_run else self._tour(before, pace, todo, judge)
+        driven = self._choose_pace(before, todo, taken=len(taken))
+        return None if dry_run else self._tour(before, driven, todo, judge)
 
     @property
     def _serial(self) -> str:
@@ -206,11 +206,11 @@ class _AlongPlan:
         _show_plan(before, options)
         return before
 
-    def _pace(self, before: Before, todo: Sequence[int], *, taken: int) -> Pace:
-        """Choose speeds and averaging time; show the accuracy to expect with this sensor's noise, and the duration."""
+    def _choose_pace(self, before: Before, todo: Sequence[int], *, taken: int) -> Before:
+        """Choose speeds and sampling; show the accuracy to expect with this sensor's noise, and the duration."""
         cell, plan = self.cell, before.plan
         if plan.sweep is not None:
-            return sweep_pace(before, slow=self.options.real and not before.known)
+            return choose_sweep_speed(before, slow=self.options.real and not before.known)
         sampling, sigma = _chosen_sampling(before, todo)
         force_N, torque_Nm = rms_sigma(sigma)
         noise = f"sigma of {sampling.average_s:g} s averages: {force_N:.2g} N, {torque_Nm:.2g} N·m"
@@ -227,24 +227,20 @@ class _AlongPlan:
             f"{len(todo)} stops left, at most {np.degrees(driven.top_speed_rad_s):.0f}°/s: "
             f"about {total_s / 60:.1f} min; {taken} poses taken before"
         )
-        window = int(len(before.quiet) * min(1.0, sampling.average_s / LISTEN_S))
-        return Pace(
-            driven,
-            before.certifier,
-            sampling,
-            quiet_std=noise_level(before.quiet.wrench, max(LEAST_SAMPLES, window)),
-            sensor_kg=before.config.sensor.mass_kg,
-            trusted=before.known,
-        )
+        return replace(before, plan=driven, config=replace(before.config, sampling=sampling))
 
-    def _tour(self, before: Before, pace: Pace, todo: Sequence[int], judge: Judge) -> Run:
-        """Ask the safety questions, then visit every pose that is left; each is on disk before the next move."""
+    def _tour(self, before: Before, driven: Before, todo: Sequence[int], judge: Judge) -> Run:
+        """Ask the safety questions, then visit every pose that is left; each is on disk before the next move.
+
+        `driven` has the speeds and the sampling of this session; later checks repeat those of `before`.
+        """
         cell, options, way = self.cell, self.options, before.approach.way_rad
         load = guards.RangeGuard(cell.limits, before.sensor_range, before.sensor_zero)
         learner = None
         if options.mode == "sweep":  # no pose shows what the tool weighs while it moves
             learner = FreeTool(before.certifier.scene.down_base, self.task.cell.tool.mass_kg or _HEAVIEST_SWEPT_KG)
-        contact = self._contact_guard(pace, judge.predict if learner is None else learner.predict)
+        quiet_std = _quiet_std(driven)
+        contact = self._contact_guard(driven, quiet_std, judge.predict if learner is None else learner.predict)
         rows = (
             guards.SupervisorGuard(cell.journal.absence),
             guards.SafetyGuard(),
@@ -272,19 +268,21 @@ class _AlongPlan:
             run = self._session.resumed or self._keep_plan(before.plan)
             book = PoseBook(cell, run, judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)
-            tour = (SweepTour if pace.plan.sweep else Tour)(guarded, pace, book, options)
+            tour = (SweepTour if driven.plan.sweep else Tour)(guarded, driven, quiet_std, book, options)
             with reporting_early_end(cell.journal, run):
                 tour.run(todo)
         if todo and not before.known:
             self._judge_completed(before.plan, run, tour.undriven)
         return run
 
-    def _contact_guard(self, pace: Pace, predict: Callable[[Array], Array | None]) -> guards.ContactGuard:
-        arm = pace.certifier.arm
+    def _contact_guard(
+        self, driven: Before, quiet_std: Array, predict: Callable[[Array], Array | None]
+    ) -> guards.ContactGuard:
+        arm = driven.certifier.arm
         heaviest_kg = self.task.cell.tool.mass_kg or _HEAVIEST_KG.get(arm.name, _HEAVIEST_OF_ALL_KG)
         reach_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in arm.tool)
-        acceleration_rad_s2 = pace.plan.acceleration_rad_s2
-        return guards.ContactGuard(self.cell.limits, heaviest_kg, reach_m, acceleration_rad_s2, pace.quiet_std, predict)
+        acceleration_rad_s2 = driven.plan.acceleration_rad_s2
+        return guards.ContactGuard(self.cell.limits, heaviest_kg, reach_m, acceleration_rad_s2, quiet_std, predict)
 
     def _keep_plan(self, plan: Plan) -> Run:
         run = self._session.new_run()
@@ -317,6 +315,12 @@ class _AlongPlan:
             remember_completed(self._serial, plan.sha256)
             return
         self.cell.note(f"the next run of this plan is slow again and needs the typed word: {why}")
+
+
+def _quiet_std(driven: Before) -> Array:
+    """Return the standard deviation (6,) of the samples of the resting sensor, as in an average of a pose."""
+    share = 0.5 if driven.plan.sweep else min(1.0, driven.config.sampling.average_s / LISTEN_S)
+    return noise_level(driven.quiet.wrench, max(LEAST_SAMPLES, int(len(driven.quiet) * share)))
 
 
 def _show_plan(before: Before, options: SessionOptions) -> None:

@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 
-from ftcalib.data.dwell_mean import LEAST_SAMPLES, noise_level
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import ConfigError, NotAccepted
@@ -15,7 +14,7 @@ from ftdrive.runs.motion import MotionRecording
 from ftdrive.session.events import MotionRecorded, State
 from ftdrive.session.guards import Guard, Seen
 from ftdrive.session.preflight import Before
-from ftdrive.session.tour import APPROACH_RAD_S, SLOW, Pace, Tour
+from ftdrive.session.tour import APPROACH_RAD_S, SLOW, Tour
 from ftdrivers.sweep import Sweep
 
 # The motion teaches so long before anything is predicted.
@@ -159,7 +158,7 @@ class SweepTour(Tour):
 
     def _rest(self, centre: np.ndarray) -> None:
         clock = self._watcher.clock
-        self._arm.wait_until_still(timeout_s=self._pace.sampling.still_timeout_s, guard=self._between_looks)
+        self._arm.wait_until_still(timeout_s=self._config.sampling.still_timeout_s, guard=self._between_looks)
         with self._watcher.watching(centre, centre, moving=False):
             for _ in clock.looks(REST_S):
                 self._between_looks()
@@ -182,8 +181,8 @@ def on_script_path(cell: CellConfig) -> CellConfig:
     return replace(cell, robot=replace(cell.robot, control="script"))
 
 
-def sweep_pace(before: Before, *, slow: bool) -> Pace:
-    """Choose the speed of a sweep, on which the speed slider does not act while it runs, and show it.
+def choose_sweep_speed(before: Before, *, slow: bool) -> Before:
+    """Return the plan at the speed of the sweep, on which the slider does not act while it runs, and show that.
 
     Raises `NotAccepted` if the slider is too low.
     """
@@ -203,12 +202,4 @@ def sweep_pace(before: Before, *, slow: bool) -> Pace:
         f"sweep of {plan.sweep.duration_s:.0f} s at {100 * share:.0f} % of the planned speed ({why}), at most "
         f"{np.degrees(plan.top_speed_rad_s):.0f}°/s: about {total_s:.0f} s of motion"
     )
-    quiet_std = noise_level(before.quiet.wrench, max(LEAST_SAMPLES, len(before.quiet) // 2))
-    return Pace(
-        plan,
-        before.certifier,
-        before.config.sampling,
-        quiet_std=quiet_std,
-        sensor_kg=before.config.sensor.mass_kg,
-        trusted=before.known,
-    )
+    return replace(before, plan=plan)

@@ -8,7 +8,6 @@ stopped the arm, and whether the cause is gone.
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
@@ -18,19 +17,16 @@ from ftcalib.errors import TooFewSamples
 from ftcalib.judge import described_cell
 from ftcalib.model import Array
 from ftcalib.routine import Stage, TourPose, take_pose
-from ftcalib.sampling import Sampling
 from ftdrive.checks.arm import SLOWEST_SLIDER
 from ftdrive.errors import Declined, NotAccepted, PlanRefused, SupervisorGone
 from ftdrive.planning.approach import arm_moves, plan_approach
-from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, move_duration_s
-from ftdrive.planning.plan import Plan
 from ftdrive.planning.words import way_in_words
 from ftdrive.session.events import GuardTripped, Hazard, Key, Question, SensorEvents, State, StateChanged, Weighed
 from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, arm_lost, by_safety, fault
 from ftdrive.session.open_session import OpenCell, PoseBook
 from ftdrive.session.options import SessionOptions
-from ftdrive.session.preflight import forbidden
+from ftdrive.session.preflight import Before, forbidden
 from ftdrive.session.progress import Progress
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.errors import DeviceError, DeviceFault
@@ -163,37 +159,24 @@ class GuardedCell:
         return Tripped(Hazard.OTHER_CLIENT if isinstance(error, DeviceFault) else Hazard.CONTROLLER_LOST, error)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Pace:
-    """How a plan is driven and measured in this session."""
-
-    plan: Plan
-    """With the speeds of this session."""
-    certifier: Certifier
-    sampling: Sampling
-    quiet_std: Array
-    """(6,) standard deviation of the resting sensor's samples."""
-    sensor_kg: float | None
-    """Mass of sensor and adapter; None if unknown. The payload is compared with it."""
-    trusted: bool
-    """Whether `--yes` may answer: the plan has run to its end on this arm, or the cell is emulated."""
-
-
 class Tour:
-    """Takes the arm along a plan; the book keeps every pose."""
+    """Takes the arm along a plan; the book keeps every pose.
 
-    def __init__(self, guarded: GuardedCell, pace: Pace, book: PoseBook, options: SessionOptions) -> None:
+    `driven` has the speeds and the sampling of this session, `quiet_std` (6,) the standard deviation of the samples of
+    the resting sensor.
+    """
+
+    def __init__(
+        self, guarded: GuardedCell, driven: Before, quiet_std: Array, book: PoseBook, options: SessionOptions
+    ) -> None:
         self._guarded, self._watcher = guarded, guarded.watcher
         self._arm, self._sensor, self._journal = guarded.cell.arm, guarded.cell.sensor, guarded.cell.journal
         self._note = guarded.cell.note
-        self._plan, self._certifier, self._pace, self._book, self._options = (
-            pace.plan,
-            pace.certifier,
-            pace,
-            book,
-            options,
-        )
-        self._nodes = pace.plan.nodes_rad
+        self._plan, self._certifier, self._config = driven.plan, driven.certifier, driven.config
+        # Whether `--yes` may answer: the plan has run to its end on this arm, or the cell is emulated.
+        self._trusted = driven.known
+        self._quiet_std, self._book, self._options = quiet_std, book, options
+        self._nodes = driven.plan.nodes_rad
         self._now = Progress(len(self._nodes))
 
     def run(self, todo: Sequence[int]) -> None:
@@ -253,7 +236,7 @@ class Tour:
             return
         self._now.payload_kg = payload_kg
         self._journal.show(Weighed(mass_kg=mass_kg, payload_kg=payload_kg, p_flange_payload_m=com_m))
-        for finding in described_cell.payload(payload_kg, mass_kg, self._pace.sensor_kg):
+        for finding in described_cell.payload(payload_kg, mass_kg, self._config.sensor.mass_kg):
             self._note(finding.words, warning=True)
 
     def _step(self, stop: int, index: int) -> bool:
@@ -283,7 +266,7 @@ class Tour:
         largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
-            drives = ", and drives it where --yes may confirm it" if self._pace.trusted and self._options.yes else ""
+            drives = ", and drives it where --yes may confirm it" if self._trusted and self._options.yes else ""
             return f"Enter plans the way and shows it{drives}, {joints}, {largest}"
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
 
@@ -346,7 +329,7 @@ class Tour:
             self._note(f"skipped: {' and '.join(left)}, {way}; --resume takes skipped poses", warning=True)
 
     def _take(self, stop: int, index: int) -> None:
-        step, pace, clock = self._plan.steps[index], self._pace, self._watcher.clock
+        step, sampling, clock = self._plan.steps[index], self._config.sampling, self._watcher.clock
         pose = TourPose(step.number, np.array(step.q_rad))
         began_s, settled_s = clock.now_s(), 0.0
 
@@ -361,13 +344,13 @@ class Tour:
                 self._sensor,
                 stop,
                 pose,
-                pace.sampling,
+                sampling,
                 guard=self._between_looks,
                 on_stage=on_stage,
-                quiet_std=pace.quiet_std,
+                quiet_std=self._quiet_std,
             )
         self._guarded.load.judge(record.samples.wrench)
-        average_s = pace.sampling.average_s
+        average_s = sampling.average_s
         judged = self._book.keep(record, stops=self._now.stops, settle_s=settled_s, average_s=average_s)
         self._guarded.show_new()
         self._journal.show(judged)
@@ -439,7 +422,7 @@ class Tour:
         """Ask before a motion; the first motion needs a typed word."""
         if not self._options.questions:
             return
-        trusted = self._pace.trusted and not by_operator
+        trusted = self._trusted and not by_operator
         if self._now.confirmed:
             if self._journal.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
                 raise _OperatorStop(f"not confirmed: {text}")
