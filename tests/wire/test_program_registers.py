@@ -15,7 +15,7 @@ import pytest
 
 from ftdrive.exports.program_functions import functions
 from ftdrivers.errors import ConnectError
-from ftdrivers.ur.program_registers import ProgramRegisters
+from ftdrivers.ur.rtde import ProgramRegisters
 from tests.wire.conftest import Station
 from tests.wire.station_process import ROOT
 

@@ -41,7 +41,7 @@ from ftdrivers.ur.rtde import Subscription
 from ftdrivers.ur.sample import MEASURING, OPTIONAL, OUTPUTS, Sample
 from ftdrivers.ur.services import ROBOT_API_PORT as API_PORT
 from ftdrivers.ur.services import Services, ServicesOf
-from ftdrivers.ur.timing import Lateness, Patience, UrTiming
+from ftdrivers.ur.timing import Patience, UrTiming
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +56,7 @@ Received = tuple[int, list[bytes]]
 _PAUSE_S: Final = 0.1
 # The first output, after the number of the recipe.
 _TIMESTAMP: Final = struct.Struct(">xd")
+_QUICKEST_OF_S: Final = 0.5
 _MODEL_M: Final = 0.020
 # Of 30 real arms, none is more than 7.5 mm and 1.32 degrees from its nominal model. Another model of a similar arm is
 # at least 8.5 mm from it in every posture, and real arms are always nearest to their own.
@@ -77,6 +78,27 @@ def _apart_as_share(one: Pose, other: Pose) -> float:
     """Return how far apart two poses are, as a share of what a real arm of the model may be."""
     distance_m, angle_rad = _apart(one, other)
     return max(distance_m / _MODEL_M, angle_rad / _MODEL_RAD)
+
+
+class _Lateness:
+    """How late samples are by the controller's clock, compared with the quickest of the last 0.5 to 1 s with samples.
+
+    A clock that is up to 4 % slow, as that of a simulator, is not late. One that stood still is late for 1 s at most.
+    """
+
+    def __init__(self) -> None:
+        self._quickest_s, self._quickest_before_s = -math.inf, -math.inf
+        self._since_s: float | None = None
+
+    def late_s(self, t_device_s: float, heard_s: float) -> float:
+        """Return how late a sample is; `heard_s` is the time of its receipt. Only differences of both clocks count."""
+        # After a stall, samples arrive that are seconds old with stamps that advance like new ones: the quickest of
+        # the last second is the measure.
+        lead_s = t_device_s - heard_s
+        if self._since_s is None or heard_s - self._since_s > _QUICKEST_OF_S:
+            self._quickest_before_s, self._quickest_s, self._since_s = self._quickest_s, lead_s, heard_s
+        self._quickest_s = max(self._quickest_s, lead_s)
+        return max(self._quickest_s, self._quickest_before_s) - lead_s
 
 
 class Reader:
@@ -106,7 +128,7 @@ class Reader:
         # When a read last returned, when with a sample, and when with `_live`.
         self._turn_s = self._read_s = self._live_s = clock.awake_s()
         self._t_device_s = math.nan
-        self._lateness, self._late_s = Lateness(), 0.0
+        self._lateness, self._late_s = _Lateness(), 0.0
         self._followers: list[Unread[Received]] = []
         # When a followed pose is compared with the model again.
         self._check_s = -math.inf

@@ -4,7 +4,7 @@ The receiving side of ur_rtde freezes the interpreter when the controller accept
 values when a link is lost, has no snapshot, and cannot parse `tcp_offset`, which the flange pose needs. Only a
 subscription that claims inputs writes to the controller, so no other can disturb a program.
 
-Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2.
+Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2, general-purpose registers.
 Checked on hardware: no.
 """
 
@@ -12,6 +12,7 @@ import contextlib
 import logging
 import socket
 import struct
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import ConnectError, DeviceTimeout, ProtocolError, StreamBroken, Unreachable
+from ftdrivers.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError, StreamBroken, Unreachable
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +48,12 @@ _INPUTS: Final[Mapping[str, str]] = {"INT32": "i", "DOUBLE": "d"}
 _RECEIVE_BYTES: Final = 65536
 # Of the CB3 generation, and from the e-Series on.
 _FULL_RATE_HZ: Final = (125.0, 500.0)
+# RTDE clients own these registers from PolyScope 3.9 and 5.3 on, fieldbuses and PLCs those below.
+FIRST_REGISTER: Final = 24
+LAST_REGISTER: Final = 47
+# Of the outputs in which a program writes its requests.
+_REQUESTS_HZ: Final = 125.0
+_SILENT_S: Final = 1.0
 
 
 def encode(kind: int, payload: bytes = b"") -> bytes:
@@ -355,3 +362,79 @@ def registers_taken(host: str, names: Sequence[str]) -> ConnectError:
         f"another client controls {host} and holds its RTDE registers{which}",
         "end it, or disable EtherNet/IP, PROFINET and other fieldbuses on the controller; wait 30 s after a cut cable",
     )
+
+
+class ProgramRegisters:
+    """Input registers with which this client answers a program on the controller, and two outputs that it writes.
+
+    Parameters
+    ----------
+    host : str
+    first : int
+        Of the registers of each kind.
+    integers, doubles : int
+        How many inputs are owned.
+    timeout_s : float
+        Of the connection.
+    clock : Clock
+
+    Raises
+    ------
+    ValueError
+        The registers are not those of RTDE clients.
+    ConnectError
+        Nothing answers, another client or a fieldbus owns a register, or this version has none.
+    """
+
+    def __init__(
+        self, host: str, first: int, integers: int, doubles: int, *, timeout_s: float = 2.0, clock: Clock = REAL
+    ) -> None:
+        if not FIRST_REGISTER <= first <= LAST_REGISTER + 1 - max(integers, doubles):
+            raise ValueError(f"registers from {first} are not within {FIRST_REGISTER} to {LAST_REGISTER}")
+        inputs = {f"input_int_register_{first + i}": "INT32" for i in range(integers)}
+        inputs |= {f"input_double_register_{first + i}": "DOUBLE" for i in range(doubles)}
+        self._names = tuple(f"output_int_register_{first + i}" for i in range(2))
+        self._link = Subscription(
+            host, dict.fromkeys(self._names, "INT32"), _REQUESTS_HZ, timeout_s=timeout_s, clock=clock, inputs=inputs
+        )
+        self._lock = threading.Lock()
+        self._failure: DeviceError | None = None
+        self._request: tuple[int, int] | None = None
+        self._reader = threading.Thread(target=self._read, name="program registers", daemon=True)
+        self._reader.start()
+
+    @property
+    def request(self) -> tuple[int, int] | None:
+        """Number and command of the last request, as the program has written them; None before the first sample.
+
+        Raises `DeviceError` when the connection is lost.
+        """
+        if self._failure is not None:
+            raise self._failure
+        return self._request
+
+    def write(self, integers: Sequence[int], doubles: Sequence[float]) -> None:
+        """Set all inputs at once. Raises `DeviceError` when the connection is lost."""
+        try:
+            with self._lock:
+                # One package, which the controller takes in one cycle: the IO client of ur_rtde writes one for each
+                # register, so a program could read half of an answer.
+                self._link.write([*integers, *doubles])
+        except OSError as error:
+            raise StreamBroken(f"the controller does not take registers ({error})", "check the cable") from error
+        if self._failure is not None:
+            raise self._failure
+
+    def close(self) -> None:
+        """Close the connection; the registers keep their last values. Idempotent."""
+        self._link.close()
+        self._reader.join(1.0)
+
+    def _read(self) -> None:
+        try:
+            while True:
+                values = self._link.decode(self._link.read(_SILENT_S))
+                number, command = (int(np.asarray(values[name])[-1]) for name in self._names)
+                self._request = number, command
+        except (OSError, StreamBroken, ProtocolError, struct.error) as error:
+            self._failure = StreamBroken(f"the registers of the controller are lost ({error})", "check robot and cable")

@@ -1,6 +1,5 @@
-"""Every time limit of a Universal Robots arm; lateness; waits for an event and for a lock."""
+"""Every time limit of a Universal Robots arm; waits for an event and for a lock."""
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from typing import Final, Self
 from ftdrivers.clock import Clock, Waitable
 
 _TURN_NS: Final = 50_000_000
-_QUICKEST_OF_S: Final = 0.5
 
 
 @dataclass(frozen=True)
@@ -92,27 +90,6 @@ class UrTiming:
 
 STRICT: Final = UrTiming()
 """Limits of a real cell."""
-
-
-class Lateness:
-    """How late samples are by the controller's clock, compared with the quickest of the last 0.5 to 1 s with samples.
-
-    A clock that is up to 4 % slow, as that of a simulator, is not late. One that stood still is late for 1 s at most.
-    """
-
-    def __init__(self) -> None:
-        self._quickest_s, self._quickest_before_s = -math.inf, -math.inf
-        self._since_s: float | None = None
-
-    def late_s(self, t_device_s: float, heard_s: float) -> float:
-        """Return how late a sample is; `heard_s` is the time of its receipt. Only differences of both clocks count."""
-        # After a stall, samples arrive that are seconds old with stamps that advance like new ones: the quickest of
-        # the last second is the measure.
-        lead_s = t_device_s - heard_s
-        if self._since_s is None or heard_s - self._since_s > _QUICKEST_OF_S:
-            self._quickest_before_s, self._quickest_s, self._since_s = self._quickest_s, lead_s, heard_s
-        self._quickest_s = max(self._quickest_s, lead_s)
-        return max(self._quickest_s, self._quickest_before_s) - lead_s
 
 
 class Patience:

@@ -11,7 +11,7 @@ from ftdrive.errors import ConfigError
 from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 from ftdrivers.registry import arm_class, sensor_from_url
-from ftdrivers.ur.program_registers import ProgramRegisters
+from ftdrivers.ur.rtde import ProgramRegisters
 from ftdrivers.ur.timing import STRICT, UrTiming
 
 

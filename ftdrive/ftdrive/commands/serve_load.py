@@ -8,7 +8,7 @@ import click
 
 from ftdrive.commands.common import SOURCE, TRACK, Source, frame_options, read_frame
 from ftdrive.errors import ConfigError
-from ftdrivers.ur.program_registers import FIRST, LAST
+from ftdrivers.ur.rtde import FIRST_REGISTER, LAST_REGISTER
 
 if TYPE_CHECKING:
     from ftdrive.live.samples import Axes, Tracking
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 @SOURCE
 @frame_options("base", "tcp")
 @TRACK
-@click.option("--first", type=int, default=FIRST, show_default=True, help="First register of each kind.")
+@click.option("--first", type=int, default=FIRST_REGISTER, show_default=True, help="First register of each kind.")
 def serve_load(
     source: Source,
     axes: "Axes",
@@ -38,11 +38,11 @@ def serve_load(
     from ftdrive.terminal.console import messages
 
     doubles = len(doubles_of(track))
-    last = LAST + 1 - max(len(INTEGERS), doubles)
-    if not FIRST <= first <= last:
+    last = LAST_REGISTER + 1 - max(len(INTEGERS), doubles)
+    if not FIRST_REGISTER <= first <= last:
         raise ConfigError(
-            f"--first is {first}: give {FIRST} to {last}, because fieldbuses and PLCs own the registers below {FIRST}, "
-            f"and {LAST} is the last one"
+            f"--first is {first}: give {FIRST_REGISTER} to {last}, because fieldbuses and PLCs own the registers below "
+            f"{FIRST_REGISTER}, and {LAST_REGISTER} is the last one"
         )
     frame = read_frame(axes, about)
     with ExitStack() as stack:

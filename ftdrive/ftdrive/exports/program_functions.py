@@ -8,7 +8,7 @@ Checked on hardware: no.
 from typing import Final
 
 from ftdrive.servers.program import CODES, DOUBLES, INTEGERS, TRACKED, Command, Condition, State
-from ftdrivers.ur.program_registers import LAST
+from ftdrivers.ur.rtde import LAST_REGISTER
 
 # Without a new live counter for so long the service is gone; the states below 0 have no other meaning.
 STALE_S: Final = 0.06
@@ -49,7 +49,7 @@ def functions(first: int, *, example: bool = False) -> str:
         "ZEROS": ", ".join(["0.0"] * len(DOUBLES[6:])),
         **{command.name: str(int(command)) for command in Command},
     }
-    tracks = first + len(DOUBLES + TRACKED) <= LAST + 1
+    tracks = first + len(DOUBLES + TRACKED) <= LAST_REGISTER + 1
     text = _TEXT + (_BIAS if tracks else "") + (_EXAMPLE if example else "")
     for name, value in values.items():
         text = text.replace(f"<{name}>", value)

@@ -3,7 +3,7 @@
 import pytest
 
 from ftdrivers.errors import ConnectError
-from ftdrivers.ur.program_registers import ProgramRegisters
+from ftdrivers.ur.rtde import ProgramRegisters
 
 
 @pytest.mark.parametrize(("first", "doubles"), [(23, 15), (34, 15), (27, 22)])
