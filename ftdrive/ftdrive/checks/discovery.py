@@ -1,13 +1,10 @@
 """Discovery of robots and sensors at an address, port or bus. They are read, never changed or moved."""
 
-from contextlib import closing
 from pathlib import Path
 
 from serial.tools import list_ports
 
-from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
-from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.checks.check import Check, who
+from ftdrive.checks.check import Check
 from ftdrive.checks.computer import (
     can_details,
     can_interfaces,
@@ -21,26 +18,8 @@ from ftdrivers.errors import ConnectError
 from ftdrivers.probe import Answer, probe_can, probe_serial
 from ftdrivers.registry import Options, split_url
 
-_LOOK_S = 0.5
 _CAN = ("socketcan", "slcan")
 _SLCAN = "slcan:///dev/ttyACM0?bitrate=250000"
-
-
-def identify_robot(host: str, model: str | None, clock: Clock = REAL) -> tuple[str, str]:
-    """Return the model of the arm at an address, and in words what it reports; raises `DeviceError`."""
-    with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
-        arm.open()
-        info, remote = arm.identify(), arm.in_remote_control()
-    switch = "" if remote is None else f", remote control {'ON' if remote else 'OFF'}"
-    return info.model, who(info) + switch
-
-
-def identify_sensor(url: str, clock: Clock = REAL) -> str:
-    """Return in words which sensor is at an address, and its rate; raises `DeviceError` or `UsageError`."""
-    with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url), clock=clock)) as sensor:
-        info = sensor.identify()
-        rate_Hz = len(sensor.collect(_LOOK_S).t_host_ns) / _LOOK_S
-    return f"{who(info)}, {rate_Hz:.0f} Hz"
 
 
 def is_place(text: str) -> bool:

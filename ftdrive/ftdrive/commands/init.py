@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
@@ -22,6 +22,7 @@ Judge = Callable[[Any], None]
 # Options that may be repeated.
 _ROWS = ("--tool", "--plane", "--box")
 _SILENT = "did not answer when this was written"
+_LOOK_S = 0.5
 
 
 @click.command()
@@ -309,7 +310,6 @@ def _checked(key: str, value: Any) -> Any:
 
 def _robot(ask: _Questions, given: str | None, model: str | None, clock: Clock) -> tuple[str, str | None, str]:
     """Return host, model, and what the arm reports; the operator may keep an address that does not answer."""
-    from ftdrive.checks.discovery import identify_robot
     from ftdrivers.errors import DeviceError
 
     if model is not None:
@@ -317,7 +317,7 @@ def _robot(ask: _Questions, given: str | None, model: str | None, clock: Clock) 
     host = ask.text("Robot address", "robot.host", given)
     while True:
         try:
-            found, words = identify_robot(host, model, clock)
+            found, words = _identify_robot(host, model, clock)
         except DeviceError as error:
             if not ask.interactive:
                 raise
@@ -333,10 +333,23 @@ def _robot(ask: _Questions, given: str | None, model: str | None, clock: Clock) 
         return host, found, words
 
 
+def _identify_robot(host: str, model: str | None, clock: Clock) -> tuple[str, str]:
+    """Return the model of the arm at an address, and in words what it reports; raises `DeviceError`."""
+    from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
+    from ftdrive.cell.devices import build_arm
+    from ftdrive.checks.check import who
+
+    with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
+        arm.open()
+        info, remote = arm.identify(), arm.in_remote_control()
+    switch = "" if remote is None else f", remote control {'ON' if remote else 'OFF'}"
+    return info.model, who(info) + switch
+
+
 def _sensor(ask: _Questions, given: str | None, clock: Clock) -> tuple[str, str]:
     """Return address and what the sensor reports; the operator may keep an address that does not answer."""
     from ftcalib.errors import UsageError
-    from ftdrive.checks.discovery import identify_sensor, is_place, places, sensor_at
+    from ftdrive.checks.discovery import is_place, places, sensor_at
     from ftdrivers.errors import DeviceError
 
     found = [] if given or not ask.interactive else places()
@@ -355,7 +368,7 @@ def _sensor(ask: _Questions, given: str | None, clock: Clock) -> tuple[str, str]
             return url, _SILENT
         try:
             url = sensor_at(url, clock) if is_place(url) else url
-            report = identify_sensor(url, clock)
+            report = _identify_sensor(url, clock)
         except (DeviceError, UsageError) as error:
             if not ask.interactive:
                 raise
@@ -367,6 +380,18 @@ def _sensor(ask: _Questions, given: str | None, clock: Clock) -> tuple[str, str]
         _say(f"{url}: {report}", "  ✔ ")
         ask.answers["--sensor"] = [url]  # not the number of a place in a list
         return url, report
+
+
+def _identify_sensor(url: str, clock: Clock) -> str:
+    """Return in words which sensor is at an address, and its rate; raises `DeviceError` or `UsageError`."""
+    from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
+    from ftdrive.cell.devices import build_sensor
+    from ftdrive.checks.check import who
+
+    with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url), clock=clock)) as sensor:
+        info = sensor.identify()
+        rate_Hz = len(sensor.collect(_LOOK_S).t_host_ns) / _LOOK_S
+    return f"{who(info)}, {rate_Hz:.0f} Hz"
 
 
 def _say(words: str, head: str = "") -> None:

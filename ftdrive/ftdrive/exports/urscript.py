@@ -12,8 +12,7 @@ from ftdrive.errors import PlanRefused
 from ftdrive.exports.shared import plain
 from ftdrive.planning.approach import NEAR_RAD
 from ftdrive.planning.geometry.scene import MOUNTINGS
-from ftdrive.planning.plan import Plan
-from ftdrive.planning.words import point_in_words, room_in_words
+from ftdrive.planning.plan import Plan, point_in_words, room_in_words
 
 FORMAT = "ftdrive.targets/1"
 COLUMNS = "pose,orientation,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,speed_rad_s,acceleration_rad_s2,clearance_m"

@@ -25,8 +25,6 @@ NEAR_RAD = float(np.radians(30))
 ROOM_RAD = np.radians([120.0, 90.0, 100.0, 120.0, 120.0, 0.0])
 # An arm within this angle of the first pose needs no approach.
 AT_RAD = 1e-3
-# A joint that turns less does not count as moving: no part of any arm moves by 20 mm.
-STILL_RAD = float(np.radians(0.5))
 NODES = 240
 NEIGHBOURS = 16
 # Maximum number of proof rounds, about a second; then the search gives up.
@@ -58,12 +56,6 @@ class Approach:
         turns = np.abs(np.diff(self.way_rad, axis=0)).max(axis=1)
         speeds = np.minimum(self.speed_rad_s, most_rad_s)
         return float(move_duration_s(turns, speeds, acceleration_rad_s2).sum())
-
-
-def arm_moves(way_rad: ArrayLike) -> bool:
-    """Return whether base, shoulder or elbow turn along a path (n, 6)."""
-    path = np.asarray(way_rad)
-    return len(path) > 0 and bool(np.ptp(path[:, :3], axis=0).max() >= STILL_RAD)
 
 
 def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, speeds: Speeds) -> Approach:

@@ -22,8 +22,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import Frames
 from ftdrive.planning.geometry.scene import Plane, Scene
 from ftdrive.planning.motion import tips
-from ftdrive.planning.plan import Plan
-from ftdrive.planning.words import JOINTS, room_in_words
+from ftdrive.planning.plan import JOINTS, Plan, room_in_words
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 

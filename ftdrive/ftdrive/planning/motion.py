@@ -3,11 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrivers.ur.kinematics import Array
 
 SAMPLE_RAD = np.radians(0.5)
+# A joint that turns less does not count as moving: no part of any arm moves by 20 mm.
+STILL_RAD = float(np.radians(0.5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,3 +82,9 @@ def tips(arm: ArmModel, q_rad: Array) -> Array:
     at = arm.frames(q_rad)
     local = np.array([[part.x_m, part.y_m, part.to_m] for part in arm.tool])
     return np.asarray(at.flange_m[:, None] + local @ np.swapaxes(at.R_base_flange, 1, 2))
+
+
+def arm_moves(way_rad: ArrayLike) -> bool:
+    """Return whether base, shoulder or elbow turn along a path (n, 6)."""
+    path = np.asarray(way_rad)
+    return len(path) > 0 and bool(np.ptp(path[:, :3], axis=0).max() >= STILL_RAD)

@@ -26,7 +26,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import PROOF_S, Plan, Step, ball_of, description_of, fingerprints
-from ftdrive.planning.search.nodes import WRIST_6_RAD, constant_tour, with_room
+from ftdrive.planning.search.nodes import constant_tour, with_room
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
@@ -285,9 +285,3 @@ def at_speed(plan: Plan, share: float) -> Plan:
     if plan.sweep is None or share == 1.0:
         return plan
     return replace(plan, sweep=plan.sweep.slower(share), acceleration_rad_s2=plan.acceleration_rad_s2 * share**2)
-
-
-def winds_little(sweep: Sweep, q_rad: Array) -> bool:
-    """Return whether wrist 3 stays in its window around a present angle."""
-    turns = sweep.at(_times(sweep, STEP_S))[:, 5] - q_rad[5]
-    return bool(np.abs(turns).max() <= WRIST_6_RAD)

@@ -174,7 +174,7 @@ def _dots(axes: Any, directions: Any, **style: Any) -> None:
 
 
 def _sweep(figure: Any, facts: Facts) -> None:
-    from ftdrive.planning.words import JOINTS
+    from ftdrive.planning.plan import JOINTS
 
     axes, sweep = figure.add_subplot(), Sweep.from_dict(facts["motion"]["sweep"])
     t_s = np.linspace(0.0, sweep.duration_s, 400)

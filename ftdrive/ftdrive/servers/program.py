@@ -83,7 +83,7 @@ CODES: Final = {
 
 
 class Registers(Protocol):
-    """Registers of the controller, see `ftdrivers.ur.program_registers`."""
+    """Registers of the controller, see `ftdrivers.ur.rtde`."""
 
     @property
     def request(self) -> tuple[int, int] | None:

@@ -18,12 +18,11 @@ from ftcalib.model import Array
 from ftcalib.routine import PoseRecord
 from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
-from ftdrive.planning.approach import Approach, arm_moves, plan_approach
+from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.motion import Speeds, move_duration_s, slower, speed_of_leading_joint
-from ftdrive.planning.plan import Plan
+from ftdrive.planning.motion import Speeds, arm_moves, move_duration_s, slower, speed_of_leading_joint
+from ftdrive.planning.plan import Plan, point_in_words, stop_in_words, turns_in_words, way_in_words
 from ftdrive.planning.planner import certifier_for, speeds_of
-from ftdrive.planning.words import point_in_words, stop_in_words, turns_in_words, way_in_words
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
 from ftdrive.session.events import GuardTripped, Planned

@@ -8,7 +8,6 @@ from typing import Any, Final, cast, get_args
 from ftcalib.published.methods import SPECIAL
 from ftcalib.result import Method
 from ftdrive.errors import ConfigError
-from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Mode, Run
 
 _BY_HAND: Final = ("manual", "listen", "passive")
@@ -112,14 +111,3 @@ def with_recorded_mode(options: SessionOptions) -> SessionOptions:
     if wrong := [name for name in _OF_MOTION if getattr(options, name[2:].replace("-", "_"))]:
         raise ConfigError(f"with --{options.mode} ftdrive neither plans nor moves: leave out {' and '.join(wrong)}")
     return options
-
-
-def plan_on_disk(options: SessionOptions, run: Run | None) -> Plan | None:
-    """Load the plan of the resumed run, or the given one; raises `ConfigError` if it lacks a pose of `redo`."""
-    if run is None:
-        return None if options.plan is None else Plan.load(options.plan)
-    plan = Plan.load(run.plan_path)
-    stops = len(plan.steps) + 1
-    if wrong := sorted(stop for stop in options.redo if not 1 <= stop <= stops):
-        raise ConfigError(f"pose {wrong[0]} cannot be taken again: the run has poses 1 to {stops}")
-    return plan

@@ -30,7 +30,7 @@ from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import take_by_hand
 from ftdrive.session.live_fit import RunningFit
 from ftdrive.session.open_session import Journal, Judge, OpenCell, Session, Task
-from ftdrive.session.options import SessionOptions, plan_on_disk, with_recorded_mode
+from ftdrive.session.options import SessionOptions, with_recorded_mode
 from ftdrive.session.passive import take_passively
 from ftdrive.session.sweep import on_script_path
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
@@ -186,7 +186,7 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
     if resumed is not None and resumed.command != task.command:
         raise ConfigError(f"{resumed.folder} was not made by {task.command}: continue it with {resumed.resume_command}")
     # A plan that lacks a pose is refused before a device is opened.
-    plan = None if options.by_hand else plan_on_disk(options, resumed)
+    plan = None if options.by_hand else _plan_on_disk(options, resumed)
     device, driver = build_sensor(config), build_arm(config)
     with (
         ExitStack() as locked,
@@ -221,6 +221,17 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
         raise Declined(f"ended before the first pose: {run.folder} has no pose to solve")
     journal.show(StateChanged(state=State.REPORT))
     return run
+
+
+def _plan_on_disk(options: SessionOptions, run: Run | None) -> Plan | None:
+    """Load the plan of the resumed run, or the given one; raises `ConfigError` if it lacks a pose of `redo`."""
+    if run is None:
+        return None if options.plan is None else Plan.load(options.plan)
+    plan = Plan.load(run.plan_path)
+    stops = len(plan.steps) + 1
+    if wrong := sorted(stop for stop in options.redo if not 1 <= stop <= stops):
+        raise ConfigError(f"pose {wrong[0]} cannot be taken again: the run has poses 1 to {stops}")
+    return plan
 
 
 def _take(session: Session) -> Run | None:

@@ -19,9 +19,9 @@ from ftcalib.model import Array
 from ftcalib.routine import Stage, TourPose, take_pose
 from ftdrive.checks.arm import SLOWEST_SLIDER
 from ftdrive.errors import Declined, NotAccepted, PlanRefused, SupervisorGone
-from ftdrive.planning.approach import arm_moves, plan_approach
-from ftdrive.planning.motion import Speeds, move_duration_s
-from ftdrive.planning.words import way_in_words
+from ftdrive.planning.approach import plan_approach
+from ftdrive.planning.motion import Speeds, arm_moves, move_duration_s
+from ftdrive.planning.plan import way_in_words
 from ftdrive.session.events import GuardTripped, Hazard, Key, Question, SensorEvents, State, StateChanged, Weighed
 from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, arm_lost, by_safety, fault
 from ftdrive.session.open_session import OpenCell, PoseBook

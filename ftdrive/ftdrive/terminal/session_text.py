@@ -7,8 +7,7 @@ from numpy.typing import ArrayLike
 
 from ftcalib.rounding import to_place_of, with_sigma
 from ftdrive.checks.arm import FlangeLoad, margin_in_words
-from ftdrive.planning.plan import Plan
-from ftdrive.planning.words import plan_in_words, point_in_words
+from ftdrive.planning.plan import Plan, plan_in_words, point_in_words
 from ftdrive.session.events import (
     Asked,
     Checked,

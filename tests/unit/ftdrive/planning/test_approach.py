@@ -6,11 +6,11 @@ import pytest
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.cell.rules import Rows
 from ftdrive.errors import ConfigError, PlanRefused
-from ftdrive.planning.approach import Approach, arm_moves, plan_approach
+from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
-from ftdrive.planning.motion import Speeds
+from ftdrive.planning.motion import Speeds, arm_moves
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for
 from ftdrivers.ur.kinematics import Array
 

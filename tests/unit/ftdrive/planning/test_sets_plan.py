@@ -12,8 +12,8 @@ from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
 from ftdrive.planning.motion import Speeds
+from ftdrive.planning.plan import plan_in_words
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_sets, plan_verification
-from ftdrive.planning.words import plan_in_words
 
 CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))
 HOW: dict[str, Any] = {"speeds": Speeds(), "guess": guess_of(CERTIFIER)}

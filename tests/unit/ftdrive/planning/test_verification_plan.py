@@ -12,9 +12,8 @@ from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.plan import Plan
+from ftdrive.planning.plan import Plan, plan_in_words
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_verification
-from ftdrive.planning.words import plan_in_words
 from ftdrive.session.along_plan import moves_s
 from ftdrive.session.tour import SLOW
 

@@ -7,14 +7,12 @@ import pytest
 from syrupy.assertion import SnapshotAssertion
 
 from ftdrive.cell.config import RobotConfig
-from ftdrive.planning.approach import arm_moves
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene
-from ftdrive.planning.motion import Speeds
-from ftdrive.planning.plan import Plan
+from ftdrive.planning.motion import Speeds, arm_moves
+from ftdrive.planning.plan import Plan, plan_in_words, room_in_words, stop_in_words, turns_in_words, way_in_words
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
-from ftdrive.planning.words import plan_in_words, room_in_words, stop_in_words, turns_in_words, way_in_words
 
 
 @pytest.fixture(scope="module")
