@@ -25,7 +25,7 @@ from ftdrive.planning.plan import Plan, point_in_words, stop_in_words, turns_in_
 from ftdrive.planning.planner import certifier_for, speeds_of
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
-from ftdrive.session.events import GuardTripped, Planned
+from ftdrive.session.events import GuardTripped, Planned, rms_sigma
 from ftdrive.session.open_session import Judge, OpenCell, PoseBook, Session, reporting_early_end
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
@@ -379,12 +379,6 @@ def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:
             speed, acceleration = APPROACH_RAD_S, SLOW.joint_rad_s2
         total_s += float(move_duration_s(np.array(turn), speed, acceleration))
     return total_s
-
-
-def rms_sigma(sigma: Array) -> tuple[float, float]:
-    """Return one standard deviation of one axis, force in N and torque in N·m, from those of all six axes."""
-    force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
-    return force_N, torque_Nm
 
 
 def _chosen_sampling(before: Before, todo: Sequence[int]) -> tuple[Sampling, Array]:

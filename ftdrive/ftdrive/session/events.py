@@ -166,6 +166,12 @@ class PoseTaken(Event):
     """Temperature of the sensor, where it reports it."""
 
 
+def rms_sigma(sigma: Array) -> tuple[float, float]:
+    """Return one standard deviation of one axis, force in N and torque in N·m, from those of all six axes."""
+    force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
+    return force_N, torque_Nm
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MotionRecorded(Event):
     """A recording in motion is on disk."""

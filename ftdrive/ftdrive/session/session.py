@@ -24,8 +24,8 @@ from ftdrive.planning.search.nodes import from_usual_wrist
 from ftdrive.runs.run import Mode, Run
 from ftdrive.runs.source import Outcome, solve_and_save
 from ftdrive.session import preflight
-from ftdrive.session.along_plan import rms_sigma, take_along_plan
-from ftdrive.session.events import Operator, State, StateChanged
+from ftdrive.session.along_plan import take_along_plan
+from ftdrive.session.events import Operator, State, StateChanged, rms_sigma
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import take_by_hand
 from ftdrive.session.live_fit import RunningFit

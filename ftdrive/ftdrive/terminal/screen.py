@@ -37,13 +37,14 @@ from ftdrive.session.events import (
     RunOpened,
     State,
     StateChanged,
+    rms_sigma,
 )
 from ftdrive.session.live_fit import GREEN
 from ftdrive.terminal.console import hanging, messages
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer, prompt, read_line
 from ftdrive.terminal.report import drift_in_words
-from ftdrive.terminal.session_text import SessionText, TextLine, in_words, rms_sigma, sigmas_of
+from ftdrive.terminal.session_text import SessionText, TextLine, in_words, sigmas_of
 from ftdrive.terminal.supervisor import Supervisor
 from ftdrive.terminal.text import as_typed
 from ftdrivers.interfaces import Array
@@ -212,7 +213,7 @@ def _last(view: SessionView) -> list[Text]:
     pose, fit = view.last, view.estimated
     if pose is None:
         return []
-    force_N, torque_Nm = rms_sigma(pose)
+    force_N, torque_Nm = rms_sigma(pose.sigma)
     line = Text(
         f"R{pose.number:02d}: settled {pose.settle_s:.1f} s, {pose.samples} samples, "
         f"sigma {force_N:.2g} N {torque_Nm:.2g} N·m"

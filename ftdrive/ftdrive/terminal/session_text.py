@@ -22,6 +22,7 @@ from ftdrive.session.events import (
     RunOpened,
     State,
     StateChanged,
+    rms_sigma,
 )
 from ftdrive.session.settings_push import Push
 from ftdrivers.interfaces import ControllerSettings
@@ -178,7 +179,7 @@ def _motion_in_words(event: MotionRecorded) -> str:
 
 
 def _pose_in_words(event: PoseTaken) -> str:
-    force_N, torque_Nm = rms_sigma(event)
+    force_N, torque_Nm = rms_sigma(event.sigma)
     words = (
         f"{event.stop}/{event.stops} R{event.number:02d}: settled {event.settle_s:.1f} s, {event.samples} samples in "
         f"{event.average_s:.1f} s, sigma {force_N:.2g} N {torque_Nm:.2g} N·m"
@@ -210,12 +211,6 @@ def _comparison_in_words(event: Compared) -> str:
 def sigmas_of(event: Compared) -> float:
     """Largest of the six differences over its standard deviation."""
     return float(np.max(np.abs(event.residual) / event.sigma))
-
-
-def rms_sigma(event: PoseTaken) -> tuple[float, float]:
-    """Standard deviation of one axis of the mean: force, N, and torque, N·m."""
-    variance = np.square(event.sigma)
-    return float(np.sqrt(variance[:3].mean())), float(np.sqrt(variance[3:].mean()))
 
 
 _LEVEL_DEG = 0.05
