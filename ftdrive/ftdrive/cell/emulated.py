@@ -132,6 +132,12 @@ class Station:
         return truth
 
     @property
+    def description(self) -> dict[str, Any]:
+        """What run.json contains about it; `of` describes the same station again."""
+        made_by = {"sensor": self.sensor, "options": self.options, "control_path": self.control_path}
+        return {"station": {**made_by, "values": self.values, "truth": self.truth}}
+
+    @property
     def pid(self) -> int:
         """Process number while the station lives."""
         return self._process.pid if self._process else 0

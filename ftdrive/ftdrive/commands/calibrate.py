@@ -115,7 +115,6 @@ def calibrate(
     from ftdrive.commands.common import start_mover
     from ftdrive.runs.run import Run
     from ftdrive.session.options import SessionOptions, method_of_poses
-    from ftdrive.session.rehearsal import describe
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import beside, messages
     from ftdrive.terminal.report import print_result
@@ -134,7 +133,7 @@ def calibrate(
             pace = REAL_PACE if sweep or passive else ()
             station = stack.enter_context(Station.of(made_by, described.sensor, pace, control_path=control))
             cell = station.cell
-            description = describe(station)
+            description = station.description
         else:
             config = described.config and described.config.absolute()
             described = replace(described, config=config, tool=tool, control=control)

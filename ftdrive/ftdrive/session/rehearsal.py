@@ -58,12 +58,6 @@ class _Unkept:
         return self._operator.pressed()
 
 
-def describe(station: Station) -> dict[str, Any]:
-    """Return what run.json says about an emulated cell."""
-    said = {"sensor": station.sensor, "options": station.options, "control_path": station.control_path}
-    return {"station": {**said, "values": station.values, "truth": station.truth}}
-
-
 def rehearse(
     station: Station,
     runs: Path,
@@ -77,7 +71,7 @@ def rehearse(
 
     `kept` says whether the folder `runs` outlives the calibration; the other keywords are those of `SessionOptions`.
     """
-    chosen = SessionOptions(runs, name, real=False, questions=False, description=describe(station), **options)
+    chosen = SessionOptions(runs, name, real=False, questions=False, description=station.description, **options)
     outcome = calibrate(station.cell, operator if kept else _Unkept(operator, runs), chosen)
     if outcome is None:
         raise RuntimeError("a rehearsal is never a dry run")

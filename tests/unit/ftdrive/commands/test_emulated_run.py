@@ -15,9 +15,7 @@ from ftdrive.session import rehearsal
 from ftdrive.session.events import Event, Noted, RunOpened
 from ftdrive.terminal import screen
 
-STATION: Any = SimpleNamespace(
-    sensor="can", options=(), control_path="auto", values={}, truth={"mass_kg": 0.5}, cell=None
-)
+STATION: Any = SimpleNamespace(description={}, truth={"mass_kg": 0.5}, cell=None)
 
 
 class Listener:
