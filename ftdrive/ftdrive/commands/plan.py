@@ -176,9 +176,7 @@ def plan(
         write_json({"schema_version": 1} | made.to_dict())
         messages.print(*saved, sep="\n", end="\n" if saved else "")
     else:
-        from ftdrive.planning.plan import plan_in_words, stop_in_words
-
-        answer.print(*filter(None, (plan_in_words(made), stop_in_words(made, cell.robot))), *saved, sep="\n")
+        answer.print(*filter(None, (made.in_words(), made.stop_in_words(cell.robot))), *saved, sep="\n")
         same = f"{' --simulate' if simulate else ''}{f' --set {sets}' if sets else ''}"
         messages.print_next(f"ftdrive calibrate{same}   (asks before anything moves)")
     if view:

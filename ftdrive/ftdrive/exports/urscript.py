@@ -12,7 +12,7 @@ from ftdrive.errors import PlanRefused
 from ftdrive.exports.shared import plain
 from ftdrive.planning.approach import NEAR_RAD
 from ftdrive.planning.geometry.scene import MOUNTINGS
-from ftdrive.planning.plan import Plan, point_in_words, room_in_words
+from ftdrive.planning.plan import Plan
 
 FORMAT = "ftdrive.targets/1"
 COLUMNS = "pose,orientation,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,speed_rad_s,acceleration_rad_s2,clearance_m"
@@ -71,7 +71,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
         yield f"#   {_cylinder(part)}"
     yield "# proven clear, all along its moves, of itself and of these surroundings, mm, base axes:"
     yield from (f"#   {plain(line)}" for line in _scene(plan.description["scene"]))
-    yield f"# {plain(room_in_words(plan))}"
+    yield f"# {plain(plan.room_in_words())}"
     yield f"# Speed: {_speeds(plan)}."
     yield from (f"# {plain(sentence)}" for sentence in plan.why)
     yield "#"
@@ -84,7 +84,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield f'textmsg("{name}: {len(steps)} poses")'
     yield (
         f'popup("{emulated}Only for a {model} with the tool of {name}. Keep a ball of {plan.ball_m:.2f} m around '
-        f"{point_in_words(plan)} (the wrist){'' if plan.arm_rests else ' and the room of the whole arm'} free, "
+        f"{plan.centre_in_words()} (the wrist){'' if plan.arm_rests else ' and the room of the whole arm'} free, "
         f"cables slack, hand on the emergency stop. Speed: {_speeds(plan)}. "
         'First time: speed slider at 30 percent. Continue moves the arm.", '
         f'title="ftdrive", warning=True, blocking=True)'

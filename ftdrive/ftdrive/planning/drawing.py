@@ -22,7 +22,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import Frames
 from ftdrive.planning.geometry.scene import Plane, Scene
 from ftdrive.planning.motion import tips
-from ftdrive.planning.plan import JOINTS, Plan, room_in_words
+from ftdrive.planning.plan import JOINTS, Plan
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
@@ -290,7 +290,7 @@ def describe(plan: Plan, move: int) -> str:
     return (
         f"Move **{move + 1} of {len(plan.steps)}**, R{step.number:02d} to R{following.number:02d}: {turn_deg:.0f}° at "
         f"{speed_deg_s:.0f}°/s.\n\nNearest: {1e3 * step.clearance_m:.0f} mm, {step.limited_by}.\n\n"
-        f"{room_in_words(plan)}"
+        f"{plan.room_in_words()}"
     )
 
 

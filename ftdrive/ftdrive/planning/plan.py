@@ -141,6 +141,57 @@ class Plan:
         """Sum of the moves at the plan's speeds, the last one back included."""
         return float(sum(step.duration_s for step in self.steps))
 
+    def limited(self, certifier: Certifier, speeds: Speeds) -> "Plan":
+        """Return the plan with its speeds reduced to these limits."""
+        q = np.array([step.q_rad for step in self.steps])
+        allowed = speed_of_leading_joint(certifier.arm, q, np.roll(q, -1, axis=0), speeds)
+        steps = (
+            replace(step, speed_rad_s=min(step.speed_rad_s, float(most)))
+            for step, most in zip(self.steps, allowed, strict=True)
+        )
+        acceleration_rad_s2 = min(self.acceleration_rad_s2, speeds.joint_rad_s2)
+        return replace(self, steps=tuple(steps), acceleration_rad_s2=acceleration_rad_s2)
+
+    def at_share(self, share: float) -> "Plan":
+        """Return the plan of a sweep with the same path at a share of the speed."""
+        if self.sweep is None or share == 1.0:
+            return self
+        return replace(self, sweep=self.sweep.slower(share), acceleration_rad_s2=self.acceleration_rad_s2 * share**2)
+
+    def in_words(self) -> str:
+        """Return the reason for the plan, its moves, joint ranges, clearances, time, space and predicted accuracy.
+
+        The table is at most 72 columns wide; each sentence is one line.
+        """
+        still = ", ".join(f"{angle:.0f}" for angle in np.degrees(self.steps[0].q_rad[:3]))
+        rest = [f"Base, shoulder and elbow stay at {still} degrees."] if self.arm_rests else []
+        if self.sweep is not None:
+            return "\n".join([*self.why, *rest, *_sweep_table(self.sweep), "", *_sweep_summary(self)])
+        return "\n".join([*self.why, *rest, *_table(self), "", *_summary(self)])
+
+    def stop_in_words(self, robot: RobotConfig) -> str:
+        """Return time and angle of a stop until rest, at the plan's highest speed; empty for other drivers."""
+        if robot.driver != "ur":
+            return ""
+        speed_deg_s, stop_deg_s2 = np.degrees(self.top_speed_rad_s), robot.stop_deceleration_deg_s2
+        return (
+            f"A stop from {speed_deg_s:.0f} °/s brakes with {stop_deg_s2:.0f} °/s²: at rest after "
+            f"{speed_deg_s / stop_deg_s2:.2f} s and {speed_deg_s**2 / (2 * stop_deg_s2):.1f}°."
+        )
+
+    def room_in_words(self) -> str:
+        """Return which space must be clear."""
+        ball = f"ball of {self.ball_m:.2f} m around {self.centre_in_words()}"
+        if self.arm_rests:
+            crossing = "where the axes of wrist 1 and 2 cross"
+            return f"All moving parts stay in a {ball}, {crossing}: keep it clear, cables slack."
+        return f"Wrist and tool stay in a {ball}, and the whole arm moves: keep the space of both clear, cables slack."
+
+    def centre_in_words(self) -> str:
+        """Return the centre of the ball as text."""
+        x, y, z = (f"{value:.2f}" for value in self.ball_centre_m)
+        return f"x {x}, y {y}, z {z} m in base"
+
     @property
     def sha256(self) -> str:
         """Hash of the file."""
@@ -387,43 +438,6 @@ def _as_json(prediction: Prediction) -> dict[str, Any]:
     return {name: finite(value) for name, value in values.items()}
 
 
-def plan_in_words(plan: Plan) -> str:
-    """Return the reason for the plan, its moves, joint ranges, clearances, time, space and predicted accuracy.
-
-    The table is at most 72 columns wide; each sentence is one line.
-    """
-    still = ", ".join(f"{angle:.0f}" for angle in np.degrees(plan.steps[0].q_rad[:3]))
-    rest = [f"Base, shoulder and elbow stay at {still} degrees."] if plan.arm_rests else []
-    if plan.sweep is not None:
-        return "\n".join([*plan.why, *rest, *_sweep_table(plan.sweep), "", *_sweep_summary(plan)])
-    return "\n".join([*plan.why, *rest, *_table(plan), "", *_summary(plan)])
-
-
-def stop_in_words(plan: Plan, robot: RobotConfig) -> str:
-    """Return time and angle from the begin of braking to rest, at the plan's highest speed; empty for other drivers."""
-    if robot.driver != "ur":
-        return ""
-    speed_deg_s, stop_deg_s2 = np.degrees(plan.top_speed_rad_s), robot.stop_deceleration_deg_s2
-    return (
-        f"A stop from {speed_deg_s:.0f} °/s brakes with {stop_deg_s2:.0f} °/s²: at rest after "
-        f"{speed_deg_s / stop_deg_s2:.2f} s and {speed_deg_s**2 / (2 * stop_deg_s2):.1f}°."
-    )
-
-
-def room_in_words(plan: Plan) -> str:
-    """Return which space must be clear."""
-    ball = f"ball of {plan.ball_m:.2f} m around {point_in_words(plan)}"
-    if plan.arm_rests:
-        return f"All moving parts stay in a {ball}, where the axes of wrist 1 and 2 cross: keep it clear, cables slack."
-    return f"Wrist and tool stay in a {ball}, and the whole arm moves: keep the space of both clear, cables slack."
-
-
-def point_in_words(plan: Plan) -> str:
-    """Return the centre of the ball as text."""
-    x, y, z = (f"{value:.2f}" for value in plan.ball_centre_m)
-    return f"x {x}, y {y}, z {z} m in base"
-
-
 def way_in_words(way_rad: ArrayLike, clearance_m: float) -> str:
     """Return the number of moves of an approach, the range of each joint, and whether the whole arm moves."""
     count = len(np.asarray(way_rad)) - 1
@@ -474,7 +488,7 @@ def _sweep_summary(plan: Plan) -> list[str]:
     return [
         f"A smooth curve from rest to rest, {proven}, {1e3 * plan.off_curve_m:.0f} mm off the curve included.",
         f"Nearest: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
-        room_in_words(plan),
+        plan.room_in_words(),
     ]
 
 
@@ -486,7 +500,7 @@ def _summary(plan: Plan) -> list[str]:
         f"{count} poses, {count} moves {proven}, none above {most:.0f}°: "
         f"{sum(step.duration_s for step in plan.steps):.0f} s of motion at the plan's speeds.",
         f"Nearest: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
-        room_in_words(plan),
+        plan.room_in_words(),
         *([] if plan.kind in ("verification", "tool") else [_accuracy(plan)]),
     ]
 

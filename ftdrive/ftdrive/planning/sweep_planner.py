@@ -10,7 +10,6 @@ straight move by at most ``acceleration step²/8``. A controller that follows wi
 """
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -278,10 +277,3 @@ def _plan(certifier: Certifier, sweep: Sweep, off_curve_m: float, q_now: Array, 
         sweep,
         off_curve_m,
     )
-
-
-def at_speed(plan: Plan, share: float) -> Plan:
-    """Return a sweep's plan with the same path at a share of the speed."""
-    if plan.sweep is None or share == 1.0:
-        return plan
-    return replace(plan, sweep=plan.sweep.slower(share), acceleration_rad_s2=plan.acceleration_rad_s2 * share**2)

@@ -20,8 +20,8 @@ from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
 from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.motion import Speeds, arm_moves, move_duration_s, slower, speed_of_leading_joint
-from ftdrive.planning.plan import Plan, point_in_words, stop_in_words, turns_in_words, way_in_words
+from ftdrive.planning.motion import arm_moves, move_duration_s, slower
+from ftdrive.planning.plan import Plan, turns_in_words, way_in_words
 from ftdrive.planning.planner import certifier_for, speeds_of
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
@@ -91,7 +91,7 @@ class _SafetyQuestions:
             room = f", and the space of the whole arm, which moves in the approach ({turns_in_words(way_rad)}),"
         for text in (
             "Is the tool free: no contact, no workpiece, no fluid, cables slack? Is the base bolted?",
-            f"Is the ball of {self._plan.ball_m:.2f} m around {point_in_words(self._plan)} (the wrist){room} free of "
+            f"Is the ball of {self._plan.ball_m:.2f} m around {self._plan.centre_in_words()} (the wrist){room} free of "
             "obstacles and people?",
             "Is the emergency stop in reach, and tested?",
         ):
@@ -219,7 +219,7 @@ class _AlongPlan:
             why = f": {_NO_SERIAL}" if self._serial == NOT_REPORTED else ""
             cell.note(f"{'every' if why else 'the first'} run of a plan is slow{why}", warning=True)
         speeds = speeds_of(self.task.cell)
-        driven = limit_speeds(plan, before.certifier, slower(speeds, SLOW) if slow else speeds)
+        driven = plan.limited(before.certifier, slower(speeds, SLOW) if slow else speeds)
         total_s = moves_s(driven, todo, before.approach)
         total_s += len(todo) * (sampling.average_s + 0.6)
         cell.note(
@@ -329,7 +329,7 @@ def _show_plan(before: Before, options: SessionOptions) -> None:
     if len(way):
         words = f"Approach to the first pose: {way_in_words(way, before.approach.clearance_m)}."
     cell.journal.show(
-        Planned(plan=plan, way_rad=way, way_words=words, stop_words=stop_in_words(plan, before.config.robot))
+        Planned(plan=plan, way_rad=way, way_words=words, stop_words=plan.stop_in_words(before.config.robot))
     )
     if options.output is not None:
         plan.save(options.output)
@@ -345,18 +345,6 @@ def _show_plan(before: Before, options: SessionOptions) -> None:
         with serve_view(plan, before.certifier, way) as url:
             open_in_browser(url)
             cell.journal.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
-
-
-def limit_speeds(plan: Plan, certifier: Certifier, speeds: Speeds) -> Plan:
-    """Return a plan with its speeds reduced to these limits."""
-    q = np.array([step.q_rad for step in plan.steps])
-    allowed = speed_of_leading_joint(certifier.arm, q, np.roll(q, -1, axis=0), speeds)
-    steps = (
-        replace(step, speed_rad_s=min(step.speed_rad_s, float(most)))
-        for step, most in zip(plan.steps, allowed, strict=True)
-    )
-    acceleration_rad_s2 = min(plan.acceleration_rad_s2, speeds.joint_rad_s2)
-    return replace(plan, steps=tuple(steps), acceleration_rad_s2=acceleration_rad_s2)
 
 
 def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:

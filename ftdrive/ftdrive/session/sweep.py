@@ -9,7 +9,6 @@ import numpy as np
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.planning.sweep_planner import at_speed
 from ftdrive.runs.motion import MotionRecording
 from ftdrive.session.events import MotionRecorded, State
 from ftdrive.session.guards import Guard, Seen
@@ -193,7 +192,7 @@ def choose_sweep_speed(before: Before, *, slow: bool) -> Before:
             f"{100 * LEAST_SLIDER:.0f} % or more"
         )
     share = min(slider, 1.0) * (FIRST_SHARE if slow else 1.0)
-    plan = at_speed(before.plan, share)
+    plan = before.plan.at_share(share)
     if plan.sweep is None:
         raise NotAccepted("the plan holds no sweep: make it with --sweep")
     why = "the first run of a plan is slow" if slow else f"speed slider {100 * slider:.0f} %"

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from ftcalib.rounding import to_place_of, with_sigma
 from ftdrive.checks.arm import FlangeLoad, margin_in_words
-from ftdrive.planning.plan import Plan, plan_in_words, point_in_words
+from ftdrive.planning.plan import Plan
 from ftdrive.session.events import (
     Asked,
     Checked,
@@ -132,7 +132,7 @@ def _plan_in_brief(plan: Plan) -> tuple[str, str]:
         motion = f"sweep of {plan.sweep.duration_s:.0f} s,"
     return (
         f"{motion} {proven}; {moving}",
-        f"keep free: ball of {plan.ball_m:.2f} m around {point_in_words(plan)}{room}",
+        f"keep free: ball of {plan.ball_m:.2f} m around {plan.centre_in_words()}{room}",
     )
 
 
@@ -155,7 +155,7 @@ def _head_and_words(event: Event) -> tuple[str, str]:
         case Checked():
             return "✔ " if event.passed else "✘ ", f"{event.name}: {event.words}"
         case Planned():
-            return "", "\n".join(filter(None, (plan_in_words(event.plan), event.stop_words, event.way_words)))
+            return "", "\n".join(filter(None, (event.plan.in_words(), event.stop_words, event.way_words)))
         case Noted():
             return "! " if event.warning else "", event.words
         case PoseTaken() | MotionRecorded():

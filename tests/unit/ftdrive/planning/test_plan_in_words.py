@@ -11,7 +11,7 @@ from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene
 from ftdrive.planning.motion import Speeds, arm_moves
-from ftdrive.planning.plan import Plan, plan_in_words, room_in_words, stop_in_words, turns_in_words, way_in_words
+from ftdrive.planning.plan import Plan, turns_in_words, way_in_words
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour
 
 
@@ -22,7 +22,7 @@ def plan() -> Plan:
 
 
 def test_every_pose_range_and_figure_is_there(plan: Plan) -> None:
-    lines = plan_in_words(plan).split("\n")
+    lines = plan.in_words().split("\n")
     rows = [line.split() for line in lines if line[:4].strip().isdecimal()]
     assert [int(row[1]) for row in rows] == [step.number for step in plan.steps]
     q_deg = np.degrees([step.q_rad[3:] for step in plan.steps])
@@ -43,22 +43,20 @@ def test_every_pose_range_and_figure_is_there(plan: Plan) -> None:
 
 
 def test_where_base_shoulder_and_elbow_move_the_room_is_that_of_the_whole_arm(plan: Plan) -> None:
-    assert "All moving parts stay" in room_in_words(plan)
+    assert "All moving parts stay" in plan.room_in_words()
     moved = replace(plan.steps[1], q_rad=(0.5, *plan.steps[1].q_rad[1:]))
     moving = replace(plan, steps=(plan.steps[0], moved, *plan.steps[2:]))
-    assert "the whole arm moves" in room_in_words(moving)
-    assert "stay at 45" not in plan_in_words(moving)
+    assert "the whole arm moves" in moving.room_in_words()
+    assert "stay at 45" not in moving.in_words()
 
 
 def test_a_plan_that_is_not_proven_does_not_look_proven(plan: Plan) -> None:
     steps = (replace(plan.steps[0], certified=False), *plan.steps[1:])
-    assert "NOT ALL PROVEN" in plan_in_words(replace(plan, steps=steps))
+    assert "NOT ALL PROVEN" in replace(plan, steps=steps).in_words()
 
 
 def test_what_the_poses_do_not_determine_is_no_crash(plan: Plan) -> None:
-    words = plan_in_words(
-        replace(plan, predicted={**plan.predicted, "mass_kg": None, "force_bias_N": [None, 0.1, 0.1]})
-    )
+    words = replace(plan, predicted={**plan.predicted, "mass_kg": None, "force_bias_N": [None, 0.1, 0.1]}).in_words()
     assert "mass nan g" in words
 
 
@@ -76,7 +74,7 @@ def test_a_way_names_the_joints_and_the_range_each_turns_over(snapshot: Snapshot
 
 def test_the_way_of_a_stop_follows_from_speed_and_deceleration(plan: Plan) -> None:
     assert max(step.speed_rad_s for step in plan.steps) == pytest.approx(np.radians(60))
-    assert "from 60 °/s brakes with 300 °/s²: at rest after 0.20 s and 6.0°" in stop_in_words(plan, RobotConfig("ur"))
+    assert "from 60 °/s brakes with 300 °/s²: at rest after 0.20 s and 6.0°" in plan.stop_in_words(RobotConfig("ur"))
     soft = RobotConfig("ur", stop_deceleration_deg_s2=100.0)
-    assert "with 100 °/s²: at rest after 0.60 s and 18.0°" in stop_in_words(plan, soft)
-    assert not stop_in_words(plan, RobotConfig("ur", driver="another"))
+    assert "with 100 °/s²: at rest after 0.60 s and 18.0°" in plan.stop_in_words(soft)
+    assert not plan.stop_in_words(RobotConfig("ur", driver="another"))

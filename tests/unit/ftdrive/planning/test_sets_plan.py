@@ -12,7 +12,6 @@ from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.plan import plan_in_words
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_sets, plan_verification
 
 CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))
@@ -24,7 +23,7 @@ def test_one_tour_visits_both_sets_with_the_wrist_alone() -> None:
     assert made.certified
     assert made.arm_rests
     assert sorted(step.number for step in made.steps) == [*range(1, 25), *numbers_of("E").tolist()]
-    words = plan_in_words(made)
+    words = made.in_words()
     assert "48 poses: A 24, E 24" in words
     assert "48 moves all proven clear" in words
 

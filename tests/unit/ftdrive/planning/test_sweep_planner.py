@@ -11,10 +11,10 @@ from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Scene
 from ftdrive.planning.motion import Speeds, tips
-from ftdrive.planning.plan import Plan, plan_in_words
+from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of
 from ftdrive.planning.search.nodes import WRIST_6_RAD
-from ftdrive.planning.sweep_planner import at_speed, plan_sweep
+from ftdrive.planning.sweep_planner import plan_sweep
 
 SPEEDS = Speeds()
 STOP_RAD_S2 = float(np.radians(300))
@@ -79,7 +79,7 @@ def test_the_file_keeps_the_curve(plan: Plan, tmp_path: Path) -> None:
 
 def test_half_the_speed_is_the_same_path(plan: Plan) -> None:
     assert plan.sweep is not None
-    half = at_speed(plan, 0.5)
+    half = plan.at_share(0.5)
     assert half.sweep is not None
     assert half.sweep.duration_s == 2 * plan.sweep.duration_s
     assert half.top_speed_rad_s == pytest.approx(plan.top_speed_rad_s / 2, rel=0.05)
@@ -95,7 +95,7 @@ def test_planning_is_deterministic(plan: Plan) -> None:
 
 
 def test_the_words_name_joints_and_proof(plan: Plan) -> None:
-    words = plan_in_words(plan)
+    words = plan.in_words()
     assert "proven clear along its whole length" in words
     assert "wrist 3" in words
     assert max(len(line) for line in words.splitlines() if line.startswith("  ")) <= 72

@@ -12,7 +12,7 @@ from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.plan import Plan, plan_in_words
+from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_verification
 from ftdrive.session.along_plan import moves_s
 from ftdrive.session.tour import SLOW
@@ -51,7 +51,7 @@ def test_two_poses_take_less_than_30_s_of_robot_time() -> None:
 
 
 def test_its_words_promise_no_calibration() -> None:
-    words = plan_in_words(plan(2))
+    words = plan(2).in_words()
     assert "2 poses that were not used in the calibration, far from its 24 poses." in words
     assert "nan" not in words
     assert "Predicted" not in words

@@ -11,7 +11,7 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour, speeds_of
-from ftdrive.session.along_plan import limit_speeds, moves_s
+from ftdrive.session.along_plan import moves_s
 from ftdrive.session.tour import APPROACH_RAD_S, SLOW
 
 
@@ -45,10 +45,10 @@ def test_the_rest_of_a_tour_counts_what_is_left_and_the_ways_past_what_is_not(ce
 
 
 def test_limits_in_force_slow_a_plan_down_and_never_speed_it_up(certifier: Certifier, plan: Plan) -> None:
-    slow = limit_speeds(plan, certifier, Speeds(0.2, 0.3, 0.1))
+    slow = plan.limited(certifier, Speeds(0.2, 0.3, 0.1))
     assert max(step.speed_rad_s for step in slow.steps) <= 0.2
     assert slow.acceleration_rad_s2 == 0.3
-    assert limit_speeds(slow, certifier, Speeds()) == slow
+    assert slow.limited(certifier, Speeds()) == slow
 
 
 def test_not_even_the_settings_of_an_old_run_go_faster_than_allowed() -> None:
