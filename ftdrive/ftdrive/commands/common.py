@@ -412,10 +412,9 @@ def rehearse(station: "Station", runs: Path, name: str, *, kept: bool = True, **
 def start_mover(station: "Station", options: "SessionOptions") -> None:
     """Let the emulated cell move its arm, in a mode in which the session does not move it."""
     from ftdrive.cell.emulated import MOVED_BY
-    from ftdrive.session.options import with_recorded_mode
     from ftdrive.terminal.console import messages
 
-    if mover := MOVED_BY.get(with_recorded_mode(options).mode):
+    if mover := MOVED_BY.get(options.with_recorded_mode().mode):
         request, words = mover
         station.control(**request)
         messages.print(f"The cell is emulated: {words}.")

@@ -27,14 +27,13 @@ class Speeds:
         """Return the slow limits for a plan that has not run in its workcell yet."""
         return cls(float(np.radians(30)), float(np.radians(40)))
 
-
-def slower(one: Speeds, other: Speeds) -> Speeds:
-    """Return the smaller of each limit."""
-    return Speeds(
-        min(one.joint_rad_s, other.joint_rad_s),
-        min(one.joint_rad_s2, other.joint_rad_s2),
-        min(one.tip_m_s or np.inf, other.tip_m_s or np.inf),
-    )
+    def limited(self, other: "Speeds") -> "Speeds":
+        """Return the smaller of each limit."""
+        return Speeds(
+            min(self.joint_rad_s, other.joint_rad_s),
+            min(self.joint_rad_s2, other.joint_rad_s2),
+            min(self.tip_m_s or np.inf, other.tip_m_s or np.inf),
+        )
 
 
 def move_duration_s(turn_rad: Array, speed_rad_s: Array | float, acceleration_rad_s2: float) -> Array:

@@ -19,7 +19,7 @@ from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene, lean_of
-from ftdrive.planning.motion import Speeds, slower
+from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.search import nodes
 from ftdrive.planning.search.chosen import Chosen, chosen_tour, tour_of_sets, verification_tour
@@ -364,7 +364,7 @@ def speeds_of(cell: CellConfig) -> Speeds:
     """Return the speed limits of a cell."""
     robot = cell.robot
     joint_rad_s, joint_rad_s2 = np.radians([robot.speed_deg_s, robot.acceleration_deg_s2])
-    return slower(Speeds(float(joint_rad_s), float(joint_rad_s2), robot.tip_speed_mm_s / 1e3), FASTEST)
+    return Speeds(float(joint_rad_s), float(joint_rad_s2), robot.tip_speed_mm_s / 1e3).limited(FASTEST)
 
 
 def plan_for(

@@ -20,13 +20,13 @@ from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
 from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.motion import arm_moves, move_duration_s, slower
+from ftdrive.planning.motion import arm_moves, move_duration_s
 from ftdrive.planning.plan import Plan, turns_in_words, way_in_words
 from ftdrive.planning.planner import certifier_for, speeds_of
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
 from ftdrive.session.events import GuardTripped, Planned, rms_sigma
-from ftdrive.session.open_session import Judge, OpenCell, PoseBook, Session, reporting_early_end
+from ftdrive.session.open_session import Judge, OpenCell, PoseBook, Session
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
 from ftdrive.session.sweep import FreeTool, SweepTour, choose_sweep_speed
@@ -219,7 +219,7 @@ class _AlongPlan:
             why = f": {_NO_SERIAL}" if self._serial == NOT_REPORTED else ""
             cell.note(f"{'every' if why else 'the first'} run of a plan is slow{why}", warning=True)
         speeds = speeds_of(self.task.cell)
-        driven = plan.limited(before.certifier, slower(speeds, SLOW) if slow else speeds)
+        driven = plan.limited(before.certifier, speeds.limited(SLOW) if slow else speeds)
         total_s = moves_s(driven, todo, before.approach)
         total_s += len(todo) * (sampling.average_s + 0.6)
         cell.note(
@@ -268,7 +268,7 @@ class _AlongPlan:
             book = PoseBook(cell, run, judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)
             tour = (SweepTour if driven.plan.sweep else Tour)(guarded, driven, quiet_std, book, options)
-            with reporting_early_end(cell.journal, run):
+            with cell.journal.reporting_early_end(run):
                 tour.run(todo)
         if todo and not before.known:
             self._judge_completed(before.plan, run, tour.undriven)

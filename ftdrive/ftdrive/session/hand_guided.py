@@ -19,7 +19,7 @@ from ftcalib.sampling import Sampling
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.run import Run
 from ftdrive.session.events import Compared, Estimated, Key, SensorEvents, State, StateChanged
-from ftdrive.session.open_session import OpenCell, PoseBook, Session, reporting_early_end
+from ftdrive.session.open_session import OpenCell, PoseBook, Session
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmState, FtSamples
 
@@ -91,7 +91,7 @@ def take_by_hand(session: Session) -> Run:
         run = session.new_run()
         cell.journal.keep_in(run)
     book = PoseBook(cell, run, task.judge(by_hand=True), down_of(task.cell.workcell.mounting))
-    with reporting_early_end(cell.journal, run):
+    with cell.journal.reporting_early_end(run):
         guide = HandGuided(cell, book, task.cell.sampling, listen=session.options.mode == "listen")
         guide.run(run.records() if session.resumed else (), task.goal)
     return run

@@ -108,6 +108,15 @@ class Journal:
                     self.show(GuardTripped(hazard=Hazard.SUPERVISOR_GONE, words=str(gone)), sync=True)
             raise
 
+    @contextmanager
+    def reporting_early_end(self, run: Run) -> Iterator[None]:
+        """Show where the data of a run are if the block ends early."""
+        try:
+            yield
+        except BaseException:
+            self.show(Noted(words=_describe_kept(run)), sync=True)
+            raise
+
     def ask(self, question: Question) -> str:
         """Ask; record the answer and who gave it. Raises `SupervisorGone`, also where `--yes` would answer."""
         assumed = question.assumed if self._yes else None
@@ -254,16 +263,6 @@ class PoseBook:
             sync=True,
         )
         return self.judge.add(record)
-
-
-@contextmanager
-def reporting_early_end(journal: Journal, run: Run) -> Iterator[None]:
-    """Show where the data of a run are if the block ends early."""
-    try:
-        yield
-    except BaseException:
-        journal.show(Noted(words=_describe_kept(run)), sync=True)
-        raise
 
 
 def _describe_kept(run: Run) -> str:

@@ -68,6 +68,23 @@ class SessionOptions:
         """Whether the operator or a program on the pendant moves the arm."""
         return self.mode in _BY_HAND
 
+    def with_recorded_mode(self) -> "SessionOptions":
+        """Return options with the mode of the resumed run; raises `ConfigError` for options that exclude each other."""
+        begun = self.mode if self.resume is None else Run(self.resume).mode
+        if self.resume is not None and begun == "sweep":
+            raise ConfigError(f"{self.resume} is a sweep, which is not continued: start again with --sweep")
+        if self.mode != "auto" and (begun in _BY_HAND) != self.by_hand:
+            way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
+            raise ConfigError(f"{self.resume} was started {way} and only continues so: leave out --{self.mode}")
+        options = replace(self, mode=begun if self.mode == "auto" else self.mode)
+        if options.redo and options.resume is None:
+            raise ConfigError("--redo needs a run: name the run with --resume RUN")
+        if not options.by_hand:
+            return options
+        if wrong := [name for name in _OF_MOTION if getattr(options, name[2:].replace("-", "_"))]:
+            raise ConfigError(f"with --{options.mode} ftdrive neither plans nor moves: leave out {' and '.join(wrong)}")
+        return options
+
 
 def refuse_contradictions(given: Mapping[str, Any]) -> None:
     """Raise `ConfigError` for options of `ftdrive calibrate` that exclude one another; their values by name."""
@@ -93,21 +110,3 @@ def method_of_poses(name: str) -> Method:
             "`ftdrive solve RUN --method carlson-cayley --mass-kg KG`"
         )
     return cast(Method, name)
-
-
-def with_recorded_mode(options: SessionOptions) -> SessionOptions:
-    """Return options with the mode of the resumed run; raises `ConfigError` for options that exclude each other."""
-    begun = options.mode if options.resume is None else Run(options.resume).mode
-    if options.resume is not None and begun == "sweep":
-        raise ConfigError(f"{options.resume} is a sweep, which is not continued: start again with --sweep")
-    if options.mode != "auto" and (begun in _BY_HAND) != options.by_hand:
-        way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
-        raise ConfigError(f"{options.resume} was started {way} and only continues so: leave out --{options.mode}")
-    options = replace(options, mode=begun if options.mode == "auto" else options.mode)
-    if options.redo and options.resume is None:
-        raise ConfigError("--redo needs a run: name the run with --resume RUN")
-    if not options.by_hand:
-        return options
-    if wrong := [name for name in _OF_MOTION if getattr(options, name[2:].replace("-", "_"))]:
-        raise ConfigError(f"with --{options.mode} ftdrive neither plans nor moves: leave out {' and '.join(wrong)}")
-    return options

@@ -14,7 +14,7 @@ from ftdrive.runs.motion import MotionRecording, means_of
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import circumstances_of
 from ftdrive.session.events import Key, MotionRecorded
-from ftdrive.session.open_session import OpenCell, Session, reporting_early_end
+from ftdrive.session.open_session import OpenCell, Session
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 
@@ -60,7 +60,7 @@ def record_passively(
     executor = fits or ThreadPoolExecutor(1)
     recorder = _Recorder(cell, run)
     try:
-        with reporting_early_end(cell.journal, run):
+        with cell.journal.reporting_early_end(run):
             recorder.record(seconds, lambda at_s: executor.submit(_fitted, run, at_s, setup, g_m_s2))
     finally:
         executor.shutdown(wait=False, cancel_futures=True)

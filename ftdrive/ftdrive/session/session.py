@@ -30,7 +30,7 @@ from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import take_by_hand
 from ftdrive.session.live_fit import RunningFit
 from ftdrive.session.open_session import Journal, Judge, OpenCell, Session, Task
-from ftdrive.session.options import SessionOptions, with_recorded_mode
+from ftdrive.session.options import SessionOptions
 from ftdrive.session.passive import take_passively
 from ftdrive.session.sweep import on_script_path
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
@@ -181,7 +181,7 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
     config = task.cell
     journal = Journal(operator, yes=options.yes)
     journal.show(StateChanged(state=State.IDLE))
-    options = with_recorded_mode(options)
+    options = options.with_recorded_mode()
     resumed = None if options.resume is None else Run(options.resume, config.clock)
     if resumed is not None and resumed.command != task.command:
         raise ConfigError(f"{resumed.folder} was not made by {task.command}: continue it with {resumed.resume_command}")

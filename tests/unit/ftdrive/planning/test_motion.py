@@ -3,7 +3,7 @@
 import numpy as np
 
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
-from ftdrive.planning.motion import Speeds, durations_s, move_duration_s, slower, speed_of_leading_joint, tips
+from ftdrive.planning.motion import Speeds, durations_s, move_duration_s, speed_of_leading_joint, tips
 from ftdrivers.ur.kinematics import Array
 
 ARM = ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1), Cylinder(0.05, 0.3, 0.03, 0.06, -0.02)])
@@ -49,5 +49,5 @@ def test_durations_of_all_moves_are_about_those_of_each() -> None:
 
 
 def test_the_slower_of_two_has_the_smaller_of_each_limit() -> None:
-    assert slower(Speeds(1.0, 2.0, 0.3), Speeds(2.0, 1.0, None)) == Speeds(1.0, 1.0, 0.3)
-    assert slower(Speeds(2.0, 1.0, 0.2), Speeds(1.0, 2.0, 0.3)) == Speeds(1.0, 1.0, 0.2)
+    assert Speeds(1.0, 2.0, 0.3).limited(Speeds(2.0, 1.0, None)) == Speeds(1.0, 1.0, 0.3)
+    assert Speeds(2.0, 1.0, 0.2).limited(Speeds(1.0, 2.0, 0.3)) == Speeds(1.0, 1.0, 0.2)

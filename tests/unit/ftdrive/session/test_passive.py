@@ -17,7 +17,7 @@ from ftdrive.runs.motion import MotionRecording, files_of
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import Circumstances
 from ftdrive.session.events import Key
-from ftdrive.session.open_session import OpenCell
+from ftdrive.session.open_session import Journal, OpenCell
 from ftdrive.session.passive import PART_S, record_passively
 from ftdrivers.errors import StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
@@ -56,9 +56,8 @@ class FakeCell:
             follow=lambda: self._follow(self._samples, STEP_S), health=lambda: health, temperature_C=lambda: None
         )
         self.arm = SimpleNamespace(follow=lambda: self._follow(self._states, 0.0))
-        self.journal = SimpleNamespace(
-            pressed=self._pressed, show=lambda event, **_: self.shown.append(event), keep_in=lambda _: None
-        )
+        operator: Any = SimpleNamespace(pressed=self._pressed, show=self.shown.append)
+        self.journal = Journal(operator)
 
     @contextmanager
     def _follow(self, rows: Any, step_s: float) -> Iterator[Any]:

@@ -18,7 +18,7 @@ from ftdrive.runs.motion import MotionRecording
 from ftdrive.session import session
 from ftdrive.session.events import Event, GuardTripped, Key, MotionRecorded, State, StateChanged
 from ftdrive.session.guards import ExpectedMotion, Seen
-from ftdrive.session.options import SessionOptions, with_recorded_mode
+from ftdrive.session.options import SessionOptions
 from ftdrive.session.sweep import FreeTool, on_script_path
 from ftdrivers.clock import REAL
 from ftdrivers.interfaces import ArmState
@@ -68,7 +68,7 @@ def test_everything_is_kept_in_one_file_and_a_sweep_is_not_continued(lab: Lab) -
     assert recording.nominal_rate_Hz != recording.nominal_rate_Hz
     assert State.SWEEP in lab.operator.states()
     with pytest.raises(ConfigError, match="start again with --sweep"):
-        with_recorded_mode(SessionOptions(lab.folder, resume=run.folder))
+        SessionOptions(lab.folder, resume=run.folder).with_recorded_mode()
 
 
 @pytest.mark.slow
