@@ -1,6 +1,5 @@
 """`ftdrive verify`: fresh poses against the prediction of a calibration."""
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -94,20 +93,11 @@ def verify(
     from ftdrive.errors import NotAccepted
     from ftdrive.runs.verification import AcceptanceLimits
     from ftdrive.session.options import SessionOptions
-    from ftdrive.session.verifying import POSES, QUICK_POSES
 
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
-    if quick and poses is not None:
-        raise ConfigError("--quick and --poses exclude one another: leave one of them out")
-    limits = AcceptanceLimits(force_N, torque_Nm)
-    if resume is not None:
-        given = {"--calibration": path, "--quick": quick, "--poses": poses}
-        begun = _begun(resume, given | {"--max-force or --max-torque": limits.given})
-        path, poses, quick = Path(begun["path"]), begun["poses"], begun["quick"]
-        limits = AcceptanceLimits(**begun["limits"])
-    poses = poses or (QUICK_POSES if quick else POSES)
     mode: Mode = "manual" if manual else "auto"
-    options = SessionOptions(runs, "verify", poses, mode, fast=quick, resume=resume, real=not simulate, yes=yes)
+    options = SessionOptions(runs, "verify", mode=mode, fast=quick, resume=resume, real=not simulate, yes=yes)
+    path, limits, options = _with_poses(options, path, poses, AcceptanceLimits(force_N, torque_Nm))
     with ExitStack() as stack:
         station = None
         if simulate:
@@ -146,8 +136,9 @@ def verify_cell(
 
     calibration = read_calibration(path)
     path = Run(path).calibration_path if path.is_dir() else path
-    wanted = {"path": str(path.absolute()), "poses": options.poses, "quick": options.fast, "limits": asdict(limits)}
-    description: dict[str, Any] = {"verification": {**wanted, "id": calibration.id}}
+    # The run keeps what is verified and how, so that --resume continues alike.
+    kept = {"path": str(path.absolute()), "poses": options.poses, "quick": options.fast, "limits": asdict(limits)}
+    description: dict[str, Any] = {"verification": {**kept, "id": calibration.id}}
     # 12 s of noise would take longer than the poses.
     if options.fast:
         cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
@@ -170,17 +161,28 @@ def failure_in_words(verified: "Verified") -> str:
     return "; ".join(verified.exceeded if verified.limits.given else (verified.verification.reason,))
 
 
-def _begun(resume: Path, given: Mapping[str, object]) -> Mapping[str, Any]:
-    """Return what a run verifies and how: --resume continues alike. Raises `ConfigError` for `given` options."""
+def _with_poses(
+    options: "SessionOptions", path: Path | None, poses: int | None, limits: "AcceptanceLimits"
+) -> tuple[Path | None, "AcceptanceLimits", "SessionOptions"]:
+    """Return what is verified and how: as given, or as the run that is resumed was begun."""
     from ftdrive.runs.run import Run
+    from ftdrive.runs.verified import AcceptanceLimits
+    from ftdrive.session.verifying import POSES, QUICK_POSES
 
+    quick, resume = options.fast, options.resume
+    if quick and poses is not None:
+        raise ConfigError("--quick and --poses exclude one another: leave one of them out")
+    if resume is None:
+        return path, limits, replace(options, poses=poses or (QUICK_POSES if quick else POSES))
+    given = {"--calibration": path, "--quick": quick, "--poses": poses, "--max-force or --max-torque": limits.given}
     if wrong := [option for option, value in given.items() if value]:
         raise ConfigError(f"--resume continues with the options of its run: leave out {' and '.join(wrong)}")
     run = Run(resume)
     if run.command != "verify":
         raise ConfigError(f"{resume} is not a verification: continue it with {run.resume_command}")
-    begun: Mapping[str, Any] = run.header()["verification"]
-    return begun
+    begun = run.header()["verification"]
+    options = replace(options, poses=begun["poses"], fast=begun["quick"])
+    return Path(begun["path"]), AcceptanceLimits(**begun["limits"]), options
 
 
 def _report(verified: "Verified", update: Answer, *, simulated: bool, as_json: bool) -> None:

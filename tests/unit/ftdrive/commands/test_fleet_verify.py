@@ -77,7 +77,7 @@ class Lab:
             raise answer
         return answer
 
-    def _session(self, cell: CellConfig, path: Path, limits: Any, options: Any) -> Any:
+    def _session(self, cell: CellConfig, path: Path, limits: AcceptanceLimits, options: Any) -> Any:
         assert not limits.given
         self.sessions.append((cell, path, options))
         outcome = self.outcomes.pop(0) if self.outcomes else ""

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -47,21 +46,13 @@ def test_options_that_contradict_are_refused(arguments: tuple[str, ...], words: 
     assert words in str(outcome.exception)
 
 
-def test_a_resumed_verification_keeps_its_options(begun: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept: list[Any] = []
-
-    def session(_: Any, path: Path, limits: AcceptanceLimits, options: SessionOptions, *__: Any, **___: Any) -> Any:
-        kept.extend((path, options.poses, options.fast, limits))
-        return SimpleNamespace(passed=True)
-
-    monkeypatch.setattr(command, "verify_cell", session)
-    cell = ("--robot", "10.0.0.2", "--sensor", "ati-can://can0")
-    assert CliRunner().invoke(command.verify, ["--resume", str(begun), *cell]).exit_code == 0
-    assert kept == [Path("cell/calibration.json"), 3, False, AcceptanceLimits(force_N=0.5)]
+def test_a_resumed_verification_keeps_its_options(begun: Path) -> None:
+    options = SessionOptions(begun.parent, resume=begun)
+    path, limits, options = command._with_poses(options, None, None, AcceptanceLimits())
+    assert (path, options.poses, limits) == (Path("cell/calibration.json"), 3, AcceptanceLimits(force_N=0.5))
     calibrate = Run.create(begun.parent, "calibrate", {"mode": "auto"}).folder
-    outcome = CliRunner().invoke(command.verify, ["--resume", str(calibrate), *cell])
-    assert isinstance(outcome.exception, ConfigError)
-    assert "ftdrive calibrate --resume" in str(outcome.exception)
+    with pytest.raises(ConfigError, match="ftdrive calibrate --resume"):
+        command._with_poses(replace(options, resume=calibrate), None, None, AcceptanceLimits())
 
 
 def failed(folder: Path, limits: AcceptanceLimits) -> Any:
