@@ -464,7 +464,7 @@ def read_recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str
 
 
 def recorded_cell(config: Mapping[str, Mapping[str, Any]]) -> CellConfig:
-    """Return the cell of a run from what `recorded` returns."""
+    """Return the cell of a run from what `read_recorded` returns."""
     return CellConfig(**{name: kind(**config.get(name, {})) for name, kind in SECTIONS.items()}, clock=clock_in_force())
 
 

@@ -87,7 +87,7 @@ def compare_devices(
 def check_calibration(
     result: "CalibrationResult", connected: Mapping[str, DeviceInfo], mount: str | EllipsisType | None = ...
 ) -> Check:
-    """Check that a calibration belongs to the connected devices, and as `belonging` does to the mounting."""
+    """Check that a calibration belongs to the connected devices, and as `compare_devices` does to the mounting."""
     name = "calibration.devices"
     belongs = compare_devices(result, connected, mount)
     if belongs.others:

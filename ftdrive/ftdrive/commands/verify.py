@@ -129,7 +129,7 @@ def verify_cell(
     from ftdrive.commands.common import start_mover
     from ftdrive.runs.run import Run
     from ftdrive.runs.source import read_calibration
-    from ftdrive.runs.verified import verify_run
+    from ftdrive.runs.verification import verify_run
     from ftdrive.session.session import take_poses
     from ftdrive.session.verifying import Verifying
     from ftdrive.terminal.screen import open_operator
@@ -166,7 +166,7 @@ def _with_poses(
 ) -> tuple[Path | None, "AcceptanceLimits", "SessionOptions"]:
     """Return what is verified and how: as given, or as the run that is resumed was begun."""
     from ftdrive.runs.run import Run
-    from ftdrive.runs.verified import AcceptanceLimits
+    from ftdrive.runs.verification import AcceptanceLimits
     from ftdrive.session.verifying import POSES, QUICK_POSES
 
     quick, resume = options.fast, options.resume

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationResult
 from ftcalib.files import JSON
 from ftcalib.model import Array
-from ftdrive.checks.flange_load import flange_load
+from ftdrive.checks.arm import flange_load
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import sensor_origin_m
 from ftdrive.runs.run import Run

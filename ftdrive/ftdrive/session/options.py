@@ -1,4 +1,4 @@
-"""Options of a session, the mode of a resumed run, and the plan on disk."""
+"""Options of a session, those that exclude one another, and the mode of a resumed run."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

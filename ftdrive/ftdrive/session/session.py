@@ -11,7 +11,7 @@ from ftcalib import CalibrationResult
 from ftcalib.model import Array
 from ftcalib.poses.information import predicted_sigma
 from ftcalib.published.methods import SPECIAL
-from ftcalib.result import LEAST_COMMON_GAIN, Method
+from ftcalib.result import LEAST_COMMON_GAIN
 from ftdrive.cell.config import CellConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.checks.check import compare_devices
@@ -106,28 +106,22 @@ class Calibrating:
     calibration: ClassVar[None] = None
     warnings: ClassVar[tuple[str, ...]] = ()
     cell: CellConfig
-    real: bool = True
-    """Whether a real arm moves."""
-    sets: str | None = None
-    """Sets of Yu's Fig. 6 instead of a number of poses."""
-    method: Method = "ml"
-    """Method that will solve the poses."""
-    sweep_s: float | None = None
-    """Duration of a sweep at the planned speed; None for poses."""
+    options: SessionOptions
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
         """Return a sweep or a tour. Raises `PlanRefused` if it lacks orientations that the method needs."""
-        if self.sweep_s is not None:
-            return sweep_for(self.cell, certifier, q_rad, self.sweep_s)
+        options = self.options
+        if options.mode == "sweep":
+            return sweep_for(self.cell, certifier, q_rad, options.seconds)
         q_rad = from_usual_wrist(certifier, q_rad)
-        plan = plan_for(self.cell, certifier, q_rad, poses, sets=self.sets)
+        plan = plan_for(self.cell, certifier, q_rad, poses, sets=options.sets)
         special = sum(step.number in NUMBERS[24] for step in plan.steps)
-        if self.method in SPECIAL and special < 24:
+        if options.method in SPECIAL and special < 24:
             raise PlanRefused(
-                f"{self.method} needs the 24 special orientations, and the tour has {special} of them: plan all 24, "
+                f"{options.method} needs the 24 special orientations, and the tour has {special} of them: plan all 24, "
                 "jog the arm to a posture with more room, or choose --method lrom"
             )
-        if self.method == "srom" and len(plan.steps) > 24:
+        if options.method == "srom" and len(plan.steps) > 24:
             raise PlanRefused(
                 f"srom needs the 24 special orientations alone, and the tour has {len(plan.steps) - 24} other poses: "
                 "choose --method mixed"
@@ -148,7 +142,7 @@ class Calibrating:
         guess = replace(guess_of(certifier, mass_kg), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
         found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
         mass_g = 1e3 * np.hypot(found.sigma["mass_kg"], LEAST_COMMON_GAIN * guess.mass_kg)
-        assumed = " (assumed: [tool] mass_kg is not set)" if self.real and not mass_kg else ""
+        assumed = " (assumed: [tool] mass_kg is not set)" if self.options.real and not mass_kg else ""
         return (
             f"predicted from that for {guess.mass_kg:g} kg{assumed}, one sigma: mass {mass_g:.2g} g, "
             f"force bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
@@ -158,11 +152,8 @@ class Calibrating:
 
 def calibrate(cell: CellConfig, operator: Operator, options: SessionOptions) -> Outcome | None:
     """Guide the operator through a calibration; None after a dry run. Raises as `take_poses`."""
-    if options.mode == "sweep":
-        task = Calibrating(on_script_path(cell), options.real, sweep_s=options.seconds)
-    else:
-        task = Calibrating(cell, options.real, options.sets, options.method)
-    run = take_poses(task, operator, options)
+    cell = on_script_path(cell) if options.mode == "sweep" else cell
+    run = take_poses(Calibrating(cell, options), operator, options)
     return None if run is None else solve_and_save(run)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.cells import cell_len
 
-from ftcalib.sphere import axes_along
+from ftcalib.judge.observability import axes_along
 from ftdrive.checks.check import Check
 from ftdrive.checks.sensor import AXES, check_rate
 from ftdrive.errors import ConfigError

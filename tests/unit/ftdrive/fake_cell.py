@@ -462,7 +462,7 @@ class Lab:
     def take_poses(self, **options: Any) -> Run | None:
         """As `calibrate`, for a test that does not ask what the poses give."""
         chosen = self._options(**options)
-        return session.take_poses(Calibrating(self.cell, chosen.real, chosen.sets), self.operator, chosen)
+        return session.take_poses(Calibrating(self.cell, chosen), self.operator, chosen)
 
     def trust(self) -> Path:
         """Let the plan of this cell count as completed; return its file."""
@@ -472,8 +472,8 @@ class Lab:
         return path
 
     def sweep(self, **options: Any) -> Run | None:
-        chosen = SessionOptions(self.folder / "runs", mode="sweep", **options)
-        return session.take_poses(Calibrating(self.cell, chosen.real, sweep_s=10.0), self.operator, chosen)
+        chosen = SessionOptions(self.folder / "runs", mode="sweep", seconds=10.0, **options)
+        return session.take_poses(Calibrating(self.cell, chosen), self.operator, chosen)
 
     def run(self) -> Run:
         (folder,) = (self.folder / "runs").iterdir()

@@ -15,7 +15,7 @@ from ftcalib.after.verification import Verification
 from ftdrive.commands import verify as command
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
-from ftdrive.runs.verified import AcceptanceLimits, Verified
+from ftdrive.runs.verification import AcceptanceLimits, Verified
 from ftdrive.session.options import SessionOptions
 from ftdrive.terminal.report import verdict_in_words
 from tests.unit.ftdrive.recorded import calibration

@@ -132,12 +132,14 @@ def test_a_session_saves_no_result_as_good_whose_tool_is_elsewhere_unless_it_was
 @pytest.mark.parametrize(("mounting", "up"), [("floor", (0, 0, 1)), ("ceiling", (0, 0, -1)), (None, None)])
 def test_a_mounting_counts_as_declared_only_if_it_was_given(mounting: str | None, up: Any, lab: Lab) -> None:
     lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting=mounting))
-    description = description_of(Calibrating(lab.cell), SessionOptions(lab.folder), {})
+    options = SessionOptions(lab.folder)
+    description = description_of(Calibrating(lab.cell, options), options, {})
     found = circumstances_of(Run.create(lab.folder, "r", description)).setup.up_in_base
     assert found == (None if up is None else pytest.approx(up, abs=1e-12))
 
 
 def test_a_cell_with_a_clock_of_its_own_marks_its_results_as_emulated(lab: Lab) -> None:
+    options = SessionOptions(lab.folder)
     for clock, station in ((FakeClock(), {}), (REAL, None)):
-        description = description_of(Calibrating(replace(lab.cell, clock=clock)), SessionOptions(lab.folder), {})
+        description = description_of(Calibrating(replace(lab.cell, clock=clock), options), options, {})
         assert circumstances_of(Run.create(lab.folder, "r", description)).origin["station"] == station
