@@ -215,9 +215,17 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
 
 
 def _plan_on_disk(options: SessionOptions, run: Run | None) -> Plan | None:
-    """Load the plan of the resumed run, or the given one; raises `ConfigError` if it lacks a pose of `redo`."""
+    """Load the plan of the resumed run, or the given one.
+
+    Raises `ConfigError` if it lacks a pose of `redo`, or is a sweep, whose guards only the mode of a sweep has.
+    """
     if run is None:
-        return None if options.plan is None else Plan.load(options.plan)
+        given = None if options.plan is None else Plan.load(options.plan)
+        if given is not None and given.sweep is not None:
+            raise ConfigError(
+                f"{options.plan} is the plan of a sweep: leave out --plan and give --sweep, which plans one"
+            )
+        return given
     plan = Plan.load(run.plan_path)
     stops = len(plan.steps) + 1
     if wrong := sorted(stop for stop in options.redo if not 1 <= stop <= stops):

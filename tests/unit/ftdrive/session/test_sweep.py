@@ -71,6 +71,15 @@ def test_everything_is_kept_in_one_file_and_a_sweep_is_not_continued(lab: Lab) -
         SessionOptions(lab.folder, resume=run.folder).with_recorded_mode()
 
 
+def test_the_plan_of_a_sweep_is_not_driven_as_a_tour(lab: Lab) -> None:
+    run = lab.sweep(real=False)
+    assert run is not None
+    sweeps = len(lab.arm.sweeps)
+    with pytest.raises(ConfigError, match="is the plan of a sweep: leave out --plan"):
+        lab.take_poses(plan=run.plan_path)
+    assert len(lab.arm.sweeps) == sweeps
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_in_a_sweep_stops_the_arm_and_resume_starts_again(fault: str, lab: Lab) -> None:
