@@ -1,0 +1,1 @@
+"""Tables of other programs: which text, which columns, which units."""

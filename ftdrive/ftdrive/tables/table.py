@@ -1,0 +1,450 @@
+"""Tables of wrenches and poses, from text or from memory, as numbers in the units and frames of the project."""
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple, Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationDataset
+from ftcalib.data.dataset import MATRIX_COLUMNS, QUATERNION_COLUMNS, VECTOR_COLUMNS, Orientation, rotations_of
+from ftcalib.errors import BadDataset
+from ftcalib.model import Array
+from ftdrive.errors import ConfigError
+from ftdrive.tables.columns import COUNTS, UNITS, Columns, Signal, factor
+from ftdrive.tables.text import TextTable
+
+WrenchAxes = Literal["sensor", "flange", "tcp", "base"]
+# Sequences of scipy: capitals turn about axes of the tool, small letters about those of the base.
+_MAKERS: Final = {"rpy": "xyz", "abc": "ZYX", "wpr": "xyz", "oat": "ZYZ"}
+# Axis about which each column turns.
+_AXES: Final = {"rpy": "xyz", "abc": "zyx", "wpr": "xyz", "oat": "zyz", "vector": "xyz", "angles": "xyz"}
+_ORIENTATIONS: Final = (
+    *("matrix", "quaternion", "quaternion_w_first", "transform", "tcp_pose", "vector", "rpy", "abc", "wpr", "oat"),
+    *("angles", "joints", "gravity", "acceleration"),
+)
+# Layouts of the orientation that a message may suggest, the likeliest first.
+_NEAREST: Final = ("quaternion", "matrix", "vector", "rpy", "abc", "tcp_pose")
+_KIND: Final = {
+    "time": "time",
+    "position": "length",
+    "acceleration": "acceleration",
+    **dict.fromkeys((*_AXES, "joints"), "angle"),
+}
+_COLUMNS: Final = {"matrix": MATRIX_COLUMNS, "quaternion": QUATERNION_COLUMNS, "vector": VECTOR_COLUMNS}
+# More than two turns in rad, or than any arm reaches in m: the numbers are degrees and mm.
+_MOST_RAD, _MOST_M = 4 * np.pi, 10.0
+_UNITS_OF_TIME: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+# 1990 to 2100, since 1970.
+_EPOCH_S: Final = (6.3e8, 4.1e9)
+# Recordings have steps between these, 50 kHz to 5 Hz, and so many rows.
+_STEPS_S: Final = (2e-5, 0.2)
+_RECORDING_ROWS = 200
+# From pose to pose; longer ones are in another unit.
+_POSE_STEPS_S: Final = (0.5, 1e3)
+# Nearer to it, any horizontal axis turns a vector upright.
+_UPSIDE_DOWN = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TableOptions:
+    """What a table does not say of itself."""
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    """Columns of the table by our names, with a unit where theirs have none: ``{"fx": "Force X [kgf]"}``."""
+    rate_Hz: float | None = None
+    """Of a table without times."""
+    euler: str = ""
+    """rpy, ABC, WPR, OAT, or three axes: ZYX turns about those of the tool, xyz about those of the base."""
+    wrench_axes: WrenchAxes | None = None
+    """Axes and reference point of the wrench; None is what the program of the table means, mostly the sensor."""
+    R_flange_tcp: Array = field(default_factory=lambda: np.eye(3))
+    """(3, 3) of the TCP, if the poses are its poses."""
+    p_flange_tcp_m: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,) of the TCP, if the poses are its poses."""
+    sign: Literal[1, -1] = 1
+    """-1 for a sensor that reports the reaction."""
+    forward: Callable[[Array], tuple[Array, Array]] | None = None
+    """Returns R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) of joint angles (n, 6) in rad."""
+
+    def __post_init__(self) -> None:
+        if self.euler and self.euler.lower() not in _MAKERS and not re.fullmatch("[xyz]{3}|[XYZ]{3}", self.euler):
+            makers = ", ".join(name if name == "rpy" else name.upper() for name in _MAKERS)
+            raise ConfigError(
+                f"--euler {self.euler}: give {makers}, or three axes, such as ZYX (of the tool) or xyz (of the base)"
+            )
+        if self.rate_Hz is not None and not self.rate_Hz > 0:
+            raise ConfigError(f"--rate {self.rate_Hz:g}: give the samples a second")
+
+
+_PLAIN: Final = TableOptions()
+
+
+_JOINTS_ONLY = "it has joint angles and no orientation: add --model, such as UR5e, or --urdf FILE"
+_ANGLES_ONLY = "it has three angles: add --euler, such as ZYX (axes of the tool) or xyz (axes of the base)"
+
+
+class Source(Protocol):
+    """Columns that are read in blocks."""
+
+    names: Sequence[str]
+    units: Sequence[str]
+    words: str
+
+    def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
+        """Give some columns (n, k) of consecutive rows, and the share of the source before the next ones."""
+
+
+class Frame:
+    """A DataFrame of pandas or Polars, or a mapping of names to arrays."""
+
+    words = ""
+
+    def __init__(self, frame: Any) -> None:
+        self._frame = frame
+        self.names: Sequence[str] = list(map(str, frame.keys() if isinstance(frame, Mapping) else frame.columns))
+        self.units: Sequence[str] = [""] * len(self.names)
+
+    def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
+        """Give all rows. Raises `BadDataset`."""
+        try:
+            yield np.column_stack([np.asarray(self._frame[self.names[i]], np.float64) for i in use]), 1.0
+        except (TypeError, ValueError) as error:
+            raise BadDataset(f"{error}: give a number in each cell") from error
+
+
+class Rows(NamedTuple):
+    """Consecutive rows of a signal."""
+
+    t_s: Array
+    """(n,)"""
+    values: Array
+    """(n, k)"""
+    place: float
+    """Share of the source before the next rows."""
+
+
+class Table:
+    """A table whose signals were found.
+
+    Parameters
+    ----------
+    source : Path, DataFrame or mapping
+    options : TableOptions
+
+    Raises
+    ------
+    BadDataset
+        It is no table, or a column contradicts its name. A signal that is missing raises where it is needed.
+    OSError
+        It cannot be read.
+    """
+
+    def __init__(self, source: Path | Any, options: TableOptions = _PLAIN) -> None:
+        self.name = source.name if isinstance(source, Path) else type(source).__name__
+        self.options = options
+        self._guesses: list[str] = []
+        self._found: dict[str, Signal | None] = {}
+        with self._named():
+            self.source: Source = TextTable(source) if isinstance(source, Path) else Frame(source)
+            self._columns = Columns(self.source.names, self.source.units, options.columns)
+            self._find()
+
+    def _find(self) -> None:
+        """Find the signals, and the factors of their units; the first rows show what no name says."""
+        find, options = self._columns.find, self.options
+        orientation = find(*(_AXES if options.euler else _ORIENTATIONS))
+        self._found = {
+            "time": None if options.rate_Hz else find("time"),
+            "wrench": find("wrench", "flange_wrench", "base_wrench"),
+            "orientation": orientation,
+            "position": None
+            if orientation is None or orientation.form in ("transform", "tcp_pose")
+            else find("position"),
+            "sigma": find("sigma"),
+        }
+        signals = [one for one in self._found.values() if one is not None]
+        use = sorted({column for one in signals for column in one.columns})
+        rows, _ = next(self.source.blocks(use), (np.empty((0, len(use))), 1.0))
+        first = {one.form: rows[:, [use.index(column) for column in one.columns]] for one in signals}
+        self._factors = {one.form: self._factors_of(one, first[one.form]) for one in signals}
+        self._first = {name: first[one.form] * self._factors[one.form] for name, one in self._found.items() if one}
+
+    @property
+    def words(self) -> str:
+        """What was recognised, in one line; empty for a table with the names and units of the project."""
+        programs = {one.program for one in self._found.values() if one} - {"ftdrive", "own program"}
+        named = [f"columns of {one}" for one in sorted(programs)]
+        return "; ".join(filter(None, [self.source.words, *named, *self._guesses]))
+
+    @property
+    def gravity_is_measured(self) -> bool:
+        """Whether the orientation is a direction of gravity, so that nothing turns about the vertical."""
+        orientation = self._found["orientation"]
+        return orientation is not None and orientation.form in ("gravity", "acceleration")
+
+    def has(self, signal: Literal["wrench", "orientation"]) -> bool:
+        """Whether the table has a signal."""
+        return self._found[signal] is not None
+
+    @cached_property
+    def in_motion(self) -> bool:
+        """Whether its rows follow one another too quickly for poses at rest, or come from two streams."""
+        if self.gravity_is_measured or not (self.has("wrench") and self.has("orientation")):
+            return False
+        wrench, orientation = (np.isfinite(self._first[one]).all(axis=1) for one in ("wrench", "orientation"))
+        both = wrench & orientation
+        if not both.any():
+            return bool(wrench.any() and orientation.any())
+        if both.sum() < _RECORDING_ROWS or not (self._found["time"] or self.options.rate_Hz):
+            return False
+        if self.options.rate_Hz:
+            return True
+        return bool(np.median(np.diff(self._first["time"].sum(axis=1)[both])) <= _STEPS_S[1])
+
+    def rate_Hz(self, signal: Literal["wrench", "orientation"]) -> float:
+        """Return the mean rate of a signal in the first rows. Raises `BadDataset` for fewer than two."""
+        if self.options.rate_Hz:
+            return self.options.rate_Hz
+        self._require_time()
+        self._require(signal)
+        t_s = self._first["time"].sum(axis=1)[np.isfinite(self._first[signal]).all(axis=1)]
+        if len(t_s) < 2:
+            raise BadDataset(f"{self.name}: it has {len(t_s)} rows of the {signal}: at least 2 are needed")
+        return (len(t_s) - 1) / max(float(t_s[-1] - t_s[0]), 1e-9)
+
+    def wrenches(self) -> Iterator[Rows]:
+        """Give wrenches (n, 6) in N and N·m, in axes of the sensor or the flange.
+
+        Raises `BadDataset` behind the last valid rows.
+        """
+        signals = [self._require("wrench")]
+        if self._axes == "base":
+            signals.append(self._require("orientation"))
+        self._require_time()
+        for t_s, (read, *pose), place in self._rows(signals):
+            with self._named():
+                wrench = self._in_flange(read, pose)
+            yield Rows(t_s, wrench, place)
+
+    def poses(self) -> Iterator[Rows]:
+        """Give R_base_flange row by row, and p_base_flange_m if it is known: (n, 9 or 12). Raises as `wrenches`."""
+        signals = [self._require("orientation"), *([one] if (one := self._found["position"]) else [])]
+        if self.gravity_is_measured:
+            raise BadDataset(f"{self.name}: gravity does not show how the arm turns about it: give the orientation too")
+        self._require_time()
+        for t_s, values, place in self._rows(signals):
+            with self._named():
+                R, p = self._flange(values)
+            yield Rows(t_s, np.hstack([R.reshape(-1, 9), *([] if p is None else [p])]), place)
+
+    def dataset(self, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
+        """Return the rows as poses at rest. Raises `BadDataset`."""
+        signals = [
+            self._require("orientation"),
+            self._require("wrench"),
+            *([one] if (one := self._found["sigma"]) else []),
+        ]
+        times, parts, _ = zip(*self._rows(signals), strict=True)
+        t_s = np.concatenate(times)
+        pose, wrench, *sigma = (np.concatenate(each) for each in zip(*parts, strict=True))
+        if not len(wrench):
+            raise BadDataset(
+                f"{self.name}: no row has an orientation and a wrench: give one row a pose, or a recording"
+            )
+        if sigma and (sigma[0] <= 0).any():
+            row = int(np.argmax((sigma[0] <= 0).any(axis=1)))
+            raise BadDataset(
+                f"{self.name}: " + _wrong_row(row, f"{sigma[0][row].min():g} is no standard error, which is above 0")
+            )
+        with self._named():
+            R, _ = self._flange([pose])
+            return CalibrationDataset(
+                R_base_flange=np.swapaxes(R, 1, 2) if orientation == "R_flange_base" else R,
+                wrench=self._in_flange(wrench, [pose]),
+                wrench_cov=sigma[0][:, :, None] ** 2 * np.eye(6) if sigma else None,
+                n_samples=np.zeros(len(wrench), np.int64),
+                t_s=t_s - t_s[0],
+                meta={"source": self.name, "orientation": orientation},
+            )
+
+    def _require_time(self) -> None:
+        if self._found["time"] is None and not self.options.rate_Hz:
+            words = self._columns.missing("time", "time")
+            raise BadDataset(f"{self.name}: {words}, or add --rate HZ if the samples are evenly spaced")
+
+    def _require(self, signal: str) -> Signal:
+        """Return a signal. Raises `BadDataset` with the line to type."""
+        if (found := self._found[signal]) is not None:
+            return found
+        with self._named():
+            raise BadDataset(self._columns.missing(signal, *(("wrench",) if signal == "wrench" else _NEAREST)))
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except BadDataset as error:
+            raise BadDataset(f"{self.name}: {error}") from error
+
+    def _factors_of(self, signal: Signal, first: Array) -> Array:
+        """Return the factor to SI of each column, guessed where no unit is named and the numbers leave no doubt."""
+        names = [self.source.names[column] for column in signal.columns]
+        kinds = {"tcp_pose": ["length"] * 3 + ["angle"] * 3}.get(signal.form, [_KIND.get(signal.form, "")] * len(names))
+        if "wrench" in signal.form or signal.form == "sigma":
+            kinds = ["force"] * 3 + ["torque"] * 3
+        if signal.form == "time" and len(names) == 2:
+            return np.array([1.0, 1e-9])
+        found = [
+            factor(unit, kind, name) if kind else None
+            for unit, kind, name in zip(signal.units, kinds, names, strict=True)
+        ]
+        if signal.form == "wrench" and any(unit.lower() in COUNTS for unit in signal.units):
+            self._guesses.append("wrench in counts")
+        largest = float(np.nanmax(np.abs(first), initial=0.0))
+        guess = 1.0
+        if signal.form == "time" and None in found:
+            unit = _unit_of_time(first[:, 0], names[0])
+            guess = _UNITS_OF_TIME[unit]
+            self._guesses += [f"time in {unit}"] if unit != "s" else []
+        elif kinds[0] == "angle" and None in found and largest > _MOST_RAD and signal.form != "vector":
+            guess = UNITS["angle"]["deg"]
+            self._guesses.append("angles in degrees")
+        elif kinds[0] == "length" and signal.form == "position" and None in found and largest > _MOST_M:
+            guess = 1e-3
+            self._guesses.append("positions in mm")
+        return np.array([guess if one is None else one for one in found])
+
+    def _rows(self, signals: Sequence[Signal]) -> Iterator[tuple[Array, list[Array], float]]:
+        """Give times, numbers in SI and place of the rows that have all of some signals.
+
+        Times are NaN without a column and a rate. Raises `BadDataset` for a row that has a part of a signal.
+        """
+        with self._named():
+            yield from self._complete_rows(signals)
+
+    def _complete_rows(self, signals: Sequence[Signal]) -> Iterator[tuple[Array, list[Array], float]]:
+        time = self._found["time"]
+        timed = [*signals, *([] if time is None else [time])]
+        use = list(dict.fromkeys(column for one in timed for column in one.columns))
+        count = 0
+        for block, place in self.source.blocks(use):
+            columns = [[use.index(column) for column in one.columns] for one in timed]
+            values = [block[:, own] * self._factors[one.form] for one, own in zip(timed, columns, strict=True)]
+            complete = np.ones(len(block), bool)
+            for one, numbers in zip(signals, values, strict=False):
+                known = np.isfinite(numbers)
+                if (partly := known.any(axis=1) & ~known.all(axis=1)).any():
+                    row = int(np.argmax(partly))
+                    name = self.source.names[one.columns[int(np.argmin(known[row]))]]
+                    raise BadDataset(_wrong_row(count + row, f"{name} is missing or no finite number"))
+                complete &= known.all(axis=1)
+            if time is not None:
+                t_s = values[-1].sum(axis=1)
+                if (untimed := complete & ~np.isfinite(t_s)).any():
+                    raise BadDataset(_wrong_row(count + int(np.argmax(untimed)), "the time is missing"))
+            else:
+                t_s = np.arange(count, count + len(block)) / (self.options.rate_Hz or np.nan)
+            count += len(block)
+            yield t_s[complete], [numbers[complete] for numbers in values[: len(signals)]], place
+
+    @property
+    def _axes(self) -> WrenchAxes:
+        form = "" if (wrench := self._found["wrench"]) is None else wrench.form
+        if self.options.wrench_axes is not None:
+            return self.options.wrench_axes
+        return "base" if form == "base_wrench" else "sensor"
+
+    def _in_flange(self, wrench: Array, pose: Sequence[Array]) -> Array:
+        """Return wrenches (n, 6) in axes of the flange and about its origin, if they are not those of the sensor."""
+        force, torque = np.hsplit(self.options.sign * wrench, 2)
+        if self._axes in ("sensor", "flange"):
+            return np.hstack([force, torque])
+        if self._axes == "tcp":
+            R_flange = self.options.R_flange_tcp
+            force, torque = force @ R_flange.T, torque @ R_flange.T
+        else:
+            R, _ = self._flange(pose[:1])
+            force, torque = (np.einsum("nji,nj->ni", R, one) for one in (force, torque))
+        return np.hstack([force, torque + np.cross(self.options.p_flange_tcp_m, force)])
+
+    def _flange(self, values: Sequence[Array]) -> tuple[Array, Array | None]:
+        """Return R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) of orientations and perhaps positions."""
+        orientation = self._found["orientation"]
+        numbers, p = values[0], values[1] if len(values) > 1 else None
+        form = "" if orientation is None else orientation.form
+        if form == "tcp_pose":
+            p, numbers, form = numbers[:, :3], numbers[:, 3:], "vector"
+        if form == "transform":  # column by column
+            matrices = numbers.reshape(-1, 4, 4).swapaxes(1, 2)
+            p, numbers, form = matrices[:, :3, 3], matrices[:, :3, :3].reshape(-1, 9), "matrix"
+        if form == "quaternion_w_first":
+            numbers, form = np.roll(numbers, -1, axis=1), "quaternion"
+        if form == "joints":
+            if self.options.forward is None:
+                raise BadDataset(_JOINTS_ONLY)
+            return self.options.forward(numbers)
+        if form in ("gravity", "acceleration"):
+            R = _upright(numbers if form == "gravity" else -numbers)
+        elif form in _AXES and (self.options.euler or form in _MAKERS):
+            R = _of_angles(numbers, self.options.euler or form, _AXES[form])
+        elif form == "angles":
+            raise BadDataset(_ANGLES_ONLY)
+        elif form == "vector" and (largest := float(np.linalg.norm(numbers, axis=1).max(initial=0.0))) > _MOST_RAD:
+            raise BadDataset(
+                f"a rotation vector of {largest:.0f} rad has degrees, or is three angles: name its unit, --columns "
+                f'"rx=… [deg],ry=… [deg],rz=… [deg]", or add --euler xyz (axes of the base) or XYZ (axes of the tool)'
+            )
+        else:
+            R = rotations_of(_COLUMNS[form], numbers)
+        R = R @ self.options.R_flange_tcp.T
+        return R, None if p is None else p - R @ self.options.p_flange_tcp_m
+
+
+def _wrong_row(row: int, words: str) -> str:
+    return f"row {row + 1}: {words}: correct or delete it"
+
+
+def _of_angles(angles: Array, euler: str, axes: str) -> Array:
+    """Return the rotations (n, 3, 3) of three angles (n, 3) about these axes, turned in the order of `euler`."""
+    sequence = _MAKERS.get(euler.lower(), euler)
+    if sequence.lower() != axes and sorted(sequence.lower()) == sorted(axes):
+        angles = angles[:, [axes.index(axis) for axis in sequence.lower()]]
+    return Rotation.from_euler(sequence, angles).as_matrix()
+
+
+def _upright(gravity: Array) -> Array:
+    """Return the least rotations (n, 3, 3) that turn a direction of gravity (n, 3) straight down."""
+    up = -gravity / np.linalg.norm(gravity, axis=1, keepdims=True)
+    halfway = np.column_stack([np.cross(up, [0.0, 0.0, 1.0]), 1 + up[:, 2]])
+    halfway[halfway[:, 3] < _UPSIDE_DOWN] = [1.0, 0.0, 0.0, 0.0]
+    return Rotation.from_quat(halfway).as_matrix()
+
+
+def _unit_of_time(t: Array, name: str) -> str:
+    """Return the unit of times (n,), s unless the numbers leave no doubt. Raises `BadDataset` if two others fit."""
+    t = t[np.isfinite(t)]
+    steps = np.diff(t)
+    steps = steps[steps > 0]
+    if not len(steps):
+        return "s"
+    since_1970 = [unit for unit, size in _UNITS_OF_TIME.items() if _EPOCH_S[0] < t[0] * size < _EPOCH_S[1]]
+    if since_1970:
+        return since_1970[0]
+    step = float(np.median(steps))
+    is_recording = len(t) >= _RECORDING_ROWS
+    least, most = _STEPS_S if is_recording else _POSE_STEPS_S
+    fitting = [unit for unit, size in _UNITS_OF_TIME.items() if least <= step * size <= most]
+    if "s" in fitting or not fitting:
+        return "s"
+    if len(fitting) > 1 and is_recording:
+        raise BadDataset(
+            f"steps of {step:g} in the times may be {' or '.join(fitting)}: name the unit, "
+            f'--columns "t={name} [{fitting[0]}]"'
+        )
+    return fitting[0]
