@@ -1,16 +1,10 @@
-"""Recordings of other programs in ROS 2: rosbag2 folders, and MCAP files without our header. Needs the extra `ros2`.
-
-`compensate` reads them as two CSV files, as it does recordings of any other program (docs/decisions/recordings.md,
-181). `solve` takes the same numbers without files, so that both agree with the CSV files of the same data.
-"""
+"""Bags of ROS 1 and ROS 2 as tables: rosbag2 folders, .db3, .bag, and MCAP files without our header. Needs `ros2`."""
 
 import struct
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset, UsageError
 from ftcalib.files import open_file
-from ftcalib.motion.samples import Means
 from ftdrive.errors import ConfigError
+from ftdrive.tables.table import Table
 from ftdrivers.errors import ProtocolError
 from ftdrivers.interfaces import Array
 from ftdrivers.ros2.arm import SCHEME, pose_reader_of
@@ -34,12 +28,16 @@ _POSES: Final = "geometry_msgs/msg/PoseStamped"
 _MAGIC: Final = b"\x89MCAP0\r\n"
 # Times in ns, and numbers.
 _Column = tuple[NDArray[np.int64], Array]
+# Time of receipt in ns, and content.
+_Message = tuple[int, bytes]
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it is a rosbag2 folder, or an MCAP file of another program."""
+    """Whether it is a bag of ROS 1 or ROS 2: a rosbag2 folder, a .db3 or .bag, or an MCAP file of another program."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
+    if path.suffix in (".bag", ".db3"):
+        return path.is_file()
     if path.suffix != ".mcap" or not path.is_file():
         return False
     with open_file(path) as file:
@@ -52,21 +50,8 @@ def is_bag(path: Path) -> bool:
     return start.startswith(_MAGIC) and not start[25 + profile : 25 + profile + library].startswith(b"ftdrive")
 
 
-class Bag(NamedTuple):
-    """Wrench and pose of a bag, in the order of their stamps, in s from the earliest of both."""
-
-    t_wrench_s: Array
-    """(n,)"""
-    wrench: Array
-    """(n, 6)"""
-    t_pose_s: Array
-    """(m,)"""
-    pose: Array
-    """(m, 7) quaternion x, y, z, w of the flange in base, then its position."""
-
-
-def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> Bag:
-    """Read wrench and pose; times are those of the headers.
+def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tuple[Table, Table]:
+    """Read wrench and pose; times are those of the headers, from the earliest of both.
 
     Parameters
     ----------
@@ -94,7 +79,7 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> Ba
             wrenches = _chosen(reader, WRENCH, wrench_topic, "--wrench-topic")
             named = _pose_reader(reader, pose_topic)
             messages = _messages(reader, [wrenches, *named.topics])
-            wrench = _numbers(wrenches, messages[wrenches], 6)
+            wrench = _numbers(reader, wrenches, messages[wrenches], 6)
             poses = _poses(reader, named, messages)
     except (UsageError, BadDataset):
         raise
@@ -103,37 +88,18 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> Ba
     except Exception as error:  # rosbags raises those of SQLite, zstd, YAML and its own
         raise BadDataset(f"{path.name} cannot be read ({error}): it is damaged, or of another version") from error
     origin_ns = min(int(wrench[0].min()), int(poses[0].min()))
-    return Bag(*_sorted(wrench, origin_ns), *_sorted(poses, origin_ns))
+    return (
+        _table(path.name, wrench, origin_ns, CHANNELS),
+        _table(path.name, poses, origin_ns, ("qx", "qy", "qz", "qw", "x", "y", "z")),
+    )
 
 
-def _sorted(column: _Column, origin_ns: int) -> tuple[Array, Array]:
+def _table(name: str, column: _Column, origin_ns: int, names: Sequence[str]) -> Table:
+    """Return times and numbers as a table, in the order of the times."""
     t_ns, values = column
     order = np.argsort(t_ns, kind="stable")
-    return np.asarray((t_ns - origin_ns)[order] * 1e-9), values[order]
-
-
-@contextmanager
-def as_csv_pair(bag: Bag, name: str) -> Iterator[tuple[Path, Path]]:
-    """Give the CSV files of wrench and pose of a bag, as long as the block lasts."""
-    with TemporaryDirectory(prefix="ftdrive-bag-") as folder:
-        files = Path(folder) / f"{name}-wrench.csv", Path(folder) / f"{name}-poses.csv"
-        for file, t_s, values, names in (
-            (files[0], bag.t_wrench_s, bag.wrench, CHANNELS),
-            (files[1], bag.t_pose_s, bag.pose, ("qx", "qy", "qz", "qw", "x", "y", "z")),
-        ):
-            header = ",".join(("t", *names))
-            # 17 digits keep every bit of a float64.
-            np.savetxt(file, np.column_stack([t_s, values]), "%.17g", ",", header=header, comments="")
-        yield files
-
-
-def bag_means(bag: Bag) -> tuple[Means, Means]:
-    """Return the means of wrench and pose, as `solve_recording` takes them."""
-    wrench, poses = Means(), Means()
-    wrench.add(bag.t_wrench_s, bag.wrench)
-    R = Rotation.from_quat(bag.pose[:, :4]).as_matrix().reshape(-1, 9)
-    poses.add(bag.t_pose_s, np.hstack([R, bag.pose[:, 4:]]))
-    return wrench, poses
+    t_s = (t_ns - origin_ns)[order] * 1e-9
+    return Table({"t": t_s, **dict(zip(names, values[order].T, strict=True))}, name=name)
 
 
 def _chosen(reader: "AnyReader", kind: str, topic: str | None, option: str) -> str:
@@ -150,40 +116,43 @@ def _chosen(reader: "AnyReader", kind: str, topic: str | None, option: str) -> s
     return topic or of_kind[0]
 
 
-def _messages(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[bytes]]:
+def _messages(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[_Message]]:
     chosen = [one for one in reader.connections if one.topic in topics]
-    found: dict[str, list[bytes]] = {topic: [] for topic in topics}
-    for connection, _, data in reader.messages(connections=chosen):
-        found[connection.topic].append(bytes(data))
+    found: dict[str, list[_Message]] = {topic: [] for topic in topics}
+    for connection, received_ns, data in reader.messages(connections=chosen):
+        found[connection.topic].append((received_ns, bytes(data)))
     return found
 
 
-def _numbers(topic: str, messages: Sequence[bytes], count: int) -> _Column:
-    """Return stamps (n,) in ns and the numbers (n, count) behind the header of messages in CDR.
+def _numbers(reader: "AnyReader", topic: str, messages: Sequence[_Message], count: int) -> _Column:
+    """Return times (n,) in ns and the numbers (n, count) behind the header of messages.
 
-    Raises `BadDataset` for no message, a stamp of zero, a number that is not finite, or frames that differ.
+    The times are those of receipt if no message has a stamp. Raises `BadDataset` for no message, a stamp of zero
+    beside others, a number that is not finite, or frames that differ.
     """
     if not messages:
         raise BadDataset(f"{topic} has no message: give another topic")
-    first = messages[0]
-    if first[:2] != b"\0\1":
+    received_ns = np.array([received for received, _ in messages])
+    data = [one for _, one in messages]
+    if reader.is2 and data[0][:2] != b"\0\1":
         raise BadDataset(f"{topic} is not encoded as little-endian CDR: record it again with the default RMW")
-    (length,) = struct.unpack_from("<I", first, 12)
-    start = 4 + -(-(12 + length) // 8) * 8
-    if {len(one) for one in messages} != {len(first)} or len(first) < start + 8 * count:
+    # ROS 1 begins with a counter, ROS 2 with four bytes for the encoding; there numbers begin at multiples of 8.
+    (length,) = struct.unpack_from("<I", data[0], 12)
+    start = 4 + -(-(12 + length) // 8) * 8 if reader.is2 else 16 + length
+    if {len(one) for one in data} != {len(data[0])} or len(data[0]) < start + 8 * count:
         raise BadDataset(f"{topic}: the messages differ in their length, so in frame or type: give another topic")
-    rows = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), len(first))
+    rows = np.frombuffer(b"".join(data), np.uint8).reshape(len(data), len(data[0]))
     if (rows[:, 12 : 16 + length] != rows[0, 12 : 16 + length]).any():
         raise BadDataset(f"{topic}: the frame changes within the bag: give a topic of one frame")
-    seconds, nanoseconds = (rows[:, i : i + 4].copy().view(kind)[:, 0] for i, kind in ((4, "<i4"), (8, "<u4")))
+    seconds, nanoseconds = (rows[:, i : i + 4].copy().view("<u4")[:, 0] for i in (4, 8))
     t_ns = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds
     numbers = rows[:, start : start + 8 * count].copy().view("<f8")
-    return _checked(topic, t_ns, numbers)
+    return _checked(topic, t_ns if t_ns.any() else received_ns, numbers)
 
 
 def _checked(topic: str, t_ns: NDArray[np.int64], numbers: Array) -> _Column:
     if (t_ns <= 0).any():
-        raise BadDataset(f"{topic}: a message has the stamp 0: set header.stamp in its driver and record again")
+        raise BadDataset(f"{topic}: some messages have the stamp 0: set header.stamp in its driver and record again")
     if not np.isfinite(numbers).all():
         row = int(np.argmax(~np.isfinite(numbers).all(axis=1)))
         raise BadDataset(f"{topic}: message {row + 1} has a number that is not finite: leave this topic out")
@@ -203,11 +172,11 @@ def _pose_reader(reader: "AnyReader", pose_topic: str | None) -> PoseReader:
     return named
 
 
-def _poses(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[bytes]]) -> _Column:
+def _poses(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[_Message]]) -> _Column:
     """Return times (m,) in ns, and quaternions x, y, z, w and positions (m, 7)."""
     if isinstance(named, Poses):
         (topic,) = named.topics
-        t_ns, numbers = _numbers(topic, messages[topic], 7)
+        t_ns, numbers = _numbers(reader, topic, messages[topic], 7)
         position, quaternion = numbers[:, :3], numbers[:, 3:]
         lengths = np.linalg.norm(quaternion, axis=1)
         if (np.abs(lengths - 1) > UNIT_TOLERANCE).any():
@@ -220,7 +189,7 @@ def _poses(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[b
         (pose.t_ns, pose.R_base_flange, pose.p_base_flange_m)
         # a bag may have latched ones late
         for topic in sorted(named.topics, key=lambda topic: topic != "/tf_static")
-        for data in messages[topic]
+        for _, data in messages[topic]
         for pose in named.read(topic, reader.deserialize(data, named.topics[topic]))
     ]
     if not found:
@@ -229,12 +198,12 @@ def _poses(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[b
     return times, np.hstack([Rotation.from_matrix(R).as_quat(), p])
 
 
-def _from_joints(reader: "AnyReader", named: Joints, messages: Mapping[str, list[bytes]]) -> _Column:
+def _from_joints(reader: "AnyReader", named: Joints, messages: Mapping[str, list[_Message]]) -> _Column:
     """Return what `_poses` does, from all messages at once."""
     (topic,) = named.topics
     t_ns: list[int] = []
     positions: defaultdict[str, list[float]] = defaultdict(list)
-    for data in messages[topic]:
+    for _, data in messages[topic]:
         message: Any = reader.deserialize(data, named.topics[topic])
         if (found := named.positions(topic, message)) is not None:
             stamp = message.header.stamp

@@ -1,6 +1,6 @@
-"""A calibration in motion from files, read piece by piece: a recording, or two CSV files of another program."""
+"""A calibration in motion from files, read piece by piece: a recording, or tables of another program."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, replace
 from math import isfinite
 from pathlib import Path
@@ -9,25 +9,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Known, Setup
-from ftcalib.data.dataset import rotations_of
-from ftcalib.errors import BadDataset
-from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
+from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
 from ftdrive.recording.compensation import NEEDED
-from ftdrive.recording.csv_pair import ORIENTATION, WRENCH, Wanted, read_table
 from ftdrive.recording.files import RecordingReader
 from ftdrive.recording.recording import Header
 from ftdrive.runs.run import made_now
 from ftdrive.runs.source import require_same_cell
-
-_POSITION = ("x", "y", "z")
+from ftdrive.tables.table import Rows, Table
 
 
 def solve_recording(
-    path: Path,
-    pair: tuple[Path, Path] | None = None,
-    means: tuple[Means, Means] | None = None,
+    source: Path | tuple[Table, Table],
     *,
     known: Known | None,
     point_mass: bool,
@@ -38,12 +32,9 @@ def solve_recording(
 
     Parameters
     ----------
-    path : Path
-        A recording of `ftdrive record`.
-    pair : tuple of Path, optional
-        Instead of it: CSV files of the wrench and of the poses, on one clock.
-    means : tuple of Means, optional
-        Instead of both: wrench and poses of a bag, whose name is that of `path`.
+    source : Path or tuple of Table
+        A recording of `ftdrive record`, or the wrench and the poses of another program on one clock, in two tables or
+        in one.
     known : Known, optional
         A known direction of gravity means a base that is level with respect to `up_in_base`.
     point_mass : bool
@@ -61,18 +52,16 @@ def solve_recording(
         The motion does not determine the parameters, or contradicts the earlier result.
     """
     provenance, height_m, g_m_s2 = made_now(), None, STANDARD_GRAVITY_M_S2
-    if means is not None:
-        wrench, poses = means
-        provenance |= {"recording": path.name}
-    elif pair is None:
-        wrench, poses, header = _read_in_motion(path)
+    if isinstance(source, Path):
+        wrench, poses, header = _read_in_motion(source)
         devices = {"arm": asdict(header.info.arm), "sensor": asdict(header.info.sensor)}
-        provenance |= {"recording": path.name, "devices": devices}
+        provenance |= {"recording": source.name, "devices": devices}
         g_m_s2 = header.info.calibration.g_m_s2
         height_m = float(header.info.p_flange_sensor_m[2])
     else:
-        wrench, poses = _read_wrench_file(pair[0]), _read_pose_file(pair[1])
-        provenance |= {"wrench": pair[0].name, "orientation": pair[1].name}
+        wrench, poses = (_means_of(rows) for rows in (source[0].wrenches(), source[1].poses()))
+        names = [table.name for table in source]
+        provenance |= {"wrench": names[0], "orientation": names[1]} if len(set(names)) == 2 else {"recording": names[0]}
     if earlier is not None:
         require_same_cell(earlier, provenance)
     setup = Setup(up_in_base=up_in_base)
@@ -106,36 +95,8 @@ def _read_in_motion(path: Path) -> tuple[Means, Means, Header]:
     return wrench, poses, reader.header
 
 
-def _read_wrench_file(path: Path) -> Means:
-    """Read columns t in s, fx, fy, fz in N, tx, ty, tz in N·m. Raises `BadDataset` or `OSError`."""
+def _means_of(every: Iterator[Rows]) -> Means:
     means = Means()
-    for part in read_table(path, WRENCH):
-        _add(means, path, part.t_s, part.numbers)
+    for rows in every:
+        means.add(rows.t_s, rows.values)
     return means
-
-
-def _read_pose_file(path: Path) -> Means:
-    """Read columns t in s, the orientation of the flange in base and, if they are there, x, y, z in m.
-
-    The orientation is r11..r33, qx, qy, qz, qw, or rx, ry, rz in rad. Raises `BadDataset` or `OSError`.
-    """
-
-    def pose(names: Sequence[str]) -> Sequence[str]:
-        return [*ORIENTATION.choose(names), *(_POSITION if set(_POSITION) <= set(names) else ())]
-
-    means = Means()
-    for part in read_table(path, Wanted(pose, ORIENTATION.words)):
-        of_orientation = tuple(name for name in part.names if name not in _POSITION)
-        try:
-            R = rotations_of(of_orientation, part.numbers[:, : len(of_orientation)]).reshape(-1, 9)
-        except BadDataset as error:
-            raise BadDataset(f"{path.name}: {error}") from error
-        _add(means, path, part.t_s, np.hstack([R, part.numbers[:, len(of_orientation) :]]))
-    return means
-
-
-def _add(means: Means, path: Path, t_s: Array, values: Array) -> None:
-    try:
-        means.add(t_s, values)
-    except BadDataset as error:
-        raise BadDataset(f"{path.name}: {error}") from error

@@ -136,6 +136,8 @@ class Table:
     ----------
     source : Path, DataFrame or mapping
     options : TableOptions
+    name : str
+        For messages; the name of the file or of the type of the source otherwise.
 
     Raises
     ------
@@ -145,8 +147,8 @@ class Table:
         It cannot be read.
     """
 
-    def __init__(self, source: Path | Any, options: TableOptions = _PLAIN) -> None:
-        self.name = source.name if isinstance(source, Path) else type(source).__name__
+    def __init__(self, source: Path | Any, options: TableOptions = _PLAIN, name: str = "") -> None:
+        self.name = name or (source.name if isinstance(source, Path) else type(source).__name__)
         self.options = options
         self._guesses: list[str] = []
         self._found: dict[str, Signal | None] = {}
@@ -227,7 +229,7 @@ class Table:
         if self._axes == "base":
             signals.append(self._require("orientation"))
         self._require_time()
-        for t_s, (read, *pose), place in self._rows(signals):
+        for t_s, (read, *pose), place in self._in_order(signals):
             with self._named():
                 wrench = self._in_flange(read, pose)
             yield Rows(t_s, wrench, place)
@@ -238,7 +240,7 @@ class Table:
         if self.gravity_is_measured:
             raise BadDataset(f"{self.name}: gravity does not show how the arm turns about it: give the orientation too")
         self._require_time()
-        for t_s, values, place in self._rows(signals):
+        for t_s, values, place in self._in_order(signals):
             with self._named():
                 R, p = self._flange(values)
             yield Rows(t_s, np.hstack([R.reshape(-1, 9), *([] if p is None else [p])]), place)
@@ -319,6 +321,17 @@ class Table:
             guess = 1e-3
             self._guesses.append("positions in mm")
         return np.array([guess if one is None else one for one in found])
+
+    def _in_order(self, signals: Sequence[Signal]) -> Iterator[tuple[Array, list[Array], float]]:
+        """Give `_rows` that exist. Raises `BadDataset` if their time goes back."""
+        last_s = -np.inf
+        for t_s, values, place in self._rows(signals):
+            if (back := np.diff(t_s, prepend=last_s) < 0).any():
+                at_s = t_s[int(np.argmax(back))]
+                raise BadDataset(f"{self.name}: the time goes back to {at_s:.9g} s: give the samples in their order")
+            if len(t_s):
+                last_s = float(t_s[-1])
+                yield t_s, values, place
 
     def _rows(self, signals: Sequence[Signal]) -> Iterator[tuple[Array, list[Array], float]]:
         """Give times, numbers in SI and place of the rows that have all of some signals.

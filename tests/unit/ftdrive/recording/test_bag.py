@@ -14,8 +14,9 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import FtdriveError
-from ftdrive.recording.bag import as_csv_pair, bag_means, is_bag, read_bag
+from ftdrive.recording.bag import is_bag, read_bag
 from ftdrive.recording.in_motion import solve_recording
+from ftdrive.tables.table import Table
 from tests.ros2.seven_joints import JOINTS, TRUTH, URDF, flange, sway, wrench
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -135,8 +136,8 @@ def bag(
 
 
 def solved(path: Path, *topics: str | None) -> Any:
-    means = bag_means(read_bag(path, *(topics or (None, None))))
-    return solve_recording(path, None, means, known=None, point_mass=True, up_in_base=None)
+    tables = read_bag(path, *(topics or (None, None)))
+    return solve_recording(tables, known=None, point_mass=True, up_in_base=None)
 
 
 def numbers(result: Any) -> Any:
@@ -148,12 +149,13 @@ def test_a_bag_with_transforms_is_solved_from_its_motion(tmp_path: Path) -> None
     assert is_bag(path)
     found = read_bag(path, None, "tf?base=base&flange=flange")
     t_wrench, t_pose, measured, _, quat, p = data()
-    assert np.allclose(found.t_wrench_s, t_wrench, rtol=0, atol=1e-9)
-    assert np.allclose(found.t_pose_s, t_pose, rtol=0, atol=1e-9)
-    assert np.array_equal(found.wrench, measured)
-    sign = np.sign(np.sum(quat * found.pose[:, :4], axis=1))
-    assert np.allclose(found.pose, np.hstack([sign[:, None] * quat, p]), rtol=0, atol=1e-12)
-    result = solve_recording(path, None, bag_means(found), known=None, point_mass=True, up_in_base=None)
+    (wrenches,), (poses,) = found[0].wrenches(), found[1].poses()
+    assert np.allclose(wrenches.t_s, t_wrench, rtol=0, atol=1e-9)
+    assert np.allclose(poses.t_s, t_pose, rtol=0, atol=1e-9)
+    assert np.array_equal(wrenches.values, measured)
+    R = Rotation.from_quat(quat).as_matrix().reshape(-1, 9)
+    assert np.allclose(poses.values, np.hstack([R, p]), rtol=0, atol=1e-12)
+    result = solve_recording(found, known=None, point_mass=True, up_in_base=None)
     assert result.motion is not None
     assert abs(result.motion.delay_s - 0.04) < 1e-3
     assert abs(result.mass_kg - TRUTH["mass_kg"]) < 3 * result.sigma["mass_kg"]
@@ -172,7 +174,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> Any:
         (pair[1], [t_pose, quat, p], "t,qx,qy,qz,qw,x,y,z"),
     ):
         np.savetxt(file, np.column_stack(columns), "%.17g", ",", header=names, comments="")
-    return solve_recording(pair[0], pair, known=None, point_mass=True, up_in_base=None)
+    return solve_recording((Table(pair[0]), Table(pair[1])), known=None, point_mass=True, up_in_base=None)
 
 
 @pytest.mark.slow
@@ -196,15 +198,6 @@ def test_a_bag_is_solved_as_the_csv_of_the_same_data(
     assert np.allclose(numbers(result), numbers(expected), rtol=0, atol=1e-9)
     assert abs(result.motion.delay_s - 0.04) < 1e-3
     assert abs(result.mass_kg - TRUTH["mass_kg"]) < 3 * result.sigma["mass_kg"]
-
-
-def test_the_files_of_a_bag_hold_the_same_numbers(tmp_path: Path) -> None:
-    found = read_bag(bag(tmp_path / "bag", rows=100), None, None)
-    with as_csv_pair(found, "bag") as (wrench_file, pose_file):
-        wrenches, poses = (np.loadtxt(file, delimiter=",", skiprows=1) for file in (wrench_file, pose_file))
-    assert np.array_equal(wrenches, np.column_stack([found.t_wrench_s, found.wrench]))
-    assert np.array_equal(poses, np.column_stack([found.t_pose_s, found.pose]))
-    assert not wrench_file.exists()
 
 
 def changed(topic: str, change: Callable[[Any], object], every: int = 50) -> Spoil:

@@ -1,5 +1,6 @@
 """A recording compensated at once."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +13,12 @@ from ftcalib.errors import BadDataset
 from ftcalib.model import predict
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Block, Stages, StreamEvent, WrenchFrame
-from ftdrive.recording import Header, Recording, csv_pair, read_recording
+from ftdrive.recording import Header, Recording, read_recording
 from ftdrive.recording.compensation import compensate_recording, estimated_bias
-from ftdrive.recording.csv_pair import CsvPair, numbers_of, read_orientation
 from ftdrive.recording.recording import rows_of
+from ftdrive.recording.table_pair import TablePair, numbers_of
+from ftdrive.tables import text as text_tables
+from ftdrive.tables.table import Table
 from ftdrivers.interfaces import Array
 from tests.unit.ftdrive.recorded import NOISE, TRUTH, calibration, info
 
@@ -137,19 +140,19 @@ def write_pair(folder: Path, delay_s: float, orientation: str) -> tuple[Path, Pa
 @pytest.mark.parametrize("orientation", ["r11,r12,r13,r21,r22,r23,r31,r32,r33", "qx,qy,qz,qw", "rx,ry,rz"])
 def test_orientations_are_read_as_matrices_quaternions_and_rotation_vectors(orientation: str, tmp_path: Path) -> None:
     _, poses = write_pair(tmp_path, 0.0, orientation)
-    (states,) = read_orientation(poses)
+    (states,) = Table(poses).poses()
     t_s = np.arange(-1.0, 11.0, 1 / 125)
-    np.testing.assert_allclose(states.t_host_ns.astype(float), 1e9 * (t_s + 100), rtol=0, atol=2)
-    np.testing.assert_allclose(states.R_base_flange, turning(t_s), atol=1e-10)
+    np.testing.assert_allclose(states.t_s, t_s + 100, rtol=0, atol=2e-9)
+    np.testing.assert_allclose(states.values.reshape(-1, 3, 3), turning(t_s), atol=1e-10)
 
 
 def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(tmp_path: Path) -> None:
     files = write_pair(tmp_path, 0.012, "rx,ry,rz")
-    found = CsvPair(*files, calibration(), "c", None)
+    found = TablePair(*map(Table, files), calibration(), "c", None)
     assert found.delay_s == pytest.approx(0.012, abs=1e-3)
     assert 0 < found.delay_sigma_s < 1e-3
     rms = compensate_recording(found, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"]
-    fixed = CsvPair(*files, calibration(), "c", 0.0)
+    fixed = TablePair(*map(Table, files), calibration(), "c", 0.0)
     assert (fixed.delay_s, fixed.delay_sigma_s) == (0.0, 0.0)
     assert rms < 1.2 * np.sqrt(3) * 0.002
     assert compensate_recording(fixed, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"] > 1.5 * rms
@@ -163,24 +166,28 @@ def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
     lines = (tmp_path / damaged).read_text().splitlines()
     lines[len(lines) * 2 // 3] = "?"
     (tmp_path / damaged).write_text("\n".join(lines))
-    monkeypatch.setattr(csv_pair, "_READ_BYTES", 1 << 15)
-    found = CsvPair(*files, calibration(), "c", None)
+    monkeypatch.setattr(text_tables, "_READ_BYTES", 1 << 15)
+    found = TablePair(*map(Table, files), calibration(), "c", None)
     assert found.delay_s == pytest.approx(0.012, abs=2e-3)
     numbers, failure = compensate_recording(found, WrenchFrame(), tmp_path / "new.csv")
     assert isinstance(failure, BadDataset)
-    assert f"{damaged}, after row" in numbers["cut"]
+    assert re.match(rf"{damaged}: line \d+", numbers["cut"])
     assert 2600 < numbers["samples"] == len(read_recording(tmp_path / "new.csv").rows) <= 3400
 
 
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("wrench", "t,fx,fy,fz,tx,ty\n", "must name t and fx, fy, fz, tx, ty, tz; it names t, fx"),
+        ("wrench", "t,fx,fy,fz,tx,ty\n0,1,2,3,4,5\n", "no wrench among the columns t, fx.* lacks tz"),
         ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n", "1 rows"),
         ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n1,1,2,x,4,5,6\n", "'x'"),
-        ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n-1,1,2,3,4,5,6\n", "row 2: .* t = -1 goes back"),
-        ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n1,1,nan,3,4,5,6\n", "row 2: a number is not finite"),
-        ("poses", "t,rx,ry,rz\n0,0,90,0\n1,0,90,0\n", "look like degrees"),
+        ("wrench", "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n-1,1,2,3,4,5,6\n", "the time goes back to -1 s"),
+        (
+            "wrench",
+            "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n1,1,nan,3,4,5,6\n2,1,2,3,4,5,6\n",
+            "row 2: fy is missing or no finite number",
+        ),
+        ("poses", "t,rx,ry,rz\n0,0,90,0\n1,0,90,0\n", "has degrees, or is three angles"),
         ("poses", "t,qx,qy,qz,qw\n0,0,0,0,1\n1,0,0,0,2\n", "row 2: the quaternion has length 2"),
         ("poses", "t,r11,r12,r13,r21,r22,r23,r31,r32,r33\n" + "0,1,0,0,0,1,0,0,0,-1\n" * 2, "reflection"),
         ("poses", "t,rx,ry,rz\n900,0,0,0\n901,0,0,0\n", "no time in common"),
@@ -193,7 +200,7 @@ def test_files_that_cannot_be_used_are_named_with_the_fault(
     for file, text in (good | {name: content}).items():
         (tmp_path / file).write_text(text)
     with pytest.raises(BadDataset, match=words):
-        list(CsvPair(tmp_path / "wrench", tmp_path / "poses", calibration(), "c", 0.0).blocks())
+        list(TablePair(Table(tmp_path / "wrench"), Table(tmp_path / "poses"), calibration(), "c", 0.0).blocks())
 
 
 RNG = np.random.default_rng(8)
@@ -232,6 +239,6 @@ def test_a_pause_of_another_program_is_a_gap(tmp_path: Path) -> None:
     table = np.c_[t_s, np.tile(np.arange(6.0), (98, 1))]
     np.savetxt(tmp_path / "w", table, delimiter=",", header="t,fx,fy,fz,tx,ty,tz", comments="")
     (tmp_path / "p").write_text("t,rx,ry,rz\n0,0,0,0\n1,0,0,0\n")
-    ((samples, _, share),) = CsvPair(tmp_path / "w", tmp_path / "p", calibration(), "c", 0.0).blocks()
+    ((samples, _, share),) = TablePair(Table(tmp_path / "w"), Table(tmp_path / "p"), calibration(), "c", 0.0).blocks()
     assert np.count_nonzero(np.diff(samples.seq) != 1) == 1
     assert (samples.seq[-1], share) == (99, 1.0)
