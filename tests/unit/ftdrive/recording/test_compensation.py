@@ -148,11 +148,11 @@ def test_orientations_are_read_as_matrices_quaternions_and_rotation_vectors(orie
 
 def test_a_pair_of_files_is_paired_with_its_delay_despite_a_push(tmp_path: Path) -> None:
     files = write_pair(tmp_path, 0.012, "rx,ry,rz")
-    found = TablePair(*map(Table, files), calibration(), "c", None)
+    found = TablePair(Table(files[0]), Table(files[1]), calibration(), "c", None)
     assert found.delay_s == pytest.approx(0.012, abs=1e-3)
     assert 0 < found.delay_sigma_s < 1e-3
     rms = compensate_recording(found, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"]
-    fixed = TablePair(*map(Table, files), calibration(), "c", 0.0)
+    fixed = TablePair(Table(files[0]), Table(files[1]), calibration(), "c", 0.0)
     assert (fixed.delay_s, fixed.delay_sigma_s) == (0.0, 0.0)
     assert rms < 1.2 * np.sqrt(3) * 0.002
     assert compensate_recording(fixed, WrenchFrame()).numbers["compensated"]["torque_rms_Nm"] > 1.5 * rms
@@ -167,7 +167,7 @@ def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
     lines[len(lines) * 2 // 3] = "?"
     (tmp_path / damaged).write_text("\n".join(lines))
     monkeypatch.setattr(text_tables, "_READ_BYTES", 1 << 15)
-    found = TablePair(*map(Table, files), calibration(), "c", None)
+    found = TablePair(Table(files[0]), Table(files[1]), calibration(), "c", None)
     assert found.delay_s == pytest.approx(0.012, abs=2e-3)
     numbers, failure = compensate_recording(found, WrenchFrame(), tmp_path / "new.csv")
     assert isinstance(failure, BadDataset)
