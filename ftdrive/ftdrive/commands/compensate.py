@@ -1,19 +1,21 @@
 """`ftdrive compensate`: a recording compensated at once, without a device."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ftdrive.commands.common import BAG_TOPICS, FILE, FORCE, FRAME, JSON, NewFile, numbers, read_frame, write_json
+from ftdrive.commands.tables import TABLE
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftcalib import CalibrationResult
     from ftdrive.live.samples import Axes
     from ftdrive.recording.recording import Source
+    from ftdrive.runs.source import SolveOptions
+    from ftdrive.tables.table import TableOptions
 
 _EXISTING = click.Path(exists=True, path_type=Path)
 CALIBRATION = click.option(
@@ -31,10 +33,11 @@ BIAS = click.option(
 @click.command()
 @click.argument("path", metavar="[RECORDING]", required=False, type=_EXISTING)
 @CALIBRATION
-@click.option("--wrench", metavar="FILE", type=FILE, help="Instead of RECORDING: CSV with t,fx,fy,fz,tx,ty,tz.")
-@click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: CSV with t and the orientation.")
+@click.option("--wrench", metavar="FILE", type=FILE, help="Instead of RECORDING: table of the wrench.")
+@click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: table of the poses of the flange.")
 @BAG_TOPICS
-@click.option("--delay", metavar="S|auto", help="With --wrench: delay of the wrench, s.  [default: auto]")
+@TABLE
+@click.option("--delay", metavar="S|auto", help="Of another program: delay of the wrench, s.  [default: auto]")
 @FORCE
 @BIAS
 @FRAME
@@ -47,6 +50,7 @@ def compensate(
     orientation_file: Path | None,
     wrench_topic: str | None,
     pose_topic: str | None,
+    table: "TableOptions | None",
     delay: str | None,
     force: bool,
     bias: str,
@@ -57,33 +61,33 @@ def compensate(
 ) -> None:
     """Compensate a whole recording with a calibration; no device is needed.
 
-    RECORDING is a file of `ftdrive record`; without --calibration its own is used. Recordings of other programs come as
-    two CSV files on one clock, each at its own rate: the wrench in N and N·m, and the orientation of the flange in base
-    as r11..r33, qx,qy,qz,qw or rx,ry,rz in rad; or as a rosbag2 folder or an MCAP file of ROS 2.
+    RECORDING is a file of `ftdrive record`; without --calibration its own is used. Recordings of other programs are a
+    table with wrench and orientation, two tables on one clock (--wrench, --orientation-file), each at its own rate, or
+    a bag of ROS 1 or ROS 2. --columns and the options beside it say what a table does not.
     """
     from ftdrive.errors import ConfigError
-    from ftdrive.recording.bag import as_csv_pair, is_bag, read_bag
+    from ftdrive.recording.bag import is_bag
     from ftdrive.recording.compensation import compensate_recording
     from ftdrive.recording.files import format_of
-    from ftdrive.runs.source import read_calibration
+    from ftdrive.runs.source import SolveOptions, read_calibration
     from ftdrive.terminal.console import beside, messages, working
 
     if output is not None:
         format_of(output)
+    if (wrench is None) != (orientation_file is None) or (wrench is None) == (path is None):
+        raise ConfigError("no recording: give its file, or --wrench and --orientation-file")
+    if (wrench_topic or pose_topic) and not (path and is_bag(path)):
+        raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS: leave them out")
     frame = read_frame(axes, about)
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
-    with working("Reading") as show, ExitStack() as stack:
-        if path is not None and is_bag(path):
-            bag = read_bag(path, wrench_topic, pose_topic)
-            wrench, orientation_file = stack.enter_context(as_csv_pair(bag, path.name))
-            path = None
-        elif wrench_topic or pose_topic:
-            raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS 2: leave them out")
-        source, found = _open(path, calibration, loaded, wrench, orientation_file, delay, everything=output is not None)
+    pair = None if wrench is None or orientation_file is None else (wrench, orientation_file)
+    options = SolveOptions(pair=pair, topics=(wrench_topic, pose_topic), table=table)
+    what = path or wrench or Path()
+    with working("Reading") as show:
+        source, found = _open(what, options, loaded, str(calibration), delay, everything=output is not None)
         numbers, failure = compensate_recording(source, frame, output, estimate_bias=bias == "estimate", show=show)
     result = {**numbers, "delay_s": found or numbers["delay_s"], "file": None if output is None else str(output)}
     if result["cut"]:
-        what = path or wrench
         messages.print(f" {what} is incomplete ({result['cut']}): {result['duration_s']:.1f} s of it are used.")
     if as_json:
         write_json({"schema_version": 1, **result})
@@ -97,30 +101,34 @@ def compensate(
 
 
 def _open(
-    path: Path | None,
-    calibration: Path | None,
-    loaded: "CalibrationResult | None",
-    wrench: Path | None,
-    orientation: Path | None,
+    path: Path,
+    options: "SolveOptions",
+    calibration: "CalibrationResult | None",
+    name: str,
     delay: str | None,
     *,
     everything: bool,
 ) -> tuple["Source", dict[str, float] | None]:
-    """Return the recording with the calibration, and the delay of a pair of files with one sigma."""
+    """Return the recording with the calibration, and the delay of one of another program with one sigma."""
     from ftdrive.errors import ConfigError
     from ftdrive.recording.compensation import NEEDED, read_with_calibration
-    from ftdrive.recording.csv_pair import CsvPair
+    from ftdrive.recording.files import tables_of
     from ftdrive.recording.recording import ROW
+    from ftdrive.recording.table_pair import TablePair
+    from ftdrive.terminal.console import messages
 
-    if path is None:
-        if wrench is None or orientation is None or loaded is None:
-            raise ConfigError("no recording: give its file, or --wrench, --orientation-file and --calibration")
-        delay_s = None if delay in (None, "auto") else numbers("--delay", str(delay), ",", [1])[0]
-        pair = CsvPair(wrench, orientation, loaded, str(calibration), delay_s)
-        return pair, {"value": pair.delay_s, "sigma": pair.delay_sigma_s}
-    if wrench or orientation or delay:
-        raise ConfigError("--wrench, --orientation-file and --delay do not go with RECORDING: leave it or them out")
-    return read_with_calibration(path, loaded, str(calibration), ROW.names or () if everything else NEEDED), None
+    tables = tables_of(path, options)
+    if tables is None:
+        if delay or options.table:
+            raise ConfigError("--delay and --columns describe another program's recording: leave them out")
+        return read_with_calibration(path, calibration, name, ROW.names or () if everything else NEEDED), None
+    if calibration is None:
+        raise ConfigError("the recording has no calibration: give --calibration PATH")
+    for words in dict.fromkeys(f"{table.name}: {table.words}" for table in tables if table.words):
+        messages.print(f" {words}")
+    delay_s = None if delay in (None, "auto") else numbers("--delay", str(delay), ",", [1])[0]
+    pair = TablePair(*tables, calibration, name, delay_s)
+    return pair, {"value": pair.delay_s, "sigma": pair.delay_sigma_s}
 
 
 def _words(result: dict[str, Any], frame: str) -> Iterator[str]:

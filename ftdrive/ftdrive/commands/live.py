@@ -29,12 +29,14 @@ from ftdrive.commands.common import (
 from ftdrive.commands.live_source import open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream, replay_run
-from ftdrive.live.samples import Axes, StreamInfo, Tracking, WrenchFrame
+from ftdrive.live.samples import Axes, Paired, StreamInfo, Tracking, WrenchFrame
 from ftdrive.live.stream import RECOVER_S, CompensatedStream, ProcessedStream
 from ftdrive.recording import Recorder, read_recording
+from ftdrive.recording.files import tables_of
 from ftdrive.recording.recording import with_calibration
+from ftdrive.recording.table_pair import TablePair
 from ftdrive.runs.run import Run
-from ftdrive.runs.source import read_calibration
+from ftdrive.runs.source import SolveOptions, read_calibration
 from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.live_feed import MEAN_S, Feed
@@ -54,7 +56,7 @@ _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
     "--replay",
     metavar="RUN|RECORDING",
     type=click.Path(exists=True, path_type=Path),
-    help="Show the samples of a run, or of a recording, which has a calibration.",
+    help="Show the samples of a run, of a recording, which has a calibration, or of a table of any program.",
 )
 @click.option("--speed", type=Number(0, min_open=True), help="Speed of --replay; 1 is the speed of the recording.")
 @FRAME
@@ -109,12 +111,18 @@ def live(
 
 
 def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> ReplayedStream:
-    """Replay a run folder, or a recording with its own calibration unless another one is given."""
+    """Replay a run folder, a recording with its own calibration unless another one is given, or another program's."""
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     if path.is_dir() and path.suffix != ".partial":
         if loaded is None:
             raise ConfigError("no calibration: give --calibration PATH")
         return replay_run(Run(path), loaded, str(calibration), frame=frame, speed=speed)
+    if (tables := tables_of(path, SolveOptions())) is not None:
+        if loaded is None:
+            raise ConfigError("no calibration: give --calibration PATH")
+        pair = TablePair(*tables, loaded, str(calibration), None)
+        rows = Paired.concatenate([block.samples for block in pair.blocks()])
+        return ReplayedStream(pair.header.info, rows, frame=frame, speed=speed)
     recording = read_recording(path)
     if loaded is not None:
         recording = replace(recording, header=with_calibration(recording.header, loaded, str(calibration)))

@@ -1,6 +1,6 @@
 """`ftdrive solve`: a calibration from data on disk, without a device."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -38,9 +38,10 @@ from ftdrive.commands.common import (
     stop_unless_accepted,
     write_json,
 )
+from ftdrive.commands.tables import TABLE
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
-from ftdrive.recording.bag import bag_means, is_bag, read_bag
-from ftdrive.recording.files import is_recording
+from ftdrive.recording.bag import is_bag
+from ftdrive.recording.files import moving_source
 from ftdrive.runs.bundle import unpack
 from ftdrive.runs.pose_hints import hints, numbers_in_dataset
 from ftdrive.runs.run import Run, in_motion
@@ -48,12 +49,12 @@ from ftdrive.runs.source import (
     RecordedData,
     SolveOptions,
     read_calibration,
-    read_dataset,
     read_source,
     require_same_cell,
     solve_in_motion,
 )
-from ftdrive.terminal.console import beside, working
+from ftdrive.tables.table import Table, TableOptions
+from ftdrive.terminal.console import beside, hanging, messages, working
 from ftdrive.terminal.report import print_cases, print_comparison, print_result, print_tests
 from ftdrive.terminal.text import echo, in_one_line
 
@@ -94,10 +95,8 @@ _EPILOG = "\b\nMETHOD is one of\n" + fill(
 @click.option(
     "--up", metavar="X,Y,Z", help="Up direction in base axes, such as 0,0,1 on a floor; declares the mounting."
 )
-@click.option("--wrench", metavar="FILE", type=FILE, help="In motion: CSV with t,fx,fy,fz,tx,ty,tz.")
-@click.option(
-    "--orientation-file", metavar="FILE", type=FILE, help="With --wrench: CSV with t, the orientation and x,y,z in m."
-)
+@click.option("--wrench", metavar="FILE", type=FILE, help="In motion: table of the wrench, if it is a file of its own.")
+@click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: table of the poses of the flange.")
 @click.option(
     "--from",
     "earlier",
@@ -116,6 +115,7 @@ _EPILOG = "\b\nMETHOD is one of\n" + fill(
 )
 @click.option("--together", "joined", is_flag=True, help="Join runs of one tool, each with a bias of its own.")
 @BAG_TOPICS
+@TABLE
 @click.option("--point-mass", is_flag=True, help="In motion: the load is known to have no inertia of its own.")
 @click.option("--output", "-o", type=NewFile(), help="Save the calibration as a new file.")
 @click.option("--force", is_flag=True, help="Save a rejected result too; it stays marked as rejected.")
@@ -140,6 +140,7 @@ def solve(
     joined: bool,
     wrench_topic: str | None,
     pose_topic: str | None,
+    table: TableOptions | None,
     point_mass: bool,
     output: Path | None,
     force: bool,
@@ -147,14 +148,14 @@ def solve(
     sensor: str | None,
     as_json: bool,
 ) -> None:
-    """Solve each DATASET: a run folder, the file of `ftdrive bundle`, a dataset.json, or a CSV file.
+    """Solve each DATASET: a run folder, the file of `ftdrive bundle`, a dataset.json, or a table of any program.
 
-    A CSV has a header with r11..r33, qx,qy,qz,qw or rx,ry,rz in rad, fx,fy,fz,tx,ty,tz in N and N·m, and optionally
-    t in seconds and sigma_fx..sigma_tz, the standard error of each pose's mean. With --json, one object a line.
+    A table has one row a pose: the orientation of the flange, the wrench, and optionally a time and sigma_fx..sigma_tz,
+    the standard error of each mean. Separator, decimal sign, names and units are recognised; --columns and the options
+    beside it say what the file does not. With --json, one object a line.
 
-    A DATASET may also be a recording of `ftdrive record`: the load is then estimated from its motion, with inertia and
-    delay. Recordings of other programs come as --wrench and --orientation-file on one clock, each at its own rate, or
-    as a rosbag2 folder or an MCAP file of ROS 2.
+    A DATASET may also be a recording in motion, from which inertia and delay are estimated too: a file of `ftdrive
+    record`, a table with both streams, --wrench and --orientation-file on one clock, or a bag of ROS 1 or ROS 2.
     """
     check_simulate(simulate, real={"DATASET": sources, "--wrench": wrench}, emulated={"--sensor": sensor})
     if (wrench is None) != (orientation_file is None) or (wrench is not None and sources):
@@ -192,8 +193,9 @@ def solve(
         pair=pair,
         point_mass=point_mass,
         topics=(wrench_topic, pose_topic),
+        table=table,
     )
-    tests = _test_set(test, orientation)
+    tests = _test_set(test, options)
     show = _show_cases if cases else partial(_show_all, options, test, tests) if method == "all" else None
     if joined:
         _solve_together(sources, options, output, force, as_json)
@@ -220,8 +222,7 @@ def _solve_each(
         # One source that fails does not keep the others from being solved.
         try:
             with unpack(source) as place:
-                at_rest = options.pair is None and not _is_in_motion(place)
-                if show is not None and (at_rest or options.method != "all"):
+                if show is not None and (options.method != "all" or not _is_in_motion(place, options)):
                     show(source, read_source(place, options), as_json)
                     continue
                 result, records = _result_of(place, options)
@@ -242,20 +243,21 @@ def _solve_each(
         raise SystemExit(exit_code(first_failure))
 
 
-def _is_in_motion(place: Path) -> bool:
-    return is_recording(place) or is_bag(place) or in_motion(place)
+def _is_in_motion(place: Path, options: SolveOptions) -> bool:
+    return in_motion(place) or moving_source(place, options) is not None
 
 
 def _result_of(place: Path, options: SolveOptions) -> tuple[CalibrationResult, Sequence[PoseRecord]]:
     """Solve a recording in motion, or poses; also return the records of a run."""
-    from_bag = options.pair is None and is_bag(place)
-    if any(options.topics) and not from_bag:
-        raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS 2: leave them out")
-    if options.pair is not None or _is_in_motion(place):
+    moving = Run(place) if in_motion(place) else moving_source(place, options)
+    if any(options.topics) and (options.pair is not None or not is_bag(place)):
+        raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS: leave them out")
+    if moving is not None:
         if options.method != "ml":
             raise ConfigError(f"--method {options.method} is for poses at rest: leave it out for a recording")
-        return _solve_motion(place, options), ()
+        return _solve_motion(moving, options), ()
     data = read_source(place, options)
+    _print_table(data.provenance)
     earlier = options.earlier or data.earlier
     if earlier is not None:
         require_same_cell(earlier, data.provenance)
@@ -263,16 +265,22 @@ def _result_of(place: Path, options: SolveOptions) -> tuple[CalibrationResult, S
     return _solve_poses(data, options), data.records
 
 
-def _solve_motion(place: Path, options: SolveOptions) -> CalibrationResult:
+def _print_table(provenance: Mapping[str, Any]) -> None:
+    """Print what was recognised in a table, so that a wrong guess is seen."""
+    if words := provenance.get("table"):
+        messages.print(hanging(" ", f"{provenance.get('source') or ''}: {words}".removeprefix(": "), messages))
+
+
+def _solve_motion(moving: Run | Path | tuple[Table, Table], options: SolveOptions) -> CalibrationResult:
     how: dict[str, Any] = {"earlier": options.earlier, "known": options.known, "point_mass": options.point_mass}
     with working("Solving"):
-        if in_motion(place):
-            return solve_in_motion(Run(place), **how)
+        if isinstance(moving, Run):
+            return solve_in_motion(moving, **how)
         from ftdrive.recording.in_motion import solve_recording  # with the filters of a stream
 
-        from_bag = options.pair is None and is_bag(place)
-        means = bag_means(read_bag(place, *options.topics)) if from_bag else None
-        return solve_recording(place, options.pair, means, up_in_base=options.up_in_base, **how)
+        result = solve_recording(moving, up_in_base=options.up_in_base, **how)
+    _print_table(result.provenance)
+    return result
 
 
 def _solve_together(
@@ -281,7 +289,7 @@ def _solve_together(
     results = []
     for source in sources:
         with unpack(source) as place:
-            if _is_in_motion(place):
+            if _is_in_motion(place, options):
                 raise ConfigError(f"--together joins poses at rest, and {source} is in motion")
             # Without the earlier result of a new tool, because a result from another one would count that twice.
             results.append(_solve_poses(read_source(place, options), options))
@@ -311,11 +319,11 @@ def _solve_poses(data: RecordedData, options: SolveOptions) -> CalibrationResult
             raise ConfigError(str(error)) from error
 
 
-def _test_set(test: Path | None, orientation: Orientation) -> CalibrationDataset | None:
+def _test_set(test: Path | None, options: SolveOptions) -> CalibrationDataset | None:
     if test is None:
         return None
     with unpack(test) as place:
-        return read_dataset(place, orientation)
+        return read_source(place, SolveOptions(orientation=options.orientation)).dataset
 
 
 def _show_all(

@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl
 
 import click
 
-from ftdrive.commands.common import MODEL, Number, numbers
+from ftdrive.commands.common import Number, numbers
 
 if TYPE_CHECKING:
     from ftdrivers.interfaces import Array
@@ -17,7 +17,7 @@ _LINKS = ("tool0", "flange")
 
 
 def TABLE(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of a table, and pass them to the command as `TableOptions`."""
+    """Add the options of a table, and pass them to the command as `TableOptions`; None if none is given."""
 
     @wraps(command)
     def with_table(
@@ -26,11 +26,14 @@ def TABLE(command: Callable[..., None]) -> Callable[..., None]:
         euler: str | None,
         tcp: str | None,
         wrench_frame: Any,
-        sign: str,
+        sign: str | None,
         model: str | None,
         urdf: str | None,
         **options: Any,
     ) -> None:
+        if not any((columns, rate, euler, tcp, wrench_frame, sign, model, urdf)):
+            command(table=None, **options)
+            return
         import numpy as np
         from scipy.spatial.transform import Rotation
 
@@ -76,10 +79,8 @@ _OPTIONS = (
         type=click.Choice(["sensor", "flange", "tcp", "base"]),
         help="Axes of the wrench; tcp and base are about the TCP.  [default: by the layout, mostly sensor]",
     ),
-    click.option(
-        "--sign", type=click.Choice(["1", "-1"]), default="1", help="-1 for a sensor that reports the reaction."
-    ),
-    MODEL,
+    click.option("--sign", type=click.Choice(["1", "-1"]), help="-1 for a sensor that reports the reaction."),
+    click.option("--model", help="Joint angles of a UR arm: its model, such as UR5e."),
     click.option("--urdf", metavar="FILE", help="Joint angles of another arm: URDF, FILE?flange=LINK&base=LINK."),
 )
 

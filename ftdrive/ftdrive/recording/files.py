@@ -1,4 +1,4 @@
-"""The file formats by their endings."""
+"""Recordings on disk: the file formats by their endings, and which files are recordings."""
 
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import closing
@@ -11,6 +11,7 @@ import numpy as np
 from ftcalib.files import open_file
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.samples import StreamEvent
+from ftdrive.recording.bag import is_bag, read_bag
 from ftdrive.recording.csv_file import CsvFile, read_csv
 from ftdrive.recording.growing_file import partial_of
 from ftdrive.recording.mcap_file import McapFile, read_mcap
@@ -25,6 +26,8 @@ from ftdrive.recording.recording import (
     Rows,
     measured,
 )
+from ftdrive.runs.source import SolveOptions
+from ftdrive.tables.table import Table
 
 
 def is_recording(path: Path) -> bool:
@@ -34,6 +37,32 @@ def is_recording(path: Path) -> bool:
         with open_file(path) as file:
             return file.readline(100).startswith(f"# {FORMAT.partition('/')[0]}/".encode())
     return ending in ENDINGS and ending != ".csv"
+
+
+def tables_of(place: Path, options: SolveOptions) -> tuple[Table, Table] | None:
+    """Return wrench and poses of another program, which may be one table; None for a recording of ours.
+
+    Raises `BadDataset`, `ConfigError` or `OSError`.
+    """
+    if options.pair is not None:
+        wrench, poses = (Table(path, options.table) for path in options.pair)
+        return wrench, poses
+    if is_recording(place):
+        return None
+    if is_bag(place):
+        return read_bag(place, *options.topics)
+    table = Table(place, options.table)
+    return table, table
+
+
+def moving_source(place: Path, options: SolveOptions) -> Path | tuple[Table, Table] | None:
+    """Return what `solve_recording` takes, a recording or two tables; None for poses at rest. Raises as `tables_of`."""
+    if options.pair is None and (place.is_dir() or place.suffix == ".json") and not is_bag(place):
+        return None
+    tables = tables_of(place, options)
+    if tables is None:
+        return place
+    return tables if options.pair is not None or is_bag(place) or tables[0].in_motion else None
 
 
 class RecordingFile(Protocol):

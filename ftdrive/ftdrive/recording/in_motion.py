@@ -62,6 +62,7 @@ def solve_recording(
         wrench, poses = (_means_of(rows) for rows in (source[0].wrenches(), source[1].poses()))
         names = [table.name for table in source]
         provenance |= {"wrench": names[0], "orientation": names[1]} if len(set(names)) == 2 else {"recording": names[0]}
+        provenance |= {"table": words} if (words := table_words(source)) else {}
     if earlier is not None:
         require_same_cell(earlier, provenance)
     setup = Setup(up_in_base=up_in_base)
@@ -78,6 +79,11 @@ def solve_recording(
         setup=setup,
         provenance=provenance,
     )
+
+
+def table_words(tables: tuple[Table, Table]) -> str:
+    """Return what was recognised in the tables of a recording, in one line; empty for plain ones."""
+    return "; ".join(dict.fromkeys(f"{one.name}: {one.words}" for one in tables if one.words))
 
 
 def _read_in_motion(path: Path) -> tuple[Means, Means, Header]:

@@ -7,17 +7,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, read_csv, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, solve
 from ftcalib.after.new_tool import new_tool
 from ftcalib.data.dataset import Orientation
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.likelihood.session import Drift
-from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters
+from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters
 from ftcalib.routine import ArmReading, DriftCheck, PoseRecord, WrenchSamples, dataset_from, drift_check
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.motion import solve_motion_file
 from ftdrive.runs.run import Run, made_now, versions
+from ftdrive.tables.table import Table, TableOptions
 
 
 class RecordedRun:
@@ -76,6 +77,8 @@ class SolveOptions:
     point_mass: bool = False
     topics: tuple[str | None, str | None] = (None, None)
     """Topics of a bag: wrench and pose."""
+    table: TableOptions | None = None
+    """What is known of a table of another program; None if nothing is."""
     words: tuple[str, ...] = ()
     """The same as typed, quoted for a shell."""
 
@@ -108,7 +111,11 @@ class RecordedData:
 
 
 def read_source(source: Path, options: SolveOptions) -> RecordedData:
-    """Read poses at rest from a run folder, a dataset.json or a CSV file. Raises `BadDataset` or `OSError`."""
+    """Read poses at rest from a run folder, a dataset.json or a table.
+
+    Raises `BadDataset`, `ConfigError` or `OSError`.
+    """
+    known = options.known
     if source.is_dir():
         run = Run(source)
         if run.in_motion:
@@ -116,10 +123,18 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         records = run.records()
         dataset, of_run = _dataset_of(run, records)
         found = RecordedData(dataset, of_run.provenance(), of_run.g_m_s2, of_run.setup, None, records, _earlier_of(run))
+    elif source.suffix == ".json":
+        found = RecordedData(CalibrationDataset.load(source), {"source": source.name, "versions": versions()})
     else:
-        dataset = CalibrationDataset.load(source) if source.suffix == ".json" else read_csv(source, options.orientation)
-        found = RecordedData(dataset, {"source": source.name, "versions": versions()})
-    up_in_base, known = options.up_in_base, options.known
+        table = Table(source, options.table)
+        recognised = {"table": table.words} if table.words else {}
+        dataset = table.dataset(options.orientation)
+        found = RecordedData(dataset, {"source": source.name, **recognised, "versions": versions()})
+        if table.gravity_is_measured:  # its direction is that of the base by definition
+            known = replace(known or Known(), gravity_direction_base=-UP_IN_BASE)
+    if options.table is not None and (source.is_dir() or source.suffix == ".json"):
+        raise ConfigError(f"{source.name} is no table: leave out the options that describe one, such as --columns")
+    up_in_base = options.up_in_base
     if up_in_base is not None:
         provenance = {**found.provenance, "up_in_base": list(up_in_base)}
         found = replace(found, setup=replace(found.setup, up_in_base=up_in_base), provenance=provenance)
@@ -128,15 +143,19 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
     return replace(found, known=known)
 
 
-def read_dataset(path: str | Path, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
+def read_dataset(
+    source: Any, orientation: Orientation = "R_base_flange", table: TableOptions | None = None
+) -> CalibrationDataset:
     """Read the poses of a calibration; `CalibrationDataset.save` writes them.
 
     Parameters
     ----------
-    path : str or Path
-        A run folder, a dataset.json or a CSV file, whose columns are those of `ftcalib.read_csv`.
+    source : str, Path, DataFrame or mapping
+        A run folder, a dataset.json, or a table of any program: text, DataFrame of pandas or Polars, arrays by name.
     orientation : {"R_base_flange", "R_flange_base"}
-        Of the rotations in a CSV file: flange to base coordinates, like a robot pose, or the inverse.
+        Of the rotations in a table: flange to base coordinates, like a robot pose, or the inverse.
+    table : TableOptions, optional
+        What the table does not say: names of columns, units, order of angles, TCP.
 
     Raises
     ------
@@ -152,7 +171,9 @@ def read_dataset(path: str | Path, orientation: Orientation = "R_base_flange") -
     >>> dataset.wrench.shape
     (24, 6)
     """
-    return read_source(Path(path), SolveOptions(orientation=orientation)).dataset
+    if not isinstance(source, str | Path):
+        return Table(source, table).dataset(orientation)
+    return read_source(Path(source), SolveOptions(orientation=orientation, table=table)).dataset
 
 
 def read_calibration(path: str | Path, *, accept_edited: bool = False) -> CalibrationResult:

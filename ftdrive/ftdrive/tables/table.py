@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset
 from ftcalib.data.dataset import MATRIX_COLUMNS, QUATERNION_COLUMNS, VECTOR_COLUMNS, Orientation, rotations_of
 from ftcalib.errors import BadDataset
+from ftcalib.files import JSON
 from ftcalib.model import Array
 from ftdrive.errors import ConfigError
 from ftdrive.tables.columns import COUNTS, UNITS, Columns, Signal, factor
@@ -82,9 +83,6 @@ class TableOptions:
             raise ConfigError(f"--rate {self.rate_Hz:g}: give the samples a second")
 
 
-_PLAIN: Final = TableOptions()
-
-
 _JOINTS_ONLY = "it has joint angles and no orientation: add --model, such as UR5e, or --urdf FILE"
 _ANGLES_ONLY = "it has three angles: add --euler, such as ZYX (axes of the tool) or xyz (axes of the base)"
 
@@ -135,7 +133,7 @@ class Table:
     Parameters
     ----------
     source : Path, DataFrame or mapping
-    options : TableOptions
+    options : TableOptions, optional
     name : str
         For messages; the name of the file or of the type of the source otherwise.
 
@@ -147,14 +145,14 @@ class Table:
         It cannot be read.
     """
 
-    def __init__(self, source: Path | Any, options: TableOptions = _PLAIN, name: str = "") -> None:
+    def __init__(self, source: Path | Any, options: TableOptions | None = None, name: str = "") -> None:
         self.name = name or (source.name if isinstance(source, Path) else type(source).__name__)
-        self.options = options
+        self.options = options or TableOptions()
         self._guesses: list[str] = []
         self._found: dict[str, Signal | None] = {}
         with self._named():
             self.source: Source = TextTable(source) if isinstance(source, Path) else Frame(source)
-            self._columns = Columns(self.source.names, self.source.units, options.columns)
+            self._columns = Columns(self.source.names, self.source.units, self.options.columns)
             self._find()
 
     def _find(self) -> None:
@@ -272,8 +270,17 @@ class Table:
                 wrench_cov=sigma[0][:, :, None] ** 2 * np.eye(6) if sigma else None,
                 n_samples=np.zeros(len(wrench), np.int64),
                 t_s=t_s - t_s[0],
-                meta={"source": self.name, "orientation": orientation},
+                meta={"source": self.name, "orientation": orientation, **self._form(signals[0].form)},
             )
+
+    def _form(self, form: str) -> dict[str, JSON]:
+        """Return what the orientations were read from, which limits what a mistake in them can be."""
+        if form in _AXES and (self.options.euler or form in _MAKERS):
+            euler = self.options.euler or form
+            return {"form": "euler", "euler": _MAKERS.get(euler.lower(), euler)}
+        return {
+            "form": {"quaternion_w_first": "quaternion", "transform": "matrix", "tcp_pose": "vector"}.get(form, form)
+        }
 
     def _require_time(self) -> None:
         if self._found["time"] is None and not self.options.rate_Hz:
