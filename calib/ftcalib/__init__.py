@@ -8,7 +8,7 @@ from importlib import import_module
 # Type checkers take it for that of `typing`.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from ftcalib.data.dataset import CalibrationDataset, read_csv
+    from ftcalib.data.dataset import CalibrationDataset
     from ftcalib.data.dwell_mean import PoseMean, is_stationary, mean_and_covariance
     from ftcalib.errors import BadCalibration, BadDataset, NotObservable
     from ftcalib.findings import Finding
@@ -31,12 +31,11 @@ __all__ = [
     "Setup",
     "is_stationary",
     "mean_and_covariance",
-    "read_csv",
     "solve",
 ]
 
 _MODULES = {
-    "ftcalib.data.dataset": ("CalibrationDataset", "read_csv"),
+    "ftcalib.data.dataset": ("CalibrationDataset",),
     "ftcalib.data.dwell_mean": ("PoseMean", "is_stationary", "mean_and_covariance"),
     "ftcalib.errors": ("BadCalibration", "BadDataset", "NotObservable"),
     "ftcalib.findings": ("Finding",),

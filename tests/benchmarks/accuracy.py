@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationDataset, NotObservable, read_csv, solve
+from ftcalib import CalibrationDataset, NotObservable, solve
 from ftcalib.judge.cross_validation import standardize
 from ftcalib.likelihood import fit as likelihood
 from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import UP_IN_BASE, Array, predict
 from ftcalib.published.methods import published
 from ftcalib.published.yu import SPECIAL_R_flange_base, lrom, srom
+from ftdrive import read_dataset
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.common import Lab, Record, Row, all_within, band, most, run
 
@@ -374,7 +375,7 @@ def real_data(lab: Lab) -> Iterator[Row]:
     lines = [f"| recording | {' | '.join(PEERS)} |", "|---|" + "---|" * len(PEERS)]
     results = {}
     for name in ("agimus_mini45_b", "foamcutting_2013_06_12"):
-        dataset = read_csv(Path(folder) / name / "poses.csv", orientation="R_flange_base")
+        dataset = read_dataset(Path(folder) / name / "poses.csv", orientation="R_flange_base")
         n = len(dataset)
         folds = [np.array([i]) for i in range(n)]
         errors = left_out(dataset.R_base_flange, dataset.wrench, None, np.arange(float(n)), folds)

@@ -80,7 +80,7 @@ WALKS = {
         ftdrive.runs.source                       read_source              reads a run folder or a file
         ftdrive.runs.source                      _dataset_of              takes the poses of a run
         ftcalib.routine                           dataset_from             makes arrays of records
-        ftcalib.data.dataset                      read_csv                 reads poses of another program
+        ftdrive.tables.table                      Table.dataset            reads poses of another program
         ftcalib.solver                            solve                    chooses, fits, judges
         ftcalib.judge.observability               require_orientations     refuses poses that are alike
         ftcalib.data.dataset                      pooled_covariance        gives each pose its weight

@@ -1,14 +1,12 @@
 """The dataset of a calibration: one orientation and one mean wrench per pose, and pooling of their covariances."""
 
-import csv
 import hashlib
-import io
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self
 
 import numpy as np
 import scipy
@@ -16,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset
-from ftcalib.files import JSON, check_format, read_file, read_object, write_object
+from ftcalib.files import JSON, check_format, read_object, write_object
 from ftcalib.model import ROUNDING, Array, Rotations, matrices_of, nearest_rotation, read_only
 
 FORMAT = "ftdrive.dataset/1"
@@ -29,12 +27,9 @@ Orientation = Literal["R_base_flange", "R_flange_base"]
 LARGEST = 1e9
 # N² or (N·m)²: sigma 1 nN; with much less, products of inverses lose all digits.
 LEAST_VARIANCE = 1e-18
-SIGMA_COLUMNS = tuple(f"sigma_{name}" for name in CHANNELS)
 MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
 VECTOR_COLUMNS = ("rx", "ry", "rz")
-# What a table may hold: rotation matrix row by row, quaternion, rotation vector in rad.
-ORIENTATION_FORMS = "r11..r33, qx, qy, qz, qw or rx, ry, rz"
 _LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
 # A quaternion rounded to two decimals differs from length 1 by no more.
 _ROUNDED_LENGTH = 0.01
@@ -199,93 +194,10 @@ class CalibrationDataset:
         return digest.hexdigest()
 
 
-def read_csv(path: str | Path, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
-    """Read poses from a comma-separated table with one header row.
-
-    Columns: the orientation as `orientation_columns` finds it, fx, fy, fz (N), tx, ty, tz (N·m), and optionally t (s)
-    and sigma_fx .. sigma_tz, the standard error of each pose's mean. Other columns are ignored.
-
-    Parameters
-    ----------
-    path : str or Path
-    orientation : Orientation
-
-    Raises
-    ------
-    BadDataset
-        The message names the column or the row, counted from 1 below the header, and the reason.
-    """
-    path = Path(path)
-    if orientation not in get_args(Orientation):
-        raise ValueError(f"orientation is '{orientation}', expected one of {', '.join(get_args(Orientation))}")
-    try:
-        return _read_csv(path, orientation)
-    except BadDataset as exc:
-        raise BadDataset(f"{path.name}: {exc}") from exc
-
-
-def _read_csv(path: Path, orientation: str) -> CalibrationDataset:
-    header, *rows = _table(path)
-    names = [name.strip() for name in header]
-    rotation_columns = orientation_columns(names)
-    sigmas = SIGMA_COLUMNS if any(c in names for c in SIGMA_COLUMNS) else ()
-    wanted = [*rotation_columns, *CHANNELS, *sigmas, *(["t"] if "t" in names else [])]
-    missing = [name for name in wanted if name not in names]
-    if missing:
-        raise BadDataset(
-            f"missing column {', '.join(missing)}: the first row must name {ORIENTATION_FORMS}, and "
-            f"fx, fy, fz, tx, ty, tz; it names {list_names(names)}."
-        )
-    repeated = [name for name in wanted if names.count(name) > 1]
-    if repeated:
-        raise BadDataset(f"column {list_names(repeated)} appears more than once: keep one.")
-    if not rows:
-        raise BadDataset("the table has a header but no row: add one row per pose.")
-
-    table = np.empty((len(rows), len(wanted)))
-    for i, row in enumerate(rows):
-        if len(row) != len(names):
-            raise BadDataset(f"row {i + 1} has {len(row)} values, the header {len(names)}.")
-        for j, name in enumerate(wanted):
-            text = row[names.index(name)].strip()
-            try:
-                table[i, j] = float(text)
-            except ValueError:
-                raise BadDataset(f"row {i + 1}: {name} is '{text}', not a number.") from None
-            if not np.isfinite(table[i, j]):
-                raise BadDataset(f"row {i + 1}: {name} is {text}, not a finite number.")
-
-    k = len(rotation_columns)
-    sigma = table[:, k + 6 : k + 12] if sigmas else None
-    if sigma is not None:
-        for i, j in np.argwhere(sigma <= 0):
-            raise BadDataset(f"row {i + 1}: {SIGMA_COLUMNS[j]} is {sigma[i, j]:g}, a standard error is above 0.")
-    R = rotations_of(rotation_columns, table[:, :k])
-    return CalibrationDataset(
-        R_base_flange=np.swapaxes(R, 1, 2) if orientation == "R_flange_base" else R,
-        wrench=table[:, k : k + 6],
-        wrench_cov=None if sigma is None else sigma[:, :, None] ** 2 * np.eye(6),
-        n_samples=np.zeros(len(rows), np.int64),
-        t_s=table[:, -1] - table[0, -1] if "t" in names else np.full(len(rows), np.nan),
-        meta={"source": path.name, "orientation": orientation},
-    )
-
-
 def list_names(names: Sequence[str], most: int = 20) -> str:
     """Return names for a message, and how many more there are."""
     shown = ", ".join(name if len(name) <= 40 else f"{name[:40]}…" for name in names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
-
-
-def orientation_columns(names: Collection[str]) -> tuple[str, ...]:
-    """Return the columns of the orientation in a table.
-
-    They are the first complete ones of `ORIENTATION_FORMS`, or the first incomplete ones.
-    """
-    forms = MATRIX_COLUMNS, QUATERNION_COLUMNS, VECTOR_COLUMNS
-    complete = [form for form in forms if set(form) <= set(names)]
-    begun = [form for form in forms if not set(form).isdisjoint(names)]
-    return (complete + begun + [MATRIX_COLUMNS])[0]
 
 
 def rotations_of(columns: Sequence[str], table: Array) -> Array:
@@ -305,17 +217,6 @@ def rotations_of(columns: Sequence[str], table: Array) -> Array:
             "look like degrees, convert them to rad."
         )
     return scipy.spatial.transform.Rotation.from_rotvec(table).as_matrix()
-
-
-def _table(path: Path) -> list[list[str]]:
-    try:
-        text = io.StringIO(read_file(path).decode("utf-8-sig"), newline="")
-        rows = [row for row in csv.reader(text) if any(cell.strip() for cell in row)]
-    except (UnicodeDecodeError, csv.Error) as exc:
-        raise BadDataset(f"this is not a text table ({exc}): save it as UTF-8 CSV.") from exc
-    if not rows:
-        raise BadDataset("the file is empty: choose a table with poses.")
-    return rows
 
 
 def finite(name: str, value: object, shape: tuple[int, ...]) -> Array:

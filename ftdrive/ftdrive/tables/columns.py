@@ -209,6 +209,10 @@ class Columns:
             raise BadDataset(f"two candidates, {' and '.join(two[:2])}. Name the columns: {line}")
         return None
 
+    def begins(self, signal: str) -> bool:
+        """Whether a part of the columns of a signal is there."""
+        return any(self._nearest(layout, signal)[0] for layout in LAYOUTS if signal in layout.signals)
+
     def missing(self, what: str, *signals: str) -> str:
         """Return the words for a signal that the table lacks: what it has, the nearest layout and the line to type."""
         near = (self._nearest(layout, one) for layout in LAYOUTS for one in signals if one in layout.signals)

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, Protocol
+from typing import Any, Final, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -245,6 +245,10 @@ class Table:
 
     def dataset(self, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
         """Return the rows as poses at rest. Raises `BadDataset`."""
+        if orientation not in get_args(Orientation):
+            raise ValueError(f"orientation is '{orientation}', expected one of {', '.join(get_args(Orientation))}")
+        if self._found["sigma"] is None and self._columns.begins("sigma"):
+            raise BadDataset(f"{self.name}: {self._columns.missing('standard errors', 'sigma')}")
         signals = [
             self._require("orientation"),
             self._require("wrench"),
@@ -460,7 +464,7 @@ def _unit_of_time(t: Array, name: str) -> str:
     is_recording = len(t) >= _RECORDING_ROWS
     least, most = _STEPS_S if is_recording else _POSE_STEPS_S
     fitting = [unit for unit, size in _UNITS_OF_TIME.items() if least <= step * size <= most]
-    if "s" in fitting or not fitting:
+    if "s" in fitting or not fitting or step < 1:  # slow samples in s, or fast ones in ms
         return "s"
     if len(fitting) > 1 and is_recording:
         raise BadDataset(

@@ -7,7 +7,6 @@ from unittest.mock import Mock
 import pytest
 
 from ftcalib import CalibrationDataset, files
-from ftcalib.data.dataset import read_csv
 from ftcalib.errors import BadDataset
 from ftcalib.files import object_of, read_file, write_new
 
@@ -17,7 +16,7 @@ def test_what_has_no_end_is_not_opened(make: object, tmp_path: Path) -> None:
     path = tmp_path / "dataset.json"
     assert callable(make)
     make(path)
-    for read in (read_file, CalibrationDataset.load, read_csv):
+    for read in (read_file, CalibrationDataset.load):
         with pytest.raises(OSError, match="is a pipe or a device: save its content in a file"):
             read(path)
 

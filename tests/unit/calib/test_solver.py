@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationDataset, CalibrationResult, Finding, NotObservable, Parameters, Setup, read_csv, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Finding, NotObservable, Parameters, Setup, solve
 from ftcalib.compare import compare
 from ftcalib.errors import BadDataset
 from ftcalib.known import Known
@@ -20,6 +20,7 @@ from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, jacobian, pr
 from ftcalib.published.methods import BASELINES, CARLSON, PUBLISHED, published
 from ftcalib.published.yu import SPECIAL_R_flange_base, lrom
 from ftcalib.result import Method
+from ftdrive import read_dataset
 
 METHODS: tuple[Method, ...] = ("ml", "srom", "lrom")
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
@@ -558,7 +559,7 @@ def real(name: str) -> CalibrationDataset:
     folder = os.environ.get("FTDRIVE_REAL_DATA")
     if not folder:
         pytest.skip("FTDRIVE_REAL_DATA is not set")
-    return read_csv(Path(folder) / name / "poses.csv", "R_flange_base")
+    return read_dataset(Path(folder) / name / "poses.csv", "R_flange_base")
 
 
 @pytest.mark.parametrize("method", ["ml", "lrom"])

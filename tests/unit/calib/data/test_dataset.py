@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from syrupy.assertion import SnapshotAssertion
 
-from ftcalib import BadDataset, CalibrationDataset, read_csv
-from ftcalib.data.dataset import Orientation, pooled_covariance
+from ftcalib import BadDataset, CalibrationDataset
+from ftcalib.data.dataset import pooled_covariance
 from ftcalib.files import write_new
 
 RNG = np.random.default_rng(3)
@@ -209,114 +209,10 @@ def test_a_file_that_is_something_else_is_named_in_one_sentence(
     assert wording(caught.value) == snapshot
 
 
-MATRIX_HEADER = "r11,r12,r13,r21,r22,r23,r31,r32,r33,fx,fy,fz,tx,ty,tz"
-IDENTITY = "1,0,0,0,1,0,0,0,1"
-
-
-def csv(tmp_path: Path, *lines: str) -> Path:
-    path = tmp_path / "poses.csv"
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
-
-
-def test_csv_matrix_is_row_major_and_orientation_defines_the_mapping(tmp_path: Path) -> None:
-    quarter = "0,-1,0,1,0,0,0,0,1"  # x goes to y
-    path = csv(tmp_path, MATRIX_HEADER, f"{quarter},1,2,3,4,5,6")
-    np.testing.assert_array_equal(read_csv(path).R_base_flange[0] @ [1, 0, 0], [0, 1, 0])
-    np.testing.assert_array_equal(read_csv(path, "R_flange_base").R_base_flange[0] @ [0, 1, 0], [1, 0, 0])
-    data = read_csv(path)
-    np.testing.assert_array_equal(data.wrench, [[1, 2, 3, 4, 5, 6]])
-    assert data.wrench_cov is None
-    assert np.isnan(data.t_s).all()
-    assert data.n_samples.tolist() == [0]
-    with pytest.raises(ValueError, match="orientation is 'x'"):
-        read_csv(path, "x")  # type: ignore[arg-type]  # the point of the test
-
-
-def test_csv_rotation_vector_time_extra_columns_and_any_order(tmp_path: Path) -> None:
-    path = csv(
-        tmp_path,
-        "\ufeffname, tz,ty,tx,fz,fy,fx,rz,ry,rx,t",
-        f"a,6,5,4,3,2,1,{np.pi / 2},0,0,10",
-        "",
-        "b,6,5,4,3,2,1,0,0,0,12.5",
-    )
-    data = read_csv(path)
-    np.testing.assert_allclose(data.R_base_flange[0] @ [1, 0, 0], [0, 1, 0], atol=1e-15)
-    np.testing.assert_array_equal(data.wrench[1], [1, 2, 3, 4, 5, 6])
-    np.testing.assert_array_equal(data.t_s, [0, 2.5])
-
-
-@pytest.mark.parametrize("orientation", ["R_base_flange", "R_flange_base"])
-def test_csv_quaternion_and_vector_are_those_of_the_matrix(tmp_path: Path, orientation: Orientation) -> None:
-    header, poses = MATRIX_HEADER.partition(",f")[0], Rotation.random(5, rng=1)
-    forms = {header: poses.as_matrix().reshape(5, 9), "qx,qy,qz,qw": poses.as_quat(), "rx,ry,rz": poses.as_rotvec()}
-    read = []
-    for columns, numbers in forms.items():
-        lines = [",".join(map(repr, [*row, 1, 2, 3, 4, 5, 6])) for row in numbers.tolist()]
-        read.append(read_csv(csv(tmp_path, f"{columns},fx,fy,fz,tx,ty,tz", *lines), orientation).R_base_flange)
-    expected = poses if orientation == "R_base_flange" else poses.inv()
-    np.testing.assert_allclose(read, [expected.as_matrix()] * 3, atol=1e-12)
-
-
-def test_csv_takes_the_first_complete_orientation(tmp_path: Path) -> None:
-    path = csv(tmp_path, "r11,rx,ry,rz,qx,qy,qz,qw,fx,fy,fz,tx,ty,tz", "7,0,0,0,0,0,1,0,1,2,3,4,5,6")
-    np.testing.assert_allclose(read_csv(path).R_base_flange[0], np.diag([-1, -1, 1]))
-
-
-def test_csv_standard_errors_become_the_covariance(tmp_path: Path) -> None:
-    sigmas = "sigma_fx,sigma_fy,sigma_fz,sigma_tx,sigma_ty,sigma_tz"
-    data = read_csv(csv(tmp_path, f"{sigmas},{MATRIX_HEADER},t", f".1,.2,.3,.01,.02,.03,{IDENTITY},1,2,3,4,5,6,7"))
-    assert data.wrench_cov is not None
-    np.testing.assert_allclose(data.wrench_cov[0], np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2)
-    np.testing.assert_array_equal(data.wrench, [[1, 2, 3, 4, 5, 6]])
-    with pytest.raises(BadDataset, match="missing column sigma_tz"):
-        read_csv(csv(tmp_path, f"{sigmas[:-9]},{MATRIX_HEADER}", f".1,.2,.3,.01,.02,{IDENTITY},1,2,3,4,5,6"))
-    with pytest.raises(BadDataset, match="row 1: sigma_fy is 0"):
-        read_csv(csv(tmp_path, f"{sigmas},{MATRIX_HEADER}", f".1,0,.3,.01,.02,.03,{IDENTITY},1,2,3,4,5,6"))
-
-
-@pytest.mark.parametrize(
-    "lines",
-    [
-        [""],
-        [MATRIX_HEADER],
-        ["r11,r12,fx,fy,tx,ty,tz", "1"],
-        ["rx,ry,fx,fy,fz,tx,ty,tz", "1"],
-        ["fx,fy,fz,tx,ty,tz", "1"],
-        [f"{IDENTITY},1,2,3,4,5,6"],
-        [f"{MATRIX_HEADER},fx", f"{IDENTITY},1,2,3,4,5,6,7"],
-        [MATRIX_HEADER, f"{IDENTITY},1,2,3,4,5,6", f"{IDENTITY},1,2,3,4,5"],
-        [MATRIX_HEADER, f"{IDENTITY},1,2,3,4,five,6"],
-        [MATRIX_HEADER, f"{IDENTITY},1,2,3,4,,6"],
-        [MATRIX_HEADER, f"{IDENTITY},1,2,nan,4,5,6"],
-        [MATRIX_HEADER, f"{IDENTITY},1,2,1e999,4,5,6"],
-        [MATRIX_HEADER, f"{IDENTITY},1,2,3,4,5,6", "1,0,0,0,1,0,0,0,2,1,2,3,4,5,6"],
-        [MATRIX_HEADER, "1,0,0,0,1,0,0,0,-1,1,2,3,4,5,6"],
-        ["qx,qy,qz,fx,fy,fz,tx,ty,tz", "0,0,0,1,2,3,4,5,6"],
-        ["qx,qy,qz,qw,fx,fy,fz,tx,ty,tz", "0,0,0,1,1,2,3,4,5,6", "0,0,0,2,1,2,3,4,5,6"],
-        ["rx,ry,rz,fx,fy,fz,tx,ty,tz", "0,90,0,1,2,3,4,5,6"],
-    ],
-)
-def test_csv_errors_name_column_or_row(tmp_path: Path, lines: list[str], snapshot: SnapshotAssertion) -> None:
-    with pytest.raises(BadDataset) as caught:
-        read_csv(csv(tmp_path, *lines))
-    assert wording(caught.value) == snapshot
-
-
 def test_a_path_may_be_text(tmp_path: Path) -> None:
     path = str(tmp_path / "dataset.json")
     dataset().save(path)
     assert CalibrationDataset.load(path).sha256() == dataset().sha256()
-    with pytest.raises(BadDataset, match=r"^dataset.json: the header|^dataset.json: missing column"):
-        read_csv(path)
-
-
-def test_csv_that_is_not_text(tmp_path: Path) -> None:
-    path = tmp_path / "poses.csv"
-    path.write_bytes(b"PK\x03\x04\xff\xfe")
-    with pytest.raises(BadDataset, match="not a text table"):
-        read_csv(path)
 
 
 Array = NDArray[np.float64]

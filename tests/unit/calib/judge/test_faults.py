@@ -15,7 +15,6 @@ from ftcalib import (
     NotObservable,
     Parameters,
     Setup,
-    read_csv,
     solve,
 )
 from ftcalib.judge.faults import CHANNELS, _Rough, broken_channels, constant_weight, least_rms, rough_fit
@@ -23,6 +22,7 @@ from ftcalib.known import Known
 from ftcalib.model import Array, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftcalib.result import Method
+from ftdrive import read_dataset
 
 Sequence = Literal["xyz", "XYZ"]
 SIGMA = np.repeat([0.05, 0.00125], 3)
@@ -295,7 +295,7 @@ def test_rotation_vectors_in_degrees_are_refused(tmp_path: Path) -> None:
     rows = "\n".join(f"{90 - k},{k},0,1,2,3,4,5,6" for k in range(6))
     (tmp_path / "poses.csv").write_text(f"rx,ry,rz,fx,fy,fz,tx,ty,tz\n{rows}\n")
     with pytest.raises(BadDataset, match="look like degrees"):
-        read_csv(tmp_path / "poses.csv")
+        read_dataset(tmp_path / "poses.csv")
 
 
 def test_nothing_is_named_in_sound_sessions() -> None:

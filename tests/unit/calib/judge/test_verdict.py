@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Parameters, Setup, solve
-from ftcalib.data.dataset import read_csv
 from ftcalib.judge.cross_validation import DriftAhead, Judged, standardize
 from ftcalib.judge.faults import faults
 from ftcalib.judge.verdict import (
@@ -34,6 +33,7 @@ from ftcalib.judge.verdict import (
 from ftcalib.likelihood.response import SIZE, Response, predicted_covariance
 from ftcalib.model import Array, DriftResult, jacobian, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftdrive import read_dataset
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
 SIGMA = np.repeat([0.05, 0.05 * 0.025], 3)
@@ -679,7 +679,7 @@ def test_the_likely_error_is_that_of_the_next_use_where_the_bias_walks() -> None
 
 @pytest.mark.slow
 def test_a_real_session_read_with_wrong_signs_is_found_out(real_data: Path) -> None:
-    dataset = read_csv(real_data / "agimus_mini45_b" / "poses.csv", "R_flange_base")
+    dataset = read_dataset(real_data / "agimus_mini45_b" / "poses.csv", "R_flange_base")
     R, wrench = dataset.R_base_flange, dataset.wrench
     assert "weight_upwards" in codes(solved(R, -wrench))
     corrections = the("axes_disagree", solved(R, wrench * [1, 1, 1, -1, 1, 1])).values["corrections"]

@@ -1,0 +1,151 @@
+"""Which numbers a table means: orientations, times, units, frames, and what the numbers themselves show."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ftcalib import BadDataset, Known, solve
+from ftcalib.data.dataset import Orientation
+from ftdrive.commands.tables import _forward
+from ftdrive.tables.table import Table, TableOptions
+from tests.unit.ftdrive.tables.test_layouts import POSES, RECORDING, columns, position, quaternion, t, wrench
+
+MATRIX = "r11 r12 r13 r21 r22 r23 r31 r32 r33"
+IDENTITY = "1,0,0,0,1,0,0,0,1"
+ROW = ",".join([*MATRIX.split(), "fx,fy,fz,tx,ty,tz"])
+
+
+def csv(tmp_path: Path, *lines: str) -> Table:
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return Table(path)
+
+
+def test_a_matrix_is_row_major_and_orientation_defines_the_mapping(tmp_path: Path) -> None:
+    table = csv(tmp_path, ROW, "0,-1,0,1,0,0,0,0,1,1,2,3,4,5,6")  # x goes to y
+    data = table.dataset()
+    np.testing.assert_array_equal(data.R_base_flange[0] @ [1, 0, 0], [0, 1, 0])
+    np.testing.assert_array_equal(table.dataset("R_flange_base").R_base_flange[0] @ [0, 1, 0], [1, 0, 0])
+    np.testing.assert_array_equal(data.wrench, [[1, 2, 3, 4, 5, 6]])
+    assert data.wrench_cov is None
+    assert np.isnan(data.t_s).all()
+    assert data.n_samples.tolist() == [0]
+    with pytest.raises(ValueError, match="orientation is 'x'"):
+        table.dataset("x")  # type: ignore[arg-type]  # the point of the test
+
+
+def test_columns_stand_in_any_order_beside_others(tmp_path: Path) -> None:
+    data = csv(
+        tmp_path,
+        "\ufeffname, tz,ty,tx,fz,fy,fx,rz,ry,rx,t",
+        f"a,6,5,4,3,2,1,{np.pi / 2},0,0,10",
+        "",
+        "b,6,5,4,3,2,1,0,0,0,12.5",
+    ).dataset()
+    np.testing.assert_allclose(data.R_base_flange[0] @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    np.testing.assert_array_equal(data.wrench[1], [1, 2, 3, 4, 5, 6])
+    np.testing.assert_array_equal(data.t_s, [0, 2.5])
+
+
+@pytest.mark.parametrize("orientation", ["R_base_flange", "R_flange_base"])
+def test_quaternion_and_vector_are_those_of_the_matrix(orientation: Orientation) -> None:
+    poses = Rotation.random(5, rng=1)
+    forms = {MATRIX: poses.as_matrix().reshape(5, 9), "qx qy qz qw": poses.as_quat(), "rx ry rz": poses.as_rotvec()}
+    free = columns("fx fy fz tx ty tz", np.ones((5, 6)))
+    read = [Table(free | columns(*form)).dataset(orientation).R_base_flange for form in forms.items()]
+    expected = poses if orientation == "R_base_flange" else poses.inv()
+    np.testing.assert_allclose(read, [expected.as_matrix()] * 3, atol=1e-12)
+
+
+def test_the_first_complete_orientation_counts(tmp_path: Path) -> None:
+    names = "r11,rx,ry,rz,qx,qy,qz,qw,fx,fy,fz,tx,ty,tz"
+    data = csv(tmp_path, names, "7,0,0,0,0,0,1,0,1,2,3,4,5,6").dataset()
+    np.testing.assert_allclose(data.R_base_flange[0], np.diag([-1, -1, 1]))
+
+
+def test_standard_errors_become_the_covariance(tmp_path: Path) -> None:
+    sigmas = "sigma_fx,sigma_fy,sigma_fz,sigma_tx,sigma_ty,sigma_tz"
+    data = csv(tmp_path, f"{sigmas},{ROW},t", f".1,.2,.3,.01,.02,.03,{IDENTITY},1,2,3,4,5,6,7").dataset()
+    assert data.wrench_cov is not None
+    np.testing.assert_allclose(data.wrench_cov[0], np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]) ** 2)
+    np.testing.assert_array_equal(data.wrench, [[1, 2, 3, 4, 5, 6]])
+    with pytest.raises(BadDataset, match="lacks sigma_tz"):
+        csv(tmp_path, f"{sigmas[:-9]},{ROW}", f".1,.2,.3,.01,.02,{IDENTITY},1,2,3,4,5,6").dataset()
+
+
+@pytest.mark.parametrize(("R", "words"), [("2,0,0,0,1,0,0,0,1", "row 2"), ("1,0,0,0,1,0,0,0,-1", "reflection")])
+def test_a_matrix_that_is_no_rotation_is_named(R: str, words: str, tmp_path: Path) -> None:
+    with pytest.raises(BadDataset, match=rf"^poses\.csv: row 2: .*{words.removeprefix('row 2')}"):
+        csv(tmp_path, ROW, f"{IDENTITY},1,2,3,4,5,6", f"{R},1,2,3,4,5,6").dataset()
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_imu_on_the_tool_serves_as_orientation(sign: int) -> None:
+    up = POSES.R.inv().apply([0.0, 0.0, 1.0])
+    names = "imu/linear_acceleration/x imu/linear_acceleration/y imu/linear_acceleration/z" if sign == 1 else "gx gy gz"
+    table = Table(wrench(POSES) | columns(names, sign * 9.81 * up))
+    assert table.gravity_is_measured
+    found = solve(table.dataset(), known=Known(gravity_direction_base=(0, 0, -1)))
+    expected = solve(Table(wrench(POSES) | quaternion(POSES)).dataset())
+    assert found.verdict == "good"
+    assert found.mass_kg == pytest.approx(expected.mass_kg, rel=1e-3)
+    np.testing.assert_allclose(found.p_sensor_com_m, expected.p_sensor_com_m, atol=2e-4)
+    np.testing.assert_allclose(found.parameters.R_flange_sensor, expected.parameters.R_flange_sensor, atol=2e-3)
+
+
+def test_joint_angles_with_a_model_are_poses() -> None:
+    q_rad = np.random.default_rng(1).uniform(-2, 2, (5, 6))
+    forward = _forward("ur5e", None)
+    assert forward is not None
+    table = columns("fx fy fz tx ty tz", np.ones((5, 6))) | columns("q1 q2 q3 q4 q5 q6", np.degrees(4 * q_rad))
+    found = Table(table, TableOptions(forward=forward)).dataset()
+    np.testing.assert_allclose(found.R_base_flange, forward(4 * q_rad)[0], atol=1e-9)
+
+
+MOVING = wrench(RECORDING) | quaternion(RECORDING)
+
+
+@pytest.mark.parametrize(("unit", "size"), [("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)])
+@pytest.mark.parametrize("origin_s", [0.0, 1.7e9])
+def test_a_unit_of_time_is_found_where_it_is_certain(unit: str, size: float, origin_s: float) -> None:
+    table = Table(t(RECORDING, "t", size, origin_s) | MOVING)
+    assert table.words == ("" if unit == "s" else f"time in {unit}")
+    assert table.rate_Hz("wrench") == pytest.approx(500, rel=1e-5)
+
+
+def test_a_named_unit_beats_the_numbers() -> None:
+    named = Table({"t [us]": 1e3 * RECORDING.t_s} | MOVING)  # 500 kHz, as nobody samples
+    assert named.rate_Hz("wrench") == pytest.approx(5e5)
+    assert Table({"t": 1e3 * RECORDING.t_s} | MOVING).words == "time in ms"
+    given = Table({"t": 1e3 * RECORDING.t_s} | MOVING, TableOptions(columns={"t": "t [us]"}))
+    assert given.rate_Hz("wrench") == pytest.approx(5e5)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        (position(POSES, size=1e-3), "positions in mm"),
+        (position(POSES), ""),
+        ({f"{name} [mm]": values for name, values in position(POSES, size=1e-3).items()}, ""),
+        (columns("x y z", np.full((24, 3), 9.9)), ""),
+    ],
+)
+def test_positions_in_mm_are_found(table: dict[str, Any], words: str) -> None:
+    assert Table(t(POSES) | wrench(POSES) | quaternion(POSES) | table).words == words
+
+
+def test_rows_that_follow_quickly_or_two_streams_are_in_motion() -> None:
+    slow = {"t": 0.5 * np.arange(len(RECORDING.t_s))}
+    assert Table(t(RECORDING) | MOVING).in_motion
+    assert not Table(slow | MOVING).in_motion
+    assert not Table(MOVING).in_motion
+    assert Table(MOVING, TableOptions(rate_Hz=500.0)).in_motion
+    assert not Table(t(POSES) | wrench(POSES) | quaternion(POSES)).in_motion
+
+
+def test_a_signal_in_counts_is_said() -> None:
+    names = {f"{name} [counts]": values for name, values in wrench(POSES).items()}
+    assert Table(names | quaternion(POSES)).words == "wrench in counts"
