@@ -81,12 +81,19 @@ def compensate(
     frame = read_frame(axes, about)
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     pair = None if wrench is None or orientation_file is None else (wrench, orientation_file)
+    delay_s = delay if delay is None or delay == "auto" else numbers("--delay", delay, ",", [1])[0]
     options = SolveOptions(pair=pair, topics=(wrench_topic, pose_topic), table=table)
     what = path or wrench or Path()
     with working("Reading") as show:
-        source, found = _open(what, options, loaded, str(calibration), delay, everything=output is not None)
-        numbers, failure = compensate_recording(source, frame, output, estimate_bias=bias == "estimate", show=show)
-    result = {**numbers, "delay_s": found or numbers["delay_s"], "file": None if output is None else str(output)}
+        source, found = _open(what, options, loaded, str(calibration), delay_s, everything=output is not None)
+        found_numbers, failure = compensate_recording(
+            source, frame, output, estimate_bias=bias == "estimate", show=show
+        )
+    result = {
+        **found_numbers,
+        "delay_s": found or found_numbers["delay_s"],
+        "file": None if output is None else str(output),
+    }
     if result["cut"]:
         messages.print(f" {what} is incomplete ({result['cut']}): {result['duration_s']:.1f} s of it are used.")
     if as_json:
@@ -105,7 +112,7 @@ def _open(
     options: "SolveOptions",
     calibration: "CalibrationResult | None",
     name: str,
-    delay: str | None,
+    delay_s: float | str | None,
     *,
     everything: bool,
 ) -> tuple["Source", dict[str, float] | None]:
@@ -119,15 +126,14 @@ def _open(
 
     tables = tables_of(path, options)
     if tables is None:
-        if delay or options.table:
+        if delay_s is not None or options.table is not None:
             raise ConfigError("--delay and --columns describe another program's recording: leave them out")
         return read_with_calibration(path, calibration, name, ROW.names or () if everything else NEEDED), None
     if calibration is None:
         raise ConfigError("the recording has no calibration: give --calibration PATH")
     for words in dict.fromkeys(f"{table.name}: {table.words}" for table in tables if table.words):
         messages.print(f" {words}")
-    delay_s = None if delay in (None, "auto") else numbers("--delay", str(delay), ",", [1])[0]
-    pair = TablePair(*tables, calibration, name, delay_s)
+    pair = TablePair(*tables, calibration, name, delay_s if isinstance(delay_s, float) else None)
     return pair, {"value": pair.delay_s, "sigma": pair.delay_sigma_s}
 
 

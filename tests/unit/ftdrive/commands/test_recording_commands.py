@@ -389,10 +389,10 @@ def test_kill_9_amid_a_write_leaves_all_blocks_before(
     [
         ([], "no recording"),
         (["--wrench", "c.json"], "--orientation-file"),
-        (["a.mcap", "--delay", "auto"], "do not go with RECORDING"),
+        (["a.mcap", "--delay", "auto"], "describe another program"),
         (["a.mcap", "--about", "here"], "--about is 'here'"),
-        (["a.mcap", "--wrench-topic", "/w"], "go with a bag of ROS 2"),
-        (["a.mcap", "--pose-topic", "/p"], "go with a bag of ROS 2"),
+        (["a.mcap", "--wrench-topic", "/w"], "go with a bag of ROS"),
+        (["a.mcap", "--pose-topic", "/p"], "go with a bag of ROS"),
         (
             ["--wrench", "c.json", "--orientation-file", "c.json", "--calibration", "c.json", "--delay", "x"],
             "--delay is",

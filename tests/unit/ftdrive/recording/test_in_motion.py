@@ -88,7 +88,7 @@ def test_files_of_another_program_are_joined_with_an_earlier_result(tmp_path: Pa
     ("arguments", "words"),
     [
         (["--wrench", "w.csv"], "give both"),
-        (["--wrench", "w.csv", "--orientation-file", "w.csv"], r"w.csv: the first row must name t and .*r11"),
+        (["--wrench", "w.csv", "--orientation-file", "w.csv"], r"w.csv: no orientation among the columns t, fx"),
         (["--wrench", "back.csv", "--orientation-file", "back.csv"], r"back.csv: the time goes back"),
         (["--wrench", "w.csv", "--orientation-file", "w.csv", "--method", "srom"], "poses at rest"),
     ],
