@@ -5,7 +5,7 @@ Modules behind them may move; these names stay.
 
 | task | names |
 |---|---|
-| calibrate from data | `read_dataset`, `CalibrationDataset`, `Known`, `Setup`, `solve`, `compare` |
+| calibrate from data | `solve`, `read_dataset`, `TableOptions`, `CalibrationDataset`, `Known`, `Setup`, `compare` |
 | judge a result | `CalibrationResult`, `Finding` |
 | keep and read results | `read_calibration`, `Run`, `read_recording`, `write_recording` |
 | compensate | `CalibrationResult.compensate`, `Compensator`, `predict`, `Parameters` |
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     from ftcalib.known import Known, Setup
     from ftcalib.model import Parameters, predict
     from ftcalib.result import CalibrationResult
-    from ftcalib.solver import solve
-    from ftdrive.library import open_arm, open_sensor, open_stream, plan_tour
+    from ftdrive.library import open_arm, open_sensor, open_stream, plan_tour, solve
     from ftdrive.live.contact import Contact
     from ftdrive.live.samples import Stages, WrenchFrame
     from ftdrive.live.weighing import CannotWeigh, weigh
     from ftdrive.recording.files import read_recording, write_recording
     from ftdrive.runs.run import Run
     from ftdrive.runs.source import read_calibration, read_dataset
+    from ftdrive.tables.table import TableOptions
     from ftdrivers.interfaces import ArmState, DeviceInfo, ForceTorqueSensor, FtSamples, ReadOnlyArm, RobotArm
     from ftdrivers.streaming.sensor import StreamingSensor
 
@@ -66,6 +66,7 @@ __all__ = [
     "Setup",
     "Stages",
     "StreamingSensor",
+    "TableOptions",
     "UsageError",
     "Weight",
     "WrenchFrame",
@@ -93,14 +94,14 @@ _MODULES = {
     "ftcalib.known": ("Known", "Setup"),
     "ftcalib.model": ("Parameters", "predict"),
     "ftcalib.result": ("CalibrationResult",),
-    "ftcalib.solver": ("solve",),
-    "ftdrive.library": ("open_arm", "open_sensor", "open_stream", "plan_tour"),
+    "ftdrive.library": ("open_arm", "open_sensor", "open_stream", "plan_tour", "solve"),
     "ftdrive.live.contact": ("Contact",),
     "ftdrive.live.samples": ("Stages", "WrenchFrame"),
     "ftdrive.live.weighing": ("CannotWeigh", "weigh"),
     "ftdrive.recording.files": ("read_recording", "write_recording"),
     "ftdrive.runs.run": ("Run",),
     "ftdrive.runs.source": ("read_calibration", "read_dataset"),
+    "ftdrive.tables.table": ("TableOptions",),
     "ftdrivers.interfaces": ("ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "ReadOnlyArm", "RobotArm"),
     "ftdrivers.streaming.sensor": ("StreamingSensor",),
 }

@@ -1,11 +1,16 @@
-"""The functions of `import ftdrive` that join several rooms: open devices and streams, plan a tour."""
+"""The functions of `import ftdrive` that join several rooms: solve, open devices and streams, plan a tour."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ftcalib import CalibrationResult
+from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup
+from ftcalib import solve as solve_dataset
+from ftcalib.likelihood.session import Drift
+from ftcalib.model import STANDARD_GRAVITY_M_S2
+from ftcalib.result import Method
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, cell_of, load, settings
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import EMULATED, Station, emulated_cell
@@ -16,8 +21,79 @@ from ftdrive.live.samples import Stages, Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
-from ftdrive.runs.source import read_calibration
+from ftdrive.recording.files import moving_source
+from ftdrive.runs.source import SolveOptions, read_calibration, read_dataset
+from ftdrive.tables.table import TableOptions
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
+
+
+def solve(
+    source: CalibrationDataset | Any,
+    method: Method = "ml",
+    *,
+    table: TableOptions | None = None,
+    drift: Drift = "auto",
+    known: Known | None = None,
+    g_m_s2: float = STANDARD_GRAVITY_M_S2,
+    setup: Setup | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    as_published: bool = False,
+) -> CalibrationResult:
+    """Calibrate from poses at rest, or from a recording in motion.
+
+    Parameters
+    ----------
+    source : CalibrationDataset, str, Path, DataFrame or mapping
+        Poses, or what `read_dataset` takes. A table whose rows follow one another quickly, a bag and a file of
+        `ftdrive record` are recordings in motion.
+    method : Method
+        "ml": maximum likelihood, from 4 poses on; or one of the published methods, for comparison.
+    table : TableOptions, optional
+        What a table does not say.
+    drift, known, g_m_s2, setup, provenance, as_published
+        As for `ftcalib.solver.solve`. A recording in motion takes `known` and the up direction of `setup`.
+
+    Raises
+    ------
+    DataError
+        The source cannot be read.
+    NotObservable
+        The poses do not determine the parameters; the message names what is missing and what to add.
+    ValueError
+        An unknown method, known values that the method cannot use, or `as_published` for another method.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> result = ftdrive.solve("poses.csv")
+    >>> result.verdict, result.n_poses
+    ('good', 24)
+    >>> dataset = ftdrive.read_dataset("poses.csv")
+    >>> result.compensate(dataset.wrench, dataset.R_base_flange).shape
+    (24, 6)
+    """
+    setup = setup or Setup()
+    if not isinstance(source, CalibrationDataset):
+        source = Path(source) if isinstance(source, str) else source
+        moving = moving_source(source, SolveOptions(table=table))
+        if moving is not None:
+            if method != "ml":
+                raise ValueError(f"method {method} is for poses at rest: leave it out for a recording")
+            from ftdrive.recording.in_motion import solve_recording
+
+            return solve_recording(moving, known=known, point_mass=False, up_in_base=setup.up_in_base)
+        source = read_dataset(source, table=table)
+    return solve_dataset(
+        source,
+        method,
+        drift=drift,
+        known=known,
+        g_m_s2=g_m_s2,
+        setup=setup,
+        provenance=provenance,
+        as_published=as_published,
+    )
+
 
 _NOT_CONFIGURED = CellConfig(RobotConfig(""), SensorConfig(""))
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import closing
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -55,8 +55,14 @@ def tables_of(place: Path, options: SolveOptions) -> tuple[Table, Table] | None:
     return table, table
 
 
-def moving_source(place: Path, options: SolveOptions) -> Path | tuple[Table, Table] | None:
-    """Return what `solve_recording` takes, a recording or two tables; None for poses at rest. Raises as `tables_of`."""
+def moving_source(place: Path | Any, options: SolveOptions) -> Path | tuple[Table, Table] | None:
+    """Return what `solve_recording` takes, a recording or two tables; None for poses at rest.
+
+    `place` may be a DataFrame or a mapping. Raises as `tables_of`.
+    """
+    if not isinstance(place, Path):
+        table = Table(place, options.table)
+        return (table, table) if table.in_motion else None
     if options.pair is None and (place.is_dir() or place.suffix == ".json") and not is_bag(place):
         return None
     tables = tables_of(place, options)
