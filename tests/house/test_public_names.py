@@ -28,7 +28,7 @@ RESULTS = ["CalibrationDataset", "CalibrationResult", "Compensator", "Finding", 
 FUNCTIONS = ["compare", "predict", "read_calibration", "read_dataset", "read_recording", "solve", "write_recording"]
 DEVICES = ["ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "ReadOnlyArm", "RobotArm", "StreamingSensor"]
 LIVE = ["CannotWeigh", "Contact", "Stages", "Weight", "WrenchFrame", "weigh"]
-OPENED = ["open_arm", "open_sensor", "open_stream", "plan_tour"]
+OPENED = ["TableOptions", "open_arm", "open_sensor", "open_stream", "plan_tour"]
 EMULATED = {"ForceTorqueSensor", "RobotArm", "Weight", "open_arm", "open_sensor", "open_stream", "weigh"}
 SLOW = EMULATED | {"compare"}  # every method of estimation
 

@@ -277,11 +277,16 @@ class Columns:
             for ways in layout.signals.values()
         )
 
+    def _has(self, word: str) -> bool:
+        if word.startswith("*"):
+            return any(f"_{key}".endswith(f"_{word[1:]}") for key in self._keys)
+        return word in self._keys
+
     def _nearest(self, layout: Layout, signal: str) -> tuple[float, str, Sequence[str], str]:
         nearest: tuple[float, str, Sequence[str], str] = (0.0, layout.program, (), signal)
         for way in layout.signals[signal].split("|"):
-            words = [word.removeprefix("*") for word in _words(way)]
-            missing = [word for word in words if not any(key == word or key.endswith(f"_{word}") for key in self._keys)]
+            words = _words(way)
+            missing = [word.removeprefix("*") for word in words if not self._has(word)]
             nearest = max(
                 nearest, (1 - len(missing) / len(words), layout.program, missing, signal), key=lambda one: one[0]
             )

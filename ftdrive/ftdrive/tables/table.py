@@ -54,7 +54,20 @@ _UPSIDE_DOWN = 1e-9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableOptions:
-    """What a table does not say of itself."""
+    """What a table does not say of itself.
+
+    Raises
+    ------
+    ConfigError
+        An order of angles or a rate that cannot be.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> table = ftdrive.TableOptions(columns={"t": "t [ms]"}, sign=1)
+    >>> ftdrive.read_dataset("poses.csv", table=table).t_s.max() < 1
+    True
+    """
 
     columns: Mapping[str, str] = field(default_factory=dict)
     """Columns of the table by our names, with a unit where theirs have none: ``{"fx": "Force X [kgf]"}``."""
