@@ -65,7 +65,7 @@ class TableOptions:
     --------
     >>> import ftdrive
     >>> table = ftdrive.TableOptions(columns={"t": "t [ms]"}, sign=1)
-    >>> ftdrive.read_dataset("poses.csv", table=table).t_s.max() < 1
+    >>> bool(ftdrive.read_dataset("poses.csv", table=table).t_s.max() < 1)
     True
     """
 
