@@ -16,11 +16,15 @@ def convert(source: Path, target: Path, as_json: bool) -> None:
 
     IN may also be the .partial of a recording that was interrupted; OUT is complete then.
     """
-    from ftdrive.recording.files import RecordingReader, format_of
+    from ftdrive.errors import BadRecording
+    from ftdrive.recording.files import RecordingReader, format_of, is_recording
     from ftdrive.recording.recorder import converted
     from ftdrive.terminal.console import beside, messages, working
 
     format_of(target)
+    if not is_recording(source):
+        line = f"ftdrive compensate {source} --calibration PATH -o {target}"
+        raise BadRecording(f"it is another program's: `{line}` converts tables and bags", source)
     with working("Converting") as show:
         reader = RecordingReader(source)
         found, failure = converted(reader, target, show)

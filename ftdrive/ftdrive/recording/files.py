@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from ftcalib import CalibrationResult
 from ftcalib.files import open_file
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.samples import StreamEvent
@@ -25,18 +26,19 @@ from ftdrive.recording.recording import (
     Recording,
     Rows,
     measured,
+    rows_of,
 )
 from ftdrive.runs.source import SolveOptions
-from ftdrive.tables.table import Table
+from ftdrive.tables.table import Table, TableOptions
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is a recording of `ftdrive record`, by its ending; a CSV by its first line."""
+    """Whether a file is a recording of `ftdrive record`: by its ending, CSV by the first line, MCAP by its writer."""
     ending = Path(path.name.removesuffix(".partial")).suffix
     if ending == ".csv" and path.is_file():
         with open_file(path) as file:
             return file.readline(100).startswith(f"# {FORMAT.partition('/')[0]}/".encode())
-    return ending in ENDINGS and ending != ".csv"
+    return ending in ENDINGS and ending != ".csv" and not is_bag(path)
 
 
 def tables_of(place: Path, options: SolveOptions) -> tuple[Table, Table] | None:
@@ -189,22 +191,33 @@ class RecordingReader:
             raise BadRecording(error.problem, self.path) from error
 
 
-def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
+def read_recording(
+    source: Any,
+    columns: Collection[str] = ROW.names or (),
+    *,
+    calibration: CalibrationResult | None = None,
+    table: TableOptions | None = None,
+) -> Recording:
     """Read a recording into memory, also the `.partial` of one that was interrupted.
 
     Parameters
     ----------
-    path : str or Path
-        Its ending names the format: .mcap, .csv or .parquet.
+    source : str, Path, DataFrame or mapping
+        A file of `ftdrive record`, whose ending names the format: .mcap, .csv or .parquet. Or another program's: a bag,
+        or a table with wrench and orientation, as text, as a DataFrame of pandas or Polars, or as arrays by name.
     columns : collection of str
         Fields of `Recording.rows` that are needed. Others may be missing, which makes reading faster.
+    calibration : CalibrationResult, optional
+        Of another program's recording, which has none; `raw` is the wrench as measured, `wrench` is 0.
+    table : TableOptions, optional
+        What another program's table does not say.
 
     Raises
     ------
     ConfigError
-        Another ending, or the package for the format is missing.
-    BadRecording
-        Damaged, without a sample, or of another program. A file that was cut is read up to there; `cut` says so.
+        Another ending, a missing package, or no calibration for another program's recording.
+    BadRecording, BadDataset
+        Damaged, without a sample, or of no known form. A file that was cut is read up to there; `cut` says so.
     OSError
         The file does not exist or cannot be read.
 
@@ -216,11 +229,27 @@ def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ())
     >>> table["fz"].shape, table["raw_fz"].shape
     ((3000,), (3000,))
     """
+    source = Path(source) if isinstance(source, str) else source
+    if not isinstance(source, Path) or not (is_recording(source) or (calibration is None and table is None)):
+        return _of_tables(source, calibration, table)
     # A damaged file raises, because a caller in Python would not see a message.
-    reader = RecordingReader(Path(path), columns)
+    reader = RecordingReader(source, columns)
     pieces = list(reader.pieces())
     events = [event for piece in pieces for event in piece.events]
     return Recording(reader.header, np.concatenate([piece.rows for piece in pieces]), events, reader.cut)
+
+
+def _of_tables(source: Any, calibration: CalibrationResult | None, table: TableOptions | None) -> Recording:
+    """Read another program's recording. Raises `ConfigError` without a calibration, or `BadDataset`."""
+    if calibration is None:
+        raise ConfigError("the recording is another program's and has no calibration: give one as calibration=")
+    from ftdrive.recording.table_pair import TablePair  # with the filters of a stream
+
+    tables = tables_of(source, SolveOptions(table=table)) if isinstance(source, Path) else (Table(source, table),) * 2
+    if tables is None:
+        raise ConfigError(f"{source} is a recording of ftdrive: leave out table=")
+    pair = TablePair(*tables, calibration, "", None)
+    return Recording(pair.header, np.concatenate([rows_of(block.samples) for block in pair.blocks()]), [])
 
 
 def write_recording(path: str | Path, recording: Recording) -> None:

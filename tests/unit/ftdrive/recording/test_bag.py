@@ -38,6 +38,14 @@ def vector(values: Any, kind: str = "Vector3") -> Any:
     return message(f"geometry_msgs/msg/{kind}", **dict(zip("xyzw", map(float, values), strict=False)))
 
 
+def wrench_of(numbers: Any) -> Any:
+    return message("geometry_msgs/msg/Wrench", force=vector(numbers[:3]), torque=vector(numbers[3:]))
+
+
+def pose_of(p: Any, q: Any) -> Any:
+    return message("geometry_msgs/msg/Pose", position=vector(p, "Point"), orientation=vector(q, "Quaternion"))
+
+
 def transform(t_s: float, parent: str, child: str, p: Any, q: Any) -> Any:
     pose = message("geometry_msgs/msg/Transform", translation=vector(p), rotation=vector(q, "Quaternion"))
     return message(
@@ -91,13 +99,10 @@ def bag(
     half = [0.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]
 
     def ft(row: int, t_s: float) -> Any:
-        parts = message("geometry_msgs/msg/Wrench", force=vector(measured[row, :3]), torque=vector(measured[row, 3:]))
-        return message(TOPICS["/ft"], header=header(t_s, "ft"), wrench=parts)
+        return message(TOPICS["/ft"], header=header(t_s, "ft"), wrench=wrench_of(measured[row]))
 
     def pose(row: int, t_s: float) -> Any:
-        orientation = vector(quat[row], "Quaternion")
-        at = message("geometry_msgs/msg/Pose", position=vector(p[row], "Point"), orientation=orientation)
-        return message(TOPICS["/pose"], header=header(t_s), pose=at)
+        return message(TOPICS["/pose"], header=header(t_s), pose=pose_of(p[row], quat[row]))
 
     def moving(row: int, t_s: float) -> Any:
         above = p[row] - Rotation.from_quat(quat[row]).apply(half[0])
@@ -284,3 +289,39 @@ def test_a_recording_of_ours_is_no_bag(tmp_path: Path) -> None:
     recorder.close()
     assert not is_bag(tmp_path / "a.mcap")
     assert not is_bag(tmp_path)
+
+
+def test_a_file_of_ros_1_and_a_bag_without_stamps_are_read(tmp_path: Path) -> None:
+    from rosbags.rosbag1 import Writer as Writer1
+
+    store: Any = get_typestore(Stores.ROS1_NOETIC)
+    t_wrench, t_pose, measured, _, quat, p = data()
+    path = tmp_path / "one.bag"
+    with Writer1(path) as writer:
+        for topic, times, make in (
+            ("/ft", t_wrench, lambda row: wrench_of(measured[row])),
+            ("/pose", t_pose, lambda row: pose_of(p[row], quat[row])),
+        ):
+            kind = TOPICS[topic]
+            connection = writer.add_connection(topic, kind, typestore=store)
+            for row, t_s in enumerate(times):
+                stamp_ns = 0 if topic == "/ft" else T0_NS + round(1e9 * t_s)
+                stamp = message("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
+                head = store.types["std_msgs/msg/Header"](seq=row, stamp=stamp, frame_id="tool")
+                content = store.serialize_ros1(store.types[kind](head, make(row)), kind)  # type: ignore[no-untyped-call]
+                writer.write(connection, T0_NS + round(1e9 * t_s), content)
+    assert is_bag(path)
+    wrenches, poses = read_bag(path, None, None)
+    (read,), (turned,) = wrenches.wrenches(), poses.poses()
+    assert np.array_equal(read.values, measured)
+    assert np.allclose(read.t_s, t_wrench, atol=1e-6)  # of receipt
+    assert np.allclose(turned.t_s, t_pose, atol=1e-6)
+    assert np.allclose(turned.values[:, 9:], p)
+
+
+@pytest.mark.slow
+def test_the_file_of_a_folder_is_a_bag_by_itself(tmp_path: Path) -> None:
+    (path,) = bag(tmp_path / "bag", rows=100).glob("*.db3")
+    assert is_bag(path)
+    (read,) = read_bag(path, None, None)[0].wrenches()
+    assert np.array_equal(read.values, data()[2][:100])
