@@ -79,7 +79,7 @@ _EPILOG = "\b\nMETHOD is one of\n" + fill(
     type=click.Choice(["R_base_flange", "R_flange_base"]),
     default="R_base_flange",
     show_default=True,
-    help="Rotation in a CSV, also that of --test: flange to base coordinates, or the inverse (as in the papers).",
+    help="Rotation in a table, also that of --test: flange to base coordinates, or the inverse (as in the papers).",
 )
 @click.option("--as-published", is_flag=True, help="Carlson's methods as they are printed, without biases.")
 @click.option(

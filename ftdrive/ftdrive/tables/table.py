@@ -309,7 +309,10 @@ class Table:
         if (found := self._found[signal]) is not None:
             return found
         with self._named():
-            raise BadDataset(self._columns.missing(signal, *(("wrench",) if signal == "wrench" else _NEAREST)))
+            words = self._columns.missing(signal, *(("wrench",) if signal == "wrench" else _NEAREST))
+            # A recording in motion is often a file for each device.
+            alone = signal == "orientation" and self.has("wrench") and self._found["time"] is not None
+            raise BadDataset(f"{words}, or give poses of their own: --wrench, --orientation-file" if alone else words)
 
     @contextmanager
     def _named(self) -> Iterator[None]:
