@@ -1,0 +1,124 @@
+"""The options that say what a table does not: their effect on `solve`, and one sentence for what cannot be."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ftdrive import cli
+from ftdrive.commands.tables import _forward
+from tests.ros2.seven_joints import URDF
+from tests.unit.ftdrive.tables.test_layouts import POSES, columns, quaternion, t, text, wrench
+
+Solved = Callable[..., tuple[int, str, str]]
+PLAIN = t(POSES) | wrench(POSES) | quaternion(POSES)
+TCP = "0.02,-0.01,0.15,0.1,0.2,0.3"
+
+
+@pytest.fixture
+def solved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Solved:
+    """Solve a table in an empty folder; return exit code, stdout and stderr."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(table: dict[str, np.ndarray], *options: str) -> tuple[int, str, str]:
+        Path("poses.csv").write_text(text(table))
+        code = cli.run(["solve", "poses.csv", "--json", *options])
+        out, err = capsys.readouterr()
+        return code, out, " ".join(err.split())
+
+    return call
+
+
+def parameters(outcome: tuple[int, str, str]) -> np.ndarray:
+    assert outcome[0] == 0, outcome[2]
+    found = json.loads(outcome[1])
+    names = ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
+    return np.concatenate([np.ravel(found[name]) for name in names])
+
+
+def near(one: np.ndarray, other: np.ndarray) -> None:
+    np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_columns_may_be_named_on_the_line_and_in_a_file(solved: Solved) -> None:
+    renamed = {f"c {i}": values for i, values in enumerate(PLAIN.values())}
+    names = {name: f"c {i}" for i, name in enumerate(PLAIN)}
+    expected = parameters(solved(PLAIN))
+    near(
+        parameters(solved(renamed, "--columns", ",".join(f"{ours}={theirs}" for ours, theirs in names.items()))),
+        expected,
+    )
+    lines = [f'{ours} = "{theirs}"' for ours, theirs in names.items()]
+    Path("columns.toml").write_text("\n".join(["[columns]", *lines]))
+    near(parameters(solved(renamed, "--columns", "columns.toml")), expected)
+
+
+def test_what_was_recognised_is_printed_and_kept(solved: Solved) -> None:
+    code, out, err = solved(
+        t(POSES, "time_ms", 1e-3) | wrench(POSES) | columns("A B C", POSES.R.as_euler("ZYX", degrees=True))
+    )
+    assert code == 0
+    assert err == "poses.csv: columns of KUKA; angles in degrees"
+    assert json.loads(out)["provenance"]["table"] == "columns of KUKA; angles in degrees"
+    assert "table" not in json.loads(solved(PLAIN)[1])["provenance"]
+
+
+def test_the_sign_reverses_what_is_read(solved: Solved) -> None:
+    reaction = PLAIN | {name: -values for name, values in wrench(POSES).items()}
+    near(parameters(solved(reaction, "--sign", "-1")), parameters(solved(PLAIN)))
+
+
+def test_poses_of_a_tcp_are_led_back_to_the_flange(solved: Solved) -> None:
+    names = "x y z rx ry rz"
+    R = POSES.R * type(POSES.R).from_rotvec([0.1, 0.2, 0.3])
+    poses = columns(names, np.hstack([POSES.p_m + POSES.R.apply([0.02, -0.01, 0.15]), R.as_rotvec()]))
+    near(parameters(solved(t(POSES) | wrench(POSES) | poses, "--tcp", TCP)), parameters(solved(PLAIN)))
+
+
+def test_a_urdf_makes_poses_of_joint_angles(tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF)
+    forward = _forward(None, f"{path}?base=link1")
+    assert forward is not None
+    R, p_m = forward(np.zeros((2, 6)))
+    np.testing.assert_allclose(p_m[:, 2], 1.3)
+    np.testing.assert_allclose(R[0], np.diag([1, -1, -1]), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--columns", "fx"], "--columns fx: give NAME=COLUMN with commas between"),
+        (["--columns", "none.toml"], "none.toml"),
+        (["--columns", "empty.toml"], "empty.toml names no columns"),
+        (["--columns", "fx=Force"], "the columns are t, fx, fy"),
+        (["--tcp", "1,2"], "--tcp is '1,2': give 3 or 6 numbers"),
+        (["--euler", "xy"], "--euler xy: give rpy, ABC"),
+        (["--rate", "0"], "--rate"),
+        (["--sign", "2"], "--sign"),
+        (["--model", "UR99"], "--model UR99: the models are UR3"),
+        (["--model", "ur5e", "--urdf", "a.urdf"], "--model and --urdf both describe the arm"),
+        (["--urdf", "none.urdf"], "--urdf none.urdf: none.urdf is not a URDF"),
+        (["--urdf", "arm.urdf?flange=tip"], "has no link 'tip'"),
+        (["--urdf", "arm.urdf"], "7 joints move, 6 are read"),
+        (["--wrench-topic", "/ft"], "go with a bag of ROS"),
+    ],
+)
+def test_an_option_that_cannot_be_used_is_one_sentence(options: list[str], words: str, solved: Solved) -> None:
+    Path("empty.toml").write_text("[other]\n")
+    Path("arm.urdf").write_text(URDF)
+    code, out, err = solved(PLAIN, *options)
+    assert code in (2, 6)
+    assert out == ""
+    assert words in err
+    assert err.count("error:") + err.count("Error:") == 1
+
+
+def test_options_of_a_table_do_not_go_with_other_data(solved: Solved) -> None:
+    near(parameters(solved(PLAIN)), parameters(solved(PLAIN, "--rate", "1")))  # poses have their times in any case
+    from ftdrive import read_dataset
+
+    read_dataset("poses.csv").save("dataset.json")
+    assert cli.run(["solve", "dataset.json", "--sign", "-1"]) == 2
