@@ -4,6 +4,7 @@ import csv
 import gzip
 import io
 import re
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -69,7 +70,7 @@ class TextTable:
                 file = io.BytesIO(raw.read().decode("utf-16", "replace").encode())
             try:
                 yield file, raw
-            except (gzip.BadGzipFile, EOFError) as error:
+            except (gzip.BadGzipFile, EOFError, zlib.error) as error:
                 raise BadDataset("the compressed file is damaged or cut: unpack what is left") from error
 
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:

@@ -198,6 +198,11 @@ BROKEN: dict[str, tuple[str | bytes, str, TableOptions]] = {
     "blank lines": ("\n\n \n", r"the file is empty", named()),
     "prose": ("this is a text\nwithout numbers, as it seems\n", r"no row has two numbers or more", named()),
     "binary": (bytes(range(256)) * 9, r"it is no text table", named()),
+    "damaged gzip": (
+        gzip.compress(text(PLAIN).encode())[:300] + b"\0" * 300,
+        r"compressed file is damaged or cut",
+        named(),
+    ),
     "half a gzip": (gzip.compress(text(PLAIN).encode())[:-200], r"compressed file is damaged or cut", named()),
     "JSON": ('{"a": [1, 2, 3]}', r"no row has two numbers or more", named()),
     # units
