@@ -112,13 +112,14 @@ class Source(Protocol):
 
 
 class Frame:
-    """A DataFrame of pandas or Polars, or a mapping of names to arrays."""
+    """A DataFrame of pandas or Polars, a table of pyarrow, or a mapping of names to arrays."""
 
     words = ""
 
     def __init__(self, frame: Any) -> None:
         self._frame = frame
-        self.names: Sequence[str] = list(map(str, frame.keys() if isinstance(frame, Mapping) else frame.columns))
+        columns = frame.keys() if isinstance(frame, Mapping) else getattr(frame, "column_names", None) or frame.columns
+        self.names: Sequence[str] = list(map(str, columns))
         self.units: Sequence[str] = [""] * len(self.names)
 
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:

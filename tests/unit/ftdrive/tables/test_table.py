@@ -96,6 +96,18 @@ def test_an_imu_on_the_tool_serves_as_orientation(sign: int) -> None:
     np.testing.assert_allclose(found.parameters.R_flange_sensor, expected.parameters.R_flange_sensor, atol=2e-3)
 
 
+def test_a_table_in_memory_is_read_by_its_names() -> None:
+    import pyarrow
+
+    plain = t(POSES) | wrench(POSES) | quaternion(POSES)
+    expected = Table(plain).dataset().sha256()
+    assert Table(pyarrow.table(plain), name="dict").dataset().sha256() == expected
+    with pytest.raises(BadDataset, match=r"^dict: .*give a number in each cell"):
+        Table({**plain, "fx": np.array(["a"] * 24)}).dataset()
+    with pytest.raises(BadDataset, match=r"^dict: .*give a number in each cell"):
+        Table({**plain, "fx": np.zeros(7)}).dataset()
+
+
 def test_joint_angles_with_a_model_are_poses() -> None:
     q_rad = np.random.default_rng(1).uniform(-2, 2, (5, 6))
     forward = _forward("ur5e", None)
