@@ -10,9 +10,12 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import pyarrow.csv
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -20,6 +23,7 @@ from ftcalib import CalibrationDataset, Parameters, solve
 from ftcalib.compensation import Compensator
 from ftcalib.likelihood import fit as likelihood
 from ftcalib.model import Array
+from ftdrive.tables.table import Table
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.common import Row, best_seconds, restart_with_one_thread, show_rows
 
@@ -139,6 +143,29 @@ def compensated_samples(repeats: int, dtype: type[np.float64 | np.float32]) -> I
         yield Row(f"  {name}", f"{speed:.0f} M/s", ">= 70 M/s", speed >= 70, repeats)
 
 
+def text_table(repeats: int) -> Iterator[Row]:
+    """Read a wrench of half a million rows, beside pyarrow on the whole file and `numpy.loadtxt` on a tenth of it."""
+    rows = np.round(np.random.default_rng(2).normal(size=(500_000, 7)), 6)
+    rows[:, 0] = np.arange(len(rows)) / 7000
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "wrench.csv")
+        np.savetxt(path, rows, "%.6f", ",", header="t,fx,fy,fz,tx,ty,tz", comments="")
+
+        def table() -> int:
+            return sum(len(part.t_s) for part in Table(path).wrenches())
+
+        def whole() -> object:
+            return pyarrow.csv.read_csv(path, pyarrow.csv.ReadOptions(use_threads=False))
+
+        def by_numpy() -> object:
+            return np.loadtxt(path, delimiter=",", skiprows=1, max_rows=50_000)
+
+        ours, peer, plain = best_seconds(repeats, table, whole, by_numpy)
+    yield Row("text table, rows a second", f"{len(rows) / ours:.2g}", ">= 4e5", len(rows) / ours >= 4e5, repeats)
+    yield Row("  over pyarrow of the whole file", f"{ours / peer:.1f}", "<= 3", ours / peer <= 3, repeats)
+    yield Row("  of numpy.loadtxt", f"{ours / (10 * plain):.2f}", "<= .5", ours / (10 * plain) <= 0.5, repeats)
+
+
 def measure(*, quick: bool = False) -> Iterator[Row]:
     """Measure everything."""
     yield from few_poses(5 if quick else 30)
@@ -147,6 +174,7 @@ def measure(*, quick: bool = False) -> Iterator[Row]:
     yield from compensated_sample(40)
     yield from compensated_samples(40, np.float64)
     yield from compensated_samples(40, np.float32)
+    yield from text_table(3 if quick else 10)
 
 
 def main() -> int:
