@@ -27,6 +27,7 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.solve import known_values, up_direction
 from ftdrive.commands.solve import solve as solve_command
+from ftdrive.commands.tables import TABLE, TABLE_NAMES
 from ftdrive.errors import ConfigError
 from ftdrive.report.facts import facts_of
 from ftdrive.report.report import Format
@@ -35,6 +36,7 @@ from ftdrive.report.subject import read_subject, trust
 from ftdrive.runs.bundle import unpack
 from ftdrive.runs.run import unused_path
 from ftdrive.runs.source import SolveOptions
+from ftdrive.tables.table import TableOptions
 from ftdrive.terminal.console import beside, hanging, messages, working
 from ftdrive.terminal.text import echo
 
@@ -72,6 +74,7 @@ DEFAULT = Path("report.html")
     type=click.Path(exists=True, path_type=Path),
     help="Compare with this calibration.json or run folder. Default: the parent that the result names.",
 )
+@TABLE
 @simulate("Report a short run of an emulated cell.")
 @EMULATED_SENSOR
 @JSON
@@ -87,11 +90,12 @@ def report(
     level_deg: float | None,
     mounting_deg: str | None,
     up: str | None,
+    table: TableOptions | None,
     simulate: bool,
     sensor: str | None,
     as_json: bool,
 ) -> None:
-    """Report SOURCE: a calibration.json, a run folder, a dataset.json or a CSV file, as `ftdrive solve` takes them.
+    """Report SOURCE: a calibration.json, a run folder, a dataset.json or a table, as `ftdrive solve` takes them.
 
     The report has verdict, findings, next step, uncertainty, cross-validation, residuals, drift, noise, coverage,
     settings and provenance. An unsolved source is solved with the options of `ftdrive solve`. Rejected results are
@@ -99,7 +103,7 @@ def report(
     """
     check_simulate(simulate, real={"SOURCE": source}, emulated={"--sensor": sensor})
     if source is None and not simulate:
-        raise ConfigError("nothing to report: give a calibration.json, a run folder or a CSV file, or --simulate")
+        raise ConfigError("nothing to report: give a calibration.json, a run folder or a table, or --simulate")
     chosen = output
     if output is None and form == "html":
         output = unused_path(DEFAULT)
@@ -110,7 +114,7 @@ def report(
     if form == "html":
         require_extra("report", "a report in HTML (not --format md)", "jinja2", "matplotlib")
     given = known_values(mass_kg, level_deg, mounting_deg), up_direction(up)
-    options = SolveOptions(method, orientation, drift, *given, words=_typed(click.get_current_context()))
+    options = SolveOptions(method, orientation, drift, *given, table=table, words=_typed(click.get_current_context()))
     gc.freeze()  # or the imports are searched for garbage again and again, as in `fleet status`
     with unpack(source) if source is not None else rehearsed_run(sensor) as found:
         with working("Solving"):
@@ -147,6 +151,7 @@ def _typed(context: click.Context) -> tuple[str, ...]:
     return tuple(
         word
         for one in context.command.params
-        if one.name in ("method", *_SHARED) and context.get_parameter_source(one.name) is not ParameterSource.DEFAULT
+        if one.name in ("method", *_SHARED, *TABLE_NAMES)
+        and context.get_parameter_source(one.name) is not ParameterSource.DEFAULT
         for word in (one.opts[0], shlex.quote(str(context.params[one.name])))
     )

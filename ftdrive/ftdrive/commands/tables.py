@@ -13,6 +13,7 @@ from ftdrive.commands.common import Number, numbers
 if TYPE_CHECKING:
     from ftdrivers.interfaces import Array
 
+TABLE_NAMES = ("columns", "rate", "euler", "tcp", "wrench_frame", "sign", "model", "urdf")
 _LINKS = ("tool0", "flange")
 
 
