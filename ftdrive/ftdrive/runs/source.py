@@ -127,8 +127,8 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         found = RecordedData(CalibrationDataset.load(source), {"source": source.name, "versions": versions()})
     else:
         table = Table(source, options.table)
-        recognised = {"table": table.words} if table.words else {}
         dataset = table.dataset(options.orientation)
+        recognised = {"table": table.words} if table.words else {}
         found = RecordedData(dataset, {"source": source.name, **recognised, "versions": versions()})
         if table.gravity_is_measured:  # its direction is that of the base by definition
             known = replace(known or Known(), gravity_direction_base=-UP_IN_BASE)

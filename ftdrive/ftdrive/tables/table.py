@@ -18,7 +18,7 @@ from ftcalib.files import JSON
 from ftcalib.model import Array
 from ftdrive.errors import ConfigError
 from ftdrive.tables.columns import COUNTS, UNITS, Columns, Signal, factor
-from ftdrive.tables.text import TextTable
+from ftdrive.tables.text import TextTable, seconds_of
 
 WrenchAxes = Literal["sensor", "flange", "tcp", "base"]
 # Sequences of scipy: capitals turn about axes of the tool, small letters about those of the base.
@@ -125,7 +125,9 @@ class Frame:
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
         """Give all rows. Raises `BadDataset`."""
         try:
-            yield np.column_stack([np.asarray(self._frame[self.names[i]], np.float64) for i in use]), 1.0
+            columns = [np.asarray(self._frame[self.names[i]]) for i in use]
+            numbers = [seconds_of(one) if one.dtype.kind == "M" else one.astype(np.float64) for one in columns]
+            yield np.column_stack(numbers), 1.0
         except (TypeError, ValueError) as error:
             raise BadDataset(f"{error}: give a number in each cell") from error
 
@@ -163,6 +165,7 @@ class Table:
         self.name = name or (source.name if isinstance(source, Path) else type(source).__name__)
         self.options = options or TableOptions()
         self._guesses: list[str] = []
+        self._count = 0
         self._found: dict[str, Signal | None] = {}
         with self._named():
             self.source: Source = TextTable(source) if isinstance(source, Path) else Frame(source)
@@ -268,6 +271,10 @@ class Table:
             self._require("wrench"),
             *([one] if (one := self._found["sigma"]) else []),
         ]
+        if len(signals) > 2 and self._axes in ("tcp", "base"):
+            raise BadDataset(
+                f"{self.name}: standard errors are those of the sensor's axes: leave them out, or rotate them"
+            )
         times, parts, _ = zip(*self._rows(signals), strict=True)
         t_s = np.concatenate(times)
         pose, wrench, *sigma = (np.concatenate(each) for each in zip(*parts, strict=True))
@@ -275,6 +282,8 @@ class Table:
             raise BadDataset(
                 f"{self.name}: no row has an orientation and a wrench: give one row a pose, or a recording"
             )
+        if missing := self._count - len(wrench):
+            self._guesses.append(f"{missing} of {self._count} rows left out, which lack the wrench or the orientation")
         if sigma and (sigma[0] <= 0).any():
             row = int(np.argmax((sigma[0] <= 0).any(axis=1)))
             raise BadDataset(
@@ -391,7 +400,7 @@ class Table:
                     raise BadDataset(_wrong_row(count + int(np.argmax(untimed)), "the time is missing"))
             else:
                 t_s = np.arange(count, count + len(block)) / (self.options.rate_Hz or np.nan)
-            count += len(block)
+            self._count = count = count + len(block)
             yield t_s[complete], [numbers[complete] for numbers in values[: len(signals)]], place
 
     @property

@@ -7,10 +7,12 @@ import re
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ftcalib.errors import BadDataset
 from ftcalib.files import open_file
@@ -25,6 +27,7 @@ _NUMBER: Final = {
 }
 # Rows at the end of the first lines decide on separator and decimal sign.
 _DECIDE = 30
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?\s*(Z|[+-]\d\d:?\d\d)?")
 _UNIT = re.compile(r"[\[(]?\s*[-%°a-zA-Zµμ·*./^²0-9 ]{0,8}\s*[\])]?")
 
 
@@ -37,6 +40,8 @@ class TextFormat(NamedTuple):
     """One a column, as in the file; "1", "2", … without a header."""
     units: Sequence[str]
     """Of a second row of the header; empty cells without one."""
+    dates: Sequence[int]
+    """Columns with dates as in ISO 8601, such as 2026-11-28 12:00:00.25."""
     first_line: int
     """Number of the first row of numbers, from 1."""
     words: str
@@ -76,7 +81,7 @@ class TextTable:
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
         """Give some columns (n, k) of consecutive rows, and the share of the file before the next ones.
 
-        A blank cell is NaN. Raises `BadDataset` behind the last valid block.
+        A blank cell is NaN, a date the seconds since 1970. Raises `BadDataset` behind the last valid block.
         """
         size = self.path.stat().st_size
         with self._open() as (file, raw):
@@ -104,7 +109,9 @@ class TextTable:
                 arrow.ReadOptions(column_names=names, block_size=len(text) + 1, use_threads=False),
                 arrow.ParseOptions(delimiter=separator),
                 arrow.ConvertOptions(
-                    column_types=dict.fromkeys(wanted, pa.float64()),
+                    column_types={
+                        names[i]: pa.timestamp("ns") if i in self.format.dates else pa.float64() for i in use
+                    },
                     include_columns=wanted,
                     null_values=[""],
                     decimal_point=self.format.decimal,
@@ -112,7 +119,8 @@ class TextTable:
             )
         except pa.ArrowInvalid:
             return self._slowly_parsed(text, separator, use, line)
-        return np.column_stack([column.to_numpy() for column in table.columns])
+        columns = [column.to_numpy() for column in table.columns]
+        return np.column_stack([seconds_of(column) if column.dtype.kind == "M" else column for column in columns])
 
     def _slowly_parsed(self, text: bytes, separator: str, use: Sequence[int], first: int) -> Array:
         """Parse what pyarrow refuses, such as a comment or `+1`. Raises `BadDataset` with the line."""
@@ -134,10 +142,19 @@ class TextTable:
             return np.nan
         if _NUMBER[self.format.decimal].fullmatch(cell):
             return float(cell.replace(",", "."))
+        if _DATE.fullmatch(cell):
+            date = datetime.fromisoformat(cell.replace(",", "."))
+            return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
         other = ",."[self.format.decimal == ","]
         point = {",": "comma", ".": "point"}[other]
         why = f"has a decimal {point}, unlike others" if _NUMBER[other].fullmatch(cell) else "is no number"
         raise BadDataset(f"line {line}: {name} is '{cell[:40]}', which {why}: correct or delete this line")
+
+
+def seconds_of(dates: NDArray[Any]) -> Array:
+    """Return the seconds since 1970 of dates (n,)."""
+    known = dates.astype("datetime64[ns]")
+    return np.where(np.isnat(known), np.nan, known.astype(np.int64) * 1e-9)
 
 
 def _format_of(head: str, more: bool) -> TextFormat:
@@ -152,9 +169,9 @@ def _format_of(head: str, more: bool) -> TextFormat:
     rows = [_split(line, separator) for line in lines]
     first = next(i for i, row in enumerate(rows) if _is_data(lines[i], row, decimal, numeric))
     above = [i for i in range(first) if lines[i].strip()]
-    # Programs write their settings above the names, one a line.
     # A separator at the end of each line makes one more column.
     ended = all(not row[-1] for row in rows[first:] if len(row) == count)
+    # Programs write their settings above the names, one a line.
     header = [(i, cells) for i in above if (cells := _header(lines[i], separator, count, ended))]
     units: Sequence[str] = ()
     if len(header) > 1 and header[-1][0] == above[-1] and all(_UNIT.fullmatch(cell) for cell in header[-1][1]):
@@ -165,7 +182,8 @@ def _format_of(head: str, more: bool) -> TextFormat:
     words += ["no header"] if not header else []
     words += [f"names in line {header[-1][0] + 1}"] if header and header[-1][0] else []
     words += ["units below the names"] if units else []
-    return TextFormat(separator, decimal, names, units or [""] * count, first + 1, ", ".join(words))
+    dates = [i for i, cell in enumerate(rows[first]) if _DATE.fullmatch(cell)]
+    return TextFormat(separator, decimal, names, units or [""] * count, dates, first + 1, ", ".join(words))
 
 
 def _decided(lines: Sequence[str]) -> tuple[str, str, int, int]:
@@ -195,7 +213,7 @@ def _split(line: str, separator: str) -> list[str]:
 
 
 def _numbers(row: Sequence[str], decimal: str) -> int:
-    return sum(bool(_NUMBER[decimal].fullmatch(cell)) for cell in row)
+    return sum(bool(_NUMBER[decimal].fullmatch(cell) or _DATE.fullmatch(cell)) for cell in row)
 
 
 def _is_data(line: str, row: Sequence[str], decimal: str, numeric: int) -> bool:

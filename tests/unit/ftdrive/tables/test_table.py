@@ -108,6 +108,33 @@ def test_a_table_in_memory_is_read_by_its_names() -> None:
         Table({**plain, "fx": np.zeros(7)}).dataset()
 
 
+@pytest.mark.parametrize("zone", ["", "Z", "+01:00"])
+@pytest.mark.parametrize("between", ["T", " "])
+def test_dates_are_times(zone: str, between: str, tmp_path: Path) -> None:
+    lines = [f"2026-11-28{between}12:00:{k / 4:06.3f}{zone},1,2,3,4,5,6,0,0,0,1" for k in range(5)]
+    data = csv(tmp_path, "timestamp,fx,fy,fz,tx,ty,tz,qx,qy,qz,qw", *lines).dataset()
+    np.testing.assert_allclose(data.t_s, np.arange(5) / 4, atol=1e-6)
+    start = np.datetime64("2026-11-28T12:00:00")
+    dates = start + np.arange(24) * np.timedelta64(250, "ms")
+    table = Table({"time": dates} | wrench(POSES) | quaternion(POSES))
+    np.testing.assert_allclose(table.dataset().t_s, np.arange(24) / 4, atol=1e-6)
+
+
+def test_rows_without_a_wrench_are_left_out_and_counted() -> None:
+    gaps = {name: np.where(np.arange(24) < 2, np.nan, values) for name, values in wrench(POSES).items()}
+    table = Table(t(POSES) | gaps | quaternion(POSES))
+    assert len(table.dataset()) == 22
+    assert table.words == "2 of 24 rows left out, which lack the wrench or the orientation"
+
+
+def test_standard_errors_are_those_of_the_axes_of_the_sensor() -> None:
+    sigma = columns("sigma_fx sigma_fy sigma_fz sigma_tx sigma_ty sigma_tz", np.full((24, 6), 0.1))
+    plain = wrench(POSES) | quaternion(POSES) | sigma
+    assert Table(plain).dataset().wrench_cov is not None
+    with pytest.raises(BadDataset, match="standard errors are those of the sensor's axes"):
+        Table(plain, TableOptions(wrench_axes="tcp")).dataset()
+
+
 def test_joint_angles_with_a_model_are_poses() -> None:
     q_rad = np.random.default_rng(1).uniform(-2, 2, (5, 6))
     forward = _forward("ur5e", None)
