@@ -3,10 +3,10 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from math import isfinite
 from typing import Any, Final, get_args
 
 from ftcalib.files import JSON
+from ftdrive.cell.rules import is_number
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import Axes, Point, Stages, WrenchFrame
 from ftdrivers.ros2.middleware import ros2_module
@@ -27,19 +27,15 @@ def checked_value(name: str, value: Any) -> JSON:
             return value
         case "about", str() if value in get_args(Point):
             return value
-        case "about", [_, _, _] if all(map(_is_number, value)):
+        case "about", [_, _, _] if all(map(is_number, value)):
             return tuple(float(x) for x in value)
         case (("bias" | "gravity" | "inertia"), bool()):
             return value
-        case (("notch_Hz" | "lowpass_Hz"), _) if _is_number(value) and value >= 0:
+        case (("notch_Hz" | "lowpass_Hz"), _) if is_number(value) and value >= 0:
             return float(value) or None
-        case (("deadband_N" | "deadband_Nm"), _) if _is_number(value) and value >= 0:
+        case (("deadband_N" | "deadband_Nm"), _) if is_number(value) and value >= 0:
             return float(value)
     raise ConfigError(f"{name} cannot be {value!r}: {_EXPECTED.get(name, 'there is no such parameter')}")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
 
 
 _FRAME_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")

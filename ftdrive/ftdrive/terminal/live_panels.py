@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rich.cells import cell_len
 
 from ftcalib.judge.observability import axes_along
-from ftdrive.checks.check import Check
+from ftdrive.checks.check import Check, who
 from ftdrive.checks.sensor import AXES, check_rate
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
@@ -487,8 +487,8 @@ def identity(view: View, width: int) -> list[Line]:
     """Name the devices with serial numbers, the calibration and the checks shared with `doctor`."""
     info = view.info
     lines = [
-        Line(" arm       ", FAINT).add(_who(info.arm)),
-        Line(" sensor    ", FAINT).add(_who(info.sensor)),
+        Line(" arm       ", FAINT).add(who(info.arm)),
+        Line(" sensor    ", FAINT).add(who(info.sensor)),
         Line(" cal       ", FAINT).add(info.calibration_name),
     ]
     for check in view.checks:
@@ -498,10 +498,6 @@ def identity(view: View, width: int) -> list[Line]:
         words = _checked(check).parts
         lines += _hanging(Line(f" {check.name.partition('.')[2]:<10}", FAINT).add(*words[0]), words[1:], width)
     return [line.fit(width) for line in lines]
-
-
-def _who(info: DeviceInfo) -> str:
-    return f"{info.model}, serial {info.serial}, firmware {info.firmware}"
 
 
 def events(view: View, width: int, rows: int) -> list[Line]:
