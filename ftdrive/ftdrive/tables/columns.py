@@ -247,11 +247,11 @@ class Columns:
 
     def _complete(self, way: str) -> list[list[tuple[int, str]]]:
         """Return the columns of each prefix for which a way is complete; two columns of one name are two candidates."""
-        if not (words := _words(way)):
+        if not (patterns := _written_out(way)):
             return []
-        first = words[0].removeprefix("*")
+        first = patterns[0].removeprefix("*")
         prefixes = [""]
-        if words[0].startswith("*"):
+        if patterns[0].startswith("*"):
             prefixes = [
                 key[: -len(first)]
                 for key in self._keys
@@ -259,7 +259,7 @@ class Columns:
             ]
         complete = []
         for prefix in prefixes:
-            keys = [prefix + word[1:] if word.startswith("*") else word for word in words]
+            keys = [prefix + word[1:] if word.startswith("*") else word for word in patterns]
             if all(key in self._keys for key in keys):
                 columns = self._of_one_case([self._keys[key] for key in keys])
                 complete += [[one[min(i, len(one) - 1)] for one in columns] for i in range(max(map(len, columns)))]
@@ -273,7 +273,7 @@ class Columns:
 
     def _matched(self, layout: Layout) -> int:
         return sum(
-            max((len(_words(way)) for way in ways.split("|") if self._complete(way)), default=0)
+            max((len(_written_out(way)) for way in ways.split("|") if self._complete(way)), default=0)
             for ways in layout.signals.values()
         )
 
@@ -285,10 +285,10 @@ class Columns:
     def _nearest(self, layout: Layout, signal: str) -> tuple[float, str, Sequence[str], str]:
         nearest: tuple[float, str, Sequence[str], str] = (0.0, layout.program, (), signal)
         for way in layout.signals[signal].split("|"):
-            words = _words(way)
-            missing = [word.removeprefix("*") for word in words if not self._has(word)]
+            keys = _written_out(way)
+            missing = [word.removeprefix("*") for word in keys if not self._has(word)]
             nearest = max(
-                nearest, (1 - len(missing) / len(words), layout.program, missing, signal), key=lambda one: one[0]
+                nearest, (1 - len(missing) / len(keys), layout.program, missing, signal), key=lambda one: one[0]
             )
         return nearest
 
@@ -352,7 +352,7 @@ def _keys_of(name: str) -> Iterator[tuple[str, str]]:
         yield normalized(match["name"]), match["suffix"]
 
 
-def _words(way: str) -> list[str]:
+def _written_out(way: str) -> list[str]:
     """Write out `?` and `#` of a way."""
     marks = {"?": "xyz", "#": "012345"}
     return [
