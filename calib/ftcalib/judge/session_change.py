@@ -1,12 +1,14 @@
 """What changed during a session: bias, load or mounting from a pose on, or between two sensors that take turns.
 
+The bias may also step several times, as by a program that zeroes the sensor at its start.
+
 Each change competes with drift, inexact orientations, gain and bumped poses: the data without it are fitted again, and
 it is named if their restricted likelihood is clearly larger.
 
 `cable_of` estimates what a cable may have moved.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -15,8 +17,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc as f_sf
 
+from ftcalib.errors import NotObservable
 from ftcalib.findings import CODES, Finding, Severity
-from ftcalib.judge.faults import CORRECTED, rough_fit
+from ftcalib.judge.faults import CORRECTED, ROUNDING, rough_fit
 from ftcalib.likelihood.descent import FARTHEST, column_scale
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.response import response_columns
@@ -45,7 +48,14 @@ MOST_POSES = 300
 CLEARLY = 0.5
 # By which twice the log-likelihood must rise, beside log(6 n) for each number of the change.
 MARGIN = 20.0
-Rows = NDArray[np.bool_]
+# Numbers of mounting and gravity that a step of the bias leaves, as matrix and vector, without their common scale.
+_SHAPE = 11
+# Steps of the bias that are looked for, and poses between two.
+MOST_STEPS, FEWEST_BETWEEN = 6, 2
+# Sets of steps that get one more.
+BEAM = 4
+Steps = tuple[int, ...]
+Rows = NDArray[np.integer | np.bool_]
 
 # Columns of `_columns`.
 TURN, BIAS, COM, LOAD = range(3), range(3, 9), range(10, 13), range(9, 13)
@@ -65,7 +75,7 @@ class SessionChange:
 
     code: str
     rows: Rows
-    """(n,) in the order of time."""
+    """(n,) in the order of time: which changed, or how often the bias had stepped."""
     values: Mapping[str, float]
     """Values of its finding."""
     corrected: Array
@@ -77,12 +87,13 @@ class SessionChange:
     @property
     def takes_turns(self) -> bool:
         """Whether every other pose differs, not all from one on."""
-        return bool(np.count_nonzero(np.diff(self.rows)) > 1)
+        step = np.diff(self.rows.astype(np.int64))
+        return bool((step > 0).any() and (step < 0).any())
 
     @property
-    def first(self) -> int:
-        """The first pose after it."""
-        return int(np.flatnonzero(np.diff(self.rows))[0]) + 1
+    def starts(self) -> NDArray[np.intp]:
+        """The first pose after each change."""
+        return np.flatnonzero(np.diff(self.rows)) + 1
 
 
 def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma: Array | None) -> list[Finding]:
@@ -103,29 +114,36 @@ def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma
     n, R, wrench = len(order), found.R_base_flange[order], found.wrench[order]
     if n < FEWEST_POSES:
         return []
-    change = likeliest_change(found.parameters, R, wrench, sigma)
     times = None if t_s is None else t_s[order]
     cov = None if sigma is None else np.diag(sigma**2)
-    if change is None or not _is_likelier(change, R, wrench, cov, times):
+    changes = [likeliest_change(found.parameters, R, wrench, sigma), bias_steps(R, wrench)]
+    costs = [(_cost(one, R, cov, times), one) for one in changes if one is not None]
+    cost, change = min(costs, key=lambda pair: pair[0], default=(np.inf, None))
+    if change is None or cost >= minus_two_log_likelihood(fit(R, wrench, cov, t_s=times)):
         return []
-    code, values = change.code, {"pose": int(order[change.first]) + 1} | dict(change.values)
+    poses = (order[change.starts] + 1).tolist()
+    code, values = change.code, {"pose": poses if len(poses) > 1 else poses[0]} | dict(change.values)
     severity: Severity = "reject"
     if change.takes_turns:
         code = "sensors_alternate"
-    elif code == "bias_stepped" or not (found.weights[order[: change.first]] > 0.5).any():  # the load as it is now
+    elif code == "bias_stepped" or not (found.weights[order[: change.starts[0]]] > 0.5).any():  # the load as it is now
         severity = "limit"
     needed = CODES[code].values
     return [Finding.of(code, severity, **{name: value for name, value in values.items() if name in needed})]
 
 
-def _is_likelier(change: SessionChange, R: Array, wrench: Array, cov: Array | None, t_s: Array | None) -> bool:
-    without = fit(R, change.corrected, cov, t_s=t_s)
+def _cost(change: SessionChange, R: Array, cov: Array | None, t_s: Array | None) -> float:
+    """Minus twice the log-likelihood without a change, and what its numbers cost; infinite if much remains."""
+    try:
+        without = fit(R, change.corrected, cov, t_s=t_s)
+    except NotObservable:
+        return np.inf
     weight_N = without.parameters.weight_N
     if np.sqrt(np.mean(np.sum(without.residuals[without.weights > 0.5, :3] ** 2, axis=1))) > CORRECTED * weight_N:
-        return False
-    as_read = fit(R, wrench, cov, t_s=t_s)
-    costs = len(KINDS[change.code]) * np.log(wrench.size) + 2 * np.log(len(wrench)) + MARGIN
-    return bool(minus_two_log_likelihood(without) + costs < minus_two_log_likelihood(as_read))
+        return np.inf
+    n, times = len(R), 1 if change.takes_turns else len(change.starts)
+    costs = times * (len(KINDS[change.code]) * np.log(6 * n) + 2 * np.log(n) + MARGIN)
+    return minus_two_log_likelihood(without) + float(costs)
 
 
 def minus_two_log_likelihood(found: Fit) -> float:
@@ -174,6 +192,71 @@ def likeliest_change(
     changes = [_refine(code, start, R, wrench, scale, rows) for code, (_, start, rows) in best.items()]
     change = min(changes, key=lambda one: one.criterion)
     return change if change.misfit < CLEARLY * without else None
+
+
+def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
+    """Find the steps of the bias that leave the least force; None in few poses.
+
+    Poses between two steps have a bias of their own, so only differences within them count. No rotation leaves less
+    than any matrix of its size, whose cost needs no start. The best sets of steps each get one more.
+
+    Parameters
+    ----------
+    R : array, shape (n, 3, 3)
+        In the order of time, as the wrench.
+    wrench : array, shape (n, 6)
+    """
+    n = len(wrench)
+    force_N = wrench[:, :3] - wrench[:, :3].mean(axis=0)
+    finest = (ROUNDING * float(np.abs(wrench[:, :3]).max())) ** 2
+    # In flange axes, M f - R.T b for a matrix M, the mounting, and gravity b: linear in both.
+    rows = np.concatenate([np.einsum("nj,ik->nijk", force_N, np.eye(3)).reshape(n, 3, 9), -R.swapaxes(1, 2)], axis=2)
+    total, sums = summed_products(rows, rows), np.concatenate([np.zeros((1, 3, 12)), np.cumsum(rows, axis=0)])
+
+    def means(first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
+        """What a bias of its own takes from the sums of squares (k, 12, 12) of these poses."""
+        own = sums[last] - sums[first]
+        return np.asarray(np.einsum("kai,kaj->kij", own, own) / np.maximum(last - first, 1)[:, None, None])
+
+    def with_another(others: Steps) -> Iterator[tuple[Steps, float]]:
+        """Add each possible step to others: all steps, and the mean square of force that they leave."""
+        bounds, at = np.array([0, *others, n]), np.arange(1, n)
+        k = np.searchsorted(bounds, at, side="right")
+        before, after = bounds[k - 1], bounds[np.minimum(k, len(bounds) - 1)]
+        gram = total - means(bounds[:-1], bounds[1:]).sum(axis=0) + means(before, after)
+        gram -= means(before, at) + means(at, after)
+        cross = gram[:, :9, 9:]
+        left = gram[:, :9, :9] - cross @ np.linalg.pinv(gram[:, 9:, 9:], hermitian=True) @ cross.swapaxes(1, 2)
+        square = 3 * np.maximum(np.linalg.eigvalsh(left)[:, 0], 0.0) / (3 * (n - len(others) - 2) - _SHAPE) + finest
+        possible = np.flatnonzero(np.minimum(at - before, after - at) >= FEWEST_BETWEEN)
+        for i in possible:
+            yield tuple(sorted([*others, int(at[i])])), float(square[i])
+
+    least, best, beam = np.inf, Steps(), [Steps()]
+    for count in range(1, min(MOST_STEPS, n - 2 - _SHAPE // 3) + 1):
+        left_by = dict(one for steps in beam for one in with_another(steps))
+        beam = sorted(left_by, key=left_by.__getitem__)[: max(BEAM, 1000 // n)]
+        if not beam:
+            break
+        criterion = 3 * n * np.log(left_by[beam[0]]) + count * len(BIAS) * np.log(6 * n)
+        if criterion < least - MARGIN:
+            least, best = criterion, beam[0]
+    if not best:
+        return None
+    p = rough_fit(_less_means(R, best), _less_means(wrench, best))
+    rest = wrench - gravity_wrench(p, R)
+    left, biases = _less_means(rest, best), rest - _less_means(rest, best)
+    size = np.linalg.norm(np.diff(biases, axis=0).reshape(-1, 2, 3), axis=2).max(axis=0)
+    values = {"force_N": float(size[0]), "torque_Nm": float(size[1])}
+    stepped = np.searchsorted(best, np.arange(n), side="right")
+    return SessionChange(
+        "bias_stepped", stepped, values, left + wrench - rest + biases[0], float(np.mean(left**2)), least
+    )
+
+
+def _less_means(values: Array, steps: Sequence[int]) -> Array:
+    """Values (n, ...) minus their mean between the steps."""
+    return np.concatenate([part - part.mean(axis=0) for part in np.split(values, steps)])
 
 
 def _groups(n: int) -> Iterator[tuple[slice | None, NDArray[np.bool_]]]:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
 from ftcalib.judge.faults import rough_fit
-from ftcalib.judge.session_change import _groups, likeliest_change, minus_two_log_likelihood
+from ftcalib.judge.session_change import _groups, bias_steps, likeliest_change, minus_two_log_likelihood
 from ftcalib.likelihood.fit import fit
 from ftcalib.likelihood.response import SIZE, response_columns
 from ftcalib.model import Parameters, jacobian, predict
@@ -138,7 +138,7 @@ def test_gain_and_cross_talk_of_a_fit_hide_no_part_of_a_change() -> None:
     wrench += rng.normal(0, SIGMA, wrench.shape) + response_columns(TOOL, ORIENTATIONS) @ rng.normal(0, 0.01, SIZE)
     change = likeliest_change(TOOL, ORIENTATIONS, wrench, SIGMA)
     assert change is not None
-    assert (change.code, change.first) == ("load_changed", 14)
+    assert (change.code, change.starts.tolist()) == ("load_changed", [14])
     # Beside 15 free parameters the sigma of a step between two halves is about that of a mean of 4 poses.
     lighter_N = np.linalg.norm(LIGHTER.gravity_force_base_N) - np.linalg.norm(TOOL.gravity_force_base_N)
     assert change.values["change_N"] == pytest.approx(lighter_N, abs=3 * SIGMA[0] / 2)
@@ -172,7 +172,7 @@ def test_a_change_is_as_large_as_it_is_and_can_be_undone(
     change = likeliest_change(rough_fit(ORIENTATIONS, wrench), ORIENTATIONS, wrench, SIGMA if measured else None)
     assert change is not None
     assert (change.code, change.takes_turns) == (code, not rows[22])
-    assert change.first == np.flatnonzero(rows)[0]
+    assert change.starts[0] == np.flatnonzero(rows)[0]
     assert {name: change.values[name] for name in values} == pytest.approx(values, rel=0.02)
     left = change.corrected - predict(rough_fit(ORIENTATIONS, change.corrected), ORIENTATIONS)
     assert np.sqrt(np.mean((left / SIGMA) ** 2)) < 0.1
@@ -219,3 +219,54 @@ def test_a_rejected_pose_costs_the_limit_and_a_logarithm_beyond_it() -> None:
     cost = np.linalg.slogdet(S)[1] + limit + 6 * np.log(distance / limit)
     assert found.components == others.components == {}
     assert minus_two_log_likelihood(found) - minus_two_log_likelihood(others) == pytest.approx(cost, abs=0.01)
+
+
+def zeroed(places: list[int], seed: int, n: int = 24) -> CalibrationResult:
+    """A tour in which the sensor was zeroed before some rows, each time in another orientation."""
+    rng = np.random.default_rng(seed)
+    R = np.asarray(Rotation.random(n, rng=rng).as_matrix())
+    wrench = predict(TOOL, R) + rng.normal(0, SIGMA, (n, 6))
+    for place in places:
+        wrench[place:] = predict(TOOL, R[place:]) - predict(TOOL, Rotation.random(1, rng=rng).as_matrix())
+        wrench[place:] += rng.normal(0, SIGMA, (n - place, 6))
+    return solve(CalibrationDataset.of(R, wrench, t_s=np.arange(float(n))))
+
+
+@pytest.mark.parametrize(
+    ("places", "n"),
+    [
+        ([4, 9], 12),
+        pytest.param([7, 11, 17], 24, marks=pytest.mark.slow),
+        pytest.param([2, 4, 6], 12, marks=pytest.mark.slow),
+    ],
+)
+def test_every_zeroing_is_named_with_its_pose_and_nothing_that_it_explains(places: list[int], n: int) -> None:
+    result = zeroed(places, 5, n)
+    assert result.verdict != "good"
+    assert result.findings[0].code == "bias_stepped"
+    assert result.findings[0].values["pose"] == [place + 1 for place in places]
+    assert "zeroed" in result.findings[0].words
+    assert not {"drift", "force_error", "residuals_alike"} & {one.code for one in result.findings}
+
+
+@pytest.mark.slow
+def test_a_sensor_that_warms_up_is_not_zeroed() -> None:
+    for seed in range(2):
+        cooling = 0.6 * np.exp(-np.arange(24) / 8)[:, None] * np.repeat([1.0, 0.025], 3)
+        found = {one.code for one in session(TOOL, 12, seed, added=cooling, measured=False).findings}
+        assert "bias_stepped" not in found
+
+
+def test_steps_of_the_bias_are_found_where_they_are() -> None:
+    rng = np.random.default_rng(2)
+    for places in ([3, 7, 13], [2, 20], [12]):
+        R = Rotation.random(24, rng=rng).as_matrix()
+        wrench = predict(TOOL, R) + rng.normal(0, SIGMA, (24, 6))
+        unstepped = wrench.copy()
+        for place in places:
+            wrench[place:] += rng.normal(0, [3, 3, 3, 0.1, 0.1, 0.1])
+        change = bias_steps(R, wrench)
+        assert change is not None
+        assert change.starts.tolist() == places
+        # A bias of a few poses is as uncertain as their fit.
+        assert np.abs(change.corrected - unstepped).max() < 20 * SIGMA[0]
