@@ -8,7 +8,7 @@ the value is there, else "no". ``{key:~sigma}`` writes a value to the place of i
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from types import MappingProxyType
 from typing import Any, Final, Literal, Self
@@ -43,7 +43,8 @@ class Code:
     @property
     def values(self) -> set[str]:
         """Names of the values that the templates need."""
-        return {place[1] for place in _PLACE.finditer(self.found + self.fix)}
+        # Files of earlier versions lack the scale.
+        return {place[1] for place in _PLACE.finditer(self.found + self.fix) if place[2] != "scale"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +130,23 @@ def ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     return tuple(sorted(findings, key=lambda one: (one.severity == "note", rank.get(one.code, len(rank)))))
 
 
+def folded(findings: Iterable[Finding]) -> list[Finding]:
+    """Leave out what a cause among ordered findings explains; the cause then counts as much as that."""
+    findings, worse = list(findings), [*_VERDICTS].index
+    for causes, consequences in _EXPLAINS:
+        cause = next((one for one in findings if one.code in causes), None)
+        if cause is None:
+            continue
+        severities = [one.severity for one in findings if one is cause or one.code in consequences]
+        worst = min(severities, key=worse)
+        if worst in CODES[cause.code].severities:
+            findings[findings.index(cause)] = cause = replace(cause, severity=worst)
+        findings = [
+            one for one in findings if one.code not in consequences or worse(one.severity) < worse(cause.severity)
+        ]
+    return findings
+
+
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
     """Return the verdict of the worst finding; good without any."""
     severities = {one.severity for one in findings}
@@ -141,6 +159,8 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
 def _write(template: str, values: Mapping[str, Any]) -> str:
     def at(place: re.Match[str]) -> str:
         name, form = place[1], place[2] or ""
+        if form == "scale":
+            return _scale(values.get(name))
         if form[:1] == "~" and None not in (values[name], sigma := values[form[1:]]):
             form = f".{decimals(sigma)}f"
         return _value(name, values[name], form)
@@ -198,6 +218,15 @@ def _orders(orders: Sequence[str]) -> str:
     return f", or for quaternions {each} that were read inverted and in another order" if orders else ""
 
 
+def _scale(unit_N: Sequence[float] | None) -> str:
+    """Write what a unit of force is by a known mass, and its sigma, both in N."""
+    if not unit_N:
+        return ""
+    return ". By the known mass 1 unit = {:.{places}f} N (sigma {:.{places}f} N)".format(
+        *unit_N, places=decimals(unit_N[1])
+    )
+
+
 _FORMS: Final[Mapping[str, Callable[[Any], str]]] = {
     "poses": _poses, "units": _units, "axes": _axes, "orders": _orders,
 }  # fmt: skip
@@ -238,34 +267,45 @@ CODES: Final[Mapping[str, Code]] = {
     "repeated_wrenches": Code(_REJECT, "{poses:poses} have identical wrenches in different orientations",
         "repeat these poses"),
     "constant_force": Code(_REJECT, "the force is {force_N:.2g} in all poses, as if the wrench were given in base axes",
-        "record it in the axes of the sensor"),
+        "add --wrench-frame base, or record it in the axes of the sensor"),
     "wrench_in_base": Code(_REJECT, "the wrench looks given in base axes (force residual {residual_N:.2g}, corrected "
-        "{corrected_N:.2g})", "record it in the axes of the sensor"),
+        "{corrected_N:.2g})", "add --wrench-frame base, with --tcp if it is about the TCP, or record it in "
+        "the axes of the sensor"),
     "orientations_inverted": Code(_REJECT, "the orientations look inverted (force residual {residual_N:.2g}, "
-        "corrected {corrected_N:.2g}){also:?, or |}{also}", "state that they map base to flange"),
+        "corrected {corrected_N:.2g}){also:?, or |}{also}",
+        "state that they map base to flange (--orientation R_flange_base)"),
     "quaternion_order": Code(_REJECT, "the quaternions look like ({order}), but were read as ({read_as}) (force "
-        "residual {residual_N:.2g}, corrected {corrected_N:.2g}){also:?, or |}{also}", "read them as ({order})"),
-    "euler_angles": Code(_REJECT, "the Euler angles look {order}, but were read as {read_as} (force residual "
-        "{residual_N:.2g}, corrected {corrected_N:.2g}){also:?, or |}{also}", "read them as {order}"),
+        "residual {residual_N:.2g}, corrected {corrected_N:.2g}){also:?, or |}{also}",
+        'exchange their columns (--columns "qx=NAME,...")'),
+    "euler_angles": Code(_REJECT, "the orientations look made of Euler angles in the order {order}, but were read "
+        "in the order {read_as} (force residual {residual_N:.2g}, corrected {corrected_N:.2g}){also:?, or |}{also}",
+        "add --euler {order} for a file of angles, or compute the rotations in this order"),
     "columns_swapped": Code(_REJECT, "forces and torques look exchanged (force residual {residual_N:.2g}, corrected "
-        "{corrected_N:.2g})", "exchange the columns of force and torque"),
+        "{corrected_N:.2g})", 'exchange the columns of force and torque (--columns "fx=NAME,...")'),
     "pairing_shifted": Code(_REJECT, "each wrench looks like that of the pose {neighbour} it (force residual "
         "{residual_N:.2g}, corrected {corrected_N:.2g})", "pair each wrench with the pose at which it was measured"),
+    "zeroed_each_pose": Code(_REJECT, "each wrench looks zeroed at the pose before (force residual {residual_N:.2g}, "
+        "corrected {corrected_N:.2g})", "zero the sensor at most once, before the first pose, and record again"),
     "pairing_or_rotations": Code(_REJECT, "the forces are those of a weight of {weight_N:.3g} to {radial_N:.2g}, but "
         "in these orientations only to {residual_N:.2g}, so wrenches are paired with other poses, or the "
-        "orientations have another form", "check the pairing, and look for Euler angles, degrees or another order"),
+        "orientations have another form",
+        "check the pairing, and look for Euler angles (--euler), degrees or another order"),
     "axes_disagree": Code(_REJECT, "force and torque axes disagree, because with {corrections:axes} the torque "
         "residual is {corrected_Nm:.2g} instead of {residual_Nm:.2g}",
         "check the wiring of the axes, or the sensor's matrix"),
     # Known values that the data contradict
     "known_mass": Code(_LIMIT_OR_NOTE, "the known mass of {known_kg:g} contradicts the data, which give "
-        "{mass_kg:~sigma_kg} (sigma {sigma_kg:~sigma_kg}){units:units}", "correct the data or the known value"),
+        "{mass_kg:~sigma_kg} (sigma {sigma_kg:~sigma_kg}){units:units}{unit_N:scale}",
+        "scale the forces so, or correct the known value"),
     "known_gravity_direction": Code(_LIMIT_OR_NOTE, "the known direction of gravity contradicts the data, which give "
         "one {off_deg:~sigma_deg} away (sigma {sigma_deg:~sigma_deg})", "correct the data or the known value"),
     "known_mounting": Code(_LIMIT_OR_NOTE, "the known mounting of the sensor contradicts the data, which give one "
         "{off_deg:~sigma_deg} away (sigma {sigma_deg:~sigma_deg}){corrections:?, as with |}{corrections:axes}",
         "correct the data or the known value"),
     # Units, drift and changes of one session
+    "bias_implausible": Code(_REJECT_OR_LIMIT, "the bias is {force_N:.5g} and {torque_Nm:.5g} for a weight of "
+        "{weight_N:.3g}, as with raw counts or other units{unit_N:scale}", "convert the counts to N and N·m by the "
+        "factors of the sensor. A known mass shows that of the force (--mass-kg)"),
     "payload_units": Code(_LIMIT, "the load is {load_kg:.2f}, but {expected_kg:.2f} by the payload in the "
         "controller{units:units}", "check the units of the sensor before you correct the payload"),
     "com_shifted": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
@@ -273,8 +313,9 @@ CODES: Final[Mapping[str, Code]] = {
     "load_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the weight has changed by {change_N:+.2g} and the "
         "centre of mass by {shift_mm:.2g}", "check whether something was lost, picked up or shifted, and calibrate "
         "again"),
-    "bias_stepped": Code(_LIMIT, "from {pose:poses} on the bias differs by {force_N:.2g} and {torque_Nm:.2g}",
-        "check whether the sensor was zeroed or a cable pulls, and calibrate again"),
+    "bias_stepped": Code(_REJECT_OR_LIMIT, "the bias steps at {pose:poses}, by up to {force_N:.2g} and {torque_Nm:.2g}"
+        ", as if the sensor was zeroed", "zero it at most once, before the first pose, and calibrate again. If no "
+        "program zeroes it, look for a cable that pulls"),
     "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
         "fasten its screws and calibrate again"),
     "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the readings are those of another sensor, turned by "
@@ -288,14 +329,23 @@ CODES: Final[Mapping[str, Code]] = {
         "at each pose, or hang something heavier on the sensor"),
     "second_solution": Code(_REJECT, "a very different mounting of the sensor explains the data almost as well "
         "(probability {probability_percent:.2g})", "add poses with another angle between the tool and the vertical"),
+    "torques_about_point": Code(_LIMIT, "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor, "
+        "as if the torques were about a point more than {inside_mm:.0f} in front of it, such as the TCP",
+        "add --wrench-frame tcp --tcp X,Y,Z,RX,RY,RZ, or record the torques about the sensor"),
+    "torques_reversed": Code(_LIMIT, "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor, as if "
+        "the torques were about a point more than {inside_mm:.0f} in front of it, such as the TCP, or reversed, or the "
+        "orientations mirrored", "push the tip aside. If that gives almost no torque, add --wrench-frame tcp "
+        "--tcp X,Y,Z,RX,RY,RZ. Otherwise reverse the torques, or give the orientations in right-handed axes, unless "
+        "the tool reaches back that far"),
     "weight_compensated": Code(_LIMIT, "the weight is only {weight_N:.2g}, as if it were compensated already, "
         "or the sensor were zeroed at each pose", "record the raw wrench, without compensation, and zero at most once, "
         "before the first pose"),
-    "weight_implausible": Code(_REJECT_OR_LIMIT, "the weight is {weight_N:.5g}{units:units}",
-        "check the units of force and torque"),
+    "weight_implausible": Code(_REJECT_OR_LIMIT, "the weight is {weight_N:.5g}{units:units}{unit_N:scale}",
+        "check the units of force and torque, and whether they are raw counts"),
     "com_too_far": Code(_REJECT_OR_LIMIT, "the centre of mass is {distance_m:.2f} from the sensor, farther than "
-        "{most_m:g}{units:units}", "check the units of force and torque, or describe the tool if it reaches so far "
-        "([tool] cylinders_mm, [workcell] measured = true)"),
+        "{most_m:g}{units:units}", "check the units of force and torque, and their reference point "
+        "(--wrench-frame, --tcp), or describe the tool if it reaches so far ([tool] cylinders_mm, [workcell] "
+        "measured = true)"),
     "com_too_near": Code(_LIMIT, "the centre of mass is only {distance_mm:.2g} from the sensor, as if torques were "
         "1000 times too small or forces were in mN", "check the units of force and torque"),
     # Directions and signs
@@ -307,18 +357,18 @@ CODES: Final[Mapping[str, Code]] = {
         "on a wall{orders:orders}, but no mounting is declared",
         "declare the mounting ([workcell] mounting, --up), or check the order and the direction of the rotations"),
     "weight_upwards": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down)",
-        "set sign = -1 if the sensor reports the reaction, or correct axes that are reversed or swapped in forces "
-        "and torques alike. If the robot hangs so, declare its mounting ([workcell] mounting, --up). Otherwise check "
-        "the order and the direction of the rotations"),
+        "add --sign -1 ([sensor] sign = -1) if the sensor reports the reaction, or correct axes that are reversed or "
+        "swapped in forces and torques alike. If the robot hangs so, declare its mounting ([workcell] mounting, --up). "
+        "Otherwise check the order and the direction of the rotations"),
     "forces_reversed": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down) and the centre of mass lies "
-        "on the robot's side of the sensor, as if the forces were reversed and the torques not, or the orientations "
-        "mirrored", "reverse the forces, or give the orientations in right-handed axes"),
-    "torques_reversed": Code(_LIMIT, "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor, as if "
-        "the torques were reversed, or the orientations mirrored", "reverse the torques, or give the orientations in "
-        "right-handed axes, unless the tool reaches back that far"),
+        "on the robot's side of the sensor, as if the wrench were the reaction about a point in front of it, such as "
+        "the TCP, or the forces alone were reversed, or the orientations mirrored",
+        "push the tip aside. If that gives almost no torque, add --sign -1 --wrench-frame tcp --tcp X,Y,Z,RX,RY,RZ. "
+        "Otherwise reverse the forces, or give the orientations in right-handed axes"),
     # The described cell
     "tool_mass_mismatch": Code(_LIMIT, "{load_kg:.3g} hang on the sensor, but the described tool has "
-        "{tool_kg:.3g}{units:units}", "check the sensor's units and what is mounted, or correct [tool] mass_kg"),
+        "{tool_kg:.3g}{units:units}{unit_N:scale}",
+        "check the sensor's units and what is mounted, or correct [tool] mass_kg"),
     "payload_mismatch": Code(_LIMIT, "the controller has a payload of {payload_kg:.2f}, but {load_kg:.2f} hang on the "
         "sensor{sensor_kg:?|, whose own mass is not configured}",
         "set the payload in the controller to {set_kg:.2f}{sensor_kg:?, with sensor and adapter| plus the mass of "
@@ -382,7 +432,7 @@ CODES: Final[Mapping[str, Code]] = {
     "base_leans": Code(_NOTE, "the base leans {lean_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) towards its {side}, "
         "compared with the declared mounting", "level the base, or set its mounting in the controller"),
     "noise_unknown": Code(_NOTE, "the noise was estimated from the residuals, so chi2 does not test the fit",
-        "state the noise of each pose to test it"),
+        "state the noise of each pose to test it (columns sigma_fx to sigma_tz)"),
     "orientations_deviate": Code(_NOTE, "the poses deviate by up to {off_deg:.2f} from the 24 orientations of the "
         "method, which puts an error of {force_N:.2g} into the gravity force",
         "use lrom or ml, which take the orientations as they are"),
@@ -406,3 +456,26 @@ CODES: Final[Mapping[str, Code]] = {
         "it was touched then", "repeat the last stop"),
 }
 # fmt: on
+
+# What is found beside the first because of it: beside wrong units or another point of the torques, and beside mistakes
+# in the data and changes in mid-session, which spoil the fit.
+_OF_UNITS: Final = frozenset((
+    "weight_compensated", "weight_implausible", "com_too_far", "com_too_near", "com_outside_tool", "tool_mass_mismatch",
+))  # fmt: skip
+_OF_MISTAKES: Final = _OF_UNITS | {
+    "drift", "weight_insignificant", "second_solution", "force_error", "torque_error", "known_values_misfit_force",
+    "known_values_misfit_torque", "noise_exceeded", "poses_rejected", "poses_unchecked", "gain_x", "gain_y", "gain_z",
+    "axes_mixed", "cross_talk", "response_small", "cable_spring", "residuals_alike", "pose_deviates",
+}  # fmt: skip
+_EXPLAINS: Final[Sequence[tuple[frozenset[str], frozenset[str]]]] = (
+    (frozenset(("bias_implausible", "torques_about_point", "torques_reversed", "forces_reversed")), _OF_UNITS),
+    (
+        frozenset((
+            "other_recording", "constant_force", "wrench_in_base", "orientations_inverted", "quaternion_order",
+            "euler_angles", "columns_swapped", "pairing_shifted", "zeroed_each_pose", "pairing_or_rotations",
+            "axes_disagree", "com_shifted", "load_changed", "bias_stepped", "sensor_turned", "sensor_changed",
+            "sensors_alternate",
+        )),
+        _OF_MISTAKES,
+    ),
+)  # fmt: skip

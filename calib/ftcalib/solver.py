@@ -103,7 +103,7 @@ def solve(
     if assumed is not None:
         free = _fit_freely(dataset, wrench_cov, drift)
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
-    quality = _judge(judged, free, dataset.t_s, measured_sigma, known, g_m_s2, setup)
+    quality = _judge(judged, free, dataset, measured_sigma, known, g_m_s2, setup)
     deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
     printed = {"as_published": True} if as_published else {}
     return CalibrationResult(
@@ -185,7 +185,7 @@ def _fit(
 def _judge(
     judged: Judged,
     free: Fit | None,
-    t_s: Array,
+    dataset: CalibrationDataset,
     measured_sigma: Array | None,
     known: Known | None,
     g_m_s2: float,
@@ -200,13 +200,20 @@ def _judge(
     unconstrained = None if free is None else Judged.of(free)
     return judge(
         judged,
-        t_s=t_s,
+        t_s=dataset.t_s,
         measured_sigma=measured_sigma,
         setup=setup,
         known=known,
         unconstrained=unconstrained,
         g_m_s2=g_m_s2,
+        written=_written(dataset),
     )
+
+
+def _written(dataset: CalibrationDataset) -> str:
+    """Return as what the orientations were written: a form, the order of Euler angles, or nothing if it is unknown."""
+    form = str(dataset.meta.get("form", ""))
+    return str(dataset.meta.get("euler", "")) if form == "euler" else form
 
 
 def _require_usable(method: Method, known: Known | None, as_published: bool) -> None:
@@ -287,7 +294,7 @@ def _mistakes(
 ) -> list[Finding]:
     """Find what explains that poses do not determine the parameters: wrong known values can leave no weight."""
     poses = dataset.R_base_flange, dataset.wrench
-    findings = faults(*poses, setup.up) or other_poses(*poses) or no_weight(*poses)
+    findings = faults(*poses, setup.up, _written(dataset)) or other_poses(*poses) or no_weight(*poses)
     if not findings and known is not None and (free := _fit_freely(dataset, wrench_cov, drift)) is not None:
         findings = contradictions(known, free.parameters, free.covariance, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
     return findings

@@ -1,7 +1,7 @@
 """What contradicts known values or the described cell: signs, mounting, payload, mass and centre of mass."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.findings import Finding
 from ftcalib.judge import units
+from ftcalib.judge.cross_validation import Judged
 from ftcalib.judge.faults import channels
 from ftcalib.judge.observability import axes_along, evenly_spread
 from ftcalib.judge.units import FARTHEST_COM_M
@@ -36,6 +37,7 @@ FAR_COM_M = 0.1
 NO_TOOL_SHARE = 0.1
 # The mass of a tool is known to about the larger of this mass and this share.
 TOOL_KG, TOOL_SHARE = 0.1, 0.3
+_SIGMAS_OF_MARGIN: Final = 3.0
 # A payload may differ by the larger of this mass and this share of the expected one.
 PAYLOAD_KG, PAYLOAD_SHARE = 0.5, 0.3
 # A payload may be larger by this where the mass of sensor and adapter is unknown.
@@ -45,7 +47,7 @@ UNIT_KG, UNIT_SHARE = 0.8, 0.3
 _SIGNIFICANT: Final = 4.0
 
 
-def directions(parameters: Parameters, covariance: Array, setup: Setup) -> list[Finding]:
+def directions(parameters: Parameters, covariance: Array, setup: Setup, written: str = "") -> list[Finding]:
     """Find signs that look reversed, and gravity that does not agree with the mounting, declared or not.
 
     Parameters
@@ -53,6 +55,8 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup) -> list[
     parameters : Parameters
     covariance : array, shape (15, 15)
     setup : Setup
+    written : str
+        As what the orientations were written, as of `faults`.
     """
     lean = lean_from(-setup.up, parameters.gravity_force_base_N, covariance[3:6, 3:6])
     inside_m = _inside_m(parameters, covariance)
@@ -60,26 +64,33 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup) -> list[
         return [Finding.of("forces_reversed" if inside_m else "weight_upwards", off_deg=lean.deg)]
     findings = []
     if 0 < inside_m <= FARTHEST_COM_M:
-        findings.append(Finding.of("torques_reversed", inside_mm=1e3 * inside_m))
+        # Gravity shows the centre of mass relative to the point of the torques alone. Only a described tool that cannot
+        # have it where reversed torques put it leaves one cause.
+        mirrored = replace(parameters, p_sensor_com_m=-parameters.p_sensor_com_m)
+        possible = not setup.cylinders_m or _outside_m(mirrored, covariance, setup) <= COM_MARGIN_M
+        code = "torques_reversed" if possible else "torques_about_point"
+        findings.append(Finding.of(code, inside_mm=1e3 * inside_m))
     along = parameters.down
     if setup.up_in_base is None:
         if lean.is_other_mounting:
             code = "mounting_undeclared" if lean.deg > HANGING_DEG else "gravity_tilted"
-            values = {"orders": _other_orders(along, setup.up)} if code == "mounting_undeclared" else {}
+            values = {"orders": _other_orders(along, setup.up, written)} if code == "mounting_undeclared" else {}
             findings.append(Finding.of(code, off_deg=lean.deg, direction=along, **values))
     elif lean.is_other_mounting:
-        orders = _other_orders(along, setup.up)
+        orders = _other_orders(along, setup.up, written)
         findings.append(Finding.of("gravity_off_mounting", off_deg=lean.deg, direction=along, orders=orders))
     elif lean.is_significant:
         findings.append(Finding.of("base_leans", lean_deg=lean.deg, sigma_deg=lean.sigma_deg, side=lean.side))
     return findings
 
 
-def _other_orders(gravity_direction_base: Array, up: Array) -> list[str]:
+def _other_orders(gravity_direction_base: Array, up: Array, written: str) -> list[str]:
     """Return the orders of quaternions with which gravity points down, had they been read inverted and in another.
 
     Such orientations are `U R V` of the true ones with fixed rotations U and V, so they fit as well.
     """
+    if written not in ("", "quaternion"):
+        return []
     along = {order: -float(up @ U @ gravity_direction_base) for order, U in _OTHER_ORDERS.items()}
     return [order for order, cosine in along.items() if cosine > np.cos(np.radians(OTHER_MOUNTING_DEG))]
 
@@ -183,12 +194,32 @@ def _mass(parameters: Parameters, covariance: Array, tool_kg: float | None, g_m_
     weight_N, along = parameters.weight_N, parameters.down
     load_kg = weight_N / g_m_s2
     sigma_kg = np.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0)) / g_m_s2
-    if tool_kg is None or abs(load_kg - tool_kg) <= max(TOOL_KG, TOOL_SHARE * tool_kg, _SIGNIFICANT * sigma_kg):
+    if tool_kg is None or abs(load_kg - tool_kg) <= max(_margin_kg(tool_kg), _SIGNIFICANT * sigma_kg):
         return []
     suspects = units.suspects(parameters, units.by_mass(load_kg, tool_kg, UNIT_SHARE))
     if not suspects and load_kg < NO_TOOL_SHARE * tool_kg:
         return [Finding.of("weight_compensated", weight_N=weight_N)]
-    return [Finding.of("tool_mass_mismatch", load_kg=load_kg, tool_kg=tool_kg, units=suspects)]
+    unit_N = units.unit_of_force(load_kg, float(sigma_kg), tool_kg, _margin_kg(tool_kg) / _SIGMAS_OF_MARGIN)
+    return [Finding.of("tool_mass_mismatch", load_kg=load_kg, tool_kg=tool_kg, units=suspects, unit_N=unit_N)]
+
+
+def unit_of_force(estimate: Judged, known: Known | None, setup: Setup, g_m_s2: float) -> tuple[float, float] | None:
+    """Return what a unit of force is by the known or the described mass, in N, and its standard deviation."""
+    if known is not None and known.mass_kg is not None:
+        true_kg, tolerance_kg = known.mass_kg, known.mass_tolerance_kg
+    elif setup.tool_mass_kg:
+        true_kg, tolerance_kg = setup.tool_mass_kg, _margin_kg(setup.tool_mass_kg) / _SIGMAS_OF_MARGIN
+    else:
+        return None
+    weight_N, along = estimate.parameters.weight_N, estimate.parameters.down
+    sigma_N = float(np.sqrt(max(float(along @ estimate.covariance[3:6, 3:6] @ along), 0.0)))
+    if weight_N == 0:
+        return None
+    return units.unit_of_force(weight_N / g_m_s2, sigma_N / g_m_s2, true_kg, tolerance_kg)
+
+
+def _margin_kg(tool_kg: float) -> float:
+    return max(TOOL_KG, TOOL_SHARE * tool_kg)
 
 
 def _units(load_kg: float, true_kg: float) -> list[str]:
@@ -196,24 +227,10 @@ def _units(load_kg: float, true_kg: float) -> list[str]:
 
 
 def _centre_of_mass(parameters: Parameters, covariance: Array, setup: Setup) -> list[Finding]:
-    """Find a centre of mass outside the described tool.
-
-    A body's centre of mass lies in its convex hull. The distance from that of the cylinders is the largest over all
-    directions of the point's reach beyond the hull's, less margin and sigma in that direction. Without the sensor's
-    height its origin may be anywhere between flange face and tip.
-    """
-    if not setup.cylinders_m:
+    """Find a centre of mass outside the described tool."""
+    if not setup.cylinders_m or (outside_m := _outside_m(parameters, covariance, setup)) <= COM_MARGIN_M:
         return []
-    height_m = setup.sensor_height_m
-    lowest_m, highest_m = (0.0, max(row[1] for row in setup.cylinders_m)) if height_m is None else (height_m,) * 2
-    R = parameters.R_flange_sensor
-    com_m = R @ parameters.p_sensor_com_m
-    along_z = _DIRECTIONS[:, 2]
-    reach_m = _DIRECTIONS @ com_m + np.minimum(along_z * lowest_m, along_z * highest_m)
-    sigma_m = np.sqrt(np.einsum("ni,ij,nj->n", _DIRECTIONS, R @ covariance[9:12, 9:12] @ R.T, _DIRECTIONS))
-    outside_m = float((reach_m - _reach_m(setup.cylinders_m) - _SIGNIFICANT * sigma_m).max())
-    if outside_m <= COM_MARGIN_M:
-        return []
+    com_m, height_m = parameters.R_flange_sensor @ parameters.p_sensor_com_m, setup.sensor_height_m
     distance_m = float(np.linalg.norm(com_m))
     return [
         Finding.of(
@@ -225,6 +242,23 @@ def _centre_of_mass(parameters: Parameters, covariance: Array, setup: Setup) -> 
             units=units.by_com(distance_m) if distance_m > FAR_COM_M else [],
         )
     ]
+
+
+def _outside_m(parameters: Parameters, covariance: Array, setup: Setup) -> float:
+    """Return how far the centre of mass surely lies outside the described cylinders; negative inside.
+
+    A body's centre of mass lies in its convex hull. The distance from that of the cylinders is the largest over all
+    directions of the point's reach beyond the hull's, less margin and sigma in that direction. Without the sensor's
+    height its origin may be anywhere between flange face and tip.
+    """
+    height_m = setup.sensor_height_m
+    lowest_m, highest_m = (0.0, max(row[1] for row in setup.cylinders_m)) if height_m is None else (height_m,) * 2
+    R = parameters.R_flange_sensor
+    com_m = R @ parameters.p_sensor_com_m
+    along_z = _DIRECTIONS[:, 2]
+    reach_m = _DIRECTIONS @ com_m + np.minimum(along_z * lowest_m, along_z * highest_m)
+    sigma_m = np.sqrt(np.einsum("ni,ij,nj->n", _DIRECTIONS, R @ covariance[9:12, 9:12] @ R.T, _DIRECTIONS))
+    return float((reach_m - _reach_m(setup.cylinders_m) - _SIGNIFICANT * sigma_m).max())
 
 
 # Neighbours are about 4° apart, so the distance is exact to 0.1 %.
@@ -280,8 +314,9 @@ def contradictions(
         mass_kg, sigma_kg = weight_N / g_m_s2, sigma_N / g_m_s2
         if abs(mass_kg - known.mass_kg) > sigmas * np.hypot(sigma_kg, known.mass_tolerance_kg):
             suspects = units.suspects(estimate, units.by_mass(mass_kg, known.mass_kg, SAME_UNIT))
-            values = {"known_kg": known.mass_kg, "mass_kg": mass_kg, "sigma_kg": sigma_kg, "units": suspects}
-            contradicted.append(Finding.of("known_mass", "limit", **values))
+            unit_N = units.unit_of_force(mass_kg, sigma_kg, known.mass_kg, known.mass_tolerance_kg)
+            values = {"known_kg": known.mass_kg, "mass_kg": mass_kg, "sigma_kg": sigma_kg, "unit_N": unit_N}
+            contradicted.append(Finding.of("known_mass", "limit", **values, units=suspects))
     if known.gravity_direction_base is not None and shows_directions:
         direction = np.asarray(known.gravity_direction_base)
         turn = turn_between(direction, unit_vector(estimate.gravity_force_base_N))

@@ -3,7 +3,8 @@
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from itertools import permutations
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,8 +23,10 @@ ROUNDING = 1e-9
 READINGS = {
     "orientations_inverted": "inverted orientations",
     "quaternion_order": "quaternions in the order ({order})",
-    "euler_angles": "{order} Euler angles",
+    "euler_angles": "Euler angles in the order {order}",
 }
+# Orders of turning by three angles about axes of the base. About axes of the tool, each is the reverse of one.
+EULER_ORDERS = tuple("".join(axes) for axes in permutations("xyz"))
 # Scores that differ by less do not decide between two readings of the orientations.
 EQUAL = 0.1
 # Accept a hypothesis if it reduces the residual to this share.
@@ -55,6 +58,8 @@ CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
 FOR_STEPS = 1000
 # Different readings of a channel that show steps: a weight along each axis reads as -weight, 0 and +weight.
 FEWEST_STEPS = 4
+# Decimal places that a table may have.
+DECIMALS = 9
 # Rounding matters if its standard deviation exceeds this share of the spread.
 COARSE = 0.005
 
@@ -116,8 +121,8 @@ class _Rough:
         return float(np.log(self.force_rms_N * self.torque_rms_Nm)) + IMPLAUSIBLE * implausible
 
 
-def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:
-    """Find the mistake that explains a bad fit: form of orientations, pairing of wrenches and poses, or axes.
+def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE, written: str = "") -> list[Finding]:
+    """Find the mistake that explains a bad fit: form of orientations, zeroing, pairing of wrenches and poses, or axes.
 
     Reversing all three axes of torque or of force only moves the centre of mass to the other side of the sensor.
 
@@ -128,6 +133,9 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
     wrench : array, shape (n, 6)
     up_in_base : array_like, shape (3,)
         Where up should be.
+    written : str
+        As what the orientations were written: quaternion, matrix, vector, joints, or three angles in an order such as
+        "xyz" or "ZYX", as scipy names it. Empty if that is unknown. Only its mistakes are tried.
     """
     if len(wrench) < RECOMMENDED_POSES + 1:
         return []
@@ -136,7 +144,7 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
     up = np.asarray(up_in_base, dtype=np.float64)
     as_read = _Rough.of(R_base_flange, wrench)
     explanations = []
-    for code, values, R, y in _readings(R_base_flange, wrench):
+    for code, values, R, y in _readings(R_base_flange, wrench, written):
         # No rotation does better than any matrix of its size: this bound spares the search over rotations.
         if code != "columns_swapped" and least_rms(R, y[:, :3]) > COLLAPSE * as_read.force_rms_N:
             continue
@@ -146,11 +154,13 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
         if smaller and force < limit and torque < NO_WORSE * as_read.shares[1]:
             explanations.append((trial.score(up), code, values, trial.force_rms_N))
     if explanations:
-        score, code, values, corrected_N = min(explanations, key=lambda each: each[0])
-        equal = [one for one in explanations if one[0] < score + EQUAL and one[1] in READINGS]
-        also = [READINGS[name].format(**own) for _, name, own, _ in equal if (name, own) != (code, values)]
+        least = min(score for score, *_ in explanations)
+        equal = [one for one in explanations if one[0] < least + EQUAL]
+        # The simplest of those that fit alike.
+        _, code, values, corrected_N = equal[0]
+        also = dict.fromkeys(READINGS[name].format(**own) for _, name, own, _ in equal[1:] if name in READINGS)
         if code in READINGS:
-            values = {**values, "also": also}
+            values = {**values, "also": [*also]}
         return [Finding.of(code, **values, residual_N=as_read.force_rms_N, corrected_N=corrected_N)]
     return _axes(as_read, wrench[:, 3:], up)
 
@@ -194,25 +204,59 @@ def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[F
     return [Finding.of("constant_force", force_N=mean)]
 
 
-def _readings(R: Array, wrench: Array) -> Iterator[tuple[str, Mapping[str, Any], Array, Array]]:
-    """Yield each mistake as code and values, with the data as they are without it."""
-    yield "orientations_inverted", {}, np.swapaxes(R, 1, 2), wrench
-    quaternions = Rotation.from_matrix(R).as_quat()
+# Code and values of a mistake, and orientations and wrench without it.
+_Reading = tuple[str, Mapping[str, Any], Array, Array]
+
+
+def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
+    """Yield each mistake as code and values, with the data as they are without it, the simplest first."""
+    for read_as in [written] if is_euler(written) else []:
+        yield from _other_orders(R, wrench, read_as)
+    if written != "joints":
+        yield "orientations_inverted", {}, np.swapaxes(R, 1, 2), wrench
     yield "columns_swapped", {}, R, np.roll(wrench, 3, axis=1)
-    for read_as, order in (("intrinsic", "extrinsic"), ("extrinsic", "intrinsic")):
-        sequence: dict[str, Literal["XYZ", "xyz"]] = {"intrinsic": "XYZ", "extrinsic": "xyz"}
-        with warnings.catch_warnings():  # gimbal lock: one of the angles is arbitrary
-            warnings.simplefilter("ignore")
-            angles = Rotation.from_matrix(R).as_euler(sequence[read_as])
-        values = {"order": order, "read_as": read_as}
-        yield "euler_angles", values, Rotation.from_euler(sequence[order], angles).as_matrix(), wrench
-    for shift, order, read_as in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
-        values = {"order": order, "read_as": read_as}
-        yield "quaternion_order", values, Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(), wrench
+    if written in ("", "quaternion"):
+        quaternions = Rotation.from_matrix(R).as_quat()
+        for shift, order, read_as in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
+            values = {"order": order, "read_as": read_as}
+            yield (
+                "quaternion_order",
+                values,
+                Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(),
+                wrench,
+            )
+    # Matrices are often computed from angles.
+    for read_as in EULER_ORDERS if written in ("", "matrix") else []:
+        yield from _other_orders(R, wrench, read_as)
     in_flange = np.concatenate([np.einsum("nji,nj->ni", R, part) for part in (wrench[:, :3], wrench[:, 3:])], axis=1)
     yield "wrench_in_base", {}, R, in_flange
     for side, own, other in (("before", slice(None, -1), slice(1, None)), ("after", slice(1, None), slice(None, -1))):
         yield "pairing_shifted", {"neighbour": side}, R[own], wrench[other]
+    # The model is linear in the orientation, so a difference of two serves as one.
+    yield "zeroed_each_pose", {}, np.diff(R, axis=0), wrench[1:]
+
+
+def is_euler(written: str) -> bool:
+    """Whether orientations were written as three angles about x, y and z in any order."""
+    return written.lower() in EULER_ORDERS
+
+
+def _other_orders(R: Array, wrench: Array, read_as: Any) -> Iterator[_Reading]:
+    """Turn by the same angles about x, y and z in the other orders.
+
+    The middle angle of the true order lies within 90°, as programs write it. Beyond, the other solution is meant.
+    """
+    extrinsic: Any = read_as if read_as.islower() else read_as[::-1].lower()
+    with warnings.catch_warnings():  # gimbal lock: one of the angles is arbitrary
+        warnings.simplefilter("ignore")
+        angles = dict(zip(extrinsic, Rotation.from_matrix(R).as_euler(extrinsic).T, strict=True))
+    same = {axis: np.pi - angle if axis == extrinsic[1] else angle + np.pi for axis, angle in angles.items()}
+    for order in EULER_ORDERS:
+        if order != extrinsic:
+            beyond = np.cos(angles[order[1]]) < 0
+            turns = np.stack([np.where(beyond, same[axis], angles[axis]) for axis in order], axis=1)
+            values = {"order": order, "read_as": read_as}
+            yield "euler_angles", values, Rotation.from_euler(order, turns).as_matrix(), wrench
 
 
 def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
@@ -266,7 +310,9 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
         return [*findings, Finding.of("quantised", step_N=coarse[0], step_Nm=coarse[1])]
     distinct = len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench)
     copied = [] if distinct else _copies(wrench)
-    ties = [(k, tied) for k in range(len(CHANNELS)) if spread[k] for tied in _tied(wrench[:, k])]
+    # A channel that spans a few of the last decimal places has equal readings by right.
+    fine = spread > FEWEST_STEPS * np.repeat([_last_place(part) for part in np.hsplit(wrench, 2)], 3)
+    ties = [(k, tied) for k in np.flatnonzero(fine & (spread > 0)) for tied in _tied(wrench[:, k])]
     repeated: list[NDArray[np.intp]] = []
     for rows in copied:
         same = bool(np.ptp(R_base_flange[rows], axis=0).max() == 0)
@@ -314,6 +360,25 @@ def _resolution(wrench: Array) -> Array:
     gaps = [np.diff(np.unique(channel)).min(initial=np.inf) for channel in wrench.T]
     finest, coarsest = ROUNDING * np.abs(wrench).max(axis=0), np.sqrt(12) * COARSE * np.ptp(wrench, axis=0)
     return np.asarray(np.maximum(np.minimum(gaps, coarsest), finest))
+
+
+def written_step(wrench: Array) -> Array:
+    """Return the last decimal place of forces and torques (6,) that were written rounded, which no noise hides.
+
+    It is 0 without one, and where rounding matters, because `broken_channels` then names it.
+    """
+    steps = []
+    for part in np.hsplit(wrench, 2):
+        spread = float(np.linalg.norm(part.std(axis=0)))
+        step = _last_place(part)
+        steps.append(step if step < np.sqrt(12) * COARSE * spread else 0.0)
+    return np.repeat(steps, 3)
+
+
+def _last_place(part: Array) -> float:
+    """Return the last decimal place of forces or torques (n, 3); 0 if they have more than a table."""
+    places = (10.0**-k for k in range(DECIMALS) if np.abs(part - np.round(part, k)).max() < 1e-3 * 10.0**-k)
+    return next(places, 0.0)
 
 
 def _coarse_step(readings: Array) -> float:

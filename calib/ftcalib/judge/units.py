@@ -13,6 +13,10 @@ FAR_COM_M, FARTHEST_COM_M = 0.25, 0.5
 NEAREST_COM_M = 5e-4
 # Weights beyond these look like forces in another unit: 30 g, and more than any UR arm carries.
 LIGHTEST_N, HEAVIEST_N, IMPOSSIBLE_N = 0.3, 500.0, 2000.0
+# A force and a torque of bias beyond the range of most sensors, in N and N·m, and of any that an arm carries.
+LARGE_BIAS, IMPOSSIBLE_BIAS = (500.0, 100.0), (2000.0, 400.0)
+# A sensor whose bias is so many times the weight was not chosen for the tool.
+LARGE_SHARE = 20.0
 # Forces in another unit leave less than this share of the weight.
 NOISY = 0.03
 FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665, "gf": 9.80665e-3, "mN": 1e-3, "kN": 1e3}
@@ -59,8 +63,24 @@ def suspects(estimate: Parameters, forces: Collection[str]) -> Suspects:
     return by_com(com_m, forces) or [(force, "N·m") for force in forces]
 
 
-def implausible(estimate: Parameters, residual_N: float, *, described: bool) -> list[Finding]:
-    """Find a weight or a centre of mass that no tool has, with the units that make it usual.
+def unit_of_force(mass: float, sigma: float, true_kg: float, tolerance_kg: float) -> tuple[float, float]:
+    """Return what a unit of force is by a known mass, in N, and its standard deviation.
+
+    Parameters
+    ----------
+    mass, sigma : float
+        As the data give it, with its standard deviation, if a unit were 1 N.
+    true_kg, tolerance_kg : float
+        The known mass, and its standard deviation.
+    """
+    unit_N = true_kg / mass
+    return unit_N, unit_N * float(np.hypot(sigma / mass, tolerance_kg / true_kg))
+
+
+def implausible(
+    estimate: Parameters, residual_N: float, *, described: bool, unit_N: tuple[float, float] | None = None
+) -> list[Finding]:
+    """Find a bias that no sensor, and a weight or a centre of mass that no tool has, with units that make it usual.
 
     Parameters
     ----------
@@ -69,13 +89,19 @@ def implausible(estimate: Parameters, residual_N: float, *, described: bool) -> 
         Root mean square of the forces.
     described : bool
         Whether the shape of the tool is, which alone limits how far its centre of mass may be.
+    unit_N : (float, float), optional
+        By a known mass, as of `unit_of_force`.
     """
     weight_N, com_m = estimate.weight_N, float(np.linalg.norm(estimate.p_sensor_com_m))
-    findings = too_light(weight_N, com_m, residual_N)
+    findings = [*_bias(estimate, unit_N), *too_light(weight_N, com_m, residual_N)]
     if weight_N > HEAVIEST_N:
         severity: Severity = "reject" if weight_N > IMPOSSIBLE_N else "limit"
         names = [unit for unit in ("gf", "mN") if LIGHTEST_N < weight_N * FORCE_UNITS_N[unit] <= HEAVIEST_N]
-        findings.append(Finding.of("weight_implausible", severity, weight_N=weight_N, units=suspects(estimate, names)))
+        findings.append(
+            Finding.of(
+                "weight_implausible", severity, weight_N=weight_N, units=suspects(estimate, names), unit_N=unit_N
+            )
+        )
     if com_m > FAR_COM_M and not described:
         values = {"distance_m": com_m, "most_m": FARTHEST_COM_M if com_m > FARTHEST_COM_M else FAR_COM_M}
         severity = "reject" if com_m > FARTHEST_COM_M else "limit"
@@ -83,6 +109,17 @@ def implausible(estimate: Parameters, residual_N: float, *, described: bool) -> 
     if com_m < NEAREST_COM_M:
         findings.append(Finding.of("com_too_near", distance_mm=1e3 * com_m))
     return findings
+
+
+def _bias(estimate: Parameters, unit_N: tuple[float, float] | None) -> list[Finding]:
+    size = np.array([np.linalg.norm(estimate.force_bias_N), np.linalg.norm(estimate.torque_bias_Nm)])
+    lever_m = max(USUAL_COM_M[1], float(np.linalg.norm(estimate.p_sensor_com_m)))
+    large = (size > LARGE_BIAS) & (size > LARGE_SHARE * estimate.weight_N * np.array([1.0, lever_m]))
+    if not large.any():
+        return []
+    impossible = bool((large & (size > IMPOSSIBLE_BIAS)).any())
+    values = {"force_N": size[0], "torque_Nm": size[1], "weight_N": estimate.weight_N, "unit_N": unit_N}
+    return [Finding.of("bias_implausible", "reject" if impossible else "limit", **values)]
 
 
 def too_light(weight_N: float, com_m: float, residual_N: float) -> list[Finding]:

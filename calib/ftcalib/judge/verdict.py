@@ -11,11 +11,19 @@ from scipy.special import ndtr as normal_cdf
 
 from ftcalib.data.dwell_mean import RESOLUTION
 from ftcalib.files import JSON
-from ftcalib.findings import Finding, Severity, Verdict, ordered, verdict_of
+from ftcalib.findings import Finding, Severity, Verdict, folded, ordered, verdict_of
 from ftcalib.judge import described_cell, units
 from ftcalib.judge.cross_validation import DriftAhead, Judged, drift_ahead, standardize
 from ftcalib.judge.described_cell import contradictions
-from ftcalib.judge.faults import COLLAPSE, ROUNDING, broken_channels, constant_weight, faults, other_poses
+from ftcalib.judge.faults import (
+    COLLAPSE,
+    ROUNDING,
+    broken_channels,
+    constant_weight,
+    faults,
+    other_poses,
+    written_step,
+)
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
 from ftcalib.judge.session_change import cable_of, session_change
 from ftcalib.known import NOTHING, Known, Setup
@@ -115,7 +123,7 @@ class Quality:
         }
 
 
-def judge(
+def judge(  # noqa: PLR0913 - one for each thing that may be known
     fit: Judged,
     *,
     t_s: Array | None = None,
@@ -125,6 +133,7 @@ def judge(
     unconstrained: Judged | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
     single_poses: bool = True,
+    written: str = "",
 ) -> Quality:
     """Judge a fit.
 
@@ -148,14 +157,19 @@ def judge(
     g_m_s2 : float
     single_poses : bool
         Whether each row is a pose of its own, with findings about single poses; rows of a motion are not.
+    written : str
+        As what the orientations were written, as of `faults`.
     """
     quality = _statistics(fit, t_s)
     parameters, weight_N = fit.parameters, fit.parameters.weight_N
     few_rejected = quality.used.sum() >= (1 - FEW_LEFT_OUT) * len(quality.used)
+    # Uneven rounding alone also rejects poses.
+    few_rejected |= bool((np.abs(fit.residuals) <= _finest(fit.wrench)).all())
     suspect = quality.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
-    # Simulated readings without noise repeat themselves by right.
-    broken = [] if quality.is_exact else broken_channels(fit.wrench, fit.R_base_flange)
-    mistakes = _mistakes(fit, quality.used, t_s, setup) if suspect else []
+    mistakes = _mistakes(fit, quality.used, t_s, setup, written) if suspect else []
+    # Simulated readings without noise repeat themselves by right, also in other poses than given.
+    is_simulated = quality.is_exact or any(map(_leaves_nothing, mistakes))
+    broken = [] if is_simulated else broken_channels(fit.wrench, fit.R_base_flange)
     # Known values that are wrong would look like a change: the fit without them is searched.
     changed = [] if mistakes else _change(unconstrained or fit, quality, measured_sigma, t_s)
     if suspect and not (mistakes or changed):
@@ -174,7 +188,12 @@ def judge(
         *quality.errors,
         *_weight(fit, weight_N, setup),
         *_second_solution(fit),
-        *units.implausible(parameters, _rms(fit.residuals[quality.used, :3]), described=bool(setup.cylinders_m)),
+        *units.implausible(
+            parameters,
+            _rms(fit.residuals[quality.used, :3]),
+            described=bool(setup.cylinders_m),
+            unit_N=described_cell.unit_of_force(unconstrained or fit, known, setup, g_m_s2),
+        ),
         *([] if contradicted or quality.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
         *(_noise(fit, quality) if single_poses else []),
         *(_poses(fit, quality, "note" if few_rejected else "limit") if single_poses else []),
@@ -185,7 +204,7 @@ def judge(
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
     # Signs and mounting follow from the estimates, which mean nothing beside a mistake or such errors.
     if not mistakes and quality.largest_share < SENSELESS_SHARE:
-        findings += described_cell.directions(parameters, fit.covariance, setup)
+        findings += described_cell.directions(parameters, fit.covariance, setup, written)
         findings += [one for one in payload if one.code == "payload_units" and not broken]
     if verdict_of(findings) != "rejected":  # its contradictions would be consequences
         findings += [one for one in payload if one not in findings]
@@ -194,7 +213,7 @@ def judge(
     if not (broken or mistakes or quality.fits_measured_noise):
         harmless = verdict_of(findings) == "good"
         findings += [replace(one, severity="note") if harmless else one for one in contradicted]
-    return replace(quality, findings=ordered(findings), cable_shift=None if cable is None else cable[1])
+    return replace(quality, findings=tuple(folded(ordered(findings))), cable_shift=None if cable is None else cable[1])
 
 
 def _statistics(fit: Judged, t_s: Array | None) -> Quality:
@@ -204,10 +223,9 @@ def _statistics(fit: Judged, t_s: Array | None) -> Quality:
     residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
     largest_share, errors, left_out_rms = _errors(fit, used, weight_N)
     measured = bool(np.isfinite(fit.measured_chi2))
-    rest, largest = (np.abs(x[used]).max(axis=0) for x in (fit.residuals, fit.wrench))
     return Quality(
         used,
-        bool((rest <= np.maximum(RESOLUTION, ROUNDING * np.repeat(largest.reshape(2, 3).max(axis=1), 3))).all()),
+        bool((np.abs(fit.residuals[used]) <= _finest(fit.wrench)).all()),
         residual_sigma,
         int(np.argmax(np.where(used, residual_sigma, -1.0))),
         *successive_correlation(residuals[used], None if t_s is None else t_s[used]),
@@ -222,16 +240,28 @@ def _statistics(fit: Judged, t_s: Array | None) -> Quality:
     )
 
 
-def _mistakes(fit: Judged, used: NDArray[np.bool_], t_s: Array | None, setup: Setup) -> list[Finding]:
+def _finest(wrench: Array) -> Array:
+    """(6,) residual that no sensor resolves, or none of readings (n, 6) that were written rounded."""
+    largest = np.abs(wrench).max(axis=0).reshape(2, 3).max(axis=1)
+    return np.asarray(np.maximum(np.maximum(RESOLUTION, ROUNDING * np.repeat(largest, 3)), written_step(wrench)))
+
+
+def _leaves_nothing(mistake: Finding) -> bool:
+    """Whether the data without a mistake fit without noise, as only simulated ones do."""
+    left_N, left_Nm = (mistake.values.get(name, np.inf) for name in ("corrected_N", "corrected_Nm"))
+    return bool(left_N <= RESOLUTION[0] or left_Nm <= RESOLUTION[3])
+
+
+def _mistakes(fit: Judged, used: NDArray[np.bool_], t_s: Array | None, setup: Setup, written: str) -> list[Finding]:
     """Look for mistakes in all poses, or of many in evenly spread runs, and if there are none, in the used poses.
 
     A wrong pose or two were rejected; only the used poses show whether most of them are wrong.
     """
     order = _some_runs(t_s, len(used))
-    findings = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
+    findings = faults(fit.R_base_flange[order], fit.wrench[order], setup.up, written)
     order = order[used[order]]
     if not findings and not used.all():
-        findings = faults(fit.R_base_flange[order], fit.wrench[order], setup.up)
+        findings = faults(fit.R_base_flange[order], fit.wrench[order], setup.up, written)
     return findings
 
 

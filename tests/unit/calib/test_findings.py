@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ftcalib.findings import CODES, Finding, Severity, ordered, verdict_of
+from ftcalib.findings import CODES, Finding, Severity, folded, ordered, verdict_of
 
 PRODUCT = Path(__file__).parents[3]
 
@@ -112,6 +112,26 @@ def test_causes_come_first_notes_last_and_the_worst_gives_the_verdict() -> None:
         "usable",
         "rejected",
     ]
+
+
+def test_a_cause_stands_for_what_it_explains_and_leaves_the_verdict() -> None:
+    def of(code: str, severity: Severity) -> Finding:
+        return Finding(code, severity, dict.fromkeys(CODES[code].values, 0))
+
+    error, far, mass = of("force_error", "reject"), of("com_too_far", "reject"), of("payload_mismatch", "limit")
+    assert folded([error, far]) == [error, far]
+    assert folded([of("bias_stepped", "limit"), mass, error]) == [of("bias_stepped", "reject"), mass]
+    # Torques about another point say nothing of an error of force, and are no reason to reject by themselves.
+    assert folded([of("torques_reversed", "limit"), far, error]) == [of("torques_reversed", "limit"), far, error]
+    assert folded([of("torques_reversed", "limit"), of("com_too_far", "limit"), error]) == [
+        of("torques_reversed", "limit"),
+        error,
+    ]
+
+
+def test_a_finding_of_an_earlier_version_has_no_scale() -> None:
+    document = Finding.of("known_mass", "limit", known_kg=1, mass_kg=1.2, sigma_kg=0.01, units=[]).to_dict()
+    assert "unit" not in Finding.from_dict(document).words
 
 
 def test_every_code_is_found_somewhere_and_every_finding_has_a_code() -> None:

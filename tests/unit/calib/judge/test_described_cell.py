@@ -304,7 +304,30 @@ def test_a_description_decides_how_far_the_centre_of_mass_may_be() -> None:
 
 def test_reversed_torques_come_before_what_they_put_outside() -> None:
     result = solve(session(com_factor=-1), setup=Setup(**TOOL | {"cylinders_m": [(0.04, 0.16, 0.08)]}))
-    assert (result.verdict, codes(result)) == ("usable", ["torques_reversed", "com_outside_tool"])
+    assert (result.verdict, codes(result)) == ("usable", ["torques_reversed"])
+
+
+@pytest.mark.parametrize(
+    ("length_m", "code"),
+    [pytest.param(0.16, "torques_reversed", marks=pytest.mark.slow), (0.07, "torques_about_point")],
+)
+def test_torques_about_the_tcp_are_not_only_called_reversed(length_m: float, code: str) -> None:
+    """The tool is long enough for a centre of mass that reversed torques would have 90 mm from the sensor, or not."""
+    data = session()
+    about_tcp = R_FLANGE_SENSOR.T @ [0.0, 0.0, 0.15]
+    torque = data.wrench[:, 3:] - np.cross(about_tcp, data.wrench[:, :3])
+    moved = replace(data, wrench=np.concatenate([data.wrench[:, :3], torque], axis=1))
+    result = solve(moved, setup=Setup(**TOOL | {"cylinders_m": [(0.0, length_m + 0.04, 0.08)]}))
+    assert (result.verdict, codes(result)[0]) == ("usable", code)
+    assert result.findings[0].values["inside_mm"] == pytest.approx(90, abs=2)
+    assert "--wrench-frame tcp --tcp" in result.findings[0].fix
+    assert ("reverse" in result.findings[0].fix) == (code == "torques_reversed")
+
+
+def test_only_quaternions_can_have_been_read_in_another_order() -> None:
+    on_wall = replace(NO_LEAN, gravity_force_base_N=np.array([-20.0, 0, 0]))
+    said = {form: directions(on_wall, CERTAIN, Setup(), form)[0].found for form in ("quaternion", "", "matrix", "xyz")}
+    assert [form for form, words in said.items() if "quaternions" in words] == ["quaternion", ""]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """What was mixed up is named, and undoing it helps."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -17,7 +17,16 @@ from ftcalib import (
     Setup,
     solve,
 )
-from ftcalib.judge.faults import CHANNELS, _Rough, broken_channels, constant_weight, least_rms, rough_fit
+from ftcalib.judge.faults import (
+    CHANNELS,
+    EULER_ORDERS,
+    _Rough,
+    broken_channels,
+    constant_weight,
+    faults,
+    least_rms,
+    rough_fit,
+)
 from ftcalib.known import Known
 from ftcalib.model import Array, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
@@ -69,7 +78,80 @@ def test_the_order_of_euler_angles_is_named(read: Sequence, written: Sequence) -
     _, R, wrench = session(1)
     angles = Rotation.from_matrix(R).as_euler(written)
     finding = first(Rotation.from_euler(read, angles).as_matrix(), wrench)
-    assert (finding.code, finding.values["order"]) == ("euler_angles", "extrinsic" if written == "xyz" else "intrinsic")
+    assert (finding.code, finding.values["order"]) == ("euler_angles", "xyz" if written == "xyz" else "zyx")
+
+
+def angles_in(R: Array, order: Any) -> Array:
+    """Angles about x, y and z as a program writes them that turns in this order."""
+    return np.asarray(Rotation.from_matrix(R).as_euler(order)[:, [order.index(axis) for axis in "xyz"]])
+
+
+def from_angles(angles: Array, order: str) -> Array:
+    return np.asarray(Rotation.from_euler(order, angles[:, ["xyz".index(axis) for axis in order]]).as_matrix())
+
+
+@pytest.mark.parametrize("written", EULER_ORDERS)
+def test_any_order_of_euler_angles_is_named_from_the_one_that_was_read(written: str) -> None:
+    _, R, wrench = session(2, 16)
+    for read, spelled in (("xyz", "ZYX"), ("yzx", "yzx")):
+        found = faults(from_angles(angles_in(R, written), read), wrench, written=spelled)
+        said = [(one.code, one.values["order"], one.values["read_as"]) for one in found]
+        assert said == [("euler_angles", written, spelled)] * (written != read)
+
+
+@pytest.mark.parametrize("form", ["matrix", "quaternion", "vector", "joints", "xyz"])
+def test_a_hypothesis_names_only_what_the_file_can_contain(form: str) -> None:
+    _, R, wrench = session(1)
+    possible = {
+        "matrix": {"orientations_inverted", "euler_angles"},
+        "quaternion": {"orientations_inverted", "quaternion_order"},
+        "vector": {"orientations_inverted"},
+        "joints": set[str](),
+        "xyz": {"orientations_inverted", "euler_angles"},
+    }[form]
+    made = {
+        "orientations_inverted": np.swapaxes(R, 1, 2),
+        "quaternion_order": Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), 1, axis=1)).as_matrix(),
+        "euler_angles": from_angles(angles_in(R, "zyx"), "xyz"),
+    }
+    named = {one.code for turned in made.values() for one in faults(turned, wrench, written=form)}
+    assert named & made.keys() == possible
+
+
+def test_a_dataset_says_as_what_its_orientations_were_written() -> None:
+    _, R, wrench = session(2, 12)
+    read = from_angles(angles_in(R, "zyx"), "xyz")
+    dataset = CalibrationDataset.of(read, wrench, meta={"form": "euler", "euler": "ZYX"})
+    finding = solve(dataset).findings[0]
+    assert (finding.code, finding.values["order"], finding.values["read_as"]) == ("euler_angles", "zyx", "ZYX")
+    assert "--euler zyx" in finding.fix
+
+
+def test_a_sensor_that_is_zeroed_before_each_move_reads_differences() -> None:
+    _, R, wrench = session(3, 12)
+    (finding,) = faults(R[1:], np.diff(wrench, axis=0))
+    assert finding.code == "zeroed_each_pose"
+
+
+def test_equal_readings_of_a_simulator_do_not_hide_its_mistake() -> None:
+    """Without noise, with the centre of mass on the axis, so that tz is 0, and orientations in steps of 30°."""
+    angles = np.radians([180, 0, 0] + 30 * np.random.default_rng(1).integers(-2, 3, (16, 3)))
+    R = Rotation.from_euler("xyz", angles).as_matrix()
+    zero = np.zeros(3)
+    wrench = predict(Parameters(np.eye(3), np.array([0.0, 0, -9.8]), zero, np.array([0.0, 0, 0.06]), zero), R)
+    assert {one.code for one in broken_channels(wrench, R)} >= {"stuck_channels"}
+    assert solved(R, wrench).verdict == "good"
+    assert solved(R, np.round(wrench, 3)).verdict == "good"
+    shuffled = Rotation.from_quat(np.roll(Rotation.from_matrix(R).as_quat(), 1, axis=1)).as_matrix()
+    result = solved(shuffled, wrench)
+    assert result.findings[0].code == "quaternion_order"
+    assert "stuck_channels" not in {one.code for one in result.findings}
+
+
+def test_a_channel_of_a_few_decimal_steps_is_not_saturated() -> None:
+    _, R, wrench = session(5, 12)
+    wrench[:, 5] = np.where(np.arange(12) % 4, 0.1, 0.101)
+    assert "saturated" not in {one.code for one in broken_channels(np.round(wrench, 3), R)}
 
 
 def test_readings_of_the_orientations_that_fit_alike_are_all_named() -> None:

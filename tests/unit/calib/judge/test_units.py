@@ -5,7 +5,7 @@ import pytest
 from scipy import constants
 
 from ftcalib import Parameters
-from ftcalib.judge.units import FORCE_UNITS_N, TORQUE_UNITS_NM, by_mass, implausible
+from ftcalib.judge.units import FORCE_UNITS_N, TORQUE_UNITS_NM, by_mass, implausible, unit_of_force
 
 
 def found(
@@ -77,3 +77,34 @@ def test_a_mass_agrees_with_another_in_the_unit_that_makes_it_so() -> None:
     assert by_mass(4.5, 20.5, 0.01) == []
     assert by_mass(20.0, 20.0, 0.01) == []
     assert by_mass(4.5, 0.0, 0.01) == []
+
+
+@pytest.mark.parametrize(
+    ("weight_N", "force_N", "torque_Nm", "severity"),
+    [
+        (10.0, 490.0, 90.0, None),
+        (10.0, 510.0, 0.0, "limit"),
+        (10.0, 0.0, 110.0, "limit"),
+        (30.0, 510.0, 110.0, None),  # a large sensor, not many weights
+        (10.0, 1990.0, 0.0, "limit"),
+        (10.0, 2010.0, 0.0, "reject"),
+        (10.0, 0.0, 410.0, "reject"),
+        (4000.0, 25_400.0, 0.0, None),  # which the weight shows
+    ],
+)
+def test_a_bias_of_no_sensor_is_named(weight_N: float, force_N: float, torque_Nm: float, severity: str | None) -> None:
+    sideways = np.array([0.6, 0.8, 0.0])
+    biased = Parameters(
+        np.eye(3), np.array([0.0, 0, -weight_N]), force_N * sideways, np.array([0.0, 0, 0.1]), torque_Nm * sideways
+    )
+    found = implausible(biased, 0.01, described=False, unit_N=(0.82, 0.01))
+    assert [one.severity for one in found if one.code == "bias_implausible"] == [severity] * (severity is not None)
+    assert all("1 unit = 0.820 N (sigma 0.010 N)" in one.found for one in found)
+
+
+def test_the_sigma_of_a_unit_is_that_of_mass_and_data() -> None:
+    rng = np.random.default_rng(0)
+    data_kg, true_kg = rng.normal(1.18, 0.01, 20_000), rng.normal(0.96, 0.006, 20_000)
+    unit_N, sigma_N = unit_of_force(1.18, 0.01, 0.96, 0.006)
+    assert unit_N == pytest.approx(np.mean(true_kg / data_kg), abs=4 * sigma_N / np.sqrt(20_000) + 1e-4)
+    assert sigma_N == pytest.approx(np.std(true_kg / data_kg), rel=0.03)
