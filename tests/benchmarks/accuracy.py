@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationDataset, NotObservable, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Finding, NotObservable, Setup, solve
+from ftcalib.files import JSON
 from ftcalib.judge.cross_validation import standardize
+from ftcalib.known import NOTHING, Known
 from ftcalib.likelihood import fit as likelihood
 from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import UP_IN_BASE, Array, predict
@@ -364,6 +366,236 @@ MARKDOWN: list[str] = []
 """The table of `side_by_side`, printed at the end."""
 
 
+# Mistakes at rest: is the cause named first, is no wrong result good, and does its advice lead to the truth?
+
+FINE: Array = np.repeat([0.01, 4e-4], 3)
+ORDERS = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")
+# Findings that accuse nothing.
+ACCUSE_NOTHING = frozenset((
+    "noise_unknown", "noise_exceeded", "residuals_alike", "pose_deviates", "poses_rejected", "poses_unchecked",
+    "gain_x", "gain_y", "gain_z", "axes_mixed", "cross_talk", "response_small", "cable_spring", "force_error",
+    "torque_error", "base_leans", "drift", "second_solution",
+))  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Handed:
+    """Poses as a user hands them in, and what is true of them."""
+
+    truth: sim.Truth
+    R: Array
+    wrench: Array
+    rng: sim.Rng
+    form: dict[str, JSON]
+    """Of `CalibrationDataset.meta`: from what the orientations were read."""
+    tcp_m: Array
+    """(3,) in the flange."""
+    known: Known | None = None
+    setup: Setup = NOTHING
+    counts_N: float = 1.0
+    """A unit of the force."""
+
+    def solved(self) -> CalibrationResult | Finding:
+        """Solve; the finding if that is refused."""
+        n = len(self.R)
+        dataset = CalibrationDataset(self.R, self.wrench, None, np.zeros(n, int), np.arange(float(n)), self.form)
+        try:
+            return solve(dataset, known=self.known, setup=self.setup)
+        except NotObservable as error:
+            return error.finding or Finding(str(error), "reject")
+
+    def is_right(self, result: CalibrationResult | Finding) -> bool:
+        if isinstance(result, Finding):
+            return False
+        x = np.linalg.norm(sim.error(self.truth, result.parameters).reshape(5, 3), axis=1)
+        return bool(x[0] < np.deg2rad(2.0) and x[1] < 0.02 * np.linalg.norm(self.truth.b) and x[3] < 0.003)
+
+
+def handed(seed: int, *, exact: bool = False) -> Handed:
+    """Draw right poses: in all orientations or within 60° of tool down; exact ones of a simulator in steps of 30°."""
+    rng = np.random.default_rng([seed, 47])
+    n = int(rng.choice([12, 24]))
+    R = sim.poses(("haar", "cone60_")[rng.integers(2)] + str(n), rng)
+    along = Rotation.from_rotvec(np.deg2rad(20) * rng.uniform() * np.append(sim.direction(rng)[:2], 0)).apply([0, 0, 1])
+    com_m, weight_N = rng.uniform(0.03, 0.15) * along, rng.uniform(0.6, 2.5) * 9.80665
+    lean = Rotation.from_rotvec(np.deg2rad(1.0) * np.append(rng.uniform(-1, 1, 2), 0))
+    mount = Rotation.from_rotvec([0, 0, rng.uniform(-np.pi, np.pi)]).as_matrix()
+    bias = np.repeat([5.0, 0.3], 3) * rng.normal(size=6)
+    truth = sim.Truth(mount, lean.apply([0, 0, -weight_N]), bias[:3], mount @ com_m, bias[3:])
+    if exact:
+        com = np.array([0.0, 0, com_m[2]])
+        truth = sim.Truth(np.eye(3), np.array([0, 0, -weight_N]), np.zeros(3), com, np.zeros(3))
+        R = Rotation.from_euler("xyz", np.deg2rad([180, 0, 0] + 30 * rng.integers(-2, 3, (n, 3)))).as_matrix()
+    tcp_m = np.array([0, 0, com_m[2] * rng.uniform(1.5, 3.0)])
+    noise = 0.0 if exact else FINE * rng.normal(size=(n, 6))
+    form: dict[str, JSON] = {"form": str(rng.choice(["matrix", "quaternion", "vector", "joints"]))}
+    right = Handed(truth, R, sim.readings(truth, R) + noise, rng, form, tcp_m)
+    if rng.integers(2):  # the tool and its mass are described
+        described = Setup(cylinders_m=[(0.0, 2 * com_m[2], 0.16)], sensor_height_m=0.0, tool_mass_kg=weight_N / 9.8)
+        return replace(right, setup=described)
+    return right
+
+
+def about_tcp(case: Handed, sign: float = 1.0) -> Handed:
+    """Move the point of the torque to the TCP; with sign -1 back."""
+    point, force = case.truth.R @ case.tcp_m, case.wrench[:, :3]
+    moved = case.wrench[:, 3:] - sign * np.cross(point, force)
+    return replace(case, wrench=np.concatenate([force, moved], axis=1))
+
+
+def negated(case: Handed) -> Handed:
+    return replace(case, wrench=-case.wrench)
+
+
+def torques_negated(case: Handed) -> Handed:
+    return replace(case, wrench=case.wrench * np.repeat([1, -1], 3))
+
+
+def zeroed(case: Handed, times: int) -> Handed:
+    """Zero the sensor some times, two poses apart or more: each time it reads 0 in another orientation."""
+    spare = len(case.R) - 2 * (times + 1)
+    gaps = np.sort(case.rng.integers(0, spare + 1, times)) + 2 * np.arange(1, times + 1)
+    wrench = case.wrench.copy()
+    for first in gaps:
+        at = sim.readings(case.truth, Rotation.random(1, rng=case.rng).as_matrix())[0]
+        wrench[first:] = case.wrench[first:] - at
+    return replace(case, wrench=wrench)
+
+
+def zeroed_before_each(case: Handed) -> Handed:
+    """Zero it before each move: at the pose before."""
+    return replace(case, wrench=np.diff(case.wrench, axis=0), R=case.R[1:])
+
+
+def in_counts(case: Handed, counts: float, offset: float, *, known: bool = False) -> Handed:
+    """Raw counts of force and torque, with an offset that a strain gauge has."""
+    offsets = offset * case.rng.uniform(0.3, 1.0, 6) * case.rng.choice([-1, 1], 6)
+    mass_kg = float(np.linalg.norm(case.truth.b)) / 9.80665
+    spoiled = replace(case, wrench=counts * case.wrench + offsets, counts_N=1 / counts)
+    return replace(spoiled, known=Known(mass_kg=mass_kg, mass_tolerance_kg=0.001 * mass_kg)) if known else spoiled
+
+
+def angles_as(case: Handed, *, form: str) -> Handed:
+    """Read three angles, one about each axis, in another order than that in which they were written."""
+    written, read = case.rng.choice(ORDERS, 2, replace=False)
+    angles = Rotation.from_matrix(case.R).as_euler(written)[:, [written.index(axis) for axis in "xyz"]]
+    R = Rotation.from_euler(read, angles[:, ["xyz".index(axis) for axis in read]]).as_matrix()
+    return replace(case, R=R, form={"form": "euler", "euler": str(read)} if form == "euler" else {"form": form})
+
+
+def quaternions_rolled(case: Handed) -> Handed:
+    rolled = np.roll(Rotation.from_matrix(case.R).as_quat(), int(case.rng.choice([-1, 1])), axis=1)
+    return replace(case, R=Rotation.from_quat(rolled).as_matrix(), form={"form": "quaternion"})
+
+
+def inverted(case: Handed) -> Handed:
+    return replace(case, R=np.swapaxes(case.R, 1, 2), form={"form": "matrix"})
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """What is wrong, what names it, and what a user does who follows the advice."""
+
+    name: str
+    spoil: Callable[[Handed], Handed]
+    named: str
+    """Codes, and words that the sentence has after "/"."""
+    follow: Callable[[Handed], Handed] | None = None
+    """None records again without the mistake."""
+    exact: bool = False
+
+
+about_sensor = partial(about_tcp, sign=-1.0)
+POINT = "torques_reversed torques_about_point/--wrench-frame tcp"
+MISTAKES: Sequence[Mistake] = (
+    Mistake("torque about the TCP", about_tcp, POINT, about_sensor),
+    Mistake("torques reversed", torques_negated, "torques_reversed/reverse", torques_negated),
+    Mistake(
+        "reaction about the TCP",
+        lambda case: negated(about_tcp(case)),
+        "forces_reversed/--sign -1 --wrench-frame tcp",
+        lambda case: about_sensor(negated(case)),
+    ),
+    Mistake("reaction", negated, "weight_upwards/--sign -1", negated),
+    Mistake("zeroed once", partial(zeroed, times=1), "bias_stepped/zeroed"),
+    Mistake("zeroed twice", partial(zeroed, times=2), "bias_stepped/zeroed"),
+    Mistake("zeroed three times", partial(zeroed, times=3), "bias_stepped/zeroed"),
+    Mistake("zeroed before each move", zeroed_before_each, "zeroed_each_pose/zeroed"),
+    Mistake("counts, 1 unit = .82 N", partial(in_counts, counts=1 / 0.82, offset=25_400), "bias_implausible/counts"),
+    Mistake(
+        "counts, 400 for 1 N",
+        partial(in_counts, counts=400.0, offset=25_400),
+        "bias_implausible weight_implausible/counts",
+    ),
+    Mistake(
+        "counts, 1 unit = .82 N, known mass",
+        partial(in_counts, counts=1 / 0.82, offset=25_400, known=True),
+        "known_mass bias_implausible/1 unit = 0.8",
+    ),
+    Mistake("Euler order", partial(angles_as, form="euler"), "euler_angles/--euler"),
+    Mistake("Euler order, in matrices", partial(angles_as, form="matrix"), "euler_angles/Euler"),
+    Mistake("quaternion order", quaternions_rolled, "quaternion_order/quaternions"),
+    Mistake("inverted matrices", inverted, "orientations_inverted/inverted", inverted),
+    Mistake("simulator: quaternion order", quaternions_rolled, "quaternion_order/quaternions", exact=True),
+    Mistake("simulator: inverted", inverted, "orientations_inverted/inverted", inverted, exact=True),
+    Mistake("simulator: torque about the TCP", about_tcp, POINT, about_sensor, exact=True),
+    Mistake("simulator: Euler order", partial(angles_as, form="euler"), "euler_angles/--euler", exact=True),
+)
+
+
+def mistake_run(seed: int, kind: int) -> dict[str, object]:
+    mistake = MISTAKES[kind]
+    right = handed(seed, exact=mistake.exact)
+    spoiled = mistake.spoil(right)
+    result = spoiled.solved()
+    first = result if isinstance(result, Finding) else (*result.findings, Finding("none", "note"))[0]
+    codes, _, word = mistake.named.partition("/")
+    named = first.code in codes.split() and word in first.words
+    good = not isinstance(result, Finding) and result.verdict == "good" and not right.is_right(result)
+    if os.environ.get("SHOW_MISTAKES") and not named:
+        print(f"{mistake.name} {seed} n={len(right.R)} {first.code}: {first.words}")  # noqa: T201
+    after = right if mistake.follow is None else mistake.follow(spoiled)
+    return {"named": named, "good": good, "led": named and right.is_right(after.solved())}
+
+
+def right_run(seed: int) -> dict[str, object]:
+    """Right poses of the same generators, with an imperfection of real cells or none."""
+    case = handed(seed, exact=seed % 6 == 5)
+    rng, wrench = case.rng, case.wrench.copy()
+    if seed % 6 == 1:  # a gain of 2 %, cross-talk of 1 % of 50 mm
+        force = wrench[:, :3] - case.truth.F0
+        wrench += np.concatenate(
+            [force @ (0.02 * rng.normal(size=(3, 3))), force @ (5e-4 * rng.normal(size=(3, 3)))], 1
+        )
+    if seed % 6 == 2:
+        wrench += np.cumsum(np.repeat([0.02, 6e-4], 3) * rng.normal(size=wrench.shape), axis=0)
+    if seed % 6 == 3:
+        R = sim.with_inexact_orientations(case.R, np.deg2rad(0.05), rng)
+        wrench += sim.readings(case.truth, R) - sim.readings(case.truth, case.R)
+    if seed % 6 == 4:  # written with two decimals and three
+        wrench = np.round(wrench, 3)
+    form: dict[str, JSON] = {"form": "euler", "euler": "xyz"} if rng.integers(3) == 0 else case.form
+    result = replace(case, wrench=wrench, form=form).solved()
+    found = (
+        [result] if isinstance(result, Finding) else [one for one in result.findings if one.code not in ACCUSE_NOTHING]
+    )
+    if os.environ.get("SHOW_MISTAKES") and found:
+        print(f"right {seed} {found[0].code}: {found[0].words}")  # noqa: T201
+    return {"false": bool(found)}
+
+
+def mistakes(lab: Lab) -> Iterator[Row]:
+    runs = lab.count(20, 6)
+    for kind, mistake in enumerate(MISTAKES):
+        found = lab.simulate(partial(mistake_run, kind=kind), runs)
+        named, good, led = (int(found[key].sum()) for key in ("named", "good", "led"))
+        passed = named >= 0.95 * runs and good == 0 and led == named
+        figure = f"{named} first, {good} good, {led} led to it"
+        yield Row(f"mistake, {mistake.name}", figure, ">= 95 %, 0, all", passed, runs)
+    runs = lab.count(500, 60)
+    yield most("mistakes, right poses with a false cause", lab.simulate(right_run, runs)["false"].sum(), 0, runs)
+
+
 # Real data
 
 
@@ -406,6 +638,7 @@ SECTIONS: dict[str, Callable[[Lab], Iterator[Row]]] = {
     "drift": drift,
     "outliers": outliers,
     "side": side_by_side,
+    "mistakes": mistakes,
     "real": real_data,
 }
 
