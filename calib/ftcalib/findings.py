@@ -292,16 +292,17 @@ CODES: Final[Mapping[str, Code]] = {
         "check the pairing, and look for Euler angles (--euler), degrees or another order"),
     "axes_disagree": Code(_REJECT, "force and torque axes disagree, because with {corrections:axes} the torque "
         "residual is {corrected_Nm:.2g} instead of {residual_Nm:.2g}",
-        "check the wiring of the axes, or the sensor's matrix"),
+        "check the columns (--columns), the wiring of the axes, or the sensor's matrix"),
     # Known values that the data contradict
     "known_mass": Code(_LIMIT_OR_NOTE, "the known mass of {known_kg:g} contradicts the data, which give "
         "{mass_kg:~sigma_kg} (sigma {sigma_kg:~sigma_kg}){units:units}{unit_N:scale}",
-        "scale the forces so, or correct the known value"),
+        "scale the forces so, or correct the known value (--mass-kg)"),
     "known_gravity_direction": Code(_LIMIT_OR_NOTE, "the known direction of gravity contradicts the data, which give "
-        "one {off_deg:~sigma_deg} away (sigma {sigma_deg:~sigma_deg})", "correct the data or the known value"),
+        "one {off_deg:~sigma_deg} away (sigma {sigma_deg:~sigma_deg})",
+        "correct the data or the known value (--level-deg, --up)"),
     "known_mounting": Code(_LIMIT_OR_NOTE, "the known mounting of the sensor contradicts the data, which give one "
         "{off_deg:~sigma_deg} away (sigma {sigma_deg:~sigma_deg}){corrections:?, as with |}{corrections:axes}",
-        "correct the data or the known value"),
+        "correct the data or the known value (--mounting-deg)"),
     # Units, drift and changes of one session
     "bias_implausible": Code(_REJECT_OR_LIMIT, "the bias is {force_N:.5g} and {torque_Nm:.5g} for a weight of "
         "{weight_N:.3g}, as with raw counts or other units{unit_N:scale}", "convert the counts to N and N·m by the "
@@ -375,7 +376,8 @@ CODES: Final[Mapping[str, Code]] = {
         "sensor and adapter ([sensor] mass_kg)}"),
     "com_outside_tool": Code(_REJECT_OR_LIMIT, "the centre of mass, at {com_mm:.0f} from the {origin} in flange axes, "
         "lies {outside_mm:.0f} outside the described tool{units:units}",
-        "check signs and units of forces and torques, then [tool] cylinders_mm"),
+        "check signs, units and reference point of the wrench (--sign, --columns, --wrench-frame), then [tool] "
+        "cylinders_mm"),
     # Recordings in motion
     "wrench_compensated": Code(_REJECT, "the load weighs {weight_N:.2g}, but has the inertia of {mass_kg:.2g}, as if a "
         "controller had compensated or zeroed the wrench", "record the wrench as the sensor measures it"),
@@ -435,7 +437,7 @@ CODES: Final[Mapping[str, Code]] = {
         "state the noise of each pose to test it (columns sigma_fx to sigma_tz)"),
     "orientations_deviate": Code(_NOTE, "the poses deviate by up to {off_deg:.2f} from the 24 orientations of the "
         "method, which puts an error of {force_N:.2g} into the gravity force",
-        "use lrom or ml, which take the orientations as they are"),
+        "use --method lrom or ml, which take the orientations as they are"),
     "earlier_cell": Code(_NOTE, "mounting, base and gain of {parent} count as known, within their sigmas"),
     "together": Code(_NOTE, "{n_runs} runs as one fit, each with a bias of its own; the bias is that of the last"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),

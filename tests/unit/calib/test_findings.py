@@ -17,7 +17,8 @@ def test_words_come_from_the_table_and_the_values() -> None:
     finding = Finding.of("axes_disagree", corrections=order, residual_Nm=np.float64(0.301), corrected_Nm=0.0029)
     assert finding.words == (
         "force and torque axes disagree, because with torque x and z reversed, or force x, y, z taken from (y, -x, z) "
-        "the torque residual is 0.0029 N·m instead of 0.3 N·m: check the wiring of the axes, or the sensor's matrix"
+        "the torque residual is 0.0029 N·m instead of 0.3 N·m: check the columns "
+        "(--columns), the wiring of the axes, or the sensor's matrix"
     )
 
 
