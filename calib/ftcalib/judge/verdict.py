@@ -170,7 +170,8 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
     # Neighbouring rows of a motion differ too little to show a bias that changes with each.
     mistakes = [one for one in mistakes if single_poses or one.code != "zeroed_each_pose"]
     # Simulated readings without noise repeat themselves by right, also in other poses than given.
-    is_simulated = quality.is_exact or any(map(_leaves_nothing, mistakes))
+    finest = _finest(fit.wrench)
+    is_simulated = quality.is_exact or any(_leaves_nothing(one, finest) for one in mistakes)
     broken = [] if is_simulated else broken_channels(fit.wrench, fit.R_base_flange)
     # Known values that are wrong would look like a change: the fit without them is searched.
     changed = [] if mistakes else _change(unconstrained or fit, quality, measured_sigma, t_s)
@@ -182,6 +183,9 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
     if known is not None and unconstrained is not None:
         at_its_best = unconstrained.parameters, unconstrained.covariance
         contradicted = contradictions(known, *at_its_best, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
+    # A contradicted mass has it already.
+    by_mass = any(one.code == "known_mass" for one in contradicted)
+    unit_N = None if by_mass else described_cell.unit_of_force(unconstrained or fit, known, setup, g_m_s2)
 
     findings = [
         *broken,
@@ -194,7 +198,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
             parameters,
             _rms(fit.residuals[quality.used, :3]),
             described=bool(setup.cylinders_m),
-            unit_N=described_cell.unit_of_force(unconstrained or fit, known, setup, g_m_s2),
+            unit_N=unit_N,
         ),
         *([] if contradicted or quality.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
         *(_noise(fit, quality) if single_poses else []),
@@ -248,10 +252,10 @@ def _finest(wrench: Array) -> Array:
     return np.asarray(np.maximum(np.maximum(RESOLUTION, ROUNDING * np.repeat(largest, 3)), written_step(wrench)))
 
 
-def _leaves_nothing(mistake: Finding) -> bool:
+def _leaves_nothing(mistake: Finding, finest: Array) -> bool:
     """Whether the data without a mistake fit without noise, as only simulated ones do."""
     left_N, left_Nm = (mistake.values.get(name, np.inf) for name in ("corrected_N", "corrected_Nm"))
-    return bool(left_N <= RESOLUTION[0] or left_Nm <= RESOLUTION[3])
+    return bool(left_N <= finest[0] or left_Nm <= finest[3])
 
 
 def _mistakes(fit: Judged, used: NDArray[np.bool_], t_s: Array | None, setup: Setup, written: str) -> list[Finding]:
