@@ -212,6 +212,8 @@ class Setup:
     """Mass of sensor and adapter, which the sensor cannot weigh."""
     payload_kg: float | None = None
     """Payload as set in the controller: all that hangs on the flange."""
+    sensor_has_arbitrary_zero: bool = False
+    """Whether the sensor may read anything without load, so that its bias shows no mistake."""
 
     def __post_init__(self) -> None:
         if self.up_in_base is not None:

@@ -202,12 +202,20 @@ def _judge(
         judged,
         t_s=dataset.t_s,
         measured_sigma=measured_sigma,
-        setup=setup,
+        setup=replace(setup, sensor_has_arbitrary_zero=setup.sensor_has_arbitrary_zero or _zero_is_arbitrary(dataset)),
         known=known,
         unconstrained=unconstrained,
         g_m_s2=g_m_s2,
         written=_written(dataset),
     )
+
+
+def _zero_is_arbitrary(dataset: CalibrationDataset) -> bool:
+    """Whether the sensor reported so when the dataset was recorded."""
+    place: Any = dataset.meta
+    for key in ("devices", "sensor", "facts"):
+        place = place.get(key) if isinstance(place, Mapping) else None
+    return isinstance(place, Mapping) and "zero" in place
 
 
 def _written(dataset: CalibrationDataset) -> str:

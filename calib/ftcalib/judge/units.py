@@ -78,7 +78,12 @@ def unit_of_force(mass: float, sigma: float, true_kg: float, tolerance_kg: float
 
 
 def implausible(
-    estimate: Parameters, residual_N: float, *, described: bool, unit_N: tuple[float, float] | None = None
+    estimate: Parameters,
+    residual_N: float,
+    *,
+    described: bool,
+    any_bias: bool = False,
+    unit_N: tuple[float, float] | None = None,
 ) -> list[Finding]:
     """Find a bias that no sensor, and a weight or a centre of mass that no tool has, with units that make it usual.
 
@@ -89,11 +94,13 @@ def implausible(
         Root mean square of the forces.
     described : bool
         Whether the shape of the tool is, which alone limits how far its centre of mass may be.
+    any_bias : bool
+        Whether the zero of the sensor is arbitrary.
     unit_N : (float, float), optional
         By a known mass, as of `unit_of_force`.
     """
     weight_N, com_m = estimate.weight_N, float(np.linalg.norm(estimate.p_sensor_com_m))
-    findings = [*_bias(estimate, unit_N), *too_light(weight_N, com_m, residual_N)]
+    findings = [*([] if any_bias else _bias(estimate, unit_N)), *too_light(weight_N, com_m, residual_N)]
     if weight_N > HEAVIEST_N:
         severity: Severity = "reject" if weight_N > IMPOSSIBLE_N else "limit"
         names = [unit for unit in ("gf", "mN") if LIGHTEST_N < weight_N * FORCE_UNITS_N[unit] <= HEAVIEST_N]

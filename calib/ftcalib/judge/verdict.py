@@ -198,6 +198,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
             parameters,
             _rms(fit.residuals[quality.used, :3]),
             described=bool(setup.cylinders_m),
+            any_bias=setup.sensor_has_arbitrary_zero,
             unit_N=unit_N,
         ),
         *([] if contradicted or quality.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),

@@ -397,7 +397,8 @@ def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = Fal
 
     if result.verdict == "rejected":
         unsaved = " and was not saved" if to_be_saved else ""
-        raise NotAccepted(f"the result is rejected{unsaved}: {'; '.join(result.reasons)}")
+        reasons = [one.words for one in result.findings if one.severity != "note"]
+        raise NotAccepted(f"the result is rejected{unsaved}: {'; '.join(reasons)}")
 
 
 def rehearse(station: "Station", runs: Path, name: str, *, kept: bool = True, **options: Any) -> "Outcome":

@@ -51,13 +51,14 @@ def solve_recording(
     NotObservable
         The motion does not determine the parameters, or contradicts the earlier result.
     """
-    provenance, height_m, g_m_s2 = made_now(), None, STANDARD_GRAVITY_M_S2
+    provenance, height_m, g_m_s2, any_zero = made_now(), None, STANDARD_GRAVITY_M_S2, False
     if isinstance(source, Path):
         wrench, poses, header = _read_in_motion(source)
         devices = {"arm": asdict(header.info.arm), "sensor": asdict(header.info.sensor)}
         provenance |= {"recording": source.name, "devices": devices}
         g_m_s2 = header.info.calibration.g_m_s2
         height_m = float(header.info.p_flange_sensor_m[2])
+        any_zero = header.info.sensor.has_arbitrary_zero
     else:
         wrench, poses = (_means_of(rows) for rows in (source[0].wrenches(), source[1].poses()))
         names = [table.name for table in source]
@@ -65,7 +66,7 @@ def solve_recording(
         provenance |= {"table": words} if (words := table_words(source)) else {}
     if earlier is not None:
         require_same_cell(earlier, provenance)
-    setup = Setup(up_in_base=up_in_base)
+    setup = Setup(up_in_base=up_in_base, sensor_has_arbitrary_zero=any_zero)
     if known is not None and known.gravity_direction_base is not None:
         known = replace(known, gravity_direction_base=-setup.up)
     return solve_motion(

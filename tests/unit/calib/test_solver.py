@@ -621,3 +621,19 @@ def test_a_baseline_counts_only_the_parameters_that_it_estimates(method: Method)
     assert result.dof == 30 - {"vougioukas": 10, "wang": 12, "yang": 13}[method]
     assert result.verdict == "usable"
     assert "there are only 5 poses" in result.reasons[0]
+
+
+def test_a_sensor_with_an_arbitrary_zero_may_have_any_bias() -> None:
+    truth = Parameters(
+        np.eye(3), np.array([0, 0, -9.0]), np.array([0, 0, 25_400.0]), np.array([0, 0, 0.1]), np.zeros(3)
+    )
+    R = Rotation.create_group("O").as_matrix()
+    noise = np.random.default_rng(5).normal(0, [0.02] * 3 + [0.001] * 3, (24, 6))
+    counts = CalibrationDataset.of(R, predict(truth, R) + noise)
+    assert solve(counts).findings[0].code == "bias_implausible"
+    facts = {"devices": {"sensor": {"facts": {"zero": {"value": "arbitrary"}}}}}
+    for known in (
+        solve(counts, setup=Setup(sensor_has_arbitrary_zero=True)),
+        solve(CalibrationDataset.of(R, counts.wrench, meta=facts)),
+    ):
+        assert known.verdict == "good"
