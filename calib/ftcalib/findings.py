@@ -379,6 +379,26 @@ CODES: Final[Mapping[str, Code]] = {
         "check signs, units and reference point of the wrench (--sign, --columns, --wrench-frame), then [tool] "
         "cylinders_mm"),
     # Recordings in motion
+    "zeroed": Code(_LIMIT, "the sensor was zeroed within the recording, at {at_s:.2f} from its start",
+        "zero it before the recording only"),
+    "positions_unit": Code(_REJECT, "the positions look given in {unit}, because they spread over {spread_m:.3g} and "
+        "accelerate as much too fast for the weight", "give them in m"),
+    "clock_rate": Code(_REJECT, "gravity and the acceleration of the poses agree if all times are {factor:~sigma} "
+        "times as long (sigma {sigma:~sigma})", "give the true rate, which is {rate:.4g} times the stated one, or the "
+        "unit of the times"),
+    "reversed_in_motion": Code(_REJECT, "the {channels} look reversed, because weight, acceleration and inertia "
+        "disagree in sign", "reverse the {channels}, or give wrench and orientations in right-handed axes"),
+    "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the poses look like those of a TCP, because the sensor lies at "
+        "{point_mm:.0f} in their axes, not on z of the flange", "give the poses of the flange"),
+    "torques_about_tcp": Code(_REJECT_OR_LIMIT, "the torques look taken about a TCP, because their point lies at "
+        "{point_mm:.0f} in the axes of the poses, beyond the centre of mass", "give the torques about the sensor "
+        "origin, and the poses of the flange"),
+    "inertia_impossible": Code(_REJECT, "no body has the principal moments of inertia {principal_gm2:.2f} g·m² (sigma "
+        "{sigma_gm2:.2g} g·m²)", "check that the poses are those of the flange, then the axes and units of wrench and "
+        "poses, then the clock"),
+    "height_impossible": Code(_REJECT, "by the motion the sensor lies {height_mm:~sigma_mm} above the flange (sigma "
+        "{sigma_mm:~sigma_mm}), where none is", "check that the poses are those of the flange, then the axes and units "
+        "of wrench and poses, then the clock"),
     "wrench_compensated": Code(_REJECT, "the load weighs {weight_N:.2g}, but has the inertia of {mass_kg:.2g}, as if a "
         "controller had compensated or zeroed the wrench", "record the wrench as the sensor measures it"),
     "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned through {range_deg:.0f} only, which leaves the mounting "

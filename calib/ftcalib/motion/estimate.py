@@ -22,6 +22,7 @@ from ftcalib.motion.model import (
     INERTIA,
     SIZE,
     Load,
+    PoseError,
     RowNoise,
     jacobian,
     runs,
@@ -45,6 +46,8 @@ MOST_CONTACT = 0.8
 MARGIN = 2
 # Distance and number of the knots of the bias.
 KNOT_S, MOST_KNOTS = 5.0, 25
+# What the steps of zeroings, removed before, may be wrong by: one sigma.
+ZEROED_N, ZEROED_NM = 10.0, 1.0
 # Keeps what is not determined finite: its sigma becomes a million times as large as its scale.
 RIDGE = 1e-12
 # A component is kept if it lowers -2 log restricted likelihood by this.
@@ -72,6 +75,8 @@ _SIZES: Mapping[str, Array] = {
     "walk_N": np.geomspace(3e-4, 3e-1, 10),
     "walk_Nm": np.geomspace(6e-6, 6e-3, 10),
 }
+
+NEVER: Array = np.zeros(0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,8 +113,10 @@ class MotionFit:
 class _Problem:
     """Rows with what is known of their load."""
 
-    def __init__(self, rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool) -> None:
-        self.rows, self.g_m_s2 = rows, g_m_s2
+    def __init__(
+        self, rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool, zeroed_s: Array = NEVER
+    ) -> None:
+        self.rows, self.g_m_s2, self.zeroed_s = rows, g_m_s2, zeroed_s
         self.constraints = Constraints(known or Known(), g_m_s2)
         self.duration_s = float(np.ptp(rows.t_s))
         self.fixed = np.zeros(SIZE, bool)
@@ -119,12 +126,14 @@ class _Problem:
         centred = np.linalg.svd(np.ones((1, count)))[2][1:].T  # a drift of mean 0: the bias is that of the mean
         steps = np.diff(np.eye(count), axis=0) @ centred
         self.walk = steps.T @ steps / (self.knots[1] - self.knots[0])
-        self.centred = np.kron(centred, np.eye(6))
+        self.courses = count + len(zeroed_s)
+        self.centred = np.kron(block_diag(centred, np.eye(len(zeroed_s))), np.eye(6))
 
     def hats(self, t_s: Array) -> Array:
-        """Weight (n, knots) of each knot."""
+        """Weight (n, courses) of each knot, and of the bias before each zeroing."""
         step = self.knots[1] - self.knots[0]
-        return np.asarray(np.maximum(1 - np.abs(t_s[:, None] - self.knots) / step, 0))
+        knots = np.maximum(1 - np.abs(t_s[:, None] - self.knots) / step, 0)
+        return np.hstack([knots, t_s[:, None] <= self.zeroed_s]) if len(self.zeroed_s) else np.asarray(knots)
 
     def predict(self, load: Load, rows: Rows) -> Array:
         return wrench_of(load, rows.motion.earlier(load.delay_s, rows.rate))
@@ -157,8 +166,8 @@ class _Problem:
     def rough(self, load: Load) -> tuple[Load, float]:
         """Fit robustly with white noise; return the load and the logarithm of its residuals' size."""
         rows = self.rows[:: max(1, len(self.rows) // _ROUGH_ROWS)]
-        limit, no_drift = np.inf, np.zeros((len(self.knots), 6))
-        nothing = np.zeros(6 * len(self.walk))
+        limit, no_drift = np.inf, np.zeros((self.courses, 6))
+        nothing = np.zeros(self.centred.shape[1])
         for _ in range(40):
             r = rows.wrench - self.predict(load, rows)
             scale = 1.4826 * np.array([np.median(np.abs(r[:, :3])), np.median(np.abs(r[:, 3:]))]) + 1e-12
@@ -180,8 +189,8 @@ class _Problem:
     ) -> tuple[Array, Array, float]:
         """Information, gradient and chi2 of load and drift, over kept rows as the noise weighs them."""
         rows, order = self.rows[kept], noise.filters.shape[0] - 1
-        state, place, knots = state[kept], runs(rows.t_s, rows.row_s), len(self.knots)
-        size = SIZE + 6 * knots
+        state, place = state[kept], runs(rows.t_s, rows.row_s)
+        size = SIZE + 6 * self.courses
         H, b, chi2 = np.zeros((size, size)), np.zeros(size), 0.0
         for start in range(0, len(rows), _CHUNK):
             part = slice(max(start - order, 0), start + _CHUNK)
@@ -232,6 +241,8 @@ class _Problem:
                     on[knots] = False
         precision, _ = self.prior(load)
         P[:SIZE, :SIZE] += np.diag(precision)
+        zeroed = range(total - 6 * len(self.zeroed_s), total)
+        P[zeroed, zeroed] = np.tile(1 / np.repeat([ZEROED_N, ZEROED_NM], 3) ** 2, len(self.zeroed_s))
         return P, on, log_det
 
     def solve(
@@ -303,6 +314,7 @@ def fit(
     prior: CellPrior | None = None,
     point_mass: bool = False,
     guarded: bool = False,
+    zeroed_s: Array = NEVER,
 ) -> MotionFit:
     """Fit all unknowns to rows.
 
@@ -319,14 +331,16 @@ def fit(
     guarded : bool
         Whether a contact guard has watched the motion. Then bursts of noise, as of gears at the reversal of a joint,
         are no contact: only rows above `TOUCH_N` or `TOUCH_NM` are, and each row has the noise of its surroundings.
+    zeroed_s : array, shape (k,)
+        Times after which the sensor has another bias, all but removed from the rows. That of the load is the last.
     """
-    problem = _Problem(rows, known, g_m_s2, point_mass=point_mass)
+    problem = _Problem(rows, known, g_m_s2, point_mass=point_mass, zeroed_s=zeroed_s)
     # Forces alone allow several mountings: the residuals of a robust fit, with the torques, decide.
     roughs = sorted((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])
     load, _ = roughs[0]
     r = rows.wrench - problem.predict(load, rows)
     kept = _untouched(r) if guarded else _first_kept(problem, load)
-    drift, sizes = np.zeros((len(problem.knots), 6)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
+    drift, sizes = np.zeros((problem.courses, 6)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
     solved = _Step.none()
     for stage in range(_STAGES):
         state = states(rows.speed_rad_s, kept)
@@ -362,12 +376,13 @@ def fit(
             others.append(there[2] - float(there[1] @ problem.solve(sizes, there, other, drift).step) - chi2)
     walk = None
     if sizes.get("walk_N") or sizes.get("walk_Nm"):
-        ends = np.zeros((6, SIZE + 6 * len(problem.knots)))
-        ends[:, -6:] += np.eye(6)
+        last = len(problem.knots) - 1
+        ends = np.zeros((6, SIZE + 6 * problem.courses))
+        ends[:, SIZE + 6 * last : SIZE + 6 * last + 6] += np.eye(6)
         ends[:, SIZE : SIZE + 6] -= np.eye(6)
         ends = ends @ block_diag(np.eye(SIZE), problem.centred)
         sigma = np.sqrt(np.einsum("ij,jk,ik->i", ends, solved.covariance, ends))
-        walk = DriftResult(drift[-1] - drift[0], sigma, problem.hats(rows.t_s) @ drift)
+        walk = DriftResult(drift[last] - drift[0], sigma, problem.hats(rows.t_s) @ drift)
     return MotionFit(
         load=load,
         covariance=solved.covariance[:SIZE, :SIZE],
@@ -425,6 +440,64 @@ def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
     """Delay of the wrench beyond that of the rows, by a robust fit."""
     problem = _Problem(rows, known, g_m_s2, point_mass=False)
     return min((problem.rough(start) for start in problem.starts()), key=lambda one: one[1])[0].delay_s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeFit:
+    """A robust fit in which the poses may have an error."""
+
+    load: Load
+    error: PoseError
+    covariance: Array
+    """(37, 37) of the load, as of `Load.moved`, then of scale and aside."""
+    residual: Array
+    """(2,) of force and torque: the median, as a standard deviation."""
+
+
+def fit_freely(rows: Rows, known: Known | None, g_m_s2: float) -> FreeFit:
+    """Fit load and error of the poses, robustly and with white noise, from each mounting that forces allow."""
+    problem = _Problem(rows[:: max(1, len(rows) // _ROUGH_ROWS)], known, g_m_s2, point_mass=False)
+    return min(
+        (_freely(problem, start) for start in problem.starts()), key=lambda one: float(np.log(one.residual).sum())
+    )
+
+
+def _freely(problem: _Problem, load: Load) -> FreeFit:
+    rows, limit = problem.rows, np.inf
+    X = np.column_stack([np.ones(len(rows)), rows.motion.columns()])
+    by_acceleration = np.linalg.lstsq(X, rows.wrench[:, :3], rcond=1e-9)[0][10:13]
+    first = -float(np.sum(by_acceleration * load.static.R_flange_sensor)) / (3 * max(load.mass_kg, 1e-9))
+    error = PoseError(first)
+    for _ in range(40):
+        now = error.corrected(rows)
+        r = rows.wrench - problem.predict(load, now)
+        scale = 1.4826 * np.array([np.median(np.abs(r[:, :3])), np.median(np.abs(r[:, 3:]))]) + 1e-12
+        unit = r / np.repeat(scale, 3)
+        distance = np.sum(unit**2, axis=1)
+        limit = max(min(limit, float(distance.max())) / 2, 22.0)
+        weight = (limit / (limit + distance)) ** 2
+        of_load = jacobian(load, now.motion.earlier(load.delay_s, now.rate), now.rate)
+        of_error = PoseError.jacobian(load, rows.motion.earlier(load.delay_s, rows.rate))
+        J = np.concatenate([of_load, of_error], axis=2) / np.repeat(scale, 3)[:, None]
+        weighted = (J * weight[:, None, None]).reshape(-1, SIZE + 3)
+        precision, value = problem.prior(load)
+        H = weighted.T @ J.reshape(-1, SIZE + 3) + np.diag(np.append(precision, np.zeros(3)))
+        b = weighted.T @ unit.ravel() - np.append(precision * value, np.zeros(3))
+        known, residuals = problem.constraints.measurements(load.static)
+        H[:15, :15] += known.T @ known
+        b[:15] += known.T @ residuals
+        basis = problem.free(load)
+        # Gain and cross-talk stay 0: they would take part of a scale.
+        Z = block_diag(basis[:, ~basis[GAINS.start :].any(axis=0)], np.eye(3))
+        H = Z.T @ H @ Z
+        size = np.sqrt(np.diag(H)) + 1e-12
+        covariance = np.linalg.inv(H / np.outer(size, size) + RIDGE * np.eye(len(H))) / np.outer(size, size)
+        step = Z @ covariance @ (Z.T @ b)
+        load = load.moved(step[:SIZE])
+        error = replace(error, scale=error.scale + float(step[SIZE]), aside_m=error.aside_m + step[SIZE + 1 :])
+        if limit == 22.0 and np.abs(step[:6]).max() < 1e-6:
+            break
+    return FreeFit(load, error, Z @ covariance @ Z.T, scale)
 
 
 def _first_kept(problem: _Problem, load: Load) -> NDArray[np.bool_]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ftcalib.likelihood.response import CROSS_TALK_M, GAIN
 from ftcalib.model import Array, Parameters, cross, skew
-from ftcalib.motion.samples import Motion
+from ftcalib.motion.samples import Motion, Rows
 
 INERTIA_NAMES = ("xx", "yy", "zz", "xy", "xz", "yz")
 # Names of what motion adds to the 15 static coordinates.
@@ -33,7 +33,7 @@ _PLACES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _BASIS = np.zeros((6, 3, 3))
 for _k, (_i, _j) in enumerate(_PLACES):
     _BASIS[_k, _i, _j] = _BASIS[_k, _j, _i] = 1.0
-_SECOND_MOMENTS = np.trace(_BASIS, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - _BASIS
+SECOND_MOMENTS = np.trace(_BASIS, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - _BASIS
 _TURNS = skew(np.eye(3))
 # Each entry of Omega as 1: what is linear in it is a product with what these give, instead of one for each row.
 _UNITS = np.eye(9).reshape(9, 3, 3)
@@ -81,6 +81,39 @@ class Load:
         return np.asarray(np.tensordot(self.inertia, _BASIS, 1))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseError:
+    """How poses differ from those of the flange: they are of another point, or their times or positions have a scale.
+
+    The acceleration of the flange axis is `scale` times that of the poses, plus that of a point at `aside_m` beside it.
+    An orientation of the point is part of the mounting, and its distance along z of the height.
+    """
+
+    scale: float = 1.0
+    aside_m: Array = field(default_factory=lambda: np.zeros(2))
+    """(2,) from the point of the poses to the axis through the sensor origin, in the axes of the poses."""
+    turning: float = 1.0
+    """Scale of `Omega`: that of the acceleration if the times are wrong, 1 if only the positions are."""
+
+    def undone(self, motion: Motion) -> Motion:
+        """Return the motion, or its rate, without the error."""
+        Omega = self.turning * motion.Omega_rad2_s2
+        acceleration = self.scale * motion.acceleration_m_s2 + Omega[:, :, :2] @ self.aside_m
+        return Motion(motion.R_base_flange, acceleration, Omega)
+
+    def corrected(self, rows: Rows) -> Rows:
+        """Return the rows without the error."""
+        return replace(rows, motion=self.undone(rows.motion), rate=self.undone(rows.rate))
+
+    @staticmethod
+    def jacobian(load: Load, motion: Motion) -> Array:
+        """Derivative (n, 6, 3) of the wrench by scale and aside, given the motion with the error."""
+        static, Omega = load.static, motion.Omega_rad2_s2
+        moved = np.concatenate([motion.acceleration_m_s2[:, :, None], Omega[:, :, :2]], axis=2)
+        dU = -load.mass_kg * static.R_flange_sensor.T @ moved
+        return np.concatenate([dU, skew(static.p_sensor_com_m) @ dU], axis=1)
+
+
 def wrench_of(load: Load, motion: Motion, *, bias: bool = True) -> Array:
     """Wrench (n, 6) that the sensor reads without contact.
 
@@ -94,7 +127,7 @@ def wrench_of(load: Load, motion: Motion, *, bias: bool = True) -> Array:
     """
     static, Q = load.static, load.static.R_flange_sensor
     u = _force(load, motion) @ Q
-    second = np.tensordot(load.inertia, _SECOND_MOMENTS, 1)
+    second = np.tensordot(load.inertia, SECOND_MOMENTS, 1)
     torque = cross(static.p_sensor_com_m, u) - motion.Omega_rad2_s2.reshape(-1, 9) @ _vee(Q.T @ _UNITS @ Q @ second)
     K, X = np.tensordot(load.response[:5], GAIN, 1), np.tensordot(load.response[5:], CROSS_TALK_M, 1)
     wrench = np.hstack([u + u @ K, torque + u @ X])
@@ -106,7 +139,7 @@ def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:
     static, m, Q = load.static, load.mass_kg, load.static.R_flange_sensor
     Qt, F_b, c = Q.T, static.gravity_force_base_N, static.p_sensor_com_m
     lever = np.array([0.0, 0.0, load.height_m]) + Q @ c
-    second = np.tensordot(load.inertia, _SECOND_MOMENTS, 1)
+    second = np.tensordot(load.inertia, SECOND_MOMENTS, 1)
     force = _force(load, motion)
     R, Omega = motion.R_base_flange, motion.Omega_rad2_s2
     accelerated = motion.acceleration_m_s2 + Omega @ lever
@@ -123,7 +156,7 @@ def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:
     for k, turn in enumerate(_TURNS):
         dT[:, :, k] -= Omega.reshape(-1, 9) @ _vee(Qt @ (turn @ _UNITS - _UNITS @ turn) @ Q @ second)
     dT[:, :, 9:12] -= skew(u)
-    for k, basis in enumerate(_SECOND_MOMENTS):
+    for k, basis in enumerate(SECOND_MOMENTS):
         dT[:, :, 15 + k] = -Omega.reshape(-1, 9) @ _vee(Qt @ _UNITS @ Q @ basis)
     K, X = np.tensordot(load.response[:5], GAIN, 1), np.tensordot(load.response[5:], CROSS_TALK_M, 1)
     dT += X @ dU

@@ -18,6 +18,20 @@ from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.response import Response
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, rough_delay
+from ftcalib.motion.mistakes import (
+    JUDGED_ROWS,
+    OF_AXES,
+    Stream,
+    Undone,
+    at_rest,
+    bias_steps,
+    falls_to_zero,
+    impossible,
+    require_seconds,
+    stays,
+    undo,
+    without_steps,
+)
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
 from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, rows_of
 from ftcalib.result import CalibrationResult, MotionResult
@@ -41,12 +55,8 @@ WRONG_HEIGHT_M = 3e-3
 MOSTLY = 0.5
 # Share of the change of the force that a wrong recording leaves.
 _UNEXPLAINED = 0.3
-_MISTAKES = frozenset(
-    ("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree")
-)
 # A weight below this share of the inertial mass was subtracted before.
-_COMPENSATED = 0.5
-_JUDGED_ROWS = 300
+_COMPENSATED = 0.2
 # A recording has no last pose from which a bias could go on, so its next use has the error expected from noise alone.
 _KEPT = ("loo_force_rms_N", "loo_torque_rms_Nm", "worst_pose", "residual_sigma", "lag1", "correlations")
 
@@ -100,15 +110,23 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     """
     prior = None if earlier is None else CellPrior(earlier)
     data = wrench.result(), poses.result()
+    require_seconds(data[0][0], "the wrench")
+    require_seconds(data[1][0], "the poses")
     positions = data[1][1].shape[1] == 12
+    data, zeroed_s = _without_zeroing(*data)
     delay_s, row_s = _coarse_delay(rows_of(*data)), NARROW_S if guarded else WIDE_S
     rows = rows_of(*data, delay_s, row_s)
+    undone = (
+        Undone() if not positions or _compensated(rows, g_m_s2) else undo(rows, _spread_m(data[1][1]), known, g_m_s2)
+    )
+    rows = undone.of(rows)
     delay_s += rough_delay(_select_rows(rows, positions), known, g_m_s2)
     # The model is linear in the delay only near that of the rows: far from it they are filtered again.
     for _ in range(3):
-        rows = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), row_s)
+        rows = undone.of(rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), row_s))
         used = _select_rows(rows, positions)
-        best = fit(used, known, g_m_s2, prior=prior, point_mass=point_mass or not positions, guarded=guarded)
+        massless = point_mass or not positions
+        best = fit(used, known, g_m_s2, prior=prior, point_mass=massless, guarded=guarded, zeroed_s=zeroed_s)
         delay_s = rows.delay_s + best.load.delay_s
         if abs(best.load.delay_s) < LINEAR_S:
             break
@@ -126,10 +144,15 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         contacts,
     )
     quality, judged = _judge(used, best, setup, known, g_m_s2)
-    mistakes = _mistakes(used, best, quality.findings)
-    findings = [*quality.findings, *mistakes]
+    causes = list(undone.findings)
+    if len(zeroed_s):
+        causes.append(Finding.of("zeroed", at_s=zeroed_s - data[0][0][0]))
+    findings = [*quality.findings, *_mistakes(used, best, quality.findings)]
     findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
     findings += _findings(rows, used, best, motion, height_m, positions=positions)
+    if positions and verdict_of([*findings, *causes]) != "rejected":
+        findings += impossible(best)
+    findings = [*causes, *(one for one in findings if not _explained(one, causes))]
     findings += [] if earlier is None else [Finding.of("earlier_cell", parent=earlier.id)]
     responding = best.components.keys() & {"gain", "cross_talk"} or (prior is not None and prior.has_response)
     places = np.r_[0:15, 23:34]
@@ -211,7 +234,7 @@ def _require_determined(rows: Rows, best: MotionFit, known: Known | None) -> Non
 
 
 def _orientations(rows: Rows) -> Array:
-    return nearest_rotation(rows.motion.R_base_flange[:: max(1, len(rows) // _JUDGED_ROWS)])
+    return nearest_rotation(rows.motion.R_base_flange[:: max(1, len(rows) // JUDGED_ROWS)])
 
 
 def _static_wrench(rows: Rows, best: MotionFit, weight_N: float) -> Array:
@@ -224,9 +247,7 @@ def _static_wrench(rows: Rows, best: MotionFit, weight_N: float) -> Array:
     kept = best.residuals[best.kept, :3]
     if float(np.sqrt(np.mean(np.sum(kept**2, axis=1)))) < 2 * USABLE_SHARE * weight_N:
         return np.asarray(static)
-    X = np.column_stack([np.ones(len(rows)), rows.motion.columns()])
-    linear = np.linalg.lstsq(X, rows.wrench, rcond=1e-9)[0]
-    return np.asarray(rows.wrench - X[:, 10:] @ linear[10:])
+    return at_rest(rows)[0]
 
 
 def _judge(
@@ -237,7 +258,7 @@ def _judge(
     A pose is a mean, so each row has the mean residual of a second around it: what is quicker is vibration.
     """
     places = np.flatnonzero(best.kept)
-    places = places[:: max(1, len(places) // _JUDGED_ROWS)]
+    places = places[:: max(1, len(places) // JUDGED_ROWS)]
     # An odd number of rows, so that the mean lies on its row.
     second = round(1 / rows.row_s / 2) * 2 + 1
     best = replace(best, residuals=_means(best, second), sigma=best.sigma / np.sqrt(second))
@@ -290,20 +311,56 @@ def _findings(
     return findings
 
 
-def _mistakes(rows: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
-    """Name a wrench that follows the acceleration but not gravity, or that does not follow the motion at all."""
+def _without_zeroing(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream], Array]:
+    """Return the streams with one bias, that of the end, and the times at which the sensor was zeroed."""
+    at_s, seen = falls_to_zero(wrench)
+    if len(at_s):
+        steps = bias_steps(rows_of(wrench, poses), at_s)
+        staying = stays(steps, seen)
+        at_s, steps = at_s[staying], steps[staying]
+    if len(at_s):
+        wrench = without_steps(wrench, at_s, steps)
+        rows = rows_of(wrench, poses, _coarse_delay(rows_of(wrench, poses)))
+        wrench = without_steps(wrench, at_s, bias_steps(rows, at_s))
+    return (wrench, poses), at_s
+
+
+def _spread_m(poses: Array) -> float:
+    return float(np.linalg.norm(np.ptp(poses[:, 9:], axis=0)))
+
+
+def _explained(finding: Finding, causes: Sequence[Finding]) -> bool:
+    """Whether a finding is a consequence of a cause that motion shows."""
+    if verdict_of(causes) == "rejected":
+        return True
+    # A point of another device puts the centre of mass behind the sensor.
+    return finding.code == "torques_reversed" and not {"torques_about_tcp", "poses_of_tcp"}.isdisjoint(
+        one.code for one in causes
+    )
+
+
+def _compensated(rows: Rows, g_m_s2: float) -> list[Finding]:
+    """Name a wrench that follows the acceleration but not gravity."""
     X, y = np.column_stack([np.ones(len(rows)), rows.motion.columns()]), rows.wrench[:, :3]
     linear, _, rank, _ = np.linalg.lstsq(X, y, rcond=1e-9)
     variance = np.mean((y - X @ linear) ** 2) * len(X) / max(len(X) - rank, 1)
     weight_N, mass_kg = (float(np.linalg.norm(linear[part]) / np.sqrt(3)) for part in (slice(1, 10), slice(10, 13)))
     sigma_kg = float(np.sqrt(max(np.trace(np.linalg.pinv(X.T @ X)[10:13, 10:13]) * variance, 0.0)))
     follows = variance < _UNEXPLAINED**2 * np.mean(y.var(axis=0))
-    light = weight_N < _COMPENSATED * mass_kg * best.load.g_m_s2
+    light = weight_N < _COMPENSATED * mass_kg * g_m_s2
     if follows and light and mass_kg > SIGNIFICANT_SIGMAS * sigma_kg:
         return [Finding.of("wrench_compensated", weight_N=weight_N, mass_kg=mass_kg)]
+    return []
+
+
+def _mistakes(rows: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
+    """Name a wrench that follows the acceleration but not gravity, or that does not follow the motion at all."""
+    if light := _compensated(rows, best.load.g_m_s2):
+        return light
+    free, y = best.kept, rows.wrench[:, :3]
     free = best.kept
     left = float(np.sqrt(np.mean(best.residuals[free, :3] ** 2) / np.mean(y[free].var(axis=0))))
-    if left > _UNEXPLAINED and not any(one.code in _MISTAKES for one in named):
+    if left > _UNEXPLAINED and not any(one.code in OF_AXES for one in named):
         return [Finding.of("other_recording", left_percent=100 * min(left, 1.0))]
     return []
 

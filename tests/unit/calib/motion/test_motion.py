@@ -116,7 +116,7 @@ def other_poses(swept: Recorded) -> Recorded:
         (lambda s: replace(s, t_pose_s=s.t_pose_s + 0.5), "clock_offset"),
         pytest.param(compensated, "wrench_compensated", marks=pytest.mark.slow),
         pytest.param(other_poses, "other_recording", marks=pytest.mark.slow),
-        (lambda s: replace(s, wrench=s.wrench * [1, -1, 1, -1, 1, -1]), "forces_reversed"),
+        (lambda s: replace(s, wrench=s.wrench * [1, -1, 1, -1, 1, -1]), "reversed_in_motion"),
         (lambda _: record(TRUTH, sweep(SWEEP_S, (0.17, 0.17, 0.17)), SWEEP_S, 1), "motion_narrow"),
     ],
 )

@@ -1,0 +1,265 @@
+"""Mistakes that the motion shows, each found before the load is fitted, and undone so that its consequences vanish.
+
+`fit_freely` separates them: the scale of the acceleration against gravity is that of clock or positions, its sign that
+of the forces, the sign of the moments of mass that of the torques, and the lever shows of which point the poses are.
+Angular velocities alone show none of this: inertia and lever absorb their scale.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from ftcalib.errors import BadDataset
+from ftcalib.findings import Finding
+from ftcalib.judge.described_cell import INSIDE_M
+from ftcalib.judge.faults import faults
+from ftcalib.judge.units import FAR_COM_M
+from ftcalib.judge.verdict import SIGNIFICANT_SIGMAS
+from ftcalib.known import Known
+from ftcalib.model import Array, nearest_rotation
+from ftcalib.motion.estimate import MotionFit, fit_freely
+from ftcalib.motion.model import HEIGHT, INERTIA, SECOND_MOMENTS, SIZE, PoseError
+from ftcalib.motion.samples import Rows
+
+# A longer step between samples is no second, but one of the units that are listed up to their longest steps.
+LONGEST_STEP_S: Final = 0.25
+_TIME_UNITS: Final = (("ms", 300.0), ("µs", 3e5), ("ns", np.inf))
+# Positions that spread farther may be in another unit, if their acceleration agrees with it by this share.
+FARTHEST_M: Final = 3.0
+LENGTHS_M: Final[Mapping[str, float]] = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
+_SAME_UNIT: Final = 0.2
+# Shares of the change of force and torque that a fit with the right causes leaves.
+_EXPLAINED: Final = (0.15, 0.3)
+# A mistake is larger than its sigma by this factor, and than errors that a calibrated arm and sensor have.
+_SIGMAS: Final = 6.0
+# Channels are not reversed if what reversed ones would make negative is so many sigma above 0.
+_SIGNED: Final = 3.0
+CLOCK_SHARE: Final = 0.03
+ASIDE_M: Final = 0.01
+# A sensor whose axis is farther from that of the flange is none.
+FAR_ASIDE_M: Final = 0.03
+# The origin of a sensor is at most this high above the flange, and at least so.
+HIGHEST_M: Final = 0.5
+LOWEST_M: Final = -5e-3
+# Torques about a point beyond the centre of mass are about a TCP from this height on.
+_TCP_M: Final = 0.1
+# Moments of mass of a body are not below 0 by more than 3 sigma and this radius of gyration.
+_GYRATION_M: Final = 0.01
+# Means of 10 ms beside a step that are averaged, and those in it.
+_BESIDE, _WITHIN = 5, 1
+# Where the sensor was zeroed, readings fall to this share, so many times farther than in the means around.
+_ZERO_SHARE, _STEPS, _AROUND, _LEAST_STEP_N = 0.25, 4.0, 101, 1.0
+# Share of a step that stays: a contact that ends where the sensor was zeroed leaves none.
+_STAYS: Final = 0.6
+_ITERATIONS: Final = 25
+# Places of aside and height in a free fit.
+_POINT: Final = np.r_[SIZE + 1, SIZE + 2, HEIGHT]
+
+# Rows that are judged as poses.
+JUDGED_ROWS: Final = 300
+# Mistakes of axes and orientations, which explain whatever else is wrong.
+OF_AXES: Final = frozenset(
+    ("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree")
+)
+
+Stream = tuple[Array, Array]
+"""Times (n,) and values (n, k)."""
+
+
+def require_seconds(t_s: Array, name: str) -> None:
+    """Raise `BadDataset` if the times (n,) of a stream cannot be in seconds."""
+    step = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
+    if step > LONGEST_STEP_S:
+        unit = next(unit for unit, longest in _TIME_UNITS if step < longest)
+        raise BadDataset(f"the times of {name} step by {step:.3g} s, as if they were in {unit}: give them in seconds")
+
+
+# ------------------------------------------------------------------------------------------------------------- zeroing
+
+
+def falls_to_zero(wrench: Stream) -> tuple[Array, Array]:
+    """Return the times (k,) at which all channels step to about 0, and the steps (k, 6).
+
+    The sensor was zeroed there, or a contact ended that began after it was zeroed in the same pose.
+    """
+    t_s, y = wrench
+    if len(t_s) < 4 * (_BESIDE + _WITHIN):
+        return np.zeros(0), np.zeros((0, 6))
+    sums = np.cumsum(np.vstack([np.zeros(6), y]), axis=0)
+    means = (sums[_BESIDE:] - sums[:-_BESIDE]) / _BESIDE
+    apart = _BESIDE + 2 * _WITHIN
+    after, steps = means[apart:], means[apart:] - means[:-apart]
+    left, sizes = (np.linalg.norm(each.reshape(-1, 2, 3), axis=2) for each in (after, steps))
+    usual = median_filter(sizes, (_AROUND, 1))
+    # The reading after it moves on as it does without.
+    to_zero = (left < np.maximum(_ZERO_SHARE * sizes, usual)).all(axis=1)
+    found = np.flatnonzero(to_zero & (sizes[:, 0] > np.maximum(_STEPS * usual[:, 0], _LEAST_STEP_N)))
+    groups = np.split(found, np.flatnonzero(np.diff(found) > 2 * apart) + 1) if len(found) else []
+    # In the middle of a group the means lie on both sides of the step.
+    best = np.array([group[len(group) // 2] for group in groups], np.intp)
+    return t_s[best + _BESIDE + _WITHIN], steps[best]
+
+
+def bias_steps(rows: Rows, at_s: Array) -> Array:
+    """Return the steps (k, 6) of the bias at these times (k,), by a robust fit of all that is linear in the motion."""
+    apart = np.abs(rows.t_s[:, None] - at_s).min(axis=1) > 4 * rows.row_s
+    X = np.column_stack([np.ones(len(rows)), rows.motion.columns(), rows.t_s[:, None] > at_s])[apart]
+    y, weight, limit = rows.wrench[apart], np.ones((int(apart.sum()), 1)), np.inf
+    solution = np.zeros((X.shape[1], 6))
+    for _ in range(_ITERATIONS):
+        solution = np.linalg.lstsq(np.sqrt(weight) * X, np.sqrt(weight) * y, rcond=1e-9)[0]
+        r = y - X @ solution
+        distance = np.sum((r / (1.4826 * np.median(np.abs(r), axis=0) + 1e-12)) ** 2, axis=1, keepdims=True)
+        limit = max(min(limit, float(distance.max(initial=0.0))) / 2, 22.0)
+        weight = (limit / (limit + distance)) ** 2
+    return np.asarray(solution[-len(at_s) :])
+
+
+def stays(steps: Array, seen: Array) -> Array:
+    """Return which steps (k,) of the reading are steps of the bias."""
+    agree = np.sum(steps[:, :3] * seen[:, :3], axis=1)
+    return np.asarray(agree > _STAYS * np.sum(seen[:, :3] ** 2, axis=1))
+
+
+def without_steps(wrench: Stream, at_s: Array, steps: Array) -> Stream:
+    """Return the wrench with the bias that it has after the last step."""
+    t_s, y = wrench
+    return t_s, y + (t_s[:, None] <= at_s).astype(np.float64) @ steps
+
+
+# ----------------------------------------------------------------------------------------------------- signs and poses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Undone:
+    """Mistakes of signs, clock and poses, and how rows are without them."""
+
+    findings: tuple[Finding, ...] = ()
+    error: PoseError = field(default_factory=PoseError)
+    signs: Array = field(default_factory=lambda: np.ones(6))
+
+    def of(self, rows: Rows) -> Rows:
+        """Return the rows without the mistakes."""
+        return replace(self.error.corrected(rows), wrench=rows.wrench * self.signs) if self.findings else rows
+
+
+def undo(rows: Rows, spread_m: float, known: Known | None, g_m_s2: float) -> Undone:
+    """Find the mistakes of signs, clock and poses that explain the rows.
+
+    Where they do not fit even so, axes and orientations are judged by what is linear in the motion, and not undone.
+
+    Parameters
+    ----------
+    rows : Rows
+    spread_m : float
+        Of the positions.
+    known : Known, optional
+    g_m_s2 : float
+    """
+    free = fit_freely(rows, known, g_m_s2)
+    change = np.sqrt(np.mean(rows.wrench.reshape(-1, 2, 3).var(axis=0), axis=1))
+    if (free.residual > _EXPLAINED * change).any():
+        static, left = at_rest(rows)
+        if (left > _EXPLAINED * change).any():
+            return Undone()
+        some = slice(None, None, max(1, len(rows) // JUDGED_ROWS))
+        named = faults(nearest_rotation(rows.motion.R_base_flange)[some], static[some])
+        return Undone(tuple(one for one in named if one.code in OF_AXES))
+    load, Q, sigma = free.load, free.load.static.R_flange_sensor, np.sqrt(np.diag(free.covariance))
+    moment = float(load.inertia[:3].sum())
+    sigma_moment = float(np.sqrt(free.covariance[INERTIA, INERTIA][:3, :3].sum()))
+    signs = np.where([free.error.scale < -_SIGMAS * sigma[SIZE], moment < -_SIGMAS * sigma_moment], -1.0, 1.0)
+    findings = list[Finding]()
+    if (signs < 0).any():
+        names = np.array(["forces", "torques"])[signs < 0]
+        findings.append(Finding.of("reversed_in_motion", channels=" and ".join(names)))
+    scale = turning = 1.0
+    found, sigma_scale = abs(free.error.scale), float(sigma[SIZE])
+    factor = 1 / float(np.sqrt(found))
+    if abs(found - 1) > _SIGMAS * sigma_scale and abs(factor - 1) > CLOCK_SHARE:
+        scale, unit = found, _unit(found, spread_m)
+        turning = 1.0 if unit else found
+        values = {"factor": factor, "sigma": factor * sigma_scale / found / 2, "rate": 1 / factor}
+        by_unit = Finding.of("positions_unit", unit=unit, spread_m=spread_m) if unit else None
+        findings.append(by_unit or Finding.of("clock_rate", **values))
+    # Forces have the lever to the centre of mass, torques that from their own point.
+    com = Q @ load.static.p_sensor_com_m
+    point = signs[0] * (np.append(free.error.aside_m, load.height_m) + com) / turning - signs.prod() * com
+    of_com = np.sqrt(np.diag(Q @ free.covariance[9:12, 9:12] @ Q.T))
+    are_signed = abs(moment) > _SIGNED * sigma_moment and found > _SIGNED * sigma_scale
+    behind = are_signed and _is_behind(signs.prod() * com, of_com)
+    other = _other_point(point, sigma[_POINT] / turning, behind=behind, upright=bool(Q[2, 2] > 0))
+    other = [] if np.linalg.norm(com) > FAR_COM_M else other  # other units of force and torque move the point too
+    aside_m = point[:2] if other else np.zeros(2)
+    return Undone((*findings, *other), PoseError(scale, aside_m, turning), np.repeat(signs, 3))
+
+
+def at_rest(rows: Rows) -> tuple[Array, Array]:
+    """Return the wrench (n, 6) at rest in the orientations, and what is left (2,) of force and torque.
+
+    The linear function of the motion that fits best has the rest, whatever axes and signs are.
+    """
+    X = np.column_stack([np.ones(len(rows)), rows.motion.columns()])
+    linear = np.linalg.lstsq(X, rows.wrench, rcond=1e-9)[0]
+    left = np.median(np.abs(rows.wrench - X @ linear).reshape(-1, 2, 3), axis=(0, 2))
+    return np.asarray(rows.wrench - X[:, 10:] @ linear[10:]), np.asarray(left)
+
+
+def _unit(scale: float, spread_m: float) -> str | None:
+    near = (unit for unit, size in LENGTHS_M.items() if abs(scale / size - 1) < _SAME_UNIT)
+    return next(near, None) if spread_m > FARTHEST_M else None
+
+
+def _other_point(point: Array, sigma: Array, *, behind: bool, upright: bool) -> list[Finding]:
+    """Find poses or torques of another point than they should be.
+
+    Parameters
+    ----------
+    point, sigma : array, shape (3,)
+        From the point of the poses to that of the torques, in the axes of the poses.
+    behind : bool
+        Whether the centre of mass lies on the robot's side of the sensor, though no channel is reversed.
+    upright : bool
+        Whether z of the sensor points along that of the poses.
+    """
+    aside_m, height_m = float(np.linalg.norm(point[:2])), float(point[2])
+    beside = aside_m > max(ASIDE_M, _SIGMAS * float(sigma[:2].max()))
+    elsewhere = not _is_height(height_m, float(sigma[2]))
+    if not (beside or elsewhere or behind):
+        return []
+    along = height_m > LOWEST_M - SIGNIFICANT_SIGMAS * sigma[2] and (not beside or height_m > aside_m)
+    near = not elsewhere and (height_m < _TCP_M if behind else True) and (not beside or aside_m < FAR_ASIDE_M)
+    code = "torques_about_tcp" if behind and upright and along else "poses_of_tcp"
+    return [Finding.of(code, "limit" if near else "reject", point_mm=1e3 * point)]
+
+
+def _is_behind(com: Array, sigma: Array) -> bool:
+    """Whether the centre of mass (3,), in the axes of the poses, lies behind the sensor rather than beside it."""
+    return bool(-com[2] > max(INSIDE_M, SIGNIFICANT_SIGMAS * sigma[2], float(np.linalg.norm(com[:2]))))
+
+
+def _is_height(height_m: float, sigma_m: float) -> bool:
+    slack_m = SIGNIFICANT_SIGMAS * sigma_m
+    return LOWEST_M - slack_m < height_m < HIGHEST_M + slack_m
+
+
+# ----------------------------------------------------------------------------------------------------- impossible body
+
+
+def impossible(best: MotionFit) -> list[Finding]:
+    """Find an inertia or a height that no body and no sensor has, whatever the cause."""
+    findings, sigma_m = list[Finding](), float(np.sqrt(best.covariance[HEIGHT, HEIGHT]))
+    moments, axes = np.linalg.eigh(np.tensordot(best.load.inertia, SECOND_MOMENTS, 1))
+    # The least second moment of mass is below 0 where a principal moment exceeds the sum of the others.
+    along = np.einsum("i,kij,j->k", axes[:, 0], SECOND_MOMENTS, axes[:, 0])
+    sigma = float(np.sqrt(along @ best.covariance[INERTIA, INERTIA] @ along))
+    if moments[0] < -SIGNIFICANT_SIGMAS * sigma - best.load.mass_kg * _GYRATION_M**2:
+        principal = np.linalg.eigvalsh(best.load.inertia_kg_m2)
+        findings.append(Finding.of("inertia_impossible", principal_gm2=1e3 * principal, sigma_gm2=1e3 * sigma))
+    if not _is_height(best.load.height_m, sigma_m):
+        values = {"height_mm": 1e3 * best.load.height_m, "sigma_mm": 1e3 * sigma_m}
+        findings.append(Finding.of("height_impossible", **values))
+    return findings
