@@ -128,8 +128,9 @@ def _time_unit(one: Drawn, rng: Generator) -> Recorded:
     return _times(one.recorded, float(rng.choice([1e3, 1e6, 1e9])))
 
 
-def _signs(*signs: int) -> Callable[[Drawn, Generator], Recorded]:
-    return lambda one, _: replace(one.recorded, wrench=one.recorded.wrench * np.repeat(signs, 3))
+def _reversed(one: Drawn, rng: Generator) -> Recorded:
+    signs = ((-1, -1), (-1, 1), (1, -1))[rng.integers(3)]
+    return replace(one.recorded, wrench=one.recorded.wrench * np.repeat(signs, 3))
 
 
 def _axes(one: Drawn, rng: Generator) -> Recorded:
@@ -151,20 +152,18 @@ def _pounds(one: Drawn, rng: Generator) -> Recorded:
     return replace(one.recorded, wrench=one.recorded.wrench / np.repeat([4.4482216, torque], 3))
 
 
-# The mistake, and the codes that name it.
+# The mistake, and the codes that name it; those of the clock last, because others know when the arm rests.
 MISTAKES: Mapping[str, tuple[Callable[[Drawn, Generator], Recorded], frozenset[str]]] = {
+    "zeroed": (_zeroed, frozenset(["zeroed"])),
     "poses of a TCP": (_tcp, frozenset(["poses_of_tcp"])),
     "torques about a TCP": (_torques_about_tcp, frozenset(["torques_about_tcp"])),
-    "zeroed": (_zeroed, frozenset(["zeroed"])),
+    "positions in mm": (_mm, frozenset(["positions_unit"])),
+    "reversed": (_reversed, frozenset(["reversed_in_motion"])),
+    "axes": (_axes, frozenset(["axes_disagree", "reversed_in_motion"])),
+    "pounds": (_pounds, frozenset(["com_too_far", "com_too_near", "weight_implausible"])),
+    "delay": (_delay, frozenset(["clock_offset"])),
     "rate": (_rate, frozenset(["clock_rate"])),
     "time unit": (_time_unit, frozenset(["BadDataset"])),
-    "positions in mm": (_mm, frozenset(["positions_unit"])),
-    "all reversed": (_signs(-1, -1), frozenset(["reversed_in_motion"])),
-    "forces reversed": (_signs(-1, 1), frozenset(["reversed_in_motion"])),
-    "torques reversed": (_signs(1, -1), frozenset(["reversed_in_motion"])),
-    "axes": (_axes, frozenset(["axes_disagree", "reversed_in_motion"])),
-    "delay": (_delay, frozenset(["clock_offset"])),
-    "pounds": (_pounds, frozenset(["com_too_far", "com_too_near", "weight_implausible"])),
 }  # fmt: skip
 
 
@@ -229,7 +228,7 @@ def _alone(name: str, runs: int) -> Iterator[Row]:
         if not hit:
             missed[f"{found.verdict} {', '.join(found.codes[:2])}".strip()] += 1
             show(f"{name}, seed {seed}: {found.verdict}, {', '.join(found.codes)}")
-    hidden = name in ("pounds", "axes", "delay")  # not of this script; the first two do not show in every recording
+    hidden = name == "pounds"  # which motion does not show in every recording
     passed = hidden or (first >= 0.95 * runs and not good)
     target = "" if hidden else "95 %, 0 good"
     yield Row(f"{name}: named first; good", f"{100 * first / runs:.0f} %; {good}", target, passed, runs)
@@ -240,7 +239,8 @@ def _together(runs: int) -> Iterator[Row]:
     verdicts, impossible, silent = Counter[str](), 0, Counter[str]()
     for seed in range(runs):
         rng, one = np.random.default_rng([seed, 33]), draw(seed)
-        names = [str(name) for name in rng.choice(list(MISTAKES), rng.integers(1, 4), replace=False)]
+        some = rng.choice(list(MISTAKES), rng.integers(1, 4), replace=False)
+        names = [name for name in MISTAKES if name in some]
         for name in names:
             one = replace(one, recorded=MISTAKES[name][0](one, rng))
         found = judged(one.recorded, one.setup)

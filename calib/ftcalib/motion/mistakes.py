@@ -12,7 +12,6 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import median_filter
 
-from ftcalib.errors import BadDataset
 from ftcalib.findings import Finding
 from ftcalib.judge.described_cell import INSIDE_M
 from ftcalib.judge.faults import faults
@@ -24,15 +23,15 @@ from ftcalib.motion.estimate import MotionFit, fit_freely
 from ftcalib.motion.model import HEIGHT, INERTIA, SECOND_MOMENTS, SIZE, PoseError
 from ftcalib.motion.samples import Rows
 
-# A longer step between samples is no second, but one of the units that are listed up to their longest steps.
-LONGEST_STEP_S: Final = 0.25
-_TIME_UNITS: Final = (("ms", 300.0), ("µs", 3e5), ("ns", np.inf))
 # Positions that spread farther may be in another unit, if their acceleration agrees with it by this share.
 FARTHEST_M: Final = 3.0
 LENGTHS_M: Final[Mapping[str, float]] = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
 _SAME_UNIT: Final = 0.2
-# Shares of the change of force and torque that a fit with the right causes leaves.
-_EXPLAINED: Final = (0.15, 0.3)
+# Shares of the change of force and torque that a fit with the right causes leaves, and that may be those of axes.
+_EXPLAINED: Final = np.array([0.15, 0.3])
+_SUSPECT: Final = 0.05
+# A weight below this share of the inertial mass was subtracted before.
+COMPENSATED: Final = 0.2
 # A mistake is larger than its sigma by this factor, and than errors that a calibrated arm and sensor have.
 _SIGMAS: Final = 6.0
 # Channels are not reversed if what reversed ones would make negative is so many sigma above 0.
@@ -67,14 +66,6 @@ OF_AXES: Final = frozenset(
 
 Stream = tuple[Array, Array]
 """Times (n,) and values (n, k)."""
-
-
-def require_seconds(t_s: Array, name: str) -> None:
-    """Raise `BadDataset` if the times (n,) of a stream cannot be in seconds."""
-    step = float(np.median(np.diff(t_s))) if len(t_s) > 1 else 0.0
-    if step > LONGEST_STEP_S:
-        unit = next(unit for unit, longest in _TIME_UNITS if step < longest)
-        raise BadDataset(f"the times of {name} step by {step:.3g} s, as if they were in {unit}: give them in seconds")
 
 
 # ------------------------------------------------------------------------------------------------------------- zeroing
@@ -161,13 +152,11 @@ def undo(rows: Rows, spread_m: float, known: Known | None, g_m_s2: float) -> Und
     """
     free = fit_freely(rows, known, g_m_s2)
     change = np.sqrt(np.mean(rows.wrench.reshape(-1, 2, 3).var(axis=0), axis=1))
-    if (free.residual > _EXPLAINED * change).any():
-        static, left = at_rest(rows)
-        if (left > _EXPLAINED * change).any():
-            return Undone()
-        some = slice(None, None, max(1, len(rows) // JUDGED_ROWS))
-        named = faults(nearest_rotation(rows.motion.R_base_flange)[some], static[some])
-        return Undone(tuple(one for one in named if one.code in OF_AXES))
+    if (free.residual > _SUSPECT * change).any() and (named := _axes(rows, change)):
+        return Undone(named)
+    # A wrench without weight gives any scale.
+    if (free.residual > _EXPLAINED * change).any() or abs(free.error.scale) > 1 / COMPENSATED:
+        return Undone()
     load, Q, sigma = free.load, free.load.static.R_flange_sensor, np.sqrt(np.diag(free.covariance))
     moment = float(load.inertia[:3].sum())
     sigma_moment = float(np.sqrt(free.covariance[INERTIA, INERTIA][:3, :3].sum()))
@@ -195,6 +184,16 @@ def undo(rows: Rows, spread_m: float, known: Known | None, g_m_s2: float) -> Und
     other = [] if np.linalg.norm(com) > FAR_COM_M else other  # other units of force and torque move the point too
     aside_m = point[:2] if other else np.zeros(2)
     return Undone((*findings, *other), PoseError(scale, aside_m, turning), np.repeat(signs, 3))
+
+
+def _axes(rows: Rows, change: Array) -> tuple[Finding, ...]:
+    """Find wrong axes and orientations in what is left of the motion at rest, whose axes do not count."""
+    static, left = at_rest(rows)
+    if (left > _EXPLAINED * change).any():
+        return ()
+    some = slice(None, None, max(1, len(rows) // JUDGED_ROWS))
+    named = faults(nearest_rotation(rows.motion.R_base_flange)[some], static[some])
+    return tuple(one for one in named if one.code in OF_AXES)
 
 
 def at_rest(rows: Rows) -> tuple[Array, Array]:

@@ -26,6 +26,9 @@ GAP_S = 0.06
 
 # Longer ones are refused: the times are of two recordings, or wrong.
 LONGEST_GAP_S = 86400.0
+# A longer step from sample to sample is one in a unit of this list, with the longest step of each.
+LONGEST_STEP_S = 0.25
+_TIME_UNITS = (("ms", 300.0), ("µs", 3e5), ("ns", np.inf))
 # Times count in units of 10 ms, which 64 bits must hold.
 LATEST_S = 1e11
 
@@ -95,6 +98,7 @@ class Means:
             )
         steps = np.diff(t_s, prepend=self._last_s if self.samples else t_s[0])
         if steps[longest := int(steps.argmax())] > LONGEST_GAP_S:
+            require_seconds(t_s, "the times")
             raise BadDataset(
                 f"no sample for {steps[longest]:.3g} s before sample {self.samples + longest + 1} at "
                 f"{t_s[longest]:.6g} s: divide the recording there, or correct the times"
@@ -119,6 +123,14 @@ class Means:
         t_s = sums[:, 1] / sums[:, 0]
         own = np.diff(t_s, prepend=-np.inf) > MEAN_S / 10  # a sample of a slow stream is alone in two means
         return t_s[own], sums[own, 2:] / sums[own, :1]
+
+
+def require_seconds(t_s: Array, name: str) -> None:
+    """Raise `BadDataset` if the times (n,) of a stream cannot be in seconds."""
+    step = float(np.quantile(np.diff(t_s), 0.25, method="lower")) if len(t_s) > 1 else 0.0
+    if step > LONGEST_STEP_S:
+        unit = next(unit for unit, longest in _TIME_UNITS if step < longest)
+        raise BadDataset(f"{name} step by {step:.3g} s, as if they were in {unit}: give them in seconds")
 
 
 def _sum_cells(cell: NDArray[np.int64], sums: Array) -> tuple[NDArray[np.int64], Array]:

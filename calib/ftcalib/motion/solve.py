@@ -19,6 +19,7 @@ from ftcalib.likelihood.response import Response
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, rough_delay
 from ftcalib.motion.mistakes import (
+    COMPENSATED,
     JUDGED_ROWS,
     OF_AXES,
     Stream,
@@ -27,13 +28,12 @@ from ftcalib.motion.mistakes import (
     bias_steps,
     falls_to_zero,
     impossible,
-    require_seconds,
     stays,
     undo,
     without_steps,
 )
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
-from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, rows_of
+from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, require_seconds, rows_of
 from ftcalib.result import CalibrationResult, MotionResult
 
 LEAST_S = 5.0
@@ -55,8 +55,6 @@ WRONG_HEIGHT_M = 3e-3
 MOSTLY = 0.5
 # Share of the change of the force that a wrong recording leaves.
 _UNEXPLAINED = 0.3
-# A weight below this share of the inertial mass was subtracted before.
-_COMPENSATED = 0.2
 # A recording has no last pose from which a bias could go on, so its next use has the error expected from noise alone.
 _KEPT = ("loo_force_rms_N", "loo_torque_rms_Nm", "worst_pose", "residual_sigma", "lag1", "correlations")
 
@@ -110,15 +108,13 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     """
     prior = None if earlier is None else CellPrior(earlier)
     data = wrench.result(), poses.result()
-    require_seconds(data[0][0], "the wrench")
-    require_seconds(data[1][0], "the poses")
+    require_seconds(data[0][0], "the times of the wrench")
+    require_seconds(data[1][0], "the times of the poses")
     positions = data[1][1].shape[1] == 12
     data, zeroed_s = _without_zeroing(*data)
     delay_s, row_s = _coarse_delay(rows_of(*data)), NARROW_S if guarded else WIDE_S
     rows = rows_of(*data, delay_s, row_s)
-    undone = (
-        Undone() if not positions or _compensated(rows, g_m_s2) else undo(rows, _spread_m(data[1][1]), known, g_m_s2)
-    )
+    undone = undo(rows, _spread_m(data[1][1]), known, g_m_s2) if positions else Undone()
     rows = undone.of(rows)
     delay_s += rough_delay(_select_rows(rows, positions), known, g_m_s2)
     # The model is linear in the delay only near that of the rows: far from it they are filtered again.
@@ -347,7 +343,7 @@ def _compensated(rows: Rows, g_m_s2: float) -> list[Finding]:
     weight_N, mass_kg = (float(np.linalg.norm(linear[part]) / np.sqrt(3)) for part in (slice(1, 10), slice(10, 13)))
     sigma_kg = float(np.sqrt(max(np.trace(np.linalg.pinv(X.T @ X)[10:13, 10:13]) * variance, 0.0)))
     follows = variance < _UNEXPLAINED**2 * np.mean(y.var(axis=0))
-    light = weight_N < _COMPENSATED * mass_kg * g_m_s2
+    light = weight_N < COMPENSATED * mass_kg * g_m_s2
     if follows and light and mass_kg > SIGNIFICANT_SIGMAS * sigma_kg:
         return [Finding.of("wrench_compensated", weight_N=weight_N, mass_kg=mass_kg)]
     return []

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array, Parameters
 from ftcalib.motion import samples
-from ftcalib.motion.mistakes import Undone, bias_steps, falls_to_zero, impossible, require_seconds, stays, undo
+from ftcalib.motion.mistakes import Undone, bias_steps, falls_to_zero, impossible, stays, undo
 from ftcalib.motion.model import HEIGHT, INERTIA, SIZE, Load
-from ftcalib.motion.samples import Motion, Rows
+from ftcalib.motion.samples import Means, Motion, Rows, require_seconds
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Recorded, Truth, means_of, programme, record
 from tests.unit.calib.motion.test_estimate import SIGMA, G, rows_of
@@ -133,6 +133,12 @@ def test_reversed_channels_are_named_and_turned_back(signs: tuple[int, int], cha
     np.testing.assert_array_equal(undone.of(rows).wrench, RIGHT.wrench)
 
 
+@pytest.mark.parametrize("channels", [[0, 1, 2, 4, 3, 5], [1, 2, 0, 3, 4, 5]])
+def test_other_axes_of_forces_or_torques_are_named(channels: list[int]) -> None:
+    (one,) = found(replace(RIGHT, wrench=RIGHT.wrench[:, channels])).findings
+    assert one.code == "axes_disagree"
+
+
 def test_rows_that_no_mistake_explains_have_none() -> None:
     other = rows_of(150, TRUTH, seed=1)
     assert codes(found(replace(RIGHT, wrench=other.wrench)[::2])) == []
@@ -142,10 +148,15 @@ def test_rows_that_no_mistake_explains_have_none() -> None:
 def test_times_that_are_no_seconds_are_refused(step_s: float, unit: str | None) -> None:
     t_s: Array = np.float64(step_s) * np.arange(10)
     if unit is None:
-        require_seconds(t_s, "the wrench")
+        require_seconds(t_s, "the times")
         return
-    with pytest.raises(BadDataset, match=f"the times of the wrench step by .* as if they were in {unit}"):
-        require_seconds(t_s, "the wrench")
+    with pytest.raises(BadDataset, match=f"the times step by .* as if they were in {unit}"):
+        require_seconds(t_s, "the times")
+
+
+def test_times_in_ns_are_refused_before_their_gaps() -> None:
+    with pytest.raises(BadDataset, match="as if they were in ns"):
+        Means().add(2e6 * np.arange(10.0), np.zeros((10, 6)))
 
 
 # -- zeroing -----------------------------------------------------------------------------------------------------------
