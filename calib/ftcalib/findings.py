@@ -383,9 +383,9 @@ CODES: Final[Mapping[str, Code]] = {
         "zero it before the recording only"),
     "positions_unit": Code(_REJECT, "the positions look given in {unit}, because they spread over {spread_m:.3g} and "
         "accelerate as much too fast for the weight", "give them in m"),
-    "clock_rate": Code(_REJECT, "gravity and the acceleration of the poses agree if all times are {factor:~sigma} "
-        "times as long (sigma {sigma:~sigma})", "give the true rate, which is {rate:.4g} times the stated one, or the "
-        "unit of the times"),
+    "clock_rate": Code(_REJECT_OR_LIMIT, "gravity and the acceleration of the poses agree if all times are "
+        "{factor:~sigma} times as long (sigma {sigma:~sigma})", "give the true rate, which is {rate:.4g} times the "
+        "stated one, or the unit of the times"),
     "reversed_in_motion": Code(_REJECT, "the {channels} look reversed, because weight, acceleration and inertia "
         "disagree in sign", "reverse the {channels}, or give wrench and orientations in right-handed axes"),
     "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the poses look like those of a TCP, because the sensor lies at "

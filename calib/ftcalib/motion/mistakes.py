@@ -17,9 +17,8 @@ from ftcalib.judge.described_cell import INSIDE_M
 from ftcalib.judge.faults import faults
 from ftcalib.judge.units import FAR_COM_M
 from ftcalib.judge.verdict import SIGNIFICANT_SIGMAS
-from ftcalib.known import Known
 from ftcalib.model import Array, nearest_rotation
-from ftcalib.motion.estimate import MotionFit, fit_freely
+from ftcalib.motion.estimate import FreeFit, MotionFit
 from ftcalib.motion.model import HEIGHT, INERTIA, SECOND_MOMENTS, SIZE, PoseError
 from ftcalib.motion.samples import Rows
 
@@ -37,6 +36,8 @@ _SIGMAS: Final = 6.0
 # Channels are not reversed if what reversed ones would make negative is so many sigma above 0.
 _SIGNED: Final = 3.0
 CLOCK_SHARE: Final = 0.03
+# A scale of the clock that is larger, but less certain, limits a result.
+_DOUBTFUL_SIGMAS, _DOUBTFUL_SHARE = 4.5, 0.15
 ASIDE_M: Final = 0.01
 # A sensor whose axis is farther from that of the flange is none.
 FAR_ASIDE_M: Final = 0.03
@@ -137,7 +138,7 @@ class Undone:
         return replace(self.error.corrected(rows), wrench=rows.wrench * self.signs) if self.findings else rows
 
 
-def undo(rows: Rows, spread_m: float, known: Known | None, g_m_s2: float) -> Undone:
+def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
     """Find the mistakes of signs, clock and poses that explain the rows.
 
     Where they do not fit even so, axes and orientations are judged by what is linear in the motion, and not undone.
@@ -145,12 +146,11 @@ def undo(rows: Rows, spread_m: float, known: Known | None, g_m_s2: float) -> Und
     Parameters
     ----------
     rows : Rows
+    free : FreeFit
+        To these rows.
     spread_m : float
         Of the positions.
-    known : Known, optional
-    g_m_s2 : float
     """
-    free = fit_freely(rows, known, g_m_s2)
     change = np.sqrt(np.mean(rows.wrench.reshape(-1, 2, 3).var(axis=0), axis=1))
     if (free.residual > _SUSPECT * change).any() and (named := _axes(rows, change)):
         return Undone(named)
@@ -168,12 +168,13 @@ def undo(rows: Rows, spread_m: float, known: Known | None, g_m_s2: float) -> Und
     scale = turning = 1.0
     found, sigma_scale = abs(free.error.scale), float(sigma[SIZE])
     factor = 1 / float(np.sqrt(found))
-    if abs(found - 1) > _SIGMAS * sigma_scale and abs(factor - 1) > CLOCK_SHARE:
+    off, share = abs(found - 1) / max(sigma_scale, 1e-12), abs(factor - 1)
+    if (is_sure := off > _SIGMAS and share > CLOCK_SHARE) or (off > _DOUBTFUL_SIGMAS and share > _DOUBTFUL_SHARE):
         scale, unit = found, _unit(found, spread_m)
         turning = 1.0 if unit else found
         values = {"factor": factor, "sigma": factor * sigma_scale / found / 2, "rate": 1 / factor}
-        by_unit = Finding.of("positions_unit", unit=unit, spread_m=spread_m) if unit else None
-        findings.append(by_unit or Finding.of("clock_rate", **values))
+        by_clock = Finding.of("clock_rate", "reject" if is_sure else "limit", **values)
+        findings.append(Finding.of("positions_unit", unit=unit, spread_m=spread_m) if unit else by_clock)
     # Forces have the lever to the centre of mass, torques that from their own point.
     com = Q @ load.static.p_sensor_com_m
     point = signs[0] * (np.append(free.error.aside_m, load.height_m) + com) / turning - signs.prod() * com

@@ -17,7 +17,7 @@ from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHA
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.response import Response
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
-from ftcalib.motion.estimate import MotionFit, fit, rough_delay
+from ftcalib.motion.estimate import MotionFit, fit, fit_freely, rough_delay
 from ftcalib.motion.mistakes import (
     COMPENSATED,
     JUDGED_ROWS,
@@ -41,6 +41,8 @@ LEAST_S = 5.0
 FARTHEST_S = 1.5
 # A longer delay is a mistake of a clock.
 OFFSET_S = 0.1
+# So far from the delay of the rows scale and signs of the motion are right.
+ALIGNED_S = 0.02
 # So far from the delay of the rows the model is linear in it.
 LINEAR_S = 2e-3
 # Fastest parts that count without positions, because their acceleration is unknown.
@@ -114,7 +116,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     data, zeroed_s = _without_zeroing(*data)
     delay_s, row_s = _coarse_delay(rows_of(*data)), NARROW_S if guarded else WIDE_S
     rows = rows_of(*data, delay_s, row_s)
-    undone = undo(rows, _spread_m(data[1][1]), known, g_m_s2) if positions else Undone()
+    undone = _undo(data, rows, known, g_m_s2) if positions else Undone()
     rows = undone.of(rows)
     delay_s += rough_delay(_select_rows(rows, positions), known, g_m_s2)
     # The model is linear in the delay only near that of the rows: far from it they are filtered again.
@@ -321,8 +323,17 @@ def _without_zeroing(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Strea
     return (wrench, poses), at_s
 
 
-def _spread_m(poses: Array) -> float:
-    return float(np.linalg.norm(np.ptp(poses[:, 9:], axis=0)))
+def _undo(data: tuple[Stream, Stream], rows: Rows, known: Known | None, g_m_s2: float) -> Undone:
+    """Find the mistakes of signs, clock, axes and poses, in rows whose delay is almost right."""
+    free = fit_freely(rows, known, g_m_s2)
+    for _ in range(2):
+        if abs(free.load.delay_s) < ALIGNED_S:
+            break
+        delay_s = float(np.clip(rows.delay_s + free.load.delay_s, -FARTHEST_S, FARTHEST_S))
+        rows = rows_of(*data, delay_s, rows.row_s)
+        free = fit_freely(rows, known, g_m_s2)
+    spread_m = float(np.linalg.norm(np.ptp(data[1][1][:, 9:], axis=0)))
+    return undo(rows, free, spread_m) if abs(free.load.delay_s) < OFFSET_S else Undone()
 
 
 def _explained(finding: Finding, causes: Sequence[Finding]) -> bool:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array, Parameters
 from ftcalib.motion import samples
+from ftcalib.motion.estimate import fit_freely
 from ftcalib.motion.mistakes import Undone, bias_steps, falls_to_zero, impossible, stays, undo
 from ftcalib.motion.model import HEIGHT, INERTIA, SIZE, Load
 from ftcalib.motion.samples import Means, Motion, Rows, require_seconds
@@ -25,7 +26,7 @@ SPREAD_M = 0.6
 
 
 def found(rows: Rows, spread_m: float = SPREAD_M) -> Undone:
-    return undo(rows, spread_m, None, G)
+    return undo(rows, fit_freely(rows, None, G), spread_m)
 
 
 def codes(undone: Undone) -> list[str]:
