@@ -23,27 +23,27 @@ from ftcalib.motion.model import HEIGHT, INERTIA, SECOND_MOMENTS, SIZE, PoseErro
 from ftcalib.motion.samples import Rows
 
 # Positions that spread farther may be in another unit, if their acceleration agrees with it by this share.
-FARTHEST_M: Final = 3.0
-LENGTHS_M: Final[Mapping[str, float]] = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
+_FARTHEST_M: Final = 3.0
+_LENGTHS_M: Final[Mapping[str, float]] = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
 _SAME_UNIT: Final = 0.2
 # Shares of the change of force and torque that a fit with the right causes leaves, and that may be those of axes.
 _EXPLAINED: Final = np.array([0.15, 0.3])
 _SUSPECT: Final = 0.05
 # A weight below this share of the inertial mass was subtracted before.
 COMPENSATED: Final = 0.2
-# A mistake is larger than its sigma by this factor, and than errors that a calibrated arm and sensor have.
+# A mistake is larger than its sigma by this factor, and than the errors of a calibrated arm, which sigma lacks.
 _SIGMAS: Final = 6.0
+_CLOCK_SHARE: Final = 0.03
+_ASIDE_M: Final = 0.01
 # Channels are not reversed if what reversed ones would make negative is so many sigma above 0.
 _SIGNED: Final = 3.0
-CLOCK_SHARE: Final = 0.03
 # A scale of the clock that is larger, but less certain, limits a result.
 _DOUBTFUL_SIGMAS, _DOUBTFUL_SHARE = 4.5, 0.15
-ASIDE_M: Final = 0.01
 # A sensor whose axis is farther from that of the flange is none.
-FAR_ASIDE_M: Final = 0.03
+_FAR_ASIDE_M: Final = 0.03
 # The origin of a sensor is at most this high above the flange, and at least so.
-HIGHEST_M: Final = 0.5
-LOWEST_M: Final = -5e-3
+_HIGHEST_M: Final = 0.5
+_LOWEST_M: Final = -5e-3
 # Torques about a point beyond the centre of mass are about a TCP from this height on.
 _TCP_M: Final = 0.1
 # Moments of mass of a body are not below 0 by more than 3 sigma and this radius of gyration.
@@ -167,9 +167,9 @@ def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
         findings.append(Finding.of("reversed_in_motion", channels=" and ".join(names)))
     scale = turning = 1.0
     found, sigma_scale = abs(free.error.scale), float(sigma[SIZE])
-    factor = 1 / float(np.sqrt(found))
+    factor = 1 / float(np.sqrt(max(found, 1e-12)))
     off, share = abs(found - 1) / max(sigma_scale, 1e-12), abs(factor - 1)
-    if (is_sure := off > _SIGMAS and share > CLOCK_SHARE) or (off > _DOUBTFUL_SIGMAS and share > _DOUBTFUL_SHARE):
+    if (is_sure := off > _SIGMAS and share > _CLOCK_SHARE) or (off > _DOUBTFUL_SIGMAS and share > _DOUBTFUL_SHARE):
         scale, unit = found, _unit(found, spread_m)
         turning = 1.0 if unit else found
         values = {"factor": factor, "sigma": factor * sigma_scale / found / 2, "rate": 1 / factor}
@@ -209,8 +209,8 @@ def at_rest(rows: Rows) -> tuple[Array, Array]:
 
 
 def _unit(scale: float, spread_m: float) -> str | None:
-    near = (unit for unit, size in LENGTHS_M.items() if abs(scale / size - 1) < _SAME_UNIT)
-    return next(near, None) if spread_m > FARTHEST_M else None
+    near = (unit for unit, size in _LENGTHS_M.items() if abs(scale / size - 1) < _SAME_UNIT)
+    return next(near, None) if spread_m > _FARTHEST_M else None
 
 
 def _other_point(point: Array, sigma: Array, *, behind: bool, upright: bool) -> list[Finding]:
@@ -226,12 +226,12 @@ def _other_point(point: Array, sigma: Array, *, behind: bool, upright: bool) -> 
         Whether z of the sensor points along that of the poses.
     """
     aside_m, height_m = float(np.linalg.norm(point[:2])), float(point[2])
-    beside = aside_m > max(ASIDE_M, _SIGMAS * float(sigma[:2].max()))
+    beside = aside_m > max(_ASIDE_M, _SIGMAS * float(sigma[:2].max()))
     elsewhere = not _is_height(height_m, float(sigma[2]))
     if not (beside or elsewhere or behind):
         return []
-    along = height_m > LOWEST_M - SIGNIFICANT_SIGMAS * sigma[2] and (not beside or height_m > aside_m)
-    near = not elsewhere and (height_m < _TCP_M if behind else True) and (not beside or aside_m < FAR_ASIDE_M)
+    along = height_m > _LOWEST_M - SIGNIFICANT_SIGMAS * sigma[2] and (not beside or height_m > aside_m)
+    near = not elsewhere and (height_m < _TCP_M if behind else True) and (not beside or aside_m < _FAR_ASIDE_M)
     code = "torques_about_tcp" if behind and upright and along else "poses_of_tcp"
     return [Finding.of(code, "limit" if near else "reject", point_mm=1e3 * point)]
 
@@ -243,7 +243,7 @@ def _is_behind(com: Array, sigma: Array) -> bool:
 
 def _is_height(height_m: float, sigma_m: float) -> bool:
     slack_m = SIGNIFICANT_SIGMAS * sigma_m
-    return LOWEST_M - slack_m < height_m < HIGHEST_M + slack_m
+    return _LOWEST_M - slack_m < height_m < _HIGHEST_M + slack_m
 
 
 # ----------------------------------------------------------------------------------------------------- impossible body

@@ -13,7 +13,7 @@ from ftcalib.model import Array, Parameters
 from ftcalib.motion import samples
 from ftcalib.motion.estimate import fit_freely
 from ftcalib.motion.mistakes import Undone, bias_steps, falls_to_zero, impossible, stays, undo
-from ftcalib.motion.model import HEIGHT, INERTIA, SIZE, Load
+from ftcalib.motion.model import HEIGHT, INERTIA, SIZE, Load, wrench_of
 from ftcalib.motion.samples import Means, Motion, Rows, require_seconds
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Recorded, Truth, means_of, programme, record
@@ -132,6 +132,13 @@ def test_reversed_channels_are_named_and_turned_back(signs: tuple[int, int], cha
     undone = found(rows)
     assert [(one.code, one.values["channels"]) for one in undone.findings] == [("reversed_in_motion", channels)]
     np.testing.assert_array_equal(undone.of(rows).wrench, RIGHT.wrench)
+
+
+@pytest.mark.parametrize("moved", [0.0, 1e-9])
+def test_an_arm_that_stands_shows_no_mistake(moved: float) -> None:
+    still = with_motion(RIGHT, moved, moved)
+    rest = wrench_of(TRUTH, still.motion) + (RIGHT.wrench - wrench_of(TRUTH, RIGHT.motion))
+    assert codes(found(replace(still, wrench=rest))) == []
 
 
 @pytest.mark.parametrize("channels", [[0, 1, 2, 4, 3, 5], [1, 2, 0, 3, 4, 5]])
