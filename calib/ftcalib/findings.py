@@ -389,7 +389,8 @@ CODES: Final[Mapping[str, Code]] = {
     "reversed_in_motion": Code(_REJECT, "the {channels} look reversed, because weight, acceleration and inertia "
         "disagree in sign", "reverse the {channels}, or give wrench and orientations in right-handed axes"),
     "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the poses look like those of a TCP, because the sensor lies at "
-        "{point_mm:.0f} in their axes, not on z of the flange", "give the poses of the flange"),
+        "{point_mm:.0f} in their axes, not on z of the flange{units:units}", "give the poses of the flange{units:?, or "
+        "correct the units|}"),
     "torques_about_tcp": Code(_REJECT_OR_LIMIT, "the torques look taken about a TCP, because their point lies at "
         "{point_mm:.0f} in the axes of the poses, beyond the centre of mass", "give the torques about the sensor "
         "origin, and the poses of the flange"),

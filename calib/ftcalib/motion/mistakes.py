@@ -12,7 +12,8 @@ from typing import Final
 import numpy as np
 from scipy.ndimage import median_filter
 
-from ftcalib.findings import Finding
+from ftcalib.findings import Finding, Severity
+from ftcalib.judge import units
 from ftcalib.judge.described_cell import INSIDE_M
 from ftcalib.judge.faults import faults
 from ftcalib.judge.units import FAR_COM_M
@@ -176,14 +177,13 @@ def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
         by_clock = Finding.of("clock_rate", "reject" if is_sure else "limit", **values)
         findings.append(Finding.of("positions_unit", unit=unit, spread_m=spread_m) if unit else by_clock)
     # Forces have the lever to the centre of mass, torques that from their own point.
-    com = Q @ load.static.p_sensor_com_m
-    point = signs[0] * (np.append(free.error.aside_m, load.height_m) + com) / turning - signs.prod() * com
+    seen = Q @ load.static.p_sensor_com_m
+    to_com, com = signs[0] * (np.append(free.error.aside_m, load.height_m) + seen) / turning, signs.prod() * seen
     of_com = np.sqrt(np.diag(Q @ free.covariance[9:12, 9:12] @ Q.T))
     are_signed = abs(moment) > _SIGNED * sigma_moment and found > _SIGNED * sigma_scale
-    behind = are_signed and _is_behind(signs.prod() * com, of_com)
-    other = _other_point(point, sigma[_POINT] / turning, behind=behind, upright=bool(Q[2, 2] > 0))
-    other = [] if np.linalg.norm(com) > FAR_COM_M else other  # other units of force and torque move the point too
-    aside_m = point[:2] if other else np.zeros(2)
+    behind = are_signed and _is_behind(com, of_com)
+    other = _other_point(to_com, com, sigma[_POINT] / turning, behind=behind, upright=bool(Q[2, 2] > 0))
+    aside_m = (to_com - com)[:2] if other else np.zeros(2)
     return Undone((*findings, *other), PoseError(scale, aside_m, turning), np.repeat(signs, 3))
 
 
@@ -213,27 +213,43 @@ def _unit(scale: float, spread_m: float) -> str | None:
     return next(near, None) if spread_m > _FARTHEST_M else None
 
 
-def _other_point(point: Array, sigma: Array, *, behind: bool, upright: bool) -> list[Finding]:
+def _other_point(to_com: Array, com: Array, sigma: Array, *, behind: bool, upright: bool) -> list[Finding]:
     """Find poses or torques of another point than they should be.
 
     Parameters
     ----------
-    point, sigma : array, shape (3,)
-        From the point of the poses to that of the torques, in the axes of the poses.
+    to_com, com : array, shape (3,)
+        To the centre of mass from the point of the poses and from that of the torques, in the axes of the poses.
+    sigma : array, shape (3,)
+        Of their difference.
     behind : bool
         Whether the centre of mass lies on the robot's side of the sensor, though no channel is reversed.
     upright : bool
         Whether z of the sensor points along that of the poses.
     """
+    point = to_com - com
     aside_m, height_m = float(np.linalg.norm(point[:2])), float(point[2])
     beside = aside_m > max(_ASIDE_M, _SIGMAS * float(sigma[:2].max()))
     elsewhere = not _is_height(height_m, float(sigma[2]))
-    if not (beside or elsewhere or behind):
+    # The units of a centre of mass so far away are named by its distance.
+    if not (beside or elsewhere or behind) or np.linalg.norm(com) > FAR_COM_M:
         return []
     along = height_m > _LOWEST_M - SIGNIFICANT_SIGMAS * sigma[2] and (not beside or height_m > aside_m)
     near = not elsewhere and (height_m < _TCP_M if behind else True) and (not beside or aside_m < _FAR_ASIDE_M)
-    code = "torques_about_tcp" if behind and upright and along else "poses_of_tcp"
-    return [Finding.of(code, "limit" if near else "reject", point_mm=1e3 * point)]
+    severity: Severity = "limit" if near else "reject"
+    if behind and upright and along:
+        return [Finding.of("torques_about_tcp", severity, point_mm=1e3 * point)]
+    return [Finding.of("poses_of_tcp", severity, point_mm=1e3 * point, units=_wrong_units(to_com, com))]
+
+
+def _wrong_units(to_com: Array, com: Array) -> list[tuple[str, str]]:
+    """Return units of force and torque that put the sensor on the axis of the flange, as the true ones would."""
+    suspects = []
+    for force, torque in units.by_com(float(np.linalg.norm(com))):
+        point = to_com - com * units.TORQUE_UNITS_NM[torque] / units.FORCE_UNITS_N[force]
+        if np.linalg.norm(point[:2]) < _ASIDE_M and _LOWEST_M < point[2] < _TCP_M:
+            suspects.append((force, torque))
+    return suspects
 
 
 def _is_behind(com: Array, sigma: Array) -> bool:

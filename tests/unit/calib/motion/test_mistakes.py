@@ -58,7 +58,7 @@ def torques_about(rows: Rows, p_sensor_point_m: Array) -> Rows:
 
 
 def test_right_rows_have_no_mistake_and_stay_as_they_are() -> None:
-    for seed in range(3):
+    for seed in range(2):
         rows = rows_of(150, TRUTH, seed=seed)
         undone = found(rows)
         assert codes(undone) == []
@@ -70,7 +70,7 @@ def test_right_rows_have_no_mistake_and_stay_as_they_are() -> None:
     [
         ((0, 0, 0.1), (0, 0, 0)),
         ((0, 0, 0.2), (np.pi, 0, 0)),
-        ((0, 0, 0.3), (0, 0, 2.0)),
+        pytest.param((0, 0, 0.3), (0, 0, 2.0), marks=pytest.mark.slow),
         ((0.06, -0.04, 0.15), (0.5, -0.3, 0.1)),
         ((0.06, -0.04, 0.15), (0, 1.5, 0)),
     ],
@@ -93,12 +93,22 @@ def test_a_sensor_a_little_beside_the_flange_axis_limits_and_is_fitted() -> None
     assert codes(found(of_point(RIGHT, np.array([5e-3, 0, 0]), np.zeros(3)))) == []
 
 
+def test_units_that_move_the_sensor_from_the_axis_are_named_too() -> None:
+    truth = replace(TRUTH, static=replace(TRUTH.static, p_sensor_com_m=np.array([0.012, -0.008, 0.03])))
+    rows = rows_of(150, truth, sigma=SIGMA / 5)
+    (one,) = found(replace(rows, wrench=rows.wrench / np.repeat([4.4482216, 1.0], 3))).findings
+    assert one.code == "poses_of_tcp"
+    assert ["lbf", "N·m"] in one.values["units"]
+    (one,) = found(of_point(RIGHT, np.array([0.03, 0, 0.15]), np.zeros(3))).findings
+    assert one.values["units"] == []
+
+
 def test_the_poses_of_a_tcp_upside_down_limit_where_the_height_shows_nothing() -> None:
     undone = found(of_point(RIGHT, np.array([0, 0, 0.1]), np.array([np.pi, 0, 0])))
     assert [(one.code, one.severity) for one in undone.findings] == [("poses_of_tcp", "limit")]
 
 
-@pytest.mark.parametrize("point_m", [(0, 0, 0.15), (0.05, -0.03, 0.2), (0, 0, 0.3)])
+@pytest.mark.parametrize("point_m", [(0, 0, 0.15), (0.05, -0.03, 0.2)])
 def test_torques_about_a_tcp_are_not_taken_for_reversed_ones(point_m: tuple[float, ...]) -> None:
     (one,) = found(torques_about(RIGHT, np.array(point_m))).findings
     assert (one.code, one.severity) == ("torques_about_tcp", "reject")
@@ -106,7 +116,9 @@ def test_torques_about_a_tcp_are_not_taken_for_reversed_ones(point_m: tuple[floa
     np.testing.assert_allclose(one.values["point_mm"], 1e3 * expected, atol=7)  # a bias of 9 N has moved too
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.9, 1.05, 2.0])
+@pytest.mark.parametrize(
+    "factor", [0.9, 2.0, *(pytest.param(factor, marks=pytest.mark.slow) for factor in (0.5, 1.05))]
+)
 def test_a_wrong_clock_is_named_with_its_factor(factor: float) -> None:
     rows = with_motion(RIGHT, factor**2, factor**2)
     (one,) = found(rows).findings
@@ -118,7 +130,7 @@ def test_a_wrong_clock_is_named_with_its_factor(factor: float) -> None:
     )
 
 
-@pytest.mark.parametrize(("unit", "size"), [("mm", 1e3), ("cm", 1e2), ("inches", 39.37)])
+@pytest.mark.parametrize(("unit", "size"), [("mm", 1e3), pytest.param("inches", 39.37, marks=pytest.mark.slow)])
 def test_positions_in_another_unit_are_named(unit: str, size: float) -> None:
     (one,) = found(with_motion(RIGHT, size, 1.0), SPREAD_M * size).findings
     assert (one.code, one.values["unit"]) == ("positions_unit", unit)
@@ -134,7 +146,7 @@ def test_reversed_channels_are_named_and_turned_back(signs: tuple[int, int], cha
     np.testing.assert_array_equal(undone.of(rows).wrench, RIGHT.wrench)
 
 
-@pytest.mark.parametrize("moved", [0.0, 1e-9])
+@pytest.mark.parametrize("moved", [0.0, pytest.param(1e-9, marks=pytest.mark.slow)])
 def test_an_arm_that_stands_shows_no_mistake(moved: float) -> None:
     still = with_motion(RIGHT, moved, moved)
     rest = wrench_of(TRUTH, still.motion) + (RIGHT.wrench - wrench_of(TRUTH, RIGHT.motion))
