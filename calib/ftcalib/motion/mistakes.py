@@ -38,7 +38,7 @@ _CLOCK_SHARE: Final = 0.03
 _ASIDE_M: Final = 0.01
 # Channels are not reversed if what reversed ones would make negative is so many sigma above 0.
 _SIGNED: Final = 3.0
-# A scale of the clock that is larger, but less certain, limits a result.
+# A scale of the clock that is larger, but less certain, limits a result if it is the only mistake. It is not undone.
 _DOUBTFUL_SIGMAS, _DOUBTFUL_SHARE = 4.5, 0.15
 # A sensor whose axis is farther from that of the flange is none.
 _FAR_ASIDE_M: Final = 0.03
@@ -170,11 +170,11 @@ def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
     found, sigma_scale = abs(free.error.scale), float(sigma[SIZE])
     factor = 1 / float(np.sqrt(max(found, 1e-12)))
     off, share = abs(found - 1) / max(sigma_scale, 1e-12), abs(factor - 1)
-    if (is_sure := off > _SIGMAS and share > _CLOCK_SHARE) or (off > _DOUBTFUL_SIGMAS and share > _DOUBTFUL_SHARE):
+    values = {"factor": factor, "sigma": factor * sigma_scale / max(found, 1e-12) / 2, "rate": 1 / factor}
+    if off > _SIGMAS and share > _CLOCK_SHARE:
         scale, unit = found, _unit(found, spread_m)
         turning = 1.0 if unit else found
-        values = {"factor": factor, "sigma": factor * sigma_scale / found / 2, "rate": 1 / factor}
-        by_clock = Finding.of("clock_rate", "reject" if is_sure else "limit", **values)
+        by_clock = Finding.of("clock_rate", "reject", **values)
         findings.append(Finding.of("positions_unit", unit=unit, spread_m=spread_m) if unit else by_clock)
     # Forces have the lever to the centre of mass, torques that from their own point.
     seen = Q @ load.static.p_sensor_com_m
@@ -184,7 +184,10 @@ def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
     behind = are_signed and _is_behind(com, of_com)
     other = _other_point(to_com, com, sigma[_POINT] / turning, behind=behind, upright=bool(Q[2, 2] > 0))
     aside_m = (to_com - com)[:2] if other else np.zeros(2)
-    return Undone((*findings, *other), PoseError(scale, aside_m, turning), np.repeat(signs, 3))
+    findings += other
+    if not findings and off > _DOUBTFUL_SIGMAS and share > _DOUBTFUL_SHARE:
+        findings.append(Finding.of("clock_rate", "limit", **values))
+    return Undone(tuple(findings), PoseError(scale, aside_m, turning), np.repeat(signs, 3))
 
 
 def _axes(rows: Rows, change: Array) -> tuple[Finding, ...]:
