@@ -42,8 +42,11 @@ def TABLE(command: Callable[..., None]) -> Callable[..., None]:
 
         offset = [0.0] * 6 if tcp is None else numbers("--tcp", tcp, ",", (3, 6))
         turn = [*offset, 0.0, 0.0, 0.0][3:6]
+        named, text = ({}, {}) if columns is None else _columns(columns)
         table = TableOptions(
-            columns={} if columns is None else _columns(columns),
+            columns=named,
+            separator=text.get("separator", ""),
+            decimal=text.get("decimal", ""),
             rate_Hz=rate,
             euler=euler or "",
             wrench_axes=wrench_frame,
@@ -86,8 +89,11 @@ _OPTIONS = (
 )
 
 
-def _columns(text: str) -> Mapping[str, str]:
-    """Return the columns that an option or a TOML file names. Raises `ConfigError` or `OSError`."""
+def _columns(text: str) -> tuple[Mapping[str, str], Mapping[str, Any]]:
+    """Return the columns that an option or a TOML file names, and what the file says of the text.
+
+    Raises `ConfigError` or `OSError`.
+    """
     import tomllib
 
     from ftcalib.files import read_file
@@ -95,16 +101,17 @@ def _columns(text: str) -> Mapping[str, str]:
 
     if text.endswith(".toml"):
         try:
-            found = tomllib.loads(read_file(text).decode())["columns"]
+            found = tomllib.loads(read_file(text).decode())
+            columns = found["columns"] if "text" not in found else found.get("columns", {})
         except (KeyError, ValueError) as error:
             raise ConfigError(
                 f'{text} names no columns ({error}): write [columns] and lines like fx = "Force X"'
             ) from error
-        return {str(name): str(column) for name, column in found.items()}
+        return {str(name): str(column) for name, column in columns.items()}, found.get("text", {})
     pairs = [part.partition("=") for part in text.split(",")]
     if not all(name.strip() and column.strip() for name, _, column in pairs):
         raise ConfigError(f'--columns {text}: give NAME=COLUMN with commas between, such as "t=Time,fx=Force X"')
-    return {name.strip(): column.strip() for name, _, column in pairs}
+    return {name.strip(): column.strip() for name, _, column in pairs}, {}
 
 
 def _forward(model: str | None, urdf: str | None) -> "Callable[[Array], tuple[Array, Array]] | None":

@@ -71,6 +71,10 @@ class TableOptions:
 
     columns: Mapping[str, str] = field(default_factory=dict)
     """Columns of the table by our names, with a unit where theirs have none: ``{"fx": "Force X [kgf]"}``."""
+    separator: Literal["", ",", ";", "\t", " "] = ""
+    """Of the text; it is recognised if it is empty."""
+    decimal: Literal["", ".", ","] = ""
+    """Sign of the text; it is recognised if it is empty."""
     rate_Hz: float | None = None
     """Of a table without times."""
     euler: str = ""
@@ -92,6 +96,9 @@ class TableOptions:
             raise ConfigError(
                 f"--euler {self.euler}: give {makers}, or three axes, such as ZYX (of the tool) or xyz (of the base)"
             )
+        if self.separator not in ("", ",", ";", "\t", " ") or self.decimal not in ("", ".", ","):
+            given = f"separator {self.separator!r}, decimal {self.decimal!r}"
+            raise ConfigError(f"[text]: {given}: give a comma, semicolon, tab or space, and a point or comma")
         if self.rate_Hz is not None and not self.rate_Hz > 0:
             raise ConfigError(f"--rate {self.rate_Hz:g}: give the samples a second")
 
@@ -168,7 +175,8 @@ class Table:
         self._count = 0
         self._found: dict[str, Signal | None] = {}
         with self._named():
-            self.source: Source = TextTable(source) if isinstance(source, Path) else Frame(source)
+            text = self.options.separator, self.options.decimal
+            self.source: Source = TextTable(source, *text) if isinstance(source, Path) else Frame(source)
             self._columns = Columns(self.source.names, self.source.units, self.options.columns)
             self._find()
 
@@ -197,6 +205,8 @@ class Table:
         """What was recognised, in one line; empty for a table with the names and units of the project."""
         programs = {one.program for one in self._found.values() if one} - {"ftdrive", "own program"}
         named = [f"columns of {one}" for one in sorted(programs)]
+        if self.options.rate_Hz:  # nothing else shows a wrong one
+            named.append(f"{self.options.rate_Hz:g} Hz as given, on whose square the inertia depends")
         return "; ".join(filter(None, [self.source.words, *named, *self._guesses]))
 
     @property

@@ -49,15 +49,15 @@ class TextFormat(NamedTuple):
 
 
 class TextTable:
-    """A text table on disk. Raises `BadDataset` or `OSError`."""
+    """A text table on disk; what is not given of how it is written is recognised. Raises `BadDataset` or `OSError`."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, separator: str = "", decimal: str = "") -> None:
         self.path = path
         with self._open() as (file, raw):
             head = file.read(_HEAD_BYTES)
             more = bool(file.read(1))
             packed = type(file).__name__ if file is not raw else ""
-        self.format = _format_of(head.decode("utf-8-sig", "replace"), more)
+        self.format = _format_of(head.decode("utf-8-sig", "replace"), more, separator, decimal)
         self.names, self.units, self.words = self.format.names, self.format.units, self.format.words
         if packed:
             self.words = ", ".join(filter(None, [self.words, "gzip" if packed == "GzipFile" else "UTF-16"]))
@@ -157,12 +157,12 @@ def seconds_of(dates: NDArray[Any]) -> Array:
     return np.where(np.isnat(known), np.nan, known.astype(np.int64) * 1e-9)
 
 
-def _format_of(head: str, more: bool) -> TextFormat:
+def _format_of(head: str, more: bool, separator: str, decimal: str) -> TextFormat:
     if "\0" in head:
         raise BadDataset("it is no text table: give a CSV file")
     lines = head.splitlines()
     lines = lines[: -1 if more and len(lines) > 1 else None]
-    separator, decimal, count, numeric = _decided(lines)
+    separator, decimal, count, numeric = _decided(lines, separator, decimal)
     if not numeric:
         found = "the file is empty" if not head.strip() else "no row has two numbers or more"
         raise BadDataset(f"{found}: give a table with one row a sample")
@@ -186,22 +186,22 @@ def _format_of(head: str, more: bool) -> TextFormat:
     return TextFormat(separator, decimal, names, units or [""] * count, dates, first + 1, ", ".join(words))
 
 
-def _decided(lines: Sequence[str]) -> tuple[str, str, int, int]:
+def _decided(lines: Sequence[str], separator: str, decimal: str) -> tuple[str, str, int, int]:
     """Return separator, decimal sign, columns and numbers a row: those by which most cells are numbers."""
     last = [line for line in lines if line.strip() and not _COMMENT.match(line)][-_DECIDE:]
     best = (",", ".", 0, 0)
     most = 0.0
-    for separator in _SEPARATORS:
-        rows = [_split(line, separator) for line in last]
+    for between in [separator] if separator else _SEPARATORS:
+        rows = [_split(line, between) for line in last]
         counts = [len(row) for row in rows]
         count = max(set(counts), key=counts.count) if counts else 0
         rows = [row for row in rows if len(row) == count]
-        for decimal in "." if separator == "," else ".,":
-            numbers = [_numbers(row, decimal) for row in rows]
+        for point in decimal or ("." if between == "," else ".,"):
+            numbers = [_numbers(row, point) for row in rows]
             # A cell that is not a number counts against it: `1,5;2,5` has numbers between commas too.
             score = sum(2 * n - sum(map(bool, row)) for n, row in zip(numbers, rows, strict=True) if n)
             if numbers and min(count, max(numbers)) > 1 and score > most:
-                best, most = (separator, decimal, count, max(numbers)), score
+                best, most = (between, point, count, max(numbers)), score
     return best
 
 
