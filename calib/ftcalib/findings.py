@@ -296,7 +296,7 @@ CODES: Final[Mapping[str, Code]] = {
     # Known values that the data contradict
     "known_mass": Code(_LIMIT_OR_NOTE, "the known mass of {known_kg:g} contradicts the data, which give "
         "{mass_kg:~sigma_kg} (sigma {sigma_kg:~sigma_kg}){units:units}{unit_N:scale}",
-        "scale the forces so, or correct the known value (--mass-kg)"),
+        "scale the forces so (--columns \"fx=NAME [.82 N],...\" for .82 N), or correct the known value (--mass-kg)"),
     "known_gravity_direction": Code(_LIMIT_OR_NOTE, "the known direction of gravity contradicts the data, which give "
         "one {off_deg:~sigma_deg} away (sigma {sigma_deg:~sigma_deg})",
         "correct the data or the known value (--level-deg, --up)"),

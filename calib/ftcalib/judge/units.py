@@ -17,6 +17,7 @@ LIGHTEST_N, HEAVIEST_N, IMPOSSIBLE_N = 0.3, 500.0, 2000.0
 LARGE_BIAS, IMPOSSIBLE_BIAS = (500.0, 100.0), (2000.0, 400.0)
 # A sensor whose bias is so many times the weight was not chosen for the tool.
 LARGE_SHARE = 20.0
+CONFIRMED_SIGMAS = 3.0
 # Forces in another unit leave less than this share of the weight.
 NOISY = 0.03
 FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665, "gf": 9.80665e-3, "mN": 1e-3, "kN": 1e3}
@@ -122,6 +123,8 @@ def _bias(estimate: Parameters, unit_N: tuple[float, float] | None) -> list[Find
     size = np.array([np.linalg.norm(estimate.force_bias_N), np.linalg.norm(estimate.torque_bias_Nm)])
     lever_m = max(USUAL_COM_M[1], float(np.linalg.norm(estimate.p_sensor_com_m)))
     large = (size > LARGE_BIAS) & (size > LARGE_SHARE * estimate.weight_N * np.array([1.0, lever_m]))
+    # Of a sensor with an arbitrary zero, a known mass confirms the unit of force.
+    large[0] &= unit_N is None or abs(unit_N[0] - 1) > CONFIRMED_SIGMAS * unit_N[1]
     if not large.any():
         return []
     impossible = bool((large & (size > IMPOSSIBLE_BIAS)).any())

@@ -325,7 +325,12 @@ def normalized(name: str) -> str:
 
 
 def factor(unit: str, kind: str, column: str) -> float | None:
-    """Return the factor of a unit to SI; None for none. Raises `BadDataset` for a unit of another kind."""
+    """Return the factor of a unit to SI; None for none. Raises `BadDataset` for a unit of another kind.
+
+    A number before the unit counts: `.82 N` is the unit of a sensor whose scale a known mass has shown.
+    """
+    if size := re.fullmatch(r"(\d*\.?\d+(?:e[+-]?\d+)?)\s+(\S.*)", unit.strip()):
+        return float(size[1]) * (factor(size[2], kind, column) or 1.0)
     text = re.sub(r"[\s.·*^-]", "", unit)
     if not text or text.lower() in COUNTS:
         return None if not text else 1.0

@@ -67,6 +67,14 @@ def test_what_is_recognised_of_the_text_can_be_given(solved: Solved) -> None:
     assert "[text]: separator '|'" in solved(PLAIN, "--columns", "text.toml")[2]
 
 
+def test_a_unit_may_have_a_size(solved: Solved) -> None:
+    scaled = PLAIN | {name: values / 0.82 for name, values in wrench(POSES).items() if name.startswith("f")}
+    near(
+        parameters(solved(scaled, "--columns", "fx=fx [.82 N],fy=fy [0.82 N],fz=fz [8.2e-1 N]")),
+        parameters(solved(PLAIN)),
+    )
+
+
 def test_what_was_recognised_is_printed_and_kept(solved: Solved) -> None:
     code, out, err = solved(
         t(POSES, "time_ms", 1e-3) | wrench(POSES) | columns("A B C", POSES.R.as_euler("ZYX", degrees=True))
