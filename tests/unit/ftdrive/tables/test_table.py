@@ -156,7 +156,7 @@ def test_a_unit_of_time_is_found_where_it_is_certain(unit: str, size: float, ori
 
 
 def test_a_named_unit_beats_the_numbers() -> None:
-    named = Table({"t [us]": 1e3 * RECORDING.t_s} | MOVING)  # 500 kHz, as nobody samples
+    named = Table({"t [us]": 1e3 * RECORDING.t_s} | MOVING)  # 500 kHz, which the numbers alone would not suggest
     assert named.rate_Hz("wrench") == pytest.approx(5e5)
     assert Table({"t": 1e3 * RECORDING.t_s} | MOVING).words == "time in ms"
     given = Table({"t": 1e3 * RECORDING.t_s} | MOVING, TableOptions(columns={"t": "t [us]"}))
