@@ -76,6 +76,8 @@ _SIZES: Mapping[str, Array] = {
     "walk_Nm": np.geomspace(6e-6, 6e-3, 10),
 }
 
+# Squared distance of a row that counts a quarter where a robust fit has settled.
+LIMIT = 22.0
 NEVER: Array = np.zeros(0)
 
 
@@ -170,19 +172,15 @@ class _Problem:
         nothing = np.zeros(self.centred.shape[1])
         for _ in range(40):
             r = rows.wrench - self.predict(load, rows)
-            scale = 1.4826 * np.array([np.median(np.abs(r[:, :3])), np.median(np.abs(r[:, 3:]))]) + 1e-12
-            unit = r / np.repeat(scale, 3)
-            distance = np.sum(unit**2, axis=1)
-            limit = max(min(limit, float(distance.max())) / 2, 22.0)
-            weight = (limit / (limit + distance)) ** 2
-            J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / np.repeat(scale, 3)[:, None]
+            scale, weight, limit = robust_weights(r, limit)
+            J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / scale[:, None]
             weighted = (J * weight[:, None, None]).reshape(-1, SIZE)
-            H, b = block_diag(weighted.T @ J.reshape(-1, SIZE), np.diag(nothing)), weighted.T @ unit.ravel()
+            H, b = block_diag(weighted.T @ J.reshape(-1, SIZE), np.diag(nothing)), weighted.T @ (r / scale).ravel()
             step = self.solve(ROUGH, (H, np.append(b, nothing), 0.0), load, no_drift).step
             load = load.moved(step[:SIZE])
-            if limit == 22.0 and np.abs(step[:6]).max() < 1e-6:
+            if limit == LIMIT and np.abs(step[:6]).max() < 1e-6:
                 break
-        return load, float(np.log(scale).sum())
+        return load, float(np.log(scale[::3]).sum())
 
     def sums(
         self, load: Load, drift: Array, noise: RowNoise, kept: NDArray[np.bool_], state: NDArray[np.intp]
@@ -436,6 +434,31 @@ def _join(
     return load, drift, solved, contradiction
 
 
+def robust_weights(residuals: Array, limit: float, *, alike: int = 3) -> tuple[Array, Array, float]:
+    """Weigh rows for the next step of a robust fit, which begins with a limit of infinity and ends at `LIMIT`.
+
+    Parameters
+    ----------
+    residuals : array, shape (n, 6)
+    limit : float
+        Squared distance of a row that counted a quarter in the step before.
+    alike : {3, 1}
+        Successive channels that have one scale: forces and torques, or each by itself.
+
+    Returns
+    -------
+    scale : array, shape (6,)
+        Standard deviations by the median.
+    weight : array, shape (n,)
+    limit : float
+    """
+    size = np.median(np.abs(residuals).reshape(len(residuals), -1, alike), axis=(0, 2))
+    scale = np.repeat(1.4826 * size + 1e-12, alike)
+    distance = np.sum((residuals / scale) ** 2, axis=1)
+    limit = max(min(limit, float(distance.max(initial=0.0))) / 2, LIMIT)
+    return scale, (limit / (limit + distance)) ** 2, limit
+
+
 def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
     """Delay of the wrench beyond that of the rows, by a robust fit."""
     problem = _Problem(rows, known, g_m_s2, point_mass=False)
@@ -471,18 +494,14 @@ def _freely(problem: _Problem, load: Load) -> FreeFit:
     for _ in range(40):
         now = error.corrected(rows)
         r = rows.wrench - problem.predict(load, now)
-        scale = 1.4826 * np.array([np.median(np.abs(r[:, :3])), np.median(np.abs(r[:, 3:]))]) + 1e-12
-        unit = r / np.repeat(scale, 3)
-        distance = np.sum(unit**2, axis=1)
-        limit = max(min(limit, float(distance.max())) / 2, 22.0)
-        weight = (limit / (limit + distance)) ** 2
+        scale, weight, limit = robust_weights(r, limit)
         of_load = jacobian(load, now.motion.earlier(load.delay_s, now.rate), now.rate)
         of_error = PoseError.jacobian(load, rows.motion.earlier(load.delay_s, rows.rate))
-        J = np.concatenate([of_load, of_error], axis=2) / np.repeat(scale, 3)[:, None]
+        J = np.concatenate([of_load, of_error], axis=2) / scale[:, None]
         weighted = (J * weight[:, None, None]).reshape(-1, SIZE + 3)
         precision, value = problem.prior(load)
         H = weighted.T @ J.reshape(-1, SIZE + 3) + np.diag(np.append(precision, np.zeros(3)))
-        b = weighted.T @ unit.ravel() - np.append(precision * value, np.zeros(3))
+        b = weighted.T @ (r / scale).ravel() - np.append(precision * value, np.zeros(3))
         known, residuals = problem.constraints.measurements(load.static)
         H[:15, :15] += known.T @ known
         b[:15] += known.T @ residuals
@@ -495,9 +514,9 @@ def _freely(problem: _Problem, load: Load) -> FreeFit:
         step = Z @ covariance @ (Z.T @ b)
         load = load.moved(step[:SIZE])
         error = replace(error, scale=error.scale + float(step[SIZE]), aside_m=error.aside_m + step[SIZE + 1 :])
-        if limit == 22.0 and np.abs(step[:6]).max() < 1e-6:
+        if limit == LIMIT and np.abs(step[:6]).max() < 1e-6:
             break
-    return FreeFit(load, error, Z @ covariance @ Z.T, scale)
+    return FreeFit(load, error, Z @ covariance @ Z.T, scale[::3])
 
 
 def _first_kept(problem: _Problem, load: Load) -> NDArray[np.bool_]:

@@ -19,7 +19,7 @@ from ftcalib.judge.faults import faults
 from ftcalib.judge.units import FAR_COM_M
 from ftcalib.judge.verdict import SIGNIFICANT_SIGMAS
 from ftcalib.model import Array, nearest_rotation
-from ftcalib.motion.estimate import FreeFit, MotionFit
+from ftcalib.motion.estimate import FreeFit, MotionFit, robust_weights
 from ftcalib.motion.model import HEIGHT, INERTIA, SECOND_MOMENTS, SIZE, PoseError
 from ftcalib.motion.samples import Rows
 
@@ -100,14 +100,12 @@ def bias_steps(rows: Rows, at_s: Array) -> Array:
     """Return the steps (k, 6) of the bias at these times (k,), by a robust fit of all that is linear in the motion."""
     apart = np.abs(rows.t_s[:, None] - at_s).min(axis=1) > 4 * rows.row_s
     X = np.column_stack([np.ones(len(rows)), rows.motion.columns(), rows.t_s[:, None] > at_s])[apart]
-    y, weight, limit = rows.wrench[apart], np.ones((int(apart.sum()), 1)), np.inf
+    y, weight, limit = rows.wrench[apart], np.ones(int(apart.sum())), np.inf
     solution = np.zeros((X.shape[1], 6))
     for _ in range(_ITERATIONS):
-        solution = np.linalg.lstsq(np.sqrt(weight) * X, np.sqrt(weight) * y, rcond=1e-9)[0]
-        r = y - X @ solution
-        distance = np.sum((r / (1.4826 * np.median(np.abs(r), axis=0) + 1e-12)) ** 2, axis=1, keepdims=True)
-        limit = max(min(limit, float(distance.max(initial=0.0))) / 2, 22.0)
-        weight = (limit / (limit + distance)) ** 2
+        root = np.sqrt(weight)[:, None]
+        solution = np.linalg.lstsq(root * X, root * y, rcond=1e-9)[0]
+        _, weight, limit = robust_weights(y - X @ solution, limit, alike=1)
     return np.asarray(solution[-len(at_s) :])
 
 

@@ -346,25 +346,17 @@ def _explained(finding: Finding, causes: Sequence[Finding]) -> bool:
     )
 
 
-def _compensated(rows: Rows, g_m_s2: float) -> list[Finding]:
-    """Name a wrench that follows the acceleration but not gravity."""
+def _mistakes(rows: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
+    """Name a wrench that follows the acceleration but not gravity, or that does not follow the motion at all."""
     X, y = np.column_stack([np.ones(len(rows)), rows.motion.columns()]), rows.wrench[:, :3]
     linear, _, rank, _ = np.linalg.lstsq(X, y, rcond=1e-9)
     variance = np.mean((y - X @ linear) ** 2) * len(X) / max(len(X) - rank, 1)
     weight_N, mass_kg = (float(np.linalg.norm(linear[part]) / np.sqrt(3)) for part in (slice(1, 10), slice(10, 13)))
     sigma_kg = float(np.sqrt(max(np.trace(np.linalg.pinv(X.T @ X)[10:13, 10:13]) * variance, 0.0)))
     follows = variance < _UNEXPLAINED**2 * np.mean(y.var(axis=0))
-    light = weight_N < COMPENSATED * mass_kg * g_m_s2
+    light = weight_N < COMPENSATED * mass_kg * best.load.g_m_s2
     if follows and light and mass_kg > SIGNIFICANT_SIGMAS * sigma_kg:
         return [Finding.of("wrench_compensated", weight_N=weight_N, mass_kg=mass_kg)]
-    return []
-
-
-def _mistakes(rows: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
-    """Name a wrench that follows the acceleration but not gravity, or that does not follow the motion at all."""
-    if light := _compensated(rows, best.load.g_m_s2):
-        return light
-    free, y = best.kept, rows.wrench[:, :3]
     free = best.kept
     left = float(np.sqrt(np.mean(best.residuals[free, :3] ** 2) / np.mean(y[free].var(axis=0))))
     if left > _UNEXPLAINED and not any(one.code in OF_AXES for one in named):
