@@ -43,8 +43,7 @@ class Code:
     @property
     def values(self) -> set[str]:
         """Names of the values that the templates need."""
-        # Files of earlier versions lack the scale.
-        return {place[1] for place in _PLACE.finditer(self.found + self.fix) if place[2] != "scale"}
+        return {place[1] for place in _PLACE.finditer(self.found + self.fix) if place[2] not in _OPTIONAL}
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,11 +158,9 @@ def verdict_of(findings: Iterable[Finding]) -> Verdict:
 def _write(template: str, values: Mapping[str, Any]) -> str:
     def at(place: re.Match[str]) -> str:
         name, form = place[1], place[2] or ""
-        if form == "scale":
-            return _scale(values.get(name))
         if form[:1] == "~" and None not in (values[name], sigma := values[form[1:]]):
             form = f".{decimals(sigma)}f"
-        return _value(name, values[name], form)
+        return _value(name, values.get(name), form)
 
     return _PLACE.sub(at, template)
 
@@ -227,8 +224,10 @@ def _scale(unit_N: Sequence[float] | None) -> str:
     )
 
 
+# Forms of values that files of earlier versions lack.
+_OPTIONAL: Final = frozenset(("scale",))
 _FORMS: Final[Mapping[str, Callable[[Any], str]]] = {
-    "poses": _poses, "units": _units, "axes": _axes, "orders": _orders,
+    "poses": _poses, "units": _units, "axes": _axes, "orders": _orders, "scale": _scale,
 }  # fmt: skip
 
 

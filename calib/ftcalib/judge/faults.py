@@ -210,8 +210,8 @@ _Reading = tuple[str, Mapping[str, Any], Array, Array]
 
 def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
     """Yield each mistake as code and values, with the data as they are without it, the simplest first."""
-    for read_as in [written] if is_euler(written) else []:
-        yield from _other_orders(R, wrench, read_as)
+    if is_euler(written):
+        yield from _other_orders(R, wrench, written)
     if written != "joints":
         yield "orientations_inverted", {}, np.swapaxes(R, 1, 2), wrench
     yield "columns_swapped", {}, R, np.roll(wrench, 3, axis=1)
