@@ -73,6 +73,11 @@ class Parameters:
         """Size of the gravity force."""
         return float(np.linalg.norm(self.gravity_force_base_N))
 
+    def weight_sigma_N(self, covariance: Array) -> float:
+        """Return one standard deviation of the weight from the covariance (15, 15) of the parameters."""
+        variance = float(self.down @ covariance[3:6, 3:6] @ self.down)
+        return float(np.sqrt(max(variance, 0.0)))  # below 0 only by rounding, if the weight is exactly known
+
     @property
     def down(self) -> Array:
         """(3,) direction of the gravity force in base; zero without a weight."""

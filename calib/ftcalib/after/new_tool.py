@@ -201,8 +201,7 @@ def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Ar
     else:
         raise NotObservable(f"the fit has not settled in {_MOST_STEPS} steps: check the poses, or solve alone.")
     covariance = np.linalg.inv(H)
-    weight_N = new.weight_N
-    sigma_N = float(np.sqrt(new.down @ covariance[3:6, 3:6] @ new.down))
+    weight_N, sigma_N = new.weight_N, new.weight_sigma_N(covariance)
     if weight_N < _SIGNIFICANT * sigma_N:
         raise NotObservable(f"the weight of the tool is {weight_N:.2g} N, sigma {sigma_N:.2g} N: check the sensor.")
     chi2 = float(np.einsum("ni,nij,nj->", left, weights, left) + r @ r)

@@ -191,15 +191,15 @@ def tool(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float)
 
 
 def _mass(parameters: Parameters, covariance: Array, tool_kg: float | None, g_m_s2: float) -> list[Finding]:
-    weight_N, along = parameters.weight_N, parameters.down
+    weight_N = parameters.weight_N
     load_kg = weight_N / g_m_s2
-    sigma_kg = np.sqrt(max(float(along @ covariance[3:6, 3:6] @ along), 0.0)) / g_m_s2
+    sigma_kg = parameters.weight_sigma_N(covariance) / g_m_s2
     if tool_kg is None or abs(load_kg - tool_kg) <= max(_margin_kg(tool_kg), _SIGNIFICANT * sigma_kg):
         return []
     suspects = units.suspects(parameters, units.by_mass(load_kg, tool_kg, UNIT_SHARE))
     if not suspects and load_kg < NO_TOOL_SHARE * tool_kg:
         return [Finding.of("weight_compensated", weight_N=weight_N)]
-    unit_N = units.unit_of_force(load_kg, float(sigma_kg), tool_kg, _margin_kg(tool_kg) / _SIGMAS_OF_MARGIN)
+    unit_N = units.unit_of_force(load_kg, sigma_kg, tool_kg, _margin_kg(tool_kg) / _SIGMAS_OF_MARGIN)
     return [Finding.of("tool_mass_mismatch", load_kg=load_kg, tool_kg=tool_kg, units=suspects, unit_N=unit_N)]
 
 
@@ -211,8 +211,7 @@ def unit_of_force(estimate: Judged, known: Known | None, setup: Setup, g_m_s2: f
         true_kg, tolerance_kg = setup.tool_mass_kg, _margin_kg(setup.tool_mass_kg) / _SIGMAS_OF_MARGIN
     else:
         return None
-    weight_N, along = estimate.parameters.weight_N, estimate.parameters.down
-    sigma_N = float(np.sqrt(max(float(along @ estimate.covariance[3:6, 3:6] @ along), 0.0)))
+    weight_N, sigma_N = estimate.parameters.weight_N, estimate.parameters.weight_sigma_N(estimate.covariance)
     if weight_N == 0:
         return None
     return units.unit_of_force(weight_N / g_m_s2, sigma_N / g_m_s2, true_kg, tolerance_kg)
@@ -307,8 +306,7 @@ def contradictions(
         Where up should be.
     """
     contradicted = []
-    weight_N, along = estimate.weight_N, estimate.down
-    sigma_N = float(np.sqrt(along @ covariance[3:6, 3:6] @ along))
+    weight_N, sigma_N = estimate.weight_N, estimate.weight_sigma_N(covariance)
     shows_directions = weight_N > sigmas * sigma_N
     if known.mass_kg is not None:
         mass_kg, sigma_kg = weight_N / g_m_s2, sigma_N / g_m_s2

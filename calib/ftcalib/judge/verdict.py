@@ -351,9 +351,7 @@ def _errors(fit: Judged, used: NDArray[np.bool_], weight_N: float) -> tuple[floa
 
 
 def _weight(fit: Judged, weight_N: float, setup: Setup) -> list[Finding]:
-    along = fit.parameters.down
-    variance = float(along @ fit.covariance[3:6, 3:6] @ along)
-    sigma_N = np.sqrt(max(variance, 0.0))  # below 0 only by rounding, if the weight is exactly known
+    sigma_N = fit.parameters.weight_sigma_N(fit.covariance)
     if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
         return []
     if given_in_base := constant_weight(fit.wrench, setup.up):

@@ -181,10 +181,7 @@ def tool_in_words(tool: str | None, *, emulated: bool) -> str:
 
 def mass_sigma_kg(parameters: "Parameters", covariance: "Array", g_m_s2: float) -> float:
     """Return one standard deviation of the mass from the covariance (15, 15) alone."""
-    import numpy as np
-
-    down = parameters.down
-    return float(np.sqrt(np.maximum(down @ covariance[3:6, 3:6] @ down, 0.0))) / g_m_s2
+    return parameters.weight_sigma_N(covariance) / g_m_s2
 
 
 def shows_bias(check: VerificationRecord | BriefVerification) -> bool:
