@@ -20,12 +20,12 @@ LARGE_SHARE = 20.0
 CONFIRMED_SIGMAS = 3.0
 # Forces in another unit leave less than this share of the weight.
 NOISY = 0.03
-FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216, "kgf": 9.80665, "gf": 9.80665e-3, "mN": 1e-3, "kN": 1e3}
+FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216152605, "kgf": 9.80665, "gf": 9.80665e-3, "mN": 1e-3, "kN": 1e3}
 TORQUE_UNITS_NM = {
     "N·m": 1.0,
     "N·mm": 1e-3,
-    "lbf·in": 0.11298483,
-    "lbf·ft": 1.3558179,
+    "lbf·in": 0.1129848290276167,
+    "lbf·ft": 1.3558179483314004,
     "kgf·cm": 0.0980665,
     "kgf·m": 9.80665,
     "kN·m": 1e3,

@@ -8,37 +8,24 @@ from typing import Final, NamedTuple
 
 from ftcalib.data.dataset import list_names
 from ftcalib.errors import BadDataset
+from ftcalib.judge.units import FORCE_UNITS_N, TORQUE_UNITS_NM
+from ftcalib.model import STANDARD_GRAVITY_M_S2
 
-_G_M_S2, _LBF_N, _DEG = 9.80665, 4.4482216152605, 0.017453292519943295
+_DEG = 0.017453292519943295
 # Factors to SI by what they measure, without spaces, dots, `·`, `*`, `-` and `^`.
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "time": {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
-    "force": {
-        "N": 1.0,
-        "mN": 1e-3,
-        "kN": 1e3,
-        "kgf": _G_M_S2,
-        "kg": _G_M_S2,
-        "gf": _G_M_S2 / 1e3,
-        "lbf": _LBF_N,
-        "lb": _LBF_N,
-    },
+    "force": {**FORCE_UNITS_N, "kg": FORCE_UNITS_N["kgf"], "lb": FORCE_UNITS_N["lbf"]},
     "torque": {
-        "Nm": 1.0,
-        "Nmm": 1e-3,
+        **{unit.replace("·", ""): size for unit, size in TORQUE_UNITS_NM.items()},
         "mNm": 1e-3,
         "Ncm": 1e-2,
-        "kgfm": _G_M_S2,
-        "kgfcm": _G_M_S2 / 1e2,
-        "kgfmm": _G_M_S2 / 1e3,
-        "lbfin": _LBF_N * 0.0254,
-        "lbin": _LBF_N * 0.0254,
-        "inlb": _LBF_N * 0.0254,
-        "lbfft": _LBF_N * 0.3048,
+        "kgfmm": TORQUE_UNITS_NM["kgf·m"] / 1e3,
+        **dict.fromkeys(("lbin", "inlb"), TORQUE_UNITS_NM["lbf·in"]),
     },
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254},
     "angle": {"rad": 1.0, "deg": _DEG, "degree": _DEG, "degrees": _DEG, "°": _DEG},
-    "acceleration": {"m/s2": 1.0, "m/s²": 1.0, "g": _G_M_S2},
+    "acceleration": {"m/s2": 1.0, "m/s²": 1.0, "g": STANDARD_GRAVITY_M_S2},
 }
 COUNTS: Final = ("counts", "count", "cts", "digits")
 _BEHIND = re.compile(r"(?P<name>.+?)(?:\s*[\[(](?P<bracket>[^\])]*)[\])]|_(?P<suffix>[^\W_]+))\s*")
