@@ -344,7 +344,7 @@ def circumstances_of(run: Run) -> Circumstances:
             sensor_height_m=None if height_mm is None else height_mm / 1e3,
             sensor_mass_kg=setup["sensor_mass_kg"],
             payload_kg=setup["payload_kg"],
-            sensor_has_arbitrary_zero="zero" in origin["devices"].get("sensor", {}).get("facts", {}),
+            sensor_has_arbitrary_zero="zero" in (_of(origin, "devices", "sensor", "facts") or ()),
         ),
         origin,
     )
