@@ -250,24 +250,24 @@ def _() -> Case:
 STAMP_S = 1.7e9
 
 
+def of_topics(clock: Table_, message: str, pose: tuple[str, str], words: str) -> Case:
+    """Two files with the names of messages: `?` is an axis, of force and torque, orientation and position."""
+    names = " ".join(axes(message.replace("*", kind)) for kind in ("force", "torque"))
+    poses = quaternion(RECORDING, axes(pose[0], "xyzw")) | position(RECORDING, axes(pose[1]))
+    return Case(text({**clock, **wrench(RECORDING, names)}), words, text({**clock, **poses}), origin_s=STAMP_S)
+
+
 @case("rostopic echo -p, two files")
 def _() -> Case:
-    names = axes("field.wrench.force.?") + " " + axes("field.wrench.torque.?")
     clock = t(RECORDING, "%time", 1e-9, STAMP_S) | t(RECORDING, "field.header.stamp", 1e-9, STAMP_S)
-    poses = quaternion(RECORDING, axes("field.pose.orientation.?", "xyzw")) | position(
-        RECORDING, axes("field.pose.position.?")
-    )
-    return Case(text(clock | wrench(RECORDING, names)), "time in ns", text(clock | poses), origin_s=STAMP_S)
+    pose = "field.pose.orientation.?", "field.pose.position.?"
+    return of_topics(clock, "field.wrench.*.?", pose, "time in ns")
 
 
 @case("rostopic echo -p, TF")
 def _() -> Case:
-    names = axes("field.wrench.force.?") + " " + axes("field.wrench.torque.?")
-    clock = t(RECORDING, "%time", 1e-9, STAMP_S)
-    poses = quaternion(RECORDING, axes("field.transform.rotation.?", "xyzw")) | position(
-        RECORDING, axes("field.transform.translation.?")
-    )
-    return Case(text(clock | wrench(RECORDING, names)), "time in ns", text(clock | poses), origin_s=STAMP_S)
+    pose = "field.transform.rotation.?", "field.transform.translation.?"
+    return of_topics(t(RECORDING, "%time", 1e-9, STAMP_S), "field.wrench.*.?", pose, "time in ns")
 
 
 def stamps(names: str) -> dict[str, Array]:
@@ -277,18 +277,14 @@ def stamps(names: str) -> dict[str, Array]:
 
 @case("rosbag_to_csv")
 def _() -> Case:
-    names = axes(".wrench.force.?") + " " + axes(".wrench.torque.?")
     clock = t(RECORDING, "time", 1.0, 5.0) | stamps(".header.stamp.secs .header.stamp.nsecs")
-    poses = quaternion(RECORDING, axes(".pose.orientation.?", "xyzw")) | position(RECORDING, axes(".pose.position.?"))
-    return Case(text(clock | wrench(RECORDING, names)), "ROS topics", text(clock | poses), origin_s=STAMP_S)
+    return of_topics(clock, ".wrench.*.?", (".pose.orientation.?", ".pose.position.?"), "ROS topics")
 
 
 @case("bagpy")
 def _() -> Case:
-    names = axes("wrench.force.?") + " " + axes("wrench.torque.?")
     clock = stamps("header.stamp.sec header.stamp.nanosec")
-    poses = quaternion(RECORDING, axes("pose.orientation.?", "xyzw")) | position(RECORDING, axes("pose.position.?"))
-    return Case(text(clock | wrench(RECORDING, names)), "ROS topics", text(clock | poses), origin_s=STAMP_S)
+    return of_topics(clock, "wrench.*.?", ("pose.orientation.?", "pose.position.?"), "ROS topics")
 
 
 PLOTJUGGLER = axes("/ft/wrench/force/?") + " " + axes("/ft/wrench/torque/?")
@@ -316,12 +312,8 @@ def _() -> Case:
 
 @case("Foxglove, receive time")
 def _() -> Case:
-    clock = t(RECORDING, "receive_time", 1e-9, STAMP_S)
-    names = axes("wrench.force.?") + " " + axes("wrench.torque.?")
-    poses = quaternion(RECORDING, axes("transform.rotation.?", "xyzw")) | position(
-        RECORDING, axes("transform.translation.?")
-    )
-    return Case(text(clock | wrench(RECORDING, names)), "time in ns", text(clock | poses), origin_s=STAMP_S)
+    pose = "transform.rotation.?", "transform.translation.?"
+    return of_topics(t(RECORDING, "receive_time", 1e-9, STAMP_S), "wrench.*.?", pose, "time in ns")
 
 
 @case("Foxglove, poses at rest")
