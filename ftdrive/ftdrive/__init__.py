@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from ftcalib.known import Known, Setup
     from ftcalib.model import Parameters, predict
     from ftcalib.result import CalibrationResult
-    from ftdrive.library import open_arm, open_sensor, open_stream, plan_tour, solve
+    from ftdrive.library import open_arm, open_sensor, open_stream, plan_tour, read_recording, solve
     from ftdrive.live.contact import Contact
     from ftdrive.live.samples import Stages, WrenchFrame
     from ftdrive.live.weighing import CannotWeigh, weigh
-    from ftdrive.recording.files import read_recording, write_recording
+    from ftdrive.recording.files import write_recording
     from ftdrive.runs.run import Run
     from ftdrive.runs.source import read_calibration, read_dataset
     from ftdrive.tables.table import TableOptions
@@ -94,11 +94,11 @@ _MODULES = {
     "ftcalib.known": ("Known", "Setup"),
     "ftcalib.model": ("Parameters", "predict"),
     "ftcalib.result": ("CalibrationResult",),
-    "ftdrive.library": ("open_arm", "open_sensor", "open_stream", "plan_tour", "solve"),
+    "ftdrive.library": ("open_arm", "open_sensor", "open_stream", "plan_tour", "read_recording", "solve"),
     "ftdrive.live.contact": ("Contact",),
     "ftdrive.live.samples": ("Stages", "WrenchFrame"),
     "ftdrive.live.weighing": ("CannotWeigh", "weigh"),
-    "ftdrive.recording.files": ("read_recording", "write_recording"),
+    "ftdrive.recording.files": ("write_recording",),
     "ftdrive.runs.run": ("Run",),
     "ftdrive.runs.source": ("read_calibration", "read_dataset"),
     "ftdrive.tables.table": ("TableOptions",),

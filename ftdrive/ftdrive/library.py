@@ -1,6 +1,6 @@
 """The functions of `import ftdrive` that join several rooms: solve, open devices and streams, plan a tour."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,10 @@ from ftdrive.live.samples import Stages, Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
-from ftdrive.recording.files import moving_source
+from ftdrive.recording.files import is_recording
+from ftdrive.recording.files import read_recording as read_ours
+from ftdrive.recording.foreign import moving_source, tables_of
+from ftdrive.recording.recording import ROW, Recording, rows_of
 from ftdrive.runs.source import SolveOptions, read_calibration, read_dataset
 from ftdrive.tables.table import TableOptions
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
@@ -93,6 +96,63 @@ def solve(
         provenance=provenance,
         as_published=as_published,
     )
+
+
+def read_recording(
+    source: Any,
+    columns: Collection[str] = ROW.names or (),
+    *,
+    calibration: CalibrationResult | None = None,
+    table: TableOptions | None = None,
+) -> Recording:
+    """Read a recording into memory, also the `.partial` of one that was interrupted.
+
+    Parameters
+    ----------
+    source : str, Path, DataFrame or mapping
+        A file of `ftdrive record`, whose ending names the format: .mcap, .csv or .parquet. Or another program's: a bag,
+        or a table with wrench and orientation, as text, as a DataFrame of pandas or Polars, or as arrays by name.
+    columns : collection of str
+        Fields of `Recording.rows` that are needed. Others may be missing, which makes reading faster.
+    calibration : CalibrationResult, optional
+        Of another program's recording, which has none; `raw` is the wrench as measured, `wrench` is 0.
+    table : TableOptions, optional
+        What another program's table does not say.
+
+    Raises
+    ------
+    ConfigError
+        Another ending, a missing package, or no calibration for another program's recording.
+    BadRecording, BadDataset
+        Damaged, without a sample, or of no known form. A file that was cut is read up to there; `cut` says so.
+    OSError
+        The file does not exist or cannot be read.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> recording = ftdrive.read_recording("peg.csv")
+    >>> table = recording.table  # a DataFrame: pandas.DataFrame(table)
+    >>> table["fz"].shape, table["raw_fz"].shape
+    ((3000,), (3000,))
+    """
+    source = Path(source) if isinstance(source, str) else source
+    if not isinstance(source, Path) or not (is_recording(source) or (calibration is None and table is None)):
+        return _of_tables(source, calibration, table)
+    return read_ours(source, columns)
+
+
+def _of_tables(source: Any, calibration: CalibrationResult | None, table: TableOptions | None) -> Recording:
+    """Read another program's recording. Raises `ConfigError` without a calibration, or `BadDataset`."""
+    if calibration is None:
+        raise ConfigError("the recording is another program's and has no calibration: give one as calibration=")
+    from ftdrive.recording.table_pair import TablePair  # with the filters of a stream
+
+    tables = tables_of(source, SolveOptions(table=table))
+    if tables is None:
+        raise ConfigError(f"{source} is a recording of ftdrive: leave out table=")
+    pair = TablePair(*tables, calibration, "", None)
+    return Recording(pair.header, np.concatenate([rows_of(block.samples) for block in pair.blocks()]), [])
 
 
 _NOT_CONFIGURED = CellConfig(RobotConfig(""), SensorConfig(""))

@@ -159,7 +159,7 @@ CALIBRATION = click.option(
 
 
 def BAG_TOPICS(command: F) -> F:
-    """Add the options --wrench-topic and --pose-topic, which `recording.bag.read_bag` takes."""
+    """Add the options --wrench-topic and --pose-topic, which `recording.foreign.read_bag` takes."""
     poses = "Of a bag of ROS: topic of PoseStamped, tf?base=B&flange=F, or /joint_states?urdf=FILE&flange=F."
     command = click.option("--pose-topic", metavar="TOPIC", help=poses)(command)
     return click.option("--wrench-topic", metavar="TOPIC", help="Of a bag of ROS: topic of WrenchStamped.")(command)

@@ -66,9 +66,8 @@ def compensate(
     a bag of ROS 1 or ROS 2. --columns and the options beside it say what a table does not.
     """
     from ftdrive.errors import ConfigError
-    from ftdrive.recording.bag import is_bag
     from ftdrive.recording.compensation import compensate_recording
-    from ftdrive.recording.files import format_of
+    from ftdrive.recording.files import format_of, is_bag
     from ftdrive.runs.source import SolveOptions, read_calibration
     from ftdrive.terminal.console import beside, messages, working
 
@@ -119,7 +118,7 @@ def _open(
     """Return the recording with the calibration, and the delay of one of another program with one sigma."""
     from ftdrive.errors import ConfigError
     from ftdrive.recording.compensation import NEEDED, read_with_calibration
-    from ftdrive.recording.files import tables_of
+    from ftdrive.recording.foreign import table_words, tables_of
     from ftdrive.recording.recording import ROW
     from ftdrive.recording.table_pair import TablePair
     from ftdrive.terminal.console import messages
@@ -131,7 +130,7 @@ def _open(
         return read_with_calibration(path, calibration, name, ROW.names or () if everything else NEEDED), None
     if calibration is None:
         raise ConfigError("the recording has no calibration: give --calibration PATH")
-    for words in dict.fromkeys(f"{table.name}: {table.words}" for table in tables if table.words):
+    if words := table_words(tables):
         messages.print(f" {words}")
     pair = TablePair(*tables, calibration, name, delay_s if isinstance(delay_s, float) else None)
     return pair, {"value": pair.delay_s, "sigma": pair.delay_sigma_s}

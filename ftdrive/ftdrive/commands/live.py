@@ -32,7 +32,7 @@ from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Axes, Paired, StreamInfo, Tracking, WrenchFrame
 from ftdrive.live.stream import RECOVER_S, CompensatedStream, ProcessedStream
 from ftdrive.recording import Recorder, read_recording
-from ftdrive.recording.files import tables_of
+from ftdrive.recording.foreign import tables_of
 from ftdrive.recording.recording import with_calibration
 from ftdrive.recording.table_pair import TablePair
 from ftdrive.runs.run import Run

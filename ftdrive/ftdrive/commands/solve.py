@@ -40,8 +40,8 @@ from ftdrive.commands.common import (
 )
 from ftdrive.commands.tables import TABLE
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
-from ftdrive.recording.bag import is_bag
-from ftdrive.recording.files import moving_source
+from ftdrive.recording.files import is_bag
+from ftdrive.recording.foreign import moving_source
 from ftdrive.runs.bundle import unpack
 from ftdrive.runs.pose_hints import hints, numbers_in_dataset
 from ftdrive.runs.run import Run, in_motion
@@ -244,7 +244,8 @@ def _solve_each(
 
 
 def _is_in_motion(place: Path, options: SolveOptions) -> bool:
-    return in_motion(place) or moving_source(place, options) is not None
+    # A bag is read whole, so it is not read for the answer.
+    return in_motion(place) or is_bag(place) or moving_source(place, options) is not None
 
 
 def _result_of(place: Path, options: SolveOptions) -> tuple[CalibrationResult, Sequence[PoseRecord]]:

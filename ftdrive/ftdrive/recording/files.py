@@ -1,18 +1,17 @@
 """Recordings on disk: the file formats by their endings, and which files are recordings."""
 
+import struct
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import closing
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
-from ftcalib import CalibrationResult
 from ftcalib.files import open_file
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.samples import StreamEvent
-from ftdrive.recording.bag import is_bag, read_bag
 from ftdrive.recording.csv_file import CsvFile, read_csv
 from ftdrive.recording.growing_file import partial_of
 from ftdrive.recording.mcap_file import McapFile, read_mcap
@@ -26,10 +25,9 @@ from ftdrive.recording.recording import (
     Recording,
     Rows,
     measured,
-    rows_of,
 )
-from ftdrive.runs.source import SolveOptions
-from ftdrive.tables.table import Table, TableOptions
+
+_MAGIC: Final = b"\x89MCAP0\r\n"
 
 
 def is_recording(path: Path) -> bool:
@@ -41,36 +39,22 @@ def is_recording(path: Path) -> bool:
     return ending in ENDINGS and ending != ".csv" and not is_bag(path)
 
 
-def tables_of(place: Path, options: SolveOptions) -> tuple[Table, Table] | None:
-    """Return wrench and poses of another program, which may be one table; None for a recording of ours.
-
-    Raises `BadDataset`, `ConfigError` or `OSError`.
-    """
-    if options.pair is not None:
-        wrench, poses = (Table(path, options.table) for path in options.pair)
-        return wrench, poses
-    if is_recording(place):
-        return None
-    if is_bag(place):
-        return read_bag(place, *options.topics)
-    table = Table(place, options.table)
-    return table, table
-
-
-def moving_source(place: Path | Any, options: SolveOptions) -> Path | tuple[Table, Table] | None:
-    """Return what `solve_recording` takes, a recording or two tables; None for poses at rest.
-
-    `place` may be a DataFrame or a mapping. Raises as `tables_of`.
-    """
-    if not isinstance(place, Path):
-        table = Table(place, options.table)
-        return (table, table) if table.in_motion else None
-    if options.pair is None and (place.is_dir() or place.suffix == ".json") and not is_bag(place):
-        return None
-    tables = tables_of(place, options)
-    if tables is None:
-        return place
-    return tables if options.pair is not None or is_bag(place) or tables[0].in_motion else None
+def is_bag(path: Path) -> bool:
+    """Whether it is a bag of ROS 1 or ROS 2: a rosbag2 folder, a .db3 or .bag, or an MCAP file of another program."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    if path.suffix in (".bag", ".db3"):
+        return path.is_file()
+    if path.suffix != ".mcap" or not path.is_file():
+        return False
+    with open_file(path) as file:
+        start = file.read(512)
+    try:
+        (profile,) = struct.unpack_from("<I", start, 17)
+        (library,) = struct.unpack_from("<I", start, 21 + profile)
+    except struct.error:
+        return False
+    return start.startswith(_MAGIC) and not start[25 + profile : 25 + profile + library].startswith(b"ftdrive")
 
 
 class RecordingFile(Protocol):
@@ -191,33 +175,22 @@ class RecordingReader:
             raise BadRecording(error.problem, self.path) from error
 
 
-def read_recording(
-    source: Any,
-    columns: Collection[str] = ROW.names or (),
-    *,
-    calibration: CalibrationResult | None = None,
-    table: TableOptions | None = None,
-) -> Recording:
+def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
     """Read a recording into memory, also the `.partial` of one that was interrupted.
 
     Parameters
     ----------
-    source : str, Path, DataFrame or mapping
-        A file of `ftdrive record`, whose ending names the format: .mcap, .csv or .parquet. Or another program's: a bag,
-        or a table with wrench and orientation, as text, as a DataFrame of pandas or Polars, or as arrays by name.
+    path : str or Path
+        Its ending names the format: .mcap, .csv or .parquet.
     columns : collection of str
         Fields of `Recording.rows` that are needed. Others may be missing, which makes reading faster.
-    calibration : CalibrationResult, optional
-        Of another program's recording, which has none; `raw` is the wrench as measured, `wrench` is 0.
-    table : TableOptions, optional
-        What another program's table does not say.
 
     Raises
     ------
     ConfigError
-        Another ending, a missing package, or no calibration for another program's recording.
-    BadRecording, BadDataset
-        Damaged, without a sample, or of no known form. A file that was cut is read up to there; `cut` says so.
+        Another ending, or the package for the format is missing.
+    BadRecording
+        Damaged, without a sample, or of another program. A file that was cut is read up to there; `cut` says so.
     OSError
         The file does not exist or cannot be read.
 
@@ -229,27 +202,11 @@ def read_recording(
     >>> table["fz"].shape, table["raw_fz"].shape
     ((3000,), (3000,))
     """
-    source = Path(source) if isinstance(source, str) else source
-    if not isinstance(source, Path) or not (is_recording(source) or (calibration is None and table is None)):
-        return _of_tables(source, calibration, table)
     # A damaged file raises, because a caller in Python would not see a message.
-    reader = RecordingReader(source, columns)
+    reader = RecordingReader(Path(path), columns)
     pieces = list(reader.pieces())
     events = [event for piece in pieces for event in piece.events]
     return Recording(reader.header, np.concatenate([piece.rows for piece in pieces]), events, reader.cut)
-
-
-def _of_tables(source: Any, calibration: CalibrationResult | None, table: TableOptions | None) -> Recording:
-    """Read another program's recording. Raises `ConfigError` without a calibration, or `BadDataset`."""
-    if calibration is None:
-        raise ConfigError("the recording is another program's and has no calibration: give one as calibration=")
-    from ftdrive.recording.table_pair import TablePair  # with the filters of a stream
-
-    tables = tables_of(source, SolveOptions(table=table)) if isinstance(source, Path) else (Table(source, table),) * 2
-    if tables is None:
-        raise ConfigError(f"{source} is a recording of ftdrive: leave out table=")
-    pair = TablePair(*tables, calibration, "", None)
-    return Recording(pair.header, np.concatenate([rows_of(block.samples) for block in pair.blocks()]), [])
 
 
 def write_recording(path: str | Path, recording: Recording) -> None:

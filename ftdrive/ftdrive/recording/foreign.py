@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2 as tables: rosbag2 folders, .db3, .bag, and MCAP files without our header. Needs `ros2`."""
+"""Recordings of other programs as tables: text, and bags of ROS 1 and ROS 2, which need the extra `ros2`."""
 
 import struct
 from collections import defaultdict
@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset, UsageError
-from ftcalib.files import open_file
 from ftdrive.errors import ConfigError
+from ftdrive.recording.files import is_bag, is_recording
+from ftdrive.runs.source import SolveOptions
 from ftdrive.tables.table import Table
 from ftdrivers.errors import ProtocolError
 from ftdrivers.interfaces import Array
@@ -25,29 +26,46 @@ if TYPE_CHECKING:
 
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 _POSES: Final = "geometry_msgs/msg/PoseStamped"
-_MAGIC: Final = b"\x89MCAP0\r\n"
 # Times in ns, and numbers.
 _Column = tuple[NDArray[np.int64], Array]
 # Time of receipt in ns, and content.
 _Message = tuple[int, bytes]
 
 
-def is_bag(path: Path) -> bool:
-    """Whether it is a bag of ROS 1 or ROS 2: a rosbag2 folder, a .db3 or .bag, or an MCAP file of another program."""
-    if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    if path.suffix in (".bag", ".db3"):
-        return path.is_file()
-    if path.suffix != ".mcap" or not path.is_file():
-        return False
-    with open_file(path) as file:
-        start = file.read(512)
-    try:
-        (profile,) = struct.unpack_from("<I", start, 17)
-        (library,) = struct.unpack_from("<I", start, 21 + profile)
-    except struct.error:
-        return False
-    return start.startswith(_MAGIC) and not start[25 + profile : 25 + profile + library].startswith(b"ftdrive")
+def tables_of(source: Any, options: SolveOptions) -> tuple[Table, Table] | None:
+    """Return wrench and poses of another program, which may be one table; None for a recording of ours.
+
+    `source` is a Path, a DataFrame or a mapping. Raises `BadDataset`, `ConfigError` or `OSError`.
+    """
+    if options.pair is not None:
+        wrench, poses = (Table(path, options.table) for path in options.pair)
+        return wrench, poses
+    if isinstance(source, Path):
+        if is_recording(source):
+            return None
+        if is_bag(source):
+            return read_bag(source, *options.topics)
+    table = Table(source, options.table)
+    return table, table
+
+
+def moving_source(source: Any, options: SolveOptions) -> Path | tuple[Table, Table] | None:
+    """Return what `solve_recording` takes, a recording or two tables; None for poses at rest. Raises as `tables_of`."""
+    if options.pair is None and isinstance(source, Path):
+        # A run folder, or a dataset.
+        has_poses = source.is_dir() or source.suffix == ".json"
+        if has_poses and not is_bag(source):
+            return None
+    tables = tables_of(source, options)
+    if tables is None:
+        return Path(source)
+    # One table has both streams or poses at rest.
+    return tables if tables[0] is not tables[1] or tables[0].in_motion else None
+
+
+def table_words(tables: tuple[Table, Table]) -> str:
+    """Return what was recognised in the tables of a recording, in one line; empty for plain ones."""
+    return "; ".join(dict.fromkeys(f"{one.name}: {one.words}" for one in tables if one.words))
 
 
 def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tuple[Table, Table]:

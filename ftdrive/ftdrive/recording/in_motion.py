@@ -14,6 +14,7 @@ from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
 from ftdrive.recording.compensation import NEEDED
 from ftdrive.recording.files import RecordingReader
+from ftdrive.recording.foreign import table_words
 from ftdrive.recording.recording import Header
 from ftdrive.runs.run import made_now
 from ftdrive.runs.source import require_same_cell
@@ -80,11 +81,6 @@ def solve_recording(
         setup=setup,
         provenance=provenance,
     )
-
-
-def table_words(tables: tuple[Table, Table]) -> str:
-    """Return what was recognised in the tables of a recording, in one line; empty for plain ones."""
-    return "; ".join(dict.fromkeys(f"{one.name}: {one.words}" for one in tables if one.words))
 
 
 def _read_in_motion(path: Path) -> tuple[Means, Means, Header]:

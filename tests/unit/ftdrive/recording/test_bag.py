@@ -14,7 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import FtdriveError
-from ftdrive.recording.bag import is_bag, read_bag
+from ftdrive.recording.files import is_bag
+from ftdrive.recording.foreign import read_bag
 from ftdrive.recording.in_motion import solve_recording
 from ftdrive.tables.table import Table
 from tests.ros2.seven_joints import JOINTS, TRUTH, URDF, flange, sway, wrench
