@@ -1,6 +1,6 @@
 """Random mistakes in random recordings in motion: what is named first, and what of it ends good.
 
-    uv run python -m tests.benchmarks.motion_mistakes                  # 2,000 with mistakes, 500 right: about an hour
+    uv run python -m tests.benchmarks.motion_mistakes                  # 2,000 with mistakes, 500 right: half an hour
     uv run python -m tests.benchmarks.motion_mistakes --runs 200       # a tenth of both
     uv run python -m tests.benchmarks.motion_mistakes --only zeroed    # one mistake alone
 
@@ -8,10 +8,14 @@ Recording k has the seed k: load, mounting, motion, noise and contacts are drawn
 simulator (tests/moving_load.py) shares no formula with the estimator. The exit code is the number of failed rows.
 """
 
+import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
+from multiprocessing.pool import Pool
 
 import click
 import numpy as np
@@ -203,11 +207,29 @@ def _is_impossible(result: CalibrationResult) -> bool:
     return bool(moments[0] < -3 * sigma - result.mass_kg * 1e-4 or not -0.01 < least_m < 0.6)
 
 
-def _right(runs: int) -> Iterator[Row]:
+def _right_one(seed: int) -> Judged:
+    one = draw(seed)
+    return judged(one.recorded, one.setup)
+
+
+def _alone_one(name: str, seed: int) -> Judged:
+    one = draw(seed)
+    return judged(MISTAKES[name][0](one, np.random.default_rng([seed, 32])), one.setup)
+
+
+def _together_one(seed: int) -> tuple[Sequence[str], Judged]:
+    """Solve a recording with up to three mistakes; also return their names."""
+    rng, one = np.random.default_rng([seed, 33]), draw(seed)
+    some = rng.choice(list(MISTAKES), rng.integers(1, 4), replace=False)
+    names = [name for name in MISTAKES if name in some]
+    for name in names:
+        one = replace(one, recorded=MISTAKES[name][0](one, rng))
+    return names, judged(one.recorded, one.setup)
+
+
+def _right(pool: Pool, runs: int) -> Iterator[Row]:
     verdicts, false = Counter[str](), Counter[str]()
-    for seed in range(runs):
-        one = draw(seed)
-        found = judged(one.recorded, one.setup)
+    for seed, found in enumerate(pool.imap(_right_one, range(runs))):
         verdicts[found.verdict] += 1
         named = CAUSES.intersection(found.codes)
         false.update(named)
@@ -217,16 +239,13 @@ def _right(runs: int) -> Iterator[Row]:
     yield Row("right: false causes", _counts(false) or "0", "0", not false, runs)
 
 
-def _alone(name: str, runs: int) -> Iterator[Row]:
-    change, expected = MISTAKES[name]
-    first, good, missed = 0, 0, Counter[str]()
-    for seed in range(runs):
-        one = draw(seed)
-        found = judged(change(one, np.random.default_rng([seed, 32])), one.setup)
+def _alone(pool: Pool, name: str, runs: int) -> Iterator[Row]:
+    expected = MISTAKES[name][1]
+    first, good = 0, 0
+    for seed, found in enumerate(pool.imap(partial(_alone_one, name), range(runs))):
         hit = bool(found.codes) and found.codes[0] in expected
         first, good = first + hit, good + (found.verdict == "good")
         if not hit:
-            missed[f"{found.verdict} {', '.join(found.codes[:2])}".strip()] += 1
             show(f"{name}, seed {seed}: {found.verdict}, {', '.join(found.codes)}")
     hidden = name == "pounds"  # which motion does not show in every recording
     passed = hidden or (first >= 0.95 * runs and not good)
@@ -234,16 +253,10 @@ def _alone(name: str, runs: int) -> Iterator[Row]:
     yield Row(f"{name}: named first; good", f"{100 * first / runs:.0f} %; {good}", target, passed, runs)
 
 
-def _together(runs: int) -> Iterator[Row]:
+def _together(pool: Pool, runs: int) -> Iterator[Row]:
     """Subsets of up to three mistakes."""
     verdicts, impossible, silent = Counter[str](), 0, Counter[str]()
-    for seed in range(runs):
-        rng, one = np.random.default_rng([seed, 33]), draw(seed)
-        some = rng.choice(list(MISTAKES), rng.integers(1, 4), replace=False)
-        names = [name for name in MISTAKES if name in some]
-        for name in names:
-            one = replace(one, recorded=MISTAKES[name][0](one, rng))
-        found = judged(one.recorded, one.setup)
+    for seed, (names, found) in enumerate(pool.imap(_together_one, range(runs))):
         verdicts[found.verdict] += 1
         if found.verdict == "good":
             silent[" + ".join(sorted(names))] += 1
@@ -263,14 +276,17 @@ def _counts(counter: Counter[str]) -> str:
 @click.option("--only", type=click.Choice(["right", "together", *MISTAKES]), multiple=True)
 def main(runs: int, only: Sequence[str]) -> None:
     """Print the rows."""
+    # Workers read it when they import numpy: two with a thread for each core would disturb each other.
+    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     failed = 0
-    for name in only or ("right", *MISTAKES, "together"):
-        if name == "right":
-            failed += show_rows(_right(max(runs // 4, 1)))
-        elif name == "together":
-            failed += show_rows(_together(runs))
-        else:
-            failed += show_rows(_alone(name, max(runs // 100, 5)))
+    with get_context("spawn").Pool(2) as pool:
+        for name in only or ("right", *MISTAKES, "together"):
+            if name == "right":
+                failed += show_rows(_right(pool, max(runs // 4, 1)))
+            elif name == "together":
+                failed += show_rows(_together(pool, runs))
+            else:
+                failed += show_rows(_alone(pool, name, max(runs // 100, 5)))
     sys.exit(failed)
 
 
