@@ -433,6 +433,8 @@ CODES: Final[Mapping[str, Code]] = {
     "poses_rejected": Code(_LIMIT_OR_NOTE, "{count} of {n_poses} poses were rejected because they do not fit the "
         "others", "repeat {poses:poses}"),
     "few_poses": Code(_LIMIT, "there are only {n_poses} poses", "take {recommended} or more"),
+    "gain_unknown": Code(_LIMIT, "{n_poses} poses do not show gain and cross-talk of the sensor: {gain_percent:.2g} is "
+        "assumed, and part of all uncertainties", "take {recommended} or more, or declare its accuracy_percent"),
     "poses_unchecked": Code(_LIMIT, "{poses:poses} cannot be checked because the others do not determine all "
         "parameters", "add similar poses"),
     # Notes

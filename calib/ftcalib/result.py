@@ -155,7 +155,8 @@ class CalibrationResult:
     """Increase of chi2 at the second best solution, under the noise model; None: there is no other."""
     quality: Mapping[str, JSON] = field(default_factory=dict)
     """Statistics behind the verdict: `loo_force_rms_N` and `loo_torque_rms_Nm` (each pose predicted from all others),
-    `next_use_force_rms_N` and `next_use_torque_rms_Nm` (`likely_error`), `last_bias_offset` (6; bias at the last pose
+    `next_use_force_rms_N` and `next_use_torque_rms_Nm`, the same for `workspace` and, where the tour shows a drift,
+    `hour` (`likely_error`), `last_bias_offset` (6; bias at the last pose
     minus that of the result, the mean of the tour), `bias_growth_per_min` (6; its change in the minute after),
     `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
     `correlations` (pairs of parameters above 0.9)."""
@@ -397,18 +398,22 @@ class CalibrationResult:
         """
         return not self.quality or self.motion is not None or (self.p_value is not None and self.p_value >= SURE)
 
-    def likely_error(self) -> Array:
+    def likely_error(self, where: Literal["next_use", "workspace", "hour"] = "next_use") -> Array:
         """Root mean square error (2,) of compensating a free tool at the next use, N and N·m.
 
         It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the error in predicting
         each pose from all others, so it holds for orientations like those of the tour. In both it has the drift of the
-        bias from the mean of the tour to one minute after the last pose.
+        bias from the mean of the tour to one minute after the last pose. In the "workspace" it is that in any
+        orientation, and after an "hour" that with the drift until then: NaN where the tour shows none.
         """
         if not self.quality:
-            return np.array(self.predicted_error())
+            return np.array(self.predicted_error()) if where != "hour" else np.full(2, np.nan)
+        units = "force_rms_N", "torque_rms_Nm"
+        if where == "hour":
+            return np.array([self.quality.get(f"hour_{unit}", np.nan) for unit in units], dtype=np.float64)
         # Files of version 0.1.0 and earlier have only the error of predicting each pose from all others.
-        keys = [f"{name}_{unit}" for name in ("next_use", "loo") for unit in ("force_rms_N", "torque_rms_Nm")]
-        return np.array([self.quality.get(keys[k], self.quality[keys[2 + k]]) for k in range(2)], dtype=np.float64)
+        names = [name for name in (where, "next_use", "loo") if f"{name}_{units[0]}" in self.quality]
+        return np.array([self.quality[f"{names[0]}_{unit}"] for unit in units], dtype=np.float64)
 
     def residual_summary(self) -> dict[str, float]:
         """Root mean square and largest norm of the force and torque residuals over the poses."""

@@ -101,7 +101,7 @@ def solve(
     judged = Judged.of(best) if estimator is None else _estimate(method, estimator, dataset, wrench_cov, best)
     free = best if estimator else None
     if assumed is not None:
-        free = _fit_freely(dataset, wrench_cov, drift)
+        free = _fit_freely(dataset, wrench_cov, drift, setup)
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
     quality = _judge(judged, free, dataset, measured_sigma, known, g_m_s2, setup)
     deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
@@ -172,7 +172,7 @@ def _fit(
     """
     poses = dataset.R_base_flange, dataset.wrench, wrench_cov
     try:
-        best = fit(*poses, t_s=dataset.t_s, drift=drift, known=assumed, g_m_s2=g_m_s2)
+        best = fit(*poses, t_s=dataset.t_s, drift=drift, known=assumed, g_m_s2=g_m_s2, gain_sigma=setup.gain_sigma)
         _require_determined(dataset.R_base_flange, best, known)
     except NotObservable as exc:
         # A mistake in the data often leaves the poses undetermined: name it, rather than ask for more poses.
@@ -281,11 +281,12 @@ def _constrain(method: Method, known: Known | None, setup: Setup) -> Known | Non
     return known
 
 
-def _fit_freely(dataset: CalibrationDataset, wrench_cov: Array | None, drift: Drift) -> Fit | None:
+def _fit_freely(dataset: CalibrationDataset, wrench_cov: Array | None, drift: Drift, setup: Setup) -> Fit | None:
     """Fit without known values; None if the poses do not determine all parameters."""
     try:
         require_orientations(dataset.R_base_flange, 4)
-        best = fit(dataset.R_base_flange, dataset.wrench, wrench_cov, t_s=dataset.t_s, drift=drift)
+        poses = dataset.R_base_flange, dataset.wrench, wrench_cov
+        best = fit(*poses, t_s=dataset.t_s, drift=drift, gain_sigma=setup.gain_sigma)
         _require_determined(dataset.R_base_flange, best, None)
     except NotObservable:
         return None
@@ -303,7 +304,7 @@ def _mistakes(
     """Find what explains that poses do not determine the parameters: wrong known values can leave no weight."""
     poses = dataset.R_base_flange, dataset.wrench
     findings = faults(*poses, setup.up, _written(dataset)) or other_poses(*poses) or no_weight(*poses)
-    if not findings and known is not None and (free := _fit_freely(dataset, wrench_cov, drift)) is not None:
+    if not findings and known is not None and (free := _fit_freely(dataset, wrench_cov, drift, setup)) is not None:
         findings = contradictions(known, free.parameters, free.covariance, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
     return findings
 

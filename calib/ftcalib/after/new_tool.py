@@ -246,40 +246,57 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
     Raises
     ------
     NotObservable
-        The runs contradict each other in more than the bias, or a run shows gain and cross-talk.
+        The runs contradict each other in more than the bias, or only some show gain and cross-talk.
     """
-    if any(one.response is not None for one in results):
-        raise NotObservable("a run shows gain or cross-talk of the sensor, and these are not joined: use --from.")
+    with_response = {one.response is not None for one in results}
+    if len(with_response) > 1:
+        raise NotObservable("some runs show gain or cross-talk of the sensor and others do not: use --from.")
     if any((np.diag(one.covariance)[_SHARED] <= 0).any() for one in results):
         raise NotObservable("a run takes a value as exactly known: solve its runs without known values.")
-    last = results[-1]
-    difference = np.array([last.parameters.difference(one.parameters)[_SHARED] for one in results])
-    information = np.array([np.linalg.inv(one.covariance[np.ix_(_SHARED, _SHARED)]) for one in results])
+    last, n = results[-1], 15
+    covariances = [joint_covariance(one.covariance, one.response) for one in results]
+    differences = [last.parameters.difference(one.parameters) for one in results]
+    if last.response is not None:
+        n += len(last.response.coefficients)
+        responses = [one.response.coefficients for one in results if one.response is not None]
+        differences = [
+            np.append(off, of_one - last.response.coefficients)
+            for off, of_one in zip(differences, responses, strict=True)
+        ]
+    alike = np.append(_SHARED, np.arange(15, n))
+    # What was not looked for has no variance.
+    alike = alike[np.all([np.diag(one)[alike] > 0 for one in covariances], axis=0)]
+    difference = np.array(differences)[:, alike]
+    information = np.array([np.linalg.inv(one[np.ix_(alike, alike)]) for one in covariances])
     C = np.linalg.inv(information.sum(axis=0))
     x = C @ np.einsum("kij,kj->i", information, difference)
     rest = difference - x
-    chi2, dof = float(np.einsum("ki,kij,kj->", rest, information, rest)), 9 * (len(results) - 1)
+    chi2, dof = float(np.einsum("ki,kij,kj->", rest, information, rest)), len(alike) * (len(results) - 1)
     if dof and chi2_sf(dof, chi2) < FALSE_ALARMS:
         raise NotObservable(
             f"the runs contradict each other in more than the bias (chi2 {chi2:.0f} for {dof} degrees of freedom): "
             "`ftdrive diff` shows in what; tool, sensor or base has changed."
         )
-    shared, own = np.ix_(_SHARED, _SHARED), np.arange(15)[BIASES]
+    shared, own = np.ix_(alike, alike), np.arange(n)[BIASES]
     # The bias belongs to the last run: it moves as far as the shared values correlate with it.
-    G = last.covariance[np.ix_(own, _SHARED)] @ np.linalg.inv(last.covariance[shared])
-    step = np.zeros(15)
-    step[_SHARED], step[own] = x, G @ x
-    covariance = np.zeros((15, 15))
+    before = covariances[-1]
+    G = before[np.ix_(own, alike)] @ np.linalg.inv(before[shared])
+    step = np.zeros(n)
+    step[alike], step[own] = x, G @ x
+    covariance = np.zeros((n, n))
     covariance[shared] = C
-    covariance[np.ix_(own, _SHARED)] = G @ C
-    covariance[np.ix_(_SHARED, own)] = (G @ C).T
-    alone = last.covariance[np.ix_(own, own)] - G @ last.covariance[np.ix_(_SHARED, own)]
+    covariance[np.ix_(own, alike)] = G @ C
+    covariance[np.ix_(alike, own)] = (G @ C).T
+    alone = before[np.ix_(own, own)] - G @ before[np.ix_(alike, own)]
     covariance[np.ix_(own, own)] = alone + G @ C @ G.T
+    covariance = (covariance + covariance.T) / 2
+    response = last.response and Response(last.response.coefficients + step[15:], covariance)
     note = Finding.of("together", n_runs=len(results))
     return replace(
         last,
-        parameters=last.parameters.moved(step),
-        covariance=(covariance + covariance.T) / 2,
+        parameters=last.parameters.moved(step[:15]),
+        covariance=covariance[:15, :15],
+        response=response,
         findings=(*last.findings, note),
         provenance={
             **last.provenance,

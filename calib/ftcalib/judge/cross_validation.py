@@ -4,7 +4,7 @@ Cross-validation interpolates a drift, but a calibration is used after its tour:
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
@@ -45,6 +45,8 @@ class Judged:
     response: Response | None = None
     drift: DriftResult | None = None
     gain_sigma: float = 0.0
+    elsewhere: Array = field(default_factory=lambda: np.zeros(6))
+    """(6,) mean square error of predicting the wrench in any orientation, less that in those of the poses."""
     fit: Fit | None = None
     """The fit by maximum likelihood that has these values; None for another method, whose noise has no model."""
 
@@ -135,6 +137,7 @@ def _root(covariance: Array) -> Array:
 USUAL_INTERVAL_S = 10.0
 # From the last pose to the next use.
 NEXT_USE_S = 60.0
+HOUR = 3600.0 / NEXT_USE_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,6 +150,8 @@ class DriftAhead:
     """(6,) change in the next minute: its size if the bias is linear in time, its standard deviation if it walks."""
     square: Array
     """(6,) expected square at the next use."""
+    hour_square: Array
+    """(6,) the same an hour after the last pose."""
 
 
 def drift_ahead(fit: Judged, t_s: Array | None = None) -> DriftAhead:
@@ -159,7 +164,7 @@ def drift_ahead(fit: Judged, t_s: Array | None = None) -> DriftAhead:
         When each pose was measured; without it, or with times that are not finite, one pose every 10 s in their order.
     """
     if fit.drift is None or fit.drift.course is None:
-        return DriftAhead(np.zeros(6), np.zeros(6), np.zeros(6))
+        return DriftAhead(*np.zeros((4, 6)))
     n = len(fit.weights)
     timed = t_s is not None and np.isfinite(t_s).all() and np.ptp(t_s) > 0
     time = np.asarray(t_s if timed else USUAL_INTERVAL_S * np.arange(n), dtype=np.float64)
@@ -173,5 +178,6 @@ def drift_ahead(fit: Judged, t_s: Array | None = None) -> DriftAhead:
         walk[channels] += intervals * fit.components.get(component("walk", channels).name, 0.0) ** 2
     linear = np.where(walk > 0, 0.0, fit.drift.change * NEXT_USE_S / (time[last] - time[first]))
     # The change from the first pose to the last has the errors of both ends.
-    square = (offset + linear) ** 2 + walk + fit.drift.sigma**2 / 2
-    return DriftAhead(offset, np.sqrt(walk + linear**2), square)
+    known = fit.drift.sigma**2 / 2
+    square, hour = ((offset + steps * linear) ** 2 + steps * walk + known for steps in (1.0, HOUR))
+    return DriftAhead(offset, np.sqrt(walk + linear**2), square, hour)

@@ -28,6 +28,7 @@ from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, 
 from ftcalib.judge.session_change import cable_of, session_change
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.response import Response, predicted_covariance
+from ftcalib.likelihood.session import FEW_POSES_FOR_GAIN, FEW_POSES_FOR_RESPONSE
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters
 from ftcalib.published.yu import SPECIAL_R_flange_base
 
@@ -46,6 +47,8 @@ FEW_LEFT_OUT = 0.1
 ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
 # Probability of a false reason.
 SURE = 1e-3
+
+_RMS = "force_rms_N", "torque_rms_Nm"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +74,10 @@ class Quality:
     loo_force_rms_N: float
     """Cross-validated: root mean square error of predicting each used pose from all others."""
     loo_torque_rms_Nm: float
+    usual_rms: Array
+    """(2,) the same, of all poses if many were rejected: what they had may come again."""
+    elsewhere: Array
+    """(2,) mean square error in any orientation less that in those of the poses."""
     expected_rms: Array
     """(2,) from noise alone, over all orientations."""
     ahead: DriftAhead
@@ -97,23 +104,44 @@ class Quality:
         return self.chi2_p is not None and self.chi2_p >= SURE
 
     @property
+    def _is_noise(self) -> bool:
+        """Whether the errors are those of noise alone."""
+        return self.fits_measured_noise and few_rejected(self.used)
+
+    @property
     def next_use_rms(self) -> Array:
         """(2,) N, N·m: error of compensating a free tool a minute after the last pose.
 
         It is that of noise alone if this explains the residuals, else the cross-validated one, with the drift until
         then.
         """
-        left_out = np.array([self.loo_force_rms_N, self.loo_torque_rms_Nm])
-        error = self.expected_rms if self.fits_measured_noise else left_out
+        error = self.expected_rms if self._is_noise else self.usual_rms
         return np.asarray(np.sqrt(error**2 + self.ahead.square.reshape(2, 3).sum(axis=1)))
+
+    @property
+    def hour_rms(self) -> Array:
+        """(2,) N, N·m: an hour after the last pose, as the drift that was found goes on."""
+        now, then = (square.reshape(2, 3).sum(axis=1) for square in (self.ahead.square, self.ahead.hour_square))
+        return np.asarray(np.sqrt(self.next_use_rms**2 + then - now))
+
+    @property
+    def workspace_rms(self) -> Array:
+        """(2,) N, N·m: the same in any orientation."""
+        more = 0.0 if self._is_noise else np.maximum(self.elsewhere, 0.0)
+        return np.asarray(np.sqrt(self.next_use_rms**2 + more))
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the statistics that a result keeps as its `quality`."""
+        drifts = bool(self.ahead.square.any())
         return {
             "loo_force_rms_N": self.loo_force_rms_N,
             "loo_torque_rms_Nm": self.loo_torque_rms_Nm,
             "next_use_force_rms_N": float(self.next_use_rms[0]),
             "next_use_torque_rms_Nm": float(self.next_use_rms[1]),
+            "workspace_force_rms_N": float(self.workspace_rms[0]),
+            "workspace_torque_rms_Nm": float(self.workspace_rms[1]),
+            # A tour without drift does not show what an hour brings.
+            **({f"hour_{unit}": float(self.hour_rms[k]) for k, unit in enumerate(_RMS)} if drifts else {}),
             "last_bias_offset": self.ahead.offset.tolist(),
             "bias_growth_per_min": self.ahead.growth_per_min.tolist(),
             "worst_pose": self.worst_pose + 1,
@@ -162,10 +190,9 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
     """
     quality = _statistics(fit, t_s)
     parameters, weight_N = fit.parameters, fit.parameters.weight_N
-    few_rejected = quality.used.sum() >= (1 - FEW_LEFT_OUT) * len(quality.used)
     # Uneven rounding alone also rejects poses.
-    few_rejected |= bool((np.abs(fit.residuals) <= _finest(fit.wrench)).all())
-    suspect = quality.errors or not few_rejected or "cross_talk" in fit.components  # which hides axes that almost agree
+    accidents = few_rejected(quality.used) or bool((np.abs(fit.residuals) <= _finest(fit.wrench)).all())
+    suspect = quality.errors or not accidents or "cross_talk" in fit.components  # which hides axes that almost agree
     mistakes = _mistakes(fit, quality.used, t_s, setup, written) if suspect else []
     # Neighbouring rows of a motion differ too little to show a bias that changes with each.
     mistakes = [one for one in mistakes if single_poses or one.code != "zeroed_each_pose"]
@@ -203,7 +230,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
         ),
         *([] if contradicted or quality.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
         *(_noise(fit, quality) if single_poses else []),
-        *(_poses(fit, quality, "note" if few_rejected else "limit") if single_poses else []),
+        *(_poses(fit, quality, "note" if accidents else "limit", setup) if single_poses else []),
         *_drift(fit.drift, quality.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
         *_response(fit.response, weight_N),
         *([] if cable is None else [cable[0]]),
@@ -239,12 +266,19 @@ def _statistics(fit: Judged, t_s: Array | None) -> Quality:
         largest_share,
         errors,
         *left_out_rms,
+        np.array(_left_out_rms(fit, used if few_rejected(used) else np.ones_like(used))),
+        fit.elsewhere.reshape(2, 3).sum(axis=1),
         np.array(expected_error(fit.parameters, fit.covariance, fit.response)),
         drift_ahead(fit, t_s),
         noise_factor=float(np.sqrt(fit.measured_chi2 / fit.dof)) if measured else None,
         chi2_p=float(chi2_sf(fit.dof, fit.measured_chi2)) if measured else None,
         correlations=strong_correlations(fit.covariance),
     )
+
+
+def few_rejected(used: NDArray[np.bool_]) -> bool:
+    """Whether so few poses were rejected that something happened to them alone."""
+    return bool(used.sum() >= (1 - FEW_LEFT_OUT) * len(used))
 
 
 def _finest(wrench: Array) -> Array:
@@ -327,8 +361,8 @@ def _errors(fit: Judged, used: NDArray[np.bool_], weight_N: float) -> tuple[floa
     Of residual, cross-validated and expected error the first is named that exceeds the highest limit.
     """
     lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
-    left_out = _rms(fit.left_out_residuals[used, :3]), _rms(fit.left_out_residuals[used, 3:])
     expected = expected_error(fit.parameters, fit.covariance, fit.response)
+    left_out = _left_out_rms(fit, used)
     largest, findings = 0.0, []
     for k, scale, unit in ((0, weight_N, "N"), (1, weight_N * lever_m, "Nm")):
         errors = (
@@ -393,7 +427,20 @@ def _noise(fit: Judged, quality: Quality) -> list[Finding]:
     ]
 
 
-def _poses(fit: Judged, quality: Quality, severity_of_rejected: Severity) -> list[Finding]:
+def _left_out_rms(fit: Judged, poses: NDArray[np.bool_]) -> tuple[float, float]:
+    """Root mean square error of predicting these poses from the others; over all orientations if they cannot."""
+    checked = poses & ~_is_unchecked(fit)
+    if not checked.any():
+        return expected_error(fit.parameters, fit.covariance, fit.response)
+    return _rms(fit.left_out_residuals[checked, :3]), _rms(fit.left_out_residuals[checked, 3:])
+
+
+def _is_unchecked(fit: Judged) -> NDArray[np.bool_]:
+    """(n,) whether the other poses determine too little to predict this one."""
+    return np.asarray(np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > fit.parameters.weight_N**2)
+
+
+def _poses(fit: Judged, quality: Quality, severity_of_rejected: Severity, setup: Setup) -> list[Finding]:
     """Name poses that were rejected, that nothing checks, or that deviate most, and drift from pose to pose."""
     findings, n = list[Finding](), int(quality.used.sum())
     if not quality.used.all():
@@ -402,8 +449,10 @@ def _poses(fit: Judged, quality: Quality, severity_of_rejected: Severity) -> lis
         findings.append(Finding.of("poses_rejected", severity_of_rejected, **values))
     if n < RECOMMENDED_POSES:
         findings.append(Finding.of("few_poses", n_poses=n, recommended=RECOMMENDED_POSES))
-    uncertain = np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > fit.parameters.weight_N**2
-    rows = np.flatnonzero(uncertain & quality.used) + 1
+    elif n < FEW_POSES_FOR_RESPONSE and setup.sensor_accuracy_percent is None and not quality.is_exact:
+        values = {"gain_percent": 100 * setup.gain_sigma, "recommended": FEW_POSES_FOR_GAIN}
+        findings.append(Finding.of("gain_unknown", n_poses=n, **values))
+    rows = np.flatnonzero(_is_unchecked(fit) & quality.used) + 1
     if 0 < rows.size <= n / 2:
         findings.append(Finding.of("poses_unchecked", poses=rows))
     if quality.is_exact:

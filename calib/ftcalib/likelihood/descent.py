@@ -287,7 +287,7 @@ def _solve(H: Array, g: Array, damping: float) -> Array:
 
 def column_scale(information: Array) -> Array:
     """Root of the diagonal, 1 where it vanishes: dividing by it makes eigenvalues independent of units."""
-    diagonal = np.sqrt(information.diagonal())
+    diagonal = np.sqrt(np.maximum(information.diagonal(), 0.0))
     return np.asarray(np.where(diagonal > 0, diagonal, 1.0))
 
 

@@ -25,6 +25,7 @@ from ftcalib.likelihood.descent import (
 from ftcalib.likelihood.session import LEVER_M, Session, inverses, white
 from ftcalib.likelihood.session_noise import Noise
 from ftcalib.likelihood.variance_components import (
+    EFFECTS,
     FORCE,
     HYSTERESIS,
     NEGLIGIBLE,
@@ -168,13 +169,14 @@ def _prune(problem: Linearised, best: Point, needed: int) -> Point:
         seen = best.theta >= NEGLIGIBLE * units(problem, best, best.components)
         seen[:needed] = True
         if not seen.all():
-            without = point(problem, [best.components[i] for i in np.flatnonzero(seen)], best.theta[seen], best)
+            visible = [best.components[i] for i in np.flatnonzero(seen)]
+            without = point(best.problem, visible, best.theta[seen], best)
             best = without if without.worth > best.worth else best
     k = needed
     while k < len(best.components):
         rest = [i for i in range(len(best.components)) if i != k]
         components, theta = [best.components[i] for i in rest], best.theta[rest]
-        without = point(problem, components, theta, best)  # the others can regain a part of what is lost
+        without = point(best.problem, components, theta, best)  # the others can regain a part of what is lost
         if best.loglik - without.loglik < SURE:
             without = maximise(problem, components, theta, best.loglik - best.components[k].needed)
         if without.worth > best.worth:
@@ -188,7 +190,12 @@ def _predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Compone
     """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
     start = units(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * start])
-    at = point(problem, components, theta) if best.own.walks else best
+    problem = problem.with_only(components)
+    at = best
+    if best.own.walks:
+        at = point(problem, components, theta)
+    elif best.problem is not problem:
+        at = point(problem, best.components, best.theta)
     slope, information = score(problem, at, components, theta)
     k = len(best.components)
     curvature, slope_k = np.diag(information)[k:], slope[k:]
@@ -280,7 +287,7 @@ class Explanation:
     @property
     def noise_moves(self) -> bool:
         """Whether the noise depends on the parameters."""
-        return not {"rotation", "gain", "cross_talk", "hysteresis"}.isdisjoint(c.kind for c in self.components)
+        return not {"rotation", *EFFECTS}.isdisjoint(c.kind for c in self.components)
 
 
 def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
@@ -323,7 +330,7 @@ def _with_expected_noise(session: Session, e: Explanation) -> Explanation:
 
 def _is_quiet(session: Session, best: Minimum) -> bool:
     """Whether the measured noise explains everything, so that nothing more would be found."""
-    always, candidates = session.always(), session.candidates()
+    always, candidates = session.always(), [*session.candidates(), *session.structure()]
     if not session.measured or always or session.drift == "linear":
         return False
     if best.chi2 > float(chi2_isf(session.dof(session.everything), SUSPICIOUS)):
@@ -360,10 +367,10 @@ def _explanations(session: Session, minima: list[Minimum], weights: Array) -> li
 
 def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
     """Improve parameters, variances, components and rejected poses in turn, until nothing changes."""
-    always, candidates = session.always(), session.candidates()
+    always, candidates, structure = session.always(), session.candidates(), session.structure()
     problem = session.linearise(p, kept)
     at = select(problem, always, session.start(problem, always), candidates, len(always))
-    best = Explanation(p, kept)
+    best, tried = Explanation(p, kept), not structure
     for _ in range(ROUNDS):
         chosen = set(at.components)
         at = _with_response_instead(problem, at, candidates, len(always))
@@ -385,9 +392,11 @@ def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
                 problem = session.linearise(p, kept)
                 at = select(problem, at.components, at.theta, (), len(always))
                 continue
-        if set(at.components) == chosen:  # all others have been tried
+        if tried and set(at.components) == chosen:  # all others have been tried
             break
-        again = select(problem, at.components, at.theta, candidates, len(always))
+        # What compensation knows has been tried first: structured errors would take its place.
+        tried = True
+        again = select(problem, at.components, at.theta, [*candidates, *structure], len(always))
         if set(again.components) == set(at.components):
             break
         at = again

@@ -7,25 +7,33 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import NotObservable
-from ftcalib.known import Constraints, Known
+from ftcalib.known import USUAL_GAIN, Constraints, Known
 from ftcalib.likelihood.descent import MAX_STEPS, Minimum, column_scale
 from ftcalib.likelihood.explanation import Explanation, explain, noise_under, rivals
-from ftcalib.likelihood.response import SIZE, Response
+from ftcalib.likelihood.response import SIZE, Response, sensor_columns
 from ftcalib.likelihood.session import Drift, Session
 from ftcalib.likelihood.session_noise import Noise, summed_products
+from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
+from ftcalib.likelihood.structure import structure_columns
 from ftcalib.likelihood.variance_components import (
     HYSTERESIS,
     POSES_THAT_SHOW_THE_NOISE,
     RESPONSE,
+    STRUCTURE,
     Component,
+    Point,
     doubt,
     estimates_of_unknown_variances,
     left_out,
     point,
 )
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
+
+# Compensation does not know them.
+UNCOMPENSATED = (HYSTERESIS, *STRUCTURE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +52,8 @@ class Fit:
     """Under the noise model: measured or estimated white noise plus `components`. About dof by construction."""
     dof: int
     measured_chi2: float
-    """Chi2 of the same poses, best fit without drift, weighted by the measured noise alone; NaN without it."""
+    """Chi2 of the same poses, best fit without drift, with gain and cross-talk where they were found, weighted by the
+    measured noise alone; NaN without it."""
     weights: Array
     """(n,) 1 = used, 0 = rejected because it does not fit the others."""
     components: Mapping[str, float]
@@ -66,8 +75,10 @@ class Fit:
     response: Response | None
     """Gain and cross-talk of the sensor, best linear prediction; None where none was found."""
     lag: tuple[Array, Array] | None
-    """Hysteresis (n, 6) of each pose, and its variance (n, 6, 6): compensation does not know it; None where none was
-    found."""
+    """Hysteresis and errors that have a structure (n, 6) of each pose, and their variance (n, 6, 6): compensation does
+    not know them; None where none were found."""
+    elsewhere: Array
+    """(6,) mean square error of predicting the wrench in any orientation, less that in those of the poses."""
 
     @property
     def wrench_cov(self) -> Array:
@@ -135,6 +146,7 @@ def fit(
     drift: Drift = "auto",
     known: Known | None = None,
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
+    gain_sigma: float = USUAL_GAIN,
 ) -> Fit:
     """Fit all 15 parameters and, where the likelihood rises enough, components of the noise.
 
@@ -154,14 +166,20 @@ def fit(
     known : Known, optional
     g_m_s2 : float
         Only to turn a known mass into a weight.
+    gain_sigma : float
+        One standard deviation of the entries of the sensor's gain, for fewer than 12 poses.
 
     Raises
     ------
     NotObservable
         The lowest point reached is not a minimum. Poor information is not refused here: see `Fit.information`.
     """
-    session = Session(R_base_flange, wrench, wrench_cov, t_s, drift, Constraints(known or Known(), g_m_s2))
-    return _fit_of(session, *explain(session))
+    session = Session(R_base_flange, wrench, wrench_cov, t_s, drift, Constraints(known or Known(), g_m_s2), gain_sigma)
+    e, minima, static_chi2 = explain(session)
+    if not minima[0].settled and session.structure():  # which explains wrong data so well that no weight remains
+        session.structured = False
+        e, minima, static_chi2 = explain(session)
+    return _fit_of(session, e, minima, static_chi2)
 
 
 def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
@@ -182,18 +200,26 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
     Z = session.constraints.free(best.parameters)
     given_noise = covariance = np.asarray(Z @ _inverse(Z.T @ best.information @ Z) @ Z.T)
     response = lag = None
-    # Many poses show the variances so well that their uncertainty does not widen that of the estimates.
-    if found.keys() & {*RESPONSE, HYSTERESIS} or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
+    measured_chi2, elsewhere = static_chi2 if session.measured else float("nan"), np.zeros(6)
+    if found or session.n <= STRUCTURED_POSES:
         problem = session.linearise(best.parameters, e.kept)
         at = point(problem, e.components, e.theta)
-        x, C = estimates_of_unknown_variances(problem, at)
+    if session.n <= STRUCTURED_POSES:
+        elsewhere = _elsewhere(session, best.parameters, at)
+    if session.measured and found.keys() & {*RESPONSE}:
+        of_sensor = [c for c in e.components if c in RESPONSE]
+        measured_chi2 = point(problem, of_sensor, np.array([found[c] for c in of_sensor])).chi2
+    # Many poses show the variances so well that their uncertainty does not widen that of the estimates.
+    if found.keys() & {*RESPONSE, *UNCOMPENSATED} or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
+        x, C = estimates_of_unknown_variances(at)
         if session.n < POSES_THAT_SHOW_THE_NOISE:
-            C = C + doubt(problem, at, rivals(problem, at, session.candidates()))
-        if HYSTERESIS in found:
-            lag, square = np.empty((session.n, 6)), np.empty((session.n, 6, 6))
-            lag[session.order] = at.effect(HYSTERESIS)
-            T = problem.hysteresis
-            square[session.order] = found[HYSTERESIS] * T @ np.swapaxes(T, 1, 2)
+            C = C + doubt(at, rivals(problem, at, [*session.candidates(), *session.structure()]))
+        if hidden := found.keys() & {*UNCOMPENSATED}:
+            lag, square = np.zeros((session.n, 6)), np.zeros((session.n, 6, 6))
+            for c in hidden:
+                T = problem.X[..., problem.columns(c)]
+                lag[session.order] += at.effect(c)
+                square[session.order] += found[c] * T @ np.swapaxes(T, 1, 2)
         Z = block_diag(Z, np.eye(SIZE))
         covariance = (Z @ C @ Z.T)[:15, :15]
         response = Response(x[-SIZE:], Z @ C @ Z.T) if x[-SIZE:].any() else None
@@ -204,7 +230,7 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
         minima=tuple(minima),
         chi2=best.chi2,
         dof=session.dof(e.kept),
-        measured_chi2=static_chi2 if session.measured else float("nan"),
+        measured_chi2=measured_chi2,
         weights=weights,
         components={c.name: _deviation(session, c, v) for c, v in found.items()},
         drift=_drift(session, best, noise, given_noise, found) if drifts else None,
@@ -216,7 +242,16 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
         covariance=covariance,
         response=response,
         lag=None if lag is None else (lag, square),
+        elsewhere=elsewhere,
     )
+
+
+def _elsewhere(session: Session, p: Parameters, at: Point) -> Array:
+    """Mean square error (6,) in any orientation, less that in those of the poses."""
+    R = Rotation.create_group("O").as_matrix()
+    effects = sensor_columns(p, R) | structure_columns(p, R, session.R.mean(axis=0))
+    everywhere = at.squares(jacobian(p, R) @ session.constraints.free(p), effects)
+    return everywhere - at.squares(at.problem.J, {kind: at.problem.effects[kind] for kind in effects})
 
 
 def _deviation(session: Session, c: Component, variance: float) -> float:
@@ -229,7 +264,7 @@ def _drift(session: Session, best: Minimum, noise: Noise, C: Array, found: Mappi
     """Best linear prediction of the bias at every pose, and the error of its change."""
     J, r = jacobian(best.parameters, session.R), session.wrench - predict(best.parameters, session.R)
     problem = session.linearise(best.parameters, noise.kept)
-    others = [(problem.columns(c), value) for c, value in found.items() if c in (*RESPONSE, HYSTERESIS)]
+    others = [(problem.columns(c), value) for c, value in found.items() if c in (*RESPONSE, *UNCOMPENSATED)]
 
     def not_drift(X: Array) -> Array:
         """Multiply by the covariance of all but the drift."""

@@ -51,6 +51,12 @@ def response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
     return T
 
 
+def sensor_columns(parameters: Parameters, R_base_flange: Array) -> dict[str, Array]:
+    """Give these derivatives by what they are of."""
+    columns = response_columns(parameters, R_base_flange)
+    return {"gain": columns[..., : len(GAIN)], "cross_talk": columns[..., len(GAIN) :]}
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
     """Gain and cross-talk as estimated; what was not looked for, or not found, is zero. Arrays are read-only."""

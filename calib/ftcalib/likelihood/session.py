@@ -6,16 +6,19 @@ from typing import Literal
 import numpy as np
 
 from ftcalib.data.dwell_mean import RESOLUTION
-from ftcalib.known import Constraints
+from ftcalib.known import USUAL_GAIN, Constraints
 from ftcalib.likelihood.descent import Descent, Kept, Minimum, Statistics, coefficients, column_scale, features
 from ftcalib.likelihood.response import LEVER_M as CROSS_TALK_LEVER_M
-from ftcalib.likelihood.response import hysteresis_columns, response_columns
+from ftcalib.likelihood.response import hysteresis_columns, sensor_columns
 from ftcalib.likelihood.session_noise import Noise, pose_times
+from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
+from ftcalib.likelihood.structure import structure_columns
 from ftcalib.likelihood.variance_components import (
     FORCE,
     HYSTERESIS,
     RESPONSE,
     ROTATION,
+    STRUCTURE,
     TORQUE,
     Component,
     Linearised,
@@ -32,6 +35,10 @@ LEVER_M = 0.025
 FEW_POSES = 6
 # Fewer cannot separate gain and cross-talk from noise.
 FEW_POSES_FOR_RESPONSE = 7
+# Fewer do not show how large gain and cross-talk are: they count as large as those of mounted sensors.
+FEW_POSES_FOR_GAIN = 12
+# Cross-talk over gain, as sigmas of their entries.
+CROSS_TALK_SHARE = 0.5
 # Fewer cannot separate drift from unknown noise.
 FEW_POSES_WITHOUT_NOISE = 12
 # Fewer cannot separate it from gain and noise.
@@ -63,8 +70,10 @@ class Session:
         t_s: Array | None,
         drift: Drift,
         constraints: Constraints,
+        gain_sigma: float = USUAL_GAIN,
     ) -> None:
         self.n = len(wrench)
+        self.gain_sigma, self.structured = gain_sigma, True
         self.given = R_base_flange, wrench
         self.drift, self.constraints = drift, constraints
         self.measured = wrench_cov is not None
@@ -125,8 +134,13 @@ class Session:
             return np.zeros(0)
         noise = np.diagonal(problem.D, axis1=1, axis2=2)
         size = np.maximum(problem.r**2, noise)[problem.kept]
-        scale = [np.mean(size[:, np.array(c.share) > 0]) for c in components]
-        return np.array([s / (10 * self.n if c.kind == "walk" else 1) for c, s in zip(components, scale, strict=True)])
+
+        def variance(c: Component) -> float:
+            if c in RESPONSE:
+                return problem.smallest(c)
+            return float(np.mean(size[:, np.array(c.share) > 0])) / (10 * self.n if c.kind == "walk" else 1)
+
+        return np.array([variance(c) for c in components])
 
     def statistics(self, noise: Noise, p: Parameters) -> Statistics:
         """Sum up under any noise, around parameters."""
@@ -143,9 +157,18 @@ class Session:
             Z = self.constraints.free(p)
             J, H, g = J @ Z, Z.T @ A.T @ A @ Z, Z.T @ A.T @ residual
         lever = float(np.linalg.norm(p.p_sensor_com_m)) / CROSS_TALK_LEVER_M
-        response = response_columns(p, self.R)
-        lag, linear = hysteresis_columns(p, self.R), self.drift == "linear"
-        return Linearised(J, r, (H, g), turn, self.cov, self.time, kept, linear, response, lag, lever)
+        effects = sensor_columns(p, self.R) | {"hysteresis": hysteresis_columns(p, self.R)}
+        if self.n <= STRUCTURED_POSES:
+            effects |= structure_columns(p, self.R, self.R.mean(axis=0))
+        least = dict(zip(("gain", "cross_talk"), self.least_response, strict=True))
+        linear = self.drift == "linear"
+        return Linearised(J, r, (H, g), turn, self.cov, self.time, kept, linear, effects, lever, least)
+
+    @property
+    def least_response(self) -> tuple[float, float]:
+        """Variances of gain and cross-talk that a sensor has, whatever a few poses show."""
+        few = FEW_POSES <= self.n < FEW_POSES_FOR_GAIN
+        return (self.gain_sigma**2, (CROSS_TALK_SHARE * self.gain_sigma) ** 2) if few else (0.0, 0.0)
 
     def _groups(self) -> list[range]:
         return [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]
@@ -159,11 +182,13 @@ class Session:
             always = [component("white", FORCE), component("white", TORQUE)]
         if self.drift == "random-walk":
             always += [component("walk", group) for group in (FORCE, TORQUE)]
+        if any(self.least_response):
+            always += RESPONSE
         return always
 
     def candidates(self) -> list[Component]:
         """Components that the data may show."""
-        found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE else []
+        found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE and not any(self.least_response) else []
         if self.n >= (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
             white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
             walks = [component("walk", group) for group in self._groups()] if self.drift == "auto" else []
@@ -171,6 +196,10 @@ class Session:
         if self.n >= FEW_POSES_FOR_HYSTERESIS:
             found.append(HYSTERESIS)
         return found
+
+    def structure(self) -> tuple[Component, ...]:
+        """Errors with a structure that the data may show."""
+        return STRUCTURE if self.structured and FEW_POSES_FOR_HYSTERESIS <= self.n <= STRUCTURED_POSES else ()
 
 
 def white(sigma_N: float, sigma_Nm: float) -> Array:

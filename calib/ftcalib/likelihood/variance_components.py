@@ -4,8 +4,8 @@ Restricted likelihood (Patterson, Thompson 1971) allows for the parameters fitte
 the logarithms of the variances with average information (Gilmour, Thompson, Cullis 1995), all in O(n).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -30,12 +30,21 @@ HOPE = 10.0
 # Share of the white noise at which slope and curvature "at zero" are taken.
 NEGLIGIBLE = 1e-4
 # Variances that no arm or sensor in working order exceeds. A larger one has another cause.
-LARGEST = {"rotation": float(np.deg2rad(3.0)) ** 2, "gain": 0.05**2, "cross_talk": 0.05**2, "hysteresis": 0.03**2}
+LARGEST = {
+    "rotation": float(np.deg2rad(3.0)) ** 2,
+    "gain": 0.05**2,
+    "cross_talk": 0.05**2,
+    "hysteresis": 0.03**2,
+    "kinematics": float(np.deg2rad(1.0)) ** 2,
+    "load": 0.05**2,
+}
 # Fewer leave its size uncertain enough to matter.
 POSES_THAT_SHOW_THE_NOISE = 1000
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
-Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk", "hysteresis"]
+Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk", "hysteresis", "load", "cable", "kinematics"]
+# Those that act on all poses, except a slope.
+EFFECTS = ("gain", "cross_talk", "hysteresis", "load", "cable", "kinematics")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +59,7 @@ class Component:
     @property
     def needed(self) -> float:
         """The gain in log-likelihood that it must bring."""
-        return GAIN_OF_RESPONSE if self.kind in ("gain", "cross_talk", "hysteresis") else GAIN
+        return GAIN_OF_RESPONSE if self.kind in EFFECTS else GAIN
 
 
 def component(kind: Kind, channels: Sequence[int]) -> Component:
@@ -63,6 +72,14 @@ FORCE, TORQUE = range(3), range(3, 6)
 ROTATION = Component("rotation_rad", "rotation", (0.0,) * 6)
 HYSTERESIS = Component("hysteresis", "hysteresis", (0.0,) * 6)
 RESPONSE = tuple(Component(kind, kind, (0.0,) * 6) for kind in ("gain", "cross_talk"))
+# What compensation does not know.
+STRUCTURE = (
+    Component("kinematics_rad", "kinematics", (0.0,) * 6),
+    Component("load_force", "load", component("load", FORCE).share),
+    Component("load_torque", "load", component("load", TORQUE).share),
+    component("cable", FORCE),
+    component("cable", TORQUE),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,26 +102,50 @@ class Linearised:
     """(n,)"""
     slope: bool
     """Whether a linear drift of unknown size is part of the model."""
-    response: Array
-    """(n, 6, 11) derivative by gain and cross-talk of the sensor."""
-    hysteresis: Array
-    """(n, 6, 6 or more) derivative by the shares of the last swing by which the axes lag."""
+    effects: Mapping[str, Array]
+    """(n, 6, k) each, by `EFFECTS`: derivative by the coefficients of what acts on all poses."""
     lever: float = 0.0
     """Distance of the centre of mass, in levers of the cross-talk."""
+    least: Mapping[str, float] = field(default_factory=dict)
+    """Variances by kind that the data are too few to refute."""
 
     @cached_property
     def X(self) -> Array:
-        """(n, 6, M) by parameters, slopes, gain, cross-talk, hysteresis: all that acts on all poses; then residuals."""
-        slopes = centre(self.time)[:, None, None] * np.eye(6)
-        return np.concatenate([self.J, slopes, self.response, self.hysteresis, self.r[..., None]], axis=2)
+        """(n, 6, M) by parameters, slopes and effects: all that acts on all poses; then residuals."""
+        slopes = np.broadcast_to(centre(self.time)[:, None, None] * np.eye(6), (len(self.time), 6, 6))
+        return np.concatenate([self.J, slopes, *self.effects.values(), self.r[..., None]], axis=2)
+
+    def with_only(self, components: Sequence[Component]) -> "Linearised":
+        """Leave out the effects, beside gain and cross-talk, that no component has: fewer columns take less time."""
+        kinds = frozenset(c.kind for c in (*RESPONSE, *components)).intersection(self.effects)
+        if kinds == self.effects.keys():
+            return self
+        if kinds not in self._parts:
+            self._parts[kinds] = replace(
+                self, effects={kind: self.effects[kind] for kind in self.effects if kind in kinds}
+            )
+        return self._parts[kinds]
+
+    @cached_property
+    def _parts(self) -> "dict[frozenset[str], Linearised]":
+        return {}
+
+    @cached_property
+    def places(self) -> Mapping[str, NDArray[np.intp]]:
+        """Columns of `X` by effect."""
+        first = self.J.shape[2] + 6
+        ends = first + np.cumsum([0, *(columns.shape[2] for columns in self.effects.values())])
+        return {kind: np.arange(ends[k], ends[k + 1]) for k, kind in enumerate(self.effects)}
 
     def columns(self, c: Component) -> NDArray[np.intp] | None:
         """Columns of `X` whose coefficients have this variance; None for what acts on each pose by itself."""
         m = self.J.shape[2]
         if c.kind == "slope":
             return np.asarray(m + np.flatnonzero(c.share))
-        ends = {"gain": (6, 11), "cross_talk": (11, 17), "hysteresis": (17, 17 + self.hysteresis.shape[2])}.get(c.kind)
-        return None if ends is None else np.arange(m + ends[0], m + ends[1])
+        places = self.places.get(c.kind)
+        if places is None or not any(c.share):
+            return places
+        return np.asarray(places.reshape(6, -1)[np.array(c.share) > 0].ravel())
 
     def size(self, c: Component) -> float:
         """Count the independent numbers that have this variance."""
@@ -118,7 +159,14 @@ class Linearised:
 
         An error of the gain acts on the torque of the weight too, as cross-talk at the lever of the centre of mass.
         """
-        return LARGEST.get(c.kind, np.inf) * ((1 + self.lever) ** 2 if c.kind == "cross_talk" else 1.0)
+        return LARGEST.get(c.kind, np.inf) * self._at_lever(c)
+
+    def smallest(self, c: Component) -> float:
+        """Variance that the sensor or the arm may have, whatever too few data show."""
+        return self.least.get(c.kind, 0.0) * self._at_lever(c)
+
+    def _at_lever(self, c: Component) -> float:
+        return (1 + self.lever) ** 2 if c.kind == "cross_talk" else 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,6 +193,7 @@ class Point:
     """(k, k) covariance of these unknowns."""
     x: Array
     """(k,) from where the problem was linearised to the best unknowns."""
+    chi2: float
     loglik: float
 
     @property
@@ -183,6 +232,27 @@ class Point:
         columns = self.problem.columns(c)
         own = np.arange(0) if columns is None else np.flatnonzero(np.isin(self.unknown, columns))
         return np.asarray(self.problem.X[..., self.unknown[own]] @ self.x[own])
+
+    def squares(self, J: Array, effects: Mapping[str, Array]) -> Array:
+        """Mean square error (6,) of predicting wrenches that are compensated for gain and cross-talk alone.
+
+        Parameters
+        ----------
+        J : array, shape (n, 6, m)
+            In other orientations, as that of the problem.
+        effects : mapping
+            As those of the problem.
+        """
+        X, found = np.zeros((*J.shape[:2], self.problem.X.shape[2] - 1)), np.zeros(self.problem.X.shape[2] - 1)
+        X[..., : J.shape[2]] = J
+        for kind, columns in effects.items():
+            X[..., self.problem.places[kind]] = columns
+        for c in STRUCTURE:
+            if c in self.components:
+                found[self.problem.columns(c)] = 1.0
+        X, found = X[..., self.unknown], found[self.unknown]
+        variance = np.einsum("nci,ij,ncj->c", X, self.C, X, optimize=True) / len(J)
+        return np.asarray(variance + np.mean((X @ (found * self.x)) ** 2, axis=0))
 
     def left_out(self) -> tuple[Array, Array]:
         """Residual (n, 6) of each pose when all others predict it, and its covariance (n, 6, 6)."""
@@ -251,8 +321,9 @@ def point(problem: Linearised, components: Sequence[Component], theta: Array, ne
         at += len(columns)
     C, logdet_H = _inverse_and_logdet(H)
     x = C @ g
-    loglik = -0.5 * (logdet + logdet_H + float(G[-1, -1] - g @ x))
-    return Point(problem, tuple(components), theta, of_poses, own, WX, G, unknown, C, x, loglik)
+    chi2 = float(G[-1, -1] - g @ x)
+    loglik = -0.5 * (logdet + logdet_H + chi2)
+    return Point(problem, tuple(components), theta, of_poses, own, WX, G, unknown, C, x, chi2, loglik)
 
 
 def _inverse_and_logdet(H: Array) -> tuple[Array, float]:
@@ -350,11 +421,13 @@ def score(problem: Linearised, at: Point, components: Sequence[Component], theta
 
 def maximise(problem: Linearised, components: Sequence[Component], theta: Array, worse_than: float = -np.inf) -> Point:
     """Climb to the best variances from these (k,), all positive; or until a log-likelihood seems out of reach."""
+    problem = problem.with_only(components)
     if not components:
         return point(problem, components, theta)
     most = np.array([problem.largest(c) for c in components])
-    best = point(problem, components, np.minimum(theta, most))
+    best = point(problem, components, np.clip(theta, [problem.smallest(c) for c in components], most))
     least = np.minimum(1e-3 * NEGLIGIBLE * units(problem, best, components), most)
+    least = np.maximum(least, [problem.smallest(c) for c in components])
     size = np.array([problem.size(c) for c in components])
     caution = 1e-3
     for _ in range(60):
@@ -402,7 +475,7 @@ def expected_variances(problem: Linearised, at: Point) -> Array:
     return np.where(white & (mean > at.theta), mean, at.theta)
 
 
-def estimates(problem: Linearised, at: Point) -> tuple[Array, Array]:
+def estimates(at: Point) -> tuple[Array, Array]:
     """Estimate parameters, and gain and cross-talk of the sensor, under given variances.
 
     Returns
@@ -411,28 +484,28 @@ def estimates(problem: Linearised, at: Point) -> tuple[Array, Array]:
         Step of the free parameters; best linear prediction of the coefficients, zero where none were found.
     covariance : array, shape (m + 11, m + 11)
     """
-    m, size = problem.J.shape[2], problem.response.shape[2]
+    problem = at.problem
     every = problem.X.shape[2] - 1
     values, covariance = np.zeros(every), np.zeros((every, every))
     values[at.unknown], covariance[np.ix_(at.unknown, at.unknown)] = at.x, at.C
-    shown = np.r_[:m, m + 6 : m + 6 + size]
+    shown = np.r_[: problem.J.shape[2], *(problem.columns(c) for c in RESPONSE)]
     return values[shown], covariance[np.ix_(shown, shown)]
 
 
-def estimates_of_unknown_variances(problem: Linearised, at: Point) -> tuple[Array, Array]:
+def estimates_of_unknown_variances(at: Point) -> tuple[Array, Array]:
     """Give the `estimates` with a covariance for variances that were estimated too.
 
     To first order in the uncertainty of the variances: estimates move with them, and the covariance at the best
     variances is as much too small (Kenward, Roger 1997; Prasad, Rao 1990). The covariance itself is uncertain: as the
     95 % interval of Student's distribution is wider by (z² + 1) / (4 nu), so is sigma, nu by Satterthwaite (1946).
     """
-    x, C = estimates(problem, at)
-    if not at.components or len(problem.r) >= POSES_THAT_SHOW_THE_NOISE:
+    x, C = estimates(at)
+    if not at.components or len(at.problem.r) >= POSES_THAT_SHOW_THE_NOISE:
         return x, C
-    _, information = score(problem, at, at.components, at.theta)
+    _, information = score(at.problem, at, at.components, at.theta)
     uncertainty = np.linalg.pinv(information, rcond=1e-6, hermitian=True)
     k, h = len(at.theta), 1e-3
-    around = [estimates(problem, point(problem, at.components, at.theta * np.exp(h * row), at)) for row in np.eye(k)]
+    around = [estimates(point(at.problem, at.components, at.theta * np.exp(h * row), at)) for row in np.eye(k)]
     moves, changes = ([(part[i] - own) / h for part in around] for i, own in enumerate((x, C)))
     scale = np.sqrt(np.diag(C))
     scale[scale == 0] = 1.0
@@ -441,12 +514,12 @@ def estimates_of_unknown_variances(problem: Linearised, at: Point) -> tuple[Arra
     return x, C + 2 * np.transpose(moves) @ uncertainty @ np.array(moves) + wider
 
 
-def doubt(problem: Linearised, at: Point, others: Sequence[tuple[Point, float]]) -> Array:
+def doubt(at: Point, others: Sequence[tuple[Point, float]]) -> Array:
     """Covariance (m + 11, m + 11) that `estimates` gain because other variances are right with a share each."""
-    x, C = estimates(problem, at)
+    x, C = estimates(at)
     total = np.zeros_like(C)
     for one, share in others:
-        other, cov = estimates(problem, one)
+        other, cov = estimates(one)
         total += share * (cov - C + np.outer(other - x, other - x))
     return total
 

@@ -104,6 +104,12 @@ class SensorConfig:
         (0, 20),
         option="--sensor-mass",
     )
+    accuracy_percent: float | None = entry(
+        "of its readings under load, 95 % of them, from the data sheet or a check; 4 is assumed if it is not set",
+        None,
+        "%",
+        (0, 20),
+    )
     delay_ms: float | None = entry(
         "delay of the wrench after the pose; estimated from motion if it is not set", None, "ms", (-100, 100)
     )

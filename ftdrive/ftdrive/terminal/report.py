@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from rich.table import Table
@@ -22,6 +22,12 @@ _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
 # A standard deviation below this share of the largest one is one of rounding: its value was taken as known.
 _ROUNDED = 1e-9
 _NO_LIMIT = 10_000
+# An error elsewhere or later is named if it is larger by this.
+_WORSE = 1.2
+_ELSEWHERE: Sequence[tuple[str, Literal["workspace", "hour"]]] = (
+    ("in any orientation", "workspace"),
+    ("after an hour", "hour"),
+)
 # Orientations over which the error of a calibration is averaged if the truth is known.
 _RANDOM = Rotation.random(1000, rng=0).as_matrix()
 # Rows that follow from mass and tilt: printed only with -v.
@@ -158,6 +164,10 @@ def error_in_words(result: CalibrationResult) -> str:
         sources.append(f"cross-validated, as {why}")
     if any(result.quality.get("last_bias_offset", ())):
         sources.append("a minute after the tour, with the drift")
+    for words, where in _ELSEWHERE:
+        error = result.likely_error(where)
+        if error[0] > _WORSE * result.likely_error()[0]:
+            sources.append("{} {:.2g} N, {:.2g} N·m".format(words, *error))
     return f"{likely} rms ({'; '.join(sources)}; predicted: {predicted})"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftcalib import BadCalibration, CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib import BadCalibration, CalibrationDataset, CalibrationResult, Parameters, Setup, solve
 from ftcalib.likelihood.response import COMMON_GAIN, SIZE, Response, hidden_covariance
 from ftcalib.model import DriftResult, predict
 from ftcalib.published.yu import weight_and_tilt
@@ -32,7 +32,8 @@ DATA = CalibrationDataset(
     np.full(10, 1000),
     np.arange(10.0),
 )
-RESULT = solve(DATA, g_m_s2=9.81, provenance={"serial": "FT1", "argv": ["calibrate"]})
+EXACT = Setup(sensor_accuracy_percent=0.0)
+RESULT = solve(DATA, g_m_s2=9.81, setup=EXACT, provenance={"serial": "FT1", "argv": ["calibrate"]})
 
 
 def test_every_promised_key_is_in_the_file_with_its_value() -> None:

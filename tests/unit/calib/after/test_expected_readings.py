@@ -9,7 +9,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
-from ftcalib import CalibrationDataset, CalibrationResult, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Setup, solve
 from ftcalib.after.expected_readings import (
     USUAL_ERRORS_RAD,
     USUAL_SHARES,
@@ -167,7 +167,9 @@ def fitted() -> tuple[CalibrationResult, CalibrationDataset]:
     dataset = CalibrationDataset(
         R, wrench, np.tile(np.diag(SIGMA**2), (6, 1, 1)), np.zeros(6, np.int64), np.full(6, np.nan)
     )
-    return replace(solve(dataset), components={"white_force_N": 1e-3}), dataset
+    return replace(
+        solve(dataset, setup=Setup(sensor_accuracy_percent=0.0)), components={"white_force_N": 1e-3}
+    ), dataset
 
 
 @pytest.mark.parametrize("kind", ["orientations", "hysteresis", "walk"])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Parameters, Setup, solve
 from ftcalib.after.expected_readings import expected_with_inexact_orientations
 from ftcalib.after.state import apply_update
 from ftcalib.after.verification import Verification, verify
@@ -46,6 +46,10 @@ def readings(parameters: Parameters, R: Array, seed: int, coefficients: Array | 
     return np.asarray(predict(parameters, R) + added + noise)
 
 
+# No error of gain is assumed.
+EXACT = Setup(sensor_accuracy_percent=0.0)
+
+
 def noise_of(n: int) -> Array:
     return np.tile(np.diag(SIGMA**2), (n, 1, 1))
 
@@ -54,7 +58,8 @@ def noise_of(n: int) -> Array:
 def calibrated(seed: int = 2, *, poses: int = 24, gain: bool = False) -> CalibrationResult:
     R = special(range(1, 25)) if poses == 24 else special(SUBSET_6)
     wrench = readings(TRUTH, R, seed, COEFFICIENTS if gain else None)
-    return solve(CalibrationDataset(R, wrench, noise_of(poses), np.zeros(poses, np.int64), np.full(poses, np.nan)))
+    dataset = CalibrationDataset(R, wrench, noise_of(poses), np.zeros(poses, np.int64), np.full(poses, np.nan))
+    return solve(dataset, setup=EXACT)
 
 
 def orientations(n: int, seed: int = 2) -> Array:
@@ -239,7 +244,7 @@ def inexact(poses: int, seed: int) -> tuple[CalibrationDataset, Array, Array]:
 def test_an_error_that_a_fit_of_six_poses_cannot_find_is_no_false_alarm() -> None:
     for seed in (20, 23, 47):  # taken for linear drift, or for noise of the torque alone
         fitted, R, wrench = inexact(6, seed)
-        calibration = solve(fitted)
+        calibration = solve(fitted, setup=EXACT)
         assert "rotation_rad" not in calibration.components
         assert not verify(calibration, R, wrench, noise_of(6)).passed
         assert verify(calibration, R, wrench, noise_of(6), fitted=fitted).passed
@@ -253,7 +258,7 @@ def test_a_walk_that_a_fit_of_six_poses_finds_in_part_is_no_false_alarm() -> Non
         walk = np.cumsum(np.repeat([0.02, 6e-4], 3) * rng.normal(size=(12, 6)), axis=0)
         wrench = readings(TRUTH, R, seed) + walk
         fitted = CalibrationDataset(R[:6], wrench[:6], noise_of(6), np.full(6, 200), np.arange(6.0))
-        calibration, new = solve(fitted), (R[6:], wrench[6:])
+        calibration, new = solve(fitted, setup=EXACT), (R[6:], wrench[6:])
         assert not verify(calibration, *new, noise_of(6)).passed
         assert verify(calibration, *new, noise_of(6), fitted=fitted).passed
         jumped = new[1] + np.array([0.6, 0, -0.8, 0, 0, 0])
@@ -262,7 +267,13 @@ def test_a_walk_that_a_fit_of_six_poses_finds_in_part_is_no_false_alarm() -> Non
 
 def test_a_change_is_found_all_the_same() -> None:
     fitted, R, wrench = inexact(6, 1)
-    found = verify(solve(fitted), R, wrench + np.array([0.3, 0.0, 0.4, 0, 0, 0]), noise_of(6), fitted=fitted)
+    found = verify(
+        solve(fitted, setup=EXACT),
+        R,
+        wrench + np.array([0.3, 0.0, 0.4, 0, 0, 0]),
+        noise_of(6),
+        fitted=fitted,
+    )
     assert (found.passed, found.change) == (False, "bias")
 
 
@@ -274,7 +285,7 @@ def test_hysteresis_is_no_false_alarm_and_hides_no_change(poses: int) -> None:
     y[1:] -= lag * np.diff(predict(TRUTH, R), axis=0)
     moved = -lag * np.diff(predict(TRUTH, np.concatenate([R[-1:], new])), axis=0)
     fitted = CalibrationDataset(R, y, noise_of(poses), np.zeros(poses, np.int64), np.full(poses, np.nan))
-    calibration = solve(fitted)
+    calibration = solve(fitted, setup=EXACT)
     assert verify(calibration, new, y_new + moved, noise_of(6), fitted=fitted).passed
     for what in ("bias", "payload", "centre of mass"):
         changed = readings(CHANGED[what], new, 100) + moved
@@ -292,7 +303,7 @@ def test_a_shifted_centre_of_mass_is_named_although_the_gain_turns_the_forces() 
 
     fitted = CalibrationDataset(R, read(TRUTH, R, 2), noise_of(24), np.zeros(24, np.int64), np.full(24, np.nan))
     moved = read(CHANGED["centre of mass"], new, 3)
-    found = verify(solve(fitted), new, moved, noise_of(6), fitted=fitted)
+    found = verify(solve(fitted, setup=EXACT), new, moved, noise_of(6), fitted=fitted)
     assert (found.change, found.alternatives) == ("centre of mass", ())
 
 
@@ -314,7 +325,7 @@ def test_gain_and_cross_talk_keep_the_size_that_the_fit_found() -> None:
 
 def test_poses_of_another_kind_of_fit_explain_nothing() -> None:
     fitted, R, _ = inexact(6, 1)
-    calibration = solve(fitted)
+    calibration = solve(fitted, setup=EXACT)
     weights = [one.weight for one in expected_with_inexact_orientations(calibration, fitted, R, noise_of(6))]
     assert sum(weights) == pytest.approx(1)
     assert min(weights) > 0

@@ -20,6 +20,7 @@ from ftcalib.likelihood.response import (
     LEVER_M,
     Response,
     hidden_covariance,
+    predicted_covariance,
     response_columns,
 )
 from ftcalib.likelihood.session import Session
@@ -144,9 +145,19 @@ def test_a_far_centre_of_mass_is_no_reason_against_gain_and_cross_talk() -> None
     assert np.sqrt(np.mean((predicted(best, elsewhere) - read(p, elsewhere, M, L)) ** 2)) < SIGMA[0]
 
 
-def test_six_poses_are_too_few_to_look_for_it() -> None:
-    _, R, wrench, _, _ = session(np.random.default_rng(2), 6, 0.03, 0.03)
-    assert fit(R, wrench, WHITE).response is None
+def test_few_poses_do_not_show_it_and_it_counts_as_that_of_usual_sensors() -> None:
+    distances = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        p, R, wrench, M, L = session(rng, 6, 0.02, 0.01)
+        best = fit(R, wrench, WHITE)
+        assert best.response is not None
+        elsewhere = np.asarray(Rotation.random(1, rng=rng).as_matrix())
+        e = (predicted(best, elsewhere) - read(p, elsewhere, M, L))[0]
+        S = predicted_covariance(best.parameters, best.covariance, best.response, elsewhere)[0]
+        distances.append(e @ np.linalg.solve(S, e))
+    assert 3 < np.mean(distances) < 12
+    assert fit(R, wrench, WHITE, gain_sigma=0.0).response is None
 
 
 def solved(seed: int = 1) -> tuple[CalibrationResult, Array, Array]:

@@ -133,8 +133,7 @@ def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...],
         time,
         np.ones(n, bool),
         False,
-        np.zeros((n, 6, 11)),
-        np.zeros((n, 6, 12)),
+        {"gain": np.zeros((n, 6, 5)), "cross_talk": np.zeros((n, 6, 6))},
     )
 
 
@@ -255,7 +254,7 @@ def test_unknown_noise_widens_sigma_like_students_distribution() -> None:
     p = problem(np.random.default_rng(8), 8, (white,), np.array([0.3]))
     p = replace(p, D=1e-6 * p.D)
     at = maximise(p, (white,), np.array([0.3]))
-    x, C = estimates_of_unknown_variances(p, at)
+    x, C = estimates_of_unknown_variances(at)
     nu = 6 * 8 - 8
     np.testing.assert_allclose(x[:8], at.step)
     np.testing.assert_allclose(C[:8, :8], at.C[:8, :8] * (1 + (1.96**2 + 1) / (2 * nu)), rtol=1e-3, atol=1e-9)
@@ -265,7 +264,7 @@ def test_unknown_noise_widens_sigma_like_students_distribution() -> None:
 def test_many_poses_show_their_noise() -> None:
     p = problem(np.random.default_rng(9), 1000, ALL[:2], THETA[:2])
     at = point(p, ALL[:2], THETA[:2])
-    np.testing.assert_array_equal(estimates_of_unknown_variances(p, at)[1], estimates(p, at)[1])
+    np.testing.assert_array_equal(estimates_of_unknown_variances(at)[1], estimates(at)[1])
 
 
 GAINS, CROSS_TALK = RESPONSE
@@ -282,14 +281,17 @@ def small(n: int = 12, bumped: int = 2) -> Linearised:
     D[:bumped] *= 100.0
     J, r, kept = rng.normal(size=(n, 6, 8)), rng.normal(size=(n, 6)), np.arange(n) >= bumped
     prior = np.zeros((8, 8)), np.zeros(8)
-    return Linearised(J, r, prior, turn, D, np.arange(n, dtype=float), kept, False, response, hysteresis, 0.5)
+    effects = {"gain": response[..., :5], "cross_talk": response[..., 5:], "hysteresis": hysteresis}
+    effects["cable"] = rng.normal(size=(n, 6, 18))
+    return Linearised(J, r, prior, turn, D, np.arange(n, dtype=float), kept, False, effects, 0.5)
 
 
 def test_each_component_has_its_columns() -> None:
     p = small()
-    np.testing.assert_array_equal(p.X[..., p.columns(GAINS)], p.response[..., :5])
-    np.testing.assert_array_equal(p.X[..., p.columns(CROSS_TALK)], p.response[..., 5:])
-    np.testing.assert_array_equal(p.X[..., p.columns(HYSTERESIS)], p.hysteresis)
+    for c in (GAINS, CROSS_TALK, HYSTERESIS):
+        np.testing.assert_array_equal(p.X[..., p.columns(c)], p.effects[c.kind])
+    for share, own in ((FORCE, slice(9)), (TORQUE, slice(9, 18))):  # three columns for each channel
+        np.testing.assert_array_equal(p.X[..., p.columns(component("cable", share))], p.effects["cable"][..., own])
     slopes = centre(p.time)[:, None, None] * np.eye(6)
     np.testing.assert_array_equal(p.X[..., p.columns(component("slope", TORQUE))], slopes[..., 3:])
     np.testing.assert_array_equal(p.X[..., -1], p.r)
@@ -350,7 +352,8 @@ def test_other_variances_are_right_by_the_odds_of_their_likelihood() -> None:
     p, turn, response = small(n, 0), rng.normal(size=(n, 6, 3)), rng.normal(size=(n, 6, 11))
     r = 0.2 * rng.normal(size=(n, 6)) + response[..., :5] @ (0.04 * rng.normal(size=5))
     r += (turn @ (0.03 * rng.normal(size=(n, 3, 1))))[..., 0]
-    p = replace(p, turn=turn, response=response, r=r, D=np.tile(0.04 * np.eye(6), (n, 1, 1)))
+    effects = {**p.effects, "gain": response[..., :5], "cross_talk": response[..., 5:]}
+    p = replace(p, turn=turn, effects=effects, r=r, D=np.tile(0.04 * np.eye(6), (n, 1, 1)))
     best = maximise(p, (GAINS, ROTATION), np.full(2, 0.02**2))
     found = rivals(p, best, [GAINS, CROSS_TALK, ROTATION, HYSTERESIS])
     (added, _), (alike, _), (lagging, _) = found
@@ -361,6 +364,6 @@ def test_other_variances_are_right_by_the_odds_of_their_likelihood() -> None:
     bonus = (0.0, 0.0, -1.0)  # hysteresis must bring more than the rotations in whose place it is
     for (other, share), less in zip(found, bonus, strict=True):
         assert share / rest == pytest.approx(np.exp(min(other.loglik - best.loglik + less, 0.0)))
-    x, C = estimates(p, best)
-    y, D = estimates(p, lagging)
-    np.testing.assert_allclose(doubt(p, best, [(lagging, 0.25)]), 0.25 * (D - C + np.outer(y - x, y - x)), atol=1e-12)
+    x, C = estimates(best)
+    y, D = estimates(lagging)
+    np.testing.assert_allclose(doubt(best, [(lagging, 0.25)]), 0.25 * (D - C + np.outer(y - x, y - x)), atol=1e-12)
