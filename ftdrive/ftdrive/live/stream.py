@@ -123,6 +123,7 @@ class ProcessedStream(Processor, ABC):
             if update is None:
                 return self.note("tare-refused", text, values)
             self._begin_bias(self._tool.set_tare(update, self._newest_ns))
+            self._following.trust()
             return self.note("tare", text, values)
 
     def undo_tare(self) -> StreamEvent:

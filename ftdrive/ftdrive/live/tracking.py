@@ -39,6 +39,13 @@ _WALKS = np.array([0.1, 0.3, 1.0, 3.0])
 _BIAS = np.repeat([1.0, 0.03], 3)
 # The likelihood of a walk counts so long.
 _FORGET_S = 3600.0
+# A bias is trusted to drift this far in an hour, N and N·m; of a sensor that is known to walk more, in proportion.
+_TRUSTED_PER_H = 10.0 * _BIAS
+# What a new sensor is known to walk in an hour, N. It is that of the last so many seconds: a contact is shorter.
+_USUAL_WALK_N, _WALK_KNOWN_S = 1.0, 1800.0
+# A bias farther from the trusted one than what it walks in a quarter of an hour, or than this many sigmas, may have a
+# contact in it.
+_DOUBTFUL_S, _DOUBTFUL_SIGMAS = 900.0, 4.0
 NOTHING_KG = 0.02
 """A lighter part is none."""
 # One sigma of mass and mass times centre of a part that is not known yet, kg and kg m.
@@ -85,17 +92,23 @@ class Tracker:
 
     A window that they do not explain begins an interruption. From then on the part is unknown. Windows in a row that
     agree on one part, which may be the one before, none or a new one, end it. Meanwhile the bias is as uncertain as
-    the random walk makes it, so what grasps and contacts do never reaches it. Several walks are tried side by side, and
-    count by their likelihood. The noise of a window is learnt for each state of motion.
+    the random walk makes it, so what grasps and contacts do does not reach it. Several walks are tried side by side,
+    and count by their likelihood. The noise of a window is learnt for each state of motion.
+
+    No single window shows a contact that grows slowly. A trusted bias therefore follows the estimate no faster than
+    the sensor drifts. The sigma includes the distance between them, and if it is clear, the trusted bias waits for the
+    end of the contact or for a tare.
 
     Parameters
     ----------
     mass_kg : float
     p_sensor_com_m : array, shape (3,)
         Of the tool: vibration shakes a part as it shakes the tool.
+    drift_per_h : array, shape (6,)
+        What the bias is known to drift, N and N·m.
     """
 
-    def __init__(self, mass_kg: float, p_sensor_com_m: Array) -> None:
+    def __init__(self, mass_kg: float, p_sensor_com_m: Array, drift_per_h: Array | float = 0.0) -> None:
         self._tool = mass_kg, mass_kg * float(np.linalg.norm(p_sensor_com_m))
         n = len(_WALKS)
         # For each walk bias (6,), mass, and mass times centre (3,).
@@ -118,29 +131,35 @@ class Tracker:
         self._run: list[Window] = []
         # The centre of mass of their part, as far as it is known.
         self._place: Array | None = None
+        self._drift_per_h = np.maximum(_TRUSTED_PER_H, drift_per_h)
+        self._known_walk_N = _USUAL_WALK_N
+        # The bias that no slow contact has changed, and the sigma of the estimate that it was taken from.
+        self._trusted, self._trusted_sigma = np.zeros(6), _BIAS
+        self._is_doubtful = False
 
     def update(self, window: Window) -> Tracked:
         """Add the next window."""
         events: list[StreamEvent] = []
-        if self._t_s is not None:
-            self._grow(self._P, window.t_s - self._t_s)
-            self._likelihood *= np.exp(-(window.t_s - self._t_s) / _FORGET_S)
+        dt_s = 0.0 if self._t_s is None else window.t_s - self._t_s
         self._t_s = window.t_s
+        self._grow(self._P, dt_s)
+        self._likelihood *= np.exp(-dt_s / _FORGET_S)
         if self._open_s is None:
             self._follow(window)
         else:
             events += self._decide(window)
         x, P = self._mixed(self._x, self._P)
+        variance, doubts = self._trust(x[:6], np.diag(P)[:6], np.diag(window.systematic), dt_s)
+        events += doubts
         known = self._open_s is None
         part, part_P = (x[6:], P[6:, 6:]) if known else self._before
-        sigma = np.sqrt(np.diag(P)[:6] + np.diag(window.systematic))
         walk_N = float(self._weights @ _WALKS)
         seen_s = window.t_s - self._seen_s
         part_sigma_kg = float(np.sqrt(part_P[0, 0]))
         return Tracked(
             window.t_s,
             x[:6],
-            sigma,
+            np.sqrt(variance),
             float(part[0]),
             part_sigma_kg,
             known,
@@ -149,6 +168,41 @@ class Tracker:
             (part.copy(), part_P.copy()),
             tuple(events),
         )
+
+    def trust(self) -> None:
+        """Take the bias as that of a free tool."""
+        self._trusted, self._is_doubtful = self._mixed(self._x, self._P)[0][:6], False
+
+    def _trust(self, bias: Array, variance: Array, systematic: Array, dt_s: float) -> tuple[Array, list[StreamEvent]]:
+        """Let the trusted bias follow by no more than drift and a better estimate explain; report when it waits.
+
+        Return the variance (6,) of the bias, and events.
+        """
+        sigma = np.sqrt(variance + systematic)
+        limit = np.maximum(_BIAS * self._known_walk_N * np.sqrt(_DOUBTFUL_S / 3600), _DOUBTFUL_SIGMAS * sigma)
+        off = bias - self._trusted
+        self._is_doubtful &= bool((np.abs(off) > limit / 2).any())
+        if not self._is_doubtful:
+            seen = np.minimum(self._trusted_sigma, np.sqrt(variance))
+            most = self._drift_per_h * max(self._known_walk_N, 1.0) * dt_s / 3600 + 3 * (self._trusted_sigma - seen)
+            self._trusted_sigma = seen
+            # One contact moves all axes.
+            self._trusted = self._trusted + off / max(1.0, float((np.abs(off) / np.maximum(most, 1e-12)).max()))
+            off = bias - self._trusted
+            self._known_walk_N += (float(self._weights @ _WALKS) - self._known_walk_N) * -np.expm1(
+                -dt_s / _WALK_KNOWN_S
+            )
+        beyond = np.maximum(np.abs(off) - sigma, 0.0)
+        if self._is_doubtful or (np.abs(off) < limit).all():
+            return sigma**2 + beyond**2, []
+        self._is_doubtful = True
+        force_N, torque_Nm = float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:]))
+        text = (
+            f"the bias has moved by {force_N:.2f} N and {torque_Nm:.3f} N·m, faster than this sensor drifts, as by a "
+            "slow contact: free the tool, then tare"
+        )
+        values = {"force_N": force_N, "torque_Nm": torque_Nm}
+        return sigma**2 + beyond**2, [StreamEvent(round((self._t_s or 0.0) * 1e9), "drift", text, values)]
 
     def _follow(self, window: Window) -> None:
         """Take a window into account whose part is known, or begin an interruption."""
@@ -162,6 +216,9 @@ class Tracker:
         self._before = x[6:].copy(), P[6:, 6:].copy()
         self._x[:, 6:] = 0.0
         self._P[:, 6:], self._P[:, :, 6:] = 0.0, 0.0
+        if self._is_doubtful:  # a slow contact may end at once
+            self._P[:, range(6), range(6)] += np.square(x[:6] - self._trusted)
+            self._x[:, :6] = self._trusted
         self._P[:, 6:, 6:] = np.diag(_ANY_PART**2)
         self._queue, self._run = [], []
         self._decide(window)
@@ -435,7 +492,7 @@ class Following:
     def __init__(self, info: StreamInfo) -> None:
         calibration = info.calibration
         self._windows = Windows(info)
-        self._tracker = Tracker(calibration.mass_kg, calibration.parameters.p_sensor_com_m)
+        self._tracker = Tracker(calibration.mass_kg, calibration.parameters.p_sensor_com_m, _drift_per_h(calibration))
         self._reported_s = -np.inf
         self.tracked: Tracked | None = None
         """None before the first window."""
@@ -443,6 +500,10 @@ class Following:
     def restart(self) -> None:
         """Forget the samples before an interruption."""
         self._windows.restart()
+
+    def trust(self) -> None:
+        """Take the bias as that of a free tool, as a tare has found."""
+        self._tracker.trust()
 
     def add(
         self, rows: Paired, states: NDArray[np.int8], noise: NoiseEstimator
@@ -455,6 +516,12 @@ class Following:
                 self._reported_s = tracked.t_s
                 events.append(StreamEvent(round(tracked.t_s * 1e9), "tracked", tracked.in_words(), tracked.to_dict()))
             yield tracked, events
+
+
+def _drift_per_h(calibration: CalibrationResult) -> Array:
+    """Return how fast the bias drifted in the tour (6,), N and N·m."""
+    growth: list[float] = calibration.quality.get("bias_growth_per_min", [0.0] * 6)
+    return 60 * np.abs(growth)
 
 
 def update_by(calibration: CalibrationResult, tracked: Tracked) -> Update | None:

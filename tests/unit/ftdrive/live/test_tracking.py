@@ -263,6 +263,54 @@ def test_noise_and_walk_are_learnt(walk_N: float) -> None:
         np.testing.assert_allclose(learnt, noise, rtol=0.2)
 
 
+def at_rest(t_s: float, residual: Array) -> Window:
+    return replace(
+        WINDOW,
+        t_s=t_s,
+        residual=residual,
+        noise=np.diag(NOISE**2 / 4),
+        state=REST,
+        lever_s2=np.zeros((3, 3)),
+        turning_rad_s2=0.0,
+        tensor_Nm=0.0,
+    )
+
+
+def test_a_contact_that_grows_slowly_is_reported_once_and_covered_by_the_sigma() -> None:
+    rng, tracker = np.random.default_rng(9), Tracker(1.2, np.array([0.0, 0.0, 0.06]))
+    contact, events = 3.0 * np.array([0.6, 0.0, -0.8, 0.005, 0.01, 0.0]), list[StreamEvent]()
+    for t_s in np.arange(0.0, 400.0):
+        held = contact * np.clip((t_s - 30) / 300, 0, 1) * (t_s < 360)
+        tracked = tracker.update(at_rest(t_s, held + NOISE / 4 * rng.standard_normal(6)))
+        events += tracked.events
+        off = np.abs(tracked.bias)
+        assert (off < np.maximum([0.2, 0.2, 0.2, 0.02, 0.02, 0.02], 3 * tracked.sigma)).all()
+    slow, *others = (event for event in events if event.kind == "drift")
+    assert not others
+    assert 0.1 < slow.values["force_N"] < 1.0
+    assert (tracked.sigma[:3] < 0.3).all()  # it has ended
+    assert (off[:3] < 0.05).all()
+
+
+def test_a_sensor_that_warms_up_is_followed_without_an_event() -> None:
+    rng, tracker = np.random.default_rng(10), Tracker(1.2, np.array([0.0, 0.0, 0.06]))
+    for t_s in np.arange(0.0, 900.0, 3.0):
+        warmed = np.array([2.0, -1.0, 0.5, 0.03, 0.02, -0.04]) * -np.expm1(-t_s / 900)
+        tracked = tracker.update(at_rest(t_s, warmed + NOISE / 4 * rng.standard_normal(6)))
+        assert not tracked.events
+    assert (np.abs(tracked.bias - warmed) < 4 * tracked.sigma).all()
+    assert (tracked.sigma < [0.1, 0.1, 0.1, 0.003, 0.003, 0.003]).all()
+
+
+def test_a_tare_ends_the_doubt() -> None:
+    tracker = Tracker(1.2, np.array([0.0, 0.0, 0.06]))
+    for t_s in np.arange(0.0, 200.0):
+        tracked = tracker.update(at_rest(t_s, np.array([1.5, 0, 0, 0, 0, 0]) * np.clip((t_s - 30) / 150, 0, 1)))
+    assert tracked.sigma[0] > 0.8
+    tracker.trust()
+    assert tracker.update(at_rest(200.0, np.array([1.5, 0, 0, 0, 0, 0]))).sigma[0] < 0.1
+
+
 def test_the_error_of_the_calibration_is_in_the_sigma() -> None:
     variance = np.array([0.1, 0.2, 0.3, 0.004, 0.005, 0.006])
     pairs = [(Tracker(1.0, np.zeros(3)), systematic) for systematic in (np.diag(variance), np.zeros((6, 6)))]
