@@ -12,13 +12,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
+from ftcalib.after.cell_errors import LOAD, sensor_error_columns
 from ftcalib.after.state import Update, apply_update
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.findings import Finding
-from ftcalib.likelihood.response import Response, joint_covariance, joint_jacobian
+from ftcalib.likelihood.response import LEVER_M, Response, joint_covariance, joint_jacobian
 from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_between_vectors, predict, skew
 from ftcalib.result import CalibrationResult
 
@@ -99,7 +101,7 @@ class CellPrior:
         what, alone : str
             Name of the data, and how to calibrate without the earlier result.
         """
-        if not dof or chi2_sf(dof, chi2) >= FALSE_ALARMS:
+        if not dof or chi2_sf(len(_BASE), chi2) >= FALSE_ALARMS:  # no part of the prior can lower it by enough
             return ""
         explained, old = list[tuple[float, str]](), self.earlier.parameters
         for cause, kept in (("the sensor is mounted otherwise", _BASE), ("the base leans otherwise", _MOUNTING)):
@@ -107,11 +109,15 @@ class CellPrior:
                 left, freedom, new = refit(kept)
             except NotObservable:
                 continue
-            if not freedom or chi2_sf(freedom, left) >= FALSE_ALARMS:
+            # The sum over all readings hides a turn that lowers it clearly.
+            fits = not freedom or chi2_sf(freedom, left) >= FALSE_ALARMS
+            if fits and chi2_sf(dof - freedom, chi2 - left) < FALSE_ALARMS:
                 turned = float(angle_between(old.R_flange_sensor, new.R_flange_sensor))
                 if kept == _MOUNTING:
                     turned = angle_between_vectors(old.down, new.down)
                 explained.append((left, f"{cause}, by {np.degrees(turned):.2g}°"))
+        if not explained and chi2_sf(dof, chi2) >= FALSE_ALARMS:
+            return ""
         misfit = f"chi2 {chi2:.0f} for {dof} degrees of freedom"
         if not explained:
             return (
@@ -160,7 +166,8 @@ def new_tool(
         raise NotObservable(
             "the noise of the poses was not measured, so nothing tests the earlier result: leave --from out."
         )
-    cov = pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier))
+    about = _start(earlier.parameters, dataset.R_base_flange, dataset.wrench)
+    cov = pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier, about))
     weights: Array = np.linalg.inv(cov).astype(np.float64)
     poses = dataset.R_base_flange, dataset.wrench, weights
     prior = CellPrior(earlier)
@@ -181,26 +188,29 @@ def new_tool(
 
 def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Array, kept: Sequence[int]) -> Update:
     """Fit all parameters; `kept` as of `CellPrior.rows`."""
-    n, coefficients = len(wrench), prior.coefficients
-    new = _start(prior.earlier.parameters, R_base_flange, wrench)
+    n, k = len(wrench), len(prior.coefficients)
+    new, coefficients = _start(prior.earlier.parameters, R_base_flange, wrench), prior.coefficients
+    unseen: Array | None = None
     for _ in range(_MOST_STEPS):
-        left = wrench - predict(new, R_base_flange)
-        J = joint_jacobian(new, prior.earlier.response, R_base_flange)
-        if prior.has_response:
-            left = left - np.ascontiguousarray(J[..., 15:]) @ coefficients
-        A, r = prior.rows(new, coefficients, kept)
+        errors = sensor_error_columns(prior.earlier, new, R_base_flange)
+        unseen = np.zeros(errors.shape[2]) if unseen is None else unseen
+        J = np.concatenate([joint_jacobian(new, prior.earlier.response, R_base_flange), errors], axis=2)
+        left = wrench - predict(new, R_base_flange) - J[..., 15:] @ np.concatenate([coefficients, unseen])
+        known, of_known = prior.rows(new, coefficients, kept)
+        A = block_diag(known, np.eye(len(unseen)))
+        r = np.concatenate([of_known, -unseen])
         WJ = weights @ J
         H = np.einsum("nij,nik->jk", J, WJ) + A.T @ A
         scale = np.sqrt(np.diag(H))
         if not (scale > 0).all() or np.linalg.cond(H / np.outer(scale, scale)) > _SINGULAR:
             raise NotObservable(f"{n} poses do not determine the tool: add poses with other tilts of the tool.")
         step = np.linalg.solve(H, np.einsum("nij,ni->j", WJ, left) + A.T @ r)
-        new, coefficients = new.moved(step[:15]), coefficients + step[15:]
+        new, coefficients, unseen = new.moved(step[:15]), coefficients + step[15 : 15 + k], unseen + step[15 + k :]
         if float(step @ H @ step) < _SETTLED:
             break
     else:
         raise NotObservable(f"the fit has not settled in {_MOST_STEPS} steps: check the poses, or solve alone.")
-    covariance = np.linalg.inv(H)
+    covariance = np.linalg.inv(H)[: 15 + k, : 15 + k]
     weight_N, sigma_N = new.weight_N, new.weight_sigma_N(covariance)
     if weight_N < _SIGNIFICANT * sigma_N:
         raise NotObservable(f"the weight of the tool is {weight_N:.2g} N, sigma {sigma_N:.2g} N: check the sensor.")
@@ -221,12 +231,24 @@ def _start(old: Parameters, R_base_flange: Array, wrench: Array) -> Parameters:
     return Parameters(old.R_flange_sensor, weight_N * old.down, x[1:4], x[4:7] / weight_N, x[7:])
 
 
-def _beyond(earlier: CalibrationResult) -> Array:
-    """Variance (6,) of a pose beyond its noise, where noise alone did not explain the residuals of the earlier fit."""
-    if earlier.noise_explains:
-        return np.zeros(6)
-    excess = np.square(earlier.likely_error()) - np.square(earlier.predicted_error())
-    return np.repeat(np.maximum(excess, 0.0) / 3, 3)
+def _beyond(earlier: CalibrationResult, new: Parameters) -> Array:
+    """Variance (6,) of a pose beyond its noise: what noise did not explain, or may have hidden, in the earlier fit.
+
+    What depends on the load grows with its square.
+    """
+    if earlier.noise_explains and earlier.measured_sigma is not None:
+        # one sigma of chi2
+        hidden = max(earlier.chi2 / earlier.dof - 1, 0.0) + np.sqrt(2 / earlier.dof)
+        variance = hidden * np.square(earlier.measured_sigma)
+    else:
+        excess = np.square(earlier.likely_error()) - np.square(earlier.predicted_error())
+        variance = np.repeat(np.maximum(excess, 0.0) / 3, 3)
+    level = np.sqrt(variance)
+    for channels, lever_m in ((slice(3), 1.0), (slice(3, 6), LEVER_M)):
+        ratio = max(1.0, new.weight_N / earlier.weight_N) if earlier.weight_N else 1.0
+        most = LOAD * new.weight_N * lever_m
+        level[channels] = np.maximum(level[channels], np.minimum(level[channels] * ratio**2, most))
+    return np.asarray(level**2)
 
 
 def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any] | None = None) -> CalibrationResult:

@@ -8,7 +8,8 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
-from ftcalib.after.new_tool import new_tool, together
+from ftcalib.after.cell_errors import sensor_error_columns
+from ftcalib.after.new_tool import _beyond, new_tool, together
 from ftcalib.data.dataset import pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.likelihood.response import Response
@@ -67,6 +68,29 @@ def test_a_turned_sensor_and_a_leaning_base_are_named() -> None:
         new_tool(calibrated(), replace(touched, wrench=wrench))
 
 
+def read_by(matrix: Array, truth: Parameters, R: Array, seed: int) -> CalibrationDataset:
+    """Readings of a sensor whose own matrix is off by so much."""
+    dataset = poses(truth, R, seed)
+    weight = predict(replace(truth, force_bias_N=np.zeros(3), torque_bias_Nm=np.zeros(3)), R)
+    return replace(dataset, wrench=dataset.wrench + weight @ matrix.T)
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+def test_errors_of_the_sensor_are_no_contact_and_hide_no_turn(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    levers = np.array([1.0, 0.05])
+    scale = np.kron(levers[:, None] / levers, np.ones((3, 3)))
+    matrix = scale * np.where(np.eye(6) > 0, 0.012, 0.006) * rng.normal(size=(6, 6))
+    R = Rotation.random(24, rng=rng).as_matrix()
+    earlier = solve(read_by(matrix, TRUTH, R, seed))
+    result = new_tool(earlier, read_by(matrix, OTHER, FOUR, seed))
+    assert abs(error(result, OTHER)[9:12]).max() < 4 * result.sigma["p_sensor_com_m"].max()  # type: ignore[union-attr]
+    turn = Rotation.from_rotvec([1.0, 0.0, 0.0], degrees=True).as_matrix()
+    turned = replace(OTHER, R_flange_sensor=TRUTH.R_flange_sensor @ turn)
+    with pytest.raises(NotObservable, match="the sensor is mounted otherwise"):
+        new_tool(earlier, read_by(matrix, turned, FOUR, seed))
+
+
 def test_poses_without_noise_are_refused() -> None:
     with pytest.raises(NotObservable, match="noise of the poses was not measured"):
         new_tool(calibrated(), CalibrationDataset.of(FOUR, predict(OTHER, FOUR)))
@@ -91,7 +115,7 @@ def test_two_days_with_a_moved_bias_are_one_fit() -> None:
 
 @pytest.mark.parametrize("gain", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_covariance_of_a_new_tool_is_that_of_first_order(gain: bool) -> None:
-    """Of readings, and of mounting, base and gain of the earlier result."""
+    """Of readings and sensor, and of mounting, base and gain of the earlier result."""
     earlier = calibrated(8)
     root = np.diag(np.repeat([3e-3, 0.03, 0.02, 1e-3, 1e-3], 3)) @ (
         np.eye(15) + 0.3 * np.random.default_rng(7).normal(size=(15, 15))
@@ -110,7 +134,8 @@ def test_the_covariance_of_a_new_tool_is_that_of_first_order(gain: bool) -> None
     y = predict(now, R) if response is None else predict(now, R) + response.wrench(now, R)
     dataset = replace(poses(now, R, 0), wrench=y)
     assert dataset.wrench_cov is not None
-    noise = block_diag(*pooled_covariance(dataset.wrench_cov, dataset.n_samples))
+    noise = block_diag(*(pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier, now))))
+    sensor = sensor_error_columns(earlier, now, R).reshape(24, -1)
 
     def solved(e: Array, shift: Array) -> Array:
         other = None if response is None else Response(response.coefficients + e[15:], C)
@@ -121,7 +146,7 @@ def test_the_covariance_of_a_new_tool_is_that_of_first_order(gain: bool) -> None
 
     found = new_tool(earlier, dataset)
     expected = propagated(lambda e: solved(e, np.zeros(24)), C) + propagated(
-        lambda e: solved(np.zeros(len(C)), e), noise
+        lambda e: solved(np.zeros(len(C)), e), noise + sensor @ sensor.T
     )
     assert_same(
         found.covariance if found.response is None else found.response.covariance, expected, 0.03 if gain else 5e-3

@@ -1,0 +1,83 @@
+"""What an unchanged cell may do to readings beyond what its fit shows: errors of the sensor, the arm and a cable.
+
+The errors of a sensor are those of its 6 x 6 matrix, of which one tool shows gain and cross-talk at its centre of mass
+alone. Their size is what the fit found, else what its poses and its residuals leave of the prior. Those of arm and
+cable are smooth over the orientations: two poses near each other have nearly the same.
+"""
+
+import numpy as np
+
+from ftcalib.likelihood.response import LEVER_M, SIZE, Response, response_columns
+from ftcalib.model import Array, Parameters, gravity_wrench, skew
+from ftcalib.result import CalibrationResult
+
+# A mounted or aged sensor before its fit, one sigma: its diagonal, and the rest of its range (levers of 50 mm).
+GAIN, CROSS = 0.02, 0.01
+# What of the gain depends on the load.
+LOAD = 0.005
+# Of the coefficients of `Response`: two of the diagonal and three of pairs, and for the cross-talk six.
+_PRIOR = np.array([GAIN, GAIN, CROSS, CROSS, CROSS, *[CROSS] * 6])
+# Squares of the bases, the sum over their entries.
+_SQUARES = np.array([1.0, 1, 2, 2, 2, 1, 1, 1, 2, 2, 2])
+# Smooth errors, one sigma: of the orientations of a calibrated arm, and of a cable at a quarter turn.
+TURN_RAD, CABLE = float(np.deg2rad(0.05)), np.repeat([0.08, 0.02], 3)
+# Correlation of two orientations a quarter turn apart.
+_CORRELATED = 0.5
+
+
+def known_response(calibration: CalibrationResult) -> Response:
+    """Return gain and cross-talk as found, or zero with the covariance that the fit leaves of the prior.
+
+    A fit of n poses shows a gain as well as n readings of the weight do, with the error of predicting one from the
+    others. Half of that counts: a small one is not found.
+    """
+    if calibration.response is not None:
+        return calibration.response
+    quality, n = calibration.quality, calibration.n_poses - len(calibration.rejected_poses)
+    left_out: list[float] = [quality.get(name, np.inf) for name in ("loo_force_rms_N", "loo_torque_rms_Nm")]
+    error = np.repeat(left_out, [5, 6]) / np.repeat([1.0, LEVER_M], [5, 6])
+    share = max(calibration.dof, 0) / (6 * n) / 2
+    shown = share * n * _SQUARES * (calibration.weight_N / np.maximum(error, 1e-12)) ** 2
+    covariance = np.zeros((15 + SIZE, 15 + SIZE))
+    covariance[:15, :15] = calibration.covariance
+    covariance[range(15, 15 + SIZE), range(15, 15 + SIZE)] = 1 / (_PRIOR**-2 + shown)
+    return Response(np.zeros(SIZE), covariance)
+
+
+def sensor_error_columns(calibration: CalibrationResult, p: Parameters, R_base_flange: Array) -> Array:
+    """Give what errors of the sensor do to the reading of a load, for one sigma of each, beyond those of the tool.
+
+    The response to the tool is that to any load at its centre of mass. A load at another has a torque beside, to which
+    the sensor responds by errors of its own, as large as those that the tool shows.
+
+    Parameters
+    ----------
+    calibration : CalibrationResult
+        Of the tool.
+    p : Parameters
+        Of the load.
+    R_base_flange : array, shape (n, 3, 3)
+
+    Returns
+    -------
+    array, shape (n, 6, k)
+        Independent columns.
+    """
+    known, variance = calibration.response, np.diag(known_response(calibration).covariance)[15:]
+    square = variance if known is None else known.coefficients**2 + variance
+    in_force, in_torque = (float(np.sqrt(np.mean(part))) for part in np.split(square / _PRIOR**2, [5]))
+    u, lever = gravity_wrench(p, R_base_flange)[:, :3], skew(p.p_sensor_com_m - calibration.p_sensor_com_m)
+    entries = np.where(np.eye(3) > 0, GAIN, CROSS)
+    columns = np.zeros((len(u), 6, 27))
+    columns[:, :3, :9] = _products(np.eye(3), u @ lever.T, np.full((3, 3), in_force * CROSS / LEVER_M))
+    columns[:, 3:, 9:18] = _products(np.eye(3), u @ lever.T, in_torque * entries)
+    columns[:, 3:, 18:] = _products(lever, u, in_force * entries)
+    # A gain of one load is that of another but for what depends on the load.
+    other = p.weight_N / calibration.weight_N - 1 if calibration.weight_N else 0.0
+    unknown = np.minimum(square, LOAD**2) * min(abs(other), 1.0) ** 2 + (variance if known is None else 0.0)
+    return np.concatenate([columns, response_columns(p, R_base_flange) * np.sqrt(unknown)], axis=2)
+
+
+def _products(A: Array, v: Array, sigma: Array) -> Array:
+    """Derivative (n, 3, 9) of A E v by the entries of E, times their sigma (3, 3), for vectors v (n, 3)."""
+    return np.asarray(np.einsum("ri,nj,ij->nrij", A, v, sigma).reshape(len(v), 3, 9))
