@@ -8,7 +8,7 @@ cable are smooth over the orientations: two poses near each other have nearly th
 import numpy as np
 
 from ftcalib.likelihood.response import LEVER_M, SIZE, Response, response_columns
-from ftcalib.model import Array, Parameters, gravity_wrench, skew
+from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 from ftcalib.result import CalibrationResult
 
 # A mounted or aged sensor before its fit, one sigma: its diagonal, and the rest of its range (levers of 50 mm).
@@ -16,12 +16,12 @@ GAIN, CROSS = 0.02, 0.01
 # What of the gain depends on the load.
 LOAD = 0.005
 # Of the coefficients of `Response`: two of the diagonal and three of pairs, and for the cross-talk six.
-_PRIOR = np.array([GAIN, GAIN, CROSS, CROSS, CROSS, *[CROSS] * 6])
+PRIOR = np.array([GAIN, GAIN, CROSS, CROSS, CROSS, *[CROSS] * 6])
 # Squares of the bases, the sum over their entries.
 _SQUARES = np.array([1.0, 1, 2, 2, 2, 1, 1, 1, 2, 2, 2])
-# Smooth errors, one sigma: of the orientations of a calibrated arm, and of a cable at a quarter turn.
-TURN_RAD, CABLE = float(np.deg2rad(0.05)), np.repeat([0.08, 0.02], 3)
-# Correlation of two orientations a quarter turn apart.
+# Smooth errors, one sigma an axis: of the orientations of a calibrated arm, and of the pull of a cable.
+TURN_RAD, CABLE = float(np.deg2rad(0.1)), np.repeat([0.05, 0.012], 3)
+# Correlation of their effects a quarter turn apart.
 _CORRELATED = 0.5
 
 
@@ -40,7 +40,7 @@ def known_response(calibration: CalibrationResult) -> Response:
     shown = share * n * _SQUARES * (calibration.weight_N / np.maximum(error, 1e-12)) ** 2
     covariance = np.zeros((15 + SIZE, 15 + SIZE))
     covariance[:15, :15] = calibration.covariance
-    covariance[range(15, 15 + SIZE), range(15, 15 + SIZE)] = 1 / (_PRIOR**-2 + shown)
+    covariance[range(15, 15 + SIZE), range(15, 15 + SIZE)] = 1 / (PRIOR**-2 + shown)
     return Response(np.zeros(SIZE), covariance)
 
 
@@ -65,7 +65,7 @@ def sensor_error_columns(calibration: CalibrationResult, p: Parameters, R_base_f
     """
     known, variance = calibration.response, np.diag(known_response(calibration).covariance)[15:]
     square = variance if known is None else known.coefficients**2 + variance
-    in_force, in_torque = (float(np.sqrt(np.mean(part))) for part in np.split(square / _PRIOR**2, [5]))
+    in_force, in_torque = (float(np.sqrt(np.mean(part))) for part in np.split(square / PRIOR**2, [5]))
     u, lever = gravity_wrench(p, R_base_flange)[:, :3], skew(p.p_sensor_com_m - calibration.p_sensor_com_m)
     entries = np.where(np.eye(3) > 0, GAIN, CROSS)
     columns = np.zeros((len(u), 6, 27))
@@ -81,3 +81,12 @@ def sensor_error_columns(calibration: CalibrationResult, p: Parameters, R_base_f
 def _products(A: Array, v: Array, sigma: Array) -> Array:
     """Derivative (n, 3, 9) of A E v by the entries of E, times their sigma (3, 3), for vectors v (n, 3)."""
     return np.asarray(np.einsum("ri,nj,ij->nrij", A, v, sigma).reshape(len(v), 3, 9))
+
+
+def smooth_errors(p: Parameters, R_base_flange: Array, others: Array, *, cable: bool = True) -> Array:
+    """Give the covariance (6n, 6m) that smooth errors of arm and cable cause between n and m orientations."""
+    cosine = np.einsum("nij,mij->nm", R_base_flange, others)
+    alike = _CORRELATED ** ((3 - cosine) / 2)
+    turn, turn_other = (jacobian(p, R)[..., :3] * TURN_RAD for R in (R_base_flange, others))
+    each = np.einsum("nik,mjk->nimj", turn, turn_other) + cable * np.diag(CABLE**2)[None, :, None]
+    return np.asarray((alike[:, None, :, None] * each).reshape(6 * len(R_base_flange), -1))

@@ -1,6 +1,6 @@
 """How far readings of an unchanged cell may be from their prediction, under each explanation of the fit's residuals.
 
-What is estimated by a fit of few poses is uncertain, and so is what acts on its readings. Four explanations are kept:
+What is estimated by a fit of few poses is uncertain, and so is what acts on its readings. Five explanations are kept:
 
 * The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
 * The measured noise, by a factor that only the residuals of the fit show, and inexact orientations, which a fit of few
@@ -10,8 +10,10 @@ What is estimated by a fit of few poses is uncertain, and so is what acts on its
   most.
 * The measured noise, by such a factor, and a bias that walks, where a fit of 24 poses or fewer found a drift, which it
   may have missed in the other three channels, or noise beyond the measured.
+* The measured noise, by such a factor, and what sensor, arm and cable usually do (`ftcalib.after.cell_errors`). The
+  residuals of the fit show its size, but not what other joint angles do in the same orientation.
 
-Under the last three, with the ratio of both variances given, the squared distance of new readings from their prediction
+Under the last four, with the ratio of both variances given, the squared distance of new readings from their prediction
 over the mean square of the fit's residuals has exactly an F distribution (predictive test of Chow, Econometrica 28,
 1960). Its probability is averaged over the ratios, each weighted by its restricted likelihood in the fit (posterior
 predictive probability), so an error that the fit cannot find widens the limit as much as the data allow.
@@ -26,14 +28,22 @@ from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import fdtrc as f_sf
 
+from ftcalib.after.cell_errors import PRIOR, smooth_errors
 from ftcalib.after.state import Update
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.files import JSON
 from ftcalib.likelihood.descent import column_scale
-from ftcalib.likelihood.response import hysteresis_columns, joint_covariance, joint_jacobian, with_covariance
+from ftcalib.likelihood.response import (
+    SIZE,
+    hysteresis_columns,
+    joint_covariance,
+    joint_jacobian,
+    response_columns,
+    with_covariance,
+)
 from ftcalib.likelihood.session_noise import pose_times, summed_products
-from ftcalib.model import BIASES, Array, Parameters, jacobian, read_only
+from ftcalib.model import BIASES, Array, Parameters, jacobian, predict, read_only
 from ftcalib.result import CalibrationResult
 
 # Errors of an arm's orientations over which the average is taken. Before the fit, each is as likely as any other.
@@ -43,6 +53,10 @@ USUAL_SHARES = np.geomspace(1e-4, 5e-3, 9)
 # Steps of the bias from pose to pose, in sigma of the measured noise, over which the average is taken: of the forces,
 # and of the torques. Before the fit, each pair is as likely as any other.
 USUAL_WALKS = np.geomspace(0.3, 30, 5)
+# Sizes of smooth errors, and of gain and cross-talk that the fit did not find, relative to usual ones.
+USUAL_SMOOTH = np.geomspace(0.03, 2, 8)
+# Of more poses every second, third, ... shows smooth errors.
+FEW_TO_SMOOTH = 100
 MANY_POSES = 1000
 # From more, the fit finds a walk in all channels that have one.
 FEW_POSES = 24
@@ -190,6 +204,60 @@ def expected_with_walk(
     share = calibration.components.get("hysteresis", 0.0)
     usual = [(0.0, share, walk) for walk in product(USUAL_WALKS, repeat=2)]
     return _weigh_explanations(calibration, fitted, R_base_flange, wrench_cov, usual)
+
+
+def expected_with_smooth_errors(
+    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
+) -> list[Expected]:
+    """Explain the fit by scaled measured noise, and by usual errors of sensor, arm and cable; all else as the others.
+
+    What they do to the new poses follows from what they have done to those of the fit, and grows with the distance.
+    """
+    p, response = calibration.parameters, calibration.response
+    kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
+    dof = 6 * int(kept.sum()) - 15
+    if fitted.wrench_cov is None or calibration.method != "ml" or calibration.dof != dof:
+        return []
+    rows = np.flatnonzero(kept)[:: -(-int(kept.sum()) // FEW_TO_SMOOTH)]
+    R, dof = fitted.R_base_flange[rows], 6 * len(rows) - 15
+    D = block_diag(*pooled_covariance(fitted.wrench_cov, fitted.n_samples)[rows])
+    e = (fitted.wrench[rows] - predict(p, R)).ravel()
+    J, J_new = (jacobian(p, one).reshape(-1, 15) for one in (R, R_base_flange))
+    T, T_new = (response_columns(p, one).reshape(-1, SIZE) for one in (R, R_base_flange))
+    smooth, between, new = (smooth_errors(p, *pair) for pair in ((R, R), (R_base_flange, R), (R_base_flange,) * 2))
+    arm = smooth_errors(p, R_base_flange, R_base_flange, cable=False)
+    sizes = np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
+    coefficients = np.zeros(SIZE) if response is None else response.coefficients
+    stored = joint_jacobian(p, response, R_base_flange).reshape(6 * len(R_base_flange), -1)
+    stored = stored @ joint_covariance(calibration.covariance, response) @ stored.T
+    explanations, likelihood = [], []
+    for size in USUAL_SMOOTH:
+        gain = np.where(sizes > 0, sizes, size * PRIOR) ** 2
+        S = D + size**2 * smooth + (T * gain) @ T.T
+        to_new = size**2 * between + (T_new * gain) @ T.T
+        P = np.linalg.inv(S)
+        H = J.T @ P @ J
+        scale = np.outer(column_scale(H), column_scale(H))
+        C = np.linalg.inv(H / scale) / scale
+        x = C @ (J.T @ (P @ e))
+        u = P @ (e - J @ x)
+        chi2, logdet = float(e @ u), float(np.linalg.slogdet(S)[1] + np.linalg.slogdet(H / scale)[1])
+        logdet += float(np.log(np.diag(scale)).sum())
+        likelihood.append(-0.5 * (logdet + dof * np.log(chi2)))
+        factor = max(chi2 / dof, LEAST_FACTOR)
+        off, B = to_new @ u + J_new @ x - T_new @ coefficients, J_new - to_new @ P @ J
+        total = block_diag(*wrench_cov) + size**2 * new + (T_new * gain) @ T_new.T - to_new @ P @ to_new.T
+        # Other joint angles may reach the same orientation, where arm and cable do as much again.
+        total += size**2 * new + arm
+        # The prediction as stored is off by what this explanation moves it.
+        total += B @ C @ B.T + np.outer(off, off) / factor
+        value, vector = np.linalg.eigh(total - stored / factor)
+        noise = (vector * np.maximum(value, 1e-6 * value[-1])) @ vector.T
+        joint = with_covariance(response, joint_covariance(calibration.covariance, response) / factor)
+        update = Update(p, calibration.covariance / factor, 0.0, 0, response=joint)
+        explanations.append(Expected(update, noise, dof, factor))
+    weights = np.exp(np.array(likelihood) - max(likelihood))
+    return [replace(one, weight=weight) for one, weight in zip(explanations, weights / weights.sum(), strict=True)]
 
 
 def _weigh_explanations(
