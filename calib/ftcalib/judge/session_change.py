@@ -35,6 +35,7 @@ from ftcalib.model import (
     jacobian,
     nearest_rotation,
     predict,
+    rotation_of,
     skew,
 )
 
@@ -58,7 +59,7 @@ Steps = tuple[int, ...]
 Rows = NDArray[np.integer | np.bool_]
 
 # Columns of `_columns`.
-TURN, BIAS, COM, LOAD = range(3), range(3, 9), range(10, 13), range(9, 13)
+TURN, BIAS, COM, LOAD, MOUNTING = range(3), range(3, 9), range(10, 13), range(9, 13), range(13, 16)
 # What changes, by code.
 KINDS = {
     "bias_stepped": [*BIAS],
@@ -66,6 +67,7 @@ KINDS = {
     "load_changed": [*LOAD],
     "sensor_turned": [*TURN],
     "sensor_changed": [*TURN, *BIAS],
+    "tool_turned": [*MOUNTING],
 }
 
 
@@ -96,7 +98,9 @@ class SessionChange:
         return np.flatnonzero(np.diff(self.rows)) + 1
 
 
-def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma: Array | None) -> list[Finding]:
+def session_change(
+    found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma: Array | None, *, steps: bool = True
+) -> list[Finding]:
     """Find a lasting change, or two sensors that take turns.
 
     Parameters
@@ -108,6 +112,8 @@ def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma
     t_s : array, shape (n,), optional
     sigma : array, shape (6,), optional
         Measured noise of a pose.
+    steps : bool
+        Whether steps of the bias count: not where the fit found no drift that they would look like.
     """
     # Negative floor division rounds the step up.
     order = order[:: -(-len(order) // MOST_POSES)]
@@ -116,7 +122,7 @@ def session_change(found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma
         return []
     times = None if t_s is None else t_s[order]
     cov = None if sigma is None else np.diag(sigma**2)
-    changes = [likeliest_change(found.parameters, R, wrench, sigma), bias_steps(R, wrench)]
+    changes = [likeliest_change(found.parameters, R, wrench, sigma), bias_steps(R, wrench) if steps else None]
     costs = [(_cost(one, R, cov, times), one) for one in changes if one is not None]
     cost, change = min(costs, key=lambda pair: pair[0], default=(np.inf, None))
     if change is None or cost >= minus_two_log_likelihood(fit(R, wrench, cov, t_s=times)):
@@ -310,10 +316,16 @@ def _refine(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, row
         turn = nearest_rotation(np.einsum("npi,npj->ij", *parts))
         step = mean_y - _turn(mean_g, turn)[0]
         undone[rows] = _turn(y[rows] - step, turn.T)
+    if code == "tool_turned":
+        turn = nearest_rotation(y[rows, :3].T @ g[rows, :3])
+        undone[rows, :3] = y[rows, :3] @ turn
+        undone[rows, 3:] += np.cross(p.p_sensor_com_m, undone[rows, :3] - y[rows, :3])
     C = _columns(p, R)[..., own] * rows[:, None, None]
     misfit, x = _least(np.concatenate([C, jacobian(p, R), response_columns(p, R)], axis=2), undone - g, scale)
-    moved = np.zeros(13)
+    moved = np.zeros(16)
     moved[own] = x[: len(own)]
+    if code == "tool_turned":
+        turn = turn @ rotation_of(moved[MOUNTING])
     step += moved[BIAS]
     values = {
         "turn_deg": float(np.degrees(angle_between(turn, np.eye(3)))),
@@ -339,11 +351,11 @@ def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
 
 
 def _columns(p: Parameters, R: Array) -> Array:
-    """(n, 6, 13) derivative by a turn of the sensor, both biases, weight and centre of mass."""
+    """(n, 6, 16) derivative by a turn of the sensor, both biases, weight, centre of mass, and a turn with the tool."""
     J, g = jacobian(p, R), gravity_wrench(p, R)
     turn = -np.concatenate([skew(g[:, :3]), skew(g[:, 3:])], axis=1)
     bias = np.broadcast_to(np.eye(6), (len(R), 6, 6))
-    return np.concatenate([turn, bias, (J[..., 3:6] @ p.down)[..., None], J[..., 9:12]], axis=2)
+    return np.concatenate([turn, bias, (J[..., 3:6] @ p.down)[..., None], J[..., 9:12], J[..., :3]], axis=2)
 
 
 def _turn(wrench: Array, turn: Array) -> Array:

@@ -515,14 +515,16 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
 
 
 def _change(fit: Judged, quality: Quality, measured_sigma: Array | None, t_s: Array | None) -> list[Finding]:
-    """Name a lasting change, where the fit needs what could hide one: drift, more noise, or poses left out."""
+    """Name a lasting change, where the fit needs what could hide one: components of the noise, or poses left out."""
     kinds = ("walk", "slope") if quality.chi2_p is None else ("walk", "slope", "white")
-    hides = any(name.startswith(kinds) for name in fit.components)
-    if fit.fit is None or not (quality.errors or hides or not quality.used.all()):
+    drifts = any(name.startswith(kinds) for name in fit.components)
+    drifts |= bool(quality.errors) or not quality.used.all()
+    # Noise from the residuals hides a turn too.
+    if fit.fit is None or not (drifts or (fit.components and not quality.is_exact)):
         return []
     if t_s is None or not np.isfinite(t_s).all():
         t_s = np.arange(len(fit.wrench), dtype=np.float64)
-    return session_change(fit.fit, np.argsort(t_s, kind="stable"), t_s, measured_sigma)
+    return session_change(fit.fit, np.argsort(t_s, kind="stable"), t_s, measured_sigma, steps=drifts)
 
 
 def _rms(vectors: Array) -> float:

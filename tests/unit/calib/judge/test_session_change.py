@@ -113,6 +113,17 @@ def test_other_changes_are_named_before_the_drift_that_they_look_like(
     assert (result.verdict == "rejected") == (code != "bias_stepped")
 
 
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+def test_a_tool_that_turns_with_its_sensor_is_named_with_its_angle(seed: int, measured: bool) -> None:
+    axis = np.random.default_rng(seed).normal(size=3)
+    turn = Rotation.from_rotvec(axis / np.linalg.norm(axis), degrees=True).as_matrix()
+    after = replace(TOOL, R_flange_sensor=TOOL.R_flange_sensor @ turn)
+    first = session(after, 9, seed, measured=measured).findings[0]
+    assert (first.code, first.severity, first.values["pose"]) == ("tool_turned", "reject", 10)
+    assert first.values["turn_deg"] == pytest.approx(1.0, abs=0.05)
+
+
 def test_rows_of_two_sensors_are_named() -> None:
     assert session(OTHER, slice(1, None, 2), seed=1).findings[0].code == "sensors_alternate"
 
