@@ -15,13 +15,22 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
-from ftcalib.after.cell_errors import LOAD, sensor_error_columns
+from ftcalib.after.cell_errors import LOAD, known_response, sensor_error_columns
 from ftcalib.after.state import Update, apply_update
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.findings import Finding
 from ftcalib.likelihood.response import LEVER_M, Response, joint_covariance, joint_jacobian
-from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_between_vectors, predict, skew
+from ftcalib.model import (
+    BIASES,
+    PARAMETER_NAMES,
+    Array,
+    Parameters,
+    angle_between,
+    angle_between_vectors,
+    predict,
+    skew,
+)
 from ftcalib.result import CalibrationResult
 
 # Share of good runs that the test of what was kept rejects.
@@ -268,22 +277,20 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
     Raises
     ------
     NotObservable
-        The runs contradict each other in more than the bias, or only some show gain and cross-talk.
+        The runs contradict each other in more than the bias.
     """
-    with_response = {one.response is not None for one in results}
-    if len(with_response) > 1:
-        raise NotObservable("some runs show gain or cross-talk of the sensor and others do not: use --from.")
     if any((np.diag(one.covariance)[_SHARED] <= 0).any() for one in results):
         raise NotObservable("a run takes a value as exactly known: solve its runs without known values.")
     last, n = results[-1], 15
-    covariances = [joint_covariance(one.covariance, one.response) for one in results]
+    covariances = [one.covariance for one in results]
     differences = [last.parameters.difference(one.parameters) for one in results]
-    if last.response is not None:
-        n += len(last.response.coefficients)
-        responses = [one.response.coefficients for one in results if one.response is not None]
+    if any(one.response is not None for one in results):
+        responses = [known_response(one) for one in results]
+        n += len(responses[-1].coefficients)
+        covariances = [one.covariance for one in responses]
         differences = [
-            np.append(off, of_one - last.response.coefficients)
-            for off, of_one in zip(differences, responses, strict=True)
+            np.append(off, one.coefficients - responses[-1].coefficients)
+            for off, one in zip(differences, responses, strict=True)
         ]
     alike = np.append(_SHARED, np.arange(15, n))
     # What was not looked for has no variance.
@@ -312,7 +319,7 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
     alone = before[np.ix_(own, own)] - G @ before[np.ix_(alike, own)]
     covariance[np.ix_(own, own)] = alone + G @ C @ G.T
     covariance = (covariance + covariance.T) / 2
-    response = last.response and Response(last.response.coefficients + step[15:], covariance)
+    response = Response(responses[-1].coefficients + step[15:], covariance) if n > len(PARAMETER_NAMES) else None
     note = Finding.of("together", n_runs=len(results))
     return replace(
         last,

@@ -25,7 +25,7 @@ from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.response import response_columns
 from ftcalib.likelihood.session import LEVER_M
 from ftcalib.likelihood.session_noise import summed_products
-from ftcalib.likelihood.variance_components import GAIN, GAIN_OF_RESPONSE, squared_length
+from ftcalib.likelihood.variance_components import EFFECTS, GAIN, GAIN_OF_RESPONSE, squared_length
 from ftcalib.model import (
     BIASES,
     Array,
@@ -156,7 +156,7 @@ def minus_two_log_likelihood(found: Fit) -> float:
     """Restricted, with what its components and its rejected poses cost."""
     information = found.free.T @ found.information @ found.free
     value = found.noise.logdet + float(np.linalg.slogdet(information)[1]) + found.chi2
-    value += sum(2 * (GAIN_OF_RESPONSE if name in ("gain", "cross_talk") else GAIN) for name in found.components)
+    value += sum(2 * (GAIN_OF_RESPONSE if name.startswith(EFFECTS) else GAIN) for name in found.components)
     rejected = found.weights < 0.5
     if rejected.any():
         S = found.left_out_cov[rejected]
